@@ -1,0 +1,1 @@
+"""Declarative ingestion of ROS recordings into typed, queryable Mosaico sequences."""

@@ -1,0 +1,70 @@
+"""This file is what comes out of a recording: channels, and messages of one channel in batches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mosaico_ingest.bag.definition import Definition
+
+__all__ = ["Channel", "Encoding", "RawBatch"]
+
+
+class Encoding(str, Enum):
+    """How a payload is serialised."""
+
+    CDR = "cdr"
+    """ROS 2: a 4-byte encapsulation header, then aligned little- or big-endian fields."""
+    ROS1 = "ros1"
+    """ROS 1: packed little-endian fields."""
+    OTHER = "other"
+    """Not a ROS encoding (protobuf, json, …): named, never decoded."""
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """Messages of one type on one topic, written the same way; a topic may have several."""
+
+    id: int
+    """Unique within the recording, whatever its parts."""
+    topic: str
+    msgtype: str
+    """`pkg/msg/Name`, also for ROS 1 and for old names."""
+    encoding: Encoding
+    count: int | None
+    """How many messages the index promises; None where there is no index."""
+    definition: Definition | None
+    """None where no definition could be found; `problem` then says why."""
+    problem: str | None = None
+    latched: bool = False
+    attributes: dict[str, str] = field(default_factory=dict[str, str])
+    """What else the recording says: QoS profiles, caller id, md5, raw encoding name."""
+
+
+@dataclass(frozen=True, slots=True)
+class RawBatch:
+    """n messages of one channel in log-time order, their payloads inside one buffer."""
+
+    channel: Channel
+    log_times: NDArray[np.int64]
+    """When each was recorded, ns since the epoch, shape (n,)."""
+    data: NDArray[np.uint8]
+    """The buffer; may hold more than the payloads."""
+    starts: NDArray[np.int64]
+    """Where each payload begins in `data`, shape (n,)."""
+    lengths: NDArray[np.int64]
+    """How many bytes each payload has, shape (n,)."""
+    offsets: NDArray[np.int64]
+    """Where each lies in the source, for messages about it: file offset of its record or chunk, or row id; shape (n,)."""
+
+    def __len__(self) -> int:
+        """Return the number of messages."""
+        return len(self.log_times)
+
+    def payload(self, row: int) -> bytes:
+        """Return the bytes of one message."""
+        start = int(self.starts[row])
+        return self.data[start : start + int(self.lengths[row])].tobytes()

@@ -1,0 +1,1 @@
+"""One file a container format: MCAP, SQLite (rosbag2), ROS 1."""

@@ -1,0 +1,1 @@
+"""This file is the job as a Python value: what a script builds by hand, a manifest compiles to."""

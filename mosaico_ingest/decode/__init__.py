@@ -1,0 +1,1 @@
+"""Raw messages in, Arrow rows in the message's own shape out."""

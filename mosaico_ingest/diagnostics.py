@@ -1,0 +1,71 @@
+"""This file is the one way to say something about a manifest, a mapping, a recording or a row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+__all__ = ["Finding", "RowFailure", "Severity", "Span", "Stage"]
+
+
+class Severity(str, Enum):
+    """How much a finding matters."""
+
+    ERROR = "error"
+    WARNING = "warning"
+    INFO = "info"
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Span:
+    """A stretch of text: 1-based line and column of its first character and one past its last."""
+
+    file: str
+    line: int
+    column: int
+    end_line: int
+    end_column: int
+
+    def __str__(self) -> str:
+        """Return `file:line:column`, which terminals make clickable."""
+        return f"{self.file}:{self.line}:{self.column}"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing to know: which rule, where, what, and the remedy."""
+
+    rule: str
+    """The rule's name in kebab-case, as `unknown-key`."""
+    severity: Severity
+    message: str
+    """What is wrong, with the value, in one line."""
+    span: Span | None = None
+    help: str | None = None
+    """What to do about it, in one line."""
+
+    def __str__(self) -> str:
+        """Return the finding in one line, without the source excerpt."""
+        place = f"{self.span}: " if self.span else ""
+        text = f"{place}{self.severity.value}[{self.rule}] {self.message}"
+        return f"{text} — {self.help}" if self.help else text
+
+
+class Stage(str, Enum):
+    """Where in the pipeline a row was lost."""
+
+    READ = "read"
+    DECODE = "decode"
+    ADAPT = "adapt"
+    WRITE = "write"
+
+
+@dataclass(frozen=True, slots=True)
+class RowFailure:
+    """One row that could not go on: its position in the batch that was given, the rule it broke, and why."""
+
+    row: int
+    rule: str
+    """A short kebab-case name that failures can be counted by, as `cdr-length`, `nan`, `out-of-range`."""
+    reason: str
+    """What was expected and what was found, in one line."""

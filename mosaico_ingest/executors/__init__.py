@@ -1,0 +1,1 @@
+"""Who runs the plans: in this process, in several, on Ray."""

@@ -1,0 +1,1 @@
+"""This file runs a plan: recording, decode, adapt, sink. It decides nothing."""

@@ -1,0 +1,1 @@
+"""Typed models and their exact Arrow columns; knows nothing of ROS."""

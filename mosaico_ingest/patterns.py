@@ -1,0 +1,49 @@
+"""This file decides which topics a list of patterns selects, and which pattern decided."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+__all__ = ["Selection", "first_match", "select"]
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """The topics that are in, and for every topic the position of the pattern that decided (None: the default)."""
+
+    selected: tuple[str, ...]
+    decided_by: dict[str, int | None]
+    unused: tuple[int, ...]
+    """Positions of the patterns that matched no topic."""
+
+
+def select(patterns: Sequence[str], topics: Iterable[str]) -> Selection:
+    """Apply `patterns` in order: a plain one adds what it matches, one with a leading `!` removes it.
+
+    `*` also crosses `/`, `?` and `[…]` work, a pattern covers the whole name, case counts. Without a plain
+    pattern the start is every topic, otherwise none.
+    """
+    names = tuple(topics)
+    default = all(pattern.startswith("!") for pattern in patterns)
+    taken = dict.fromkeys(names, default)
+    decided: dict[str, int | None] = dict.fromkeys(names)
+    unused: list[int] = []
+    for position, pattern in enumerate(patterns):
+        glob = pattern.removeprefix("!")
+        matched = [name for name in names if fnmatchcase(name, glob)]
+        for name in matched:
+            taken[name] = not pattern.startswith("!")
+            decided[name] = position
+        if not matched:
+            unused.append(position)
+    return Selection(tuple(name for name in names if taken[name]), decided, tuple(unused))
+
+
+def first_match(patterns: Iterable[str], topic: str) -> str | None:
+    """Return the pattern that applies to `topic`: its exact name before any glob, then the first glob listed."""
+    globs = list(patterns)
+    if topic in globs:
+        return topic
+    return next((glob for glob in globs if fnmatchcase(topic, glob)), None)

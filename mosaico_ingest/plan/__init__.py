@@ -1,0 +1,1 @@
+"""Every decision about a job, made against the real recording; writes nothing."""

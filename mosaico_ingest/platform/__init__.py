@@ -1,0 +1,1 @@
+"""A Mosaico server as a destination."""

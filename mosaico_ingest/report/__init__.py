@@ -1,0 +1,1 @@
+"""What happened: events while it happens, a report at the end."""
