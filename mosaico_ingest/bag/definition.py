@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
+from typing import Protocol
 
-__all__ = ["Constant", "Container", "Definition", "Field", "MessageType", "Source"]
+__all__ = ["Constant", "Container", "Definition", "Embedded", "Field", "MessageType", "Resolver", "Source"]
 
 
 class Container(str, Enum):
@@ -73,3 +74,24 @@ class Definition:
     def message(self) -> MessageType:
         """The type this definition is about."""
         return self.types[self.root]
+
+
+@dataclass(frozen=True, slots=True)
+class Embedded:
+    """The definition text a recording carries for a type, as it stands there."""
+
+    encoding: str
+    """`ros1msg`, `ros2msg`, `ros2idl`, or what else the recording calls it."""
+    text: str
+
+
+class Resolver(Protocol):
+    """Finds the definition of a type: embedded first, then the caller's own, then the distro's."""
+
+    def resolve(self, msgtype: str, embedded: Embedded | None, *, ros_version: int) -> Definition:
+        """Return the definition of `msgtype`, any spelling of the name.
+
+        Raises:
+            BagError: None is known, or the one in the recording cannot be read; the text says which.
+        """
+        ...
