@@ -1,1 +1,69 @@
 """This file spells the platform's Flight actions, bodies and metadata keys once, for client and server."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from mosaico_ingest.errors import SinkError
+
+__all__ = ["check_metadata", "check_sequence_name", "check_topic_name"]
+
+_FORBIDDEN = re.compile(r"[^\x21-\x7e]|[!\"'*£$%&.:]")
+_KEY = re.compile(r"[A-Za-z0-9 _-]+")
+_NAMES = "ASCII without blanks and without ! \" ' * $ % & . :"
+
+
+def check_sequence_name(name: str) -> str:
+    """Return the name of a sequence, or raise SinkError with the first character that is not allowed."""
+    if not name:
+        raise SinkError("a sequence needs a name", hint="set sequence.name")
+    _refuse(name, _FORBIDDEN.search(name), kind="sequence", allowed=f"{_NAMES} /")
+    _refuse(name, re.search("/", name), kind="sequence", allowed=f"{_NAMES} /")
+    return name
+
+
+def check_topic_name(name: str) -> str:
+    """Return the name of a topic with its leading slash, or raise SinkError with what is not allowed."""
+    _refuse(name, _FORBIDDEN.search(name), kind="topic", allowed=_NAMES)
+    path = name.removeprefix("/")
+    if not all(path.split("/")):
+        raise SinkError(f"topic name {name!r} has an empty part", hint="rename it in topic_settings")
+    return f"/{path}"
+
+
+def _refuse(name: str, bad: re.Match[str] | None, *, kind: str, allowed: str) -> None:
+    if bad is not None:
+        hint = "set sequence.name" if kind == "sequence" else "rename it in topic_settings"
+        raise SinkError(
+            f"{kind} name {name!r} has {bad.group()!r} at position {bad.start()}; allowed is {allowed}",
+            hint=hint,
+        )
+
+
+def check_metadata(metadata: Mapping[str, Any], *, where: str) -> str:
+    """Return the metadata as JSON, or raise SinkError with the path of the key or value that is refused."""
+    for path, key in _keys(metadata, ""):
+        if not _KEY.fullmatch(key) or "--" in key:
+            raise SinkError(
+                f"metadata key {path!r} is refused; allowed are letters, digits, blanks, _ and single -",
+                where=where,
+            )
+    try:
+        return json.dumps(metadata, allow_nan=False)
+    except (TypeError, ValueError) as err:
+        raise SinkError(f"metadata is not JSON: {err}", where=where) from err
+
+
+def _keys(value: object, path: str) -> list[tuple[str, str]]:
+    if isinstance(value, Mapping):
+        found: list[tuple[str, str]] = []
+        for key, child in value.items():
+            inner = f"{path}.{key}" if path else str(key)
+            found += [(inner, str(key)), *_keys(child, inner)]
+        return found
+    if isinstance(value, list | tuple):
+        return [pair for i, child in enumerate(value) for pair in _keys(child, f"{path}[{i}]")]
+    return []
