@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-__all__ = ["Finding", "RowFailure", "Severity", "Span", "Stage"]
+__all__ = ["Edit", "Finding", "RowFailure", "Severity", "Span", "Stage"]
 
 
 class Severity(str, Enum):
@@ -32,6 +32,14 @@ class Span:
 
 
 @dataclass(frozen=True, slots=True)
+class Edit:
+    """A change that mends a finding: the text of `span` becomes `text`."""
+
+    span: Span
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class Finding:
     """One thing to know: which rule, where, what, and the remedy."""
 
@@ -43,6 +51,8 @@ class Finding:
     span: Span | None = None
     help: str | None = None
     """What to do about it, in one line."""
+    fix: Edit | None = None
+    """The same as a change of the text, where it is safe to make without asking."""
 
     def __str__(self) -> str:
         """Return the finding in one line, without the source excerpt."""

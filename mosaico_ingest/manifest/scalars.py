@@ -1,0 +1,66 @@
+"""This file says what a plain YAML scalar means: YAML 1.2's core schema, and where YAML 1.1 disagrees."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+__all__ = ["Scalar", "Trap", "resolve_plain"]
+
+Scalar = str | int | float | bool | None
+
+_CONSTANTS: dict[str, Scalar] = {
+    **dict.fromkeys(("", "~", "null", "Null", "NULL")),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+    **dict.fromkeys((".nan", ".NaN", ".NAN"), float("nan")),
+    **dict.fromkeys((".inf", ".Inf", ".INF", "+.inf", "+.Inf", "+.INF"), float("inf")),
+    **dict.fromkeys(("-.inf", "-.Inf", "-.INF"), float("-inf")),
+}
+_OLD_BOOLEANS = {"yes": "true", "on": "true", "no": "false", "off": "false"}
+_INTEGER = re.compile(r"[-+]?[0-9]+")
+_HEXADECIMAL = re.compile(r"0x[0-9a-fA-F]+")
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+_OCTAL = re.compile(r"[-+]?0o?[0-7]+")
+_OTHER_NUMBER = re.compile(
+    r"[-+]?(0b[01_]+|0x[0-9a-fA-F]*_[0-9a-fA-F_]*|[0-9][0-9_]*_[0-9_]*(\.[0-9_]*)?|[0-9]+(:[0-5]?[0-9])+(\.[0-9]*)?)"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Trap:
+    """A scalar that YAML readers understand differently."""
+
+    rule: str
+    message: str
+    help: str
+
+
+def resolve_plain(text: str) -> tuple[Scalar, Trap | None]:
+    """Return the value of an unquoted scalar, and why it should not be written like this, if so."""
+    if text in _CONSTANTS:
+        return _CONSTANTS[text], None
+    meant = _OLD_BOOLEANS.get(text.lower()) if text in {text.lower(), text.upper(), text.title()} else None
+    if meant is not None:
+        message = f"{text} is a boolean to some YAML readers and text to others"
+        return text, Trap("yaml-boolean", message, f'write {meant}, or "{text}" for the text')
+    if text[:1] not in "+-.0123456789":
+        return text, None
+    return _number(text)
+
+
+def _number(text: str) -> tuple[Scalar, Trap | None]:
+    if _OCTAL.fullmatch(text) and text.lstrip("+-") != "0":
+        decimal = str(int(text.replace("o", ""), 8))
+        message = f"{text} is {decimal} to some YAML readers (octal) and something else to others"
+        return text, Trap("yaml-number", message, f'write {decimal}, or "{text}" for the text')
+    if _INTEGER.fullmatch(text):
+        return int(text), None
+    if _HEXADECIMAL.fullmatch(text):
+        return int(text, 16), None
+    if _FLOAT.fullmatch(text):
+        return float(text), None
+    if _OTHER_NUMBER.fullmatch(text):
+        message = f"{text} is a number to some YAML readers and text to others"
+        return text, Trap("yaml-number", message, f'write the digits alone, or "{text}" for the text')
+    return text, None
