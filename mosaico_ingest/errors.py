@@ -89,7 +89,13 @@ class BagError(IngestError):
 
 
 class DecodeError(BagError):
-    """A message's bytes do not fit its type."""
+    """A message's bytes do not fit its type; `rule` is the short name failures are counted by."""
+
+    def __init__(
+        self, what: str, *, rule: str = "decode", where: str | None = None, hint: str | None = None
+    ) -> None:
+        super().__init__(what, where=where, hint=hint)
+        self.rule = rule
 
 
 class AdapterError(IngestError):

@@ -38,6 +38,8 @@ class Field:
     container: Container = Container.SCALAR
     size: int = 0
     """The length of an array, the bound of a sequence (0: unbounded)."""
+    string_bound: int = 0
+    """What `string<=N` says (0: unbounded); the bytes do not depend on it."""
 
 
 @dataclass(frozen=True, slots=True)
