@@ -1,0 +1,97 @@
+"""This file is the PNG form of stored images: the raw buffer's bytes as an 8-bit greyscale picture, lossless."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from mosaico_ingest.adapters.adapter import Adapted, Adapter, AdapterSpec, Envelope
+from mosaico_ingest.bag.definition import Definition
+from mosaico_ingest.ontology.types import OntologyType
+
+__all__ = ["PngImageSpec", "greyscale_png"]
+
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_GREYSCALE_8_BIT = bytes((8, 0, 0, 0, 0))
+_FASTEST = 1
+
+
+def greyscale_png(data: bytes | memoryview, *, width: int, height: int) -> bytes:
+    """Encode `height` rows of `width` bytes; `data` must hold exactly that many, and both be positive."""
+    scanlines = np.empty((height, width + 1), np.uint8)
+    scanlines[:, 0] = 0  # filter type "none"
+    scanlines[:, 1:] = np.frombuffer(data, np.uint8).reshape(height, width)
+    header = struct.pack(">II", width, height) + _GREYSCALE_8_BIT
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(scanlines.data, _FASTEST)), (b"IEND", b""))
+    return _SIGNATURE + b"".join(_chunk(kind, body) for kind, body in chunks)
+
+
+def _chunk(kind: bytes, body: bytes) -> bytes:
+    checksum = zlib.crc32(body, zlib.crc32(kind))
+    return b"".join((struct.pack(">I", len(body)), kind, body, struct.pack(">I", checksum)))
+
+
+@dataclass(frozen=True, slots=True)
+class PngImageSpec:
+    """An image adapter whose raw rows are stored as PNG; of other ontologies it changes nothing."""
+
+    inner: AdapterSpec
+
+    @property
+    def name(self) -> str:
+        """The inner adapter's name."""
+        return self.inner.name
+
+    @property
+    def ros_types(self) -> tuple[str, ...]:
+        """The inner adapter's types."""
+        return self.inner.ros_types
+
+    @property
+    def default(self) -> bool:
+        """Whether the inner adapter is its types' default."""
+        return self.inner.default
+
+    def bind(self, definition: Definition, shape: pa.StructType) -> Adapter:
+        """Bind the inner adapter."""
+        adapter = self.inner.bind(definition, shape)
+        return _PngImages(adapter) if adapter.ontology.tag == "Image" else adapter
+
+
+@dataclass(frozen=True, slots=True)
+class _PngImages:
+    inner: Adapter
+
+    @property
+    def ontology(self) -> OntologyType:
+        return self.inner.ontology
+
+    def topic_metadata(self, first_row: pa.StructScalar | None) -> dict[str, Any]:
+        return self.inner.topic_metadata(first_row)
+
+    def adapt(self, rows: pa.StructArray, envelope: Envelope) -> Adapted:
+        adapted = self.inner.adapt(rows, envelope)
+        return Adapted(_as_png(adapted.rows), adapted.index, adapted.failures)
+
+
+def _as_png(rows: pa.StructArray) -> pa.StructArray:
+    """Encode every row whose buffer is height x stride bytes; the others stay raw."""
+    columns = {field.name: rows.field(field.name) for field in rows.type}
+    heights, strides = columns["height"].to_numpy(), columns["stride"].to_numpy()
+    formats = columns["format"].to_pylist()
+    data: list[bytes | memoryview] = []
+    for row, raw in enumerate(columns["data"]):
+        buffer, height, width = raw.as_buffer(), int(heights[row]), int(strides[row])
+        if formats[row] == "raw" and height > 0 and width > 0 and buffer.size == height * width:
+            data.append(greyscale_png(memoryview(buffer), width=width, height=height))
+            formats[row] = "png"
+        else:
+            data.append(memoryview(buffer))
+    columns["data"] = pa.array(data, rows.type.field("data").type)
+    columns["format"] = pa.array(formats, rows.type.field("format").type)
+    return pa.StructArray.from_arrays(list(columns.values()), fields=list(rows.type))
