@@ -1,0 +1,32 @@
+"""This file is one recorded message: when, and what."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+from pydantic import BaseModel, ConfigDict, SerializeAsAny
+
+from mosaico_ingest.ontology.serializable import Serializable
+
+__all__ = ["Message"]
+
+_Model = TypeVar("_Model", bound=Serializable)
+
+
+class Message(BaseModel):
+    """The envelope around a row."""
+
+    model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
+
+    timestamp_ns: int
+    """When it was recorded, ns since the epoch."""
+    data: SerializeAsAny[Serializable]
+    """The row itself."""
+
+    def get_data(self, model: type[_Model]) -> _Model | None:
+        """Return the row where it is a `model`, None otherwise."""
+        return self.data if isinstance(self.data, model) else None
+
+    def ontology_tag(self) -> str:
+        """Return the tag of the row."""
+        return self.data.ontology_tag()

@@ -1,0 +1,125 @@
+"""This file is single values without a header."""
+
+from __future__ import annotations
+
+from mosaico_ingest.ontology.fields import (
+    Float16,
+    Float32,
+    Float64,
+    Int8,
+    Int16,
+    Int32,
+    Int64,
+    UInt8,
+    UInt16,
+    UInt32,
+    UInt64,
+)
+from mosaico_ingest.ontology.serializable import Serializable
+
+__all__ = [
+    "Boolean",
+    "Floating16",
+    "Floating32",
+    "Floating64",
+    "Integer8",
+    "Integer16",
+    "Integer32",
+    "Integer64",
+    "String",
+    "Unsigned8",
+    "Unsigned16",
+    "Unsigned32",
+    "Unsigned64",
+]
+
+
+class Boolean(Serializable):
+    """Yes or no."""
+
+    data: bool
+    """The value."""
+
+
+class Floating16(Serializable):
+    """A half-precision number."""
+
+    data: Float16
+    """The value."""
+
+
+class Floating32(Serializable):
+    """A single-precision number."""
+
+    data: Float32
+    """The value."""
+
+
+class Floating64(Serializable):
+    """A double-precision number."""
+
+    data: Float64
+    """The value."""
+
+
+class Integer8(Serializable):
+    """A whole number of 8 bits with a sign."""
+
+    data: Int8
+    """The value."""
+
+
+class Integer16(Serializable):
+    """A whole number of 16 bits with a sign."""
+
+    data: Int16
+    """The value."""
+
+
+class Integer32(Serializable):
+    """A whole number of 32 bits with a sign."""
+
+    data: Int32
+    """The value."""
+
+
+class Integer64(Serializable):
+    """A whole number of 64 bits with a sign."""
+
+    data: Int64
+    """The value."""
+
+
+class Unsigned8(Serializable):
+    """A whole number of 8 bits, never negative."""
+
+    data: UInt8
+    """The value."""
+
+
+class Unsigned16(Serializable):
+    """A whole number of 16 bits, never negative."""
+
+    data: UInt16
+    """The value."""
+
+
+class Unsigned32(Serializable):
+    """A whole number of 32 bits, never negative."""
+
+    data: UInt32
+    """The value."""
+
+
+class Unsigned64(Serializable):
+    """A whole number of 64 bits, never negative."""
+
+    data: UInt64
+    """The value."""
+
+
+class String(Serializable):
+    """A text, UTF-8."""
+
+    data: str
+    """The value."""

@@ -1,0 +1,118 @@
+"""This file is the base of every ontology model: annotated fields in, Arrow columns and batches out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar
+
+import pyarrow as pa
+from pydantic import BaseModel, ConfigDict, ValidationError
+from typing_extensions import Self
+
+from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.ontology.schema import struct_of
+from mosaico_ingest.ontology.tags import MODULES
+from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
+
+__all__ = ["DEFINED", "Serializable"]
+
+DEFINED: dict[str, type[Serializable]] = {}
+"""Every model class by tag, from the moment it is defined; a later one of the same tag replaces it."""
+
+
+class Serializable(BaseModel):
+    """A row of one topic. Subclass it with annotated fields; its columns are derived from them.
+
+    `int` becomes int64, `float` double, `bytes` binary, `list[X]` a list, `X | None` a nullable column, a nested
+    model a struct; `ontology.fields` names the exact types.
+    """
+
+    model_config = ConfigDict(extra="forbid", validate_assignment=True, use_attribute_docstrings=True)
+
+    __ontology_tag__: ClassVar[str]
+    """The name the platform stores; the class's own name where nothing is said."""
+    __serialization_format__: ClassVar[SerializationFormat] = SerializationFormat.DEFAULT
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:  # noqa: ANN401 - pydantic's signature
+        """Make the class known by its tag.
+
+        Raises:
+            AdapterError: The tag is a built-in's, whose readers expect the built-in's columns.
+        """
+        super().__pydantic_init_subclass__(**kwargs)
+        tag = cls.__dict__.get("__ontology_tag__", cls.__name__)
+        if tag in MODULES and cls.__module__ != f"{__package__}.{MODULES[tag]}":
+            raise AdapterError(
+                f"the tag {tag!r} is a built-in's",
+                where=f"{cls.__module__}.{cls.__qualname__}",
+                hint="rename the class or set __ontology_tag__",
+            )
+        cls.__ontology_tag__ = tag
+        DEFINED[tag] = cls
+
+    @classmethod
+    def ontology_tag(cls) -> str:
+        """Return the tag, as `IMU`."""
+        return cls.__ontology_tag__
+
+    @classmethod
+    def ontology_type(cls) -> OntologyType:
+        """Return tag, columns and serialization format.
+
+        Raises:
+            AdapterError: A field's annotation has no Arrow type.
+        """
+        return OntologyType(cls.__ontology_tag__, cls._columns(), cls.__serialization_format__)
+
+    @classmethod
+    def to_batch(cls, models: Iterable[Self]) -> pa.StructArray:
+        """Return one row a model.
+
+        Raises:
+            AdapterError: A value does not fit its column; names the row.
+        """
+        rows = [model.to_row() for model in models]
+        try:
+            return pa.array(rows, type=cls._columns())
+        except (pa.ArrowException, OverflowError, TypeError, ValueError) as error:
+            raise cls._misfit(rows, error) from error
+
+    @classmethod
+    def from_row(cls, row: Mapping[str, Any]) -> Self:
+        """Return the model of one row as Arrow gives it; a struct without any value counts as none.
+
+        Raises:
+            AdapterError: The values break the model's rules; names the field and the value.
+        """
+        try:
+            return cls.model_validate({name: _without_hollow(value) for name, value in row.items()})
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            place = ".".join((cls.__ontology_tag__, *map(str, first["loc"])))
+            raise AdapterError(f"{first['msg']}, found {first['input']!r:.80}", where=place) from error
+
+    def to_row(self) -> dict[str, Any]:
+        """Return the values of the columns."""
+        return self.model_dump()
+
+    @classmethod
+    def _columns(cls) -> pa.StructType:
+        return struct_of(cls)
+
+    @classmethod
+    def _misfit(cls, rows: list[dict[str, Any]], error: Exception) -> AdapterError:
+        for position, row in enumerate(rows):
+            try:
+                pa.array([row], type=cls._columns())
+            except (pa.ArrowException, OverflowError, TypeError, ValueError) as reason:
+                return AdapterError(f"row {position}: {reason}", where=cls.__ontology_tag__)
+        return AdapterError(str(error), where=cls.__ontology_tag__)
+
+
+def _without_hollow(value: Any) -> Any:  # noqa: ANN401 - any cell
+    """Return `value` with every struct of nothing but nulls replaced by None."""
+    if not isinstance(value, dict):
+        return value
+    cells = {name: _without_hollow(cell) for name, cell in value.items()}
+    return cells if any(cell is not None for cell in cells.values()) else None
