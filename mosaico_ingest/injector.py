@@ -1,1 +1,124 @@
 """This file runs a plan: recording, decode, adapt, sink. It decides nothing."""
+
+from __future__ import annotations
+
+from mosaico_ingest.bag.recording import Recording
+from mosaico_ingest.diagnostics import Stage
+from mosaico_ingest.errors import Interrupted, VerificationError
+from mosaico_ingest.plan.model import Plan
+from mosaico_ingest.policies import SessionLevelErrorPolicy
+from mosaico_ingest.report.events import Observer, Rejected, TopicClosed, TopicProgress, Unreadable
+from mosaico_ingest.sink import Session, Sink, StoredTopic
+from mosaico_ingest.stream import Stream
+from mosaico_ingest.write_buffer import WriteBuffer
+
+__all__ = ["inject"]
+
+
+def inject(plan: Plan, recording: Recording, sink: Sink, observe: Observer) -> None:
+    """Read what the plan names, adapt it, write it, and check what the destination then holds.
+
+    Raises:
+        IngestError: What ended the run; under the `report` policy the rows accepted before it are kept.
+        VerificationError: The destination does not hold what was written.
+    """
+    failure: BaseException | None = None
+    streams: tuple[Stream, ...] = ()
+    try:
+        with sink.open(plan.sequence, plan.metadata, if_exists=plan.if_exists) as session:
+            streams = _open_streams(plan, recording, session, observe)
+            try:
+                _pump(plan, recording, streams, observe)
+            except BaseException as error:
+                # Every way to end early, Ctrl-C too, is the session policy's to judge.
+                failure = _named(error)
+                if plan.on_error is SessionLevelErrorPolicy.Delete or not any(s.rows for s in streams):
+                    raise failure from error
+                session.note_error(str(failure))
+    except BaseException as error:
+        for stream in streams:
+            _take_back(stream, stream.rows, f"the session was discarded: {error}", observe)
+            observe(TopicClosed(stream.plan.target, stream.status, 0, error=stream.error))
+        raise
+    wrong = _close(session.stored(), streams, observe, forgive=failure)
+    if failure is not None:
+        raise failure
+    if wrong:
+        raise VerificationError("; ".join(wrong), hint="the destination lost rows; ingest the recording again")
+
+
+def _named(error: BaseException) -> BaseException:
+    if isinstance(error, KeyboardInterrupt):
+        return Interrupted("stopped before the end of the recording", hint="run the job again for all of it")
+    return error
+
+
+def _open_streams(
+    plan: Plan, recording: Recording, session: Session, observe: Observer
+) -> tuple[Stream, ...]:
+    channels = {channel.id: channel for channel in recording.channels}
+    streams: list[Stream] = []
+    for topic in plan.topics:
+        stream = Stream(topic, plan.on_message_error, session, observe)
+        for channel_id in topic.channels:
+            stream.bind(channels[channel_id])
+        streams.append(stream)
+    return tuple(streams)
+
+
+def _pump(plan: Plan, recording: Recording, streams: tuple[Stream, ...], observe: Observer) -> None:
+    """Move every batch of the recording through its stream, writing on a thread of its own."""
+    by_channel = {channel: stream for stream in streams for channel in stream.plan.channels}
+    with WriteBuffer(max_bytes=plan.memory_bytes // 4) as buffer:
+        batches = recording.batches(
+            tuple(by_channel),
+            start_ns=plan.read_from_ns,
+            end_ns=plan.read_until_ns,
+            memory_bytes=plan.memory_bytes // 2,
+        )
+        for batch in batches:
+            by_channel[batch.channel.id].feed(batch, buffer)
+    for loss in recording.losses:
+        stream = by_channel.get(loss.channel) if loss.channel is not None else None
+        observe(Unreadable(stream.plan.target if stream else None, loss.count, loss.offset, loss.reason))
+
+
+def _close(
+    stored: tuple[StoredTopic, ...],
+    streams: tuple[Stream, ...],
+    observe: Observer,
+    *,
+    forgive: BaseException | None,
+) -> list[str]:
+    """Close each stream in the report; return how the destination differs from what was written.
+
+    After a failure, rows that were on their way are no difference: they are taken back from the count.
+    """
+    held = {topic.topic: topic for topic in stored}
+    wrong: list[str] = []
+    for stream in streams:
+        found = held.get(stream.plan.target)
+        rows = found.rows if found else 0
+        if forgive is not None:
+            _take_back(stream, stream.rows - rows, f"not written before the run ended: {forgive}", observe)
+        elif (stream.rows, stream.start_ns, stream.end_ns) != _held(found):
+            wrong.append(
+                f"{stream.plan.target}: wrote {stream.rows} rows in [{stream.start_ns}, {stream.end_ns}], "
+                f"found {'{} rows in [{}, {}]'.format(*_held(found))}"
+            )
+        stored_bytes = found.stored_bytes if found else 0
+        observe(TopicClosed(stream.plan.target, stream.status, stored_bytes, error=stream.error))
+    return wrong
+
+
+def _held(found: StoredTopic | None) -> tuple[int, int | None, int | None]:
+    return (found.rows, found.start_ns, found.end_ns) if found else (0, None, None)
+
+
+def _take_back(stream: Stream, rows: int, why: str, observe: Observer) -> None:
+    """Count rows that were handed over but are not there as rejected."""
+    if rows > 0:
+        observe(TopicProgress(stream.plan.target, written=-rows))
+        observe(
+            Rejected(stream.plan.target, Stage.WRITE, "not-written", rows, why, stream.start_ns or 0, -1)
+        )

@@ -1,0 +1,30 @@
+"""This file is `ingest run`: jobs from their manifests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+__all__ = ["run"]
+
+
+def run(
+    manifests: Annotated[
+        list[Path], typer.Argument(metavar="JOB.yaml...", help="Job manifests, run in order.")
+    ],
+    report: Annotated[
+        Path | None, typer.Option("--report", help="Write the report of this call as JSON.", metavar="FILE")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
+    log: Annotated[
+        str | None, typer.Option("--log", help="Log level; overrides run.log_level.", metavar="LEVEL")
+    ] = None,
+) -> None:
+    """Ingest what the manifests name."""
+    from mosaico_ingest import api
+    from mosaico_ingest.cli.session import run_configs
+
+    configs = [config for manifest in manifests for config in api.compile_job(manifest)]
+    run_configs(configs, report=report, quiet=quiet, log=log)

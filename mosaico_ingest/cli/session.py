@@ -1,0 +1,48 @@
+"""This file runs configurations with a display, writes the report and leaves with its exit code."""
+
+from __future__ import annotations
+
+import logging
+import signal
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+
+import typer
+
+from mosaico_ingest import api
+from mosaico_ingest.cli.progress import display
+from mosaico_ingest.cli.tables import print_report
+from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.report.write import write_report
+
+__all__ = ["run_configs"]
+
+
+def run_configs(
+    configs: Sequence[ROSInjectionConfig], *, report: Path | None, quiet: bool, log: str | None
+) -> None:
+    """Run each configuration in turn; exit with the report's code unless it is 0."""
+    _set_up_logging(log or configs[0].log_level)
+    signal.signal(signal.SIGTERM, _as_interrupt)
+    with display(quiet=quiet) as observe:
+        result = api.run(configs, observe=observe)
+    for target in {path for path in (report, *(config.report for config in configs)) if path is not None}:
+        write_report(result, target)
+    print_report(result, quiet=quiet)
+    if result.exit_code:
+        raise typer.Exit(result.exit_code)
+
+
+def _as_interrupt(_signal: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def _set_up_logging(level: str) -> None:
+    numeric = logging.getLevelName(level.upper())
+    if not isinstance(numeric, int):
+        raise ManifestError(
+            f"log level {level!r} is unknown", hint="use DEBUG, INFO, WARNING, ERROR or CRITICAL"
+        )
+    logging.basicConfig(level=numeric, format="%(levelname)s %(name)s: %(message)s", force=True)

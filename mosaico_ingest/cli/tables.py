@@ -1,0 +1,150 @@
+"""This file prints what commands found: an inspection, a report; tables for people, JSON for programs."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from mosaico_ingest.cli.units import bytes_text, count_text, seconds_text, time_text
+from mosaico_ingest.report.events import RunStatus, TopicStatus
+from mosaico_ingest.report.inspection import Inspection
+from mosaico_ingest.report.model import Report, RunReport, TopicReport
+
+__all__ = ["print_inspection", "print_json", "print_report"]
+
+
+def print_json(text: str) -> None:
+    """Write JSON to standard output as it is."""
+    sys.stdout.write(text + "\n")
+
+
+def print_inspection(found: Inspection, *, as_json: bool) -> None:
+    """Print what a recording holds."""
+    if as_json:
+        print_json(found.model_dump_json(indent=2))
+        return
+    console = Console()
+    span = f"{time_text(found.start_ns)} .. {time_text(found.end_ns)} UTC"
+    if found.duration_s is not None:
+        span += f" ({seconds_text(found.duration_s)})"
+    messages = "?" if found.messages is None else count_text(found.messages)
+    console.print(Text(f"{', '.join(found.files)}", style="bold"))
+    console.print(
+        f"{found.container}, {bytes_text(found.size_bytes)}, {messages} messages, {span}", highlight=False
+    )
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for name, right in (
+        ("topic", False),
+        ("type", False),
+        ("messages", True),
+        ("rate", True),
+        ("definition", False),
+        ("becomes", False),
+        ("adapter", False),
+    ):
+        table.add_column(name, justify="right" if right else "left", overflow="fold")
+    for topic in found.topics:
+        count = "?" if topic.count is None else count_text(topic.count)
+        rate = "" if topic.rate_hz is None else f"{topic.rate_hz:.1f} Hz"
+        style = None if topic.ontology else "yellow"
+        table.add_row(
+            topic.topic,
+            topic.msgtype,
+            count,
+            rate,
+            topic.definition,
+            topic.ontology or "-",
+            topic.adapter,
+            style=style,
+        )
+    console.print(table)
+    for topic in found.topics:
+        if topic.problem:
+            console.print(Text(f"{topic.topic}: {topic.problem}", style="yellow"))
+    for finding in found.findings:
+        console.print(Text(f"note: {finding}", style="yellow"))
+
+
+def print_report(report: RunReport, *, quiet: bool) -> None:
+    """Print what was done: a table on standard output, errors on standard error."""
+    errors = Console(stderr=True)
+    for recording in report.recordings:
+        if not quiet:
+            _print_recording(recording, Console())
+        if recording.error is not None:
+            errors.print(Text(f"error: {recording.error}", style="red"), soft_wrap=True)
+
+
+def _print_recording(report: Report, console: Console) -> None:
+    if not report.topics:
+        if report.status is RunStatus.SKIPPED:
+            console.print(f"{report.sequence}: skipped, the sequence is there already", highlight=False)
+        return
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    table.add_column("topic", overflow="fold")
+    table.add_column("ontology", style="cyan")
+    for column in ("read", "written", "rejected", "rate", "payload", "stored"):
+        table.add_column(column, justify="right")
+    for topic in report.topics:
+        if topic.status is not TopicStatus.LEFT_OUT:
+            table.add_row(*_cells(topic))
+    console.print(table)
+    for topic in report.topics:
+        _print_trouble(topic, console)
+    _print_totals(report, console)
+
+
+def _cells(topic: TopicReport) -> tuple[str | Text, ...]:
+    rate = "" if topic.rate_hz is None else f"{topic.rate_hz:.1f} Hz"
+    rejected = Text(count_text(topic.rejected), style="red" if topic.rejected else "dim")
+    return (
+        topic.target,
+        topic.ontology,
+        count_text(topic.read),
+        count_text(topic.written),
+        rejected,
+        rate,
+        bytes_text(topic.payload_bytes),
+        bytes_text(topic.stored_bytes),
+    )
+
+
+def _print_trouble(topic: TopicReport, console: Console) -> None:
+    if topic.status is TopicStatus.LEFT_OUT:
+        console.print(
+            Text(f"left out {topic.topic} ({topic.msgtype}): {topic.why}", style="dim"), soft_wrap=True
+        )
+    for rejection in topic.rejections:
+        line = (
+            f"{topic.target}: {count_text(rejection.count)} rejected [{rejection.rule}]: {rejection.reason}"
+        )
+        console.print(Text(line, style="yellow"), soft_wrap=True)
+
+
+def _print_totals(report: Report, console: Console) -> None:
+    totals = report.totals
+    parts = [f"{count_text(totals.written)} of {count_text(totals.read)} messages written"]
+    if totals.rejected:
+        parts.append(f"{count_text(totals.rejected)} rejected")
+    if totals.downsampled:
+        parts.append(f"{count_text(totals.downsampled)} sampled away")
+    if totals.stored_bytes and report.source_bytes:
+        saved = 1 - totals.stored_bytes / report.source_bytes
+        parts.append(
+            f"{bytes_text(report.source_bytes)} -> {bytes_text(totals.stored_bytes)} ({saved:+.0%} saved)"
+        )
+    rate = totals.read / report.duration_s if report.duration_s else 0
+    parts.append(f"{seconds_text(report.duration_s)}, {count_text(round(rate))} msg/s")
+    style = "green" if report.exit_code == 0 else "yellow" if report.exit_code == 4 else "red"  # noqa: PLR2004 - exit code 4: done with rejected messages
+    console.print(
+        Text(f"{report.sequence} in {report.destination}: {', '.join(parts)}", style=style), soft_wrap=True
+    )
+
+
+def print_table_json(rows: object) -> None:
+    """Print any plain value as JSON."""
+    print_json(json.dumps(rows, indent=2, default=str))

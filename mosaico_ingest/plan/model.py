@@ -1,0 +1,81 @@
+"""This file is the plan: every decision about one recording, as frozen data that can be printed, compared and sent."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mosaico_ingest.adapters.adapter import AdapterSpec
+from mosaico_ingest.bag.definition import Resolver
+from mosaico_ingest.config import Destination
+from mosaico_ingest.diagnostics import Finding
+from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.policies import (
+    IfExists,
+    LoaderErrorPolicy,
+    SessionLevelErrorPolicy,
+    TopicLevelErrorPolicy,
+)
+
+__all__ = ["LeftOut", "Plan", "TopicPlan"]
+
+
+@dataclass(frozen=True, slots=True)
+class TopicPlan:
+    """One stream: the channels it is made of, what it becomes, and why."""
+
+    topic: str
+    """Its name in the recording."""
+    target: str
+    """Its name in the sequence."""
+    msgtype: str
+    channels: tuple[int, ...]
+    adapter: AdapterSpec
+    why: str
+    """Which rule chose the adapter."""
+    ontology: OntologyType
+    count: int | None
+    """How many messages the index promises."""
+    metadata: Mapping[str, Any]
+    on_error: TopicLevelErrorPolicy
+    every: int = 1
+    """Keep the first of each `every` messages."""
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """A topic of the recording that will not be read, and why."""
+
+    topic: str
+    msgtype: str
+    count: int | None
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What will be done with one recording."""
+
+    files: tuple[Path, ...]
+    container: str
+    source_bytes: int
+    resolver: Resolver
+    sequence: str
+    metadata: Mapping[str, Any]
+    destination: Destination
+    if_exists: IfExists
+    on_error: SessionLevelErrorPolicy
+    on_message_error: LoaderErrorPolicy
+    topics: tuple[TopicPlan, ...]
+    left_out: tuple[LeftOut, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    start_ns: int | None = None
+    """The first instant of the recording, ns since the epoch."""
+    end_ns: int | None = None
+    read_from_ns: int | None = None
+    """Messages recorded before are not read."""
+    read_until_ns: int | None = None
+    """Messages recorded at this instant or later are not read."""
+    memory_bytes: int = 256 * 1024 * 1024

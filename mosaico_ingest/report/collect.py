@@ -1,0 +1,157 @@
+"""This file sums the events of one recording into its report."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+
+from mosaico_ingest.diagnostics import Stage
+from mosaico_ingest.report.events import (
+    Event,
+    Expected,
+    Noted,
+    Rejected,
+    RunFinished,
+    RunStarted,
+    RunStatus,
+    TopicClosed,
+    TopicProgress,
+    TopicStatus,
+    Unreadable,
+)
+from mosaico_ingest.report.model import Loss, Rejection, Report, TopicReport
+
+__all__ = ["Collector"]
+
+
+@dataclass(slots=True)
+class _Sum:
+    read: int = 0
+    written: int = 0
+    filtered: int = 0
+    downsampled: int = 0
+    payload_bytes: int = 0
+    start_ns: int | None = None
+    end_ns: int | None = None
+    rejections: dict[tuple[Stage, str], Rejection] = field(default_factory=dict[tuple[Stage, str], Rejection])
+    closed: TopicClosed | None = None
+
+    def add(self, more: TopicProgress) -> None:
+        self.read += more.read
+        self.written += more.written
+        self.filtered += more.filtered
+        self.downsampled += more.downsampled
+        self.payload_bytes += more.payload_bytes
+        if more.start_ns is not None:
+            self.start_ns = more.start_ns if self.start_ns is None else min(self.start_ns, more.start_ns)
+        if more.end_ns is not None:
+            self.end_ns = more.end_ns if self.end_ns is None else max(self.end_ns, more.end_ns)
+
+    def reject(self, event: Rejected) -> None:
+        key = (event.stage, event.rule)
+        known = self.rejections.get(key)
+        if known is None:
+            self.rejections[key] = Rejection(
+                stage=event.stage,
+                rule=event.rule,
+                count=event.count,
+                reason=event.reason,
+                first_log_time_ns=event.first_log_time_ns,
+                first_offset=event.first_offset,
+            )
+        else:
+            self.rejections[key] = known.model_copy(update={"count": known.count + event.count})
+
+
+class Collector:
+    """An observer that ends as a `Report`."""
+
+    def __init__(self) -> None:
+        self._began = time.perf_counter()
+        self._started_at = datetime.now(timezone.utc)
+        self._start = RunStarted(sequence="", destination="", files=(), source_bytes=0, topics=())
+        self._sums: dict[str, _Sum] = defaultdict(_Sum)
+        self._losses: list[Loss] = []
+        self._findings: list[str] = []
+        self._finish = RunFinished(status=RunStatus.FAILED, exit_code=1)
+
+    def __call__(self, event: Event) -> None:
+        """Add one event to the sum."""
+        match event:
+            case TopicProgress():
+                self._sums[event.target].add(event)
+            case Rejected():
+                self._sums[event.target].reject(event)
+            case RunStarted():
+                self._start = event
+            case Unreadable():
+                self._losses.append(
+                    Loss(topic=event.target, count=event.count, offset=event.offset, reason=event.reason)
+                )
+            case Noted():
+                self._findings.append(str(event.finding))
+            case TopicClosed():
+                self._sums[event.target].closed = event
+            case RunFinished():
+                self._finish = event
+
+    @property
+    def rejected(self) -> int:
+        """How many messages were rejected so far."""
+        return sum(r.count for s in self._sums.values() for r in s.rejections.values())
+
+    def written(self, target: str) -> _Sum:
+        """Return what was written to one stream so far."""
+        return self._sums[target]
+
+    def report(self) -> Report:
+        """Return the sum so far; complete once the run has finished."""
+        return Report(
+            sequence=self._start.sequence,
+            destination=self._start.destination,
+            files=self._start.files,
+            status=self._finish.status,
+            exit_code=self._finish.exit_code,
+            error=self._finish.error,
+            started_at=self._started_at,
+            duration_s=round(time.perf_counter() - self._began, 6),
+            source_bytes=self._start.source_bytes,
+            topics=tuple(self._topic(topic) for topic in self._start.topics),
+            losses=tuple(self._losses),
+            findings=tuple(self._findings),
+        )
+
+    def _topic(self, expected: Expected) -> TopicReport:
+        total = self._sums[expected.target] if not expected.left_out else _Sum()
+        rejections = tuple(total.rejections.values())
+        return TopicReport(
+            topic=expected.topic,
+            target=expected.target,
+            msgtype=expected.msgtype,
+            adapter=expected.adapter,
+            ontology=expected.ontology,
+            why=expected.why,
+            status=_status(expected, total),
+            promised=expected.count,
+            read=total.read,
+            written=total.written,
+            filtered=total.filtered,
+            downsampled=total.downsampled,
+            rejected=sum(rejection.count for rejection in rejections),
+            rejections=rejections,
+            start_ns=total.start_ns if total.written else None,
+            end_ns=total.end_ns if total.written else None,
+            payload_bytes=total.payload_bytes,
+            stored_bytes=(total.closed.stored_bytes or 0) if total.closed else 0,
+            error=total.closed.error if total.closed else None,
+        )
+
+
+def _status(expected: Expected, total: _Sum) -> TopicStatus:
+    if expected.left_out:
+        return TopicStatus.LEFT_OUT
+    if total.closed is not None:
+        return total.closed.status
+    return TopicStatus.WRITTEN if total.written else TopicStatus.EMPTY

@@ -1,0 +1,150 @@
+"""This file is what the pipeline says while it runs; the display draws it, the report is its sum."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import TypeAlias
+
+from mosaico_ingest.diagnostics import Finding, Stage
+
+__all__ = [
+    "Event",
+    "Expected",
+    "Noted",
+    "Observer",
+    "Rejected",
+    "RunFinished",
+    "RunStarted",
+    "RunStatus",
+    "TopicClosed",
+    "TopicProgress",
+    "TopicStatus",
+    "Unreadable",
+    "ignore_events",
+]
+
+
+class RunStatus(str, Enum):
+    """How the ingestion of one recording ended."""
+
+    COMPLETED = "completed"
+    REJECTED = "completed_with_rejected"
+    """Everything that could be ingested was, but some messages could not."""
+    SKIPPED = "skipped"
+    """The same content is there already."""
+    FAILED = "failed"
+    INTERRUPTED = "interrupted"
+
+
+class TopicStatus(str, Enum):
+    """How one topic ended."""
+
+    WRITTEN = "written"
+    EMPTY = "empty"
+    """The recording has the topic and no message of it."""
+    FINALIZED = "finalized"
+    """Closed early by the `finalize` policy."""
+    FAILED = "failed"
+    """The destination or the adapter refused the topic; the `ignore` policy let the others go on."""
+    LEFT_OUT = "left_out"
+    """Not selected, or nothing here can read it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """A topic of the plan, as the display and the report need it."""
+
+    topic: str
+    target: str
+    msgtype: str
+    adapter: str
+    ontology: str
+    why: str
+    count: int | None
+    """How many messages the index promises."""
+    left_out: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class RunStarted:
+    """The plan stands and the work begins."""
+
+    sequence: str
+    destination: str
+    files: tuple[str, ...]
+    source_bytes: int
+    topics: tuple[Expected, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class TopicProgress:
+    """More messages of one stream went through; every number is an increment."""
+
+    target: str
+    read: int = 0
+    written: int = 0
+    filtered: int = 0
+    downsampled: int = 0
+    payload_bytes: int = 0
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """Messages of one stream that could not go on for one reason; `first_*` is about the first of them."""
+
+    target: str
+    stage: Stage
+    rule: str
+    count: int
+    reason: str
+    first_log_time_ns: int
+    first_offset: int
+
+
+@dataclass(frozen=True, slots=True)
+class Unreadable:
+    """A stretch of the recording that could not be read."""
+
+    target: str | None
+    """None where it cannot be told which topics lost messages."""
+    count: int | None
+    offset: int | None
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Noted:
+    """A finding about the recording that does not stop the run."""
+
+    finding: Finding
+
+
+@dataclass(frozen=True, slots=True)
+class TopicClosed:
+    """A stream came to its end."""
+
+    target: str
+    status: TopicStatus
+    stored_bytes: int | None = None
+    error: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RunFinished:
+    """The recording is done with, one way or another."""
+
+    status: RunStatus
+    exit_code: int
+    error: str | None = None
+
+
+Event: TypeAlias = RunStarted | TopicProgress | Rejected | Unreadable | Noted | TopicClosed | RunFinished
+Observer: TypeAlias = Callable[[Event], None]
+
+
+def ignore_events(_event: Event) -> None:
+    """Do nothing: the observer of whoever does not want one."""

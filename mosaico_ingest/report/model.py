@@ -1,0 +1,156 @@
+"""This file is the report: what was read, written, left out and lost, per topic and in total; its JSON is versioned."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from mosaico_ingest.diagnostics import Stage
+from mosaico_ingest.report.events import RunStatus, TopicStatus
+
+__all__ = ["Loss", "Rejection", "Report", "RunReport", "TopicReport", "Totals", "report_schema"]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+class Rejection(_Part):
+    """Messages of one topic that were rejected for the same reason."""
+
+    stage: Stage
+    """Where in the pipeline they were lost."""
+    rule: str
+    """The rule they broke."""
+    count: int
+    """How many."""
+    reason: str
+    """What was wrong with the first of them."""
+    first_log_time_ns: int
+    """When the first of them was recorded, ns since the epoch."""
+    first_offset: int
+    """Where the first of them lies in the source: file offset of its record or chunk, or row id."""
+
+
+class Loss(_Part):
+    """A stretch of the recording that could not be read."""
+
+    topic: str | None
+    """The topic, where it can be told."""
+    count: int | None
+    """How many messages, where the index says."""
+    offset: int | None
+    """Where in the file."""
+    reason: str
+    """What was found there."""
+
+
+class TopicReport(_Part):
+    """One topic: read = written + filtered + downsampled + rejected, always."""
+
+    topic: str
+    """Its name in the recording."""
+    target: str
+    """Its name in the sequence."""
+    msgtype: str
+    adapter: str
+    ontology: str
+    """The ontology tag its rows have."""
+    why: str
+    """Why this adapter, or why the topic was left out."""
+    status: TopicStatus
+    promised: int | None
+    """How many messages the recording's index promises."""
+    read: int = 0
+    written: int = 0
+    filtered: int = 0
+    downsampled: int = 0
+    rejected: int = 0
+    rejections: tuple[Rejection, ...] = ()
+    start_ns: int | None = None
+    """The first time stamp written, ns since the epoch."""
+    end_ns: int | None = None
+    """The last time stamp written, inclusive."""
+    payload_bytes: int = 0
+    """Size of the messages read, as they were serialised."""
+    stored_bytes: int = 0
+    """Size of the rows in the destination, as far as it says."""
+    error: str | None = None
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Messages written a second over the topic's own span."""
+        if self.start_ns is None or self.end_ns is None or self.end_ns <= self.start_ns:
+            return None
+        return (self.written - 1) / ((self.end_ns - self.start_ns) / 1e9)
+
+
+class Totals(_Part):
+    """Sums over the topics."""
+
+    read: int
+    written: int
+    filtered: int
+    downsampled: int
+    rejected: int
+    payload_bytes: int
+    stored_bytes: int
+
+
+class Report(_Part):
+    """What became of one recording."""
+
+    sequence: str
+    destination: str
+    files: tuple[str, ...]
+    status: RunStatus
+    exit_code: int
+    error: str | None = None
+    """The error that ended the run, in one line."""
+    started_at: datetime
+    duration_s: float
+    source_bytes: int
+    """Size of the recording's files."""
+    topics: tuple[TopicReport, ...] = ()
+    losses: tuple[Loss, ...] = ()
+    """What could not be read at all."""
+    findings: tuple[str, ...] = ()
+    """What there was to say about the recording."""
+
+    @property
+    def totals(self) -> Totals:
+        """The sums over all topics that were taken."""
+        taken = [topic for topic in self.topics if topic.status is not TopicStatus.LEFT_OUT]
+        return Totals(
+            read=sum(t.read for t in taken),
+            written=sum(t.written for t in taken),
+            filtered=sum(t.filtered for t in taken),
+            downsampled=sum(t.downsampled for t in taken),
+            rejected=sum(t.rejected for t in taken),
+            payload_bytes=sum(t.payload_bytes for t in taken),
+            stored_bytes=sum(t.stored_bytes for t in taken),
+        )
+
+
+class RunReport(_Part):
+    """What one call of the tool did: a report for each recording; `version` changes when the form does."""
+
+    version: int = Field(default=1, ge=1)
+    tool: str
+    """Name and version of the program that wrote this."""
+    recordings: tuple[Report, ...]
+
+    @property
+    def exit_code(self) -> int:
+        """The code of the first recording that failed, else 4 where messages were rejected, else 0."""
+        codes = [report.exit_code for report in self.recordings]
+        failed = [code for code in codes if code not in {0, 4}]
+        return failed[0] if failed else max(codes, default=0)
+
+
+def report_schema() -> dict[str, Any]:
+    """Return the JSON Schema (draft 2020-12) of a report file."""
+    schema = RunReport.model_json_schema(mode="serialization")
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}

@@ -1,0 +1,242 @@
+"""This file is one topic of a plan at work: every message that comes in is written, left out or accounted for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from mosaico_ingest.adapters.adapter import Adapter, Envelope
+from mosaico_ingest.bag.batch import Channel, RawBatch
+from mosaico_ingest.decode.arrow import ros_shape
+from mosaico_ingest.decode.choose import decoder_for
+from mosaico_ingest.decode.decoder import Decoder
+from mosaico_ingest.diagnostics import RowFailure, Stage
+from mosaico_ingest.errors import AdapterError, BagError, DecodeError, IngestError, SinkError
+from mosaico_ingest.plan.model import TopicPlan
+from mosaico_ingest.policies import LoaderErrorPolicy, TopicLevelErrorPolicy
+from mosaico_ingest.report.events import Observer, Rejected, TopicProgress, TopicStatus
+from mosaico_ingest.sink import ENVELOPE, Session, TopicWriter
+from mosaico_ingest.write_buffer import WriteBuffer
+
+__all__ = ["Stream"]
+
+
+@dataclass(frozen=True, slots=True)
+class _Lost:
+    """A message that did not go through, at its position in the raw batch."""
+
+    stage: Stage
+    failure: RowFailure
+
+
+@dataclass(frozen=True, slots=True)
+class _Translated:
+    """What became of a raw batch: rows, where they were in it, what was lost, what was sampled away."""
+
+    rows: pa.StructArray
+    index: NDArray[np.int64]
+    lost: tuple[_Lost, ...]
+    skipped: NDArray[np.int64]
+
+
+@dataclass(slots=True)
+class Stream:
+    """A topic's adapters by channel, its writer once there are rows, and its sums.
+
+    A message that breaks a policy of `raise` or `finalize` ends the stream there: rows before it are
+    written, whatever the size of the batches.
+    """
+
+    plan: TopicPlan
+    on_message_error: LoaderErrorPolicy
+    session: Session
+    observe: Observer
+    rows: int = 0
+    start_ns: int | None = None
+    end_ns: int | None = None
+    status: TopicStatus = TopicStatus.EMPTY
+    error: str | None = None
+    _decoders: dict[int, Decoder] = field(default_factory=dict[int, Decoder])
+    _adapters: dict[int, Adapter] = field(default_factory=dict[int, Adapter])
+    _writer: TopicWriter | None = None
+    _seen: int = 0
+
+    def bind(self, channel: Channel) -> None:
+        """Make the decoder and the adapter of one channel.
+
+        Raises:
+            BagError: The channel has no definition.
+            AdapterError: The adapter does not fit it.
+        """
+        if channel.definition is None:
+            raise BagError(channel.problem or "no definition of its type is known", where=channel.topic)
+        self._decoders[channel.id] = decoder_for(channel)
+        self._adapters[channel.id] = self.plan.adapter.bind(channel.definition, ros_shape(channel.definition))
+
+    def feed(self, batch: RawBatch, buffer: WriteBuffer) -> None:
+        """Take a batch all the way; account for every message of it.
+
+        Raises:
+            IngestError: A policy says that the run ends here.
+        """
+        if self.status in {TopicStatus.FINALIZED, TopicStatus.FAILED}:
+            self._count(batch, len(batch))
+            self._reject_rest(batch, 0)
+            return
+        done = self._translate(batch)
+        fatal = next((lost for lost in done.lost if self._ends_topic(lost)), None)
+        end = len(batch) if fatal is None else fatal.failure.row + 1
+        self._count(batch, end, downsampled=int((done.skipped < end).sum()))
+        self._reject(batch, (lost for lost in done.lost if lost.failure.row < end))
+        kept = int(np.searchsorted(done.index, end))
+        if kept:
+            self._write(
+                _record_batch(batch.log_times[done.index[:kept]], done.rows[:kept]), batch, done.index, buffer
+            )
+        if fatal is not None:
+            self._end(fatal, batch, end)
+
+    def _translate(self, batch: RawBatch) -> _Translated:
+        positions = np.arange(len(batch), dtype=np.int64)
+        taken = (positions + self._seen) % self.plan.every == 0
+        self._seen += len(batch)
+        keep = positions[taken]
+        sampled = batch if taken.all() else _take(batch, keep)
+        decoded = self._decoders[batch.channel.id].decode(sampled)
+        lost = [_Lost(Stage.DECODE, replace(f, row=int(keep[f.row]))) for f in decoded.failures]
+        index = keep[decoded.index]
+        envelope = Envelope(self.plan.topic, self.plan.msgtype, batch.log_times[index])
+        try:
+            adapted = self._adapters[batch.channel.id].adapt(decoded.rows, envelope)
+        except AdapterError as error:
+            broken = (RowFailure(int(row), "adapter-broken", str(error)) for row in index)
+            lost += [_Lost(Stage.ADAPT, failure) for failure in broken]
+            rows, index = decoded.rows[:0], index[:0]
+        else:
+            lost += [_Lost(Stage.ADAPT, replace(f, row=int(index[f.row]))) for f in adapted.failures]
+            rows, index = adapted.rows, index[adapted.index]
+        lost.sort(key=lambda one: one.failure.row)
+        return _Translated(rows, index, tuple(lost), positions[~taken])
+
+    def _ends_topic(self, lost: _Lost) -> bool:
+        if lost.stage is Stage.DECODE:
+            return self.on_message_error is LoaderErrorPolicy.RAISE
+        return self.plan.on_error is not TopicLevelErrorPolicy.Ignore
+
+    def _end(self, fatal: _Lost, batch: RawBatch, end: int) -> None:
+        """Apply the policy a lost message has triggered."""
+        kind = DecodeError if fatal.stage is Stage.DECODE else AdapterError
+        offset = int(batch.offsets[fatal.failure.row])
+        error = kind(fatal.failure.reason, where=f"{self.plan.topic} at offset {offset}")
+        self.error = str(error)
+        self.session.note_error(self.error, topic=self.plan.target)
+        if fatal.stage is Stage.DECODE or self.plan.on_error is TopicLevelErrorPolicy.Raise:
+            raise error
+        self.status = TopicStatus.FINALIZED
+        self._count_rest(batch, end)
+
+    def _count_rest(self, batch: RawBatch, end: int) -> None:
+        rest = batch.lengths[end:]
+        if len(rest):
+            self.observe(TopicProgress(self.plan.target, read=len(rest), payload_bytes=int(rest.sum())))
+            self._reject_rest(batch, end)
+
+    def _reject_rest(self, batch: RawBatch, start: int) -> None:
+        self.observe(
+            Rejected(
+                self.plan.target,
+                Stage.WRITE,
+                "topic-closed",
+                len(batch) - start,
+                f"the topic was closed: {self.error}",
+                int(batch.log_times[start]),
+                int(batch.offsets[start]),
+            )
+        )
+
+    def _write(
+        self, rows: pa.RecordBatch, batch: RawBatch, index: NDArray[np.int64], buffer: WriteBuffer
+    ) -> None:
+        if self._writer is None:
+            try:
+                self._writer = self.session.topic(self.plan.target, self.plan.ontology, self.plan.metadata)
+            except SinkError as error:
+                self._refused(error, rows, batch, index)
+                return
+        buffer.put(self._writer, rows)
+        times = rows.column(0).to_numpy()
+        first, last = int(times.min()), int(times.max())
+        self.rows += rows.num_rows
+        self.start_ns = first if self.start_ns is None else min(self.start_ns, first)
+        self.end_ns = last if self.end_ns is None else max(self.end_ns, last)
+        self.status = TopicStatus.WRITTEN
+        self.observe(TopicProgress(self.plan.target, written=rows.num_rows, start_ns=first, end_ns=last))
+
+    def _refused(
+        self, error: IngestError, rows: pa.RecordBatch, batch: RawBatch, index: NDArray[np.int64]
+    ) -> None:
+        """Give the topic up, or the run, as its policy says."""
+        self.status, self.error = TopicStatus.FAILED, str(error)
+        first = int(index[0])
+        self.observe(
+            Rejected(
+                self.plan.target,
+                Stage.WRITE,
+                "topic-refused",
+                rows.num_rows,
+                self.error,
+                int(batch.log_times[first]),
+                int(batch.offsets[first]),
+            )
+        )
+        if self.plan.on_error is TopicLevelErrorPolicy.Raise:
+            raise error
+
+    def _count(self, batch: RawBatch, end: int, *, downsampled: int = 0) -> None:
+        self.observe(
+            TopicProgress(
+                self.plan.target,
+                read=end,
+                downsampled=downsampled,
+                payload_bytes=int(batch.lengths[:end].sum()),
+            )
+        )
+
+    def _reject(self, batch: RawBatch, lost: Iterable[_Lost]) -> None:
+        """Say what was lost, once for each rule, with the first message as the example."""
+        groups: dict[tuple[Stage, str], list[RowFailure]] = {}
+        for one in lost:
+            groups.setdefault((one.stage, one.failure.rule), []).append(one.failure)
+        for (stage, rule), failures in groups.items():
+            first = failures[0]
+            self.observe(
+                Rejected(
+                    self.plan.target,
+                    stage,
+                    rule,
+                    len(failures),
+                    first.reason,
+                    int(batch.log_times[first.row]),
+                    int(batch.offsets[first.row]),
+                )
+            )
+
+
+def _take(batch: RawBatch, keep: NDArray[np.int64]) -> RawBatch:
+    return replace(
+        batch,
+        log_times=batch.log_times[keep],
+        starts=batch.starts[keep],
+        lengths=batch.lengths[keep],
+        offsets=batch.offsets[keep],
+    )
+
+
+def _record_batch(log_times: NDArray[np.int64], rows: pa.StructArray) -> pa.RecordBatch:
+    """Put the time stamps before the ontology's columns."""
+    schema = pa.schema([ENVELOPE, *rows.type])
+    return pa.RecordBatch.from_arrays([pa.array(log_times), *rows.flatten()], schema=schema)

@@ -1,0 +1,79 @@
+"""This file is the asynchronous write buffer: batches wait here, bounded in bytes, while a thread writes them."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from types import TracebackType
+
+import pyarrow as pa
+from typing_extensions import Self
+
+from mosaico_ingest.sink import TopicWriter
+
+__all__ = ["WriteBuffer"]
+
+
+class WriteBuffer:
+    """Writes batches in order on one thread of its own; `put` waits while too many bytes are queued.
+
+    The first error of a writer stops the thread; it is raised by the next `put` or when the buffer is left.
+    Leaving normally waits until everything is written; leaving by an exception too, so that rows accepted
+    before an error are not lost.
+    """
+
+    def __init__(self, *, max_bytes: int) -> None:
+        self._max_bytes = max_bytes
+        self._queue: deque[tuple[TopicWriter, pa.RecordBatch, int]] = deque()
+        self._queued_bytes = 0
+        self._changed = threading.Condition()
+        self._closed = False
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._work, name="mosaico-ingest-write", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join()
+        if kind is None and self._error is not None:
+            raise self._error
+
+    def put(self, writer: TopicWriter, batch: pa.RecordBatch) -> None:
+        """Queue a batch, waiting for room; a batch larger than the whole buffer is let in alone."""
+        size = batch.nbytes
+        with self._changed:
+            while self._error is None and self._queue and self._queued_bytes + size > self._max_bytes:
+                self._changed.wait()
+            if self._error is not None:
+                raise self._error
+            self._queue.append((writer, batch, size))
+            self._queued_bytes += size
+            self._changed.notify_all()
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                while not self._queue and not self._closed:
+                    self._changed.wait()
+                if not self._queue:
+                    return
+                writer, batch, size = self._queue[0]
+            try:
+                writer.write(batch)
+            except BaseException as error:  # noqa: BLE001 - a thread's border: raised again by put or on leaving
+                with self._changed:
+                    self._error = error
+                    self._queue.clear()
+                    self._changed.notify_all()
+                return
+            with self._changed:
+                self._queue.popleft()
+                self._queued_bytes -= size
+                self._changed.notify_all()

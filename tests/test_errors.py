@@ -1,0 +1,38 @@
+"""Errors print in one line, keep their fields across processes and know their exit codes."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+
+from mosaico_ingest import errors
+from mosaico_ingest.errors import IngestError, ManifestError, SinkUnavailable
+
+KINDS = [getattr(errors, name) for name in errors.__all__]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_error_survives_pickling_with_its_fields(kind: type[IngestError]) -> None:
+    error = pickle.loads(pickle.dumps(kind("it broke", where="job.yaml:1:2", hint="mend it")))  # noqa: S301 - our own bytes
+    assert type(error) is kind
+    assert str(error) == "job.yaml:1:2: it broke — mend it"
+    assert error.args == ("it broke",)
+
+
+def test_findings_survive_pickling() -> None:
+    error = pickle.loads(pickle.dumps(ManifestError("two mistakes", findings=("a", "b"))))  # noqa: S301 - our own bytes
+    assert error.findings == ("a", "b")
+
+
+def test_only_an_unavailable_destination_is_worth_another_try() -> None:
+    assert [kind for kind in KINDS if kind.retryable] == [SinkUnavailable]
+
+
+def test_exit_codes_are_the_documented_ones() -> None:
+    codes = {kind.__name__: kind.exit_code for kind in KINDS}
+    assert codes["ManifestError"] == 2
+    assert codes["NothingMatched"] == 3
+    assert codes["VerificationError"] == 5
+    assert codes["Interrupted"] == 130
+    assert codes["BagError"] == codes["SinkError"] == codes["AdapterError"] == 1

@@ -1,0 +1,79 @@
+"""The write buffer keeps order, bounds its bytes and hands errors back."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pyarrow as pa
+import pytest
+
+from mosaico_ingest.errors import SinkError
+from mosaico_ingest.write_buffer import WriteBuffer
+
+
+def batch(value: int, rows: int = 4) -> pa.RecordBatch:
+    return pa.record_batch({"timestamp_ns": pa.array([value] * rows, pa.int64())})
+
+
+class Writer:
+    def __init__(self, *, fail_on: int | None = None, delay_s: float = 0.0) -> None:
+        self.seen: list[int] = []
+        self.fail_on = fail_on
+        self.delay_s = delay_s
+
+    def write(self, batch: pa.RecordBatch) -> None:
+        time.sleep(self.delay_s)
+        value = batch.column(0)[0].as_py()
+        if value == self.fail_on:
+            raise SinkError("disk full")
+        self.seen.append(value)
+
+
+def threads() -> list[str]:
+    return [thread.name for thread in threading.enumerate() if thread.name.startswith("mosaico-ingest")]
+
+
+def test_batches_are_written_in_order_and_all_of_them() -> None:
+    writer = Writer()
+    with WriteBuffer(max_bytes=100) as buffer:
+        for value in range(50):
+            buffer.put(writer, batch(value))
+    assert writer.seen == list(range(50))
+    assert not threads()
+
+
+def test_a_batch_larger_than_the_buffer_goes_through_alone() -> None:
+    writer = Writer()
+    with WriteBuffer(max_bytes=1) as buffer:
+        for value in range(3):
+            buffer.put(writer, batch(value))
+    assert writer.seen == [0, 1, 2]
+
+
+def test_an_error_of_the_writer_reaches_whoever_puts_or_leaves() -> None:
+    writer = Writer(fail_on=3)
+    with pytest.raises(SinkError, match="disk full"), WriteBuffer(max_bytes=100) as buffer:
+        for value in range(1000):
+            buffer.put(writer, batch(value))
+    assert writer.seen == [0, 1, 2]
+    assert not threads()
+
+
+def test_rows_accepted_before_an_error_outside_are_still_written() -> None:
+    writer = Writer(delay_s=0.001)
+    with pytest.raises(KeyError), WriteBuffer(max_bytes=10_000) as buffer:
+        for value in range(10):
+            buffer.put(writer, batch(value))
+        raise KeyError
+    assert writer.seen == list(range(10))
+    assert not threads()
+
+
+def test_put_waits_while_the_buffer_is_full() -> None:
+    writer = Writer(delay_s=0.02)
+    with WriteBuffer(max_bytes=batch(0).nbytes * 2) as buffer:
+        for value in range(6):
+            buffer.put(writer, batch(value))
+            assert value - len(writer.seen) <= 3
+    assert len(writer.seen) == 6
