@@ -1,0 +1,275 @@
+"""This file reads one message at a time into plain values: slow, exact, and what faster decoders are compared with.
+
+The rules a message can break, which failures are counted by:
+
+* `encapsulation`, `pl-cdr`, `xcdr2`: the first four bytes do not announce plain CDR.
+* `truncated`: a field needs more bytes than are left.
+* `string-length`, `string-terminator`, `utf8`, `utf16`: a string ends outside the message, a CDR string does not
+  end in NUL, text is not Unicode. Text is never repaired: a wrong byte is lost data or a wrong definition.
+* `sequence-length`, `sequence-bound`: more elements than the bytes left could hold, or than the definition allows.
+* `trailing-bytes`: bytes remain. CDR may end in up to 3 bytes of padding, and in 4 to 7 if they are zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from struct import Struct, unpack_from
+from typing import Any
+
+from mosaico_ingest.bag.batch import Encoding
+from mosaico_ingest.bag.definition import Container, Definition, Field, MessageType
+from mosaico_ingest.errors import BagError, DecodeError
+
+__all__ = ["BLOBS", "FORMATS", "Deserializer", "min_size"]
+
+FORMATS: Mapping[str, str] = {
+    "bool": "B", "byte": "B", "char": "B", "uint8": "B", "int8": "b", "uint16": "H", "int16": "h",
+    "uint32": "I", "int32": "i", "uint64": "Q", "int64": "q", "float32": "f", "float64": "d",
+}  # fmt: skip
+"""The `struct` letter of each primitive of a fixed size; any non-zero `bool` is true."""
+
+BLOBS = frozenset({"byte", "char", "uint8"})
+"""A sequence of these is `bytes`."""
+
+_SIZES = {kind: Struct(f"<{letter}").size for kind, letter in FORMATS.items()}
+_MAX_EMPTY = 1 << 16
+_MAX_PADDING = 3
+_MAX_ZEROS = 7
+_XCDR2 = {6: "CDR2", 7: "CDR2", 8: "D_CDR2", 9: "D_CDR2", 10: "PL_CDR2", 11: "PL_CDR2"} | dict.fromkeys(
+    range(0x10, 0x18), "CDR2"
+)
+
+
+class _Cursor:
+    """A position in the bytes behind the encapsulation header, from which CDR counts its alignment."""
+
+    __slots__ = ("cdr", "data", "order", "pos")
+
+    def __init__(self, data: bytes, order: str, *, cdr: bool) -> None:
+        self.data = data
+        self.order = order
+        self.cdr = cdr
+        self.pos = 0
+
+    @property
+    def left(self) -> int:
+        return max(0, len(self.data) - self.pos)
+
+    @property
+    def offset(self) -> int:
+        """Where in the payload the cursor is."""
+        return self.pos + 4 * self.cdr
+
+    def take(self, size: int, align: int, path: str) -> int:
+        """Step over `size` bytes behind the padding, and return where they begin."""
+        start = (self.pos + align - 1) & -align if self.cdr else self.pos
+        self.pos = start
+        if start + size > len(self.data):
+            raise DecodeError(
+                f"{path}: {size} bytes needed at byte {self.offset}, {self.left} left", rule="truncated"
+            )
+        self.pos = start + size
+        return start
+
+    def word(self, path: str) -> int:
+        """Read a length word."""
+        start = self.take(4, 4, path)
+        return unpack_from(f"{self.order}I", self.data, start)[0]
+
+
+_Read = Callable[[_Cursor], Any]
+
+
+class Deserializer:
+    """Reads messages of one definition; fixed arrays and sequences become lists, sequences of bytes `bytes`."""
+
+    def __init__(self, definition: Definition, encoding: Encoding) -> None:
+        if encoding is Encoding.OTHER:
+            raise BagError(f"{definition.root}: only CDR and ROS 1 payloads can be read")
+        self._definition = definition
+        self._cdr = encoding is Encoding.CDR
+        self._read = _message(definition.message, "", definition.types, cdr=self._cdr)
+        self.padded = 0
+        """How many messages ended in 4 to 7 zero bytes that the definition does not account for."""
+
+    def to_dict(self, payload: bytes) -> dict[str, Any]:
+        """Return the message's fields by name.
+
+        Raises:
+            DecodeError: The bytes do not fit the definition; `rule` says how.
+        """
+        order = _byte_order(payload) if self._cdr else "<"
+        cursor = _Cursor(payload[4:] if self._cdr else payload, order, cdr=self._cdr)
+        if self._definition.message.fields:
+            values: dict[str, Any] = self._read(cursor)
+        else:
+            values = {}
+            cursor.pos = min(1, cursor.left) if self._cdr else 0
+        self._check_tail(cursor)
+        return values
+
+    def _check_tail(self, cursor: _Cursor) -> None:
+        left = cursor.left
+        if left <= (_MAX_PADDING if self._cdr else 0):
+            return
+        if self._cdr and left <= _MAX_ZEROS and not any(cursor.data[cursor.pos :]):
+            self.padded += 1
+            return
+        raise DecodeError(
+            f"the definition of {self._definition.root} is shorter than the data by {left} bytes; "
+            f"it came from {_ORIGINS[self._definition.source.value]}",
+            rule="trailing-bytes",
+        )
+
+
+_ORIGINS = {"bag": "the recording", "custom": "a custom definition", "distro": "the distro's definitions"}
+
+
+def _byte_order(payload: bytes) -> str:
+    """Return `<` or `>` as the encapsulation header says."""
+    if len(payload) >= 4 and payload[0] == 0:  # noqa: PLR2004 - the header's size, as CDR defines it
+        kind = payload[1]
+        if kind <= 1:
+            return "<" if kind else ">"
+        if kind in {2, 3}:
+            raise DecodeError(
+                "the payload is a CDR parameter list (PL_CDR); only plain CDR is read", rule="pl-cdr"
+            )
+        if kind in _XCDR2:
+            raise DecodeError(f"the payload is XCDR2 ({_XCDR2[kind]}); only plain CDR is read", rule="xcdr2")
+    raise DecodeError(
+        f"no CDR encapsulation header (00 00 or 00 01): {len(payload)} bytes beginning {payload[:16].hex(' ')!r}",
+        rule="encapsulation",
+    )
+
+
+def min_size(kind: str, types: Mapping[str, MessageType], *, cdr: bool) -> int:
+    """Return the fewest bytes a value of the type takes, without padding; 0 is possible in ROS 1 only."""
+    if kind in _SIZES:
+        return _SIZES[kind]
+    if kind in {"string", "wstring"}:
+        return 4
+    fields = types[kind].fields
+    return sum(_field_min(field, types, cdr=cdr) for field in fields) if fields else int(cdr)
+
+
+def _field_min(field: Field, types: Mapping[str, MessageType], *, cdr: bool) -> int:
+    if field.container is Container.SEQUENCE:
+        return 4
+    count = field.size if field.container is Container.ARRAY else 1
+    return count * min_size(field.type, types, cdr=cdr)
+
+
+def _message(message: MessageType, path: str, types: Mapping[str, MessageType], *, cdr: bool) -> _Read:
+    prefix = f"{path}." if path else ""
+    readers = [(field.name, _field(field, prefix + field.name, types, cdr=cdr)) for field in message.fields]
+    if readers or not cdr:
+        return lambda cursor: {name: read(cursor) for name, read in readers}
+
+    def read_empty(cursor: _Cursor) -> dict[str, Any]:
+        cursor.take(1, 1, path)  # a structure without members is one unused byte in ROS 2
+        return {}
+
+    return read_empty
+
+
+def _field(field: Field, path: str, types: Mapping[str, MessageType], *, cdr: bool) -> _Read:
+    if field.container is Container.SCALAR:
+        return _value(field, path, types, cdr=cdr)
+    if field.type in FORMATS:
+        return _numbers(field, path)
+    read = _value(field, f"{path}[]", types, cdr=cdr)
+    if field.container is Container.ARRAY:
+        size = field.size
+        return lambda cursor: [read(cursor) for _ in range(size)]
+    least = min_size(field.type, types, cdr=cdr)
+    return lambda cursor: [read(cursor) for _ in range(_count(cursor, field, path, least))]
+
+
+def _value(field: Field, path: str, types: Mapping[str, MessageType], *, cdr: bool) -> _Read:
+    if field.is_message:
+        return _message(types[field.type], path, types, cdr=cdr)
+    if field.type == "string":
+        return lambda cursor: _string(cursor, path)
+    if field.type == "wstring":
+        return lambda cursor: _wstring(cursor, path)
+    return _number(field.type, path)
+
+
+def _number(kind: str, path: str) -> _Read:
+    size = _SIZES[kind]
+    little, big = Struct(f"<{FORMATS[kind]}").unpack_from, Struct(f">{FORMATS[kind]}").unpack_from
+
+    def read(cursor: _Cursor) -> int | float:
+        start = cursor.take(size, size, path)
+        return (little if cursor.order == "<" else big)(cursor.data, start)[0]
+
+    return (lambda cursor: bool(read(cursor))) if kind == "bool" else read
+
+
+def _numbers(field: Field, path: str) -> _Read:
+    """Return a reader of a sequence or array of numbers; an empty one is not aligned."""
+    kind, size, letter = field.type, _SIZES[field.type], FORMATS[field.type]
+    fixed = field.size if field.container is Container.ARRAY else None
+
+    def read(cursor: _Cursor) -> bytes | list[Any]:
+        count = _count(cursor, field, path, size) if fixed is None else fixed
+        start = cursor.take(count * size, size, path) if count else cursor.pos
+        if kind in BLOBS and fixed is None:
+            return cursor.data[start : start + count]
+        values = unpack_from(f"{cursor.order}{count}{letter}", cursor.data, start)
+        return list(map(bool, values)) if kind == "bool" else list(values)
+
+    return read
+
+
+def _count(cursor: _Cursor, field: Field, path: str, least: int) -> int:
+    """Read how many elements follow, and check that they can."""
+    count = cursor.word(path)
+    if count * least > cursor.left or (not least and count > _MAX_EMPTY):
+        raise DecodeError(
+            f"{path}: {count} elements of at least {least} bytes at byte {cursor.offset}, {cursor.left} bytes left",
+            rule="sequence-length",
+        )
+    if field.size and count > field.size:
+        raise DecodeError(
+            f"{path}: {count} elements, at most {field.size} are allowed", rule="sequence-bound"
+        )
+    return count
+
+
+def _string(cursor: _Cursor, path: str) -> str:
+    size = cursor.word(path)
+    if size > cursor.left:
+        raise DecodeError(
+            f"{path}: a string of {size} bytes at byte {cursor.offset}, {cursor.left} left",
+            rule="string-length",
+        )
+    start, cursor.pos = cursor.pos, cursor.pos + size
+    end = cursor.pos
+    if cursor.cdr and size:
+        end -= 1
+        if cursor.data[end]:
+            raise DecodeError(
+                f"{path}: the string of {size} bytes does not end in NUL", rule="string-terminator"
+            )
+    try:
+        return cursor.data[start:end].decode()
+    except UnicodeDecodeError as error:
+        raise DecodeError(f"{path}: byte {error.start} of the string is not UTF-8", rule="utf8") from None
+
+
+def _wstring(cursor: _Cursor, path: str) -> str:
+    """Read UTF-16 code units, which every ROS 2 middleware writes as 32-bit words without a terminator."""
+    count = cursor.word(path)
+    if count * 4 > cursor.left:
+        raise DecodeError(
+            f"{path}: a string of {count} units at byte {cursor.offset}, {cursor.left} bytes left",
+            rule="string-length",
+        )
+    units = unpack_from(f"{cursor.order}{count}I", cursor.data, cursor.pos)
+    cursor.pos += count * 4
+    try:
+        return b"".join(chr(unit).encode("utf-16-le", "surrogatepass") for unit in units).decode("utf-16-le")
+    except (UnicodeDecodeError, ValueError, OverflowError):
+        raise DecodeError(f"{path}: the string is not UTF-16", rule="utf16") from None

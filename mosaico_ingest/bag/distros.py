@@ -1,0 +1,47 @@
+"""This file is the distros' own message types, loaded when the first one is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+
+from rosbags.interfaces.typing import Typesdict
+from rosbags.typesys import Stores as RosbagsStores
+from rosbags.typesys import get_typestore
+
+from mosaico_ingest.bag.definition import Field, MessageType
+from mosaico_ingest.bag.names import DURATION, TIME
+from mosaico_ingest.bag.schemas import message_type
+from mosaico_ingest.policies import Stores
+
+__all__ = ["BUILTIN", "agreed_type", "distro_type", "ros_version"]
+
+_PARTS = (Field("sec", "int32"), Field("nanosec", "uint32"))
+BUILTIN: Mapping[str, MessageType] = {name: MessageType(name, _PARTS) for name in (TIME, DURATION)}
+"""The types every distro has and a ROS 1 text spells `time` and `duration`."""
+
+
+def ros_version(distro: Stores) -> int | None:
+    """Return 1 or 2; None for the store without a distro."""
+    if distro is Stores.EMPTY:
+        return None
+    return 1 if distro.value.startswith("ros1") else 2
+
+
+def distro_type(distro: Stores, name: str) -> MessageType | None:
+    """Return a distro's type by full name, None where it has none."""
+    types = _types(distro)
+    return message_type(name, types) if name in types else None
+
+
+@lru_cache(maxsize=4096)
+def agreed_type(version: int, name: str) -> MessageType | None:
+    """Return the type if all distros of a ROS version that have it agree on its fields; the newest one's form."""
+    distros = [distro for distro in Stores if distro is not Stores.LATEST and ros_version(distro) == version]
+    found = [known for distro in distros if (known := distro_type(distro, name))]
+    return found[-1] if found and all(known.fields == found[0].fields for known in found) else None
+
+
+@lru_cache(maxsize=None)
+def _types(distro: Stores) -> Typesdict:
+    return get_typestore(RosbagsStores(distro.value)).fielddefs

@@ -1,0 +1,199 @@
+"""This file reads `.msg` text, one type or several in one text, and writes a definition back as such text."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from mosaico_ingest.bag.definition import Constant, Container, Field, MessageType
+from mosaico_ingest.bag.names import DURATION, TIME, short_msgtype
+from mosaico_ingest.errors import BagError
+
+__all__ = ["PRIMITIVES", "SEPARATOR", "Section", "flatten", "parse_msg", "sections"]
+
+SEPARATOR = "=" * 80
+
+PRIMITIVES = frozenset(
+    {
+        "bool", "byte", "char", "int8", "uint8", "int16", "uint16", "int32", "uint32",
+        "int64", "uint64", "float32", "float64", "string", "wstring",
+    }
+)  # fmt: skip
+"""The types that are not messages; `time` and `duration` are read as messages of two fields."""
+
+_SEPARATOR_LINE = re.compile(r"^={10,}[ \t\r]*(?:\n|\Z)", re.MULTILINE)
+_HEAD = re.compile(r"\s*(?P<kind>MSG|IDL):[ \t]*(?P<name>\S+)[ \t\r]*(?:\n|\Z)")
+_LINE = re.compile(
+    r"(?P<type>[A-Za-z]\w*(?:/\w+)*)(?:<=(?P<bound>\d+))?(?P<array>\[(?:<=)?\d*\])?\s+(?P<name>[A-Za-z_]\w*)"
+    r"(?:\s*=(?P<value>.*)|\s*(?:#.*)?|\s+[-+.\w'\"\[].*)"
+)
+_ANNOTATION = re.compile(r"@(?P<name>\w+)(?:\([^)]*\))?\s*")
+_QUOTED = re.compile(r"""(?:'((?:\\.|[^'\\])*)'|"((?:\\.|[^"\\])*)")\s*(?:#.*)?""")
+_MAX_SIZE = 2**31 - 1
+_BUILTIN = {"time": TIME, "duration": DURATION}
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """The text of one type among several; the first may have no name of its own."""
+
+    kind: str
+    """`MSG`, `IDL`, or empty where there is no head."""
+    name: str
+    text: str
+    line: int
+    """How many lines of the whole come before it."""
+
+
+def sections(text: str) -> Iterator[Section]:
+    """Split a text at its `===` lines; empty text is one section, an empty part before a separator none."""
+    separators = list(_SEPARATOR_LINE.finditer(text))
+    starts = [0, *(separator.end() for separator in separators)]
+    ends = [*(separator.start() for separator in separators), len(text)]
+    for start, end in zip(starts, ends, strict=True):
+        head = _HEAD.match(text, start, end)
+        body = head.end() if head else start
+        if head or text[start:end].strip() or not separators:
+            kind, name = (head["kind"], head["name"]) if head else ("", "")
+            yield Section(kind, name, text[body:end], text.count("\n", 0, body))
+
+
+def parse_msg(text: str, name: str, *, where: str | None = None, line: int = 0) -> MessageType:
+    """Return the one type that `text` defines; types its fields refer to keep the spelling of the text.
+
+    `where` names the source and `line` the lines before the text in it, for messages.
+
+    Raises:
+        BagError: A line is no field, no constant and no comment.
+    """
+    fields, constants = list[Field](), list[Constant]()
+    for number, raw in enumerate(text.lstrip("\ufeff").split("\n"), start=line + 1):
+        content = raw.strip(" \t\r\0\f")
+        if not content or content.startswith("#"):
+            continue
+        try:
+            item = _item(content)
+        except ValueError as error:
+            place = f"{where or name}:{number}"
+            hint = "a line is `type name`, `type NAME=value` or a `#` comment"
+            raise BagError(f"cannot read {content!r}: {error}", where=place, hint=hint) from None
+        if isinstance(item, Field):
+            fields.append(item)
+        elif item:
+            constants.append(item)
+    _refuse_twins(fields, where or name)
+    return MessageType(name, tuple(fields), tuple(constants))
+
+
+def _item(content: str) -> Field | Constant | None:
+    while annotation := _ANNOTATION.match(content):
+        if annotation["name"] == "optional":
+            raise ValueError("optional fields have no place in plain CDR")
+        content = content[annotation.end() :]
+    if not content or content.startswith("#"):
+        return None
+    match = _LINE.fullmatch(content)
+    if not match:
+        raise ValueError("not a field or constant")
+    kind = match["type"]
+    if match["bound"] and kind not in {"string", "wstring"}:
+        raise ValueError(f"{kind} cannot be bounded")
+    if match["value"] is not None:
+        return Constant(match["name"], kind, _value(kind, match["value"].strip()))
+    container, size = _container(match["array"])
+    return Field(
+        match["name"],
+        _BUILTIN.get(kind, kind),
+        is_message=kind not in PRIMITIVES,
+        container=container,
+        size=size,
+        string_bound=int(match["bound"] or 0),
+    )
+
+
+def _container(array: str | None) -> tuple[Container, int]:
+    if array is None:
+        return Container.SCALAR, 0
+    bounded = array.startswith("[<=")
+    digits = array.strip("[<=]")
+    size = int(digits or 0)
+    if size > _MAX_SIZE or (bounded and not digits):
+        raise ValueError(f"{array} is no size")
+    return (Container.SEQUENCE if bounded or not digits else Container.ARRAY), size
+
+
+def _value(kind: str, text: str) -> str | bool | int | float:
+    """Return a constant's value; a string's runs to the end of the line unless it is quoted."""
+    if kind not in PRIMITIVES:
+        raise ValueError(f"a constant of type {kind}")
+    quoted = _QUOTED.fullmatch(text)
+    if quoted:
+        return quoted[1] if quoted[1] is not None else quoted[2]
+    if kind in {"string", "wstring"}:
+        return text
+    plain = text.partition("#")[0].strip()
+    if kind == "bool" and plain.lower() in {"true", "false"}:
+        return plain.lower() == "true"
+    if kind == "bool":
+        return bool(_integer(plain))
+    return float(plain) if kind.startswith("float") else _integer(plain)
+
+
+def _integer(text: str) -> int:
+    digits = text.lstrip("+-")
+    octal = len(digits) > 1 and digits.startswith("0") and digits.isdecimal()
+    return int(text, 8 if octal else 0)
+
+
+def _refuse_twins(fields: list[Field], where: str) -> None:
+    counts = Counter(field.name for field in fields)
+    twin = next((name for name, count in counts.items() if count > 1), None)
+    if twin:
+        raise BagError(f"the field {twin!r} is defined twice", where=where)
+
+
+def flatten(root: str, types: Mapping[str, MessageType], *, ros_version: int) -> str:
+    """Return the text of `root`, then of each type it needs, after a separator, in the order they are met."""
+    order = dict[str, None]()
+    _collect(types[root], types, order, hidden=_hidden(ros_version))
+    order.pop(root, None)
+    texts = [_own_text(types[root], ros_version)]
+    texts += [f"{SEPARATOR}\nMSG: {short_msgtype(n)}\n{_own_text(types[n], ros_version)}" for n in order]
+    return "".join(texts)
+
+
+def _hidden(ros_version: int) -> Mapping[str, str]:
+    return {TIME: "time", DURATION: "duration"} if ros_version == 1 else {}
+
+
+def _collect(
+    message: MessageType,
+    types: Mapping[str, MessageType],
+    order: dict[str, None],
+    *,
+    hidden: Mapping[str, str],
+) -> None:
+    for field in message.fields:
+        if field.is_message and field.type not in order and field.type not in hidden:
+            order[field.type] = None
+            _collect(types[field.type], types, order, hidden=hidden)
+
+
+def _own_text(message: MessageType, ros_version: int) -> str:
+    hidden = _hidden(ros_version)
+    lines = [f"{constant.type} {constant.name}={constant.value}" for constant in message.constants]
+    for field in message.fields:
+        kind = hidden.get(field.type) or short_msgtype(field.type)
+        bound = f"<={field.string_bound}" if field.string_bound else ""
+        lines.append(f"{kind}{bound}{_brackets(field)} {field.name}")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _brackets(field: Field) -> str:
+    if field.container is Container.SCALAR:
+        return ""
+    if field.container is Container.ARRAY:
+        return f"[{field.size}]"
+    return f"[<={field.size}]" if field.size else "[]"
