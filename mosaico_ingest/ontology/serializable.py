@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import pyarrow as pa
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -18,6 +18,8 @@ __all__ = ["DEFINED", "Serializable"]
 
 DEFINED: dict[str, type[Serializable]] = {}
 """Every model class by tag, from the moment it is defined; a later one of the same tag replaces it."""
+
+_MISFITS = (pa.ArrowException, OverflowError, TypeError, ValueError)
 
 
 class Serializable(BaseModel):
@@ -72,11 +74,13 @@ class Serializable(BaseModel):
         Raises:
             AdapterError: A value does not fit its column; names the row.
         """
-        rows = [model.to_row() for model in models]
+        rows, columns = [model.to_row() for model in models], cls._columns()
         try:
-            return pa.array(rows, type=cls._columns())
-        except (pa.ArrowException, OverflowError, TypeError, ValueError) as error:
-            raise cls._misfit(rows, error) from error
+            return _array(rows, columns)
+        except _MISFITS as error:
+            reasons = ((at, _misfit(row, columns)) for at, row in enumerate(rows))
+            at, reason = next(((at, reason) for at, reason in reasons if reason), (0, str(error)))
+            raise AdapterError(f"row {at}: {reason}", where=cls.__ontology_tag__) from error
 
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> Self:
@@ -100,14 +104,18 @@ class Serializable(BaseModel):
     def _columns(cls) -> pa.StructType:
         return struct_of(cls)
 
-    @classmethod
-    def _misfit(cls, rows: list[dict[str, Any]], error: Exception) -> AdapterError:
-        for position, row in enumerate(rows):
-            try:
-                pa.array([row], type=cls._columns())
-            except (pa.ArrowException, OverflowError, TypeError, ValueError) as reason:
-                return AdapterError(f"row {position}: {reason}", where=cls.__ontology_tag__)
-        return AdapterError(str(error), where=cls.__ontology_tag__)
+
+def _array(rows: list[dict[str, Any]], columns: pa.StructType) -> pa.StructArray:
+    return cast("pa.StructArray", pa.array(rows, type=columns))  # the class follows from the type
+
+
+def _misfit(row: dict[str, Any], columns: pa.StructType) -> str | None:
+    """Return why `row` does not fit, None where it does."""
+    try:
+        _array([row], columns)
+    except _MISFITS as reason:
+        return str(reason)
+    return None
 
 
 def _without_hollow(value: Any) -> Any:  # noqa: ANN401 - any cell

@@ -41,5 +41,5 @@ def fingerprint(struct: pa.StructType) -> str:
         pa.large_binary(): pa.binary(),
         pa.binary_view(): pa.binary(),
     }
-    fields = [field.with_type(plain.get(field.type, field.type)) for field in struct]
+    fields = [pa.field(field.name, plain.get(field.type) or field.type, field.nullable) for field in struct]
     return hashlib.sha1(str(pa.struct(fields)).encode(), usedforsecurity=False).hexdigest()[:10]
