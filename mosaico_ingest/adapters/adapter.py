@@ -35,6 +35,8 @@ class Adapted:
     index: NDArray[np.int64]
     """Position among the given rows, ascending, shape (len(rows),)."""
     failures: tuple[RowFailure, ...]
+    log_times: NDArray[np.int64] | None = None
+    """Times to store instead of the recorded ones, shape (len(rows),); only a Python `translate` changes them."""
 
 
 class Adapter(Protocol):
