@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import lru_cache
+from functools import cache, lru_cache
 
 from rosbags.interfaces.typing import Typesdict
 from rosbags.typesys import Stores as RosbagsStores
@@ -42,6 +42,6 @@ def agreed_type(version: int, name: str) -> MessageType | None:
     return found[-1] if found and all(known.fields == found[0].fields for known in found) else None
 
 
-@lru_cache(maxsize=None)
+@cache
 def _types(distro: Stores) -> Typesdict:
     return get_typestore(RosbagsStores(distro.value)).fielddefs

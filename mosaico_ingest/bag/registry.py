@@ -106,8 +106,10 @@ def register_source(msg_type: str, source: Path | str) -> Registered:
 
 
 def _is_text(source: Path | str) -> bool:
-    """Say whether a source is a definition; a word that ends like a file name is one."""
-    return isinstance(source, str) and (not source.endswith(_SUFFIXES) or len(source.split()) > 1)
+    """Say whether a source is a definition; one line that ends like a definition's file name is a path."""
+    if isinstance(source, Path) or not source.endswith(_SUFFIXES) or "\n" in source:
+        return isinstance(source, str)
+    return len(source.split()) > 1 and not Path(source).is_file()
 
 
 def _read(path: Path) -> tuple[str, str]:

@@ -1,0 +1,182 @@
+"""This file finds the definition of a connection's type, and of each type that one needs, wherever it is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mosaico_ingest.bag.definition import Definition, Embedded, MessageType, Source
+from mosaico_ingest.bag.distros import BUILTIN, agreed_type, distro_type, ros_version
+from mosaico_ingest.bag.link import link
+from mosaico_ingest.bag.msgtext import flatten
+from mosaico_ingest.bag.names import normalize_msgtype
+from mosaico_ingest.bag.registry import (
+    Registered,
+    ROSTypeRegistry,
+    directory_types,
+    register_source,
+    store_of,
+)
+from mosaico_ingest.bag.schemas import read_types
+from mosaico_ingest.diagnostics import Finding, Severity
+from mosaico_ingest.errors import BagError
+from mosaico_ingest.policies import Stores
+
+__all__ = ["CustomMessages", "TypeResolver"]
+
+CustomMessages = tuple[str, Path, Stores | str | None]
+"""A package, the directory of its `.msg` files (or one file), and the distro it is for (None: all)."""
+
+_LANGUAGES = frozenset({"ros1msg", "ros2msg", "ros2idl", "omgidl", "idl", "msg", "unknown", ""})
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """One place where types are looked for."""
+
+    label: str
+    source: Source
+    find: Callable[[str], MessageType | None]
+
+
+class TypeResolver:
+    """Finds definitions: in the recording, then the run's own, then announced ones, then the distro's.
+
+    Each nested type is looked for on its own in the same order. Without a distro a standard type is taken where all
+    distros of the ROS version agree on it, with a finding. What the registry holds is copied when a resolver is made.
+    """
+
+    def __init__(
+        self,
+        distro: Stores | str | None = None,
+        custom: Iterable[CustomMessages] = (),
+        *,
+        types: Mapping[str, Path | str] | None = None,
+        registry: type[ROSTypeRegistry] = ROSTypeRegistry,
+    ) -> None:
+        """Read the run's own definitions: `custom` by package, `types` one by one, as text or file.
+
+        Raises:
+            BagError: One of them cannot be read.
+        """
+        self.distro = store_of(distro)
+        self._other_distros = dict[str, str]()
+        own = list[Registered]()
+        for package, path, store in custom:
+            entries = list(directory_types(package, Path(path)))
+            scope = store_of(store)
+            if scope and self.distro and scope is not self.distro:
+                self._other_distros |= {entry.msgtype: scope.value for entry in entries}
+            else:
+                own += entries
+        own += [register_source(name, source) for name, source in (types or {}).items()]
+        self._custom = _by_name(own)
+        self._registered = _by_name(registry.entries(self.distro).values())
+        self._resolved = dict[tuple[str, Embedded | None, int], Definition]()
+        self._assumed = dict[str, int]()
+        self._replaced = dict[str, str]()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_resolved": {}}
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What was decided without being asked for, so far."""
+        findings = [
+            Finding(
+                "unreadable-definition", Severity.WARNING, f"{root}: the job's definition is used; {problem}"
+            )
+            for root, problem in self._replaced.items()
+        ]
+        for version in sorted(set(self._assumed.values())):
+            names = ", ".join(name for name, known in self._assumed.items() if known == version)
+            message = f"without definitions in the recording, as all ROS {version} distros have them: {names}"
+            findings.append(
+                Finding("assumed-definition", Severity.INFO, message, help="set ros_distro to be sure")
+            )
+        return tuple(findings)
+
+    def resolve(self, msgtype: str, embedded: Embedded | None, *, ros_version: int) -> Definition:
+        """Return the definition of `msgtype`, any spelling of the name.
+
+        Raises:
+            BagError: It or a type it needs is not known, or the text in the recording cannot be read.
+        """
+        key = (msgtype, embedded, ros_version)
+        if key not in self._resolved:
+            self._resolved[key] = self._resolve(normalize_msgtype(msgtype), embedded, ros_version)
+        return self._resolved[key]
+
+    def _resolve(self, root: str, embedded: Embedded | None, version: int) -> Definition:
+        places = self._places(root, embedded, version)
+        found = next(((known, place.source) for place in places if (known := place.find(root))), None)
+        hint = self._hint(places, version)
+        if not found:
+            elsewhere = self._other_distros.get(root)
+            limited = f"; custom_msgs has it for {elsewhere} only" if elsewhere else ""
+            raise BagError(f"the definition of {root} is not known{limited}", hint=hint)
+        message, source = found
+
+        def find(name: str) -> MessageType | None:
+            known = (place.find(name) for place in places)
+            return next((message for message in known if message), BUILTIN.get(name))
+
+        types = link(message, find, ros_version=version, hint=hint)
+        return Definition(root, types, source, flatten(root, types, ros_version=version), version)
+
+    def _places(self, root: str, embedded: Embedded | None, version: int) -> list[_Place]:
+        places = [
+            _Place("the recording", Source.BAG, self._embedded(root, embedded).get),
+            _Place("custom_msgs", Source.CUSTOM, self._custom.get),
+            _Place("the type registry", Source.CUSTOM, self._registered.get),
+        ]
+        distro = self.distro
+        if distro is None:
+            label = f"what all ROS {version} distros agree on"
+            places.append(_Place(label, Source.DISTRO, lambda name: self._agreed(version, name)))
+        elif ros_version(distro) == version:
+            places.append(_Place(distro.value, Source.DISTRO, lambda name: distro_type(distro, name)))
+        if embedded and not embedded.text.strip():
+            # An empty text is a type without fields, unless the type is known: recorders that lack a definition
+            # write an empty one.
+            places.append(_Place("the recording's empty text", Source.BAG, {root: MessageType(root, ())}.get))
+        return places
+
+    def _embedded(self, root: str, embedded: Embedded | None) -> Mapping[str, MessageType]:
+        if embedded is None or not embedded.text.strip():
+            return {}
+        if embedded.encoding.lower() not in _LANGUAGES:
+            raise BagError(f"a schema in {embedded.encoding!r} is no ROS definition", where=root)
+        try:
+            return read_types(embedded.text, root)
+        except BagError as error:
+            if root not in self._custom and root not in self._registered:
+                problem = f"the definition in the recording cannot be read: {error.what}"
+                raise BagError(problem, where=error.where, hint="give the type with custom_msgs") from error
+            self._note(
+                "unreadable-definition",
+                f"{root}: the job's definition is used; in the recording {error.what}",
+            )
+            return {}
+
+    def _agreed(self, version: int, name: str) -> MessageType | None:
+        known = agreed_type(version, name)
+        if known and name not in BUILTIN:
+            self._assumed[name] = version
+        return known
+
+    def _hint(self, places: list[_Place], version: int) -> str:
+        searched = f"searched: {', '.join(place.label for place in places)}"
+        if self.distro and ros_version(self.distro) != version:
+            return f"{searched}; the recording is ROS {version}, ros_distro is {self.distro.value}; set the right one"
+        remedy = "give it with custom_msgs" if self.distro else "set ros_distro, or give it with custom_msgs"
+        return f"{searched}; {remedy}"
+
+
+def _by_name(entries: Iterable[Registered]) -> dict[str, MessageType]:
+    """Return all types by name; one given under its own name wins over the same inside another's text."""
+    chosen = list(entries)
+    types = {name: message for entry in reversed(chosen) for name, message in entry.types.items()}
+    return types | {entry.msgtype: entry.types[entry.msgtype] for entry in chosen}
