@@ -27,7 +27,8 @@ def model(tag: str) -> type[Serializable]:
         import_module(f"mosaico_ingest.ontology.{MODULES[tag]}")
     if tag in DEFINED:
         return DEFINED[tag]
-    near = get_close_matches(tag, tags(), n=3, cutoff=0.5)
+    by_letters = {_letters(known): known for known in tags()}
+    near = [by_letters[name] for name in get_close_matches(_letters(tag), by_letters, n=3)]
     hint = f"did you mean {' or '.join(near)}?" if near else f"known are {', '.join(tags())}"
     raise UnknownTag(f"no ontology model has the tag {tag!r}", hint=hint)
 
@@ -44,3 +45,8 @@ def ontology_type(tag: str) -> OntologyType:
 def tags() -> tuple[str, ...]:
     """Return every known tag in alphabetical order."""
     return tuple(sorted({*MODULES, *DEFINED}))
+
+
+def _letters(tag: str) -> str:
+    """Return the tag without what older tags, as `vector_3_d`, spell differently."""
+    return tag.replace("_", "").lower()
