@@ -12,7 +12,7 @@ import yaml
 from mosaico_ingest.diagnostics import Edit, Finding, Severity, Span
 from mosaico_ingest.manifest.scalars import Scalar, resolve_plain
 
-__all__ = ["MAX_DEPTH", "MAX_NODES", "Composer", "LimitExceeded", "Path", "Value"]
+__all__ = ["MAX_DEPTH", "MAX_NODES", "Composer", "LimitExceeded", "Path", "Value", "member"]
 
 Key: TypeAlias = Scalar
 Value: TypeAlias = "Scalar | list[Value] | dict[Key, Value]"
@@ -32,6 +32,19 @@ MAX_DEPTH = 40
 """How deep values may nest."""
 MAX_NODES = 50_000
 """How many values there may be, each alias counted with all it stands for."""
+
+
+def member(value: Value, part: Key) -> Value:
+    """Return what a mapping or list holds under a key or at a position.
+
+    Raises:
+        LookupError: There is nothing.
+    """
+    if isinstance(value, dict):
+        return value[part]
+    if isinstance(value, list) and isinstance(part, int):
+        return value[part]
+    raise LookupError(part)
 
 
 class LimitExceeded(Exception):  # noqa: N818 - a signal inside this package, never seen outside
@@ -262,9 +275,6 @@ def _as_key(value: Value) -> Key:
 
 def _part(node: _Node, key: Key) -> _Node:
     """Return what `node` holds under `key` as a node of its own."""
-    value = node.value[key] if isinstance(node.value, dict) else None
-    if isinstance(node.value, list) and isinstance(key, int):
-        value = node.value[key]
     inner = {path[1:]: span for path, span in node.inner.items() if path[0] == key and len(path) > 1}
     keys = {path[1:]: span for path, span in node.keys.items() if path[0] == key and len(path) > 1}
-    return _Node(value, node.inner[(key,)], inner, keys, 1 + len(inner))
+    return _Node(member(node.value, key), node.inner[(key,)], inner, keys, 1 + len(inner))

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 import yaml
 
 from mosaico_ingest.diagnostics import Finding, Severity, Span
-from mosaico_ingest.manifest.compose import Composer, LimitExceeded, Path, Value
+from mosaico_ingest.manifest.compose import Composer, LimitExceeded, Path, Value, member
 
-__all__ = ["MAX_CHARACTERS", "Path", "Source", "Value", "load_source"]
+__all__ = ["MAX_CHARACTERS", "Path", "Source", "Value", "load_source", "member"]
 
 MAX_CHARACTERS = 1_000_000
 """How long a document may be; it also bounds the time a hostile one takes."""
@@ -78,7 +78,7 @@ class Source:
         line = self.line(whole.line)
         written = line[whole.column - 1 : whole.end_column - 1] if whole.line == whole.end_line else ""
         value = written[1:-1] if written[:1] in {'"', "'"} else written
-        if not value or self._at(path) != value:
+        if not value or self.at(path) != value:
             return whole
         first = whole.column + (len(written) - len(value)) // 2
         return Span(self.file, whole.line, first + start, whole.line, first + end)
@@ -88,15 +88,14 @@ class Source:
         lines = self.text.splitlines()
         return lines[number - 1] if 0 < number <= len(lines) else ""
 
-    def _at(self, path: Path) -> Value:
+    def at(self, path: Path) -> Value:
+        """Return the value at `path`, None where there is none."""
         value = self.value
-        for part in path:
-            if isinstance(value, dict):
-                value = value.get(part)
-            elif isinstance(value, list) and isinstance(part, int) and part < len(value):
-                value = value[part]
-            else:
-                return None
+        try:
+            for part in path:
+                value = member(value, part)
+        except LookupError:
+            return None
         return value
 
 

@@ -1,0 +1,163 @@
+"""This file loads a job manifest: text, environment, model; every mistake in one go."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from mosaico_ingest.diagnostics import Finding, Severity, Span
+from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.manifest.environment import Filled, fill_in
+from mosaico_ingest.manifest.model import Manifest
+from mosaico_ingest.manifest.problems import explain
+from mosaico_ingest.manifest.scalars import resolve_plain
+from mosaico_ingest.manifest.schema import job_schema
+from mosaico_ingest.manifest.source import Path as Place
+from mosaico_ingest.manifest.source import Source, Value, load_source, member
+
+__all__ = ["LoadedManifest", "check_manifest", "load_manifest", "read_text"]
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedManifest:
+    """A manifest that holds together, with the place of everything in it."""
+
+    manifest: Manifest
+    source: Source
+    path: Path
+
+    def where(self, *place: str | int) -> str:
+        """Return `file:line:column` of the value at a path, for the errors of later stages."""
+        return str(self.source.span(place))
+
+    def resolve(self, path: str) -> Path:
+        """Return a path of the manifest as seen from here: relative ones start in the manifest's folder."""
+        return self.path.parent / Path(path).expanduser()
+
+
+def load_manifest(path: Path | str, *, env: Mapping[str, str] | None = os.environ) -> LoadedManifest:
+    """Load a job manifest; `env=None` judges it without looking at the environment.
+
+    Raises:
+        ManifestError: The file cannot become a job; `findings` has one entry for each mistake.
+    """
+    file = Path(path)
+    source = load_source(read_text(file), file=str(path))
+    manifest, findings = check_manifest(source, env=env)
+    if manifest is None:
+        raise _refusal(findings, str(path))
+    return LoadedManifest(manifest, source, file)
+
+
+def check_manifest(
+    source: Source, *, env: Mapping[str, str] | None
+) -> tuple[Manifest | None, tuple[Finding, ...]]:
+    """Return the model, None if there are mistakes, and the findings in the order of the text."""
+    if not isinstance(source.value, dict):
+        return None, source.findings or (_not_a_job(source),)
+    filled = fill_in(source, env)
+    findings = [*source.findings, *filled.findings]
+    filled.value = _with_text_keys(filled.value, (), source, findings)
+    manifest, mistakes = _validate(source, filled)
+    known = {finding.span for finding in findings}
+    findings += [finding for finding in mistakes if finding.span not in known]  # one word for one place
+    ordered = tuple(sorted(findings, key=lambda finding: finding.span or Span("", 0, 0, 0, 0)))
+    return (None if ordered else manifest), ordered
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file.
+
+    Raises:
+        ManifestError: It is not there, not readable, or not UTF-8.
+    """
+    try:
+        return path.read_bytes().decode()
+    except UnicodeDecodeError as err:
+        message = f"not UTF-8 text: byte {err.start} is 0x{err.object[err.start]:02x}"
+        finding = Finding(
+            "not-utf8", Severity.ERROR, message, Span(str(path), 1, 1, 1, 1), "save it as UTF-8"
+        )
+        raise _refusal((finding,), str(path)) from err
+    except OSError as err:
+        message = f"cannot be read: {(err.strerror or str(err)).lower()}"
+        finding = Finding("unreadable-file", Severity.ERROR, message, Span(str(path), 1, 1, 1, 1))
+        raise _refusal((finding,), str(path)) from err
+
+
+def _refusal(findings: tuple[Finding, ...], where: str) -> ManifestError:
+    first = findings[0]
+    if len(findings) == 1:
+        return ManifestError(
+            first.message, where=str(first.span or where), hint=first.help, findings=findings
+        )
+    return ManifestError(
+        f"{len(findings)} mistakes; the first: {first.message}", where=where, findings=findings
+    )
+
+
+def _not_a_job(source: Source) -> Finding:
+    span = source.span(())
+    if source.value is None:
+        return Finding(
+            "empty-manifest", Severity.ERROR, "there is nothing in it", span, "start with bag: {path: …}"
+        )
+    return Finding("not-a-mapping", Severity.ERROR, "a job is a mapping", span, "start with bag: {path: …}")
+
+
+def _with_text_keys(value: Value, path: Place, source: Source, findings: list[Finding]) -> Value:
+    """Report keys that are not text, and leave them out."""
+    if isinstance(value, list):
+        return [_with_text_keys(item, (*path, i), source, findings) for i, item in enumerate(value)]
+    if not isinstance(value, dict):
+        return value
+    for key in value:
+        if not isinstance(key, str):
+            span = source.key_span((*path, key))
+            message = f"the key {json.dumps(key)} is not text"
+            findings.append(Finding("yaml-key", Severity.ERROR, message, span, "quote it"))
+    return {
+        key: _with_text_keys(inner, (*path, key), source, findings)
+        for key, inner in value.items()
+        if isinstance(key, str)
+    }
+
+
+def _validate(source: Source, filled: Filled) -> tuple[Manifest | None, list[Finding]]:
+    """Validate; a variable may stand for a number, and one that is not known for anything."""
+    explained: list[tuple[Place, Finding]] = []
+    for _ in range(2):
+        try:
+            # As JSON, so that strict means: no text for a number, and lists and names for what they are.
+            return Manifest.model_validate_json(json.dumps(filled.value), strict=True), []
+        except ValidationError as error:
+            explained = explain(error, source=source, schema=_schema())
+        retry = [place for place, _ in explained if place in filled.changed]
+        for place in retry:
+            _reread(filled, place)
+    return None, [finding for place, finding in explained if place not in filled.unknown]
+
+
+def _reread(filled: Filled, place: Place) -> None:
+    """Read a filled-in text as YAML would read it unquoted; take it out if its value is not known."""
+    parent = filled.value
+    for part in place[:-1]:
+        parent = member(parent, part)
+    if isinstance(parent, dict):
+        value = parent[place[-1]]
+        if place in filled.unknown:
+            del parent[place[-1]]
+        elif isinstance(value, str):
+            parent[place[-1]] = resolve_plain(value)[0]
+
+
+@cache
+def _schema() -> dict[str, Any]:
+    return job_schema()

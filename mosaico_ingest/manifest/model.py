@@ -1,0 +1,240 @@
+"""This file is the manifest's keys: their types, defaults, descriptions and examples, said once."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    JsonValue,
+    SecretStr,
+    StringConstraints,
+    Tag,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
+
+from mosaico_ingest.manifest.units import parse_instant, parse_offset, parse_size
+from mosaico_ingest.policies import (
+    IfExists,
+    LoaderErrorPolicy,
+    SessionLevelErrorPolicy,
+    Stores,
+    TopicLevelErrorPolicy,
+    Unmodeled,
+)
+
+__all__ = [
+    "DEFAULT_TOPIC",
+    "VERSION",
+    "AdaptersSection",
+    "BagSection",
+    "CustomMessages",
+    "Manifest",
+    "OnErrorSection",
+    "RunSection",
+    "SequenceSection",
+    "TargetSection",
+    "TimeSection",
+    "TopicSettings",
+]
+
+VERSION = 1
+"""The newest manifest version this tool reads."""
+DEFAULT_TOPIC = "default"
+"""The key of `on_error.topic` for every topic that no other key matches."""
+
+
+def _check_time(text: str) -> str:
+    (parse_offset if text[:1] in {"+", "-"} else parse_instant)(text)
+    return text
+
+
+def _check_size(text: str) -> str:
+    parse_size(text)
+    return text
+
+
+def _shape(value: Any) -> str:  # noqa: ANN401 - whatever YAML holds
+    return "several" if isinstance(value, list | tuple | dict) else "one"
+
+
+Text = Annotated[str, StringConstraints(min_length=1)]
+TimeText = Annotated[
+    Text,
+    AfterValidator(_check_time),
+    Field(json_schema_extra={"pattern": r"^([+-][0-9.]+ ?(ns|us|ms|s|min|h)|[0-9]{4}-[0-9]{2}-[0-9]{2}.*)$"}),
+]
+SizeText = Annotated[
+    Text, AfterValidator(_check_size), Field(json_schema_extra={"pattern": r"^[0-9.]+ ?[kKMGT]?i?B$"})
+]
+Paths = Annotated[
+    Annotated[Text, Tag("one")] | Annotated[tuple[Text, ...], Field(min_length=1), Tag("several")],
+    Discriminator(_shape),
+]
+TopicPolicies = Annotated[
+    Annotated[TopicLevelErrorPolicy, Tag("one")]
+    | Annotated[dict[Text, TopicLevelErrorPolicy], Tag("several")],
+    Discriminator(_shape),
+]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+class CustomMessages(_Section):
+    """Message definitions of one package, for recordings that do not carry them."""
+
+    package: Text = Field(examples=["my_custom_pkg"])
+    """The ROS package; the types become `<package>/msg/<file name>`."""
+    path: Text = Field(examples=["definitions/my_pkg"])
+    """A directory of `.msg` files, or one `.msg` file."""
+    store: Stores | None = None
+    """The distro the definitions belong to; without it they serve every one."""
+
+
+class TimeSection(_Section):
+    """Which part of the recording: offsets (`+10s` from the first message, `-5s` from the last) or instants."""
+
+    start: TimeText | None = Field(default=None, examples=["+10s", "2026-03-01T12:00:00Z"])
+    """The first moment that is in."""
+    end: TimeText | None = Field(default=None, examples=["-5s", "2026-03-01T12:30:00Z"])
+    """The first moment that is out again."""
+
+
+class BagSection(_Section):
+    """The recording, and what it takes to read it."""
+
+    path: Paths = Field(examples=["data/session_01.db3", ["part_0.mcap", "part_1.mcap"], "data/*.mcap"])
+    """A file or rosbag2 directory; a list: the parts of one recording; a glob: one sequence for each match."""
+    ros_distro: Stores | None = Field(default=None, examples=["ros2_humble"])
+    """The distro whose definitions are used where the recording does not carry its own."""
+    custom_msgs: tuple[CustomMessages, ...] = ()
+    """Definitions of messages that are in no distro."""
+    time: TimeSection | None = None
+    """Which part of the recording; all of it without this."""
+
+
+class SequenceSection(_Section):
+    """What the recording becomes."""
+
+    name: Text = Field(default="{stem}", examples=["Test_Run_01", "{parent}_{stem}"])
+    """The sequence's name; placeholders {stem} {name} {parent} {date} {index} are filled in for each recording."""
+    metadata: dict[Text, JsonValue] = Field(
+        default={}, examples=[{"driver_version": "v2.1", "weather": "sunny"}]
+    )
+    """What to know about the sequence; anything JSON can say."""
+    metadata_file: Text | None = Field(default=None, examples=["metadata.json"])
+    """A JSON file with more metadata; what `metadata` says wins."""
+    if_exists: IfExists = IfExists.FAIL
+    """What to do when the name is taken: fail, skip (the same content is there), append, replace."""
+
+
+class TopicSettings(_Section):
+    """What is special about the topics that a name or glob matches."""
+
+    rename: Text | None = Field(default=None, examples=["/sensors/imu"])
+    """The topic's name in the sequence; only for a single topic, not for a glob."""
+    metadata: dict[Text, JsonValue] = Field(default={}, examples=[{"mount": "roof"}])
+    """What to know about the topic."""
+    every: Annotated[int, Field(ge=1)] = Field(default=1, examples=[3])
+    """Keep one message in so many."""
+    image: Literal["raw", "png"] = "raw"
+    """How the pixels of raw images are stored: as recorded, or as PNG."""
+
+
+class AdaptersSection(_Section):
+    """How messages become ontology records where the built-in adapters are not wanted."""
+
+    load: tuple[Text, ...] = Field(
+        default=(), examples=[["adapters/battery_pack.yaml", "my_pkg.adapters:WheelAdapter"]]
+    )
+    """Adapters that serve every topic of their types: YAML files, `module:Class` or `file.py:Class`."""
+    override: dict[Text, Text] = Field(default={}, examples=[{"/lidar/*": "LidarAdapter"}])
+    """The adapter for a topic name or glob: one of the above, or the name of a built-in one."""
+    unmodeled: Unmodeled = Unmodeled.KEEP
+    """What to do with a type that no adapter takes: keep its ROS shape, skip its topics, fail."""
+
+
+class OnErrorSection(_Section):
+    """What an error costs."""
+
+    session: SessionLevelErrorPolicy = SessionLevelErrorPolicy.Report
+    """After an error that ends the run: report (keep what was accepted, note the error) or delete the session."""
+    topic: TopicPolicies = Field(
+        default=TopicLevelErrorPolicy.Raise, examples=["raise", {"default": "raise", "/gps/*": "ignore"}]
+    )
+    """After an error in a topic: raise (end the run), ignore (reject the message), finalize (close the topic)."""
+    message: LoaderErrorPolicy = LoaderErrorPolicy.LOG_WARN
+    """For a message whose bytes do not fit its type: ignore (count it), log_warn (and say so), raise (end the run)."""
+
+
+class TargetSection(_Section):
+    """Where sequences go: a store of files, or a Mosaico server; without both, the store `./mosaico`."""
+
+    store: Text | None = Field(default=None, examples=["./mosaico"])
+    """The directory of the embedded store."""
+    host: Text | None = Field(default=None, examples=["mosaico.example.org"])
+    """The server's name or address."""
+    port: Annotated[int, Field(ge=1, le=65535)] = 6726
+    """The server's port."""
+    api_key: SecretStr | None = Field(
+        default=None, examples=["${MOSAICO_API_KEY:?a key with write permission}"]
+    )
+    """A key with write permission; take it from the environment."""
+    tls_cert: Text | None = Field(default=None, examples=["certs/ca.pem"])
+    """The certificate to trust; naming one turns TLS on."""
+    tls: bool = False
+    """Whether the connection is encrypted; certificates are those the system trusts, unless one is named."""
+
+    @model_validator(mode="after")
+    def _one_place(self) -> TargetSection:
+        if self.store is not None and self.host is not None:
+            raise PydanticCustomError("contradiction", "store and host are two targets", {"key": "host"})
+        alone = sorted(self.model_fields_set - {"store", "host"})
+        if self.host is None and alone:
+            raise PydanticCustomError(
+                "contradiction", "{key} says how to reach a server, and no host is named", {"key": alone[0]}
+            )
+        return self
+
+
+class RunSection(_Section):
+    """How the job is run; nothing here changes what is stored."""
+
+    log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"] = "INFO"
+    """How much is said on the terminal."""
+    report: Text | None = Field(default=None, examples=["report.json"])
+    """The file the run's report is written to."""
+    memory: SizeText | None = Field(default=None, examples=["512MiB"])
+    """How much memory batches may take, as `512MiB`."""
+    jobs: Annotated[int, Field(ge=1, le=1024)] = 1
+    """How many recordings are ingested at the same time."""
+
+
+class Manifest(_Section):
+    """A job: a recording, what it becomes, and where it goes."""
+
+    version: Literal[1] = VERSION
+    """The version of this language."""
+    bag: BagSection
+    """The recording, and what it takes to read it."""
+    sequence: SequenceSection = SequenceSection()
+    """What the recording becomes."""
+    topics: tuple[Text, ...] = Field(default=(), examples=[["/cam*", "!/cam/debug*"]])
+    """Globs in order, the last that matches decides, `!` leaves out; without any, every topic."""
+    topic_settings: dict[Text, TopicSettings] = Field(default={}, examples=[{"/camera/*": {"every": 3}}])
+    """What is special about a topic name or glob."""
+    adapters: AdaptersSection = AdaptersSection()
+    """How messages become ontology records where the built-in adapters are not wanted."""
+    on_error: OnErrorSection = OnErrorSection()
+    """What an error costs."""
+    target: TargetSection = TargetSection()
+    """Where sequences go."""
+    run: RunSection = RunSection()
+    """How the job is run."""

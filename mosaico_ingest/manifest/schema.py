@@ -1,0 +1,64 @@
+"""This file derives the JSON Schema of a job manifest from its model."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+from mosaico_ingest.manifest.model import Manifest
+
+__all__ = ["DIALECT", "job_schema"]
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+_VARIABLE = {"type": "string", "pattern": r"\$\{[^{}]+\}", "description": "A variable of the environment."}
+
+
+def job_schema() -> dict[str, Any]:
+    """Return the schema (draft 2020-12) that editors complete and check manifests with."""
+    schema = _tidy(Manifest.model_json_schema())
+    definitions: dict[str, Any] = schema.pop("$defs")
+    for model in [schema, *definitions.values()]:
+        model["properties"] = {
+            key: _or_variable(node, definitions) for key, node in _properties(model).items()
+        }
+        if not model["properties"]:
+            del model["properties"]
+    definitions["Variable"] = _VARIABLE
+    return {"$schema": DIALECT, "title": "mosaico-ingest job", **schema, "$defs": definitions}
+
+
+def _properties(model: dict[str, Any]) -> dict[str, Any]:
+    return model.get("properties", {})
+
+
+def _or_variable(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:
+    """Allow `${VAR}` where the value is a number or one of a few words; in a text it is allowed anyway."""
+    target = definitions[node["$ref"].rsplit("/", 1)[-1]] if "$ref" in node else node
+    if "enum" not in target and target.get("type") not in {"integer", "boolean"}:
+        return node
+    about = {key: value for key, value in node.items() if key in {"default", "description", "examples"}}
+    return {
+        **about,
+        "anyOf": [{k: v for k, v in node.items() if k not in about}, {"$ref": "#/$defs/Variable"}],
+    }
+
+
+def _tidy(node: dict[str, Any]) -> dict[str, Any]:
+    """Leave out the titles, which repeat the keys, and the null that stands for a key left out."""
+    branches = [branch for branch in node.get("anyOf", ()) if branch != {"type": "null"}]
+    if len(branches) == 1:
+        node = {**{key: value for key, value in node.items() if key != "anyOf"}, **branches[0]}
+    kept = {key: value for key, value in node.items() if key != "title" and (key, value) != ("default", None)}
+    return {key: _tidy_member(key, value) for key, value in kept.items()}
+
+
+def _tidy_member(key: str, value: object) -> object:
+    if key in {"default", "examples"}:
+        return value
+    if key in {"properties", "$defs"}:
+        members = cast("dict[str, dict[str, Any]]", value)  # names, not keywords
+        return {name: _tidy(member) for name, member in members.items()}
+    if isinstance(value, dict):
+        return _tidy(cast("dict[str, Any]", value))
+    if isinstance(value, list):
+        return [_tidy(cast("dict[str, Any]", item)) if isinstance(item, dict) else item for item in value]
+    return value

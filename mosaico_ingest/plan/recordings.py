@@ -1,0 +1,126 @@
+"""This file finds the recordings a manifest names, and names what they become; it looks at paths, never inside."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from difflib import get_close_matches
+from glob import has_magic
+from pathlib import Path
+
+from mosaico_ingest.errors import ManifestError, NothingMatched
+from mosaico_ingest.manifest.load import LoadedManifest
+
+__all__ = ["PLACEHOLDERS", "Recording", "find_recordings", "sequence_name"]
+
+PLACEHOLDERS = ("stem", "name", "parent", "date", "index")
+
+_PLACEHOLDER = re.compile(r"\{([^{}]*)\}")
+_RECORDING = re.compile(r"\.(bag|db3|mcap)(\.(zstd|zst|lz4|gz|bz2))?$", re.IGNORECASE)
+_REFUSED = re.compile(r"[^A-Za-z0-9_-]+")
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """One recording: its parts, and its position (from 1) among those of the job."""
+
+    paths: tuple[Path, ...]
+    index: int
+
+    @property
+    def main(self) -> Path:
+        """The path it is named after; a rosbag2 directory for its metadata.yaml."""
+        first = self.paths[0]
+        return first.parent if first.name == "metadata.yaml" else first
+
+
+def find_recordings(loaded: LoadedManifest) -> tuple[Recording, ...]:
+    """Return what `bag.path` names: a list is one recording, a glob one for each match.
+
+    Raises:
+        NothingMatched: A file is not there, or a glob matches no recording.
+    """
+    path = loaded.manifest.bag.path
+    if isinstance(path, str):
+        matches = _matches(loaded, path, ("bag", "path"))
+        return tuple(Recording((match,), index) for index, match in enumerate(matches, 1))
+    parts = [part for i, item in enumerate(path) for part in _matches(loaded, item, ("bag", "path", i))]
+    return (Recording(tuple(dict.fromkeys(parts)), 1),)
+
+
+def sequence_name(loaded: LoadedManifest, recording: Recording) -> str:
+    """Fill in the placeholders of `sequence.name`; in what they stand for, `_` replaces what no name may have.
+
+    Raises:
+        ManifestError: There is no such placeholder.
+    """
+    template = loaded.manifest.sequence.name
+
+    def fill(match: re.Match[str]) -> str:
+        placeholder, _, width = match[1].partition(":")
+        if placeholder not in PLACEHOLDERS or (width and not (placeholder == "index" and width.isdigit())):
+            raise ManifestError(
+                f"unknown placeholder {match[0]} in sequence.name",
+                where=loaded.where("sequence", "name"),
+                hint=f"the placeholders are {', '.join(f'{{{name}}}' for name in PLACEHOLDERS)}, and {{index:03}}",
+            )
+        return _fill(placeholder, width, recording)
+
+    return _PLACEHOLDER.sub(fill, template)
+
+
+def _fill(placeholder: str, width: str, recording: Recording) -> str:
+    main = recording.main
+    if placeholder == "index":
+        return f"{recording.index:{width}}"
+    if placeholder == "date":
+        changed = datetime.fromtimestamp(main.stat().st_mtime, tz=timezone.utc)
+        return f"{changed:%Y-%m-%d}"
+    texts = {"stem": _RECORDING.sub("", main.name), "name": main.name, "parent": main.resolve().parent.name}
+    return _REFUSED.sub("_", texts[placeholder]).strip("_")
+
+
+def _matches(loaded: LoadedManifest, pattern: str, place: tuple[str | int, ...]) -> list[Path]:
+    """Return the file or directory `pattern` names, or the recordings it matches, sorted."""
+    path = loaded.resolve(pattern)
+    if path.exists():
+        return [path]
+    where = loaded.where(*place)
+    if not has_magic(pattern):
+        raise NothingMatched(f"no such file or directory: {path}", where=where, hint=_nearby(path))
+    found = sorted(_glob(path))
+    recordings = [match for match in found if _is_recording(match)]
+    if not recordings:
+        only = f"; it matches {len(found)} other files" if found else ""
+        raise NothingMatched(f"no recording matches {path}{only}", where=where, hint=_nearby(path))
+    return recordings
+
+
+def _glob(path: Path) -> Iterable[Path]:
+    fixed = next(parent for parent in path.parents if not has_magic(str(parent)))
+    return fixed.glob(str(path.relative_to(fixed)))
+
+
+def _is_recording(path: Path) -> bool:
+    if path.is_file():
+        return _RECORDING.search(path.name) is not None
+    return (path / "metadata.yaml").is_file() or _any_recording(path.iterdir())
+
+
+def _any_recording(paths: Iterable[Path]) -> bool:
+    return any(_RECORDING.search(path.name) for path in paths)
+
+
+def _nearby(path: Path) -> str:
+    """Say what is there instead: the part of the path that exists, and the nearest name in it."""
+    folder = path.parent
+    while not folder.is_dir() and folder != folder.parent:
+        path, folder = folder, folder.parent
+    names = sorted(entry.name for entry in folder.iterdir())
+    close = get_close_matches(path.name, names, n=1, cutoff=0.5)
+    if close:
+        return f"{folder} has {close[0]!r}"
+    recordings = [name for name in names if _RECORDING.search(name)]
+    return f"{folder} has {', '.join(recordings[:5]) or 'no recording'}"
