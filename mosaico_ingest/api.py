@@ -1,1 +1,129 @@
-"""This file is the whole pipeline in a few functions: load, lint, compile, plan, run, inspect."""
+"""This file is the whole pipeline in a few functions: compile, plan, run, inspect."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.executors.inspection import inspect
+from mosaico_ingest.executors.local import run_all
+from mosaico_ingest.executors.worker import execute, make_plan
+from mosaico_ingest.manifest.load import load_manifest
+from mosaico_ingest.plan.compile import compile_manifest
+from mosaico_ingest.plan.model import Plan
+from mosaico_ingest.report.events import Observer, ignore_events
+from mosaico_ingest.report.inspection import Inspection
+from mosaico_ingest.report.model import Report, RunReport
+from mosaico_ingest.version import __version__
+
+__all__ = ["RosbagInjector", "compile_job", "inspect_recording", "quick_config", "run"]
+
+
+class RosbagInjector:
+    """Ingests what one configuration names.
+
+    It draws nothing and configures no logging: progress is events, given to `observe`.
+    """
+
+    def __init__(self, config: ROSInjectionConfig, *, observe: Observer = ignore_events) -> None:
+        self._config = config
+        self._observe = observe
+
+    def plan(self) -> Plan:
+        """Open the recording and decide everything, without writing.
+
+        Raises:
+            IngestError: The job cannot be done; the message says why.
+        """
+        return make_plan(self._config)
+
+    def run(self) -> Report | None:
+        """Read, adapt and write the recording; return what happened, None for a dry run.
+
+        Raises:
+            IngestError: What ended the run; what the session policy keeps is in the destination.
+        """
+        plan = self.plan()
+        if self._config.dry_run:
+            return None
+        report, failure = execute(plan, self._observe)
+        if failure is not None:
+            raise failure
+        return report
+
+
+def compile_job(manifest: Path) -> tuple[ROSInjectionConfig, ...]:
+    """Return the configurations a manifest stands for, one for each recording.
+
+    Raises:
+        ManifestError: Its `findings` say where and what.
+        NothingMatched: There is no such recording.
+    """
+    return compile_manifest(load_manifest(manifest))
+
+
+def run(configs: Sequence[ROSInjectionConfig], *, observe: Observer = ignore_events) -> RunReport:
+    """Run every configuration; a failure is in the report, not raised."""
+    return RunReport(tool=f"mosaico-ingest {__version__}", recordings=tuple(run_all(configs, observe)))
+
+
+def inspect_recording(path: Path, *, ros_distro: str | None = None) -> Inspection:
+    """Return what a recording holds and what would become of it.
+
+    Raises:
+        BagError: It cannot be opened.
+    """
+    config = ROSInjectionConfig(file_path=path, sequence_name="inspected", ros_distro=ros_distro)
+    return inspect(config)
+
+
+def quick_config(
+    path: Path,
+    *,
+    metadata: str | None,
+    api_key: str | None,
+    host: str | None,
+    **options: Any,  # noqa: ANN401 - the rest of the configuration's fields
+) -> ROSInjectionConfig:
+    """Return the configuration of `ingest bag`: the same fields as a manifest's.
+
+    Raises:
+        ManifestError: An option's value is not what it must be.
+    """
+    return ROSInjectionConfig(
+        file_path=path,
+        metadata=_metadata(metadata),
+        host=host,
+        # The key may come from the environment, which says nothing about where this sequence goes.
+        mosaico_api_key=api_key if host else None,
+        **options,
+    )
+
+
+def _metadata(given: str | None) -> dict[str, Any]:
+    """Read metadata given as JSON, or as the file that holds it."""
+    if given is None:
+        return {}
+    text, where = given, "--metadata"
+    if not given.lstrip().startswith("{"):
+        where = given
+        try:
+            text = Path(given).read_text(encoding="utf-8")
+        except OSError as error:
+            raise ManifestError(
+                f"is neither a JSON object nor a file that can be read ({error.strerror})",
+                where=f"--metadata {given}",
+            ) from error
+    try:
+        value = json.loads(text)
+    except ValueError as error:
+        raise ManifestError(f"is not JSON: {error}", where=where) from error
+    if not isinstance(value, dict):
+        raise ManifestError(
+            f"holds {type(value).__name__}, not an object", where=where, hint='write {"key": "value"}'
+        )
+    return value

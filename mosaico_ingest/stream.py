@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from mosaico_ingest.adapters.adapter import Adapter, Envelope
+from mosaico_ingest.adapters.adapter import Adapted, Adapter, Envelope
 from mosaico_ingest.bag.batch import Channel, RawBatch
 from mosaico_ingest.decode.arrow import ros_shape
 from mosaico_ingest.decode.choose import decoder_for
@@ -38,6 +39,7 @@ class _Translated:
     """What became of a raw batch: rows, where they were in it, what was lost, what was sampled away."""
 
     rows: pa.StructArray
+    log_times: NDArray[np.int64]
     index: NDArray[np.int64]
     lost: tuple[_Lost, ...]
     skipped: NDArray[np.int64]
@@ -63,6 +65,8 @@ class Stream:
     _decoders: dict[int, Decoder] = field(default_factory=dict[int, Decoder])
     _adapters: dict[int, Adapter] = field(default_factory=dict[int, Adapter])
     _writer: TopicWriter | None = None
+    _configuration: dict[str, Any] | None = None
+    """What the adapter says of the topic, from its first message."""
     _seen: int = 0
 
     def bind(self, channel: Channel) -> None:
@@ -110,17 +114,18 @@ class Stream:
         lost = [_Lost(Stage.DECODE, replace(f, row=int(keep[f.row]))) for f in decoded.failures]
         index = keep[decoded.index]
         envelope = Envelope(self.plan.topic, self.plan.msgtype, batch.log_times[index])
+        adapter = self._adapters[batch.channel.id]
+        if self._configuration is None and len(decoded.rows):
+            self._configuration = adapter.topic_metadata(decoded.rows[0])
         try:
-            adapted = self._adapters[batch.channel.id].adapt(decoded.rows, envelope)
+            adapted = adapter.adapt(decoded.rows, envelope)
         except AdapterError as error:
-            broken = (RowFailure(int(row), "adapter-broken", str(error)) for row in index)
-            lost += [_Lost(Stage.ADAPT, failure) for failure in broken]
-            rows, index = decoded.rows[:0], index[:0]
-        else:
-            lost += [_Lost(Stage.ADAPT, replace(f, row=int(index[f.row]))) for f in adapted.failures]
-            rows, index = adapted.rows, index[adapted.index]
+            broken = tuple(RowFailure(row, "adapter-broken", str(error)) for row in range(len(index)))
+            adapted = Adapted(decoded.rows[:0], index[:0], broken)
+        lost += [_Lost(Stage.ADAPT, replace(f, row=int(index[f.row]))) for f in adapted.failures]
+        times = envelope.log_times[adapted.index] if adapted.log_times is None else adapted.log_times
         lost.sort(key=lambda one: one.failure.row)
-        return _Translated(rows, index, tuple(lost), positions[~taken])
+        return _Translated(adapted.rows, times, index[adapted.index], tuple(lost), positions[~taken])
 
     def _ends_topic(self, lost: _Lost) -> bool:
         if lost.stage is Stage.DECODE:
@@ -163,7 +168,8 @@ class Stream:
     ) -> None:
         if self._writer is None:
             try:
-                self._writer = self.session.topic(self.plan.target, self.plan.ontology, self.plan.metadata)
+                metadata = {**(self._configuration or {}), **self.plan.metadata}
+                self._writer = self.session.topic(self.plan.target, self.plan.ontology, metadata)
             except SinkError as error:
                 self._refused(error, rows, batch, index)
                 return

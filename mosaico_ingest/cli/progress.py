@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -36,7 +36,7 @@ MAX_ROWS = 30
 
 
 @contextmanager
-def display(*, quiet: bool) -> Iterator[Observer]:
+def display(*, quiet: bool) -> Generator[Observer]:
     """Yield the observer that draws, on standard error."""
     if quiet:
         yield ignore_events

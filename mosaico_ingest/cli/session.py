@@ -28,11 +28,17 @@ def run_configs(
     signal.signal(signal.SIGTERM, _as_interrupt)
     with display(quiet=quiet) as observe:
         result = api.run(configs, observe=observe)
-    for target in {path for path in (report, *(config.report for config in configs)) if path is not None}:
+    for target in {
+        path for path in (report, *(_report_path(config) for config in configs)) if path is not None
+    }:
         write_report(result, target)
     print_report(result, quiet=quiet)
     if result.exit_code:
         raise typer.Exit(result.exit_code)
+
+
+def _report_path(config: ROSInjectionConfig) -> Path | None:
+    return None if config.report_path is None else Path(config.report_path)
 
 
 def _as_interrupt(_signal: int, _frame: FrameType | None) -> None:
@@ -40,7 +46,7 @@ def _as_interrupt(_signal: int, _frame: FrameType | None) -> None:
 
 
 def _set_up_logging(level: str) -> None:
-    numeric = logging.getLevelName(level.upper())
+    numeric = getattr(logging, level.upper(), None)
     if not isinstance(numeric, int):
         raise ManifestError(
             f"log level {level!r} is unknown", hint="use DEBUG, INFO, WARNING, ERROR or CRITICAL"

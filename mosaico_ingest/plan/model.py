@@ -9,7 +9,7 @@ from typing import Any
 
 from mosaico_ingest.adapters.adapter import AdapterSpec
 from mosaico_ingest.bag.definition import Resolver
-from mosaico_ingest.config import Destination
+from mosaico_ingest.config import ServerTarget, StoreTarget
 from mosaico_ingest.diagnostics import Finding
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.policies import (
@@ -19,7 +19,9 @@ from mosaico_ingest.policies import (
     TopicLevelErrorPolicy,
 )
 
-__all__ = ["LeftOut", "Plan", "TopicPlan"]
+__all__ = ["DEFAULT_MEMORY_BYTES", "LeftOut", "Plan", "TopicPlan"]
+
+DEFAULT_MEMORY_BYTES = 256 * 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +66,7 @@ class Plan:
     resolver: Resolver
     sequence: str
     metadata: Mapping[str, Any]
-    destination: Destination
+    target: StoreTarget | ServerTarget
     if_exists: IfExists
     on_error: SessionLevelErrorPolicy
     on_message_error: LoaderErrorPolicy
@@ -78,4 +80,5 @@ class Plan:
     """Messages recorded before are not read."""
     read_until_ns: int | None = None
     """Messages recorded at this instant or later are not read."""
-    memory_bytes: int = 256 * 1024 * 1024
+    memory_bytes: int = DEFAULT_MEMORY_BYTES
+    """How much memory batches may take, from reading to writing."""

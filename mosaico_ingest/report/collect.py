@@ -102,9 +102,10 @@ class Collector:
         """How many messages were rejected so far."""
         return sum(r.count for s in self._sums.values() for r in s.rejections.values())
 
-    def written(self, target: str) -> _Sum:
-        """Return what was written to one stream so far."""
-        return self._sums[target]
+    @property
+    def unreadable(self) -> bool:
+        """Whether a stretch of the recording could not be read."""
+        return bool(self._losses)
 
     def report(self) -> Report:
         """Return the sum so far; complete once the run has finished."""

@@ -1,0 +1,147 @@
+"""This file is the composition root: it turns a configuration into a plan, and a plan's target into a sink."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+
+from mosaico_ingest.bag.recording import Recording, open_recording
+from mosaico_ingest.bag.registry import ROSTypeRegistry
+from mosaico_ingest.bag.types import TypeResolver
+from mosaico_ingest.bridge import ROSBridge
+from mosaico_ingest.config import ROSInjectionConfig, ServerTarget, StoreTarget
+from mosaico_ingest.errors import IngestError, Interrupted
+from mosaico_ingest.injector import inject
+from mosaico_ingest.plan.model import Plan
+from mosaico_ingest.plan.resolve import resolve
+from mosaico_ingest.report.collect import Collector
+from mosaico_ingest.report.events import (
+    Event,
+    Expected,
+    Noted,
+    Observer,
+    RunFinished,
+    RunStarted,
+    RunStatus,
+)
+from mosaico_ingest.report.model import Report
+from mosaico_ingest.sink import Sink
+from mosaico_ingest.store.sink import StoreSink
+from mosaico_ingest.store.store import Store
+
+__all__ = ["execute", "make_plan", "open_for", "run_config", "sink_for"]
+
+EXIT_REJECTED = 4
+"""Everything that could be ingested was, but some messages could not."""
+
+
+def resolver_for(config: ROSInjectionConfig) -> TypeResolver:
+    """Return where definitions are looked for: the run's own, the registry, the distro."""
+    custom = [(package, Path(path), store) for package, path, store in config.custom_msgs]
+    return TypeResolver(config.ros_distro, custom, registry=config.registry or ROSTypeRegistry)
+
+
+@contextmanager
+def open_for(config: ROSInjectionConfig) -> Generator[tuple[Recording, TypeResolver]]:
+    """Open the recording a configuration names."""
+    resolver = resolver_for(config)
+    with open_recording(config.paths, resolve=resolver) as recording:
+        yield recording, resolver
+
+
+def make_plan(config: ROSInjectionConfig) -> Plan:
+    """Open the recording, decide everything, write nothing."""
+    bridge = ROSBridge.for_config(config)
+    with open_for(config) as (recording, resolver):
+        return resolve(config, recording, bridge=bridge, resolver=resolver)
+
+
+def sink_for(target: StoreTarget | ServerTarget) -> Sink:
+    """Turn a target into the object that writes there."""
+    if isinstance(target, StoreTarget):
+        return StoreSink(Store.open(target.path))
+    from mosaico_ingest.platform.sink import PlatformSink  # noqa: PLC0415 - Flight is slow to import and rarely needed
+
+    return PlatformSink(target)
+
+
+def execute(plan: Plan, observe: Observer, *, sink: Sink | None = None) -> tuple[Report, IngestError | None]:
+    """Run a plan; return what happened, and the error that ended it, if one did.
+
+    `sink` stands in for the plan's target where the caller has its own.
+    """
+    failure: IngestError | None = None
+    collector = Collector()
+
+    def tell(event: Event) -> None:
+        collector(event)
+        observe(event)
+
+    tell(_started(plan))
+    for finding in plan.findings:
+        tell(Noted(finding))
+    try:
+        with open_recording(plan.files, resolve=plan.resolver) as recording:
+            inject(plan, recording, sink or sink_for(plan.target), tell)
+    except IngestError as error:
+        failure = error
+    tell(_failed(failure) if failure else _done(collector))
+    return collector.report(), failure
+
+
+def run_config(config: ROSInjectionConfig, observe: Observer) -> Report:
+    """Plan and run one configuration; every outcome is a report."""
+    try:
+        plan = make_plan(config)
+    except IngestError as error:
+        collector = Collector()
+        for event in (_unplanned(config), _failed(error)):
+            collector(event)
+            observe(event)
+        return collector.report()
+    report, _ = execute(plan, observe)
+    return report
+
+
+def _started(plan: Plan) -> RunStarted:
+    taken = (
+        Expected(t.topic, t.target, t.msgtype, t.adapter.name, t.ontology.tag, t.why, t.count)
+        for t in plan.topics
+    )
+    left = (
+        Expected(t.topic, t.topic, t.msgtype, "", "", t.why, t.count, left_out=True) for t in plan.left_out
+    )
+    return RunStarted(
+        sequence=plan.sequence,
+        destination=place(plan.target),
+        files=tuple(str(path) for path in plan.files),
+        source_bytes=plan.source_bytes,
+        topics=(*taken, *left),
+    )
+
+
+def _unplanned(config: ROSInjectionConfig) -> RunStarted:
+    return RunStarted(
+        sequence=config.sequence_name,
+        destination=place(config.target),
+        files=tuple(str(path) for path in config.paths),
+        source_bytes=0,
+        topics=(),
+    )
+
+
+def place(target: StoreTarget | ServerTarget) -> str:
+    """Return a target as people write it, without its key."""
+    return str(target.path) if isinstance(target, StoreTarget) else f"{target.host}:{target.port}"
+
+
+def _failed(error: IngestError) -> RunFinished:
+    status = RunStatus.INTERRUPTED if isinstance(error, Interrupted) else RunStatus.FAILED
+    return RunFinished(status, error.exit_code, str(error))
+
+
+def _done(collector: Collector) -> RunFinished:
+    if collector.rejected or collector.unreadable:
+        return RunFinished(RunStatus.REJECTED, EXIT_REJECTED)
+    return RunFinished(RunStatus.COMPLETED, 0)

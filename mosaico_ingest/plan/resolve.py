@@ -1,0 +1,117 @@
+"""This file makes the plan: it holds a configuration against the recording and decides everything."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from difflib import get_close_matches
+
+from mosaico_ingest.bag.definition import Resolver
+from mosaico_ingest.bag.recording import Recording
+from mosaico_ingest.bridge import ROSBridge
+from mosaico_ingest.config import ROSInjectionConfig, TimeBound, TimeRange
+from mosaico_ingest.diagnostics import Finding, Severity
+from mosaico_ingest.errors import BagError, NothingMatched
+from mosaico_ingest.patterns import Selection, first_match, select
+from mosaico_ingest.plan.model import DEFAULT_MEMORY_BYTES, LeftOut, Plan, TopicPlan
+from mosaico_ingest.plan.topics import decide, merge
+
+__all__ = ["resolve"]
+
+
+def resolve(
+    config: ROSInjectionConfig, recording: Recording, *, bridge: ROSBridge, resolver: Resolver
+) -> Plan:
+    """Decide what becomes of each topic of the recording.
+
+    Raises:
+        NothingMatched: No topic is left, or the recording has no message.
+        AdapterError: An override does not fit its topic, or a type without adapter is not wanted.
+    """
+    topics = tuple(dict.fromkeys(channel.topic for channel in recording.channels))
+    selection = select(config.topics or (), topics)
+    findings = [*recording.findings, *_findings(config, selection, topics)]
+    taken: list[TopicPlan] = []
+    left: list[LeftOut] = []
+    for channel in recording.channels:
+        outcome = decide(config, channel, selection, bridge, recording.files[0].name)
+        if isinstance(outcome, LeftOut):
+            left.append(outcome)
+        elif (finding := merge(taken, outcome)) is not None:
+            findings.append(finding)
+    if not taken:
+        raise _nothing(config, recording, left)
+    read_from_ns, read_until_ns = _window(config.time_range, recording)
+    return Plan(
+        files=recording.files,
+        container=recording.container,
+        source_bytes=recording.size_bytes,
+        resolver=resolver,
+        sequence=config.sequence_name,
+        metadata=config.metadata,
+        target=config.target,
+        if_exists=config.if_exists,
+        on_error=config.on_error,
+        on_message_error=config.messages_on_error,
+        topics=tuple(taken),
+        left_out=tuple(left),
+        findings=tuple(findings),
+        start_ns=recording.start_ns,
+        end_ns=recording.end_ns,
+        read_from_ns=read_from_ns,
+        read_until_ns=read_until_ns,
+        memory_bytes=config.memory_bytes or DEFAULT_MEMORY_BYTES,
+    )
+
+
+def _window(wanted: TimeRange, recording: Recording) -> tuple[int | None, int | None]:
+    """Return from and until when to read, ns since the epoch."""
+
+    def instant(bound: TimeBound | None) -> int | None:
+        if bound is None or not bound.relative:
+            return bound.ns if bound else None
+        if recording.start_ns is None or recording.end_ns is None:
+            raise BagError(
+                "the recording has no index, so it is not known when it begins and ends",
+                where=str(recording.files[0]),
+                hint="give bag.time as instants, not as offsets",
+            )
+        return bound.at(recording.start_ns, recording.end_ns)
+
+    return instant(wanted.start), instant(wanted.end)
+
+
+def _findings(config: ROSInjectionConfig, selection: Selection, topics: tuple[str, ...]) -> Iterator[Finding]:
+    """Yield what the configuration names that the recording does not have."""
+    patterns = config.topics or ()
+    for position in selection.unused:
+        yield _no_match("topics", patterns[position], topics)
+    settings = {**config.topic_metadata, **config.images, **config.rename, **config.every}
+    for key, globs in (("adapters.override", config.adapter_override), ("topic_settings", settings)):
+        for glob in globs:
+            if not any(first_match((glob,), topic) for topic in topics):
+                yield _no_match(key, glob, topics)
+
+
+def _no_match(key: str, glob: str, topics: tuple[str, ...]) -> Finding:
+    near = get_close_matches(glob.lstrip("!"), topics, n=1, cutoff=0.5)
+    return Finding(
+        "matches-nothing",
+        Severity.WARNING,
+        f"{key}: {glob!r} matches none of {len(topics)} topics",
+        help=f"the nearest is {near[0]}" if near else None,
+    )
+
+
+def _nothing(config: ROSInjectionConfig, recording: Recording, left: list[LeftOut]) -> NothingMatched:
+    where = str(recording.files[0])
+    if not left:
+        return NothingMatched("the recording has no topic", where=where)
+    if config.topics and all("`topics`" in one.why for one in left):
+        names = ", ".join(sorted({one.topic for one in left})[:8])
+        return NothingMatched(
+            f"no topic matches {list(config.topics)}", where=where, hint=f"the recording has {names}"
+        )
+    first = left[0]
+    return NothingMatched(
+        f"none of {len(left)} topics can be ingested", where=where, hint=f"{first.topic}: {first.why}"
+    )

@@ -1,0 +1,112 @@
+"""This file decides what becomes of one channel: left out and why, or which adapter, name and columns it gets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+from mosaico_ingest.adapters.metadata import ros_metadata
+from mosaico_ingest.bag.batch import Channel, Encoding
+from mosaico_ingest.bridge import ROSBridge
+from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.decode.arrow import ros_shape
+from mosaico_ingest.diagnostics import Finding, Severity
+from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.patterns import Selection, first_match
+from mosaico_ingest.plan.model import LeftOut, TopicPlan
+from mosaico_ingest.policies import Unmodeled
+
+__all__ = ["decide", "merge"]
+
+T = TypeVar("T")
+
+
+def decide(
+    config: ROSInjectionConfig, channel: Channel, selection: Selection, bridge: ROSBridge, source_file: str
+) -> TopicPlan | LeftOut:
+    """Return the plan for one channel, or why it is left out.
+
+    Raises:
+        AdapterError: An override does not fit, or the type has no adapter and the job says to fail then.
+    """
+    if channel.topic not in selection.selected:
+        return _left_out(channel, _why_not_selected(config.topics or (), selection, channel.topic))
+    if channel.encoding is Encoding.OTHER:
+        encoding = channel.attributes.get("encoding", "unknown")
+        return _left_out(channel, channel.problem or f"not a ROS encoding: {encoding}")
+    if channel.definition is None:
+        return _left_out(channel, channel.problem or f"no definition of {channel.msgtype} is known")
+    found = bridge.resolve(channel.topic, channel.msgtype)
+    if found.unmodeled and config.unmodeled is not Unmodeled.KEEP:
+        if config.unmodeled is Unmodeled.FAIL:
+            raise AdapterError(
+                f"no adapter takes {channel.msgtype}",
+                where=channel.topic,
+                hint="name one in adapters.override, or set adapters.unmodeled to keep or skip",
+            )
+        return _left_out(channel, f"no adapter takes {channel.msgtype}, and adapters.unmodeled is skip")
+    bound = found.spec.bind(channel.definition, ros_shape(channel.definition))
+    metadata = {
+        **_setting(config.topic_metadata, channel.topic, {}),
+        **ros_metadata(channel.definition, source_file),
+    }
+    return TopicPlan(
+        topic=channel.topic,
+        target=config.rename.get(channel.topic, channel.topic),
+        msgtype=channel.msgtype,
+        channels=(channel.id,),
+        adapter=found.spec,
+        why=found.why,
+        ontology=bound.ontology,
+        count=channel.count,
+        metadata=metadata,
+        on_error=config.topic_policy(channel.topic),
+        every=_setting(config.every, channel.topic, 1),
+    )
+
+
+def merge(taken: list[TopicPlan], more: TopicPlan) -> Finding | None:
+    """Add a channel's plan: to the stream with the same topic and columns, else as a stream of its own."""
+    same_topic = [plan for plan in taken if plan.target == more.target]
+    for position, plan in enumerate(taken):
+        same = plan.target == more.target and plan.msgtype == more.msgtype and plan.ontology == more.ontology
+        if same and plan.topic == more.topic:
+            count = None if plan.count is None or more.count is None else plan.count + more.count
+            taken[position] = replace(plan, channels=(*plan.channels, *more.channels), count=count)
+            return None
+    if not same_topic:
+        taken.append(more)
+        return None
+    target = _free_name(more, {plan.target for plan in taken})
+    taken.append(replace(more, target=target))
+    return Finding(
+        "two-types-on-a-topic",
+        Severity.WARNING,
+        f"{more.topic} carries {same_topic[0].msgtype} and {more.msgtype}"
+        if same_topic[0].msgtype != more.msgtype
+        else f"{more.topic} carries two definitions of {more.msgtype}",
+        help=f"the second one is stored as {target}",
+    )
+
+
+def _setting(settings: Mapping[str, T], topic: str, default: T) -> T:
+    match = first_match(settings, topic)
+    return default if match is None else settings[match]
+
+
+def _free_name(plan: TopicPlan, used: set[str]) -> str:
+    base = f"{plan.target}/{plan.msgtype.rpartition('/')[2]}"
+    candidates = (base, *(f"{base}_{number}" for number in range(2, len(used) + 3)))
+    return next(name for name in candidates if name not in used)
+
+
+def _left_out(channel: Channel, why: str) -> LeftOut:
+    return LeftOut(channel.topic, channel.msgtype, channel.count, why)
+
+
+def _why_not_selected(patterns: Sequence[str], selection: Selection, topic: str) -> str:
+    position = selection.decided_by[topic]
+    if position is None:
+        return "no pattern of `topics` matches it"
+    return f"left out by {patterns[position]!r} in `topics`"
