@@ -1,0 +1,190 @@
+"""This file is the catalog's format and how to reach it: one SQLite file, a connection for each task.
+
+A connection lives only for one task, so threads and forked processes share nothing, and a catalog that
+was deleted is noticed instead of being written to after its end.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import time
+from collections.abc import Generator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+from mosaico_ingest.errors import SinkError
+from mosaico_ingest.store.faults import explained
+
+__all__ = ["FORMAT", "Catalog"]
+
+FORMAT = 1
+"""Counts up when a catalog can no longer be read by what was released before."""
+
+_APPLICATION = 0x6D6F7361  # "mosa", which `file catalog.sqlite` shows
+_BUSY_S = 30.0
+
+_TABLES = """
+CREATE TABLE sequences (
+    id INTEGER PRIMARY KEY AUTOINCREMENT,
+    name TEXT NOT NULL UNIQUE,
+    metadata TEXT NOT NULL,
+    created_ns INTEGER NOT NULL
+);
+CREATE TABLE sessions (
+    id TEXT PRIMARY KEY,
+    sequence_id INTEGER NOT NULL REFERENCES sequences ON DELETE CASCADE,
+    metadata TEXT NOT NULL,
+    created_ns INTEGER NOT NULL,
+    completed_ns INTEGER NOT NULL
+);
+CREATE INDEX sessions_of_sequence ON sessions (sequence_id);
+CREATE TABLE topics (
+    id INTEGER PRIMARY KEY,
+    sequence_id INTEGER NOT NULL REFERENCES sequences ON DELETE CASCADE,
+    session_id TEXT NOT NULL,
+    name TEXT NOT NULL,
+    ontology_tag TEXT NOT NULL,
+    serialization_format TEXT NOT NULL,
+    fingerprint TEXT NOT NULL,
+    arrow_schema BLOB NOT NULL,
+    metadata TEXT NOT NULL,
+    created_ns INTEGER NOT NULL,
+    UNIQUE (sequence_id, name)
+);
+CREATE TABLE segments (
+    id INTEGER PRIMARY KEY,
+    topic_id INTEGER NOT NULL REFERENCES topics ON DELETE CASCADE,
+    session_id TEXT NOT NULL REFERENCES sessions ON DELETE CASCADE,
+    path TEXT NOT NULL UNIQUE,
+    rows INTEGER NOT NULL,
+    bytes INTEGER NOT NULL,
+    start_ns INTEGER NOT NULL,
+    end_ns INTEGER NOT NULL
+);
+CREATE INDEX segments_of_topic ON segments (topic_id, start_ns);
+CREATE INDEX segments_of_session ON segments (session_id);
+CREATE TABLE bounds (
+    segment_id INTEGER NOT NULL REFERENCES segments ON DELETE CASCADE,
+    column_path TEXT NOT NULL,
+    low,
+    high,
+    PRIMARY KEY (segment_id, column_path)
+) WITHOUT ROWID;
+CREATE TABLE notes (
+    id INTEGER PRIMARY KEY,
+    sequence_id INTEGER NOT NULL REFERENCES sequences ON DELETE CASCADE,
+    topic TEXT,
+    message TEXT NOT NULL,
+    created_ns INTEGER NOT NULL
+);
+CREATE INDEX notes_of_sequence ON notes (sequence_id);
+CREATE TABLE reservations (
+    session_id TEXT PRIMARY KEY,
+    sequence TEXT NOT NULL
+);
+"""
+
+
+class Catalog:
+    """The catalog at `path`; `create` makes it where it is not there."""
+
+    def __init__(self, path: Path, *, create: bool) -> None:
+        self.path = path
+        with explained(path):
+            if create:
+                path.parent.mkdir(parents=True, exist_ok=True)
+            elif not path.is_file():
+                raise SinkError("there is no store here", where=str(path.parent), hint="check the path")
+            self._prepare(create=create)
+
+    @contextmanager
+    def read(self) -> Generator[sqlite3.Connection, None, None]:
+        """Give a connection that sees one state of the catalog throughout."""
+        with self._task("BEGIN", mode="ro") as db:
+            yield db
+
+    @contextmanager
+    def write(self) -> Generator[sqlite3.Connection, None, None]:
+        """Give a connection inside a transaction: all of it happens, or nothing."""
+        with self._task("BEGIN IMMEDIATE", mode="rw") as db:
+            yield db
+
+    @contextmanager
+    def _task(self, begin: str, *, mode: str) -> Generator[sqlite3.Connection, None, None]:
+        with explained(self.path), closing(self._connect(mode)) as db:
+            db.execute(begin)
+            try:
+                yield db
+            except BaseException:
+                db.rollback()
+                raise
+            db.commit()
+
+    def _connect(self, mode: str) -> sqlite3.Connection:
+        try:
+            return self._opened(f"mode={mode}")
+        except sqlite3.OperationalError:
+            if mode != "ro" or not self.path.is_file() or os.access(self.path.parent, os.W_OK):
+                raise
+            return self._opened("immutable=1")  # a read-only medium has no room for the files of the WAL
+
+    def _opened(self, query: str) -> sqlite3.Connection:
+        uri = f"{self.path.absolute().as_uri()}?{query}"
+        db = sqlite3.connect(uri, uri=True, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
+        try:
+            db.row_factory = sqlite3.Row
+            db.execute("PRAGMA foreign_keys = ON")
+            db.execute("PRAGMA synchronous = FULL")
+            db.execute("SELECT count(*) FROM sqlite_master")
+        except sqlite3.Error:
+            db.close()
+            raise
+        return db
+
+    def _prepare(self, *, create: bool) -> None:
+        with closing(self._connect("rwc" if create else "ro")) as db:
+            if create and self._format(db) == 0:
+                _use_wal(db)
+                db.execute("BEGIN IMMEDIATE")
+                if self._format(db) == 0:  # nobody else was faster
+                    for statement in _TABLES.split(";"):
+                        db.execute(statement)
+                    db.execute(f"PRAGMA application_id = {_APPLICATION}")
+                    db.execute(f"PRAGMA user_version = {FORMAT}")
+                db.execute("COMMIT")
+            found = self._format(db)
+        if found > FORMAT:
+            raise SinkError(
+                f"the store has format {found}, this version knows up to {FORMAT}",
+                where=str(self.path.parent),
+                hint="upgrade mosaico-ingest",
+            )
+        if found == 0:
+            raise SinkError("there is no store here", where=str(self.path.parent), hint="check the path")
+
+    def _format(self, db: sqlite3.Connection) -> int:
+        version, application = (db.execute(f"PRAGMA {name}").fetchone()[0] for name in _STAMPS)
+        tables = db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
+        if application != _APPLICATION and (application or version or tables):
+            raise SinkError("the file is no catalog of a store", where=str(self.path), hint="check the path")
+        return int(version)
+
+
+_STAMPS = ("user_version", "application_id")
+
+
+def _use_wal(db: sqlite3.Connection) -> None:
+    deadline = time.monotonic() + _BUSY_S
+    while not _switched_to_wal(db) and time.monotonic() < deadline:
+        time.sleep(0.01)
+
+
+def _switched_to_wal(db: sqlite3.Connection) -> bool:
+    try:
+        db.execute("PRAGMA journal_mode = WAL")
+    except sqlite3.OperationalError as err:  # this pragma does not wait for others by itself
+        if "locked" not in str(err):
+            raise
+        return False
+    return True

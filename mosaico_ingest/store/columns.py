@@ -1,0 +1,134 @@
+"""This file decides how each column is written: its codec, its encoding, its dictionary."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+__all__ = ["Leaf", "check_columns", "leaves", "writer_options"]
+
+_LEVEL = 1
+_SAMPLE_BYTES = 1 << 18
+_SAMPLES = 16
+_PIECE_BYTES = _SAMPLE_BYTES // _SAMPLES
+_WORTH_IT = 0.9
+
+
+@dataclass(frozen=True, slots=True)
+class Leaf:
+    """One Parquet column: a value without children."""
+
+    parquet_path: str
+    """As Parquet spells it, as `transforms.list.item.x`."""
+    steps: tuple[str, ...]
+    """The names of the fields on the way, as `("transforms", "x")`."""
+    type: pa.DataType
+    repeated: bool
+    """Whether it lies inside a list."""
+
+    @property
+    def path(self) -> str:
+        """The way as users write it, as `transforms.x`."""
+        return ".".join(self.steps)
+
+
+def leaves(schema: pa.Schema) -> tuple[Leaf, ...]:
+    """Return the columns in the order Parquet numbers them."""
+    return tuple(
+        leaf
+        for field in schema
+        for leaf in _walk(Leaf(field.name, (field.name,), field.type, repeated=False))
+    )
+
+
+def _walk(at: Leaf) -> Iterator[Leaf]:
+    kind = at.type
+    if isinstance(kind, pa.StructType):
+        for child in kind:
+            path = f"{at.parquet_path}.{child.name}"
+            yield from _walk(Leaf(path, (*at.steps, child.name), child.type, at.repeated))
+    elif isinstance(kind, pa.ListType | pa.LargeListType | pa.FixedSizeListType):
+        path = f"{at.parquet_path}.list.{kind.value_field.name}"
+        yield from _walk(Leaf(path, at.steps, kind.value_type, repeated=True))
+    elif isinstance(kind, pa.MapType):
+        for child in (kind.key_field, kind.item_field):
+            path = f"{at.parquet_path}.key_value.{child.name}"
+            yield from _walk(Leaf(path, (*at.steps, child.name), child.type, repeated=True))
+    else:
+        yield at
+
+
+def check_columns(schema: pa.Schema) -> None:
+    """Raise what Parquet says against the columns, before there is a file or a row."""
+    if len(set(schema.names)) != len(schema.names):
+        raise pa.ArrowInvalid(f"a column name is used twice: {schema.names}")
+    pq.ParquetWriter(pa.BufferOutputStream(), schema, use_compliant_nested_type=False).close()
+
+
+def writer_options(columns: tuple[Leaf, ...], rows: pa.Table) -> dict[str, Any]:
+    """Return what `pq.ParquetWriter` is told: by type, and for blobs by how a sample of the first rows shrinks.
+
+    Splitting the bytes of floats makes them smaller and faster to write than plain or dictionary pages;
+    JPEGs and their like only cost time in a second compressor.
+    """
+    packed = {leaf.parquet_path for leaf in columns if _is_blob(leaf) and not _shrinks(leaf, rows)}
+    zstd = [leaf.parquet_path for leaf in columns if leaf.parquet_path not in packed]
+    encodings = {leaf.parquet_path: "BYTE_STREAM_SPLIT" for leaf in columns if _splits(leaf.type)}
+    encodings[columns[0].parquet_path] = "DELTA_BINARY_PACKED"
+    return {
+        "compression": dict.fromkeys(zstd, "zstd") | dict.fromkeys(packed, "none"),
+        "compression_level": dict.fromkeys(zstd, _LEVEL),
+        "use_dictionary": [leaf.parquet_path for leaf in columns if _is_text(leaf.type)],
+        "column_encoding": encodings,
+        "write_statistics": [leaf.parquet_path for leaf in columns if not _is_blob(leaf)],
+    }
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    return pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind)
+
+
+def _is_blob(leaf: Leaf) -> bool:
+    return _is_binary(leaf.type) or (leaf.repeated and leaf.type in {pa.uint8(), pa.int8()})
+
+
+def _is_binary(kind: pa.DataType) -> bool:
+    return pa.types.is_binary(kind) or pa.types.is_large_binary(kind) or pa.types.is_binary_view(kind)
+
+
+def _splits(kind: pa.DataType) -> bool:
+    return pa.types.is_float32(kind) or pa.types.is_float64(kind)
+
+
+def _shrinks(leaf: Leaf, rows: pa.Table) -> bool:
+    sample = b"".join(_samples(leaf, rows))
+    if len(sample) < _SAMPLE_BYTES // 8:
+        return True
+    packed = pa.Codec("zstd", compression_level=_LEVEL).compress(sample)
+    return len(packed) < _WORTH_IT * len(sample)
+
+
+def _samples(leaf: Leaf, rows: pa.Table) -> Iterator[bytes]:
+    """Yield bytes from the middle of a few values, where no header flatters the result."""
+    for chunk in rows.column(leaf.steps[0]).chunks[:_SAMPLES]:
+        values: pa.Array[Any] = chunk
+        for step in leaf.steps[1:]:
+            values = pc.struct_field(_values(values), step)
+        values = _values(values)
+        if _is_binary(values.type):
+            for blob in values.slice(len(values) // 2, _SAMPLES).drop_null():
+                data = blob.as_buffer()
+                yield data.slice(data.size // 2, min(data.size // 2, _PIECE_BYTES)).to_pybytes()
+        else:
+            yield values.drop_null().slice(len(values) // 2, _PIECE_BYTES).to_numpy().tobytes()
+
+
+def _values(array: pa.Array[Any]) -> pa.Array[Any]:
+    while isinstance(array, pa.ListArray | pa.LargeListArray | pa.FixedSizeListArray):
+        array = array.flatten()
+    return array

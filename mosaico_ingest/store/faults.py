@@ -1,0 +1,57 @@
+"""This file turns what the disk, SQLite and Arrow complain about into one line of ours."""
+
+from __future__ import annotations
+
+import errno
+import sqlite3
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pyarrow as pa
+
+from mosaico_ingest.errors import SinkError, SinkUnavailable
+
+__all__ = ["explained"]
+
+_HINTS = {
+    errno.ENOSPC: "free some space, or choose another target.store",
+    errno.EDQUOT: "the quota is used up; choose another target.store",
+    errno.EROFS: "choose a target.store that can be written",
+    errno.EACCES: "choose a target.store that can be written",
+    errno.EPERM: "choose a target.store that can be written",
+    errno.EMFILE: "raise the limit of open files (ulimit -n)",
+    errno.ENOENT: "the store was changed by something else; check it and run again",
+}
+
+
+@contextmanager
+def explained(where: Path | str) -> Generator[None, None, None]:
+    """Raise SinkError, with the place and a remedy, for whatever the store's ground refuses inside."""
+    try:
+        yield
+    except OSError as err:
+        code = err.errno or 0
+        what = err.strerror if err.strerror and err.filename else _first_line(err)
+        raise SinkError(what, where=str(err.filename or where), hint=_HINTS.get(code)) from err
+    except pa.ArrowException as err:
+        raise SinkError(_first_line(err), where=str(where)) from err
+    except sqlite3.OperationalError as err:
+        raise _explain(err, str(where)) from err
+    except sqlite3.Error as err:
+        raise SinkError(f"the catalog refuses: {_first_line(err)}", where=str(where)) from err
+
+
+def _explain(err: sqlite3.OperationalError, where: str) -> SinkError:
+    text = str(err)
+    if "locked" in text:
+        return SinkUnavailable("the catalog is busy with another process", where=where, hint="try again")
+    if "full" in text:
+        return SinkError("no space left on the device", where=where, hint=_HINTS[errno.ENOSPC])
+    if "readonly" in text or "unable to open" in text:
+        return SinkError(f"the catalog cannot be written: {text}", where=where, hint=_HINTS[errno.EROFS])
+    return SinkError(f"the catalog refuses: {text}", where=where)
+
+
+def _first_line(err: BaseException) -> str:
+    return (str(err).strip() or type(err).__name__).splitlines()[0]

@@ -1,0 +1,130 @@
+"""This file is where things lie in a store, and how they get there to stay.
+
+    catalog.sqlite
+    segments/<sequence>/<topic…>/<session>-<number>.parquet
+    staging/<session>/                       what an open session has written so far, and its lock
+
+A part of a name keeps its letters, digits, `_` and `-`; every other byte becomes `%XX`, so no name leads
+out of its folder, and a part too long for a file system ends in a hash.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import secrets
+import shutil
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["Layout", "fsync", "new_session_id"]
+
+_UNSAFE = re.compile(rb"[^A-Za-z0-9_-]")
+_LONGEST = 200
+_ATTEMPTS = 5
+_CROCKFORD = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """The paths of the store at `root`."""
+
+    root: Path
+
+    @property
+    def catalog(self) -> Path:
+        """The SQLite file."""
+        return self.root / "catalog.sqlite"
+
+    @property
+    def segments(self) -> Path:
+        """The folder of committed Parquet files."""
+        return self.root / "segments"
+
+    @property
+    def staging(self) -> Path:
+        """The folder of open sessions."""
+        return self.root / "staging"
+
+    def session(self, session: str) -> Path:
+        """Return the folder an open session writes to."""
+        return self.staging / session
+
+    def lock(self, session: str) -> Path:
+        """Return the file an open session keeps locked."""
+        return self.session(session) / "lock"
+
+    def topic(self, sequence: str, topic: str) -> Path:
+        """Return the folder of a topic's segments."""
+        parts = (sequence, *topic.strip("/").split("/"))
+        return self.segments.joinpath(*(_encode(part) for part in parts))
+
+    def relative(self, path: Path) -> str:
+        """Return how the catalog spells a segment's path."""
+        return path.relative_to(self.root).as_posix()
+
+    def open_sessions(self) -> list[str]:
+        """Return the sessions that have a staging folder, live or not."""
+        return sorted(entry.name for entry in self.staging.iterdir()) if self.staging.is_dir() else []
+
+    def segment_files(self) -> Iterator[Path]:
+        """Yield every file below the folder of segments."""
+        for folder, _, files in os.walk(self.segments):
+            yield from (Path(folder, name) for name in files)
+
+    def publish(self, staged: Path, target: Path) -> None:
+        """Move a finished file to its place, so that it is there after a power cut."""
+        missing = [folder for folder in target.parents if not folder.exists()]
+        for attempt in range(_ATTEMPTS):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                staged.rename(target)
+                break
+            except FileNotFoundError:  # a deletion next door may remove the empty folder just made
+                if attempt == _ATTEMPTS - 1 or not staged.exists():
+                    raise
+        for folder in (target.parent, *(folder.parent for folder in missing)):
+            fsync(folder)
+
+    def remove(self, paths: Iterable[Path]) -> None:
+        """Remove segment files and the folders that are empty then; garbage collection gets what resists."""
+        for path in paths:
+            with suppress(OSError):
+                path.unlink()
+            with suppress(OSError):
+                self._prune(path.parent)
+
+    def _prune(self, folder: Path) -> None:
+        while folder != self.segments:
+            folder.rmdir()
+            folder = folder.parent
+
+    def discard(self, session: str) -> None:
+        """Remove what a session has staged."""
+        shutil.rmtree(self.session(session), ignore_errors=True)
+
+
+def fsync(path: Path) -> None:
+    """Wait until the file's or folder's content is on the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def new_session_id() -> str:
+    """Return a ULID: 48 bits of milliseconds, 80 random bits, in 26 characters that sort by time."""
+    number = (time.time_ns() // 1_000_000) << 80 | secrets.randbits(80)
+    return "".join(_CROCKFORD[number >> shift & 31] for shift in range(125, -1, -5))
+
+
+def _encode(part: str) -> str:
+    safe = _UNSAFE.sub(lambda match: b"%%%02X" % match.group()[0], part.encode()).decode()
+    if len(safe) <= _LONGEST:
+        return safe
+    return f"{safe[:_LONGEST]}%{hashlib.sha256(part.encode()).hexdigest()[:16]}"

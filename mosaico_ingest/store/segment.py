@@ -1,0 +1,121 @@
+"""This file writes one Parquet segment: row groups of one topic, each later than the one before."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from mosaico_ingest.store.columns import Leaf, leaves, writer_options
+from mosaico_ingest.store.layout import fsync
+
+__all__ = ["Bounds", "Segment", "SegmentWriter", "sorted_rows", "time_span"]
+
+Bounds = tuple[str, Any, Any]
+"""A column's path, its smallest and its largest value."""
+
+_LONGEST_TEXT = 256
+_LARGEST_INTEGER = 1 << 63
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """A finished segment, on the disk to stay."""
+
+    path: Path
+    rows: int
+    stored_bytes: int
+    start_ns: int
+    end_ns: int
+    bounds: tuple[Bounds, ...]
+
+
+class SegmentWriter:
+    """Writes row groups to `path`; the columns' codecs are chosen from the first rows."""
+
+    def __init__(self, path: Path, schema: pa.Schema, first_rows: pa.Table) -> None:
+        self.path = path
+        self.end_ns = -(1 << 63)
+        self._leaves = leaves(schema)
+        self._footers: list[pq.FileMetaData] = []
+        self._writer = pq.ParquetWriter(
+            path,
+            schema,
+            use_compliant_nested_type=False,  # a list item's name is part of the type readers look for
+            sorting_columns=[pq.SortingColumn(0)],
+            write_batch_size=4096,
+            metadata_collector=self._footers,
+            **writer_options(self._leaves, first_rows),
+        )
+
+    @property
+    def written_bytes(self) -> int:
+        """How much is in the file by now."""
+        return self.path.stat().st_size
+
+    def append(self, rows: pa.Table) -> None:
+        """Write one row group; the rows are sorted, and none is earlier than what is there."""
+        self._writer.write_table(rows, row_group_size=max(1, rows.num_rows))
+        self.end_ns = rows.column(0)[-1].as_py()
+
+    def close(self) -> Segment:
+        """Finish the file and wait until it is on the disk."""
+        self._writer.close()
+        fsync(self.path)
+        (footer,) = self._footers
+        bounds = tuple(_bounds(self._leaves, footer))
+        _, start_ns, end_ns = bounds[0]
+        return Segment(self.path, footer.num_rows, self.path.stat().st_size, start_ns, end_ns, bounds)
+
+    def abandon(self) -> None:
+        """Close the file without caring for its content."""
+        try:
+            self._writer.close()
+        except (OSError, pa.ArrowException):
+            return
+
+
+def sorted_rows(batches: Iterable[pa.RecordBatch], schema: pa.Schema) -> pa.Table:
+    """Return the rows by time stamp; rows that are in order already are not copied, equal ones keep theirs."""
+    table = pa.Table.from_batches(batches, schema)
+    times = table.column(0).to_numpy()
+    if (times[1:] >= times[:-1]).all():
+        return table
+    return table.take(np.argsort(times, kind="stable"))
+
+
+def time_span(footer: pq.FileMetaData, group: int) -> tuple[int, int]:
+    """Return the first and the last time stamp of a row group that this file wrote."""
+    times = footer.row_group(group).column(0).statistics
+    if times is None or not times.has_min_max:
+        raise pa.ArrowInvalid("a row group has no statistics of timestamp_ns")
+    low: Any = times.min
+    high: Any = times.max
+    return low, high
+
+
+def _bounds(columns: tuple[Leaf, ...], footer: pq.FileMetaData) -> Iterable[Bounds]:
+    """Yield what the footer says of each column; columns without an order, or with longer values, are left out."""
+    groups = [footer.row_group(i) for i in range(footer.num_row_groups)]
+    for number, leaf in enumerate(columns):
+        statistics = [group.column(number).statistics for group in groups]
+        known = [each for each in statistics if each is not None and each.has_min_max]
+        if len(known) == len(groups):
+            lows: list[Any] = [each.min for each in known]
+            highs: list[Any] = [each.max for each in known]
+            low, high = min(lows), max(highs)
+            if _fits(low) and _fits(high):
+                yield leaf.path, low, high
+
+
+def _fits(value: object) -> bool:
+    if isinstance(value, str):
+        return len(value) <= _LONGEST_TEXT
+    if isinstance(value, int):
+        return -_LARGEST_INTEGER <= value < _LARGEST_INTEGER
+    return isinstance(value, float)

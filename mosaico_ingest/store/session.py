@@ -1,0 +1,143 @@
+"""This file is a writing session of the store: what it wrote appears in one transaction, or not at all."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+
+from mosaico_ingest import wire
+from mosaico_ingest.errors import SinkError
+from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.policies import IfExists
+from mosaico_ingest.sink import StoredTopic, check_same_type
+from mosaico_ingest.store import entries
+from mosaico_ingest.store.catalog import Catalog
+from mosaico_ingest.store.faults import explained
+from mosaico_ingest.store.layout import Layout, new_session_id
+from mosaico_ingest.store.lease import Lease, is_live
+from mosaico_ingest.store.segment import Segment, time_span
+from mosaico_ingest.store.topic import Staging, StoreTopic
+
+__all__ = ["StoreSession"]
+
+
+class StoreSession:
+    """One writing session; `commit` or `discard` ends it."""
+
+    def __init__(
+        self,
+        layout: Layout,
+        catalog: Catalog,
+        sequence: str,
+        metadata: str,
+        *,
+        if_exists: IfExists,
+        buffer_bytes: int,
+    ) -> None:
+        self.id = new_session_id()
+        self.created_ns = time.time_ns()
+        self._layout = layout
+        self._catalog = catalog
+        self._metadata = metadata
+        self._given: dict[str, StoreTopic] = {}
+        self._notes: list[entries.NewNote] = []
+        self._staging = Staging(layout.session(self.id), buffer_bytes=buffer_bytes)
+        with explained(layout.staging):
+            layout.session(self.id).mkdir(parents=True)
+            self._lease = Lease(layout.lock(self.id))
+        try:
+            with catalog.write() as db:
+                self._claim = entries.claim(db, self.id, sequence, if_exists, is_live=self._is_live)
+        except BaseException:
+            self._leave()
+            raise
+
+    def topic(self, name: str, ontology: OntologyType, metadata: Mapping[str, Any]) -> StoreTopic:
+        """Open a topic; see `Session.topic`."""
+        path = wire.check_topic_name(name)
+        described = wire.check_metadata(metadata, where=name)
+        if path in self._staging.topics:
+            raise SinkError("the topic is open already", where=name)
+        held = self._claim.types.get(path)
+        if held is not None:
+            check_same_type(held, ontology, where=name)
+        with explained(name):
+            topic = StoreTopic(self._staging, path, ontology, described)
+        self._staging.topics[path] = self._given[name] = topic
+        return topic
+
+    def note_error(self, message: str, *, topic: str | None = None) -> None:
+        """Attach an error; see `Session.note_error`."""
+        path = None if topic is None else wire.check_topic_name(topic)
+        self._notes.append(entries.NewNote(path, message, time.time_ns()))
+
+    def stored(self) -> tuple[StoredTopic, ...]:
+        """Return what the footers of the committed files say; see `Session.stored`."""
+        return tuple(self._stored(name, topic) for name, topic in self._given.items())
+
+    def commit(self) -> None:
+        """Finish every topic, move the segments to their places, and enter them in the catalog at once."""
+        with ThreadPoolExecutor(thread_name_prefix="segment") as pool:
+            list(pool.map(StoreTopic.close, self._staging.topics.values()))
+        published: list[Path] = []
+        try:
+            topics = tuple(self._publish(topic, published) for topic in self._staging.topics.values())
+            new = entries.NewSession(self.id, self._metadata, self.created_ns, topics, tuple(self._notes))
+            with self._catalog.write() as db:
+                replaced = entries.commit(db, self._claim, new)
+        except BaseException:
+            self._layout.remove(published)
+            raise
+        self._leave()
+        self._layout.remove(self._layout.root / path for path in replaced)
+
+    def discard(self) -> None:
+        """Leave no trace."""
+        for topic in self._staging.topics.values():
+            topic.abandon()
+        try:
+            with self._catalog.write() as db:
+                entries.release(db, self.id)
+        except SinkError:
+            return  # the error that ended the session matters more, and the name is free without its lock
+        finally:
+            self._leave()
+
+    def _publish(self, topic: StoreTopic, published: list[Path]) -> entries.NewTopic:
+        folder = self._layout.topic(self._claim.sequence, topic.name)
+        segments: dict[str, Segment] = {}
+        for segment in topic.segments:
+            target = folder / segment.path.name
+            with explained(target):
+                self._layout.publish(segment.path, target)
+            published.append(target)
+            segments[self._layout.relative(target)] = segment
+        return entries.NewTopic(
+            topic.name, topic.ontology, topic.schema, topic.metadata, topic.created_ns, segments
+        )
+
+    def _stored(self, name: str, topic: StoreTopic) -> StoredTopic:
+        folder = self._layout.topic(self._claim.sequence, topic.name)
+        rows = stored_bytes = 0
+        times: list[int] = []
+        for segment in topic.segments:
+            path = folder / segment.path.name
+            with explained(path):
+                footer = pq.read_metadata(path)
+                stored_bytes += path.stat().st_size
+                rows += footer.num_rows
+                for group in range(footer.num_row_groups):
+                    times += time_span(footer, group)
+        return StoredTopic(name, rows, min(times, default=None), max(times, default=None), stored_bytes)
+
+    def _leave(self) -> None:
+        self._lease.release()
+        self._layout.discard(self.id)
+
+    def _is_live(self, session: str) -> bool:
+        return is_live(self._layout.lock(session))

@@ -1,0 +1,115 @@
+"""This file takes the rows of one topic: they gather in memory, then go to a staged segment in row groups."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from pathlib import Path
+
+import pyarrow as pa
+
+from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.sink import check_batch, topic_schema
+from mosaico_ingest.store.columns import check_columns
+from mosaico_ingest.store.faults import explained
+from mosaico_ingest.store.segment import Segment, SegmentWriter, sorted_rows
+
+__all__ = ["Staging", "StoreTopic"]
+
+_GROUP_BYTES = 32 << 20
+_GROUP_ROWS = 1 << 20
+_SEGMENT_BYTES = 512 << 20
+
+
+class Staging:
+    """The topics of a session, the folder their segments are staged in, and the memory they share."""
+
+    def __init__(self, folder: Path, *, buffer_bytes: int) -> None:
+        self.folder = folder
+        self.topics: dict[str, StoreTopic] = {}
+        self._buffer_bytes = buffer_bytes
+        self._numbers = itertools.count()
+
+    def next_path(self) -> Path:
+        """Return a file name no other segment of the session has."""
+        return self.folder / f"{self.folder.name}-{next(self._numbers):04}.parquet"
+
+    def relieve(self) -> None:
+        """Write out the topic that holds most where all of them hold too much."""
+        topics = tuple(self.topics.values())
+        if sum(topic.buffered_bytes for topic in topics) > self._buffer_bytes:
+            max(topics, key=lambda topic: topic.buffered_bytes).flush()
+
+
+class StoreTopic:
+    """The writer of one topic; several threads may write, and an error leaves its batch out as a whole."""
+
+    def __init__(self, staging: Staging, name: str, ontology: OntologyType, metadata: str) -> None:
+        self.name = name
+        self.ontology = ontology
+        self.metadata = metadata
+        self.schema = topic_schema(ontology)
+        check_columns(self.schema)
+        self.created_ns = time.time_ns()
+        self.buffered_bytes = 0
+        self.segments: list[Segment] = []
+        self._staging = staging
+        self._batches: list[pa.RecordBatch] = []
+        self._rows = 0
+        self._writer: SegmentWriter | None = None
+        self._lock = threading.Lock()
+
+    def write(self, batch: pa.RecordBatch) -> None:
+        """Append rows; see `TopicWriter.write`."""
+        check_batch(batch, self.schema, where=self.name)
+        if not batch.num_rows:
+            return
+        with self._lock:
+            self._batches.append(batch)
+            self._rows += batch.num_rows
+            self.buffered_bytes += batch.nbytes
+            full = self.buffered_bytes >= _GROUP_BYTES or self._rows >= _GROUP_ROWS
+        if full:
+            self.flush()
+        else:
+            self._staging.relieve()
+
+    def flush(self) -> None:
+        """Write what is in memory as one row group."""
+        with self._lock, explained(self._staging.folder):
+            self._flush()
+
+    def close(self) -> None:
+        """Write what is in memory and finish the last segment."""
+        with self._lock, explained(self._staging.folder):
+            self._flush()
+            self._finish_segment()
+
+    def abandon(self) -> None:
+        """Let go of the memory and of the open file."""
+        with self._lock:
+            self._batches.clear()
+            if self._writer is not None:
+                self._writer.abandon()
+                self._writer = None
+
+    def _flush(self) -> None:
+        batches, self._batches = self._batches, []
+        self._rows = self.buffered_bytes = 0
+        if batches:
+            self._write_group(sorted_rows(batches, self.schema))
+
+    def _write_group(self, rows: pa.Table) -> None:
+        if self._writer is not None and rows.column(0)[0].as_py() < self._writer.end_ns:
+            self._finish_segment()  # a segment is sorted from its first row to its last
+        if self._writer is None:
+            self._writer = SegmentWriter(self._staging.next_path(), self.schema, rows)
+        self._writer.append(rows)
+        if self._writer.written_bytes >= _SEGMENT_BYTES:
+            self._finish_segment()
+
+    def _finish_segment(self) -> None:
+        if self._writer is not None:
+            self.segments.append(self._writer.close())
+            self._writer = None
