@@ -27,7 +27,7 @@ _SEPARATOR_LINE = re.compile(r"^={10,}[ \t\r]*(?:\n|\Z)", re.MULTILINE)
 _HEAD = re.compile(r"\s*(?P<kind>MSG|IDL):[ \t]*(?P<name>\S+)[ \t\r]*(?:\n|\Z)")
 _LINE = re.compile(
     r"(?P<type>[A-Za-z]\w*(?:/\w+)*)(?:<=(?P<bound>\d+))?(?P<array>\[(?:<=)?\d*\])?\s+(?P<name>[A-Za-z_]\w*)"
-    r"(?:\s*=(?P<value>.*)|\s*(?:#.*)?|\s+[-+.\w'\"\[].*)"
+    r"(?:\s*=(?P<value>.*)|\s*(?:#.*)?|\s+(?P<default>[-+.\w'\"\[].*))"
 )
 _ANNOTATION = re.compile(r"@(?P<name>\w+)(?:\([^)]*\))?\s*")
 _QUOTED = re.compile(r"""(?:'((?:\\.|[^'\\])*)'|"((?:\\.|[^"\\])*)")\s*(?:#.*)?""")
@@ -100,6 +100,8 @@ def _item(content: str) -> Field | Constant | None:
     kind = match["type"]
     if match["bound"] and kind not in {"string", "wstring"}:
         raise ValueError(f"{kind} cannot be bounded")
+    if match["default"] and kind not in PRIMITIVES:
+        raise ValueError(f"a default for {kind}")
     if match["value"] is not None:
         return Constant(match["name"], kind, _value(kind, match["value"].strip()))
     container, size = _container(match["array"])

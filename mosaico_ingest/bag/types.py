@@ -155,10 +155,7 @@ class TypeResolver:
             if root not in self._custom and root not in self._registered:
                 problem = f"the definition in the recording cannot be read: {error.what}"
                 raise BagError(problem, where=error.where, hint="give the type with custom_msgs") from error
-            self._note(
-                "unreadable-definition",
-                f"{root}: the job's definition is used; in the recording {error.what}",
-            )
+            self._replaced[root] = error.what
             return {}
 
     def _agreed(self, version: int, name: str) -> MessageType | None:
