@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from rich.cells import cell_len
@@ -30,10 +31,8 @@ def texts_of(findings: Iterable[Finding]) -> dict[str, str]:
     """Read the files that findings point into; what cannot be read is left out."""
     texts: dict[str, str] = {}
     for file in {finding.span.file for finding in findings if finding.span is not None}:
-        try:
+        with suppress(OSError):
             texts[file] = Path(file).read_text(encoding="utf-8", errors="replace")
-        except OSError:
-            continue
     return texts
 
 

@@ -53,7 +53,7 @@ def _text(text: str, path: Path, source: Source, env: Mapping[str, str] | None, 
         if inside is None:
             report(
                 "variable-syntax",
-                f"{match[0] or '${'} is no variable",
+                f"{'${' if match[0] == '$' else match[0]} is no variable",
                 "write ${NAME}, or $$ for a dollar",
                 match,
             )

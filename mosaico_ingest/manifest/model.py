@@ -220,7 +220,7 @@ class RunSection(_Section):
 class Manifest(_Section):
     """A job: a recording, what it becomes, and where it goes."""
 
-    version: Literal[1] = VERSION
+    version: Annotated[int, Field(ge=1, le=VERSION)] = VERSION
     """The version of this language."""
     bag: BagSection
     """The recording, and what it takes to read it."""

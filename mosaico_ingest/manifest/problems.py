@@ -143,7 +143,7 @@ def _describe(problem: _Problem) -> Finding:
     if kind in _EXPECTED:
         return _wrong_type(problem, _EXPECTED[kind])
     message = problem.error["msg"].removeprefix("Value error, ")
-    return problem.finding("wrong-value", f"{problem.name}: {message}", None)
+    return problem.finding("wrong-value", f"{problem.name}: {message}", _example(problem))
 
 
 def _suggestion(problem: _Problem) -> str | None:
@@ -195,7 +195,7 @@ def _wrong_type(problem: _Problem, expected: str) -> Finding:
     remedy = fix = None
     node = _node_at(problem.schema, problem.path)
     if expected == "text" and not _fits(written, node, problem.schema):
-        remedy = f"write it as {node['examples'][0]}" if node.get("examples") else None
+        remedy = _example(problem)
     elif expected == "text" and (_PLAIN.fullmatch(written) or _BRACED.fullmatch(written)):
         remedy, fix = f'quote it: "{written}"', Edit(problem.span, f'"{written}"')
     elif expected == "a list" and isinstance(value, str):
@@ -205,7 +205,14 @@ def _wrong_type(problem: _Problem, expected: str) -> Finding:
     elif expected == "a mapping":
         keys = keys_at(problem.schema, problem.path)
         remedy = f"its keys are {', '.join(keys)}" if keys else "write key: value pairs"
-    return problem.finding("wrong-type", message, remedy, fix=fix)
+    return problem.finding("wrong-type", message, remedy or _example(problem) or f"write {expected}", fix=fix)
+
+
+def _example(problem: _Problem) -> str | None:
+    """Say how the value may be written, in the words of the model's examples."""
+    examples = _node_at(problem.schema, problem.path).get("examples", ())
+    shown = [str(example) for example in examples if isinstance(example, str | int | float)]
+    return f"write it as {' or '.join(shown)}" if shown else None
 
 
 def _fits(text: str, node: dict[str, Any], schema: dict[str, Any]) -> bool:
@@ -234,9 +241,6 @@ def _kind(value: Value) -> str:
 
 def _not_a_choice(problem: _Problem) -> Finding:
     allowed = problem.error.get("ctx", {}).get("expected", "")
-    if problem.path == ("version",) and isinstance(problem.value, int) and problem.value > 1:
-        message = f"version {problem.value} of the manifest is newer than this tool, which reads {allowed}"
-        return problem.finding("newer-version", message, "upgrade mosaico-ingest")
     if problem.value is None:
         return _wrong_type(problem, "text")
     shown = repr(problem.value) if isinstance(problem.value, str) else _kind(problem.value)
@@ -255,6 +259,9 @@ def _not_a_choice(problem: _Problem) -> Finding:
 
 def _out_of_range(problem: _Problem) -> Finding:
     bounds = problem.error.get("ctx", {})
+    if problem.path == ("version",) and "le" in bounds:
+        message = f"version {problem.value} is newer than this tool, which reads {bounds['le']}"
+        return problem.finding("newer-version", message, "upgrade mosaico-ingest")
     words = {"ge": "at least", "le": "at most", "gt": "more than", "lt": "less than"}
     limit = next(f"{words[key]} {bounds[key]}" for key in words if key in bounds)
     return problem.finding("wrong-value", f"{problem.name} is {problem.value}", f"it must be {limit}")

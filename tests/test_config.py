@@ -1,0 +1,126 @@
+"""A configuration is checked when it is made, and holds each value in its one form."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mosaico_ingest.config import ROSInjectionConfig, ServerTarget, StoreTarget, TimeBound
+from mosaico_ingest.errors import IngestError, ManifestError
+from mosaico_ingest.policies import (
+    IfExists,
+    LoaderErrorPolicy,
+    SessionLevelErrorPolicy,
+    Stores,
+    TopicLevelErrorPolicy,
+)
+
+
+class MyCustomRGBDAdapter:
+    """Stands for a user's adapter."""
+
+
+def config(**fields: Any) -> ROSInjectionConfig:
+    return ROSInjectionConfig(**{"file_path": "a.bag", "sequence_name": "run", **fields})
+
+
+def test_the_reference_example_is_accepted() -> None:
+    made = ROSInjectionConfig(
+        file_path=Path("data/session_01.db3"),
+        sequence_name="test_ros_sequence",
+        metadata={"driver_version": "v2.1", "weather": "sunny", "location": "test_track_A"},
+        topics=["/cam*"],
+        ros_distro=Stores.ROS2_HUMBLE,
+        custom_msgs=[("my_custom_pkg", Path("./definitions/my_pkg/"), Stores.ROS2_HUMBLE)],
+        adapter_override={"/camera/depth/points": MyCustomRGBDAdapter},
+        log_level="WARNING",
+        on_error=SessionLevelErrorPolicy.Report,
+        topics_on_error=TopicLevelErrorPolicy.Raise,
+    )
+    assert made.paths == (Path("data/session_01.db3"),)
+    assert made.topics == ("/cam*",)
+    assert made.adapter_overrides == made.adapter_override == {"/camera/depth/points": MyCustomRGBDAdapter}
+    assert made.target == StoreTarget(Path("mosaico"))
+    assert pickle.loads(pickle.dumps(made)) == made  # noqa: S301 - our own bytes
+
+
+def test_words_become_what_they_name() -> None:
+    made = config(
+        ros_distro="ros2_humble",
+        on_error="delete",
+        topics_on_error="ignore",
+        messages_on_error="raise",
+        topics="/imu",
+    )
+    assert made.ros_distro is Stores.ROS2_HUMBLE
+    assert made.on_error is SessionLevelErrorPolicy.Delete
+    assert made.topics_on_error is TopicLevelErrorPolicy.Ignore
+    assert made.messages_on_error is LoaderErrorPolicy.RAISE
+    assert made.topics == ("/imu",)
+
+
+def test_the_plural_spelling_of_overrides_is_the_same() -> None:
+    made = config(adapter_overrides={"/a": MyCustomRGBDAdapter})
+    assert made.adapter_override == {"/a": MyCustomRGBDAdapter}
+    with pytest.raises(ManifestError, match="disagree on '/a'"):
+        config(adapter_overrides={"/a": MyCustomRGBDAdapter}, adapter_override={"/a": "Other"})
+
+
+def test_the_destination_follows_one_rule() -> None:
+    assert config().target == StoreTarget(Path("mosaico"))
+    assert config(store="s").target == StoreTarget(Path("s"))
+    assert config(host="h").target == ServerTarget("h", 6726)
+    server = config(host="h", port=1, mosaico_api_key="k", tls_cert_path="c.pem").target
+    assert server == ServerTarget("h", 1, "k", Path("c.pem"), tls=True)
+    assert "api_key" not in repr(server)
+
+
+def test_update_if_exists_is_append() -> None:
+    assert config(update_if_exists=True).if_exists is IfExists.APPEND
+
+
+def test_each_topic_has_its_policy() -> None:
+    made = config(topics_on_error={"default": "finalize", "/gps/*": "ignore", "/gps/fix": "raise"})
+    assert made.topic_policy("/gps/fix") is TopicLevelErrorPolicy.Raise
+    assert made.topic_policy("/gps/other") is TopicLevelErrorPolicy.Ignore
+    assert made.topic_policy("/imu") is TopicLevelErrorPolicy.Finalize
+    assert config(topics_on_error={"/a": "ignore"}).topic_policy("/b") is TopicLevelErrorPolicy.Raise
+
+
+def test_the_key_is_not_shown() -> None:
+    assert "s3cret" not in repr(config(host="h", mosaico_api_key="s3cret"))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"file_path": []}, "file_path is empty"),
+        ({"ros_distro": "humble"}, "ros_distro is 'humble' — allowed: "),
+        ({"on_error": "explode"}, "on_error is 'explode'"),
+        ({"topics_on_error": {"/a": "no"}}, "topics_on_error\\['/a'\\] is 'no'"),
+        ({"log_level": "LOUD"}, "log_level is 'LOUD'"),
+        ({"store": "s", "host": "h"}, "store 's' and host 'h' are two targets"),
+        ({"port": 0}, "port is 0"),
+        ({"mosaico_api_key": "k"}, "no host is named"),
+        ({"update_if_exists": True, "if_exists": "replace"}, "append and if_exists says replace"),
+        ({"every": {"/a": 0}}, "every\\['/a'\\] is 0"),
+        ({"images": {"/a": "jpg"}}, "images\\['/a'\\] is 'jpg'"),
+        ({"jobs": 0}, "jobs is 0"),
+        ({"sequence_name": "a b"}, "sequence name 'a b'"),
+        ({"metadata": {"a.b": 1}}, "metadata key 'a.b'"),
+        ({"topic_metadata": {"/a": {"x/y": 1}}}, "metadata key 'x/y'"),
+        ({"rename": {"/a": "/b c"}}, "topic name '/b c'"),
+    ],
+)
+def test_what_cannot_be_is_refused_with_the_value(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(IngestError, match=message):
+        config(**fields)
+
+
+def test_a_relative_moment_is_counted_from_the_nearer_end() -> None:
+    assert TimeBound(5, relative=True).at(100, 200) == 105
+    assert TimeBound(-5, relative=True).at(100, 200) == 195
+    assert TimeBound(5).at(100, 200) == 5
