@@ -17,6 +17,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from mosaico_ingest.diagnostics import Finding
+
 __all__ = [
     "AdapterError",
     "BagError",
@@ -72,7 +74,7 @@ class ManifestError(IngestError):
         *,
         where: str | None = None,
         hint: str | None = None,
-        findings: tuple[object, ...] = (),
+        findings: tuple[Finding, ...] = (),
     ) -> None:
         super().__init__(what, where=where, hint=hint)
         self.findings = findings

@@ -7,9 +7,11 @@ import pickle
 import pytest
 
 from mosaico_ingest import errors
+from mosaico_ingest.diagnostics import Finding, Severity
 from mosaico_ingest.errors import IngestError, ManifestError, SinkUnavailable
 
 KINDS = [getattr(errors, name) for name in errors.__all__]
+FINDING = Finding("unknown-key", Severity.ERROR, "unknown key")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -21,8 +23,8 @@ def test_an_error_survives_pickling_with_its_fields(kind: type[IngestError]) -> 
 
 
 def test_findings_survive_pickling() -> None:
-    error = pickle.loads(pickle.dumps(ManifestError("two mistakes", findings=("a", "b"))))  # noqa: S301 - our own bytes
-    assert error.findings == ("a", "b")
+    error = pickle.loads(pickle.dumps(ManifestError("two mistakes", findings=(FINDING,))))  # noqa: S301 - our own bytes
+    assert error.findings == (FINDING,)
 
 
 def test_only_an_unavailable_destination_is_worth_another_try() -> None:

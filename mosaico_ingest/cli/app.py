@@ -92,9 +92,18 @@ def _with_command(arguments: list[str]) -> list[str]:
 
 
 def _complain(error: IngestError) -> None:
-    from mosaico_ingest.cli.render import render_error
+    """Print an error: its findings with their source lines, else its one line."""
+    from rich.console import Console
+    from rich.text import Text
 
-    typer.echo(render_error(error), err=True)
+    from mosaico_ingest.cli.render import render_findings, texts_of
+    from mosaico_ingest.errors import ManifestError
+
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    if isinstance(error, ManifestError) and error.findings:
+        console.print(render_findings(error.findings, texts_of(error.findings)))
+    else:
+        console.print(Text.assemble(("error: ", "bold red"), str(error)))
 
 
 if __name__ == "__main__":
