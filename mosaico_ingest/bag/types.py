@@ -61,12 +61,13 @@ class TypeResolver:
         Raises:
             BagError: One of them cannot be read.
         """
-        self.distro = store_of(distro)
+        store = store_of(distro)
+        self.distro = None if store is Stores.EMPTY else store
         self._other_distros = dict[str, str]()
         own = list[Registered]()
-        for package, path, store in custom:
+        for package, path, only in custom:
             entries = list(directory_types(package, Path(path)))
-            scope = store_of(store)
+            scope = store_of(only)
             if scope and self.distro and scope is not self.distro:
                 self._other_distros |= {entry.msgtype: scope.value for entry in entries}
             else:
