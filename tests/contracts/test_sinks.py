@@ -1,0 +1,284 @@
+"""One behaviour for every sink: what is written is there after the commit, and nothing before or without it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import pyarrow as pa
+import pytest
+
+from mosaico_ingest.errors import SequenceExists, SinkError
+from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.policies import IfExists
+from mosaico_ingest.sink import MemorySink, Sink, topic_schema
+from mosaico_ingest.store import Store, StoreSink
+
+POINT = OntologyType(
+    "Point",
+    pa.struct(
+        [
+            pa.field("x", pa.float64(), nullable=False),
+            pa.field("name", pa.string()),
+            pa.field("raw", pa.list_(pa.field("item", pa.uint8(), nullable=False))),
+        ]
+    ),
+)
+FLAG = OntologyType("Flag", pa.struct([pa.field("on", pa.bool_())]))
+
+
+class Destination(Protocol):
+    """A sink, and the way a reader looks at what it wrote."""
+
+    @property
+    def sink(self) -> Sink: ...
+    def sequences(self) -> Sequence[str]: ...
+    def metadata(self, sequence: str) -> Mapping[str, Any]: ...
+    def topics(self, sequence: str) -> Mapping[str, tuple[OntologyType, Mapping[str, Any]]]: ...
+    def rows(self, sequence: str, topic: str) -> pa.Table: ...
+    def errors(self, sequence: str) -> Sequence[tuple[str | None, str]]: ...
+
+
+class InMemory:
+    def __init__(self, _: Path) -> None:
+        self.sink = MemorySink()
+
+    def sequences(self) -> Sequence[str]:
+        return sorted(self.sink.sequences)
+
+    def metadata(self, sequence: str) -> Mapping[str, Any]:
+        return self.sink.sequences[sequence].metadata
+
+    def topics(self, sequence: str) -> Mapping[str, tuple[OntologyType, Mapping[str, Any]]]:
+        topics = self.sink.sequences[sequence].topics
+        return {name: (topic.ontology, topic.metadata) for name, topic in topics.items()}
+
+    def rows(self, sequence: str, topic: str) -> pa.Table:
+        return self.sink.sequences[sequence].topics[topic].table().sort_by("timestamp_ns")
+
+    def errors(self, sequence: str) -> Sequence[tuple[str | None, str]]:
+        return self.sink.sequences[sequence].errors
+
+
+class InStore:
+    def __init__(self, folder: Path) -> None:
+        self.store = Store.open(folder / "mosaico")
+        self.sink = StoreSink(self.store)
+
+    def sequences(self) -> Sequence[str]:
+        return [info.name for info in self.store.sequences()]
+
+    def metadata(self, sequence: str) -> Mapping[str, Any]:
+        return self.store.sequence(sequence).metadata
+
+    def topics(self, sequence: str) -> Mapping[str, tuple[OntologyType, Mapping[str, Any]]]:
+        topics = self.store.sequence(sequence).topics
+        return {topic.name: (topic.ontology, topic.metadata) for topic in topics}
+
+    def rows(self, sequence: str, topic: str) -> pa.Table:
+        return self.store.scan(sequence, topic).read_all()
+
+    def errors(self, sequence: str) -> Sequence[tuple[str | None, str]]:
+        return [(note.topic, note.message) for note in self.store.sequence(sequence).notes]
+
+
+DESTINATIONS: tuple[Callable[[Path], Destination], ...] = (InMemory, InStore)
+
+
+@pytest.fixture(params=DESTINATIONS, ids=lambda make: make.__name__)
+def there(request: pytest.FixtureRequest, tmp_path: Path) -> Destination:
+    return request.param(tmp_path)
+
+
+class CrashError(Exception):
+    """Something goes wrong in the middle of a session."""
+
+
+def points(*times: int) -> pa.RecordBatch:
+    rows = [
+        {"timestamp_ns": time, "x": time / 2, "name": f"p{time}" if time % 2 else None, "raw": [time % 256]}
+        for time in times
+    ]
+    return pa.RecordBatch.from_pylist(rows, topic_schema(POINT))
+
+
+def write(
+    there: Destination, *times: int, sequence: str = "drive", if_exists: IfExists = IfExists.FAIL
+) -> None:
+    with there.sink.open(sequence, {"car": 7}, if_exists=if_exists) as session:
+        session.topic("/gps/fix", POINT, {"mount": "roof"}).write(points(*times))
+
+
+def test_what_is_written_is_there_after_the_commit(there: Destination) -> None:
+    with there.sink.open("drive", {"car": {"wheels": [4, 4.5, None]}}) as session:
+        writer = session.topic("/gps/fix", POINT, {"mount": "roof"})
+        writer.write(points(1, 2))
+        session.topic("imu", FLAG, {})
+        writer.write(points(3))
+    assert there.sequences() == ["drive"]
+    assert there.metadata("drive") == {"car": {"wheels": [4, 4.5, None]}}
+    assert there.topics("drive") == {"/gps/fix": (POINT, {"mount": "roof"}), "/imu": (FLAG, {})}
+    assert there.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(1, 2, 3)]))
+
+
+def test_the_destination_is_asked_what_it_holds(there: Destination) -> None:
+    with there.sink.open("drive", {}) as session:
+        session.topic("/gps/fix", POINT, {}).write(points(5, 3, 4))
+        session.topic("imu", FLAG, {})
+    fix, imu = session.stored()
+    assert (fix.topic, fix.rows, fix.start_ns, fix.end_ns) == ("/gps/fix", 3, 3, 5)
+    assert (imu.topic, imu.rows, imu.start_ns, imu.end_ns) == ("imu", 0, None, None)
+    assert fix.stored_bytes > 0
+
+
+def test_nothing_is_visible_before_the_commit(there: Destination) -> None:
+    with there.sink.open("drive", {}) as session:
+        session.topic("/gps/fix", POINT, {}).write(points(1))
+        assert there.sequences() == []
+
+
+def test_an_exception_leaves_no_trace(there: Destination) -> None:
+    with pytest.raises(CrashError), there.sink.open("drive", {}) as session:
+        session.topic("/gps/fix", POINT, {}).write(points(1))
+        raise CrashError
+    assert there.sequences() == []
+    write(there, 1)
+
+
+def test_rows_come_back_in_time_order(there: Destination) -> None:
+    with there.sink.open("drive", {}) as session:
+        writer = session.topic("/gps/fix", POINT, {})
+        for times in ((7, 9, 8), (1,), (), (5, 2)):
+            writer.write(points(*times))
+    assert there.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(1, 2, 5, 7, 8, 9)]))
+
+
+def test_an_empty_session_leaves_an_empty_sequence(there: Destination) -> None:
+    with there.sink.open("drive", {"car": 7}):
+        pass
+    assert there.sequences() == ["drive"]
+    assert there.topics("drive") == {}
+
+
+@pytest.mark.parametrize("if_exists", [IfExists.FAIL, IfExists.SKIP])
+def test_a_taken_name_is_refused_at_once(there: Destination, if_exists: IfExists) -> None:
+    write(there, 1)
+    with pytest.raises(SequenceExists, match="drive"), there.sink.open("drive", {}, if_exists=if_exists):
+        pytest.fail("the session opened")
+    assert there.rows("drive", "/gps/fix").num_rows == 1
+
+
+def test_append_adds_a_session(there: Destination) -> None:
+    write(there, 1, 4)
+    with there.sink.open("drive", {"car": 8}, if_exists=IfExists.APPEND) as session:
+        session.topic("/gps/fix", POINT, {}).write(points(2, 3))
+        session.topic("/flag", FLAG, {})
+    assert there.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(1, 2, 3, 4)]))
+    assert there.metadata("drive") == {"car": 7}
+    assert [topic.rows for topic in session.stored()] == [2, 0]
+
+
+def test_append_creates_what_is_not_there(there: Destination) -> None:
+    write(there, 1, if_exists=IfExists.APPEND)
+    assert there.sequences() == ["drive"]
+
+
+def test_append_refuses_another_type_for_the_same_topic(there: Destination) -> None:
+    write(there, 1)
+    with (
+        pytest.raises(SinkError, match=r"/gps/fix.*Point.*Flag"),
+        there.sink.open("drive", {}, if_exists=IfExists.APPEND) as session,
+    ):
+        session.topic("/gps/fix", FLAG, {})
+
+
+def test_replace_swaps_at_the_commit(there: Destination) -> None:
+    write(there, 1)
+    with there.sink.open("drive", {"car": 8}, if_exists=IfExists.REPLACE) as session:
+        session.topic("/gps/fix", POINT, {}).write(points(2, 3))
+        assert there.rows("drive", "/gps/fix").num_rows == 1
+    assert there.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(2, 3)]))
+    assert there.metadata("drive") == {"car": 8}
+
+
+def test_a_failed_replace_keeps_the_old(there: Destination) -> None:
+    write(there, 1)
+    with pytest.raises(CrashError), there.sink.open("drive", {}, if_exists=IfExists.REPLACE) as session:
+        session.topic("/gps/fix", POINT, {}).write(points(2, 3))
+        raise CrashError
+    assert there.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(1)]))
+
+
+def test_errors_are_kept_with_the_sequence(there: Destination) -> None:
+    with there.sink.open("drive", {}) as session:
+        session.topic("/gps/fix", POINT, {})
+        session.note_error("the run ended early")
+        session.note_error("one row was lost", topic="/gps/fix")
+    assert sorted(there.errors("drive"), key=str) == [
+        ("/gps/fix", "one row was lost"),
+        (None, "the run ended early"),
+    ]
+
+
+def test_a_topic_is_opened_once(there: Destination) -> None:
+    with there.sink.open("drive", {}) as session:
+        session.topic("/imu", FLAG, {})
+        with pytest.raises(SinkError, match="imu"):
+            session.topic("imu", FLAG, {})
+
+
+@pytest.mark.parametrize(
+    "batch",
+    [
+        points(1).rename_columns(["timestamp_ns", "y", "name", "raw"]),
+        points(1).select(["timestamp_ns", "x", "name"]),
+        pa.RecordBatch.from_arrays(
+            [pa.array([None], pa.int64()), *points(1).columns[1:]], schema=points(1).schema
+        ),
+    ],
+    ids=["other name", "missing column", "no time stamp"],
+)
+def test_a_batch_that_does_not_fit_is_refused_and_the_rest_stays(
+    there: Destination, batch: pa.RecordBatch
+) -> None:
+    with there.sink.open("drive", {}) as session:
+        writer = session.topic("/gps/fix", POINT, {})
+        writer.write(points(1))
+        with pytest.raises(SinkError, match="/gps/fix"):
+            writer.write(batch)
+        writer.write(points(2))
+    assert there.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(1, 2)]))
+
+
+@pytest.mark.parametrize("name", ["", "a b", "a/b", "a:b", "..", "ünï", "a\nb", 'a"b', "a\x00"])
+def test_a_sequence_name_the_platform_refuses_is_refused(there: Destination, name: str) -> None:
+    with pytest.raises(SinkError), there.sink.open(name, {}):
+        pytest.fail("the session opened")
+
+
+@pytest.mark.parametrize("name", ["", "/", "//a", "/a//b", "/a/", "/a.b", "/../x", "/a b", "/a:b"])
+def test_a_topic_name_the_platform_refuses_is_refused(there: Destination, name: str) -> None:
+    with there.sink.open("drive", {}) as session, pytest.raises(SinkError):
+        session.topic(name, FLAG, {})
+
+
+@pytest.mark.parametrize(
+    "name", ["/_hidden", "/~x", "/a@b/c", "/A-1_b", "/a=b", "/a\\b", "/(x)", "/" + "long" * 200]
+)
+def test_a_topic_name_the_platform_accepts_is_kept(there: Destination, name: str) -> None:
+    with there.sink.open("drive", {}) as session:
+        session.topic(name, POINT, {}).write(points(1))
+    assert list(there.topics("drive")) == [name]
+    assert there.rows("drive", name).num_rows == 1
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    [{"a.b": 1}, {"a": {"b/c": 1}}, {"a": [{"--": 1}]}, {"": 1}, {"a": float("nan")}, {"a": object()}],
+)
+def test_metadata_the_platform_refuses_is_refused(there: Destination, metadata: dict[str, Any]) -> None:
+    with pytest.raises(SinkError, match="drive"), there.sink.open("drive", metadata):
+        pytest.fail("the session opened")
+    with there.sink.open("drive", {}) as session, pytest.raises(SinkError, match="/imu"):
+        session.topic("/imu", FLAG, metadata)
