@@ -1,0 +1,90 @@
+"""This file finds messages that are laid out alike: one of them is walked, the others are only checked.
+
+Messages of one topic nearly always repeat the lengths of their texts and sequences. Where all length words of a
+message have the values of the one that was walked, everything in it lies where it lies there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mosaico_ingest.decode.layout import Layout
+from mosaico_ingest.decode.places import Frame, Int64s, Located, Places
+from mosaico_ingest.decode.stepwise import Notes, Stepper
+
+__all__ = ["locate_clustered"]
+
+_SMALLEST = 16
+"""Messages a cluster has at least; walking one costs about as much as this many in lockstep."""
+
+_STEPWISE_NS, _CLUSTER_NS, _CHECK_NS = 2_000, 60_000, 10
+_VECTOR_NS, _LOCKSTEP_NS = 25_000, 60
+"""What a length word costs in the walked message, a cluster in itself, a word in a checked message; and in
+lockstep a word for the batch and for each message. Measured once; only the ratios matter."""
+
+
+def locate_clustered(layout: Layout, frame: Frame) -> list[Located]:
+    """Return the clusters that pay; messages in none of them are left to another way of walking."""
+    groups = list(_same_length(frame.ends - frame.origins))
+    if not groups:
+        return []
+    words = len(_Sample(layout, frame, int(groups[0][0])).words)
+    members = sum(map(len, groups))
+    clustered = len(groups) * (_CLUSTER_NS + words * _STEPWISE_NS) + members * words * _CHECK_NS
+    if clustered > words * (_VECTOR_NS + members * _LOCKSTEP_NS):
+        return []
+    return [cluster for rows in groups for cluster in _split(layout, frame, rows)]
+
+
+def _same_length(lengths: Int64s) -> Iterator[Int64s]:
+    """Yield the positions of each length that is frequent enough."""
+    if lengths.min() == lengths.max():
+        yield np.arange(len(lengths))
+        return
+    order = np.argsort(lengths, kind="stable")
+    borders = np.flatnonzero(np.diff(lengths[order])) + 1
+    yield from (rows for rows in np.split(order, borders) if len(rows) >= _SMALLEST)
+
+
+def _split(layout: Layout, frame: Frame, rows: Int64s) -> Iterator[Located]:
+    """Yield the clusters within messages of one length, as long as each takes a good part of the rest."""
+    while len(rows) >= _SMALLEST:
+        sample = _Sample(layout, frame, int(rows[0]))
+        alike = sample.compare(frame.take(rows))
+        members = rows[alike]
+        if len(members):
+            yield Located(members, sample.spread(frame.origins[members]))
+        if len(members) * 4 < len(rows):
+            return
+        rows = rows[~alike]
+
+
+class _Sample:
+    """One message that was walked."""
+
+    __slots__ = ("_frame", "_nuls", "_places", "fits", "words")
+
+    def __init__(self, layout: Layout, frame: Frame, row: int) -> None:
+        stepper, notes = Stepper(layout, frame), Notes(layout.body)
+        self._frame = frame.take(np.array([row]))
+        self.fits = stepper.message(row, notes)
+        self.words = np.array(stepper.words, np.int64) - frame.origins[row]
+        self._nuls = np.array(stepper.nuls, np.int64) - frame.origins[row]
+        self._places = notes.places()
+
+    def compare(self, frame: Frame) -> NDArray[np.bool_]:
+        """Return which messages, all of the sample's length, have its length words and closing NULs."""
+        if not self.fits:
+            return np.zeros(len(frame), bool)
+        words = frame.words()
+        expected = words[self._frame.origins + self.words]
+        found = words[frame.origins[:, None] + self.words]
+        ends = frame.data[frame.origins[:, None] + self._nuls]
+        return (found == expected).all(axis=1) & ~ends.any(axis=1)
+
+    def spread(self, origins: Int64s) -> Places:
+        """Return the places in messages that compared equal."""
+        return tuple(place.spread(origins - self._frame.origins) for place in self._places)

@@ -1,0 +1,102 @@
+"""This file decodes all messages of a batch at once, and leaves those it cannot vouch for to the row-wise decoder."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow as pa
+
+from mosaico_ingest.bag.batch import Encoding, RawBatch
+from mosaico_ingest.bag.definition import Definition
+from mosaico_ingest.decode.columns import build_columns
+from mosaico_ingest.decode.decoder import Decoded
+from mosaico_ingest.decode.layout import compile_layout
+from mosaico_ingest.decode.locate import locate
+from mosaico_ingest.decode.places import Frame, Int64s
+from mosaico_ingest.decode.rowwise import RowwiseDecoder
+from mosaico_ingest.diagnostics import RowFailure
+
+__all__ = ["ColumnarDecoder"]
+
+_HEADER = 4
+_ORDERS = {">": 0, "<": 1}
+"""The second byte of the encapsulation header of plain CDR."""
+
+
+class ColumnarDecoder:
+    """Decodes by columns; what `RowwiseDecoder` says about a message is what counts.
+
+    Raises:
+        DecodeError: The definition has no Arrow shape.
+    """
+
+    def __init__(self, definition: Definition, encoding: Encoding) -> None:
+        self._rowwise = RowwiseDecoder(definition, encoding)
+        self._layout = compile_layout(definition, encoding)
+
+    @property
+    def shape(self) -> pa.StructType:
+        """The ROS shape."""
+        return self._rowwise.shape
+
+    def decode(self, batch: RawBatch) -> Decoded:
+        """Decode all messages of the batch."""
+        left = np.ones(len(batch), bool)
+        parts: list[tuple[Int64s, pa.StructArray]] = []
+        for order, rows in self._by_order(batch):
+            part = self._decode(_frame(batch, rows, order, self._layout.encoding))
+            left[rows[part[0]]] = False
+            parts.append((rows[part[0]], part[1]))
+        rest = np.flatnonzero(left)
+        failures: tuple[RowFailure, ...] = ()
+        if len(rest) or not parts:
+            slow = self._rowwise.decode(_take(batch, rest))
+            parts.append((rest[slow.index], slow.rows))
+            failures = tuple(
+                RowFailure(int(rest[failure.row]), failure.rule, failure.reason) for failure in slow.failures
+            )
+        return _merge(parts, failures)
+
+    def _by_order(self, batch: RawBatch) -> list[tuple[str, Int64s]]:
+        """Return the positions of the messages of each byte order, without those of none."""
+        if self._layout.encoding is Encoding.ROS1:
+            return [("<", np.arange(len(batch)))] if len(batch) else []
+        rows = np.flatnonzero(batch.lengths >= _HEADER)
+        first, second = batch.data[batch.starts[rows]], batch.data[batch.starts[rows] + 1]
+        groups = [(order, rows[(first == 0) & (second == kind)]) for order, kind in _ORDERS.items()]
+        return [(order, members) for order, members in groups if len(members)]
+
+    def _decode(self, frame: Frame) -> tuple[Int64s, pa.StructArray]:
+        """Return the rows that could be decoded here, ascending positions in the frame, and their values."""
+        located = locate(self._layout, frame)
+        rows, unreadable = build_columns(self._layout, self.shape, frame, located)
+        if len(unreadable):
+            located = located.take(np.delete(np.arange(len(located.rows)), unreadable))
+            rows, _ = build_columns(self._layout, self.shape, frame, located)
+        return located.rows, rows
+
+
+def _frame(batch: RawBatch, rows: Int64s, order: str, encoding: Encoding) -> Frame:
+    starts = batch.starts[rows]
+    origins = starts + _HEADER if encoding is Encoding.CDR else starts
+    return Frame(np.ascontiguousarray(batch.data), order, origins, starts + batch.lengths[rows])
+
+
+def _take(batch: RawBatch, rows: Int64s) -> RawBatch:
+    return RawBatch(
+        channel=batch.channel,
+        log_times=batch.log_times[rows],
+        data=batch.data,
+        starts=batch.starts[rows],
+        lengths=batch.lengths[rows],
+        offsets=batch.offsets[rows],
+    )
+
+
+def _merge(parts: list[tuple[Int64s, pa.StructArray]], failures: tuple[RowFailure, ...]) -> Decoded:
+    filled = [part for part in parts if len(part[0])] or parts[:1]
+    if len(filled) == 1:
+        return Decoded(filled[0][1], filled[0][0], failures)
+    index = np.concatenate([rows for rows, _ in filled])
+    order = np.argsort(index)
+    rows = pa.concat_arrays([values for _, values in filled]).take(pa.array(order))
+    return Decoded(rows, index[order], failures)

@@ -1,0 +1,41 @@
+"""This file chooses how the messages of a batch are walked."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mosaico_ingest.decode.clustered import locate_clustered
+from mosaico_ingest.decode.layout import Block, Layout
+from mosaico_ingest.decode.lockstep import FEW, locate_lockstep
+from mosaico_ingest.decode.places import Frame, Located, join
+from mosaico_ingest.decode.stepwise import locate_stepwise
+
+__all__ = ["locate"]
+
+
+def locate(layout: Layout, frame: Frame) -> Located:
+    """Find where everything lies in the messages that fit the layout."""
+    if all(isinstance(step, Block) for step in layout.body.steps):
+        return locate_lockstep(layout, frame)  # nothing in a message depends on its bytes
+    if len(frame) <= FEW:
+        return locate_stepwise(layout, frame)
+    parts = locate_clustered(layout, frame)
+    left = np.ones(len(frame), bool)
+    for part in parts:
+        left[part.rows] = False
+    rest = np.flatnonzero(left)
+    if len(rest):
+        walk = locate_stepwise if len(rest) <= FEW else locate_lockstep
+        found = walk(layout, frame.take(rest))
+        parts.append(Located(rest[found.rows], found.places))
+    return _merge(parts)
+
+
+def _merge(parts: list[Located]) -> Located:
+    if len(parts) == 1:
+        return parts[0]
+    rows = np.concatenate([part.rows for part in parts])
+    order = np.argsort(rows)
+    slots = np.empty(len(rows), np.int64)
+    slots[order] = np.arange(len(rows))
+    return Located(rows[order], join([part.places for part in parts], slots))
