@@ -12,12 +12,10 @@ from pathlib import Path
 
 from mosaico_ingest.errors import ManifestError, NothingMatched
 from mosaico_ingest.manifest.load import LoadedManifest
+from mosaico_ingest.manifest.placeholders import PLACEHOLDERS, Placeholder, placeholders_in
 
-__all__ = ["PLACEHOLDERS", "Recording", "find_recordings", "sequence_name"]
+__all__ = ["Recording", "find_recordings", "sequence_name"]
 
-PLACEHOLDERS = ("stem", "name", "parent", "date", "index")
-
-_PLACEHOLDER = re.compile(r"\{([^{}]*)\}")
 _RECORDING = re.compile(r"\.(bag|db3|mcap)(\.(zstd|zst|lz4|gz|bz2))?$", re.IGNORECASE)
 _REFUSED = re.compile(r"[^A-Za-z0-9_-]+")
 
@@ -57,29 +55,27 @@ def sequence_name(loaded: LoadedManifest, recording: Recording) -> str:
         ManifestError: There is no such placeholder.
     """
     template = loaded.manifest.sequence.name
-
-    def fill(match: re.Match[str]) -> str:
-        placeholder, _, width = match[1].partition(":")
-        if placeholder not in PLACEHOLDERS or (width and not (placeholder == "index" and width.isdigit())):
+    for placeholder in reversed(list(placeholders_in(template))):
+        if not placeholder.known:
             raise ManifestError(
-                f"unknown placeholder {match[0]} in sequence.name",
+                f"unknown placeholder {template[placeholder.start : placeholder.end]} in sequence.name",
                 where=loaded.where("sequence", "name"),
                 hint=f"the placeholders are {', '.join(f'{{{name}}}' for name in PLACEHOLDERS)}, and {{index:03}}",
             )
-        return _fill(placeholder, width, recording)
+        filled = _fill(placeholder, recording)
+        template = template[: placeholder.start] + filled + template[placeholder.end :]
+    return template
 
-    return _PLACEHOLDER.sub(fill, template)
 
-
-def _fill(placeholder: str, width: str, recording: Recording) -> str:
+def _fill(placeholder: Placeholder, recording: Recording) -> str:
     main = recording.main
-    if placeholder == "index":
-        return f"{recording.index:{width}}"
-    if placeholder == "date":
+    if placeholder.name == "index":
+        return f"{recording.index:{placeholder.width}}"
+    if placeholder.name == "date":
         changed = datetime.fromtimestamp(main.stat().st_mtime, tz=timezone.utc)
         return f"{changed:%Y-%m-%d}"
     texts = {"stem": _RECORDING.sub("", main.name), "name": main.name, "parent": main.resolve().parent.name}
-    return _REFUSED.sub("_", texts[placeholder]).strip("_")
+    return _REFUSED.sub("_", texts[placeholder.name]).strip("_")
 
 
 def _matches(loaded: LoadedManifest, pattern: str, place: tuple[str | int, ...]) -> list[Path]:
