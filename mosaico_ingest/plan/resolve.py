@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from difflib import get_close_matches
 
-from mosaico_ingest.bag.definition import Resolver
 from mosaico_ingest.bag.recording import Recording
+from mosaico_ingest.bag.types import TypeResolver
 from mosaico_ingest.bridge import ROSBridge
 from mosaico_ingest.config import ROSInjectionConfig, TimeBound, TimeRange
 from mosaico_ingest.diagnostics import Finding, Severity
@@ -19,7 +19,7 @@ __all__ = ["resolve"]
 
 
 def resolve(
-    config: ROSInjectionConfig, recording: Recording, *, bridge: ROSBridge, resolver: Resolver
+    config: ROSInjectionConfig, recording: Recording, *, bridge: ROSBridge, resolver: TypeResolver
 ) -> Plan:
     """Decide what becomes of each topic of the recording.
 
@@ -29,7 +29,7 @@ def resolve(
     """
     topics = tuple(dict.fromkeys(channel.topic for channel in recording.channels))
     selection = select(config.topics or (), topics)
-    findings = [*recording.findings, *_findings(config, selection, topics)]
+    findings = [*recording.findings, *resolver.findings, *_findings(config, selection, topics)]
     taken: list[TopicPlan] = []
     left: list[LeftOut] = []
     for channel in recording.channels:

@@ -1,0 +1,156 @@
+"""Each folder here is a case: a job, the messages of its recording, and what must come of it; on every container.
+
+`messages.yaml` lists `{t: seconds, topic, type, data}`; fields left out of `data` are zero. `raw: "hex"` is a payload
+as it stands. `expected.yaml` has the exit code, part of the error, and for each topic counts and rows; a row names the
+fields that matter. `containers` in `expected.yaml` narrows the list of containers.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Ros2Writer
+from rosbags.typesys import Stores, get_typestore
+
+from mosaico_ingest import api
+from mosaico_ingest.bag.batch import Encoding
+from mosaico_ingest.bag.definition import Container, Definition, Field
+from mosaico_ingest.bag.serialize import Serializer
+from mosaico_ingest.bag.types import TypeResolver
+from mosaico_ingest.errors import IngestError
+from mosaico_ingest.report.model import Report, TopicReport
+from mosaico_ingest.store import Store
+
+CASES = sorted(path.parent for path in Path(__file__).parent.glob("*/job.yaml"))
+CONTAINERS = {"recording.mcap": 2, "recording.db3": 2, "recording.bag": 1}
+START_S = 1_700_000_000
+
+
+def default(field: Field, definition: Definition, given: Any) -> Any:
+    """Return `given`, or zero, with every field of nested messages."""
+    if field.container is Container.SCALAR:
+        if field.is_message:
+            return complete(field.type, definition, given or {})
+        zero: Any = "" if "string" in field.type else False if field.type == "bool" else 0
+        return zero if given is None else given
+    count = field.size if field.container is Container.ARRAY else 0
+    values = [None] * count if given is None else given
+    if isinstance(values, str):
+        return bytes.fromhex(values)
+    one = Field(field.name, field.type, field.is_message)
+    filled = [default(one, definition, value) for value in values]
+    return bytes(filled) if field.type in {"uint8", "byte", "char"} and not count else filled
+
+
+def complete(msgtype: str, definition: Definition, given: dict[str, Any]) -> dict[str, Any]:
+    if msgtype in {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration", "time", "duration"}:
+        return {"sec": 0, "nanosec": 0, **given}
+    fields = definition.types[msgtype].fields
+    assert not given.keys() - {field.name for field in fields}, f"{msgtype} has no such field"
+    return {field.name: default(field, definition, given.get(field.name)) for field in fields}
+
+
+def write_recording(path: Path, messages: list[dict[str, Any]]) -> Path:
+    """Write the messages of a case; a directory for ROS 2 is unpacked to its one file."""
+    version = CONTAINERS[path.name]
+    distro = Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE
+    store = get_typestore(distro)
+    resolver = TypeResolver(distro.value)
+    folder = path.with_suffix("")
+    plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
+    writer = Ros1Writer(path) if version == 1 else Ros2Writer(folder, version=9, storage_plugin=plugin)
+    with writer:
+        connections = {}
+        for message in messages:
+            key = (message["topic"], message["type"])
+            if key not in connections:
+                connections[key] = writer.add_connection(*key, typestore=store)
+            at = int((START_S + message["t"]) * 1_000_000_000)
+            writer.write(connections[key], at, payload(message, resolver, version))
+    if version == 1:
+        return path
+    return next(folder.glob(f"*{path.suffix}")).rename(path)
+
+
+def payload(message: dict[str, Any], resolver: TypeResolver, version: int) -> bytes:
+    if "raw" in message:
+        return bytes.fromhex(message["raw"])
+    definition = resolver.resolve(message["type"], None, ros_version=version)
+    encoding = Encoding.ROS1 if version == 1 else Encoding.CDR
+    values = complete(definition.root, definition, message.get("data", {}))
+    return Serializer(definition, encoding).from_dict(values)
+
+
+def matches(found: Any, wanted: Any) -> bool:
+    """Whether `found` has everything `wanted` names."""
+    if isinstance(wanted, dict):
+        return isinstance(found, dict) and all(matches(found.get(key), value) for key, value in wanted.items())
+    if isinstance(wanted, list):
+        return len(found) == len(wanted) and all(map(matches, found, wanted))
+    if isinstance(wanted, float):
+        return isinstance(found, float) and math.isclose(found, wanted, rel_tol=1e-6)
+    return found == wanted
+
+
+def run(folder: Path) -> tuple[Report | None, int, str]:
+    try:
+        report = api.run(api.compile_job(folder / "job.yaml"))
+    except IngestError as error:
+        return None, error.exit_code, str(error)
+    recording = report.recordings[0]
+    return recording, report.exit_code, recording.error or ""
+
+
+def check_topic(topic: TopicReport, wanted: dict[str, Any], store: Store, sequence: str) -> None:
+    rows = wanted.pop("rows", None)
+    rules = wanted.pop("rules", None)
+    for name, value in wanted.items():
+        assert getattr(topic, name) == value, f"{topic.target}: {name}"
+    if rules is not None:
+        assert {rejection.rule: rejection.count for rejection in topic.rejections} == rules
+    if rows is not None:
+        found = store.scan(sequence, topic.target).read_all().to_pylist()
+        assert len(found) == len(rows)
+        for one, expected in zip(found, rows, strict=True):
+            assert matches(one, expected), one
+
+
+def cases() -> list[Any]:
+    params = []
+    for case in CASES:
+        expected = yaml.safe_load((case / "expected.yaml").read_text())
+        for container in expected.get("containers", CONTAINERS):
+            params.append(pytest.param(case, container, id=f"{case.name}-{Path(container).suffix[1:]}"))
+    return params
+
+
+@pytest.mark.parametrize(("case", "container"), cases())
+def test_case(case: Path, container: str, tmp_path: Path) -> None:
+    expected = yaml.safe_load((case / "expected.yaml").read_text())
+    messages = yaml.safe_load((case / "messages.yaml").read_text())
+    write_recording(tmp_path / container, messages)
+    for extra in case.iterdir():
+        if extra.name not in {"messages.yaml", "expected.yaml"}:
+            text = extra.read_text().replace("RECORDING", container)
+            (tmp_path / extra.name).write_text(text)
+
+    report, exit_code, error = run(tmp_path)
+
+    assert expected.get("error", "") in error
+    assert exit_code == expected["exit_code"], error
+    if report is None:
+        return
+    store = Store.open(tmp_path / "store")
+    topics = {topic.target: topic for topic in report.topics}
+    for name, wanted in expected.get("topics", {}).items():
+        check_topic(topics[name], dict(wanted), store, report.sequence)
+    for topic in report.topics:
+        assert topic.read == topic.written + topic.filtered + topic.downsampled + topic.rejected
+    stored = {info.name for info in store.sequences()}
+    assert (report.sequence in stored) == expected.get("stored", True)
