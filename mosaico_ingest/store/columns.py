@@ -16,6 +16,7 @@ _LEVEL = 1
 _SAMPLE_BYTES = 1 << 18
 _SAMPLES = 16
 _PIECE_BYTES = _SAMPLE_BYTES // _SAMPLES
+_TOO_LITTLE = 1 << 12
 _WORTH_IT = 0.9
 
 
@@ -107,7 +108,7 @@ def _splits(kind: pa.DataType) -> bool:
 
 def _shrinks(leaf: Leaf, rows: pa.Table) -> bool:
     sample = b"".join(_samples(leaf, rows))
-    if len(sample) < _SAMPLE_BYTES // 8:
+    if len(sample) < _TOO_LITTLE:
         return True
     packed = pa.Codec("zstd", compression_level=_LEVEL).compress(sample)
     return len(packed) < _WORTH_IT * len(sample)

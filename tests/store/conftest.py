@@ -1,0 +1,46 @@
+"""A store to write to, and rows that are quick to make."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.sink import topic_schema
+from mosaico_ingest.store import Store, StoreSink
+
+SAMPLE = OntologyType("Sample", pa.struct([pa.field("value", pa.float64()), pa.field("source", pa.int32())]))
+
+Rows = Callable[..., pa.RecordBatch]
+
+
+def make_rows(times: Sequence[int], source: int = 0) -> pa.RecordBatch:
+    stamps = np.asarray(times, dtype=np.int64)
+    columns = [pa.array(stamps), pa.array(stamps / 2), pa.array(np.full(len(stamps), source, np.int32))]
+    return pa.RecordBatch.from_arrays(columns, schema=topic_schema(SAMPLE))
+
+
+@pytest.fixture(scope="session")
+def rows() -> Rows:
+    """Make rows of `sample` from their time stamps."""
+    return make_rows
+
+
+@pytest.fixture(scope="session")
+def sample() -> OntologyType:
+    """The type of those rows."""
+    return SAMPLE
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store.open(tmp_path / "mosaico")
+
+
+@pytest.fixture
+def sink(store: Store) -> StoreSink:
+    return StoreSink(store)

@@ -1,0 +1,108 @@
+from __future__ import annotations
+
+import json
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.sink import topic_schema
+from mosaico_ingest.store import Store, StoreSink
+from mosaico_ingest.store.segment import SegmentWriter
+
+ROWS = 400
+NOISE = np.random.default_rng(7).bytes(3000 * ROWS)
+
+
+BLOBS = {
+    "packed": [NOISE[i : i + 3000] for i in range(0, 3000 * ROWS, 3000)],
+    "loose": [bytes(3000)] * ROWS,
+}
+
+
+def written(path: Path, name: str, values: pa.Array) -> pq.ColumnChunkMetaData:
+    times = pa.array(np.arange(len(values)))
+    schema = topic_schema(OntologyType("T", pa.struct([pa.field(name, values.type)])))
+    table = pa.table([times, values], schema=schema)
+    writer = SegmentWriter(path / "s.parquet", schema, table)
+    writer.append(table)
+    writer.close()
+    assert pq.read_table(path / "s.parquet").equals(table)
+    return pq.read_metadata(path / "s.parquet").row_group(0).column(1)
+
+
+@pytest.mark.parametrize(("kind", "codec"), [("packed", "UNCOMPRESSED"), ("loose", "ZSTD")])
+@pytest.mark.parametrize("shape", ["binary", "large binary", "bytes in a list", "binary in a struct"])
+def test_blobs_are_compressed_only_where_they_shrink(
+    tmp_path: Path, shape: str, kind: str, codec: str
+) -> None:
+    blobs = BLOBS[kind]
+    values = {
+        "binary": lambda: pa.array(blobs),
+        "large binary": lambda: pa.array(blobs, pa.large_binary()),
+        "bytes in a list": lambda: pa.array([list(each) for each in blobs], pa.list_(pa.uint8())),
+        "binary in a struct": lambda: pa.array([{"a": each} for each in blobs]),
+    }[shape]()
+    chunk = written(tmp_path, "data", values)
+    assert chunk.compression == codec
+    assert chunk.statistics is None or not chunk.statistics.has_min_max
+
+
+def test_floats_are_split_and_text_gets_a_dictionary(tmp_path: Path) -> None:
+    floats = written(tmp_path, "x", pa.array(np.arange(ROWS) / 3))
+    assert floats.compression == "ZSTD"
+    assert "BYTE_STREAM_SPLIT" in floats.encodings
+    assert not floats.has_dictionary_page
+    assert written(tmp_path, "s", pa.array(["base_link"] * ROWS)).has_dictionary_page
+    assert not written(tmp_path, "i", pa.array(np.arange(ROWS))).has_dictionary_page
+
+
+def test_an_all_null_column_and_a_name_with_a_dot_are_written(tmp_path: Path) -> None:
+    written(tmp_path, "data", pa.array([None] * ROWS, pa.binary()))
+    written(tmp_path, "da.ta", pa.array([b"x" * 4000] * ROWS))
+
+
+def test_the_catalog_knows_the_bounds_of_every_column_that_has_some(store: Store, sink: StoreSink) -> None:
+    pose = pa.struct([pa.field("x", pa.float64()), pa.field("tags", pa.list_(pa.string()))])
+    kind = OntologyType(
+        "T",
+        pa.struct(
+            [
+                pa.field("pose", pose),
+                pa.field("big", pa.uint64()),
+                pa.field("ok", pa.bool_()),
+                pa.field("raw", pa.binary()),
+            ]
+        ),
+    )
+    rows = [
+        {
+            "timestamp_ns": 3,
+            "pose": {"x": -0.5, "tags": ["b", "a"]},
+            "big": 2**64 - 1,
+            "ok": True,
+            "raw": b"a",
+        },
+        {"timestamp_ns": 4, "pose": {"x": float("nan"), "tags": []}, "big": 0, "ok": False, "raw": b"b"},
+        {
+            "timestamp_ns": 5,
+            "pose": {"x": float("inf"), "tags": ["c" * 300]},
+            "big": 0,
+            "ok": False,
+            "raw": None,
+        },
+    ]
+    with sink.open("s", {}) as session:
+        topic = session.topic("/t", kind, {})
+        topic.write(pa.RecordBatch.from_pylist(rows, topic.schema))
+    with sqlite3.connect(store.layout.catalog) as db:
+        found = {
+            path: (low, high) for path, low, high in db.execute("SELECT column_path, low, high FROM bounds")
+        }
+    db.close()
+    assert found == {"timestamp_ns": (3, 5), "pose.x": (-0.5, float("inf")), "ok": (0, 1)}
+    assert json.dumps(list(found)) == '["ok", "pose.x", "timestamp_ns"]'
