@@ -1,4 +1,4 @@
-"""This file spells the platform's Flight actions, bodies and metadata keys once, for client and server."""
+"""This file is the platform's rules for names of sequences and topics, and for metadata keys."""
 
 from __future__ import annotations
 

@@ -1,0 +1,87 @@
+"""This file is what can go wrong on a server, and how Flight carries it across in both directions.
+
+Flight for Python has no exception for two of the platform's statuses; the text then begins with their name.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import pyarrow as pa
+import pyarrow.flight as fl
+
+__all__ = ["Condition", "as_flight_error", "condition_of", "text_of"]
+
+
+class Condition(str, Enum):
+    """The platform's statuses."""
+
+    EXISTS = "ALREADY_EXISTS"
+    NOT_FOUND = "NOT_FOUND"
+    INVALID = "INVALID_ARGUMENT"
+    UNAUTHENTICATED = "UNAUTHENTICATED"
+    PERMISSION = "PERMISSION_DENIED"
+    PRECONDITION = "FAILED_PRECONDITION"
+    UNAVAILABLE = "UNAVAILABLE"
+    TIMED_OUT = "DEADLINE_EXCEEDED"
+    CANCELLED = "CANCELLED"
+    TOO_LARGE = "OUT_OF_RANGE"
+    UNIMPLEMENTED = "UNIMPLEMENTED"
+    INTERNAL = "INTERNAL"
+
+
+_BY_TYPE: tuple[tuple[type[Exception], Condition], ...] = (
+    (fl.FlightUnauthenticatedError, Condition.UNAUTHENTICATED),
+    (fl.FlightUnauthorizedError, Condition.PERMISSION),
+    (fl.FlightUnavailableError, Condition.UNAVAILABLE),
+    (fl.FlightTimedOutError, Condition.TIMED_OUT),
+    (fl.FlightCancelledError, Condition.CANCELLED),
+    (fl.FlightInternalError, Condition.INTERNAL),
+    (pa.ArrowKeyError, Condition.NOT_FOUND),
+    (pa.ArrowNotImplementedError, Condition.UNIMPLEMENTED),
+    (pa.ArrowInvalid, Condition.INVALID),
+)
+_BY_TEXT: tuple[tuple[str, Condition], ...] = (
+    ("already exist", Condition.EXISTS),
+    ("already_exist", Condition.EXISTS),
+    ("failed_precondition", Condition.PRECONDITION),
+    ("failed precondition", Condition.PRECONDITION),
+    ("out_of_range", Condition.TOO_LARGE),
+    ("message length too large", Condition.TOO_LARGE),
+    ("larger than max", Condition.TOO_LARGE),
+    ("resource_exhausted", Condition.TOO_LARGE),
+    ("unauthenticated", Condition.UNAUTHENTICATED),
+    ("permission denied", Condition.PERMISSION),
+    ("permission_denied", Condition.PERMISSION),
+    ("socket closed", Condition.UNAVAILABLE),
+    ("connection reset", Condition.UNAVAILABLE),
+    ("unimplemented", Condition.UNIMPLEMENTED),
+    ("unknown action", Condition.UNIMPLEMENTED),
+    ("not found", Condition.NOT_FOUND),
+)
+_SPECIFIC = frozenset({fl.FlightUnauthenticatedError, fl.FlightUnauthorizedError, fl.FlightUnavailableError})
+
+
+def condition_of(error: BaseException) -> Condition:
+    """Return what went wrong; where Flight's type is too coarse, the text decides."""
+    found = next((condition for kind, condition in _BY_TYPE if isinstance(error, kind)), Condition.INTERNAL)
+    if type(error) in _SPECIFIC:
+        return found
+    text = text_of(error).lower()
+    return next((condition for words, condition in _BY_TEXT if words in text), found)
+
+
+def text_of(error: BaseException) -> str:
+    """Return what the server said, in one line and without what Flight and gRPC add."""
+    text = str(error).strip().strip("'")
+    for end in (". Detail: ", ". gRPC client debug context", " Client context:", "\n"):
+        text = text.partition(end)[0]
+    return text.rpartition(", with message: ")[2].strip() or type(error).__name__
+
+
+def as_flight_error(condition: Condition, text: str) -> Exception:
+    """Return the exception a server raises so that clients see `condition`."""
+    kind = next((kind for kind, known in _BY_TYPE if known is condition), None)
+    if kind is not None:
+        return kind(text)
+    return fl.FlightServerError(f"{condition.value}: {text}")
