@@ -1,1 +1,73 @@
 """Declarative ingestion of ROS recordings into typed, queryable Mosaico sequences."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from mosaico_ingest.version import __version__
+
+if TYPE_CHECKING:
+    from mosaico_ingest.adapters import ROSAdapterBase, register_default_adapter
+    from mosaico_ingest.api import RosbagInjector
+    from mosaico_ingest.bag.loader import ROSLoader
+    from mosaico_ingest.bag.message import ROSMessage
+    from mosaico_ingest.bag.registry import ROSTypeRegistry
+    from mosaico_ingest.bridge import ROSBridge
+    from mosaico_ingest.config import ROSInjectionConfig
+    from mosaico_ingest.ontology import Message, Serializable
+    from mosaico_ingest.policies import (
+        IfExists,
+        LoaderErrorPolicy,
+        SessionLevelErrorPolicy,
+        Stores,
+        TopicLevelErrorPolicy,
+    )
+
+__all__ = [
+    "IfExists",
+    "LoaderErrorPolicy",
+    "Message",
+    "ROSAdapterBase",
+    "ROSBridge",
+    "ROSInjectionConfig",
+    "ROSLoader",
+    "ROSMessage",
+    "ROSTypeRegistry",
+    "RosbagInjector",
+    "Serializable",
+    "SessionLevelErrorPolicy",
+    "Stores",
+    "TopicLevelErrorPolicy",
+    "__version__",
+    "register_default_adapter",
+]
+
+_WHERE = {
+    "IfExists": "policies",
+    "LoaderErrorPolicy": "policies",
+    "Message": "ontology",
+    "ROSAdapterBase": "adapters",
+    "ROSBridge": "bridge",
+    "ROSInjectionConfig": "config",
+    "ROSLoader": "bag.loader",
+    "ROSMessage": "bag.message",
+    "ROSTypeRegistry": "bag.registry",
+    "RosbagInjector": "api",
+    "Serializable": "ontology",
+    "SessionLevelErrorPolicy": "policies",
+    "Stores": "policies",
+    "TopicLevelErrorPolicy": "policies",
+    "register_default_adapter": "adapters",
+}
+"""A name is imported when it is asked for, so that `ingest --help` does not wait for Arrow."""
+
+
+def __getattr__(name: str) -> object:
+    if name not in _WHERE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_WHERE[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,26 @@
+"""The package exports what it lists, and importing it is cheap."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import mosaico_ingest
+
+
+def test_every_listed_name_is_there() -> None:
+    for name in mosaico_ingest.__all__:
+        assert getattr(mosaico_ingest, name) is not None
+    assert mosaico_ingest.__all__ == sorted(mosaico_ingest.__all__)
+    assert set(mosaico_ingest._WHERE) == set(mosaico_ingest.__all__) - {"__version__"}
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    assert not hasattr(mosaico_ingest, "Nonsense")
+
+
+def test_help_imports_neither_arrow_nor_rosbags_nor_pydantic() -> None:
+    code = "import sys; import mosaico_ingest.cli.app; print([m for m in HEAVY if m in sys.modules])"
+    heavy = "HEAVY = ('pyarrow', 'rosbags', 'pydantic', 'numpy', 'yaml'); "
+    done = subprocess.run([sys.executable, "-c", heavy + code], capture_output=True, text=True, check=True)  # noqa: S603 - our own code
+    assert done.stdout.strip() == "[]"
