@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import sqlite3
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -32,7 +33,7 @@ def explained(where: Path | str) -> Generator[None, None, None]:
         yield
     except OSError as err:
         code = err.errno or 0
-        what = err.strerror if err.strerror and err.filename else _first_line(err)
+        what = os.strerror(code) if code else _first_line(err)
         raise SinkError(what, where=str(err.filename or where), hint=_HINTS.get(code)) from err
     except pa.ArrowException as err:
         raise SinkError(_first_line(err), where=str(where)) from err

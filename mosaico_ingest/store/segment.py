@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,21 +43,20 @@ class SegmentWriter:
         self.path = path
         self.end_ns = -(1 << 63)
         self._leaves = leaves(schema)
-        self._footers: list[pq.FileMetaData] = []
+        self._file = pa.OSFile(str(path), "wb")
         self._writer = pq.ParquetWriter(
-            path,
+            self._file,
             schema,
             use_compliant_nested_type=False,  # a list item's name is part of the type readers look for
             sorting_columns=[pq.SortingColumn(0)],
             write_batch_size=4096,
-            metadata_collector=self._footers,
             **writer_options(self._leaves, first_rows),
         )
 
     @property
     def written_bytes(self) -> int:
         """How much is in the file by now."""
-        return self.path.stat().st_size
+        return self._file.tell()
 
     def append(self, rows: pa.Table) -> None:
         """Write one row group; the rows are sorted, and none is earlier than what is there."""
@@ -64,20 +64,21 @@ class SegmentWriter:
         self.end_ns = rows.column(0)[-1].as_py()
 
     def close(self) -> Segment:
-        """Finish the file and wait until it is on the disk."""
+        """Finish the file, wait until it is on the disk, and read its footer back."""
         self._writer.close()
+        self._file.close()
         fsync(self.path)
-        (footer,) = self._footers
+        footer = pq.read_metadata(self.path)
         bounds = tuple(_bounds(self._leaves, footer))
         _, start_ns, end_ns = bounds[0]
         return Segment(self.path, footer.num_rows, self.path.stat().st_size, start_ns, end_ns, bounds)
 
     def abandon(self) -> None:
         """Close the file without caring for its content."""
-        try:
+        with suppress(OSError, pa.ArrowException):
             self._writer.close()
-        except (OSError, pa.ArrowException):
-            return
+        with suppress(OSError, pa.ArrowException):
+            self._file.close()
 
 
 def sorted_rows(batches: Iterable[pa.RecordBatch], schema: pa.Schema) -> pa.Table:

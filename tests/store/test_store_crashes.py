@@ -1,0 +1,191 @@
+"""A writer is killed at random moments; what is left is the old state or the new one."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+
+from mosaico_ingest.errors import SequenceExists, SinkError
+from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.policies import IfExists
+from mosaico_ingest.store import Store, StoreSink
+
+WRITER = Path(__file__).with_name("writer_process.py")
+Rows = Callable[..., pa.RecordBatch]
+
+
+@contextmanager
+def writer(
+    store: Store, sequence: str, if_exists: str = "fail", source: int = 1
+) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, str(WRITER), str(store.path), sequence, if_exists, str(source)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:  # noqa: S603 - this interpreter, our own script
+        try:
+            yield process
+        finally:
+            process.kill()
+            process.wait()
+
+
+def sources(store: Store, sequence: str) -> set[int]:
+    """Return who wrote the rows, after a look at whether all of them are there."""
+    info = store.sequence(sequence)
+    assert [topic.name for topic in info.topics] == ["/t0", "/t1", "/t2", "/t3"]
+    found: set[int] = set()
+    for topic in info.topics:
+        table = store.scan(sequence, topic.name).read_all()
+        assert table["timestamp_ns"].to_pylist() == list(range(2000))
+        found |= set(table["source"].to_pylist())
+    return found
+
+
+def assert_tidy(store: Store) -> None:
+    """Nothing is staged, and the files below segments are those of the catalog."""
+    store.collect_garbage(grace_s=0)
+    known = {
+        path
+        for info in store.sequences()
+        for topic in info.topics
+        for path in store.paths(info.name, topic.name)
+    }
+    assert set(store.layout.segment_files()) == known
+    assert store.layout.open_sessions() == []
+
+
+def kill_and_look(store: Store, moments: random.Random, rounds: int) -> None:
+    current = 0
+    with writer(store, "drive", "replace", current) as first:
+        assert first.wait(30) == 0
+    for source in range(1, rounds + 1):
+        with writer(store, "drive", "replace", source) as process:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "ready\n"
+            time.sleep(moments.random() * 0.12)
+            process.kill()
+            process.wait()
+        (survivor,) = sources(store, "drive")
+        assert survivor in {current, source}
+        current = survivor
+    assert_tidy(store)
+    assert sources(store, "drive") == {current}
+
+
+def test_a_killed_writer_leaves_the_old_or_the_new(store: Store) -> None:
+    kill_and_look(store, random.Random(), rounds=3)  # noqa: S311 - any moment will do
+
+
+@pytest.mark.slow
+def test_a_killed_writer_leaves_the_old_or_the_new_200_times(store: Store) -> None:
+    kill_and_look(store, random.Random(), rounds=200)  # noqa: S311 - any moment will do
+
+
+def test_the_name_of_a_killed_writer_is_free_again(store: Store) -> None:
+    with writer(store, "drive") as process:
+        assert process.stdout is not None
+        assert [process.stdout.readline() for _ in range(2)] == ["ready\n", "open\n"]
+    with writer(store, "drive") as second:
+        assert second.wait(30) == 0
+    assert_tidy(store)
+    assert sources(store, "drive") == {1}
+
+
+def test_garbage_collection_spares_the_living(
+    store: Store, sink: StoreSink, rows: Rows, sample: OntologyType
+) -> None:
+    with sink.open("drive", {}) as session:
+        topic = session.topic("/t", sample, {})
+        topic.write(rows([1, 2]))
+        topic.flush()
+        assert store.collect_garbage(grace_s=0).sessions == 0
+    orphan = store.paths("drive", "/t")[0].with_name("01ABC-0000.parquet")
+    orphan.write_bytes(b"left by a crash")
+    (store.layout.staging / "01ABD").mkdir()
+    assert store.collect_garbage().sessions == 0
+    collected = store.collect_garbage(grace_s=0)
+    assert (collected.sessions, collected.files, collected.stored_bytes) == (1, 0, 0)
+    assert store.scan("drive", "/t").read_all().num_rows == 2
+    assert not orphan.exists()
+
+
+def test_two_writers_write_two_sequences_at_once(store: Store) -> None:
+    with writer(store, "a", source=1) as one, writer(store, "b", source=2) as two:
+        assert (one.wait(30), two.wait(30)) == (0, 0)
+    assert (sources(store, "a"), sources(store, "b")) == ({1}, {2})
+
+
+def test_only_one_of_two_writers_gets_the_name(
+    sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
+) -> None:
+    with sink.open("drive", {}) as session:
+        session.topic("/t", sample, {}).write(rows([1]))
+        with pytest.raises(SequenceExists, match="another run"), sink.open("drive", {}):
+            pytest.fail("the second session opened")
+    assert store.sequence("drive").rows == 1
+
+
+def test_two_sessions_append_to_a_new_sequence_at_once(
+    sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
+) -> None:
+    with sink.open("drive", {}, if_exists=IfExists.APPEND) as one:
+        one.topic("/t", sample, {}).write(rows([1]))
+        with sink.open("drive", {}, if_exists=IfExists.APPEND) as two:
+            two.topic("/t", sample, {}).write(rows([0]))
+    assert store.scan("drive", "/t").read_all()["timestamp_ns"].to_pylist() == [0, 1]
+    assert len(store.sequence("drive").sessions) == 2
+
+
+def test_a_replacement_does_not_swallow_a_session_added_meanwhile(
+    sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
+) -> None:
+    with sink.open("drive", {}) as session:
+        session.topic("/t", sample, {}).write(rows([1]))
+    with (
+        pytest.raises(SinkError, match="meanwhile"),
+        sink.open("drive", {}, if_exists=IfExists.REPLACE),
+        sink.open("drive", {}, if_exists=IfExists.APPEND) as other,
+    ):
+        other.topic("/t", sample, {}).write(rows([2]))
+    assert store.sequence("drive").rows == 2
+
+
+def test_a_sequence_deleted_meanwhile_is_not_revived_by_an_append(
+    sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
+) -> None:
+    with sink.open("drive", {}) as session:
+        session.topic("/t", sample, {}).write(rows([1]))
+    with pytest.raises(SinkError, match="meanwhile"), sink.open("drive", {}, if_exists=IfExists.APPEND):
+        store.delete_sequence("drive")
+    assert store.sequences() == ()
+    assert_tidy(store)
+
+
+def test_what_is_deleted_takes_its_files_along(
+    sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
+) -> None:
+    for times in ([1, 2], [3]):
+        with sink.open("drive", {}, if_exists=IfExists.APPEND) as session:
+            session.topic("/a", sample, {}).write(rows(times))
+            session.topic(f"/b/{len(times)}", sample, {}).write(rows(times))
+    _, second = store.sequence("drive").sessions
+    store.delete_session("drive", second.id)
+    assert {topic.name: topic.rows for topic in store.sequence("drive").topics} == {"/a": 2, "/b/2": 2}
+    store.delete_topic("drive", "a")
+    assert [topic.name for topic in store.sequence("drive").topics] == ["/b/2"]
+    assert len(list(store.layout.segment_files())) == 1
+    store.delete_sequence("drive")
+    assert list(store.layout.segments.iterdir()) == []
+    for gone in (
+        lambda: store.delete_sequence("drive"),
+        lambda: store.delete_topic("drive", "a"),
+        lambda: store.delete_session("drive", second.id),
+    ):
+        with pytest.raises(SinkError, match="no sequence 'drive'"):
+            gone()

@@ -1,0 +1,192 @@
+"""What the ground under a store does to it: each costs one line, and leaves nothing half written."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
+from multiprocessing import get_context
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+
+from mosaico_ingest.errors import SinkError, SinkUnavailable
+from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.store import Store, StoreSink
+from mosaico_ingest.store.catalog import FORMAT
+from mosaico_ingest.store.faults import explained
+from mosaico_ingest.store.lease import Lease, is_live
+
+Rows = Callable[..., pa.RecordBatch]
+
+
+def test_a_store_that_is_not_there_is_said_so(tmp_path: Path) -> None:
+    with pytest.raises(SinkError, match="there is no store here"):
+        Store.open(tmp_path / "nowhere", create=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_newer_store_is_left_alone(store: Store) -> None:
+    with closing(sqlite3.connect(store.layout.catalog)) as db:
+        db.execute(f"PRAGMA user_version = {FORMAT + 1}")
+    with pytest.raises(SinkError, match=f"format {FORMAT + 1}.*upgrade"):
+        Store.open(store.path)
+
+
+def test_another_programs_file_is_left_alone(tmp_path: Path) -> None:
+    with closing(sqlite3.connect(tmp_path / "catalog.sqlite")) as db:
+        db.execute("CREATE TABLE theirs (x)")
+    with pytest.raises(SinkError, match="no catalog of a store"):
+        Store.open(tmp_path)
+    (tmp_path / "catalog.sqlite").write_bytes(b"certainly not a database, but long enough to be one" * 20)
+    with pytest.raises(SinkError, match="not a database"):
+        Store.open(tmp_path)
+
+
+def test_a_file_in_the_way_is_said_so(tmp_path: Path) -> None:
+    (tmp_path / "mosaico").write_text("a file")
+    with pytest.raises(SinkError, match="mosaico"):
+        Store.open(tmp_path / "mosaico")
+
+
+def test_a_catalog_left_empty_by_a_crash_is_made_anew(tmp_path: Path) -> None:
+    (tmp_path / "catalog.sqlite").touch()
+    assert Store.open(tmp_path).sequences() == ()
+
+
+def _open(path: Path) -> int:
+    return len(Store.open(path).sequences())
+
+
+@pytest.mark.slow
+def test_many_processes_may_make_the_same_store(tmp_path: Path) -> None:
+    with ProcessPoolExecutor(8, mp_context=get_context("spawn")) as pool:
+        for attempt in range(5):
+            assert list(pool.map(_open, [tmp_path / str(attempt)] * 16)) == [0] * 16
+
+
+def test_a_store_deleted_under_way_fails_the_session(
+    sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
+) -> None:
+    with pytest.raises(SinkError, match=r"mosaico.*No such file"), sink.open("s", {}) as session:
+        session.topic("/t", sample, {}).write(rows([1]))
+        shutil.rmtree(store.path)
+    assert not store.path.exists() or list(store.path.rglob("*.parquet")) == []
+
+
+def test_a_catalog_deleted_under_way_fails_the_session(
+    sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
+) -> None:
+    with pytest.raises(SinkError, match=r"catalog"), sink.open("s", {}) as session:
+        session.topic("/t", sample, {}).write(rows([1]))
+        store.layout.catalog.unlink()
+    assert list(store.layout.segment_files()) == []
+
+
+def test_a_segment_deleted_under_way_is_said_so(
+    sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
+) -> None:
+    with sink.open("s", {}) as session:
+        session.topic("/t", sample, {}).write(rows([1]))
+    reader = store.scan("s", "/t")
+    store.paths("s", "/t")[0].unlink()
+    with pytest.raises(SinkError, match=r"\.parquet"):
+        reader.read_all()
+    with pytest.raises(SinkError, match=r"\.parquet"):
+        session.stored()
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write everywhere")
+def test_a_folder_that_cannot_be_written_is_said_so(store: Store) -> None:
+    store.path.chmod(0o500)
+    try:
+        assert Store.open(store.path, create=False).sequences() == ()
+        with pytest.raises(SinkError, match="written"), StoreSink(store).open("s", {}):
+            pytest.fail("the session opened")
+    finally:
+        store.path.chmod(0o700)
+
+
+@pytest.fixture
+def little_space(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 2 MB."""
+    folder = tmp_path / "small"
+    folder.mkdir()
+    mount, umount = shutil.which("mount"), shutil.which("umount")
+    if mount is None or umount is None or os.geteuid() != 0:
+        pytest.skip("mounting a small file system takes the superuser")
+    command = [mount, "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(folder)]
+    done = subprocess.run(command, check=False, capture_output=True)  # noqa: S603 - fixed arguments
+    if done.returncode:
+        pytest.skip("no small file system can be mounted here")
+    yield folder
+    subprocess.run([umount, folder], check=True)  # noqa: S603 - fixed arguments
+
+
+def test_a_full_disk_fails_the_session_and_leaves_nothing(
+    little_space: Path, sample: OntologyType, rows: Rows
+) -> None:
+    store = Store.open(little_space / "mosaico")
+    noise = OntologyType("Noise", pa.struct([pa.field("raw", pa.binary())]))
+    with (
+        pytest.raises(SinkError, match=r"No space left.*free some space"),
+        StoreSink(store).open("s", {}) as session,
+    ):
+        topic = session.topic("/t", noise, {})
+        blobs = pa.array([os.urandom(4_000_000)])
+        topic.write(pa.RecordBatch.from_arrays([pa.array([1]), blobs], schema=topic.schema))
+    assert store.sequences() == ()
+    assert list(store.path.rglob("*.parquet")) == []
+    with StoreSink(store).open("s", {}) as session:
+        session.topic("/t", sample, {}).write(rows([1]))
+    assert store.sequence("s").rows == 1
+
+
+FULL = """
+import signal, resource, sys
+from mosaico_ingest.errors import SinkError
+sys.path.insert(0, sys.argv[2])
+from writer_process import main
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+from mosaico_ingest.store import Store
+Store.open(sys.argv[1])
+resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))
+try:
+    main(sys.argv[1], "s", "fail", 1)
+except SinkError as err:
+    print(str(err).count("\\n"), err)
+"""
+
+
+def test_a_file_that_may_not_grow_fails_the_session(store: Store) -> None:
+    done = subprocess.run(  # noqa: S603 - this interpreter, our own script
+        [sys.executable, "-c", FULL, str(store.path), str(Path(__file__).parent)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    last = done.stdout.splitlines()[-1]
+    assert last.startswith("0 ")
+    assert "done" not in done.stdout
+    assert store.sequences() == ()
+    assert list(store.path.rglob("*.parquet")) == []
+
+
+def test_a_busy_catalog_may_be_tried_again() -> None:
+    with pytest.raises(SinkUnavailable, match="busy"), explained("store"):
+        raise sqlite3.OperationalError("database is locked")
+
+
+def test_a_lease_is_live_until_it_is_released(tmp_path: Path) -> None:
+    path = tmp_path / "lock"
+    assert not is_live(path)
+    lease = Lease(path)
+    assert is_live(path)
+    lease.release()
+    assert not is_live(path)
