@@ -14,10 +14,12 @@ from mosaico_ingest.decode.locate import locate
 from mosaico_ingest.decode.places import Frame, Int64s
 from mosaico_ingest.decode.rowwise import RowwiseDecoder
 from mosaico_ingest.diagnostics import RowFailure
+from mosaico_ingest.errors import DecodeError
 
 __all__ = ["ColumnarDecoder"]
 
 _HEADER = 4
+_LARGEST = 2**31 - 1
 _ORDERS = {">": 0, "<": 1}
 """The second byte of the encapsulation header of plain CDR."""
 
@@ -39,7 +41,18 @@ class ColumnarDecoder:
         return self._rowwise.shape
 
     def decode(self, batch: RawBatch) -> Decoded:
-        """Decode all messages of the batch."""
+        """Decode all messages of the batch.
+
+        Raises:
+            DecodeError: The batch is larger than the 2 GiB a column can hold.
+        """
+        if int(batch.lengths.sum()) > _LARGEST:
+            raise DecodeError(
+                f"a batch of {int(batch.lengths.sum())} bytes, columns hold {_LARGEST}",
+                rule="batch-size",
+                where=batch.channel.topic,
+                hint="read smaller batches",
+            )
         left = np.ones(len(batch), bool)
         parts: list[tuple[Int64s, pa.StructArray]] = []
         for order, rows in self._by_order(batch):
@@ -68,9 +81,9 @@ class ColumnarDecoder:
     def _decode(self, frame: Frame) -> tuple[Int64s, pa.StructArray]:
         """Return the rows that could be decoded here, ascending positions in the frame, and their values."""
         located = locate(self._layout, frame)
-        rows, unreadable = build_columns(self._layout, self.shape, frame, located)
-        if len(unreadable):
-            located = located.take(np.delete(np.arange(len(located.rows)), unreadable))
+        rows, unread = build_columns(self._layout, self.shape, frame, located)
+        if len(unread):
+            located = located.take(np.delete(np.arange(len(located.rows)), unread))
             rows, _ = build_columns(self._layout, self.shape, frame, located)
         return located.rows, rows
 
@@ -98,5 +111,5 @@ def _merge(parts: list[tuple[Int64s, pa.StructArray]], failures: tuple[RowFailur
         return Decoded(filled[0][1], filled[0][0], failures)
     index = np.concatenate([rows for rows, _ in filled])
     order = np.argsort(index)
-    rows = pa.concat_arrays([values for _, values in filled]).take(pa.array(order))
+    rows = pa.concat_arrays([values for _, values in filled]).take(order)
     return Decoded(rows, index[order], failures)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from mosaico_ingest.decode.arrow import NUMBERS
-from mosaico_ingest.decode.gather import cells, spans
+from mosaico_ingest.decode.gather import Array, array_of, cells, offsets_of, spans
 from mosaico_ingest.decode.layout import (
     Block,
     Column,
@@ -23,177 +25,125 @@ from mosaico_ingest.decode.layout import (
     Words,
 )
 from mosaico_ingest.decode.places import Frame, Int64s, Located, Place, Places, expand
+from mosaico_ingest.decode.texts import owners_of, utf8_texts, wide_texts
 
 __all__ = ["build_columns"]
-
-_ASCII_END = 0x80
-_SURROGATES = (0xD800, 0xE000)
-_UNICODE_END = 0x110000
 
 
 def build_columns(
     layout: Layout, shape: pa.StructType, frame: Frame, located: Located
 ) -> tuple[pa.StructArray, Int64s]:
-    """Return one row a located message, and the positions of the rows whose texts are not Unicode."""
+    """Return one row a located message, and the positions of those whose texts could not be read here."""
     builder = _Builder(frame)
-    root = _Instances(layout.body.steps, located.places, len(located.rows), ())
+    root = _Instances(layout.body.steps, located.places, len(located.rows))
     rows = builder.column(layout.record, shape, root, root.count)
-    return rows, np.unique(np.concatenate([np.zeros(0, np.int64), *builder.unreadable]))
+    # A record of a struct's type is an array of structs, which the stubs cannot know.
+    return cast("pa.StructArray", rows), builder.unread
 
 
 class _Instances:
     """The m instances of a body whose columns are built; `owners` leads back to the messages they belong to."""
 
-    __slots__ = ("_cells", "count", "owners", "places", "steps")
+    __slots__ = ("blocks", "count", "owners", "places", "steps")
 
     def __init__(
-        self,
-        steps: tuple[Step, ...],
-        places: Places,
-        count: int,
-        owners: tuple[Int64s, ...],
-        cell: NDArray[np.uint8] | None = None,
+        self, steps: tuple[Step, ...], places: Places, count: int, owners: tuple[Int64s, ...] = ()
     ) -> None:
         self.steps = steps
         self.places = places
         self.count = count
         self.owners = owners
-        self._cells = {} if cell is None else {0: cell}
-
-    def block(self, data: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
-        """Return the bytes of a block, shape (m, size), gathered once for all columns in it."""
-        if step not in self._cells:
-            block = self.steps[step]
-            size = block.size if isinstance(block, Block) else 0
-            self._cells[step] = cells(data, self.places[step].at, size)
-        return self._cells[step]
+        self.blocks: dict[int, NDArray[np.uint8]] = {}
+        """The bytes of blocks, shape (m, size): gathered once for all columns that lie in one."""
 
     def messages(self, which: Int64s) -> Int64s:
         """Return the position of the message each of some instances belongs to."""
         for counts in reversed(self.owners):
-            which = _owner(counts, which)
+            which = owners_of(counts, which)
         return which
 
 
 class _Builder:
-    __slots__ = ("_data", "_order", "unreadable")
+    """Builds the columns of one frame."""
+
+    __slots__ = ("_data", "_order", "unread")
 
     def __init__(self, frame: Frame) -> None:
         self._data = frame.data
         self._order = frame.order
-        self.unreadable: list[Int64s] = []
+        self.unread = np.zeros(0, np.int64)
 
-    def column(self, column: Column, shape: pa.DataType, inst: _Instances, count: int) -> pa.Array:
+    def column(self, column: Column, kind: pa.DataType, inst: _Instances, count: int) -> Array:
         """Return `count` values: one for each instance, or one for each place in the grids around it."""
         if not count:
-            return pa.array([], shape)
+            return pa.array([], kind)
         match column:
             case Leaf():
-                return self._leaf(column, shape, inst)
+                return self._leaf(column, kind, inst)
             case Words(step=step):
-                return self._text(shape, inst, step)
+                return self._texts(kind, inst, step)
             case Grid(count=size, item=item):
-                values = self.column(item, shape.value_type, inst, count * size)
-                return pa.Array.from_buffers(shape, count, [None], children=[values])
+                values = self.column(item, kind.field(0).type, inst, count * size)
+                return array_of(kind, count, children=[values])
             case Items():
-                return self._items(column, shape, inst)
+                return self._items(column, kind, inst)
             case Record(children=children):
-                kinds = [shape.field(number).type for number in range(shape.num_fields)]
-                arrays = [self.column(*child, inst, count) for child in zip(children, kinds, strict=True)]
-                return pa.Array.from_buffers(shape, count, [None], children=arrays)
+                arrays = [
+                    self.column(child, kind.field(number).type, inst, count)
+                    for number, child in enumerate(children)
+                ]
+                return array_of(kind, count, children=arrays)
 
-    def _leaf(self, leaf: Leaf, shape: pa.DataType, inst: _Instances) -> pa.Array:
-        block = inst.block(self._data, leaf.step)
+    def _leaf(self, leaf: Leaf, kind: pa.DataType, inst: _Instances) -> Array:
+        block = self._block(inst, leaf.step)
         counts, strides = zip(*leaf.dims, strict=True) if leaf.dims else ((), ())
-        kind = np.dtype(f"{self._order}{'u1' if leaf.type == 'bool' else NUMBERS[leaf.type]}")
-        view = np.ndarray((len(block), *counts), kind, block, leaf.offset, (block.shape[1], *strides))
+        number = np.dtype(f"{self._order}{'u1' if leaf.type == 'bool' else NUMBERS[leaf.type]}")
+        view = np.ndarray((len(block), *counts), number, block, leaf.offset, (block.shape[1], *strides))
         if leaf.type == "bool":
             return pa.array((view != 0).reshape(-1))
-        values = np.require(view, kind.newbyteorder("="), ["C_CONTIGUOUS", "ALIGNED"])
-        return pa.Array.from_buffers(shape, values.size, [None, pa.py_buffer(values)])
+        values = np.require(view, number.newbyteorder("="), ["C_CONTIGUOUS", "ALIGNED"])
+        return array_of(kind, values.size, values)
 
-    def _items(self, items: Items, shape: pa.DataType, inst: _Instances) -> pa.Array:
+    def _block(self, inst: _Instances, number: int) -> NDArray[np.uint8]:
+        if number not in inst.blocks:
+            step = inst.steps[number]
+            size = step.size if isinstance(step, Block) else 0
+            inst.blocks[number] = cells(self._data, inst.places[number].at, size)
+        return inst.blocks[number]
+
+    def _items(self, items: Items, kind: pa.DataType, inst: _Instances) -> Array:
         step, place = inst.steps[items.step], inst.places[items.step]
-        counts = place.counts
-        if isinstance(step, Loop):
-            inner = _Instances(step.body.steps, place.body, int(counts.sum()), (*inst.owners, counts))
-        else:
-            inner = self._cells(step, place)
-            if pa.types.is_binary(shape):
-                return _ragged(shape, counts, inner.block(self._data, 0))
-        values = self.column(items.item, shape.value_type, inner, inner.count)
-        if pa.types.is_fixed_size_list(shape):
-            return pa.Array.from_buffers(shape, len(counts), [None], children=[values])
-        return pa.Array.from_buffers(
-            shape, len(counts), [None, pa.py_buffer(_offsets(counts))], children=[values]
-        )
+        if isinstance(step, Run) and pa.types.is_binary(kind):
+            data = spans(self._data, place.at, place.counts)
+            return array_of(kind, inst.count, offsets_of(place.counts), data)
+        inner = self._cells(step, place) if isinstance(step, Run) else self._elements(step, place, inst)
+        values = self.column(items.item, kind.field(0).type, inner, inner.count)
+        if pa.types.is_fixed_size_list(kind):
+            return array_of(kind, inst.count, children=[values])
+        return array_of(kind, inst.count, offsets_of(place.counts), children=[values])
 
     def _cells(self, run: Run, place: Place) -> _Instances:
         """Return the cells of a run as instances of a body that is one block."""
         counts, size = place.counts, run.cell.size
         total = int(counts.sum())
-        if size and run.stride == size:
-            cell = spans(self._data, place.at, counts * size).reshape(total, size)
-            return _Instances((run.cell,), (place,), total, (), cell)
-        return _Instances((run.cell,), (Place(expand(place.at, counts, run.stride)),), total, ())
+        if run.stride > size or not size:
+            return _Instances((run.cell,), (Place(expand(place.at, counts, run.stride)),), total)
+        inner = _Instances((run.cell,), (place,), total)
+        inner.blocks[0] = spans(self._data, place.at, counts * size).reshape(total, size)
+        return inner
 
-    def _text(self, shape: pa.DataType, inst: _Instances, step: int) -> pa.Array:
-        place = inst.places[step]
-        sizes, text = place.counts, spans(self._data, place.at, place.counts)
-        unit = inst.steps[step]
-        if isinstance(unit, Text) and unit.unit > 1:
-            return self._wide_text(shape, inst, sizes // unit.unit, text)
-        array = _ragged(shape, sizes, text)
-        if text.max(initial=0) >= _ASCII_END:
-            try:
-                array.validate(full=True)
-            except pa.ArrowInvalid:
-                self.unreadable.append(inst.messages(_not_utf8(array, text)))
-        return array
+    def _elements(self, step: Step, place: Place, inst: _Instances) -> _Instances:
+        steps = step.body.steps if isinstance(step, Loop) else ()
+        return _Instances(steps, place.body, int(place.counts.sum()), (*inst.owners, place.counts))
 
-    def _wide_text(
-        self, shape: pa.DataType, inst: _Instances, counts: Int64s, text: NDArray[np.uint8]
-    ) -> pa.Array:
-        """Return texts whose every unit is a code point; pairs of surrogates are left to the row-wise decoder."""
-        points = text.view(f"{self._order}u4").astype("<u4")
-        wrong = ((points >= _SURROGATES[0]) & (points < _SURROGATES[1])) | (points >= _UNICODE_END)
-        if wrong.any():
-            self.unreadable.append(inst.messages(_owner(counts, np.flatnonzero(wrong))))
-            points[wrong] = 0
-        widths = 1 + (points >= 0x80).astype(np.int32) + (points >= 0x800) + (points >= 0x10000)  # noqa: PLR2004 - UTF-8
-        ends = np.concatenate([[0], np.cumsum(widths)]).astype(np.int32)
-        encoded = points.tobytes().decode("utf-32-le").encode()
-        buffers = [None, pa.py_buffer(ends[_offsets(counts)]), pa.py_buffer(encoded)]
-        return pa.Array.from_buffers(shape, len(counts), buffers)
-
-
-def _offsets(counts: Int64s) -> NDArray[np.int32]:
-    offsets = np.zeros(len(counts) + 1, np.int32)
-    np.cumsum(counts, out=offsets[1:])
-    return offsets
-
-
-def _ragged(shape: pa.DataType, sizes: Int64s, values: NDArray[np.uint8]) -> pa.Array:
-    buffers = [None, pa.py_buffer(_offsets(sizes)), pa.py_buffer(values)]
-    return pa.Array.from_buffers(shape, len(sizes), buffers)
-
-
-def _owner(counts: Int64s, which: Int64s) -> Int64s:
-    """Return whose element each of `which` is, when owner i has the next `counts[i]` of them."""
-    return np.searchsorted(np.cumsum(counts), which, side="right")
-
-
-def _not_utf8(array: pa.Array, text: NDArray[np.uint8]) -> Int64s:
-    """Return the positions of the values that are not UTF-8."""
-    sizes = np.diff(np.frombuffer(array.buffers()[1], np.int32)[: len(array) + 1]).astype(np.int64)
-    suspects = np.unique(_owner(sizes, np.flatnonzero(text >= _ASCII_END)))
-    values = array.cast(pa.binary())
-    return np.array([row for row in suspects.tolist() if not _is_utf8(values[row].as_py())], np.int64)
-
-
-def _is_utf8(value: bytes) -> bool:
-    try:
-        value.decode()
-    except UnicodeDecodeError:
-        return False
-    return True
+    def _texts(self, kind: pa.DataType, inst: _Instances, number: int) -> Array:
+        step, place = inst.steps[number], inst.places[number]
+        unit = step.unit if isinstance(step, Text) else 1
+        data = spans(self._data, place.at, place.counts)
+        if unit == 1:
+            texts, wrong = utf8_texts(kind, place.counts, data)
+        else:
+            texts, wrong = wide_texts(kind, place.counts // unit, data.view(f"{self._order}u{unit}"))
+        if len(wrong):
+            self.unread = np.union1d(self.unread, inst.messages(wrong))
+        return texts

@@ -1,6 +1,9 @@
-"""This file copies bytes from where they lie into one piece, once."""
+"""This file copies bytes from where they lie into one piece, once, and makes Arrow arrays of such pieces."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -8,13 +11,16 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.decode.places import Int64s
 
-__all__ = ["cells", "spans"]
+__all__ = ["Array", "array_of", "cells", "offsets_of", "spans"]
+
+Array: TypeAlias = "pa.Array[Any]"
+Bytes: TypeAlias = NDArray[np.uint8]
 
 _LARGE = 4096
 """Bytes from which on a copy of its own is faster than taking the value among others."""
 
 
-def cells(data: NDArray[np.uint8], at: Int64s, size: int) -> NDArray[np.uint8]:
+def cells(data: Bytes, at: Int64s, size: int) -> Bytes:
     """Return the `size` bytes at each position, shape (len(at), size)."""
     if not len(at) or not size:
         return np.zeros((len(at), size), np.uint8)
@@ -22,7 +28,7 @@ def cells(data: NDArray[np.uint8], at: Int64s, size: int) -> NDArray[np.uint8]:
     return view[at].view(np.uint8).reshape(len(at), size)
 
 
-def spans(data: NDArray[np.uint8], at: Int64s, sizes: Int64s) -> NDArray[np.uint8]:
+def spans(data: Bytes, at: Int64s, sizes: Int64s) -> Bytes:
     """Return `sizes[i]` bytes from each `at[i]`, one behind the other; a view where they lie so already."""
     if not len(at):
         return np.zeros(0, np.uint8)
@@ -37,7 +43,7 @@ def spans(data: NDArray[np.uint8], at: Int64s, sizes: Int64s) -> NDArray[np.uint
     return _taken(data, at, ends)[:total]
 
 
-def _copied(data: NDArray[np.uint8], at: Int64s, ends: Int64s, total: int) -> NDArray[np.uint8]:
+def _copied(data: Bytes, at: Int64s, ends: Int64s, total: int) -> Bytes:
     out = np.empty(total, np.uint8)
     pos = 0
     for start, end in zip(at.tolist(), ends.tolist(), strict=True):
@@ -46,7 +52,7 @@ def _copied(data: NDArray[np.uint8], at: Int64s, ends: Int64s, total: int) -> ND
     return out
 
 
-def _taken(data: NDArray[np.uint8], at: Int64s, ends: Int64s) -> NDArray[np.uint8]:
+def _taken(data: Bytes, at: Int64s, ends: Int64s) -> Bytes:
     """Copy by Arrow's `take`: to it the spans are every other value of one binary array over the buffer."""
     picks = np.arange(0, 2 * len(at), 2)
     if (at[1:] < ends[:-1]).any():  # not ascending, as its offsets have to be
@@ -54,8 +60,22 @@ def _taken(data: NDArray[np.uint8], at: Int64s, ends: Int64s) -> NDArray[np.uint
         picks = np.empty_like(picks)
         picks[order] = np.arange(0, 2 * len(at), 2)
         at, ends = at[order], ends[order]
-    borders = np.stack([at, ends], axis=1)
-    every = pa.Array.from_buffers(
-        pa.large_binary(), borders.size - 1, [None, pa.py_buffer(borders), pa.py_buffer(data)]
-    )
-    return np.frombuffer(every.take(pa.array(picks)).buffers()[2], np.uint8)
+    borders = np.stack([at, ends], axis=1).reshape(-1)
+    every = array_of(pa.large_binary(), len(borders) - 1, borders, data)
+    taken = every.take(picks).buffers()[-1]
+    return np.zeros(0, np.uint8) if taken is None else np.frombuffer(memoryview(taken), np.uint8)
+
+
+def offsets_of(counts: Int64s) -> NDArray[np.int32]:
+    """Return where each of the values begins that have `counts` bytes or elements, and where the last ends."""
+    offsets = np.zeros(len(counts) + 1, np.int32)
+    np.cumsum(counts, out=offsets[1:])
+    return offsets
+
+
+def array_of(
+    kind: pa.DataType, length: int, *buffers: NDArray[Any], children: Sequence[Array] | None = None
+) -> Array:
+    """Return an Arrow array over the buffers that follow its validity, which no decoded value needs."""
+    parts = [None, *(pa.py_buffer(buffer.data) for buffer in buffers)]
+    return pa.Array.from_buffers(kind, length, parts, children=children)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -45,5 +45,6 @@ class RowwiseDecoder:
                 index.append(row)
             except DecodeError as error:  # noqa: PERF203 - a bad row costs a row
                 failures.append(RowFailure(row, error.rule, error.what))
-        rows = pa.array(values, type=self._shape)
+        # An array of a struct type is one of structs, which the stubs cannot know.
+        rows = cast("pa.StructArray", pa.array(values, type=self._shape))
         return Decoded(rows, np.array(index, np.int64), tuple(failures))

@@ -126,8 +126,9 @@ class Stepper:
             pos, count = self._count(pos, step.body.least, step.bound)
         at.append(pos)
         counts.append(count)
-        for _ in range(count if notes else 0):
-            pos = self._walk(step.body, notes, pos)
+        if notes is not None:
+            for _ in range(count):
+                pos = self._walk(step.body, notes, pos)
         return pos
 
     def _count(self, pos: int, least: int, bound: int) -> tuple[int, int]:
