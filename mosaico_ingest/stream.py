@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.adapters.adapter import Adapted, Adapter, Envelope
 from mosaico_ingest.bag.batch import Channel, RawBatch
-from mosaico_ingest.decode.arrow import ros_shape
+from mosaico_ingest.bag.shape import ros_shape
 from mosaico_ingest.decode.choose import decoder_for
 from mosaico_ingest.decode.decoder import Decoder
 from mosaico_ingest.diagnostics import RowFailure, Stage

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from mosaico_ingest.decode.arrow import NUMBERS
+from mosaico_ingest.bag.shape import NUMBERS
 from mosaico_ingest.decode.gather import Array, array_of, cells, offsets_of, spans
 from mosaico_ingest.decode.layout import (
     Block,

@@ -14,7 +14,7 @@ import numpy as np
 
 from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.definition import Container, Definition, Field, MessageType
-from mosaico_ingest.decode.arrow import NUMBERS, TEXTS
+from mosaico_ingest.bag.shape import NUMBERS, TEXTS
 
 __all__ = [
     "WORD",

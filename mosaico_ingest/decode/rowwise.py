@@ -10,7 +10,7 @@ import pyarrow as pa
 from mosaico_ingest.bag.batch import Encoding, RawBatch
 from mosaico_ingest.bag.definition import Definition
 from mosaico_ingest.bag.deserialize import Deserializer
-from mosaico_ingest.decode.arrow import ros_shape
+from mosaico_ingest.bag.shape import ros_shape
 from mosaico_ingest.decode.decoder import Decoded
 from mosaico_ingest.diagnostics import RowFailure
 from mosaico_ingest.errors import DecodeError

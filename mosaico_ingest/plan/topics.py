@@ -8,9 +8,9 @@ from typing import TypeVar
 
 from mosaico_ingest.adapters.metadata import ros_metadata
 from mosaico_ingest.bag.batch import Channel, Encoding
+from mosaico_ingest.bag.shape import ros_shape
 from mosaico_ingest.bridge import ROSBridge
 from mosaico_ingest.config import ROSInjectionConfig
-from mosaico_ingest.decode.arrow import ros_shape
 from mosaico_ingest.diagnostics import Finding, Severity
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.patterns import Selection, first_match
