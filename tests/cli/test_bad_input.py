@@ -1,0 +1,155 @@
+"""A user's mistake is one line that says what, where and what to do, with the documented exit code and no traceback."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from mosaico_ingest.cli.app import main
+
+Ingest = Callable[..., tuple[int, str, str]]
+QUICKSTART = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
+
+
+@pytest.fixture
+def ingest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Ingest:
+    """Run the command in an empty folder; return exit code, output and errors."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        code = 0
+        try:
+            main(arguments)
+        except SystemExit as leave:
+            code = int(leave.code or 0)
+        out, err = capsys.readouterr()
+        assert "Traceback" not in err
+        return code, out, err
+
+    return run
+
+
+def job(folder: Path, text: str) -> str:
+    (folder / "job.yaml").write_text(text)
+    return "job.yaml"
+
+
+GOOD = f"version: 1\nbag: {{path: {QUICKSTART}}}\nsequence: {{name: good}}\n"
+
+
+def test_a_missing_manifest(ingest: Ingest) -> None:
+    code, _, err = ingest("nowhere.yaml")
+    assert code == 2
+    assert "nowhere.yaml" in err
+
+
+def test_a_manifest_that_is_not_a_mapping(ingest: Ingest, tmp_path: Path) -> None:
+    code, _, err = ingest(job(tmp_path, "- one\n- two\n"))
+    assert code == 2
+    assert "job.yaml:1:1" in err
+
+
+def test_an_unknown_key_names_its_place_and_the_nearest_key(ingest: Ingest, tmp_path: Path) -> None:
+    code, _, err = ingest(job(tmp_path, GOOD.replace("bag:", "bga:")))
+    assert code == 2
+    assert "job.yaml:2:1" in err
+    assert "bag" in err
+
+
+def test_a_missing_recording(ingest: Ingest, tmp_path: Path) -> None:
+    code, _, err = ingest(job(tmp_path, "version: 1\nbag: {path: gone.mcap}\nsequence: {name: x}\n"))
+    assert code == 3
+    assert "gone.mcap" in err
+    assert not (tmp_path / "mosaico").exists()
+
+
+def test_an_empty_recording(ingest: Ingest, tmp_path: Path) -> None:
+    (tmp_path / "empty.bag").touch()
+    code, _, err = ingest("bag", "empty.bag", "--name", "x")
+    assert code == 1
+    assert "empty" in err
+
+
+def test_something_that_is_no_recording(ingest: Ingest, tmp_path: Path) -> None:
+    (tmp_path / "text.mcap").write_text("hello, this is no recording at all\n")
+    code, _, err = ingest("bag", "text.mcap", "--name", "x")
+    assert code == 1
+    assert "text.mcap" in err
+
+
+def test_a_directory_without_a_recording(ingest: Ingest, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    code, _, err = ingest("bag", "empty", "--name", "x")
+    assert code in {1, 3}
+    assert "empty" in err
+
+
+def test_a_store_that_cannot_be_written(ingest: Ingest, tmp_path: Path) -> None:
+    (tmp_path / "mosaico").write_text("a file where the store should be")
+    code, _, err = ingest(job(tmp_path, GOOD))
+    assert code == 1
+    assert "mosaico" in err
+
+
+def test_a_store_of_a_newer_format(ingest: Ingest, tmp_path: Path) -> None:
+    assert ingest(job(tmp_path, GOOD), "-q")[0] == 0
+    with sqlite3.connect(tmp_path / "mosaico" / "catalog.sqlite") as db:
+        db.execute("PRAGMA user_version = 99")
+    db.close()
+    code, _, err = ingest(job(tmp_path, GOOD.replace("good", "other")))
+    assert code == 1
+    assert "99" in err
+
+
+def test_a_name_that_exists_leaves_the_old_sequence(ingest: Ingest, tmp_path: Path) -> None:
+    assert ingest(job(tmp_path, GOOD), "-q")[0] == 0
+    code, _, err = ingest(job(tmp_path, GOOD))
+    assert code == 1
+    assert "good" in err
+    assert "if_exists" in err
+    assert ingest("store", "show", "good")[0] == 0
+
+
+def test_an_unknown_word_names_the_nearest_command(ingest: Ingest) -> None:
+    code, _, err = ingest("inspct")
+    assert code == 2
+    assert "did you mean `ingest inspect`" in err
+
+
+def test_metadata_that_is_not_an_object(ingest: Ingest) -> None:
+    code, _, err = ingest("bag", str(QUICKSTART), "--name", "x", "--metadata", "[1]")
+    assert code == 2
+    assert "--metadata" in err
+
+
+def test_a_distro_that_does_not_exist(ingest: Ingest) -> None:
+    code, _, err = ingest("bag", str(QUICKSTART), "--name", "x", "--ros-distro", "ros2_hmble")
+    assert code == 2
+    assert "ros2_humble" in err
+
+
+def test_a_log_level_that_does_not_exist(ingest: Ingest) -> None:
+    code, _, err = ingest("bag", str(QUICKSTART), "--name", "x", "--log", "LOUD")
+    assert code == 2
+    assert "LOUD" in err
+
+
+def test_debug_shows_the_traceback(tmp_path: Path) -> None:
+    from mosaico_ingest.errors import ManifestError  # noqa: PLC0415 - as the command line does
+
+    with pytest.raises(ManifestError):
+        main(["--debug", str(tmp_path / "nowhere.yaml")])
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_read_only_folder(ingest: Ingest, tmp_path: Path) -> None:
+    manifest = job(tmp_path, GOOD)
+    tmp_path.chmod(0o500)
+    code, _, err = ingest(manifest)
+    tmp_path.chmod(0o700)
+    assert code == 1
+    assert "mosaico" in err

@@ -1,0 +1,114 @@
+"""The quickstart, as a user runs it: every topic of the recording arrives typed, and the README's code reads it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from rosbags.rosbag2 import Reader
+
+from mosaico_ingest.report.model import RunReport
+from mosaico_ingest.store import Store
+
+ROOT = Path(__file__).resolve().parents[2]
+TYPED = {
+    "/battery": ("BatteryState", 10),
+    "/camera/camera_info": ("CameraInfo", 50),
+    "/camera/image_raw/compressed": ("CompressedImage", 50),
+    "/gps/fix": ("GPS", 50),
+    "/imu": ("IMU", 1000),
+    "/joint_states": ("RobotJoint", 500),
+    "/lidar/points": ("PointCloud2", 50),
+    "/odom": ("MotionState", 200),
+    "/tf": ("FrameTransform", 200),
+}
+
+
+def ingest(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(  # noqa: S603 - our own command
+        [sys.executable, "-m", "mosaico_ingest", *map(str, arguments)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the repository's examples in which the quickstart has been run."""
+    folder = tmp_path_factory.mktemp("project")
+    shutil.copytree(ROOT / "configs", folder / "configs")
+    done = ingest("configs/quickstart.yaml", "--report", "report.json", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_every_topic_arrives_typed_and_whole(project: Path) -> None:
+    topics = Store.open(project / "mosaico").sequence("quickstart_drive").topics
+    assert {topic.name: (topic.ontology.tag, topic.rows) for topic in topics} == TYPED
+
+
+def test_the_report_accounts_for_every_message(project: Path) -> None:
+    report = RunReport.model_validate_json((project / "report.json").read_text())
+    recording = report.recordings[0]
+    assert recording.totals.read == recording.totals.written == sum(count for _, count in TYPED.values())
+    assert recording.totals.rejected == 0
+    assert {topic.topic for topic in recording.topics if topic.status == "left_out"} == {"/camera/image_raw"}
+
+
+def test_the_battery_went_through_the_declared_adapter(project: Path) -> None:
+    row = Store.open(project / "mosaico").scan("quickstart_drive", "/battery").read_all().to_pylist()[0]
+    assert row["voltage"] == pytest.approx(24, abs=0.2)
+    assert row["current"] == pytest.approx(-2.4)
+    assert row["percentage"] == pytest.approx(0.8)
+    assert len(row["cell_voltage"]) == 6
+    assert row["power_supply_status"] == 2
+    assert row["serial_number"] == "PK-0042"
+
+
+def test_a_second_run_says_that_the_name_is_taken(project: Path) -> None:
+    done = ingest("configs/quickstart.yaml", cwd=project)
+    assert done.returncode == 1
+    assert "quickstart_drive" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_the_store_can_be_looked_into(project: Path) -> None:
+    listed = json.loads(ingest("store", "ls", "--json", cwd=project).stdout)
+    assert [sequence["name"] for sequence in listed] == ["quickstart_drive"]
+    shown = ingest("store", "show", "quickstart_drive/imu", cwd=project).stdout
+    assert "acceleration" in shown
+    assert "1,000 rows" in shown
+
+
+def test_the_readmes_reading_examples_work(project: Path) -> None:
+    blocks = re.findall(
+        r"<!-- example: read -->\n```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL
+    )
+    assert blocks
+    for block in blocks:
+        done = subprocess.run(  # noqa: S603 - the README's own code
+            [sys.executable, "-c", block], cwd=project, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+
+
+def test_the_recording_is_what_its_script_writes(tmp_path: Path) -> None:
+    script = ROOT / "configs" / "quickstart" / "make_recording.py"
+    subprocess.run([sys.executable, str(script), str(tmp_path / "again.mcap")], check=True)  # noqa: S603 - our own script
+    assert content(tmp_path / "again.mcap") == content(ROOT / "configs" / "quickstart" / "drive.mcap")
+
+
+def content(path: Path) -> str:
+    digest = hashlib.sha256()
+    with Reader(path) as reader:
+        for connection, log_time, data in reader.messages():
+            digest.update(f"{connection.topic} {log_time} ".encode() + data)
+    return digest.hexdigest()
