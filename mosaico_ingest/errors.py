@@ -40,11 +40,20 @@ class IngestError(Exception):
     exit_code: ClassVar[int] = 1
     retryable: ClassVar[bool] = False
 
-    def __init__(self, what: str, *, where: str | None = None, hint: str | None = None) -> None:
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: str | None = None,
+        hint: str | None = None,
+        findings: tuple[Finding, ...] = (),
+    ) -> None:
         super().__init__(what)
         self.what = what
         self.where = where
         self.hint = hint
+        self.findings = findings
+        """One for each mistake, where there can be several, with its place."""
 
     def __str__(self) -> str:
         """Return `where: what — hint` with the parts that are known."""
@@ -68,17 +77,6 @@ class ManifestError(IngestError):
 
     exit_code = 2
 
-    def __init__(
-        self,
-        what: str,
-        *,
-        where: str | None = None,
-        hint: str | None = None,
-        findings: tuple[Finding, ...] = (),
-    ) -> None:
-        super().__init__(what, where=where, hint=hint)
-        self.findings = findings
-
 
 class NothingMatched(IngestError):  # noqa: N818 - it names what happened, as the exit code's table does
     """No recording or no topic was selected."""
@@ -101,7 +99,7 @@ class DecodeError(BagError):
 
 
 class AdapterError(IngestError):
-    """Rows do not fit their ontology, or an adapter does not fit its message type."""
+    """Rows do not fit their ontology, an adapter does not fit its message type, or its file is wrong (`findings`)."""
 
 
 class SinkError(IngestError):
