@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.bag.definition import Definition
 
-__all__ = ["Channel", "Encoding", "RawBatch"]
+__all__ = ["Channel", "Encoding", "Loss", "RawBatch"]
 
 
 class Encoding(str, Enum):
@@ -68,3 +68,18 @@ class RawBatch:
         """Return the bytes of one message."""
         start = int(self.starts[row])
         return self.data[start : start + int(self.lengths[row])].tobytes()
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """Something of a recording that could not be read, and why."""
+
+    file: str
+    offset: int
+    """Where in the file the record or chunk begins, or the row id."""
+    reason: str
+    """What was expected and what was found, in one line."""
+    channel: int | None = None
+    """The channel the messages belonged to; None where that is unknown."""
+    count: int | None = None
+    """How many messages were lost; None where that is unknown, 0 where all could be had another way."""

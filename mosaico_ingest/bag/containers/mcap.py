@@ -1,0 +1,255 @@
+"""This file reads MCAP: messages are found through the message indexes, as arrays, or record by record."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mosaico_ingest.bag.batch import Encoding
+from mosaico_ingest.bag.containers.compression import inflate, inflate_some
+from mosaico_ingest.bag.containers.mcap_index import (
+    MAGIC,
+    RECORD,
+    ChunkHead,
+    McapChannel,
+    McapIndex,
+    Op,
+    Piece,
+    Schema,
+    chunk_head,
+    read_index,
+    read_loose,
+)
+from mosaico_ingest.bag.containers.part import Block, Hole, Loaded, Slab, Stream, Want
+from mosaico_ingest.bag.containers.slab import by_key, stretches, wanted
+from mosaico_ingest.bag.containers.source import FileSource
+from mosaico_ingest.bag.definition import Embedded
+from mosaico_ingest.errors import BagError
+
+__all__ = ["MAGIC", "McapPart"]
+
+_ENCODINGS = {"cdr": Encoding.CDR, "ros1": Encoding.ROS1}
+_ENTRY = np.dtype([("time", "<i8"), ("offset", "<u8")])
+_HEAD = np.dtype(
+    [
+        ("op", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("time", "<i8"),
+        ("published", "<i8"),
+    ]
+)
+_FIXED_BYTES = _HEAD.itemsize - RECORD.size
+"""How much of a message record's length is not payload."""
+
+
+class McapPart:
+    """One MCAP file, with or without summary, indexes, chunks, profile or end."""
+
+    container = "mcap"
+
+    def __init__(self, path: Path, name: Path | None = None) -> None:
+        self.path = name or path
+        self._source = FileSource(path, name)
+        try:
+            self._index = read_index(self._source)
+        except BaseException:
+            self._source.close()
+            raise
+        index = self._index
+        self.streams: tuple[Stream, ...] = tuple(
+            _stream(key, channel, index) for key, channel in sorted(index.channels.items())
+        )
+        self.start_ns: int | None = index.start_ns
+        self.end_ns: int | None = index.end_ns
+        self.message_count: int | None = sum(index.counts.values()) if index.counts is not None else None
+        self.holes: list[Hole] = index.holes
+        self.notes: list[str] = []
+
+    def blocks(self, want: Want) -> Iterator[Block]:
+        """Yield the chunks, and the stretches between chunks, that may hold wanted messages."""
+        index = read_loose(self._source, self._index)
+        keys = frozenset(want.keys)
+        losses = index.holes[len(self.holes) :]
+        if losses:
+            yield Block(0, lambda: Loaded([], losses))
+        for piece in sorted(index.pieces, key=lambda piece: piece.start_ns):
+            named = {key for key, _ in piece.index_offsets()}
+            if want.times(piece.start_ns, piece.end_ns) and (not named or named & keys):
+                yield Block(piece.start_ns, partial(self._load, piece, want))
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._source.close()
+
+    def _load(self, piece: Piece, want: Want) -> Loaded:
+        raw = self._source.read(piece.offset, piece.stop - piece.offset)
+        loaded = Loaded([], [])
+        if not piece.is_chunk:
+            _scan(np.frombuffer(raw, np.uint8), piece.offset, want, loaded, where=piece.offset)
+            return loaded
+        try:
+            head = chunk_head(raw)
+            data = _cut_chunk(raw, head, piece, loaded) if piece.is_cut else _chunk(raw, head)
+        except BagError as err:
+            loaded.holes.extend(_whole_chunk(piece, raw, want, f"broken chunk: {err.what}"))
+            return loaded
+        records = np.frombuffer(data, np.uint8)
+        if piece.indexes:
+            try:
+                _by_index(records, raw, piece, want, loaded)
+            except BagError as err:
+                reason = f"{err.what}; the chunk was read record by record"
+                loaded.holes.append(Hole(piece.offset, reason, count=0))
+            else:
+                return loaded
+        _scan(records, piece.offset, want, loaded)
+        return loaded
+
+
+def _stream(key: int, channel: McapChannel, index: McapIndex) -> Stream:
+    schema = index.schemas.get(channel.schema, Schema("", "", ""))
+    ros_version = 1 if channel.encoding == "ros1" or schema.encoding == "ros1msg" else 2
+    counts = index.counts
+    return Stream(
+        key,
+        channel.topic,
+        schema.name,
+        _ENCODINGS.get(channel.encoding, Encoding.OTHER),
+        ros_version,
+        Embedded(schema.encoding, schema.text) if schema.text else None,
+        counts.get(key, 0) if counts is not None else None,
+        latched=channel.metadata.get("latching") == "1",
+        attributes={"encoding": channel.encoding, "schema_encoding": schema.encoding, **channel.metadata},
+    )
+
+
+def _chunk(raw: bytes, head: ChunkHead) -> bytes | memoryview:
+    if head.end > len(raw):
+        raise BagError(f"{head.end - head.begin} bytes announced, {len(raw) - head.begin} left")
+    data = inflate(memoryview(raw)[head.begin : head.end], head.compression, head.size)
+    if head.crc and zlib.crc32(data) != head.crc:
+        raise BagError(f"its checksum is {zlib.crc32(data):08x}, {head.crc:08x} expected")
+    return data
+
+
+def _cut_chunk(raw: bytes, head: ChunkHead, piece: Piece, loaded: Loaded) -> bytes:
+    data = inflate_some(memoryview(raw)[head.begin : head.end], head.compression, head.size)
+    reason = f"the file ends within this chunk; {len(data)} of its {head.size} bytes could be read"
+    loaded.holes.append(Hole(piece.offset, reason))
+    return data
+
+
+def _whole_chunk(piece: Piece, raw: bytes, want: Want, reason: str) -> Iterator[Hole]:
+    """Yield the loss of a chunk, by channel where its index says how many messages each had."""
+    if not piece.indexes:
+        yield Hole(piece.offset, reason)
+    for key, offset in piece.index_offsets():
+        if key in want.keys:
+            try:
+                count: int | None = len(_entries(raw, piece, key, offset))
+            except BagError:
+                count = None
+            yield Hole(piece.offset, reason, key=key, count=count)
+
+
+def _entries(raw: bytes, piece: Piece, key: int, offset: int) -> NDArray[np.void]:
+    """Return the times and offsets of one message index record."""
+    at = offset - piece.offset
+    if not 0 <= at <= len(raw) - RECORD.size - 6:
+        raise BagError(f"the message index of channel {key} lies at {offset}, outside its chunk's stretch")
+    op, _, channel, size = struct.unpack_from("<BQHI", raw, at)
+    begin = at + RECORD.size + 6
+    if op != Op.MESSAGE_INDEX or channel != key or size % _ENTRY.itemsize or begin + size > len(raw):
+        raise BagError(f"no message index of channel {key} at {offset}")
+    return np.frombuffer(raw, _ENTRY, size // _ENTRY.itemsize, begin)
+
+
+def _by_index(records: NDArray[np.uint8], raw: bytes, piece: Piece, want: Want, loaded: Loaded) -> None:
+    """Add the wanted messages that the chunk's message indexes name.
+
+    Raises:
+        BagError: An index does not agree with the records.
+    """
+    indexes = [
+        (key, _entries(raw, piece, key, offset)) for key, offset in piece.index_offsets() if key in want.keys
+    ]
+    if not indexes:
+        return
+    entries = np.concatenate([found for _, found in indexes])
+    offsets = entries["offset"]
+    if len(offsets) and int(offsets.max()) > len(records) - _HEAD.itemsize:
+        raise BagError("a message index points outside its chunk")
+    starts = offsets.astype(np.int64)
+    heads = _heads(records, starts)
+    sizes = [len(found) for _, found in indexes]
+    keys = np.repeat(np.array([key for key, _ in indexes], np.uint16), sizes)
+    fits = (heads["op"] == Op.MESSAGE) & (heads["channel"] == keys) & (heads["time"] == entries["time"])
+    if not bool((fits & _within(heads, starts, len(records))).all()):
+        raise BagError("a message index does not point at its messages")
+    first = 0
+    for (key, _), size in zip(indexes, sizes, strict=True):
+        rows = slice(first, first + size)
+        _add(key, records, heads[rows], starts[rows], piece.offset, want, loaded)
+        first += size
+
+
+def _scan(
+    records: NDArray[np.uint8], offset: int, want: Want, loaded: Loaded, *, where: int | None = None
+) -> None:
+    """Add the wanted messages record by record, up to the first that does not fit; `where` counts offsets from there."""
+    data = memoryview(records)
+    found: list[int] = []
+    at = 0
+    while at < len(data):
+        op, length = RECORD.unpack_from(data, at) if at + RECORD.size <= len(data) else (0, 0)
+        end = at + RECORD.size + length
+        if op == 0 or end > len(data) or (op == Op.MESSAGE and length < _FIXED_BYTES):
+            reason = f"no whole record at byte {at} of {len(data)}; the rest is not read"
+            loaded.holes.append(Hole(offset, reason))
+            break
+        if op == Op.MESSAGE:
+            found.append(at)
+        at = end
+    starts = np.array(found, np.int64)
+    heads = _heads(records, starts)
+    for key, rows in by_key(heads["channel"], want.keys):
+        _add(key, records, heads[rows], starts[rows], offset, want, loaded, where=where)
+
+
+def _heads(records: NDArray[np.uint8], starts: NDArray[np.int64]) -> NDArray[np.void]:
+    if not len(starts):
+        return np.empty(0, _HEAD)
+    return stretches(records, starts, _HEAD.itemsize).view(_HEAD).reshape(-1)
+
+
+def _within(heads: NDArray[np.void], starts: NDArray[np.int64], size: int) -> NDArray[np.bool_]:
+    length = heads["length"]
+    room = (size - RECORD.size - starts).astype(np.uint64)
+    return (length >= _FIXED_BYTES) & (length <= room)
+
+
+def _add(
+    key: int,
+    records: NDArray[np.uint8],
+    heads: NDArray[np.void],
+    starts: NDArray[np.int64],
+    offset: int,
+    want: Want,
+    loaded: Loaded,
+    *,
+    where: int | None = None,
+) -> None:
+    offsets = np.full(len(starts), offset, np.int64) if where is None else starts + where
+    lengths = heads["length"].astype(np.int64) - _FIXED_BYTES
+    times = np.ascontiguousarray(heads["time"])
+    slab = wanted(Slab(key, times, records, starts + _HEAD.itemsize, lengths, offsets), want, loaded.holes)
+    if len(slab):
+        loaded.slabs.append(slab)

@@ -1,0 +1,384 @@
+"""This file finds out what is where in an MCAP file: by its summary, or by walking over its records."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+from mosaico_ingest.bag.containers.compression import inflate_some
+from mosaico_ingest.bag.containers.part import Hole
+from mosaico_ingest.bag.containers.source import Fields, FileSource, Window
+from mosaico_ingest.errors import BagError
+
+__all__ = [
+    "MAGIC",
+    "RECORD",
+    "ChunkHead",
+    "McapIndex",
+    "Op",
+    "Piece",
+    "chunk_head",
+    "read_index",
+    "read_loose",
+]
+
+MAGIC = b"\x89MCAP0\r\n"
+RECORD = struct.Struct("<BQ")
+"""Every record begins with its kind and the number of bytes that follow."""
+_FOOTER_BYTES = RECORD.size + 20
+_INDEX_ENTRY_BYTES = 16
+_RUN_BYTES = 4 << 20
+"""How much of the messages outside chunks is read at once."""
+_MESSAGE = struct.Struct("<HIQ")
+
+
+class Op:
+    """The kinds of records that matter here, as the MCAP specification numbers them."""
+
+    HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
+    STATISTICS = 0x0B
+    DATA_END = 0x0F
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """A message type as the file describes it."""
+
+    name: str
+    encoding: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class McapChannel:
+    """A channel as the file describes it."""
+
+    schema: int
+    topic: str
+    encoding: str
+    metadata: dict[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """Records that are read at once: a chunk with the message indexes behind it, or messages outside chunks."""
+
+    offset: int
+    stop: int
+    start_ns: int
+    end_ns: int
+    indexes: bytes = b""
+    """Channel (u16) and file offset (u64) of each message index; empty where there is none."""
+    is_chunk: bool = True
+    is_cut: bool = False
+
+    def index_offsets(self) -> list[tuple[int, int]]:
+        """Return channel and file offset of each message index."""
+        return list(struct.iter_unpack("<HQ", self.indexes))
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkHead:
+    """A chunk's own fields; `begin` and `end` bound its data within the bytes it was read from."""
+
+    start_ns: int
+    end_ns: int
+    size: int
+    crc: int
+    compression: str
+    begin: int
+    end: int
+
+
+@dataclass(slots=True)
+class McapIndex:
+    """What is where."""
+
+    schemas: dict[int, Schema] = field(default_factory=dict[int, Schema])
+    channels: dict[int, McapChannel] = field(default_factory=dict[int, McapChannel])
+    pieces: list[Piece] = field(default_factory=list[Piece])
+    counts: dict[int, int] | None = None
+    """Messages by channel, where the file or a walk could tell."""
+    start_ns: int | None = None
+    end_ns: int | None = None
+    data_end: int = 0
+    """Where the summary, or what cannot be read, begins."""
+    holes: list[Hole] = field(default_factory=list[Hole])
+    walked: bool = False
+    """Whether every record was looked at, and not only the summary."""
+
+
+def chunk_head(data: bytes, at: int = RECORD.size) -> ChunkHead:
+    """Return a chunk's fields from the bytes of its record; its data may be cut off.
+
+    Raises:
+        BagError: The record ends within its fields.
+    """
+    fields = Fields(data, at)
+    start_ns, end_ns, size, crc = fields.u64(), fields.u64(), fields.u64(), fields.u32()
+    compression = fields.text()
+    length = fields.u64()
+    begin = len(data) - fields.left
+    return ChunkHead(start_ns, end_ns, size, crc, compression, begin, begin + length)
+
+
+def read_index(source: FileSource) -> McapIndex:
+    """Return what the summary says, or, where it is missing, incomplete or damaged, what a walk finds."""
+    try:
+        index = _summary(source)
+    except BagError as err:
+        index, problem = None, str(err)
+    else:
+        problem = None
+    if index is not None:
+        return index
+    index = McapIndex(data_end=source.size)
+    if problem:
+        index.holes.append(Hole(source.size, f"{problem}; the file was read record by record", count=0))
+    _Walk(source, index).over(len(MAGIC), source.size)
+    return index
+
+
+def read_loose(source: FileSource, index: McapIndex) -> McapIndex:
+    """Return the index with what the summary does not name: messages and chunks between its chunks."""
+    if index.walked:
+        return index
+    found = McapIndex(dict(index.schemas), dict(index.channels), [], index.counts, walked=True)
+    walk = _Walk(source, found)
+    at = len(MAGIC)
+    known = sorted(index.pieces, key=lambda piece: piece.offset)
+    for piece in known:
+        if piece.offset > at:
+            walk.over(at, piece.offset)
+        at = max(at, piece.stop)
+    walk.over(at, index.data_end)
+    pieces = known + found.pieces
+    return McapIndex(
+        found.schemas,
+        found.channels,
+        pieces,
+        index.counts,
+        index.start_ns,
+        index.end_ns,
+        index.data_end,
+        index.holes + found.holes,
+        walked=True,
+    )
+
+
+def _summary(source: FileSource) -> McapIndex | None:
+    tail_at = source.size - _FOOTER_BYTES - len(MAGIC)
+    if tail_at < len(MAGIC):
+        raise BagError("the file ends without a footer")
+    tail = source.read(tail_at, _FOOTER_BYTES + len(MAGIC))
+    if tail[0] != Op.FOOTER or tail[-len(MAGIC) :] != MAGIC:
+        raise BagError("the file ends without a footer")
+    begin, _, crc = struct.unpack_from("<QQI", tail, RECORD.size)
+    if not begin:
+        return None
+    if not len(MAGIC) <= begin <= tail_at:
+        raise BagError(f"the footer puts the summary at {begin}, outside the file")
+    data = source.read(begin, tail_at - begin)
+    if crc and zlib.crc32(tail[: RECORD.size + 16], zlib.crc32(data)) != crc:
+        raise BagError("the summary does not have the checksum that the footer gives it")
+    return _from_summary(data, begin)
+
+
+def _from_summary(data: bytes, begin: int) -> McapIndex | None:
+    """Return the summary's content, or None where it does not say all that is needed."""
+    index = McapIndex(data_end=begin)
+    chunk_count: int | None = None
+    for op, start, end in _records(data):
+        fields = Fields(data, start, end)
+        if op == Op.CHUNK_INDEX:
+            index.pieces.append(_indexed_chunk(fields, begin))
+        elif op == Op.STATISTICS:
+            chunk_count = _statistics(fields, index)
+        else:
+            _describe(op, fields, index)
+    counts = index.counts
+    if counts is None or chunk_count != len(index.pieces) or not index.channels.keys() >= counts.keys():
+        return None
+    return index
+
+
+def _records(data: bytes) -> Iterator[tuple[int, int, int]]:
+    at = 0
+    while at < len(data):
+        if at + RECORD.size > len(data):
+            raise BagError(f"{len(data) - at} bytes left where a record must begin")
+        op, length = RECORD.unpack_from(data, at)
+        at += RECORD.size
+        if length > len(data) - at:
+            raise BagError(f"a record of {length} bytes with {len(data) - at} left")
+        yield op, at, at + length
+        at += length
+
+
+def _describe(op: int, fields: Fields, index: McapIndex) -> None:
+    """Take note of a schema or channel record; others say nothing about what messages are."""
+    if op == Op.SCHEMA:
+        key = fields.u16()
+        index.schemas[key] = Schema(fields.text(), fields.text(), fields.text())
+    elif op == Op.CHANNEL:
+        key = fields.u16()
+        index.channels[key] = McapChannel(fields.u16(), fields.text(), fields.text(), fields.texts())
+
+
+def _indexed_chunk(fields: Fields, data_end: int) -> Piece:
+    start_ns, end_ns, offset, length = fields.u64(), fields.u64(), fields.u64(), fields.u64()
+    indexes = fields.take(fields.u32())
+    stop = offset + length + fields.u64()
+    if stop > data_end or len(indexes) % 10:
+        raise BagError(f"the chunk index at {offset} does not fit the file")
+    return Piece(offset, stop, start_ns, end_ns, indexes)
+
+
+def _statistics(fields: Fields, index: McapIndex) -> int:
+    total = fields.u64()
+    fields.take(2 + 4 + 4 + 4)
+    chunks = fields.u32()
+    start_ns, end_ns = fields.u64(), fields.u64()
+    index.counts = {channel: count for channel, count in fields.pairs("<HQ") if count}
+    if total != sum(index.counts.values()):
+        raise BagError(f"{total} messages in all, {sum(index.counts.values())} by channel")
+    if total:
+        index.start_ns, index.end_ns = start_ns, end_ns
+    return chunks
+
+
+class _Walk:
+    """Goes from record to record and writes down what is there."""
+
+    def __init__(self, source: FileSource, index: McapIndex) -> None:
+        self._source = source
+        self._window = Window(source)
+        self._index = index
+        self._run: Piece | None = None
+        self._counts: dict[int, int] | None = {}
+        index.walked = True
+
+    def over(self, at: int, stop: int) -> None:
+        """Look at every record from `at` to `stop`, or to the first that does not fit."""
+        while at < stop:
+            head = self._window.peek(at, RECORD.size)
+            op, length = RECORD.unpack(head) if len(head) == RECORD.size else (0, 0)
+            end = at + RECORD.size + length
+            if op in (0, Op.DATA_END, Op.FOOTER) or end > stop:
+                self._ending(op, at, end, stop)
+                break
+            self._record(op, at, end)
+            at = end
+        self._finish_run()
+        self._index.data_end = at
+        self._summarise()
+
+    def _record(self, op: int, at: int, end: int) -> None:
+        if op == Op.MESSAGE:
+            self._message(at, end)
+            return
+        self._finish_run()
+        if op == Op.CHUNK:
+            self._chunk(at, end)
+        elif op == Op.MESSAGE_INDEX:
+            self._message_index(at, end)
+        elif op in (Op.SCHEMA, Op.CHANNEL):
+            start = at + RECORD.size
+            try:
+                _describe(op, Fields(self._source.read(start, end - start)), self._index)
+            except BagError as err:
+                self._index.holes.append(Hole(at, f"a damaged record of kind {op}: {err.what}"))
+
+    def _ending(self, op: int, at: int, end: int, stop: int) -> None:
+        """Say why the walk ends before its time; a chunk that is cut off may still hold messages."""
+        if op in (Op.DATA_END, Op.FOOTER) and end <= stop:
+            return
+        if op == Op.CHUNK:
+            try:
+                head = chunk_head(self._source.read(at, min(stop - at, 1 << 12)))
+            except BagError:
+                head = None
+            if head is not None:
+                piece = Piece(at, stop, head.start_ns, head.end_ns, is_cut=True)
+                self._index.pieces.append(piece)
+                self._counts = None
+                self._learn(piece)
+                return
+        pieces = self._index.pieces
+        if op == Op.MESSAGE_INDEX and pieces and pieces[-1].stop == at:
+            pieces[-1] = replace(pieces[-1], indexes=b"")  # it does not name all messages of its chunk
+            self._learn(pieces[-1])
+        found = f"a record of kind {op} with {end - at} bytes" if op else "no record"
+        self._index.holes.append(Hole(at, f"{found} where {stop - at} bytes are left; they are not read"))
+        self._counts = None
+
+    def _message(self, at: int, end: int) -> None:
+        fixed = self._window.peek(at + RECORD.size, _MESSAGE.size)
+        if end - at < RECORD.size + _MESSAGE.size:
+            return  # too short for its own fields: reading the run will say so
+        channel, _, time_ns = _MESSAGE.unpack(fixed)
+        if self._counts is not None:
+            self._counts[channel] = self._counts.get(channel, 0) + 1
+        run = self._run
+        if run is not None and end - run.offset > _RUN_BYTES:
+            self._finish_run()
+            run = None
+        start_ns, end_ns = (
+            (min(run.start_ns, time_ns), max(run.end_ns, time_ns)) if run else (time_ns, time_ns)
+        )
+        self._run = Piece(run.offset if run else at, end, start_ns, end_ns, is_chunk=False)
+
+    def _finish_run(self) -> None:
+        if self._run is not None:
+            self._index.pieces.append(self._run)
+            self._run = None
+
+    def _chunk(self, at: int, end: int) -> None:
+        try:
+            head = chunk_head(self._source.read(at, min(end - at, 1 << 12)))
+        except BagError as err:
+            self._index.holes.append(Hole(at, f"a damaged chunk record: {err.what}"))
+            return
+        piece = Piece(at, end, head.start_ns, head.end_ns)
+        self._index.pieces.append(piece)
+        following = self._window.peek(end, 1)
+        if following != bytes([Op.MESSAGE_INDEX]) and head.size:
+            self._counts = None
+            self._learn(piece)
+
+    def _message_index(self, at: int, end: int) -> None:
+        """Add a message index to the chunk before it."""
+        pieces = self._index.pieces
+        fixed = self._window.peek(at + RECORD.size, 6)
+        if not pieces or pieces[-1].stop != at or end - at < RECORD.size + 6:
+            return
+        channel, size = struct.unpack("<HI", fixed)
+        if self._counts is not None:
+            self._counts[channel] = self._counts.get(channel, 0) + size // _INDEX_ENTRY_BYTES
+        last = pieces[-1]
+        entry = struct.pack("<HQ", channel, at)
+        pieces[-1] = replace(last, stop=end, indexes=last.indexes + entry)
+        if channel not in self._index.channels:
+            self._learn(last)
+
+    def _learn(self, piece: Piece) -> None:
+        """Take note of the schemas and channels inside a chunk."""
+        try:
+            data = self._source.read(piece.offset, piece.stop - piece.offset)
+            head = chunk_head(data)
+            records = inflate_some(data[head.begin : head.end], head.compression, head.size)
+            for op, start, end in _records(records):
+                _describe(op, Fields(records, start, end), self._index)
+        except BagError:
+            return  # reading the chunk will say what is wrong with it
+
+    def _summarise(self) -> None:
+        index = self._index
+        counted = self._counts
+        index.counts = index.counts or counted
+        filled = [piece for piece in index.pieces if piece.end_ns]
+        if filled:
+            index.start_ns = min(piece.start_ns for piece in filled)
+            index.end_ns = max(piece.end_ns for piece in filled)

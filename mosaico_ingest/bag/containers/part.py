@@ -1,0 +1,128 @@
+"""This file is what every container gives: the streams of one file, and their messages block by block."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mosaico_ingest.bag.batch import Encoding
+from mosaico_ingest.bag.definition import Embedded
+
+__all__ = ["EARLIEST_NS", "LATEST_NS", "Block", "Hole", "Loaded", "Part", "Slab", "Stream", "Want"]
+
+EARLIEST_NS, LATEST_NS = -(2**63), 2**63 - 1
+"""The first and last time stamps there are; the last is in the year 2262."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """One connection as its file describes it."""
+
+    key: int
+    """Unique within the part."""
+    topic: str
+    msgtype: str
+    """As the file spells it."""
+    encoding: Encoding
+    ros_version: int
+    embedded: Embedded | None
+    count: int | None
+    """How many messages the index promises."""
+    latched: bool = False
+    attributes: dict[str, str] = field(default_factory=dict[str, str])
+
+
+@dataclass(frozen=True, slots=True)
+class Slab:
+    """n messages of one stream inside one buffer; every start and length has been checked against it."""
+
+    key: int
+    log_times: NDArray[np.int64]
+    data: NDArray[np.uint8]
+    starts: NDArray[np.int64]
+    lengths: NDArray[np.int64]
+    offsets: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        """Return the number of messages."""
+        return len(self.log_times)
+
+    def rows(self, choice: NDArray[np.int64] | NDArray[np.bool_] | slice) -> Slab:
+        """Return some of the messages, over the same buffer."""
+        return Slab(
+            self.key,
+            self.log_times[choice],
+            self.data,
+            self.starts[choice],
+            self.lengths[choice],
+            self.offsets[choice],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Hole:
+    """What could not be read of one file: `bag.batch.Loss` before streams have become channels."""
+
+    offset: int
+    reason: str
+    key: int | None = None
+    count: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Loaded:
+    """What one block gave."""
+
+    slabs: list[Slab]
+    holes: list[Hole]
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A piece of a file that is read at once; none of its messages is older than `start_ns`."""
+
+    start_ns: int
+    load: Callable[[], Loaded]
+
+
+@dataclass(frozen=True, slots=True)
+class Want:
+    """Which messages to read: streams by key, and times from `start_ns` up to, not including, `end_ns`."""
+
+    keys: Collection[int]
+    start_ns: int = EARLIEST_NS
+    end_ns: int = LATEST_NS + 1
+
+    def times(self, first_ns: int, last_ns: int) -> bool:
+        """Return whether anything between the two times, both inclusive, may be wanted."""
+        return first_ns < self.end_ns and last_ns >= self.start_ns
+
+
+class Part(Protocol):
+    """One open file of a recording."""
+
+    path: Path
+    """The file as it was named, not a copy that had to be made."""
+    container: str
+    streams: tuple[Stream, ...]
+    start_ns: int | None
+    end_ns: int | None
+    """The last message's time, inclusive."""
+    message_count: int | None
+    holes: list[Hole]
+    """What was found broken while opening."""
+    notes: list[str]
+    """What else is worth saying about the file, one line each."""
+
+    def blocks(self, want: Want) -> Iterator[Block]:
+        """Yield what holds wanted messages, by ascending `start_ns`."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the file."""
+        ...

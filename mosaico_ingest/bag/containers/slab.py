@@ -1,0 +1,110 @@
+"""This file moves many messages at once: checks, sorts, splits and packs them without a step per message."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mosaico_ingest.bag.containers.part import LATEST_NS, Hole, Slab, Want
+
+__all__ = ["by_key", "in_time", "pack", "stretches", "wanted"]
+
+_FEW_ROWS = 8
+"""With fewer rows to a length on average, one index for every byte is cheaper than one step for every length."""
+_INDEX_BYTES = 1 << 20
+"""How many bytes are gathered through an index at once; the index is eight times as large."""
+
+Bytes = NDArray[np.uint8]
+Longs = NDArray[np.int64]
+
+
+def stretches(data: Bytes, starts: Longs, size: int) -> Bytes:
+    """Return the `size` bytes from each start on, shape (len(starts), size); the caller checked the bounds."""
+    windows = np.lib.stride_tricks.as_strided(data, (len(data) - size + 1, size), (1, 1), writeable=False)
+    return windows[starts]
+
+
+def by_key(keys: NDArray[np.integer], wanted_keys: Collection[int]) -> Iterator[tuple[int, Longs]]:
+    """Yield each wanted key with the rows that have it, in their order."""
+    order = np.argsort(keys, kind="stable")
+    ranked = keys[order]
+    edges = np.flatnonzero(np.diff(ranked)) + 1
+    for rows in np.split(order, edges) if len(order) else []:
+        key = int(keys[rows[0]])
+        if key in wanted_keys:
+            yield key, rows
+
+
+def wanted(slab: Slab, want: Want, holes: list[Hole]) -> Slab:
+    """Return the messages within the wanted time; those after 2262 are noted as lost."""
+    times = slab.log_times
+    if not len(times):
+        return slab
+    first, last = int(times.min()), int(times.max())
+    if first < 0:  # unsigned in the file
+        broken = times < 0
+        offset = int(slab.offsets[int(broken.argmax())])
+        reason = f"recorded at {int(times.view(np.uint64).max())} ns, which is after the year 2262"
+        holes.append(Hole(offset, reason, key=slab.key, count=int(broken.sum())))
+        return wanted(slab.rows(~broken), want, holes)
+    if first >= want.start_ns and last < want.end_ns:
+        return slab
+    keep = times >= want.start_ns
+    if want.end_ns <= LATEST_NS:
+        keep &= times < want.end_ns
+    return slab.rows(keep)
+
+
+def in_time(slab: Slab) -> Slab:
+    """Return the messages by log time; those of the same time stay in their order."""
+    times = slab.log_times
+    if len(times) < 2 or bool((times[1:] >= times[:-1]).all()):  # noqa: PLR2004 - one message is in order
+        return slab
+    return slab.rows(np.argsort(times, kind="stable"))
+
+
+def pack(slab: Slab) -> Slab:
+    """Return the same messages in a buffer of their own that holds nothing else, equal lengths side by side."""
+    lengths = slab.lengths
+    shortest, longest = int(lengths.min()), int(lengths.max())
+    if shortest == longest:
+        data = stretches(slab.data, slab.starts, shortest).reshape(-1)
+        return _with(slab, data, np.arange(len(slab), dtype=np.int64) * shortest)
+    kinds = np.unique(lengths)
+    if len(kinds) * _FEW_ROWS > len(lengths):
+        return _with(slab, _gather(slab), np.cumsum(lengths) - lengths)
+    starts = np.empty(len(slab), np.int64)
+    pieces: list[Bytes] = []
+    end = 0
+    for length in kinds.tolist():
+        rows = np.flatnonzero(lengths == length)
+        starts[rows] = end + np.arange(len(rows), dtype=np.int64) * length
+        pieces.append(stretches(slab.data, slab.starts[rows], length).reshape(-1))
+        end += len(rows) * length
+    return _with(slab, np.concatenate(pieces), starts)
+
+
+def _with(slab: Slab, data: Bytes, starts: Longs) -> Slab:
+    return Slab(slab.key, slab.log_times, data, starts, slab.lengths, slab.offsets)
+
+
+def _gather(slab: Slab) -> Bytes:
+    """Return the payloads one after the other, through an index of bytes."""
+    ends = np.cumsum(slab.lengths)
+    out = np.empty(int(ends[-1]), np.uint8)
+    first = 0
+    while first < len(ends):
+        begin = int(ends[first] - slab.lengths[first])
+        last = max(int(np.searchsorted(ends, begin + _INDEX_BYTES, side="right")), first + 1)
+        lengths = slab.lengths[first:last]
+        if last == first + 1:
+            start = int(slab.starts[first])
+            out[begin : int(ends[first])] = slab.data[start : start + int(lengths[0])]
+        else:
+            shift = slab.starts[first:last] - (ends[first:last] - lengths)
+            index = np.arange(begin, int(ends[last - 1]), dtype=np.int64) + np.repeat(shift, lengths)
+            out[begin : int(ends[last - 1])] = slab.data[index]
+        first = last
+    return out

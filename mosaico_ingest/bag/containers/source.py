@@ -1,0 +1,135 @@
+"""This file reads stretches of a file; a stretch that is not there is an error, never a crash."""
+
+from __future__ import annotations
+
+import os
+import struct
+from pathlib import Path
+
+from mosaico_ingest.errors import BagError
+
+__all__ = ["Fields", "FileSource", "Window"]
+
+_WINDOW_BYTES = 1 << 16
+
+
+class FileSource:
+    """A file opened for reading by position.
+
+    Not a memory map: a file that is cut off while it is read must end in an error, not in a signal.
+    """
+
+    def __init__(self, path: Path, name: Path | None = None) -> None:
+        self.path = name or path
+        try:
+            self._fd = os.open(path, os.O_RDONLY)
+            self.size = os.fstat(self._fd).st_size
+        except OSError as err:
+            raise BagError(f"cannot be opened: {err.strerror}", where=str(path)) from err
+
+    def read(self, offset: int, size: int) -> bytes:
+        """Return `size` bytes from `offset` on.
+
+        Raises:
+            BagError: The file ends before that, or the disk refuses.
+        """
+        if offset < 0 or size < 0 or offset + size > self.size:
+            raise BagError(
+                f"{size} bytes expected at {offset}, the file ends at {self.size}", where=str(self.path)
+            )
+        try:
+            data = os.pread(self._fd, size, offset)
+            while len(data) < size:
+                more = os.pread(self._fd, size - len(data), offset + len(data))
+                if not more:
+                    raise BagError(
+                        f"{size} bytes expected at {offset}, {len(data)} found: the file became shorter",
+                        where=str(self.path),
+                    )
+                data += more
+        except OSError as err:
+            raise BagError(f"cannot be read at {offset}: {err.strerror}", where=str(self.path)) from err
+        return data
+
+    def close(self) -> None:
+        """Close the file; once is enough, twice does no harm."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+
+class Window:
+    """Looks at a file in small steps forward, reading it in large ones."""
+
+    def __init__(self, source: FileSource) -> None:
+        self._source = source
+        self._data = b""
+        self._at = 0
+
+    def peek(self, offset: int, size: int) -> bytes:
+        """Return up to `size` bytes from `offset` on, fewer at the end of the file."""
+        begin = offset - self._at
+        if begin < 0 or begin + size > len(self._data):
+            left = max(self._source.size - offset, 0)
+            self._data = self._source.read(offset, min(max(size, _WINDOW_BYTES), left))
+            self._at, begin = offset, 0
+        return self._data[begin : begin + size]
+
+
+class Fields:
+    """Takes little-endian values off a record's bytes, one after the other.
+
+    Every method raises BagError where the record ends too early.
+    """
+
+    __slots__ = ("_data", "_end", "_pos")
+
+    def __init__(self, data: bytes, start: int = 0, end: int | None = None) -> None:
+        self._data = data
+        self._pos = start
+        self._end = len(data) if end is None else end
+
+    @property
+    def left(self) -> int:
+        """How many bytes have not been taken."""
+        return self._end - self._pos
+
+    def take(self, size: int) -> bytes:
+        """Return the next `size` bytes."""
+        if size > self.left:
+            raise BagError(f"a field of {size} bytes in a record with {self.left} left")
+        self._pos += size
+        return self._data[self._pos - size : self._pos]
+
+    def u16(self) -> int:
+        """Return an unsigned 16-bit number."""
+        return int.from_bytes(self.take(2), "little")
+
+    def u32(self) -> int:
+        """Return an unsigned 32-bit number."""
+        return int.from_bytes(self.take(4), "little")
+
+    def u64(self) -> int:
+        """Return an unsigned 64-bit number."""
+        return int.from_bytes(self.take(8), "little")
+
+    def text(self) -> str:
+        """Return a string behind its 32-bit length; bytes that are no UTF-8 become U+FFFD."""
+        return self.take(self.u32()).decode("utf-8", "replace")
+
+    def texts(self) -> dict[str, str]:
+        """Return a map of strings behind its length in bytes."""
+        inner = Fields(self.take(self.u32()))
+        found: dict[str, str] = {}
+        while inner.left:
+            name = inner.text()
+            found[name] = inner.text()
+        return found
+
+    def pairs(self, code: str) -> list[tuple[int, int]]:
+        """Return a map of numbers behind its length in bytes; `code` is the entry as `struct` spells it."""
+        data = self.take(self.u32())
+        layout = struct.Struct(code)
+        if len(data) % layout.size:
+            raise BagError(f"a map of {len(data)} bytes, which is no multiple of {layout.size}")
+        return [(int(a), int(b)) for a, b in layout.iter_unpack(data)]

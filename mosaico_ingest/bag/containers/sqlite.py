@@ -1,0 +1,210 @@
+"""This file reads rosbag2's SQLite databases of every age, without ever writing to them or beside them."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mosaico_ingest.bag.batch import Encoding
+from mosaico_ingest.bag.containers.part import EARLIEST_NS, LATEST_NS, Block, Hole, Loaded, Slab, Stream, Want
+from mosaico_ingest.bag.containers.slab import by_key
+from mosaico_ingest.bag.definition import Embedded
+from mosaico_ingest.errors import BagError
+
+__all__ = ["MAGIC", "SqlitePart"]
+
+MAGIC = b"SQLite format 3\x00"
+_PAGE_BYTES = 4 << 20
+_PAGE_ROWS = 1 << 16
+
+Row = tuple[int, int, int, bytes]
+
+
+@dataclass(frozen=True, slots=True)
+class _Columns:
+    """What the tables of this file have; rosbag2 added columns and tables over the years."""
+
+    topics: frozenset[str]
+    has_definitions: bool
+    has_time_index: bool
+
+
+class SqlitePart:
+    """One `.db3` file."""
+
+    container = "sqlite3"
+
+    def __init__(self, path: Path, name: Path | None = None) -> None:
+        self.path = name or path
+        self.holes: list[Hole] = []
+        self.notes: list[str] = []
+        self._stack = ExitStack()
+        try:
+            self._connection = _open(path, self._stack, self.notes)
+            self._columns = _columns(self._connection)
+            self.streams: tuple[Stream, ...] = self._read_streams()
+            self.start_ns, self.end_ns = self._read_bounds()
+        except sqlite3.Error as err:
+            self._stack.close()
+            raise BagError(f"the SQLite file cannot be read: {err}", where=str(self.path)) from err
+        except BaseException:
+            self._stack.close()
+            raise
+
+    @property
+    def message_count(self) -> int | None:
+        """How many messages the table holds."""
+        counts = [stream.count for stream in self.streams]
+        return None if None in counts else sum(count or 0 for count in counts)
+
+    def blocks(self, want: Want) -> Iterator[Block]:
+        """Yield pages of rows by time stamp; past a damaged page, of the rows that can still be found."""
+        keys = ",".join(str(int(key)) for key in want.keys)
+        bounds = (max(want.start_ns, EARLIEST_NS), min(want.end_ns - 1, LATEST_NS))
+        query = (
+            "SELECT rowid, topic_id, timestamp, data FROM messages "  # noqa: S608 - the keys are numbers
+            f"WHERE topic_id IN ({keys}) AND timestamp >= ? AND timestamp <= ? ORDER BY timestamp"
+        )
+        for page in _pages(self._connection.execute(query, bounds)):
+            yield Block(page[0][2], partial(_load, page))
+
+    def close(self) -> None:
+        """Let go of the file and of the copy, if there had to be one."""
+        self._stack.close()
+
+    def _read_streams(self) -> tuple[Stream, ...]:
+        counts = self._read_counts()
+        definitions = self._read_definitions()
+        names = [
+            "id",
+            "name",
+            "type",
+            "serialization_format",
+            "offered_qos_profiles",
+            "type_description_hash",
+        ]
+        present = [name for name in names if name in self._columns.topics]
+        rows = self._connection.execute(f"SELECT {','.join(present)} FROM topics ORDER BY id")  # noqa: S608 - constants
+        return tuple(_stream(dict(zip(present, row, strict=True)), counts, definitions) for row in rows)
+
+    def _read_counts(self) -> dict[int, int] | None:
+        try:
+            return dict(self._connection.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
+        except sqlite3.DatabaseError as err:
+            self.notes.append(f"the messages cannot be counted: {err}")
+            return None
+
+    def _read_definitions(self) -> dict[str, Embedded]:
+        if not self._columns.has_definitions:
+            return {}
+        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions ORDER BY id DESC"
+        return {
+            str(name): Embedded(str(encoding), _text(text))
+            for name, encoding, text in self._connection.execute(query)
+        }
+
+    def _read_bounds(self) -> tuple[int | None, int | None]:
+        try:
+            return self._connection.execute("SELECT min(timestamp), max(timestamp) FROM messages").fetchone()
+        except sqlite3.DatabaseError as err:
+            self.notes.append(f"the first and last time stamps cannot be read: {err}")
+            return None, None
+
+
+def _open(path: Path, stack: ExitStack, notes: list[str]) -> sqlite3.Connection:
+    """Open read-only; a file with changes still to be replayed is copied first, as replaying writes."""
+    pending = [beside for suffix in ("-wal", "-journal") if _has_bytes(beside := Path(f"{path}{suffix}"))]
+    if pending:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mosaico-")))
+        for file in (path, *pending):
+            shutil.copyfile(file, folder / file.name)
+        path = folder / path.name
+        notes.append(f"{pending[0].name} holds changes; they were replayed on a copy")
+    uri = f"{path.absolute().as_uri()}?{'mode=rw' if pending else 'mode=ro&immutable=1'}"
+    connection = sqlite3.connect(uri, uri=True, check_same_thread=False)
+    stack.callback(connection.close)
+    connection.text_factory = _text
+    return connection
+
+
+def _has_bytes(path: Path) -> bool:
+    return path.is_file() and path.stat().st_size > 0
+
+
+def _text(value: object) -> str:
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def _columns(connection: sqlite3.Connection) -> _Columns:
+    tables = {
+        str(name) for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
+    }
+    if not {"topics", "messages"} <= tables:
+        raise BagError(
+            f"a SQLite file without the tables of a recording; it has {', '.join(sorted(tables)) or 'none'}"
+        )
+    topics = frozenset(str(row[1]) for row in connection.execute("PRAGMA table_info(topics)"))
+    messages = {str(row[1]) for row in connection.execute("PRAGMA table_info(messages)")}
+    missing = ({"id", "name", "type"} - topics) | ({"topic_id", "timestamp", "data"} - messages)
+    if missing:
+        raise BagError(f"a SQLite file whose tables lack the columns {', '.join(sorted(missing))}")
+    indexes = [row[1] for row in connection.execute("PRAGMA index_list(messages)")]
+    leading = [
+        list(connection.execute("SELECT name FROM pragma_index_info(?) LIMIT 1", (name,))) for name in indexes
+    ]
+    return _Columns(topics, "message_definitions" in tables, [("timestamp",)] in leading)
+
+
+def _stream(row: dict[str, Any], counts: dict[int, int] | None, definitions: dict[str, Embedded]) -> Stream:
+    encoding = str(row.get("serialization_format", "cdr"))
+    attributes = {"encoding": encoding}
+    for name in ("offered_qos_profiles", "type_description_hash"):
+        if row.get(name):
+            attributes[name] = str(row[name])
+    return Stream(
+        int(row["id"]),
+        str(row["name"]),
+        str(row["type"]),
+        Encoding.CDR if encoding == "cdr" else Encoding.OTHER,
+        2,
+        definitions.get(str(row["type"])),
+        None if counts is None else counts.get(int(row["id"]), 0),
+        attributes=attributes,
+    )
+
+
+def _pages(rows: Iterator[Row]) -> Iterator[list[Row]]:
+    """Yield rows in lists of a few megabytes; one is read at a time, as its size is known only then."""
+    page: list[Row] = []
+    size = 0
+    for row in rows:
+        page.append(row)
+        size += len(row[3])
+        if size >= _PAGE_BYTES or len(page) >= _PAGE_ROWS:
+            yield page
+            page, size = [], 0
+    if page:
+        yield page
+
+
+def _load(page: list[Row]) -> Loaded:
+    ids, topics, times, blobs = zip(*page, strict=True)
+    data = np.frombuffer(b"".join(blobs), np.uint8)
+    lengths = np.fromiter(map(len, blobs), np.int64, len(blobs))
+    starts = np.cumsum(lengths) - lengths
+    all_times, all_ids = np.array(times, np.int64), np.array(ids, np.int64)
+    keys = np.array(topics, np.int64)
+    slabs = [
+        Slab(key, all_times[rows], data, starts[rows], lengths[rows], all_ids[rows])
+        for key, rows in by_key(keys, set(topics))
+    ]
+    return Loaded(slabs, [])

@@ -1,0 +1,146 @@
+"""This file finds the files that a path stands for: a file, a directory, a split recording with its metadata."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mosaico_ingest.bag.containers.opening import is_recording
+from mosaico_ingest.bag.metadata import FILE_NAME, Metadata, read_metadata
+from mosaico_ingest.diagnostics import Finding, Severity
+from mosaico_ingest.errors import BagError
+
+__all__ = ["Found", "discover"]
+
+_SUFFIX = ".zstd"
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """The files of one recording, the metadata that describe all of them, and what is odd about either."""
+
+    files: tuple[Path, ...]
+    metadata: Metadata | None
+    findings: tuple[Finding, ...]
+
+
+def discover(paths: Sequence[Path]) -> Found:
+    """Return the files that `paths` stand for, each once.
+
+    Raises:
+        BagError: A path does not exist, or holds no recording.
+    """
+    if not paths:
+        raise BagError("no path given", hint="name a recording, a directory or a metadata.yaml")
+    found = [_one(path) for path in paths]
+    files = tuple(dict.fromkeys(file for one in found for file in one.files))
+    findings = tuple(finding for one in found for finding in one.findings)
+    return Found(files, found[0].metadata if len(found) == 1 else None, findings)
+
+
+def _one(path: Path) -> Found:
+    if not path.exists():
+        raise BagError(
+            "does not exist", where=str(path), hint="check the path; relative ones start at the manifest"
+        )
+    if path.is_dir():
+        return _directory(path)
+    if path.name == FILE_NAME:
+        return _listed(read_metadata(path))
+    return _file(path)
+
+
+def _file(path: Path) -> Found:
+    """A file is itself; the metadata beside it count where they speak of this file alone."""
+    beside = path.parent / FILE_NAME
+    if not beside.is_file():
+        return Found((path,), None, ())
+    try:
+        metadata = read_metadata(beside)
+    except BagError as err:
+        return Found((path,), None, (_unreadable(err),))
+    names = [Path(name).name for name in metadata.files]
+    if not {path.name, path.name.removesuffix(_SUFFIX)} & set(names):
+        return Found((path,), None, ())
+    if len(names) == 1:
+        return Found((path,), metadata, ())
+    part = Finding(
+        "part-of-recording",
+        Severity.INFO,
+        f"{path.name} is one of the {len(names)} parts that {beside} lists",
+        help=f"name {path.parent} to read all of them",
+    )
+    return Found((path,), None, (part,))
+
+
+def _directory(path: Path) -> Found:
+    listing = path / FILE_NAME
+    findings: tuple[Finding, ...] = ()
+    if listing.is_file():
+        try:
+            return _listed(read_metadata(listing))
+        except BagError as err:
+            findings = (_unreadable(err),)
+    files = tuple(
+        sorted((file for file in path.iterdir() if file.is_file() and is_recording(file)), key=_natural)
+    )
+    if not files:
+        held = ", ".join(sorted(entry.name for entry in path.iterdir())[:5])
+        raise BagError(
+            f"a directory without a recording; it holds {held or 'nothing'}",
+            where=str(path),
+            hint="name a .bag, .db3 or .mcap file, or a directory with a metadata.yaml",
+        )
+    return Found(files, None, findings)
+
+
+def _listed(metadata: Metadata) -> Found:
+    folder = metadata.path.parent
+    files: list[Path] = []
+    missing: list[str] = []
+    for name in metadata.files:
+        file = next((file for file in _candidates(folder, name) if file.is_file()), None)
+        if file is None:
+            missing.append(name)
+        else:
+            files.append(file)
+    if not files:
+        present = sorted((f for f in folder.iterdir() if f.is_file() and is_recording(f)), key=_natural)
+        if not present:
+            raise BagError(
+                f"none of the files it lists is there: {', '.join(metadata.files) or 'it lists none'}",
+                where=str(metadata.path),
+                hint="restore the files beside it",
+            )
+        files = present
+    findings = tuple(
+        Finding(
+            "missing-part",
+            Severity.WARNING,
+            f"{metadata.path} lists {name}, which is not there",
+            help="restore it, or accept that its messages are missing",
+        )
+        for name in missing
+    )
+    return Found(tuple(files), metadata, findings)
+
+
+def _candidates(folder: Path, name: str) -> Iterator[Path]:
+    """Yield where a listed file may be: old versions wrote a directory, or left off the compression's suffix."""
+    for base in (folder / name, folder / Path(name).name):
+        yield base
+        yield Path(f"{base}{_SUFFIX}")
+        yield Path(str(base).removesuffix(_SUFFIX))
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Sort `part_10` behind `part_9`."""
+    return [(int(piece), "") if piece.isdigit() else (-1, piece) for piece in re.split(r"(\d+)", path.name)]
+
+
+def _unreadable(err: BagError) -> Finding:
+    return Finding(
+        "metadata-unreadable", Severity.WARNING, str(err), help="the storage alone decides what is read"
+    )

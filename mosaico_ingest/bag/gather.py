@@ -1,0 +1,151 @@
+"""This file coalesces what blocks give into large batches, channel by channel, in time order, in bounded memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from mosaico_ingest.bag.batch import Channel, RawBatch
+from mosaico_ingest.bag.containers.part import LATEST_NS, Slab
+from mosaico_ingest.bag.containers.slab import in_time, pack
+
+__all__ = ["Gather", "compact"]
+
+BATCH_BYTES = 8 << 20
+"""A batch ends at about this many bytes of payload."""
+_BIG_BYTES = 16 << 10
+"""Messages larger than this on average are not copied: the batch points into the block they came in."""
+_ROW_BYTES = 32
+"""What a message costs beside its payload."""
+
+
+@dataclass(slots=True)
+class _Waiting:
+    """What a channel has so far."""
+
+    slabs: list[Slab] = field(default_factory=list[Slab])
+    rows: int = 0
+    held_bytes: int = 0
+
+    def add(self, slab: Slab) -> None:
+        self.slabs.append(slab)
+        self.rows += len(slab)
+        self.held_bytes += len(slab.data) + len(slab) * _ROW_BYTES
+
+
+class Gather:
+    """Holds messages back until there are many, or until memory is short; the fullest channel goes first."""
+
+    def __init__(self, channels: Mapping[int, Channel], *, rows: int, memory_bytes: int) -> None:
+        self._channels = channels
+        self._rows = rows
+        self._memory_bytes = memory_bytes
+        self._waiting: dict[int, _Waiting] = {}
+
+    def add(self, channel: int, slab: Slab, floor_ns: int) -> Iterator[RawBatch]:
+        """Take `compact` messages; none that come later, these included, is older than `floor_ns`."""
+        waiting = self._waiting.setdefault(channel, _Waiting())
+        payload_bytes = int(slab.lengths.sum())
+        if waiting.slabs and self._is_full(waiting, len(slab), payload_bytes):
+            yield from self._flush(channel, floor_ns)
+        self._waiting[channel].add(slab)
+
+    def settle(self, floor_ns: int) -> Iterator[RawBatch]:
+        """Give what should not wait: full channels, blocks held whole, and the fullest while memory is short.
+
+        No message that comes later is older than `floor_ns`; younger ones wait, unless memory forbids.
+        """
+        for channel, waiting in self._waiting.items():
+            if waiting.slabs and (_is_view(waiting.slabs[-1]) or self._is_full(waiting)):
+                yield from self._flush(channel, floor_ns)
+        while self._held() > self._memory_bytes:
+            fullest = max(self._waiting, key=lambda channel: self._waiting[channel].held_bytes)
+            before = self._waiting[fullest].held_bytes
+            yield from self._flush(fullest, floor_ns)
+            if self._waiting[fullest].held_bytes > before // 2:
+                yield from self._flush(fullest, LATEST_NS)
+
+    def rest(self) -> Iterator[RawBatch]:
+        """Give everything."""
+        for channel in self._waiting:
+            yield from self._flush(channel, LATEST_NS)
+
+    def _held(self) -> int:
+        return sum(waiting.held_bytes for waiting in self._waiting.values())
+
+    def _is_full(self, waiting: _Waiting, rows: int = 1, payload_bytes: int = 0) -> bool:
+        return waiting.rows + rows > self._rows or waiting.held_bytes + payload_bytes > BATCH_BYTES
+
+    def _flush(self, channel: int, floor_ns: int) -> Iterator[RawBatch]:
+        """Give the messages up to `floor_ns`, keep the others."""
+        slabs = [in_time(slab) for slab in self._waiting[channel].slabs]
+        waiting = self._waiting[channel] = _Waiting()
+        ready: list[Slab] = []
+        for slab in slabs:
+            count = int(np.searchsorted(slab.log_times, floor_ns, side="right"))
+            if count:
+                ready.append(slab.rows(slice(0, count)))
+            if count < len(slab):
+                waiting.add(slab if not count else compact(slab.rows(slice(count, None))))
+        for group in _groups(_ordered(ready)):
+            yield from self._batches(self._channels[channel], group)
+
+    def _batches(self, channel: Channel, slab: Slab) -> Iterator[RawBatch]:
+        """Cut into batches of the allowed size, as equal as can be."""
+        payload_bytes = int(slab.lengths.sum())
+        parts = min(len(slab), max(-(-len(slab) // self._rows), -(-payload_bytes // BATCH_BYTES)), 1 << 16)
+        edges = np.linspace(0, len(slab), max(parts, 1) + 1).astype(np.int64).tolist()
+        for begin, end in pairwise(edges):
+            rows = slab.rows(slice(begin, end))
+            yield RawBatch(channel, rows.log_times, rows.data, rows.starts, rows.lengths, rows.offsets)
+
+
+def compact(slab: Slab) -> Slab:
+    """Return the messages in a buffer of their own, unless they are too big to be worth a copy."""
+    return slab if _is_view(slab) else pack(slab)
+
+
+def _is_view(slab: Slab) -> bool:
+    """Return whether the slab's buffer is that of the block it came in."""
+    return int(slab.lengths.sum()) > _BIG_BYTES * len(slab)
+
+
+def _ordered(slabs: Sequence[Slab]) -> list[Slab]:
+    """Return the slabs one after the other in time; where they interleave, as one."""
+    ordered = sorted(slabs, key=lambda slab: int(slab.log_times[0]))
+    pairs = pairwise(ordered)
+    if all(one.log_times[-1] <= other.log_times[0] for one, other in pairs):
+        return ordered
+    return [in_time(_joined([pack(slab) for slab in slabs]))]
+
+
+def _groups(slabs: Sequence[Slab]) -> Iterator[Slab]:
+    """Join neighbours, except those that are views of a block."""
+    small: list[Slab] = []
+    for slab in slabs:
+        if _is_view(slab):
+            if small:
+                yield _joined(small)
+                small = []
+            yield slab
+        else:
+            small.append(slab)
+    if small:
+        yield _joined(small)
+
+
+def _joined(slabs: Sequence[Slab]) -> Slab:
+    if len(slabs) == 1:
+        return slabs[0]
+    bases = np.cumsum([0, *(len(slab.data) for slab in slabs[:-1])])
+    return Slab(
+        slabs[0].key,
+        np.concatenate([slab.log_times for slab in slabs]),
+        np.concatenate([slab.data for slab in slabs]),
+        np.concatenate([slab.starts + base for slab, base in zip(slabs, bases.tolist(), strict=True)]),
+        np.concatenate([slab.lengths for slab in slabs]),
+        np.concatenate([slab.offsets for slab in slabs]),
+    )

@@ -1,0 +1,75 @@
+"""This file reads rosbag2's `metadata.yaml`: a hint about a recording, whose storage decides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from mosaico_ingest.errors import BagError
+
+__all__ = ["FILE_NAME", "Metadata", "TopicHint", "read_metadata"]
+
+FILE_NAME = "metadata.yaml"
+_LIMIT_BYTES = 16 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class TopicHint:
+    """What the metadata say of a topic."""
+
+    topic: str
+    msgtype: str
+    count: int
+    serialization_format: str
+    qos: str
+
+
+@dataclass(frozen=True, slots=True)
+class Metadata:
+    """The parts of `metadata.yaml` that can be compared with the storage."""
+
+    path: Path
+    files: tuple[str, ...]
+    message_count: int
+    topics: tuple[TopicHint, ...]
+    distro: str
+
+
+def read_metadata(path: Path) -> Metadata:
+    """Read a `metadata.yaml` of any version.
+
+    Raises:
+        BagError: It is no YAML, or not of rosbag2's shape.
+    """
+    try:
+        if path.stat().st_size > _LIMIT_BYTES:
+            raise BagError(f"larger than {_LIMIT_BYTES} bytes", where=str(path))
+        content = yaml.load(path.read_bytes(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))  # noqa: S506 - both are safe loaders, one is fast
+        info = content["rosbag2_bagfile_information"]
+        return Metadata(
+            path,
+            tuple(str(name) for name in info.get("relative_file_paths") or ()),
+            int(info.get("message_count") or 0),
+            tuple(_topic(entry) for entry in info.get("topics_with_message_count") or ()),
+            str(info.get("ros_distro") or ""),
+        )
+    except OSError as err:
+        raise BagError(f"cannot be read: {err.strerror}", where=str(path)) from err
+    except yaml.YAMLError as err:
+        raise BagError(f"no YAML: {' '.join(str(err).split())}", where=str(path)) from err
+    except (KeyError, TypeError, ValueError, AttributeError) as err:
+        raise BagError(f"not of the shape of rosbag2's metadata: {err}", where=str(path)) from err
+
+
+def _topic(entry: dict[str, Any]) -> TopicHint:
+    about = entry.get("topic_metadata") or entry["topic_and_type"]
+    return TopicHint(
+        str(about["name"]),
+        str(about["type"]),
+        int(entry.get("message_count") or 0),
+        str(about.get("serialization_format") or ""),
+        str(about.get("offered_qos_profiles") or ""),
+    )
