@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mosaico_ingest.bag.batch import Channel, Encoding, RawBatch
+from mosaico_ingest.bag.batch import Encoding, RawBatch
 from mosaico_ingest.bag.definition import Container, Definition, Field, MessageType, Source
 from mosaico_ingest.bag.serialize import Serializer
 from mosaico_ingest.decode import lockstep
-from mosaico_ingest.decode.columnar import ColumnarDecoder
 from mosaico_ingest.decode.decoder import Decoded
 from mosaico_ingest.decode.layout import compile_layout
 from mosaico_ingest.decode.locate import locate
 from mosaico_ingest.decode.lockstep import locate_lockstep
 from mosaico_ingest.decode.places import Frame, Located, Place
-from mosaico_ingest.decode.rowwise import RowwiseDecoder
 from mosaico_ingest.decode.stepwise import locate_stepwise
+
+BatchOf = Callable[[Sequence[bytes], Definition, Encoding], RawBatch]
+AssertAgree = Callable[[Sequence[bytes], Definition, Encoding], Decoded]
 
 RELAXED = settings(deadline=None, suppress_health_check=list(HealthCheck), max_examples=120)
 
@@ -38,46 +38,6 @@ PRIMITIVES = (*INTEGERS, "bool", "float32", "float64", "string", "wstring")
 def make(root: str, types: dict[str, Sequence[Field]], *, ros_version: int = 2) -> Definition:
     messages = {name: MessageType(name, tuple(fields)) for name, fields in types.items()}
     return Definition(root, messages, Source.BAG, "", ros_version)
-
-
-def batch_of(payloads: Sequence[bytes], definition: Definition, encoding: Encoding) -> RawBatch:
-    """Lay the payloads into one buffer, with other bytes before, between and after them."""
-    lengths = np.array([len(payload) for payload in payloads], np.int64)
-    gaps = 3 + np.arange(len(payloads)) % 5
-    starts = np.cumsum(lengths + gaps) - lengths
-    data = b"".join(b"\xff" * int(gap) + payload for gap, payload in zip(gaps, payloads, strict=True))
-    channel = Channel(1, "/topic", definition.root, encoding, len(payloads), definition)
-    number = np.arange(len(payloads), dtype=np.int64)
-    return RawBatch(channel, number, np.frombuffer(data, np.uint8), starts, lengths, number)
-
-
-def bits(array: pa.Array) -> Any:
-    """Return the array as values that can be compared, NaN with NaN and 0.0 not with -0.0."""
-    kind = array.type
-    if pa.types.is_struct(kind):
-        return len(array), [bits(array.field(number)) for number in range(kind.num_fields)]
-    if pa.types.is_list(kind):
-        return array.value_lengths().to_pylist(), bits(array.flatten())
-    if pa.types.is_fixed_size_list(kind):
-        return len(array), bits(array.flatten())
-    if pa.types.is_floating(kind):
-        return array.to_numpy(zero_copy_only=False).tobytes()
-    return array.to_pylist()
-
-
-def assert_same(fast: Decoded, slow: Decoded) -> None:
-    fast.rows.validate(full=True)
-    assert fast.rows.type.equals(slow.rows.type, check_metadata=True)
-    assert fast.index.tolist() == slow.index.tolist()
-    assert fast.failures == slow.failures
-    assert bits(fast.rows) == bits(slow.rows)
-
-
-def assert_agree(payloads: Sequence[bytes], definition: Definition, encoding: Encoding) -> Decoded:
-    batch = batch_of(payloads, definition, encoding)
-    slow = RowwiseDecoder(definition, encoding).decode(batch)
-    assert_same(ColumnarDecoder(definition, encoding).decode(batch), slow)
-    return slow
 
 
 @st.composite
@@ -145,18 +105,18 @@ def messages(draw: st.DrawFn) -> tuple[Definition, Encoding, list[bytes]]:
 
 
 @RELAXED
-@given(messages())
+@given(case=messages())
 def test_columns_equal_rows_for_any_definition_and_values(
-    case: tuple[Definition, Encoding, list[bytes]],
+    assert_agree: AssertAgree, case: tuple[Definition, Encoding, list[bytes]]
 ) -> None:
     definition, encoding, payloads = case
     assert not assert_agree(payloads, definition, encoding).failures
 
 
 @RELAXED
-@given(messages(), st.data())
+@given(case=messages(), data=st.data())
 def test_columns_equal_rows_for_damaged_messages(
-    case: tuple[Definition, Encoding, list[bytes]], data: st.DataObject
+    assert_agree: AssertAgree, case: tuple[Definition, Encoding, list[bytes]], data: st.DataObject
 ) -> None:
     definition, encoding, payloads = case
     assert_agree([data.draw(damaged(payload)) for payload in payloads], definition, encoding)
@@ -192,9 +152,9 @@ def same_located(one: Located, other: Located) -> bool:
 
 
 @RELAXED
-@given(messages(), st.data(), st.integers(0, 3))
+@given(case=messages(), data=st.data(), few=st.integers(0, 3))
 def test_every_way_of_walking_finds_the_same_places(
-    case: tuple[Definition, Encoding, list[bytes]], data: st.DataObject, few: int
+    batch_of: BatchOf, case: tuple[Definition, Encoding, list[bytes]], data: st.DataObject, few: int
 ) -> None:
     definition, encoding, payloads = case
     payloads = [data.draw(damaged(payload)) for payload in payloads]

@@ -1,0 +1,72 @@
+"""What the decoders' tests share: batches out of payloads, and the comparison of the two decoders."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from mosaico_ingest.bag.batch import Channel, Encoding, RawBatch
+from mosaico_ingest.bag.definition import Definition
+from mosaico_ingest.decode.columnar import ColumnarDecoder
+from mosaico_ingest.decode.decoder import Decoded
+from mosaico_ingest.decode.rowwise import RowwiseDecoder
+
+
+def make_batch(payloads: Sequence[bytes], definition: Definition, encoding: Encoding) -> RawBatch:
+    """Lay the payloads into one buffer, with other bytes before, between and after them."""
+    lengths = np.array([len(payload) for payload in payloads], np.int64)
+    gaps = 3 + np.arange(len(payloads)) % 5
+    starts = np.cumsum(lengths + gaps) - lengths
+    data = b"".join(b"\xff" * int(gap) + payload for gap, payload in zip(gaps, payloads, strict=True))
+    channel = Channel(1, "/topic", definition.root, encoding, len(payloads), definition)
+    number = np.arange(len(payloads), dtype=np.int64)
+    return RawBatch(channel, number, np.frombuffer(data, np.uint8), starts, lengths, number)
+
+
+def bits(array: pa.Array) -> Any:
+    """Return the array as values that can be compared, NaN with NaN and 0.0 not with -0.0."""
+    kind = array.type
+    if pa.types.is_struct(kind):
+        return len(array), [bits(array.field(number)) for number in range(kind.num_fields)]
+    if pa.types.is_list(kind):
+        return array.value_lengths().to_pylist(), bits(array.flatten())
+    if pa.types.is_fixed_size_list(kind):
+        return len(array), bits(array.flatten())
+    if pa.types.is_floating(kind):
+        return array.to_numpy(zero_copy_only=False).tobytes()
+    return array.to_pylist()
+
+
+def check_same(fast: Decoded, slow: Decoded) -> None:
+    fast.rows.validate(full=True)
+    assert fast.rows.type.equals(slow.rows.type, check_metadata=True)
+    assert fast.index.tolist() == slow.index.tolist()
+    assert fast.failures == slow.failures
+    assert bits(fast.rows) == bits(slow.rows)
+
+
+@pytest.fixture(scope="session")
+def batch_of() -> Callable[[Sequence[bytes], Definition, Encoding], RawBatch]:
+    return make_batch
+
+
+@pytest.fixture(scope="session")
+def assert_same() -> Callable[[Decoded, Decoded], None]:
+    return check_same
+
+
+@pytest.fixture(scope="session")
+def assert_agree() -> Callable[[Sequence[bytes], Definition, Encoding], Decoded]:
+    """Decode the payloads both ways, compare, and return what the row-wise decoder says."""
+
+    def check(payloads: Sequence[bytes], definition: Definition, encoding: Encoding) -> Decoded:
+        batch = make_batch(payloads, definition, encoding)
+        slow = RowwiseDecoder(definition, encoding).decode(batch)
+        check_same(ColumnarDecoder(definition, encoding).decode(batch), slow)
+        return slow
+
+    return check

@@ -1,0 +1,158 @@
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mosaico_ingest.bag.batch import Channel, Encoding, RawBatch
+from mosaico_ingest.bag.definition import Container, Definition, Field, MessageType, Source
+from mosaico_ingest.bag.serialize import Serializer
+from mosaico_ingest.bag.types import TypeResolver
+from mosaico_ingest.decode.choose import decoder_for
+from mosaico_ingest.decode.columnar import ColumnarDecoder
+from mosaico_ingest.decode.decoder import Decoded
+from mosaico_ingest.errors import DecodeError
+from mosaico_ingest.policies import Stores
+
+BatchOf = Callable[[Sequence[bytes], Definition, Encoding], RawBatch]
+AssertAgree = Callable[[Sequence[bytes], Definition, Encoding], Decoded]
+
+HUMBLE = TypeResolver(Stores.ROS2_HUMBLE)
+STRING = HUMBLE.resolve("std_msgs/msg/String", None, ros_version=2)
+IMAGE = HUMBLE.resolve("sensor_msgs/msg/CompressedImage", None, ros_version=2)
+LITTLE, BIG = b"\0\1\0\0", b"\0\0\0\0"
+
+
+def message(*fields: Field) -> Definition:
+    return Definition("test/msg/T", {"test/msg/T": MessageType("test/msg/T", fields)}, Source.BAG, "", 2)
+
+
+def text(value: bytes, order: str = "<") -> bytes:
+    return (LITTLE if order == "<" else BIG) + struct.pack(f"{order}I", len(value) + 1) + value + b"\0"
+
+
+def test_a_lying_length_costs_its_row_and_allocates_nothing(assert_agree: AssertAgree) -> None:
+    numbers = message(Field("v", "float64", container=Container.SEQUENCE))
+    lie = LITTLE + struct.pack("<I", 2**32 - 1)
+    good = Serializer(numbers, Encoding.CDR).from_dict({"v": [1.0, 2.0]})
+    decoded = assert_agree([good, lie, good] * 20, numbers, Encoding.CDR)
+    assert [failure.rule for failure in decoded.failures] == ["sequence-length"] * 20
+    assert decoded.rows.field("v").to_pylist() == [[1.0, 2.0]] * 40
+
+
+def test_a_message_that_breaks_inside_a_loop_leaves_the_others_alone(assert_agree: AssertAgree) -> None:
+    names = message(Field("v", "string", container=Container.SEQUENCE), Field("end", "uint32"))
+    serializer = Serializer(names, Encoding.CDR)
+    good = [serializer.from_dict({"v": ["ab"] * (number % 7), "end": number}) for number in range(60)]
+    bad = good[5][:16] + struct.pack("<I", 2**31) + good[5][20:]
+    decoded = assert_agree([*good[:30], bad, bad, *good[30:]], names, Encoding.CDR)
+    assert [failure.row for failure in decoded.failures] == [30, 31]
+    assert decoded.rows.field("end").to_pylist() == list(range(60))
+
+
+def test_both_byte_orders_may_come_in_one_batch(assert_agree: AssertAgree) -> None:
+    payloads = [text(b"a"), text(b"bcd", ">"), text(b""), text(b"e", ">")] * 10
+    decoded = assert_agree(payloads, STRING, Encoding.CDR)
+    assert decoded.rows.field("data").to_pylist() == ["a", "bcd", "", "e"] * 10
+
+
+@pytest.mark.parametrize(
+    ("payload", "rule"),
+    [
+        (b"", "encapsulation"),
+        (b"\0\2\0\0", "pl-cdr"),
+        (b"\0\7\0\0", "xcdr2"),
+        (text(b"a")[:-1], "string-length"),
+        (text(b"a")[:-1] + b"b", "string-terminator"),
+        (text(b"\xff"), "utf8"),
+        (text(b"\xed\xa0\x80"), "utf8"),
+        (text(b"a") + bytes(8), "trailing-bytes"),
+        (text(b"a") + b"\0\0\0\1", "trailing-bytes"),
+    ],
+)
+@pytest.mark.parametrize("others", [2, 50])
+def test_a_bad_message_fails_by_the_rule_it_breaks(
+    assert_agree: AssertAgree, payload: bytes, rule: str, others: int
+) -> None:
+    good = [text(b"x" * (number % 3)) for number in range(others)]
+    decoded = assert_agree([*good, payload, *good], STRING, Encoding.CDR)
+    assert [(failure.row, failure.rule) for failure in decoded.failures] == [(others, rule)]
+
+
+def test_padding_and_a_few_zeros_after_a_message_are_no_failure(assert_agree: AssertAgree) -> None:
+    payloads = [text(b"a" * (number % 4)) + bytes(number % 8) for number in range(64)]
+    assert not assert_agree(payloads, STRING, Encoding.CDR).failures
+
+
+def test_text_outside_ascii_and_wide_text_with_surrogates_are_read(assert_agree: AssertAgree) -> None:
+    wide = message(Field("v", "wstring", container=Container.SEQUENCE))
+    values = [["", "é"], ["𝄞 clef", "plain"], ["漢字"]] * 12
+    payloads = [Serializer(wide, Encoding.CDR).from_dict({"v": value}) for value in values]
+    assert assert_agree(payloads, wide, Encoding.CDR).rows.field("v").to_pylist() == values
+    assert not assert_agree([text("é漢𝄞".encode())] * 20, STRING, Encoding.CDR).failures
+
+
+def test_any_byte_but_zero_is_true(assert_agree: AssertAgree) -> None:
+    flag = message(Field("v", "bool"))
+    decoded = assert_agree([LITTLE + bytes([value]) for value in range(256)], flag, Encoding.CDR)
+    assert decoded.rows.field("v").to_pylist() == [False] + [True] * 255
+
+
+def test_a_message_without_fields_still_counts_as_a_row(assert_agree: AssertAgree) -> None:
+    empty = message()
+    assert len(assert_agree([LITTLE, LITTLE + b"\0", LITTLE + bytes(4)], empty, Encoding.CDR).rows) == 3
+    assert len(assert_agree([b"", b"", b"\0"], empty, Encoding.ROS1).rows) == 2
+
+
+def test_an_empty_batch_has_no_rows(assert_agree: AssertAgree) -> None:
+    assert len(assert_agree([], STRING, Encoding.CDR).rows) == 0
+
+
+def test_payloads_may_lie_in_the_buffer_in_any_order(batch_of: BatchOf) -> None:
+    batch = batch_of(
+        [text(bytes([97 + number] * (number % 5))) for number in range(26)], STRING, Encoding.CDR
+    )
+    mixed = np.random.default_rng(3).permutation(26)
+    shuffled = replace(batch, starts=batch.starts[mixed], lengths=batch.lengths[mixed])
+    decoder = ColumnarDecoder(STRING, Encoding.CDR)
+    expected = np.array(decoder.decode(batch).rows.field("data").to_pylist())[mixed]
+    assert decoder.decode(shuffled).rows.field("data").to_pylist() == expected.tolist()
+
+
+def test_a_single_blob_is_not_copied(batch_of: BatchOf) -> None:
+    blob = np.random.default_rng(2).bytes(100_000)
+    value = {"header": {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "c"}, "format": "jpeg", "data": blob}
+    batch = batch_of([Serializer(IMAGE, Encoding.CDR).from_dict(value)], IMAGE, Encoding.CDR)
+    data = ColumnarDecoder(IMAGE, Encoding.CDR).decode(batch).rows.field("data")
+    assert data[0].as_py() == blob
+    assert np.shares_memory(np.frombuffer(data.buffers()[2], np.uint8), batch.data)
+
+
+def test_a_batch_beyond_what_a_column_can_hold_is_refused_before_anything_is_read(batch_of: BatchOf) -> None:
+    batch = batch_of([text(b"a")] * 2, STRING, Encoding.CDR)
+    with pytest.raises(DecodeError, match="read smaller batches"):
+        ColumnarDecoder(STRING, Encoding.CDR).decode(replace(batch, lengths=np.array([2**31, 5])))
+
+
+def channel(encoding: Encoding, definition: Definition | None) -> Channel:
+    return Channel(
+        1,
+        "/t",
+        "a/msg/B",
+        encoding,
+        0,
+        definition,
+        None if definition else "no text",
+        attributes={"encoding": "json"},
+    )
+
+
+def test_a_channel_that_cannot_be_decoded_says_why() -> None:
+    with pytest.raises(DecodeError, match=r"/t: the messages are not in a ROS encoding \(json\)"):
+        decoder_for(channel(Encoding.OTHER, STRING))
+    with pytest.raises(DecodeError, match="/t: no definition of a/msg/B: no text"):
+        decoder_for(channel(Encoding.CDR, None))
+    assert decoder_for(channel(Encoding.CDR, STRING)).shape.names == ["data"]
