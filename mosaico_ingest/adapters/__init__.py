@@ -1,1 +1,32 @@
-"""Rows in the ROS shape in, rows in the ontology's shape out; knows nothing of bytes."""
+"""ROS rows in, ontology rows out: the mapping language, the catalog written in it, adapters in Python.
+
+Knows nothing of bytes. `from mosaico_ingest.adapters import IMUAdapter` gives any built-in adapter as a class.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+_BASE = ("ROSAdapterBase", "register_default_adapter")
+
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401 - a class or a function
+    """Import what `name` needs, and nothing before."""
+    if name in _BASE:
+        from mosaico_ingest.adapters import base  # noqa: PLC0415 - on demand
+
+        return getattr(base, name)
+    if name.endswith("Adapter"):
+        from mosaico_ingest.adapters.builtin import BY_NAME  # noqa: PLC0415 - on demand
+
+        if name in BY_NAME:
+            from mosaico_ingest.adapters.names import adapter_class  # noqa: PLC0415 - on demand
+
+            return adapter_class(name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    from mosaico_ingest.adapters.builtin import BY_NAME  # noqa: PLC0415 - on demand
+
+    return sorted({*globals(), *_BASE, *BY_NAME})

@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from mosaico_ingest.adapters.adapter import Adapted, Envelope
 from mosaico_ingest.bag.definition import Definition
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 
 __all__ = ["UnmodeledSpec"]
 
@@ -24,6 +24,7 @@ class UnmodeledSpec:
     name: str = "Unmodeled"
     ros_types: tuple[str, ...] = ()
     default: bool = False
+    serialization_format: SerializationFormat = SerializationFormat.DEFAULT
 
     def bind(self, definition: Definition, shape: pa.StructType) -> UnmodeledAdapter:
         """Take the ROS shape for the ontology's columns; two types of one short name differ by fingerprint."""
@@ -31,7 +32,7 @@ class UnmodeledSpec:
         names = _free_of_the_envelope(shape)
         struct = pa.struct([field.with_name(names[field.name]) for field in shape])
         renamed = {new: old for old, new in names.items() if new != old}
-        return UnmodeledAdapter(OntologyType(tag, struct), renamed)
+        return UnmodeledAdapter(OntologyType(tag, struct, self.serialization_format), renamed)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,260 @@
+"""Adapters written in Python: the contracts of the base class, by message and by columns."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from mosaico_ingest.adapters import base
+from mosaico_ingest.adapters.adapter import Adapted
+from mosaico_ingest.adapters.base import ROSAdapterBase, register_default_adapter, registered_adapters
+from mosaico_ingest.adapters.python_adapter import PythonAdapterSpec, ontology_of
+from mosaico_ingest.adapters.reference import adapter_spec, load_adapter_reference
+from mosaico_ingest.bag.definition import Definition
+from mosaico_ingest.bag.message import ROSMessage
+from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.ontology.message import Message
+from mosaico_ingest.ontology.serializable import Serializable
+
+
+class Speed(Serializable):
+    """A row of the tests."""
+
+    value: float
+    name: str | None = None
+
+
+class SpeedAdapter(ROSAdapterBase[Speed]):
+    ros_msgtype = "std_msgs/Float64"
+    __mosaico_ontology_type__ = Speed
+
+    @classmethod
+    def from_dict(cls, ros_data: dict[str, Any], **kwargs: Any) -> Speed:
+        if ros_data["data"] < 0:
+            raise ValueError(f"speed is {ros_data['data']}")
+        return Speed(value=ros_data["data"], **kwargs)
+
+
+@pytest.fixture
+def floats(define: Callable[..., Definition], adapt: Callable[..., Adapted]) -> Callable[..., Adapted]:
+    def run(adapter: type[Any], *values: float) -> Adapted:
+        return adapt(PythonAdapterSpec(adapter), define("std_msgs/msg/Float64"), [{"data": v} for v in values])
+
+    return run
+
+
+@pytest.fixture(autouse=True)
+def _nothing_stays_registered() -> Iterator[None]:
+    before = dict(base._registered)
+    yield
+    base._registered.clear()
+    base._registered.update(before)
+
+
+def test_each_message_becomes_a_row_in_order(floats: Callable[..., Adapted]) -> None:
+    adapted = floats(SpeedAdapter, *range(600))
+    assert adapted.rows.field("value").to_pylist() == list(range(600))
+    assert adapted.index.tolist() == list(range(600))
+    assert adapted.rows.type == Speed.ontology_type().struct
+    assert adapted.log_times is None
+
+
+def test_no_message_is_no_row(floats: Callable[..., Adapted]) -> None:
+    adapted = floats(SpeedAdapter)
+    assert len(adapted.rows) == 0
+    assert adapted.rows.type == Speed.ontology_type().struct
+
+
+def test_an_exception_rejects_its_row_and_no_other(floats: Callable[..., Adapted]) -> None:
+    adapted = floats(SpeedAdapter, 1, -2, 3)
+    assert adapted.index.tolist() == [0, 2]
+    (failure,) = adapted.failures
+    assert (failure.row, failure.rule) == (1, "adapter")
+    assert failure.reason == "SpeedAdapter: ValueError: speed is -2.0"
+
+
+def test_translate_that_is_overridden_is_called_with_the_envelope(floats: Callable[..., Adapted]) -> None:
+    class Shifted(SpeedAdapter):
+        @classmethod
+        def translate(cls, ros_msg: ROSMessage, **kwargs: Any) -> Message:
+            message = super().translate(ros_msg, name=ros_msg.topic, **kwargs)
+            return Message(timestamp_ns=ros_msg.bag_timestamp_ns + 100, data=message.data)
+
+    adapted = floats(Shifted, 5, 6)
+    assert adapted.rows.to_pylist() == [{"value": 5.0, "name": "/topic"}, {"value": 6.0, "name": "/topic"}]
+    assert adapted.log_times is not None
+    assert adapted.log_times.tolist() == [100, 101]
+
+
+def test_another_object_than_promised_rejects_the_row(floats: Callable[..., Adapted]) -> None:
+    class Wrong(SpeedAdapter):
+        @classmethod
+        def from_dict(cls, ros_data: dict[str, Any], **_: Any) -> Any:
+            return None if ros_data["data"] else Speed(value=0)
+
+    adapted = floats(Wrong, 1, 0)
+    assert adapted.index.tolist() == [1]
+    assert "returned NoneType, expected Speed" in adapted.failures[0].reason
+
+
+def test_columns_are_adapted_by_from_batch(floats: Callable[..., Adapted]) -> None:
+    class ByColumns(SpeedAdapter):
+        calls = 0
+
+        @classmethod
+        def from_batch(cls, rows: pa.StructArray) -> pa.StructArray:
+            cls.calls += 1
+            values = rows.field("data")
+            columns = [values, pa.nulls(len(rows), pa.string())]
+            missing = pa.array(np.asarray(values) == 7)
+            return pa.StructArray.from_arrays(columns, fields=list(Speed.ontology_type().struct), mask=missing)
+
+    adapted = floats(ByColumns, 1, 7, 3)
+    assert ByColumns.calls == 1
+    assert adapted.index.tolist() == [0, 2]
+    assert adapted.rows.field("value").to_pylist() == [1, 3]
+    assert adapted.failures[0].row == 1
+
+
+def test_a_batch_that_raises_is_halved_until_the_rows_are_found(floats: Callable[..., Adapted]) -> None:
+    class Picky(SpeedAdapter):
+        @classmethod
+        def from_batch(cls, rows: pa.StructArray) -> pa.StructArray:
+            values = rows.field("data").to_pylist()
+            if 13 in values:
+                raise ValueError("thirteen")
+            return pa.array([{"value": value} for value in values], Speed.ontology_type().struct)
+
+    adapted = floats(Picky, *range(20))
+    assert adapted.index.tolist() == [*range(13), *range(14, 20)]
+    assert [(failure.row, failure.reason) for failure in adapted.failures] == [(13, "Picky: ValueError: thirteen")]
+
+
+def test_columns_of_another_type_break_the_adapter(floats: Callable[..., Adapted]) -> None:
+    class Broken(SpeedAdapter):
+        @classmethod
+        def from_batch(cls, rows: pa.StructArray) -> pa.Array:
+            return rows.field("data")
+
+    with pytest.raises(AdapterError, match=r"Broken.from_batch returned 1 rows of double, expected 1 rows of Speed"):
+        floats(Broken, 1)
+
+
+def test_metadata_is_read_from_the_first_message(define: Callable[..., Definition]) -> None:
+    class Telling(SpeedAdapter):
+        @classmethod
+        def schema_metadata(cls, ros_data: dict[str, Any], **_: Any) -> dict[str, Any] | None:
+            return {"first": ros_data["data"]}
+
+    definition = define("std_msgs/msg/Float64")
+    rows = pa.array([{"data": 2.0}])
+    bound = PythonAdapterSpec(Telling).bind(definition, rows.type)
+    assert bound.topic_metadata(rows[0]) == {"first": 2.0}
+    assert bound.topic_metadata(None) == {}
+    assert PythonAdapterSpec(SpeedAdapter).bind(definition, rows.type).topic_metadata(rows[0]) == {}
+
+
+def test_registering_makes_a_class_the_default_of_its_types() -> None:
+    assert register_default_adapter(SpeedAdapter) is SpeedAdapter
+    assert registered_adapters()["std_msgs/msg/Float64"] is SpeedAdapter
+    register_default_adapter(SpeedAdapter)
+
+    class Other(SpeedAdapter): ...
+
+    with pytest.raises(AdapterError, match=r"Other and .*SpeedAdapter both register as the default for std_msgs/msg/Float64"):
+        register_default_adapter(Other)
+
+
+def test_a_class_without_its_parts_says_which_is_missing(define: Callable[..., Definition]) -> None:
+    class NoType(ROSAdapterBase[Speed]): ...
+
+    class NoOntology(ROSAdapterBase[Speed]):
+        ros_msgtype = ("std_msgs/msg/Float64",)
+
+    with pytest.raises(AdapterError, match="NoType has no ros_msgtype"):
+        _ = PythonAdapterSpec(NoType).ros_types
+    with pytest.raises(AdapterError, match="NoOntology has no __mosaico_ontology_type__"):
+        PythonAdapterSpec(NoOntology).bind(define("std_msgs/msg/Float64"), pa.struct([]))
+    with pytest.raises(AdapterError, match="int is no ontology class"):
+        ontology_of(int)
+
+
+_FILE = '''
+from mosaico_ingest.adapters import ROSAdapterBase
+from mosaico_ingest.ontology import Serializable
+from beside import FACTOR
+
+class {name}Row(Serializable):
+    value: float
+
+class {name}(ROSAdapterBase[{name}Row]):
+    ros_msgtype = "std_msgs/msg/Float64"
+    __mosaico_ontology_type__ = {name}Row
+
+    @classmethod
+    def from_dict(cls, ros_data):
+        return {name}Row(value=FACTOR * ros_data["data"])
+'''
+
+
+def test_a_file_beside_the_manifest_is_loaded_and_survives_pickling(tmp_path: Path) -> None:
+    (tmp_path / "beside.py").write_text("FACTOR = 2\n")
+    (tmp_path / "mine.py").write_text(_FILE.format(name="Doubling"))
+    spec = load_adapter_reference("mine.py:Doubling", tmp_path)
+    assert (spec.name, spec.ros_types, spec.default) == ("Doubling", ("std_msgs/msg/Float64",), True)
+    again = pickle.loads(pickle.dumps(spec))  # noqa: S301 - what was just pickled
+    assert again == spec
+
+
+def test_a_module_is_found_beside_the_manifest_too(tmp_path: Path) -> None:
+    (tmp_path / "beside.py").write_text("FACTOR = 2\n")
+    (tmp_path / "adapters_of_mine.py").write_text(_FILE.format(name="Tripling"))
+    assert load_adapter_reference("adapters_of_mine:Tripling", tmp_path).name == "Tripling"
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "reason"),
+    [
+        ("import os\nraise RuntimeError('no\\nlicence')\n", "broken.py:2", "RuntimeError: no licence"),
+        ("def f(:\n    pass\n", "broken.py:1", "SyntaxError"),
+        ("import nothing_like_it\n", "broken.py:1", "No module named 'nothing_like_it'"),
+    ],
+)
+def test_a_module_that_fails_to_import_names_file_and_line(
+    tmp_path: Path, text: str, place: str, reason: str
+) -> None:
+    (tmp_path / "broken.py").write_text(text)
+    with pytest.raises(AdapterError) as caught:
+        load_adapter_reference("broken.py:Adapter", tmp_path)
+    assert str(caught.value).count("\n") == 0
+    assert place in str(caught.value)
+    assert reason in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("ref", "reason"),
+    [
+        ("IMUAdaptor", "did you mean IMUAdapter?"),
+        ("nowhere.py:Adapter", "there is no file"),
+        ("no_such_module_here:Adapter", "there is no module no_such_module_here"),
+        ("mine.py:Doublin", "did you mean Doubling?"),
+    ],
+)
+def test_a_reference_to_nothing_says_what_there_is(tmp_path: Path, ref: str, reason: str) -> None:
+    (tmp_path / "beside.py").write_text("FACTOR = 2\n")
+    (tmp_path / "mine.py").write_text(_FILE.format(name="Doubling"))
+    with pytest.raises(AdapterError, match=reason.replace("?", r"\?")):
+        load_adapter_reference(ref, tmp_path)
+
+
+def test_what_is_no_adapter_is_refused() -> None:
+    with pytest.raises(AdapterError, match="int 3 is no adapter"):
+        adapter_spec(3, Path())
+    with pytest.raises(AdapterError, match="Speed is no adapter"):
+        adapter_spec(Speed, Path())

@@ -1,0 +1,72 @@
+"""The PNG form of raw images loses nothing and is made only where it can be."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mosaico_ingest.adapters.adapter import Adapted
+from mosaico_ingest.adapters.builtin import BY_NAME
+from mosaico_ingest.adapters.image import PngImageSpec, greyscale_png
+from mosaico_ingest.bag.definition import Definition
+
+
+def _pixels(png: bytes) -> tuple[int, int, bytes]:
+    """Read back width, height and bytes of a PNG without filters, checking every chunk."""
+    assert png[:8] == b"\x89PNG\r\n\x1a\n"
+    at, chunks = 8, dict[bytes, bytes]()
+    while at < len(png):
+        size, kind = struct.unpack_from(">I4s", png, at)
+        body = png[at + 8 : at + 8 + size]
+        assert struct.unpack_from(">I", png, at + 8 + size)[0] == zlib.crc32(kind + body)
+        chunks[kind] = body
+        at += 12 + size
+    width, height, depth, colour = struct.unpack_from(">IIBB", chunks[b"IHDR"])
+    assert (depth, colour) == (8, 0)
+    lines = zlib.decompress(chunks[b"IDAT"])
+    return width, height, b"".join(lines[i + 1 : i + 1 + width] for i in range(0, len(lines), width + 1))
+
+
+@given(data=st.data(), width=st.integers(1, 40), height=st.integers(1, 40))
+def test_the_bytes_come_back(data: st.DataObject, width: int, height: int) -> None:
+    raw = data.draw(st.binary(min_size=width * height, max_size=width * height))
+    assert _pixels(greyscale_png(raw, width=width, height=height)) == (width, height, raw)
+
+
+@pytest.fixture
+def images(define: Callable[..., Definition], adapt: Callable[..., Adapted]) -> Callable[..., list[dict[str, Any]]]:
+    def run(*messages: dict[str, Any]) -> list[dict[str, Any]]:
+        spec = PngImageSpec(BY_NAME["ImageAdapter"])
+        return adapt(spec, define("sensor_msgs/msg/Image"), messages).rows.to_pylist()
+
+    return run
+
+
+def test_the_picture_is_as_wide_as_a_row_has_bytes(images: Callable[..., list[dict[str, Any]]]) -> None:
+    (row,) = images({"height": 2, "width": 1, "step": 3, "encoding": "rgb8", "data": b"abcdef"})
+    assert row["format"] == "png"
+    assert _pixels(row["data"]) == (3, 2, b"abcdef")
+    assert (row["width"], row["height"], row["stride"], row["encoding"]) == (1, 2, 3, "rgb8")
+
+
+def test_a_buffer_of_another_size_stays_raw(images: Callable[..., list[dict[str, Any]]]) -> None:
+    short, empty, good = images(
+        {"height": 2, "width": 1, "step": 3, "data": b"abc"},
+        {"height": 0, "width": 0, "step": 0, "data": b""},
+        {"height": 1, "width": 1, "step": 1, "data": b"a"},
+    )
+    assert (short["format"], short["data"]) == ("raw", b"abc")
+    assert (empty["format"], empty["data"]) == ("raw", b"")
+    assert good["format"] == "png"
+
+
+def test_other_ontologies_are_left_alone(define: Callable[..., Definition], adapt: Callable[..., Adapted]) -> None:
+    definition = define("sensor_msgs/msg/Imu")
+    plain = adapt(BY_NAME["IMUAdapter"], definition, [{}])
+    assert adapt(PngImageSpec(BY_NAME["IMUAdapter"]), definition, [{}]).rows.equals(plain.rows)
