@@ -1,0 +1,320 @@
+"""This file gives every name of an expression its meaning and every part its type, or says what is wrong with it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from mosaico_ingest.adapters.mapping.arrow import arrays, pt
+from mosaico_ingest.adapters.mapping.expression import (
+    Attribute,
+    Call,
+    Choice,
+    Each,
+    Item,
+    ListOf,
+    Literal,
+    LiteralValue,
+    Name,
+    Node,
+    Place,
+)
+from mosaico_ingest.adapters.mapping.functions import lookup
+from mosaico_ingest.adapters.mapping.functions.registry import check, nearest
+from mosaico_ingest.adapters.mapping.kinds import (
+    Kind,
+    Unfit,
+    is_number,
+    join,
+    kind_of,
+    listed,
+    narrowest_int,
+    spell,
+)
+from mosaico_ingest.adapters.mapping.typed import (
+    Apply,
+    Cast,
+    ChoiceOf,
+    Const,
+    EachOf,
+    FieldOf,
+    Fold,
+    ItemOf,
+    ListValue,
+    Typed,
+    Whole,
+)
+from mosaico_ingest.bag.definition import MessageType
+
+__all__ = ["CAST_TYPES", "Checker", "Report", "Scope", "constant"]
+
+CAST_TYPES = {
+    "bool": arrays.bool_(),
+    **{
+        f"{sign}int{bits}": getattr(arrays, f"{sign}int{bits}")()
+        for sign in ("", "u")
+        for bits in (8, 16, 32, 64)
+    },
+    **{f"float{bits}": getattr(arrays, f"float{bits}")() for bits in (16, 32, 64)},
+}
+"""What `cast` makes, by its name in the language."""
+_NUMBERS = {"nan": math.nan, "inf": math.inf, "pi": math.pi}
+
+Report = Callable[[str, Place, "str | None"], None]
+"""Takes a mistake: what, where in the expression, what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scope:
+    """Where names are looked up: a message and the types it is made of."""
+
+    kind: Kind
+    types: Mapping[str, MessageType]
+
+    def field(self, kind: Kind, name: str) -> Kind | None:
+        """Return the kind of a field of a message."""
+        position = kind.type.get_field_index(name)
+        if position < 0:
+            return None
+        known = self.types.get(kind.msgtype or "")
+        declared = next((field for field in known.fields if field.name == name), None) if known else None
+        msgtype = declared.type if declared is not None and declared.is_message else None
+        return replace(kind_of(kind.type.field(position).type, msgtype=msgtype), axes=kind.axes)
+
+    def constant(self, kind: Kind, name: str) -> LiteralValue:
+        """Return a constant of a message's type."""
+        known = self.types.get(kind.msgtype or "")
+        return next((c.value for c in known.constants if c.name == name), None) if known else None
+
+    def names(self, kind: Kind) -> list[str]:
+        """Return the fields of a message."""
+        return [field.name for field in kind.type]
+
+    def describe(self, kind: Kind, name: str) -> str:
+        """Return the sentence for a field that is not there."""
+        names = self.names(kind)
+        near = nearest(name, names)
+        listing = f"it has {', '.join(names)}" if names else "it has no fields"
+        return f"{near} {listing}" if near else listing
+
+
+def constant(value: LiteralValue, text: str = "") -> Const:
+    """Return a literal as a typed value."""
+    if value is None:
+        return Const(value, Kind(arrays.null()), text)
+    if isinstance(value, bool):
+        return Const(value, Kind(arrays.bool_()), text)
+    if isinstance(value, int):
+        type_ = arrays.int64() if value < 2**63 else arrays.uint64()
+        return Const(value, Kind(type_, bounds=(value, value)), text)
+    if isinstance(value, float):
+        return Const(value, Kind(arrays.float16()), text)  # its precision is what it meets
+    return Const(value, Kind(arrays.string()), text)
+
+
+class Checker:
+    """Types the expressions of one scope; a mistake is reported once and poisons what is built on it."""
+
+    def __init__(self, scope: Scope, report: Report, text: str) -> None:
+        self._scope = scope
+        self._report = report
+        self._text = text
+
+    def infer(self, node: Node) -> Typed | None:
+        """Return the typed expression, or None after a report."""
+        match node:
+            case Literal():
+                return constant(node.value, self._source(node))
+            case Name():
+                return self._name(node)
+            case Attribute():
+                return self._attribute(node)
+            case Each():
+                return self._each(node)
+            case Item():
+                return self._item(node)
+            case ListOf():
+                return self._list(node)
+            case Choice():
+                return self._choice(node)
+            case Call(name="cast"):
+                return self._cast(node)
+            case Call(name="either"):
+                return self._either(node)
+            case Call():
+                return self._call(node)
+
+    def _fail(self, message: str, place: Place, hint: str | None = None) -> None:
+        self._report(message, place, hint)
+
+    def _source(self, node: Node) -> str:
+        return self._text[node.at[0] : node.at[1]]
+
+    def _name(self, node: Name) -> Typed | None:
+        scope = self._scope
+        field = scope.field(scope.kind, node.name)
+        if node.name == "self" and field is None:
+            return Whole(scope.kind)
+        if field is not None:
+            return FieldOf(Whole(scope.kind), node.name, field, node.name)
+        value = scope.constant(scope.kind, node.name)
+        value = _NUMBERS.get(node.name) if value is None else value
+        if value is not None:
+            return constant(value, node.name)
+        what = f"no field {node.name!r} in {spell(scope.kind)}"
+        self._fail(what, node.at, scope.describe(scope.kind, node.name))
+        return None
+
+    def _attribute(self, node: Attribute) -> Typed | None:
+        of = self.infer(node.of)
+        if of is None:
+            return None
+        element = of.kind.element
+        if not pt.is_struct(element.type):
+            hint = f"write {of.text}[].{node.name}" if _is_list(element) else None
+            self._fail(f"`{of.text}` is {spell(element)}, it has no fields", node.name_at, hint)
+            return None
+        field = self._scope.field(of.kind, node.name)
+        if field is not None:
+            return FieldOf(of, node.name, field, self._source(node))
+        value = self._scope.constant(element, node.name)
+        if value is not None:
+            return constant(value, self._source(node))
+        what = f"no field {node.name!r} in `{of.text}` ({spell(element)})"
+        self._fail(what, node.name_at, self._scope.describe(element, node.name))
+        return None
+
+    def _listed(self, node: Each | Item) -> Typed | None:
+        of = self.infer(node.of)
+        if of is not None and not _is_list(of.kind):
+            self._fail(f"`{of.text}` is {spell(of.kind.element)}, not a list", node.at)
+            return None
+        return of
+
+    def _each(self, node: Each) -> Typed | None:
+        of = self._listed(node)
+        if of is None:
+            return None
+        type_ = of.kind.type
+        size = type_.list_size if pt.is_fixed_size_list(type_) else None
+        kind = kind_of(type_.value_type, msgtype=of.kind.msgtype)
+        return EachOf(of, replace(kind, axes=(*of.kind.axes, size)), self._source(node))
+
+    def _item(self, node: Item) -> Typed | None:
+        of = self._listed(node)
+        if of is None:
+            return None
+        kind = kind_of(of.kind.type.value_type, msgtype=of.kind.msgtype)
+        return ItemOf(of, node.index, replace(kind, axes=of.kind.axes), self._source(node))
+
+    def _list(self, node: ListOf) -> Typed | None:
+        items = self._all(node.items)
+        if items is None:
+            return None
+        if not items:
+            return ListValue((), Kind(arrays.list_(arrays.null())), self._source(node))
+        joined = self._joined(items, node)
+        if joined is None:
+            return None
+        element = narrowest_int(joined.bounds) if joined.bounds else joined.type
+        kind = Kind(listed(element, len(items)), axes=_deepest(items), msgtype=joined.msgtype)
+        return ListValue(items, kind, self._source(node))
+
+    def _all(self, nodes: tuple[Node, ...]) -> tuple[Typed, ...] | None:
+        """Infer all, so that each mistake is reported; None if there was one."""
+        typed = [self.infer(node) for node in nodes]
+        good = tuple(value for value in typed if value is not None)
+        return good if len(good) == len(typed) else None
+
+    def _joined(self, values: tuple[Typed, ...], node: Node) -> Kind | None:
+        try:
+            return join([value.kind.element for value in values])
+        except Unfit as unfit:
+            self._fail(str(unfit), node.at, unfit.hint)
+            return None
+
+    def _choice(self, node: Choice) -> Typed | None:
+        parts = self._all((node.condition, node.then, node.otherwise))
+        if parts is None:
+            return None
+        condition, then, otherwise = parts
+        if not (pt.is_boolean(condition.kind.type) or pt.is_null(condition.kind.type)):
+            what = f"a condition is true or false, `{condition.text}` is {spell(condition.kind.element)}"
+            self._fail(what, node.condition.at, "compare it: x != 0")
+            return None
+        joined = self._joined((then, otherwise), node)
+        if joined is None:
+            return None
+        return ChoiceOf(*parts, kind=replace(joined, axes=_deepest(parts)), text=self._source(node))
+
+    def _cast(self, node: Call) -> Typed | None:
+        if len(node.arguments) != 2:  # noqa: PLR2004 - value and type
+            self._fail(
+                "inside an expression cast(x, 'type') needs the type",
+                node.at,
+                f"one of {', '.join(CAST_TYPES)}",
+            )
+            return None
+        of = self.infer(node.arguments[0])
+        wanted = node.arguments[1]
+        type_ = CAST_TYPES.get(str(wanted.value)) if isinstance(wanted, Literal) else None
+        if type_ is None:
+            self._fail("cast makes " + ", ".join(CAST_TYPES), wanted.at, "write the type in quotes")
+            return None
+        return None if of is None else self.cast(of, type_, node)
+
+    def cast(self, of: Typed, type_: Any, node: Node) -> Typed | None:  # noqa: ANN401 - an Arrow type
+        """Return a value as another number type, checked for each row."""
+        element = of.kind.type
+        if not (is_number(element) or pt.is_boolean(element) or pt.is_null(element)):
+            self._fail(
+                f"cast takes a number, `{of.text}` is {spell(of.kind.element)}",
+                node.at,
+                "number(x) reads text",
+            )
+            return None
+        return Cast(of, type_, replace(kind_of(type_), axes=of.kind.axes), self._source(node))
+
+    def _either(self, node: Call) -> Typed | None:
+        """Take the first argument whose fields exist; where none does, the last says what is there."""
+        quiet = Checker(self._scope, lambda *_: None, self._text)
+        found = (quiet.infer(argument) for argument in node.arguments[:-1])
+        return next((typed for typed in found if typed is not None), None) or self.infer(node.arguments[-1])
+
+    def _call(self, node: Call) -> Typed | None:
+        function = lookup(node.name)
+        arguments = self._all(node.arguments)
+        if function is None or arguments is None:
+            return None  # an unknown function was reported when the file was read
+        arguments = tuple(_folded(a, function.take(i).takes) for i, a in enumerate(arguments))
+        for position, argument in enumerate(arguments):
+            if function.take(position).literal and not isinstance(argument, Const):
+                self._fail(f"{node.name} takes a text in quotes here", node.arguments[position].at)
+                return None
+        try:
+            kind = check(function, [argument.kind.element for argument in arguments])
+        except Unfit as unfit:
+            blamed = node if unfit.argument is None else node.arguments[unfit.argument]
+            self._fail(str(unfit), blamed.at, unfit.hint)
+            return None
+        kind = replace(kind, axes=_deepest(arguments))
+        return Apply(node.name, function, arguments, kind, self._source(node))
+
+
+def _is_list(kind: Kind) -> bool:
+    return pt.is_list(kind.type) or pt.is_fixed_size_list(kind.type)
+
+
+def _folded(value: Typed, takes: Callable[[Kind], bool]) -> Typed:
+    """Close the innermost open list if the function takes the list, not its elements."""
+    if not value.kind.axes or takes(value.kind.element):
+        return value
+    folded = value.kind.folded()
+    return Fold(value, folded, value.text) if takes(folded.element) else value
+
+
+def _deepest(values: tuple[Typed, ...]) -> tuple[int | None, ...]:
+    """Return the open lists of the value that has most."""
+    return max((value.kind.axes for value in values), key=len, default=())

@@ -1,0 +1,178 @@
+"""This file is a column while it is computed: flat values, and the lists they are the elements of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from mosaico_ingest.adapters.mapping.arrow import Array, DataType, Scalar, arrays, pc, pt
+
+__all__ = [
+    "Axis",
+    "Column",
+    "Mask",
+    "field_of",
+    "fixed_list",
+    "null_where",
+    "nulls",
+    "one_type",
+    "open_list",
+    "repeat",
+    "struct_of",
+    "var_list",
+]
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Axis:
+    """How n rows are made of elements; offsets begin at 0, a null row has no elements (fixed: has, unused)."""
+
+    offsets: NDArray[np.int64]
+    """Shape (n + 1,)."""
+    null: Mask | None
+    """True where the list itself is null, shape (n,)."""
+    size: int | None
+    """The length of every row, where it is fixed."""
+
+    @property
+    def lengths(self) -> NDArray[np.int64]:
+        """Elements of each row, shape (n,)."""
+        return np.diff(self.offsets)
+
+    @property
+    def parents(self) -> NDArray[np.int64]:
+        """The row of each element, shape (elements,)."""
+        return np.repeat(np.arange(len(self.offsets) - 1), self.lengths)
+
+    def like(self, other: Axis) -> bool:
+        """Return whether elements of both stand side by side."""
+        return self is other or np.array_equal(self.offsets, other.offsets)
+
+    def close(self, values: Array, type_: DataType = None) -> Array:
+        """Return the list column of the elements `values`; shares their memory."""
+        size = self.size if type_ is None or pt.is_fixed_size_list(type_) else None
+        if size is not None:
+            return fixed_list(values, size, self.null, len(self.offsets) - 1, type_)
+        return var_list(values, self.offsets, self.null, type_)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Column:
+    """Values of the innermost elements; without axes, one a row. A literal stays a scalar."""
+
+    values: Array | Scalar
+    axes: tuple[Axis, ...] = ()
+
+    def array(self, rows: int) -> Array:
+        """Return the values as an array of one a row (only without axes) or one an element."""
+        if isinstance(self.values, pa.Scalar):
+            return repeat(self.values, rows)
+        return self.values
+
+    def closed(self, rows: int) -> Array:
+        """Return the column with its lists closed, one value a row."""
+        values = self.array(rows)
+        for axis in reversed(self.axes):
+            values = axis.close(values)
+        return values
+
+    def folded(self) -> Column:
+        """Close the innermost list."""
+        return Column(self.axes[-1].close(self.array(0)), self.axes[:-1])
+
+    def over(self, axes: tuple[Axis, ...]) -> Column:
+        """Repeat the values for the elements of further axes; literals stay as they are."""
+        values = self.values
+        if isinstance(values, pa.Array):
+            for axis in axes[len(self.axes) :]:
+                values = values.take(arrays.array(axis.parents))
+        return Column(values, axes)
+
+
+def repeat(scalar: Scalar, length: int) -> Array:
+    """Return an array of one value."""
+    return arrays.repeat(scalar, length) if scalar.is_valid else arrays.nulls(length, scalar.type)
+
+
+def nulls(array: Array) -> Mask | None:
+    """Return where an array is null, or None where it never is."""
+    return np.asarray(array.is_null()) if array.null_count else None
+
+
+def field_of(rows: Array, name: str) -> Array:
+    """Return a field of every row, null where the row is; shares memory where no row is null."""
+    position = rows.type.get_field_index(name)
+    return pc.struct_field(rows, [position]) if rows.null_count else rows.field(position)
+
+
+def open_list(array: Array) -> tuple[Array, Axis]:
+    """Return the elements of a list column and how they make up its rows."""
+    null = nulls(array)
+    if pt.is_fixed_size_list(array.type):
+        size = array.type.list_size
+        values = array.values.slice(array.offset * size, len(array) * size)
+        return values, Axis(np.arange(len(array) + 1, dtype=np.int64) * size, null, size)
+    lengths = np.asarray(pc.fill_null(pc.list_value_length(array), 0)).astype(np.int64)
+    offsets = np.concatenate((np.zeros(1, np.int64), np.cumsum(lengths)))
+    return array.flatten(), Axis(offsets, null, None)
+
+
+def var_list(values: Array, offsets: NDArray[np.int64], null: Mask | None, type_: DataType = None) -> Array:
+    """Return a list column over `values`."""
+    mask = None if null is None else arrays.array(null)
+    starts = arrays.array(offsets.astype(np.int32))
+    return arrays.ListArray.from_arrays(starts, values, type=type_ or arrays.list_(values.type), mask=mask)
+
+
+def fixed_list(values: Array, size: int, null: Mask | None, rows: int, type_: DataType = None) -> Array:
+    """Return a fixed-size list column over `values`."""
+    type_ = type_ or arrays.list_(values.type, size)
+    if size == 0:
+        return arrays.array([[]] * rows, type_)
+    mask = None if null is None else arrays.array(null)
+    return arrays.FixedSizeListArray.from_arrays(values, type=type_, mask=mask)
+
+
+def struct_of(children: list[Array], type_: DataType, null: Mask | None, rows: int) -> Array:
+    """Return a struct column; a type without fields keeps its number of rows."""
+    if not children:
+        return arrays.array([{}] * rows, type_)
+    mask = None if null is None or not null.any() else arrays.array(null)
+    return arrays.StructArray.from_arrays(children, fields=list(type_), mask=mask)
+
+
+def null_where(array: Array, mask: Mask) -> Array:
+    """Return the array with further rows null; what they held stays below, so that nothing is copied."""
+    if not mask.any():
+        return array
+    known = nulls(array)
+    null = mask if known is None else mask | known
+    if pt.is_struct(array.type):
+        children = [array.field(i) for i in range(array.type.num_fields)]
+        return struct_of(children, array.type, null, len(array))
+    return arrays.array(pc.if_else(arrays.array(null), arrays.scalar(None, array.type), array))
+
+
+def one_type(*values: Array) -> list[Array]:
+    """Return arrays or scalars in a type that holds them all; the checker made sure that there is one."""
+    known = [v.type for v in values if not pt.is_null(v.type)]
+    if not known:
+        return list(values)
+    both = known[0]
+    if any(t != both for t in known) and not pt.is_nested(both):
+        both = arrays.float64() if any(pt.is_floating(t) for t in known) else arrays.int64()
+    return [_in_type(v, both) for v in values]
+
+
+def _in_type(values: Array, type_: DataType) -> Array:
+    if values.type == type_:
+        return values
+    if pt.is_null(values.type):
+        scalar = isinstance(values, pa.Scalar)
+        return arrays.scalar(None, type_) if scalar else arrays.nulls(len(values), type_)
+    return pc.cast(values, type_, safe=False)

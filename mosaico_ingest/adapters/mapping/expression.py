@@ -1,0 +1,366 @@
+"""This file reads the text of an expression into a small tree; it is parsed as Python and never run as Python."""
+
+from __future__ import annotations
+
+import ast
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+__all__ = [
+    "Attribute",
+    "Call",
+    "Choice",
+    "Each",
+    "ExpressionError",
+    "Item",
+    "ListOf",
+    "Literal",
+    "LiteralValue",
+    "Name",
+    "Node",
+    "Place",
+    "children",
+    "parse",
+]
+
+MAX_CHARACTERS = 4000
+MAX_DEPTH = 60
+
+LiteralValue: TypeAlias = "bool | int | float | str | None"
+Place: TypeAlias = tuple[int, int]
+"""First character and one past the last, within the expression's text."""
+
+
+class ExpressionError(Exception):
+    """The text is not an expression of this language; `place` says which part, `help` what to write."""
+
+    def __init__(self, message: str, place: Place, hint: str | None = None) -> None:
+        super().__init__(message)
+        self.place = place
+        self.hint = hint
+
+
+@dataclass(frozen=True, slots=True)
+class Literal:
+    """A number, text, `true`, `false` or `null`."""
+
+    value: LiteralValue
+    at: Place = field(compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Name:
+    """A field or constant of the message."""
+
+    name: str
+    at: Place = field(compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Attribute:
+    """`of.name`."""
+
+    of: Node
+    name: str
+    at: Place = field(compare=False)
+    name_at: Place = field(compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Each:
+    """`of[]`: every element of a list."""
+
+    of: Node
+    at: Place = field(compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """`of[index]`."""
+
+    of: Node
+    index: int
+    at: Place = field(compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class ListOf:
+    """`[a, b, c]`."""
+
+    items: tuple[Node, ...]
+    at: Place = field(compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """A function or an operator, by its name (`sqrt`, `+`, `==`)."""
+
+    name: str
+    arguments: tuple[Node, ...]
+    at: Place = field(compare=False)
+    name_at: Place = field(compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """`then if condition else otherwise`."""
+
+    condition: Node
+    then: Node
+    otherwise: Node
+    at: Place = field(compare=False)
+
+
+Node: TypeAlias = "Literal | Name | Attribute | Each | Item | ListOf | Call | Choice"
+
+_WORDS: dict[str, LiteralValue] = {"null": None, "true": True, "false": False}
+_OPERATORS: dict[type[ast.AST], str] = {
+    ast.Add: "+",
+    ast.Sub: "-",
+    ast.Mult: "*",
+    ast.Div: "/",
+    ast.FloorDiv: "//",
+    ast.Mod: "%",
+    ast.Pow: "**",
+    ast.Eq: "==",
+    ast.NotEq: "!=",
+    ast.Lt: "<",
+    ast.LtE: "<=",
+    ast.Gt: ">",
+    ast.GtE: ">=",
+    ast.In: "in",
+    ast.And: "and",
+    ast.Or: "or",
+    ast.Not: "not",
+    ast.USub: "negative",
+    ast.UAdd: "positive",
+}
+
+
+def parse(text: str) -> Node:
+    """Read an expression.
+
+    Raises:
+        ExpressionError: It is none; the place is the offending part.
+    """
+    if len(text) > MAX_CHARACTERS:
+        raise ExpressionError(
+            f"the expression has {len(text)} characters; {MAX_CHARACTERS} are allowed", (0, 1)
+        )
+    code, moved = _spell_each(text.replace("\n", " "))
+    lead = len(code) - len(code.lstrip())
+    code = code[lead:]
+    if not code:
+        raise ExpressionError("the expression is empty", (0, 1), "write a field's name, or null")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # '\d' in a pattern is meant as it stands
+            tree = ast.parse(code, mode="eval")
+    except SyntaxError as error:
+        raise _syntax_error(error, text, moved, lead) from None
+    except (ValueError, MemoryError, RecursionError):
+        raise ExpressionError("the expression cannot be read: it nests too deeply", (0, len(text))) from None
+    return _Reader(code, text, moved, lead).read(tree.body, 0)
+
+
+def children(node: Node) -> tuple[Node, ...]:
+    """Return the nodes directly below."""
+    match node:
+        case Attribute() | Each() | Item():
+            return (node.of,)
+        case ListOf():
+            return node.items
+        case Call():
+            return node.arguments
+        case Choice():
+            return (node.condition, node.then, node.otherwise)
+        case _:
+            return ()
+
+
+def _spell_each(text: str) -> tuple[str, list[int]]:
+    """Spell `a[]` as `a[:]`, which Python can read; return where characters were put in."""
+    out: list[str] = []
+    moved: list[int] = []
+    quote = ""
+    for index, character in enumerate(text):
+        if quote:
+            quote = "" if character == quote and text[index - 1] != "\\" else quote
+        elif character in "'\"":
+            quote = character
+        elif character == "]" and text[index - 1 : index] == "[":
+            before = text[: index - 1].rstrip()[-1:]
+            if before.isalnum() or before in {"_", "]", ")"}:
+                moved.append(len(out))
+                out.append(":")
+        out.append(character)
+    return "".join(out), moved
+
+
+def _syntax_error(error: SyntaxError, text: str, moved: list[int], lead: int) -> ExpressionError:
+    at = min(_original(max((error.offset or 1) - 1, 0) + lead, moved), max(len(text) - 1, 0))
+    return ExpressionError(
+        f"this is not an expression ({error.msg})",
+        (at, at + 1),
+        "text needs quotes of its own, a field named like a Python keyword is self['from']",
+    )
+
+
+def _original(position: int, moved: list[int]) -> int:
+    return position - sum(1 for put_in in moved if put_in < position)
+
+
+class _Reader:
+    """Turns Python's tree into ours, refusing what the language does not have."""
+
+    def __init__(self, code: str, text: str, moved: list[int], lead: int) -> None:
+        self._bytes = code.encode()
+        self._text = text
+        self._moved = moved
+        self._lead = lead
+        self._readers: dict[type[ast.expr], Callable[..., Node]] = {
+            ast.Constant: self._constant,
+            ast.Name: self._name,
+            ast.Attribute: self._attribute,
+            ast.Subscript: self._subscript,
+            ast.List: self._list,
+            ast.UnaryOp: self._unary,
+            ast.BinOp: self._binary,
+            ast.BoolOp: self._logic,
+            ast.Compare: self._compare,
+            ast.IfExp: self._choice,
+            ast.Call: self._call,
+        }
+
+    def read(self, node: ast.expr, depth: int) -> Node:
+        """Read one node and all below."""
+        reader = self._readers.get(type(node))
+        if reader is None:
+            raise ExpressionError(
+                f"`{self._source(node)}` is not part of the language",
+                self._place(node),
+                "use operators, comparisons, `x if c else y` and the listed functions",
+            )
+        if depth > MAX_DEPTH:
+            raise ExpressionError(f"more than {MAX_DEPTH} levels of nesting", self._place(node))
+        return reader(node, depth + 1)
+
+    def _place(self, node: ast.expr) -> Place:
+        end = len(self._bytes) if node.end_col_offset is None else node.end_col_offset
+        return (self._position(node.col_offset), self._position(end))
+
+    def _position(self, byte: int) -> int:
+        # ast counts UTF-8 bytes; what was read is one line
+        return _original(len(self._bytes[:byte].decode()) + self._lead, self._moved)
+
+    def _source(self, node: ast.expr) -> str:
+        start, end = self._place(node)
+        return self._text[start:end]
+
+    def _constant(self, node: ast.Constant, _: int) -> Node:
+        if node.value is not None and not isinstance(node.value, (bool, int, float, str)):
+            raise ExpressionError(
+                f"`{self._source(node)}` is no value of the language",
+                self._place(node),
+                "write a number, text in quotes, true, false or null",
+            )
+        if isinstance(node.value, int) and not -(2**63) <= node.value < 2**64:
+            raise ExpressionError(f"{node.value} has more than 64 bits", self._place(node))
+        return Literal(node.value, self._place(node))
+
+    def _name(self, node: ast.Name, _: int) -> Node:
+        if node.id in _WORDS:
+            return Literal(_WORDS[node.id], self._place(node))
+        return Name(node.id, self._place(node))
+
+    def _attribute(self, node: ast.Attribute, depth: int) -> Node:
+        start, end = self._place(node)
+        return Attribute(self.read(node.value, depth), node.attr, (start, end), (end - len(node.attr), end))
+
+    def _subscript(self, node: ast.Subscript, depth: int) -> Node:
+        of = self.read(node.value, depth)
+        place = self._place(node)
+        match node.slice:
+            case ast.Slice(lower=None, upper=None, step=None):
+                return Each(of, place)
+            case ast.Constant(value=str() as name):
+                return Attribute(of, name, place, self._place(node.slice))
+            case ast.Constant(value=int() as index) if not isinstance(index, bool):
+                return Item(of, index, place)
+            case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() as index)):
+                return Item(of, -index, place)
+            case _:
+                raise ExpressionError(
+                    "an index is a number",
+                    self._place(node.slice),
+                    "write a[] for each element, a[0] for the first, a[-1] for the last",
+                )
+
+    def _list(self, node: ast.List, depth: int) -> Node:
+        return ListOf(tuple(self.read(item, depth) for item in node.elts), self._place(node))
+
+    def _unary(self, node: ast.UnaryOp, depth: int) -> Node:
+        place = self._place(node)
+        operand = self.read(node.operand, depth)
+        if isinstance(node.op, ast.USub) and isinstance(operand, Literal):
+            value = operand.value
+            if isinstance(value, (int, float)) and not isinstance(value, bool):
+                return Literal(-value, place)
+        return self._operation(node.op, (operand,), place)
+
+    def _binary(self, node: ast.BinOp, depth: int) -> Node:
+        return self._operation(
+            node.op, (self.read(node.left, depth), self.read(node.right, depth)), self._place(node)
+        )
+
+    def _logic(self, node: ast.BoolOp, depth: int) -> Node:
+        place = self._place(node)
+        result = self.read(node.values[0], depth)
+        for value in node.values[1:]:
+            result = self._operation(node.op, (result, self.read(value, depth)), place)
+        return result
+
+    def _compare(self, node: ast.Compare, depth: int) -> Node:
+        """`a < b < c` is `a < b and b < c`."""
+        place = self._place(node)
+        sides = [self.read(side, depth) for side in (node.left, *node.comparators)]
+        pairs = [
+            self._operation(operator, (left, right), place)
+            for operator, left, right in zip(node.ops, sides, sides[1:], strict=False)
+        ]
+        result = pairs[0]
+        for pair in pairs[1:]:
+            result = Call("and", (result, pair), place, place)
+        return result
+
+    def _operation(self, operator: ast.AST, arguments: tuple[Node, ...], place: Place) -> Node:
+        name = _OPERATORS.get(type(operator))
+        if name is None:
+            raise ExpressionError(
+                "this operator is not part of the language",
+                place,
+                "there are + - * / // % ** == != < <= > >= in and or not; for null: is_null(x)",
+            )
+        return Call(name, arguments, place, place)
+
+    def _choice(self, node: ast.IfExp, depth: int) -> Node:
+        parts = (self.read(part, depth) for part in (node.test, node.body, node.orelse))
+        return Choice(*parts, at=self._place(node))
+
+    def _call(self, node: ast.Call, depth: int) -> Node:
+        place = self._place(node)
+        if not isinstance(node.func, ast.Name):
+            raise ExpressionError(
+                "only a function can be called", self._place(node.func), "write len(x), not x.len()"
+            )
+        if node.keywords:
+            raise ExpressionError(
+                "arguments are given by position", self._place(node.keywords[0].value), "drop the name"
+            )
+        name, at = node.func.id, self._place(node.func)
+        arguments = tuple(self.read(argument, depth) for argument in node.args)
+        if name == "if_else" and len(arguments) == 3:  # noqa: PLR2004 - condition, then, otherwise
+            return Choice(*arguments, at=place)
+        return Call(name, arguments, place, at)

@@ -1,0 +1,125 @@
+"""This file is the functions over the elements of a list."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mosaico_ingest.adapters.mapping.arrow import Array, arrays, pc, pt
+from mosaico_ingest.adapters.mapping.columns import Axis, open_list
+from mosaico_ingest.adapters.mapping.functions.operators import computed, whole
+from mosaico_ingest.adapters.mapping.functions.registry import Refuse, Take, function, list_of
+from mosaico_ingest.adapters.mapping.kinds import Kind, int_bounds, is_number, kind_of
+
+__all__ = ["BOOLEANS", "NUMBERS"]
+
+NUMBERS = list_of("a list of numbers", is_number)
+BOOLEANS = list_of("a list of true and false", pt.is_boolean)
+_MOST_ELEMENTS = 2**31 - 1
+_NEAR_OVERFLOW = 2.0**62
+"""Below this a float sum of integers proves that the integer sum is exact."""
+
+
+def _len_accepts(kind: Kind) -> bool:
+    return any(test(kind.type) for test in (pt.is_list, pt.is_fixed_size_list, pt.is_string, pt.is_binary))
+
+
+@function(Take("a list, text or bytes", _len_accepts), gives=lambda _: whole(0, _MOST_ELEMENTS))
+def len_(x: Array) -> Array:
+    """Elements of a list, characters of text, bytes of binary."""
+    if pt.is_string(x.type):
+        return pc.cast(pc.utf8_length(x), arrays.int64())
+    return pc.cast(pc.binary_length(x) if pt.is_binary(x.type) else pc.list_value_length(x), arrays.int64())
+
+
+def _element(kind: Kind) -> Kind:
+    return kind_of(kind.type.value_type) if not pt.is_null(kind.type) else kind
+
+
+def _total(kind: Kind) -> Kind:
+    element = _element(kind)
+    return whole() if int_bounds(element.type) else computed(element)
+
+
+def _fold(values: NDArray[Any], axis: Axis, run: np.ufunc, empty: Any) -> NDArray[Any]:  # noqa: ANN401 - a number
+    """Reduce the elements of each row; `empty` where there are none."""
+    filled = axis.lengths > 0
+    result = np.full(len(filled), empty, values.dtype)
+    if len(values):
+        with np.errstate(all="ignore"):
+            result[filled] = run.reduceat(values, axis.offsets[:-1][filled])
+    return result
+
+
+def _absent(elements: Array, axis: Axis) -> NDArray[np.bool_]:
+    """Return the rows that are null or have a null among their elements."""
+    absent = np.zeros(len(axis.lengths), bool) if axis.null is None else axis.null.copy()
+    if elements.null_count:
+        absent[axis.parents[np.asarray(elements.is_null())]] = True
+    return absent
+
+
+def _plain(elements: Array) -> NDArray[Any]:
+    dtype = np.int64 if pt.is_integer(elements.type) else np.float64
+    return np.asarray(pc.fill_null(elements, 0)).astype(dtype)
+
+
+@function(NUMBERS, gives=_total, name="sum")
+def sum_(refuse: Refuse, x: Array) -> Array:
+    """Sum of the elements; 0 where there are none."""
+    elements, axis = open_list(x)
+    values = _plain(elements)
+    total = _fold(values, axis, np.add, 0)
+    if values.dtype == np.int64:
+        near = np.abs(_fold(values.astype(np.float64), axis, np.add, 0)) > _NEAR_OVERFLOW
+        if near.any():
+            refuse(near, "overflow", lambda _: "the sum comes near 64 bits")
+    return arrays.array(total, mask=_absent(elements, axis))
+
+
+@function(NUMBERS, gives=lambda kind: computed(_element(kind)))
+def mean(x: Array) -> Array:
+    """Mean of the elements; null where there are none."""
+    elements, axis = open_list(x)
+    total = _fold(_plain(elements).astype(np.float64), axis, np.add, 0)
+    mask = _absent(elements, axis) | (axis.lengths == 0)
+    return arrays.array(total / np.maximum(axis.lengths, 1), mask=mask)
+
+
+def _extreme(x: Array, run: np.ufunc) -> Array:
+    elements, axis = open_list(x)
+    values = np.asarray(pc.fill_null(elements, 0))
+    mask = _absent(elements, axis) | (axis.lengths == 0)
+    return arrays.array(_fold(values, axis, run, 0), mask=mask)
+
+
+@function(NUMBERS, gives=_element)
+def least(x: Array) -> Array:
+    """Smallest element; null where there are none."""
+    return _extreme(x, np.minimum)
+
+
+@function(NUMBERS, gives=_element)
+def greatest(x: Array) -> Array:
+    """Largest element; null where there are none."""
+    return _extreme(x, np.maximum)
+
+
+def _logic(x: Array, run: np.ufunc, empty: bool) -> Array:  # noqa: FBT001 - the neutral element, not a switch
+    elements, axis = open_list(x)
+    values = np.asarray(pc.fill_null(elements, empty)).astype(bool)
+    return arrays.array(_fold(values, axis, run, empty), mask=_absent(elements, axis))
+
+
+@function(BOOLEANS, gives=arrays.bool_(), name="any")
+def any_(x: Array) -> Array:
+    """Whether an element is true: `any(covariance[] > 0)`; null where one is null."""
+    return _logic(x, np.logical_or, empty=False)
+
+
+@function(BOOLEANS, gives=arrays.bool_(), name="all")
+def all_(x: Array) -> Array:
+    """Whether every element is true; null where one is null."""
+    return _logic(x, np.logical_and, empty=True)

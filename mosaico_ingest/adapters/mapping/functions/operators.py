@@ -1,0 +1,295 @@
+"""This file is the operators: arithmetic, comparison, logic."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from mosaico_ingest.adapters.mapping.arrow import Array, arrays, pc, pt
+from mosaico_ingest.adapters.mapping.functions.registry import (
+    ANY,
+    BOOLEAN,
+    FLOAT,
+    NUMBER,
+    Refuse,
+    function,
+    nullified,
+)
+from mosaico_ingest.adapters.mapping.kinds import INT64, Kind, Unfit, is_number, spell, widest_float
+
+__all__ = ["comparable", "computed", "whole"]
+
+_MOST_BITS = 64
+
+
+def computed(*kinds: Kind) -> Kind:
+    """Return the kind of a float computed from numbers: as wide as the widest float field."""
+    return Kind(widest_float(*(kind.type for kind in kinds)))
+
+
+def whole(low: int = INT64[0], high: int = INT64[1]) -> Kind:
+    """Return the kind of an integer computed in 64 bits."""
+    return Kind(arrays.int64(), bounds=(max(low, INT64[0]), min(high, INT64[1])))
+
+
+def _integers(kinds: tuple[Kind, ...]) -> bool:
+    return all(kind.bounds is not None or pt.is_null(kind.type) for kind in kinds)
+
+
+def _spread(combine: Callable[[int, int], int]) -> Callable[[Kind, Kind], Kind]:
+    """Return the rule for an operator whose extremes are those of its operands' extremes."""
+
+    def gives(left: Kind, right: Kind) -> Kind:
+        if not _integers((left, right)):
+            return computed(left, right)
+        ends = [combine(a, b) for a in left.bounds or (0, 0) for b in right.bounds or (0, 0)]
+        return whole(min(ends), max(ends))
+
+    return gives
+
+
+def _sum_kind(left: Kind, right: Kind) -> Kind:
+    texts = [pt.is_string(kind.type) for kind in (left, right) if not pt.is_null(kind.type)]
+    if texts and all(texts):
+        return Kind(arrays.string())
+    for position, kind in enumerate((left, right)):
+        if not (is_number(kind.type) or pt.is_null(kind.type)):
+            wanted = "text" if any(texts) else "a number"
+            raise Unfit(f"+ takes numbers or texts, {spell(kind)} is not {wanted}", argument=position)
+    if any(texts):
+        raise Unfit("+ takes two numbers or two texts", argument=0, hint="text(x) makes a number text")
+    return _spread(operator.add)(left, right)
+
+
+def _ordered(left: Kind, right: Kind) -> Kind:
+    """Return bool, where two values can be compared."""
+    for position, kind in enumerate((left, right)):
+        if pt.is_null(kind.type):
+            raise Unfit("a comparison with null is always null", argument=position, hint="use is_null(x)")
+    if not (is_number(left.type) and is_number(right.type)) and left.type != right.type:
+        raise Unfit(f"{spell(left)} cannot be compared with {spell(right)}")
+    if pt.is_nested(left.type):
+        raise Unfit(f"{spell(left)} cannot be compared", argument=0, hint="compare its fields or elements")
+    return Kind(arrays.bool_())
+
+
+def _to_int64(refuse: Refuse, values: Array) -> Array:
+    if values.type != arrays.uint64():
+        return values if values.type == arrays.int64() else pc.cast(values, arrays.int64())
+    bad = np.atleast_1d(
+        np.asarray(pc.fill_null(pc.greater(values, arrays.scalar(INT64[1], arrays.uint64())), False))
+    )
+    if bad.any():
+        refuse(bad, "overflow", lambda i: f"{values[i]} has more than 63 bits")
+        values = nullified(values, bad)
+    return pc.cast(values, arrays.int64())
+
+
+def numbers(refuse: Refuse, *values: Array) -> list[Array]:
+    """Return numbers ready to compute with: all int64, or all float64."""
+    if all(pt.is_integer(v.type) for v in values):
+        return [_to_int64(refuse, v) for v in values]
+    return [v if pt.is_float64(v.type) else pc.cast(v, arrays.float64(), safe=False) for v in values]
+
+
+def comparable(left: Array, right: Array) -> tuple[Array, Array]:
+    """Return two values in a type both can be compared in without loss."""
+    if left.type == right.type:
+        return left, right
+    if pt.is_floating(left.type) or pt.is_floating(right.type):
+        both = arrays.float64()
+    elif arrays.uint64() in {left.type, right.type}:
+        both = arrays.decimal128(20)
+    else:
+        both = arrays.int64()
+    return pc.cast(left, both, safe=False), pc.cast(right, both, safe=False)
+
+
+def _length(left: Array, right: Array) -> int:
+    return max(len(v) for v in (left, right) if hasattr(v, "__len__"))
+
+
+def _listed(values: Array, length: int) -> list[Any]:
+    return values.to_pylist() if hasattr(values, "to_pylist") else [values.as_py()] * length
+
+
+def _checked(
+    refuse: Refuse, sign: str, run: Callable[[Array, Array], Array], left: Array, right: Array
+) -> Array:
+    """Run a checked integer operation; where it overflows, find the elements one by one."""
+    try:
+        return run(left, right)
+    except arrays.ArrowInvalid:
+        pairs = list(zip(_listed(left, n := _length(left, right)), _listed(right, n), strict=True))
+        bad = np.fromiter((_overflows(sign, a, b) for a, b in pairs), bool, n)
+        refuse(bad, "overflow", lambda i: f"{pairs[i][0]} {sign} {pairs[i][1]} has more than 64 bits")
+        return run(nullified(left, bad), nullified(right, bad))
+
+
+_EXACT: dict[str, Callable[[int, int], int]] = {
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "**": operator.pow,
+}
+
+
+def _overflows(sign: str, left: int | None, right: int | None) -> bool:
+    if left is None or right is None:
+        return False
+    if sign == "**" and right > _MOST_BITS:
+        return abs(left) > 1
+    return not INT64[0] <= _EXACT[sign](left, right) <= INT64[1]
+
+
+def _arithmetic(sign: str, checked: Any, plain: Any, refuse: Refuse, left: Array, right: Array) -> Array:  # noqa: ANN401 - pyarrow's functions
+    left, right = numbers(refuse, left, right)
+    if pt.is_integer(left.type):
+        return _checked(refuse, sign, checked, left, right)
+    return plain(left, right)
+
+
+@function(ANY, ANY, gives=_sum_kind, name="+", scalars=True)
+def add(refuse: Refuse, left: Array, right: Array) -> Array:
+    """Sum of numbers; texts joined."""
+    if pt.is_string(left.type) or pt.is_string(right.type):
+        both = (pc.cast(left, arrays.string()), pc.cast(right, arrays.string()))
+        return pc.binary_join_element_wise(*both, "")
+    return _arithmetic("+", pc.add_checked, pc.add, refuse, left, right)
+
+
+@function(NUMBER, NUMBER, gives=_spread(operator.sub), name="-", scalars=True)
+def subtract(refuse: Refuse, left: Array, right: Array) -> Array:
+    """Difference."""
+    return _arithmetic("-", pc.subtract_checked, pc.subtract, refuse, left, right)
+
+
+@function(NUMBER, NUMBER, gives=_spread(operator.mul), name="*", scalars=True)
+def multiply(refuse: Refuse, left: Array, right: Array) -> Array:
+    """Product."""
+    return _arithmetic("*", pc.multiply_checked, pc.multiply, refuse, left, right)
+
+
+@function(FLOAT, FLOAT, gives=computed, name="/", scalars=True)
+def divide(left: Array, right: Array) -> Array:
+    """Quotient, always a float; by zero: inf or nan."""
+    return pc.divide(left, right)
+
+
+def _floored(refuse: Refuse, sign: str, run: Any, left: Array, right: Array) -> Array:  # noqa: ANN401 - a numpy ufunc
+    left, right = numbers(refuse, left, right)
+    n = _length(left, right)
+    if pt.is_integer(left.type):
+        zero = np.broadcast_to(np.asarray(pc.fill_null(pc.equal(right, 0), False)), n)
+        lowest = pc.and_kleene(pc.equal(left, INT64[0]), pc.equal(right, -1))
+        bad = zero | (np.broadcast_to(np.asarray(pc.fill_null(lowest, False)), n) & (sign == "//"))
+        if bad.any():
+            pairs = _listed(left, n), _listed(right, n)
+            refuse(bad, "division", lambda i: f"{pairs[0][i]} {sign} {pairs[1][i]} has no result")
+            right = nullified(right, bad)
+    absent = np.broadcast_to(np.asarray(pc.or_(pc.is_null(left), pc.is_null(right))), n)
+    with np.errstate(all="ignore"):
+        values = run(np.asarray(pc.fill_null(left, 1)), np.asarray(pc.fill_null(right, 1)))
+    return arrays.array(np.broadcast_to(values, n), mask=absent if absent.any() else None)
+
+
+def _remainder_kind(left: Kind, right: Kind) -> Kind:
+    if not _integers((left, right)):
+        return computed(left, right)
+    low, high = right.bounds or (0, 0)
+    return whole(min(low + 1, 0), max(high - 1, 0))
+
+
+def _floor_kind(left: Kind, right: Kind) -> Kind:
+    if not _integers((left, right)):
+        return computed(left, right)
+    reach = max(abs(end) for end in left.bounds or (0, 0))
+    positive = min(*(left.bounds or (0, 0)), *(right.bounds or (0, 0))) >= 0
+    return whole(0 if positive else -reach, reach)
+
+
+@function(NUMBER, NUMBER, gives=_floor_kind, name="//")
+def floor_divide(refuse: Refuse, left: Array, right: Array) -> Array:
+    """Quotient rounded down."""
+    return _floored(refuse, "//", np.floor_divide, left, right)
+
+
+@function(NUMBER, NUMBER, gives=_remainder_kind, name="%")
+def remainder(refuse: Refuse, left: Array, right: Array) -> Array:
+    """Remainder, with the sign of the divisor."""
+    return _floored(refuse, "%", np.mod, left, right)
+
+
+def _power_kind(left: Kind, right: Kind) -> Kind:
+    natural = right.bounds is not None and right.bounds[0] >= 0
+    return whole() if _integers((left, right)) and natural else computed(left, right)
+
+
+@function(NUMBER, NUMBER, gives=_power_kind, name="**", scalars=True)
+def power(refuse: Refuse, left: Array, right: Array) -> Array:
+    """Power; an integer where both are and the exponent cannot be negative."""
+    natural = pt.is_unsigned_integer(right.type) or (
+        isinstance(right, arrays.Int64Scalar) and right.is_valid and right.as_py() >= 0
+    )
+    left, right = numbers(refuse, left, right)
+    if natural and pt.is_integer(left.type):
+        return _checked(refuse, "**", pc.power_checked, left, right)
+    return pc.power(pc.cast(left, arrays.float64(), safe=False), pc.cast(right, arrays.float64(), safe=False))
+
+
+def _negative_kind(of: Kind) -> Kind:
+    return whole(-of.bounds[1], -of.bounds[0]) if of.bounds is not None else computed(of)
+
+
+@function(NUMBER, gives=_negative_kind)
+def negative(refuse: Refuse, x: Array) -> Array:
+    """-x."""
+    (x,) = numbers(refuse, x)
+    zero = arrays.scalar(0, x.type)
+    return _checked(refuse, "-", pc.subtract_checked, zero, x) if pt.is_integer(x.type) else pc.negate(x)
+
+
+@function(NUMBER, gives=lambda of: of)
+def positive(x: Array) -> Array:
+    """+x."""
+    return x
+
+
+def _add_comparison(sign: str, run: Callable[[Any, Any], Any]) -> None:
+    def compare(left: Array, right: Array) -> Array:
+        """Compare."""
+        return run(*comparable(left, right))
+
+    function(ANY, ANY, gives=_ordered, name=sign, scalars=True)(compare)
+
+
+for _sign, _run in (
+    ("==", pc.equal),
+    ("!=", pc.not_equal),
+    ("<", pc.less),
+    ("<=", pc.less_equal),
+    (">", pc.greater),
+    (">=", pc.greater_equal),
+):
+    _add_comparison(_sign, _run)
+
+
+@function(BOOLEAN, BOOLEAN, gives=arrays.bool_(), name="and")
+def and_(left: Array, right: Array) -> Array:
+    """Both."""
+    return pc.and_kleene(left, right)
+
+
+@function(BOOLEAN, BOOLEAN, gives=arrays.bool_(), name="or")
+def or_(left: Array, right: Array) -> Array:
+    """One or both."""
+    return pc.or_kleene(left, right)
+
+
+@function(BOOLEAN, gives=arrays.bool_(), name="not")
+def not_(x: Array) -> Array:
+    """The opposite."""
+    return pc.invert(x)

@@ -1,0 +1,117 @@
+"""This file is the functions of text and bytes."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from mosaico_ingest.adapters.mapping.arrow import Array, arrays, pc, pt
+from mosaico_ingest.adapters.mapping.columns import nulls, open_list
+from mosaico_ingest.adapters.mapping.functions.registry import (
+    TEXT,
+    TEXT_LITERAL,
+    Refuse,
+    Take,
+    bad_where,
+    function,
+    list_of,
+    nullified,
+)
+from mosaico_ingest.adapters.mapping.kinds import Kind, is_number
+
+__all__: list[str] = []
+
+_OCTETS = list_of("bytes or a list of uint8", pt.is_uint8)
+_BYTES = Take(_OCTETS.words, lambda kind: pt.is_binary(kind.type) or _OCTETS.accepts(kind))
+_SPELLED = Take("a number, text, true or false", lambda kind: _is_spelled(kind))
+_NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|nan)\s*")
+
+
+def _is_spelled(kind: Kind) -> bool:
+    return is_number(kind.type) or pt.is_boolean(kind.type) or pt.is_string(kind.type)
+
+
+@function(TEXT, gives=arrays.string())
+def lower(s: Array) -> Array:
+    """Lower case."""
+    return pc.utf8_lower(s)
+
+
+@function(TEXT, gives=arrays.string())
+def upper(s: Array) -> Array:
+    """Upper case."""
+    return pc.utf8_upper(s)
+
+
+@function(TEXT, gives=arrays.string())
+def strip(s: Array) -> Array:
+    """Without white space at the ends."""
+    return pc.utf8_trim_whitespace(s)
+
+
+@function(TEXT, TEXT_LITERAL, TEXT_LITERAL, gives=arrays.string())
+def replace(s: Array, old: str, new: str) -> Array:
+    """Every occurrence replaced."""
+    return pc.replace_substring(s, pattern=old, replacement=new)
+
+
+@function(TEXT, TEXT_LITERAL, gives=arrays.bool_())
+def starts_with(s: Array, start: str) -> Array:
+    """Whether it begins so."""
+    return pc.starts_with(s, pattern=start)
+
+
+@function(TEXT, TEXT_LITERAL, gives=arrays.bool_())
+def ends_with(s: Array, end: str) -> Array:
+    """Whether it ends so."""
+    return pc.ends_with(s, pattern=end)
+
+
+@function(TEXT, TEXT_LITERAL, gives=arrays.bool_())
+def contains(s: Array, part: str) -> Array:
+    """Whether it occurs."""
+    return pc.match_substring(s, pattern=part)
+
+
+@function(TEXT, TEXT_LITERAL, gives=arrays.list_(arrays.string()))
+def split(s: Array, separator: str) -> Array:
+    """The parts between separators, a list of text."""
+    return pc.split_pattern(s, pattern=separator)
+
+
+@function(TEXT, TEXT_LITERAL, gives=arrays.string())
+def extract(s: Array, pattern: str) -> Array:
+    """What the pattern's first group matches; null where it does not match."""
+    named = re.sub(r"(?<!\\)\((?!\?)", "(?P<part>", pattern, count=1)
+    return pc.struct_field(pc.extract_regex(s, pattern=named), [0])
+
+
+@function(_SPELLED, gives=arrays.string())
+def text(x: Array) -> Array:
+    """A number, true or false as text."""
+    return pc.cast(x, arrays.string())
+
+
+@function(TEXT, gives=arrays.float64())
+def number(refuse: Refuse, s: Array) -> Array:
+    """Text as a number; text that is none rejects the row."""
+    try:
+        return pc.cast(pc.utf8_trim_whitespace(s), arrays.float64())
+    except arrays.ArrowInvalid:
+        bad = bad_where(s, lambda value: _NUMBER.fullmatch(value) is not None)
+        refuse(bad, "number", lambda i: f"{s[i].as_py()!r} is no number")
+        return pc.cast(pc.utf8_trim_whitespace(nullified(s, bad)), arrays.float64())
+
+
+@function(_BYTES, gives=arrays.binary())
+def bytes_(x: Array) -> Array:
+    """A list of uint8, of fixed length or not, as bytes."""
+    if pt.is_binary(x.type) or pt.is_null(x.type):
+        return pc.cast(x, arrays.binary())
+    octets, axis = open_list(x)
+    data = arrays.py_buffer(np.ascontiguousarray(np.asarray(pc.fill_null(octets, 0))))
+    absent = nulls(x)
+    validity = None if absent is None else arrays.array(~absent).buffers()[1]
+    offsets = arrays.py_buffer(axis.offsets.astype(np.int32))
+    return arrays.Array.from_buffers(arrays.binary(), len(x), [validity, offsets, data])

@@ -1,0 +1,205 @@
+"""This file is the way in: an adapter file becomes an adapter, or all that is wrong with it is said at once."""
+
+from __future__ import annotations
+
+from contextvars import ContextVar
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from pydantic import ValidationError
+
+from mosaico_ingest.adapters.adapter import Adapted, Envelope
+from mosaico_ingest.adapters.mapping.build import Filled, fill
+from mosaico_ingest.adapters.mapping.check import Scope
+from mosaico_ingest.adapters.mapping.compile import AdapterLookup, Compiler
+from mosaico_ingest.adapters.mapping.evaluate import Evaluation, RowsRefused
+from mosaico_ingest.adapters.mapping.inline_type import make_type
+from mosaico_ingest.adapters.mapping.kinds import Kind
+from mosaico_ingest.adapters.mapping.model import InlineType, MappingFile
+from mosaico_ingest.adapters.mapping.schema import adapter_schema
+from mosaico_ingest.adapters.mapping.typed import Typed
+from mosaico_ingest.bag.definition import Definition
+from mosaico_ingest.bag.names import normalize_msgtype
+from mosaico_ingest.diagnostics import Finding, RowFailure, Severity
+from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.manifest.problems import explain
+from mosaico_ingest.manifest.source import Source, load_source
+from mosaico_ingest.ontology.registry import UnknownTag, ontology_type
+from mosaico_ingest.ontology.types import OntologyType
+
+__all__ = ["MappingAdapter", "MappingSpec", "load_adapter"]
+
+_BINDING: ContextVar[tuple[tuple[str, str], ...]] = ContextVar("binding", default=())
+"""The adapters being bound and the types they are bound to, to notice one that uses itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class MappingAdapter:
+    """A mapping bound to one message definition; satisfies `Adapter`."""
+
+    ontology: OntologyType
+    record: Filled
+    metadata: dict[str, Typed]
+    msgtype: str
+
+    def adapt(self, rows: pa.StructArray, envelope: Envelope) -> Adapted:
+        """Adapt a whole batch; a row that does not fit is a failure, the others go on."""
+        index = np.arange(len(rows), dtype=np.int64)
+        failures: list[RowFailure] = []
+        while True:
+            try:
+                adapted = fill(Evaluation(rows, envelope), self.record)
+            except RowsRefused as refused:
+                for row, (rule, reason) in refused.refusals.items():
+                    failures.append(RowFailure(int(index[row]), rule, reason))
+                good = np.ones(len(rows), bool)
+                good[list(refused.refusals)] = False
+                rows, index = rows.filter(pa.array(good)), index[good]
+                envelope = Envelope(envelope.topic, envelope.msgtype, envelope.log_times[good])
+            else:
+                failures.sort(key=lambda failure: failure.row)
+                return Adapted(adapted, index, tuple(failures))
+
+    def topic_metadata(self, first_row: pa.StructScalar | None) -> dict[str, Any]:
+        """Return the values of `schema_metadata` for one row; {} without one, or where it does not fit."""
+        if first_row is None or not self.metadata:
+            return {}
+        row: Any = pa.array([first_row.as_py()], first_row.type)
+        evaluation = Evaluation(row, Envelope("", self.msgtype, np.zeros(1, np.int64)))
+        try:
+            return {key: evaluation.of(typed).closed(1)[0].as_py() for key, typed in self.metadata.items()}
+        except RowsRefused:
+            return {}
+
+
+@dataclass(frozen=True, slots=True)
+class MappingSpec:
+    """An adapter file that reads well; satisfies `AdapterSpec`, and survives pickling if its look-up does."""
+
+    model: MappingFile
+    source: Source
+    ontology: OntologyType
+    adapters: AdapterLookup | None = None
+    """Finds the adapters that `use` names; a module-level function."""
+
+    @property
+    def name(self) -> str:
+        """As `IMUAdapter`."""
+        return self.model.adapter
+
+    @property
+    def ros_types(self) -> tuple[str, ...]:
+        """The message types it takes, as `sensor_msgs/msg/Imu`."""
+        return tuple(normalize_msgtype(name) for name in self.model.ros_types)
+
+    @property
+    def default(self) -> bool:
+        """Whether it is used for its types without being asked for."""
+        return self.model.default
+
+    def check(self, definition: Definition, shape: pa.StructType) -> tuple[Finding, ...]:
+        """Return every mistake the mapping has for a message type; none means that it binds."""
+        return self._compile(definition, shape)[1]
+
+    def bind(self, definition: Definition, shape: pa.StructType) -> MappingAdapter:
+        """Check the mapping against the real definition and compile it.
+
+        Raises:
+            AdapterError: It does not fit; `findings` has one for each mistake, with its place in the file.
+        """
+        adapter, findings = self._compile(definition, shape)
+        if adapter is None or findings:
+            raise _refused(f"{self.name} does not fit {definition.root}", self.source, findings)
+        return adapter
+
+    def _compile(
+        self, definition: Definition, shape: pa.StructType
+    ) -> tuple[MappingAdapter | None, tuple[Finding, ...]]:
+        variant = next((n for n in self.model.ros_types if normalize_msgtype(n) == definition.root), None)
+        if variant is None:
+            where = self.source.key_span(("variants",) if self.model.variants else ("ros_type",))
+            takes = f"{self.name} takes {', '.join(self.ros_types)}, not {definition.root}"
+            return None, (Finding("misfit", Severity.ERROR, takes, where),)
+        step, chain = (self.name, definition.root), _BINDING.get()
+        if step in chain:
+            names = " → ".join(name for name, _ in (*chain[chain.index(step) :], step))
+            where = self.source.key_span(("adapter",))
+            return None, (Finding("cycle", Severity.ERROR, f"adapters use one another: {names}", where),)
+        token = _BINDING.set((*chain, step))
+        try:
+            return self._compiled(definition, shape, variant)
+        finally:
+            _BINDING.reset(token)
+
+    def _compiled(
+        self, definition: Definition, shape: pa.StructType, variant: str
+    ) -> tuple[MappingAdapter | None, tuple[Finding, ...]]:
+        compiler = Compiler(self.source, definition, self.adapters)
+        scope = Scope(Kind(shape, msgtype=definition.root), definition.types)
+        record = compiler.record(self.model, self.ontology, scope, variant)
+        metadata = compiler.metadata(self.model.schema_metadata, scope)
+        if record is None:
+            return None, tuple(compiler.findings)
+        return MappingAdapter(self.ontology, record, metadata, definition.root), tuple(compiler.findings)
+
+
+def load_adapter(
+    path_or_text: Path | str, *, file: str | None = None, adapters: AdapterLookup | None = None
+) -> MappingSpec:
+    """Read an adapter file (`Path`) or its text (`str`, called `file` in messages).
+
+    Raises:
+        AdapterError: It cannot be read or is not a mapping; `findings` has one for each mistake.
+    """
+    if isinstance(path_or_text, Path):
+        file = file or str(path_or_text)
+        try:
+            path_or_text = path_or_text.read_text("utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise AdapterError(f"the adapter file cannot be read: {error}", where=file) from error
+    source = load_source(path_or_text, file=file or "<adapter>")
+    spec, findings = _read(source, adapters)
+    if spec is None or findings:
+        raise _refused("this is no valid adapter", source, findings)
+    return spec
+
+
+def _read(source: Source, adapters: AdapterLookup | None) -> tuple[MappingSpec | None, tuple[Finding, ...]]:
+    if source.findings:
+        return None, source.findings
+    try:
+        model = MappingFile.model_validate(source.value)
+    except ValidationError as error:
+        return None, tuple(finding for _, finding in explain(error, source=source, schema=adapter_schema()))
+    compiler = Compiler(source, None, adapters)
+    if (model.ros_type is None) == (model.variants is None):
+        compiler.report(
+            ("adapter",), "either ros_type or variants says what the adapter takes", "give one of them"
+        )
+    ontology = _ontology(model, compiler)
+    if ontology is None:
+        return None, tuple(compiler.findings)
+    compiler.record(model, ontology, None, None)
+    compiler.metadata(model.schema_metadata, None)
+    return MappingSpec(model, source, ontology, adapters), tuple(compiler.findings)
+
+
+def _ontology(model: MappingFile, compiler: Compiler) -> OntologyType | None:
+    if isinstance(model.ontology, InlineType):
+        return make_type(model.ontology, compiler.report)
+    try:
+        return ontology_type(model.ontology)
+    except UnknownTag as unknown:
+        compiler.report(("ontology",), unknown.what, unknown.hint, rule="unknown-tag")
+        return None
+
+
+def _refused(what: str, source: Source, findings: tuple[Finding, ...]) -> AdapterError:
+    first = findings[0] if findings else None
+    more = f" (and {len(findings) - 1} more)" if len(findings) > 1 else ""
+    said = f"{what}: {first.message}{more}" if first else what
+    where = str(first.span) if first and first.span else source.file
+    return AdapterError(said, where=where, hint=first.help if first else None, findings=findings)
