@@ -14,11 +14,19 @@ from mosaico_ingest.bag.names import DURATION, TIME
 from mosaico_ingest.bag.schemas import message_type
 from mosaico_ingest.policies import Stores
 
-__all__ = ["BUILTIN", "agreed_type", "distro_type", "ros_version"]
+__all__ = ["BEFORE_IRON", "BUILTIN", "ROS1", "ROS2", "agreed_type", "distro_type", "ros_version"]
 
 _PARTS = (Field("sec", "int32"), Field("nanosec", "uint32"))
 BUILTIN: Mapping[str, MessageType] = {name: MessageType(name, _PARTS) for name in (TIME, DURATION)}
 """The types every distro has and a ROS 1 text spells `time` and `duration`."""
+
+
+ROS1 = (Stores.ROS1_NOETIC,)
+BEFORE_IRON = (
+    Stores.ROS2_DASHING, Stores.ROS2_ELOQUENT, Stores.ROS2_FOXY, Stores.ROS2_GALACTIC, Stores.ROS2_HUMBLE,
+)  # fmt: skip
+"""The distros whose recordings hold no definitions."""
+ROS2 = (*BEFORE_IRON, Stores.ROS2_IRON, Stores.ROS2_JAZZY, Stores.ROS2_KILTED, Stores.ROS2_LYRICAL)
 
 
 def ros_version(distro: Stores) -> int | None:
@@ -35,9 +43,8 @@ def distro_type(distro: Stores, name: str) -> MessageType | None:
 
 
 @lru_cache(maxsize=4096)
-def agreed_type(version: int, name: str) -> MessageType | None:
-    """Return the type if all distros of a ROS version that have it agree on its fields; the newest one's form."""
-    distros = [distro for distro in Stores if distro is not Stores.LATEST and ros_version(distro) == version]
+def agreed_type(name: str, distros: tuple[Stores, ...]) -> MessageType | None:
+    """Return the type if all of the distros that have it agree on its fields; the last one's form."""
     found = [known for distro in distros if (known := distro_type(distro, name))]
     return found[-1] if found and all(known.fields == found[0].fields for known in found) else None
 

@@ -165,8 +165,16 @@ class ROSLoader:
         messages = sum(channel.count or 0 for channel in self._channels.values())
         pieces = max(recording.size_bytes // _WINDOW_BYTES, messages // _WINDOW_MESSAGES) + 1
         step = max((last - first) // min(pieces, _MAX_WINDOWS) + 1, 1)
-        for start in range(first, last + 1, step):
-            yield list(recording.batches(ids, start_ns=start, end_ns=min(start + step, last + 1)))
+        starts = range(first, last + 1, step)
+        for start in starts:
+            # Open at both ends: an index may be wrong about the first and last message.
+            yield list(
+                recording.batches(
+                    ids,
+                    start_ns=start if start != starts[0] else None,
+                    end_ns=start + step if start != starts[-1] else None,
+                )
+            )
 
     def _messages(self, batches: list[RawBatch], readers: Mapping[int, Deserializer]) -> Iterator[ROSMessage]:
         if not batches:

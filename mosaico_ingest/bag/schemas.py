@@ -18,7 +18,10 @@ from mosaico_ingest.errors import BagError
 __all__ = ["message_type", "read_types"]
 
 _MODULE = re.compile(r"^\s*module\s+\w+\s*\{", re.MULTILINE)
+_DASHES = re.compile(r"^---[ \t\r]*$", re.MULTILINE)
+_SERVICE_PARTS = re.compile(r"(.+/srv/.+)_(?:Event|Request|Response)")
 _PLACEHOLDER = "structure_needs_at_least_one_member"
+_EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 _CONTAINERS = {Nodetype.ARRAY: Container.ARRAY, Nodetype.SEQUENCE: Container.SEQUENCE}
 _IDL_ERRORS = (
     TypesysError,
@@ -52,7 +55,25 @@ def _read_section(section: Section, root: str, where: str | None) -> list[Messag
     if section.kind == "IDL" or (not section.kind and _MODULE.search(section.text)):
         return _read_idl(section, where or root)
     name = normalize_msgtype(section.name) if section.name else root
+    service, dashes = _SERVICE_PARTS.fullmatch(name), _DASHES.search(section.text)
+    if service and dashes:
+        return _read_service(service[1], section, dashes, where or root)
     return [parse_msg(section.text, name, where=where or root, line=section.line)]
+
+
+def _read_service(name: str, section: Section, dashes: re.Match[str], where: str) -> list[MessageType]:
+    """Return request, response and event of a service; recorders keep the `.srv` text for its events."""
+    request, response = section.text[: dashes.start()], section.text[dashes.end() :]
+    later = section.line + section.text.count("\n", 0, dashes.end())
+    parts = [
+        Field(part, f"{name}_{part.title()}", is_message=True, container=Container.SEQUENCE, size=1)
+        for part in ("request", "response")
+    ]
+    return [
+        parse_msg(request, parts[0].type, where=where, line=section.line),
+        parse_msg(response, parts[1].type, where=where, line=later),
+        MessageType(f"{name}_Event", (Field("info", _EVENT_INFO, is_message=True), *parts)),
+    ]
 
 
 def _read_idl(section: Section, where: str) -> list[MessageType]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mosaico_ingest.bag.definition import Definition, Embedded, MessageType, Source
-from mosaico_ingest.bag.distros import BUILTIN, agreed_type, distro_type, ros_version
+from mosaico_ingest.bag.distros import BEFORE_IRON, BUILTIN, ROS1, ROS2, agreed_type, distro_type, ros_version
 from mosaico_ingest.bag.link import link
 from mosaico_ingest.bag.msgtext import flatten
 from mosaico_ingest.bag.names import normalize_msgtype
@@ -76,7 +76,7 @@ class TypeResolver:
         self._custom = _by_name(own)
         self._registered = _by_name(registry.entries(self.distro).values())
         self._resolved = dict[tuple[str, Embedded | None, int], Definition]()
-        self._assumed = dict[str, int]()
+        self._assumed = dict[str, str]()
         self._replaced = dict[str, str]()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -91,9 +91,9 @@ class TypeResolver:
             )
             for root, problem in self._replaced.items()
         ]
-        for version in sorted(set(self._assumed.values())):
-            names = ", ".join(name for name, known in self._assumed.items() if known == version)
-            message = f"without definitions in the recording, as all ROS {version} distros have them: {names}"
+        for who in dict.fromkeys(self._assumed.values()):
+            names = ", ".join(name for name, known in self._assumed.items() if known == who)
+            message = f"the recording does not define these types, they are read as in {who}: {names}"
             findings.append(
                 Finding("assumed-definition", Severity.INFO, message, help="set ros_distro to be sure")
             )
@@ -135,8 +135,7 @@ class TypeResolver:
         ]
         distro = self.distro
         if distro is None:
-            label = f"what all ROS {version} distros agree on"
-            places.append(_Place(label, Source.DISTRO, lambda name: self._agreed(version, name)))
+            places += self._agreements(embedded, version)
         elif ros_version(distro) == version:
             places.append(_Place(distro.value, Source.DISTRO, lambda name: distro_type(distro, name)))
         if embedded and not embedded.text.strip():
@@ -159,11 +158,23 @@ class TypeResolver:
             self._replaced[root] = error.what
             return {}
 
-    def _agreed(self, version: int, name: str) -> MessageType | None:
-        known = agreed_type(version, name)
-        if known and name not in BUILTIN:
-            self._assumed[name] = version
-        return known
+    def _agreements(self, embedded: Embedded | None, version: int) -> list[_Place]:
+        """Return what can be known without a distro: a recording that holds no definition at all is an old one."""
+        places = [self._agreement(f"all ROS {version} distros", ROS1 if version == 1 else ROS2)]
+        if embedded is None and version != 1:
+            places.append(
+                self._agreement("all distros until Humble, the last to record no definitions", BEFORE_IRON)
+            )
+        return places
+
+    def _agreement(self, who: str, distros: tuple[Stores, ...]) -> _Place:
+        def find(name: str) -> MessageType | None:
+            known = agreed_type(name, distros)
+            if known and name not in BUILTIN:
+                self._assumed.setdefault(name, who)
+            return known
+
+        return _Place(f"what {who.partition(',')[0]} agree on", Source.DISTRO, find)
 
     def _hint(self, places: list[_Place], version: int) -> str:
         searched = f"searched: {', '.join(place.label for place in places)}"
