@@ -1,0 +1,104 @@
+"""Every message type of a distro of each generation, and every message of the real recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores as RosbagsStores
+from rosbags.typesys import get_typestore
+
+from mosaico_ingest.bag.batch import Encoding, RawBatch
+from mosaico_ingest.bag.definition import Container, Definition, Field
+from mosaico_ingest.bag.recording import open_recording
+from mosaico_ingest.bag.serialize import Serializer
+from mosaico_ingest.bag.types import TypeResolver
+from mosaico_ingest.decode.choose import decoder_for
+from mosaico_ingest.decode.decoder import Decoded
+from mosaico_ingest.decode.rowwise import RowwiseDecoder
+from mosaico_ingest.errors import DecodeError, IngestError
+from mosaico_ingest.policies import Stores
+
+AssertAgree = Callable[[Sequence[bytes], Definition, Encoding], Decoded]
+AssertSame = Callable[[Decoded, Decoded], None]
+LARGEST_ROWWISE = 40_000_000
+
+
+class Values:
+    """Random values of any type, short where lengths are free."""
+
+    def __init__(self, definition: Definition, seed: int) -> None:
+        self.types = definition.types
+        self.random = np.random.default_rng(seed)
+
+    def message(self, name: str) -> dict[str, Any]:
+        return {field.name: self.field(field) for field in self.types[name].fields}
+
+    def field(self, field: Field) -> Any:
+        if field.container is Container.SCALAR:
+            return self.one(field)
+        most = min(field.size or 2, 2)
+        count = field.size if field.container is Container.ARRAY else int(self.random.integers(0, most + 1))
+        return [self.one(field) for _ in range(count)]
+
+    def one(self, field: Field) -> Any:
+        if field.is_message:
+            return self.message(field.type)
+        if field.type in {"string", "wstring"}:
+            return "añ漢b"[: self.random.integers(0, 5)]
+        if field.type.startswith("float"):
+            return float(np.float32(self.random.standard_normal()))
+        return bool(self.random.integers(0, 2)) if field.type == "bool" else int(self.random.integers(0, 100))
+
+
+def types_of(distro: Stores, version: int) -> Iterator[Definition]:
+    resolver = TypeResolver(distro)
+    for name in sorted(get_typestore(RosbagsStores(distro.value)).fielddefs):
+        yield resolver.resolve(name, None, ros_version=version)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("distro", "version", "encoding"),
+    [(Stores.ROS2_HUMBLE, 2, Encoding.CDR), (Stores.ROS1_NOETIC, 1, Encoding.ROS1)],
+)
+def test_every_standard_type_decodes_the_same_both_ways(
+    assert_agree: AssertAgree, distro: Stores, version: int, encoding: Encoding
+) -> None:
+    for definition in types_of(distro, version):
+        serializer = Serializer(definition, encoding)
+        values = [Values(definition, seed).message(definition.root) for seed in range(24)]
+        payloads = [serializer.from_dict(value) for value in values]
+        assert not assert_agree([*payloads, *payloads[:1] * 20], definition, encoding).failures
+
+
+def batches_of(corpus: Path) -> Iterator[RawBatch]:
+    """Yield the batches of every recording that opens, those of one-message rows as large as row-wise can bear."""
+    for line in (corpus / "INDEX.tsv").read_text().splitlines()[1:]:
+        path = corpus / line.split("\t")[0]
+        try:
+            with open_recording(path, resolve=TypeResolver(Stores.ROS2_HUMBLE)) as recording:
+                yield from recording.batches()
+        except IngestError:
+            continue
+
+
+@pytest.mark.slow
+def test_every_message_of_the_real_recordings_decodes_the_same_both_ways(
+    corpus: Path, assert_same: AssertSame
+) -> None:
+    messages = 0
+    for batch in batches_of(corpus):
+        try:
+            decoder = decoder_for(batch.channel)
+        except DecodeError:
+            continue
+        if batch.channel.definition is None or batch.lengths.sum() > LARGEST_ROWWISE:
+            continue
+        slow = RowwiseDecoder(batch.channel.definition, batch.channel.encoding).decode(batch)
+        assert_same(decoder.decode(batch), slow)
+        messages += len(batch)
+    assert messages > 100_000
