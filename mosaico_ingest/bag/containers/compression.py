@@ -5,7 +5,7 @@ from __future__ import annotations
 import bz2
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import lz4.frame
 import zstandard
@@ -29,7 +29,7 @@ class _Stream(Protocol):
     def decompress(self, data: bytes, /) -> bytes: ...
 
 
-_STREAMS: dict[str, Callable[[], _Stream]] = {
+_STREAMS: dict[str, Callable[[], Any]] = {  # of _Stream; lz4 has no annotations to say so
     "zstd": lambda: zstandard.ZstdDecompressor().decompressobj(),
     "lz4": lz4.frame.LZ4FrameDecompressor,
     "bz2": bz2.BZ2Decompressor,
@@ -91,23 +91,19 @@ def inflate_message(data: bytes, limit: int) -> bytes:
 
 def inflate_file(source: Path, target: Path) -> str | None:
     """Write what the zstd file `source` holds to `target`; return why it ended early, if it did."""
-    stream = zstandard.ZstdDecompressor().decompressobj()
+    stream = None
     try:
         with source.open("rb") as packed, target.open("wb") as plain:
             for data in iter(lambda: packed.read(_STEP_BYTES), b""):
-                plain.write(stream.decompress(data))
-                while stream.eof and stream.unused_data:
-                    rest = stream.unused_data
-                    stream = zstandard.ZstdDecompressor().decompressobj()
+                rest = data
+                while rest:
+                    stream = stream or zstandard.ZstdDecompressor().decompressobj()
                     plain.write(stream.decompress(rest))
-                if stream.eof:
-                    stream = zstandard.ZstdDecompressor().decompressobj()
-                    ended = True
-                else:
-                    ended = False
+                    rest = stream.unused_data if stream.eof else b""
+                    stream = None if stream.eof else stream
     except zstandard.ZstdError as err:
         return f"damaged zstd file: {err}"
-    return None if ended else "the zstd file is cut off"
+    return "the zstd file is cut off" if stream else None
 
 
 def _inflate(data: bytes | memoryview, compression: str, size: int) -> bytes:
@@ -137,7 +133,7 @@ def _pieces(data: bytes | memoryview, compression: str) -> Iterator[bytes]:
     """Inflate in steps of the input, so that a lying size or a bomb is noticed on the way."""
     if compression not in _STREAMS:
         raise BagError(f"compression {compression!r} is unknown; known are none, zstd, lz4, bz2")
-    stream = _STREAMS[compression]()
+    stream: _Stream = _STREAMS[compression]()
     for position in range(0, len(data), _STEP_BYTES):
         yield stream.decompress(bytes(data[position : position + _STEP_BYTES]))
         if stream.eof:

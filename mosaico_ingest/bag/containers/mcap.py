@@ -6,6 +6,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ from mosaico_ingest.bag.containers.mcap_index import (
     read_loose,
 )
 from mosaico_ingest.bag.containers.part import Block, Hole, Loaded, Slab, Stream, Want
-from mosaico_ingest.bag.containers.slab import by_key, stretches, wanted
+from mosaico_ingest.bag.containers.slab import Bytes, by_key, keep, stretches
 from mosaico_ingest.bag.containers.source import FileSource
 from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.errors import BagError
@@ -93,7 +94,7 @@ class McapPart:
         raw = self._source.read(piece.offset, piece.stop - piece.offset)
         loaded = Loaded([], [])
         if not piece.is_chunk:
-            _scan(np.frombuffer(raw, np.uint8), piece.offset, want, loaded, where=piece.offset)
+            _scan(raw, piece, want, loaded)
             return loaded
         try:
             head = chunk_head(raw)
@@ -101,16 +102,8 @@ class McapPart:
         except BagError as err:
             loaded.holes.extend(_whole_chunk(piece, raw, want, f"broken chunk: {err.what}"))
             return loaded
-        records = np.frombuffer(data, np.uint8)
-        if piece.indexes:
-            try:
-                _by_index(records, raw, piece, want, loaded)
-            except BagError as err:
-                reason = f"{err.what}; the chunk was read record by record"
-                loaded.holes.append(Hole(piece.offset, reason, count=0))
-            else:
-                return loaded
-        _scan(records, piece.offset, want, loaded)
+        if not piece.indexes or not _by_index(data, raw, piece, want, loaded):
+            _scan(data, piece, want, loaded)
         return loaded
 
 
@@ -124,7 +117,7 @@ def _stream(key: int, channel: McapChannel, index: McapIndex) -> Stream:
         schema.name,
         _ENCODINGS.get(channel.encoding, Encoding.OTHER),
         ros_version,
-        Embedded(schema.encoding, schema.text) if schema.text else None,
+        Embedded(schema.encoding, schema.text) if schema.encoding else None,
         counts.get(key, 0) if counts is not None else None,
         latched=channel.metadata.get("latching") == "1",
         attributes={"encoding": channel.encoding, "schema_encoding": schema.encoding, **channel.metadata},
@@ -172,40 +165,44 @@ def _entries(raw: bytes, piece: Piece, key: int, offset: int) -> NDArray[np.void
     return np.frombuffer(raw, _ENTRY, size // _ENTRY.itemsize, begin)
 
 
-def _by_index(records: NDArray[np.uint8], raw: bytes, piece: Piece, want: Want, loaded: Loaded) -> None:
-    """Add the wanted messages that the chunk's message indexes name.
+def _by_index(data: bytes | memoryview, raw: bytes, piece: Piece, want: Want, loaded: Loaded) -> bool:
+    """Add the wanted messages that the chunk's message indexes name; return whether they could be trusted."""
+    try:
+        slabs = _indexed(np.frombuffer(data, np.uint8), raw, piece, want)
+    except BagError as err:
+        loaded.holes.append(Hole(piece.offset, f"{err.what}; the chunk was read record by record", count=0))
+        return False
+    for slab in slabs:
+        keep(slab, want, loaded)
+    return True
+
+
+def _indexed(records: Bytes, raw: bytes, piece: Piece, want: Want) -> list[Slab]:
+    """Return the messages of the wanted channels, all checked at once against the records.
 
     Raises:
         BagError: An index does not agree with the records.
     """
-    indexes = [
-        (key, _entries(raw, piece, key, offset)) for key, offset in piece.index_offsets() if key in want.keys
-    ]
-    if not indexes:
-        return
-    entries = np.concatenate([found for _, found in indexes])
-    offsets = entries["offset"]
-    if len(offsets) and int(offsets.max()) > len(records) - _HEAD.itemsize:
+    wanted = [(key, offset) for key, offset in piece.index_offsets() if key in want.keys]
+    if not wanted:
+        return []
+    indexes = [_entries(raw, piece, key, offset) for key, offset in wanted]
+    entries = np.concatenate(indexes)
+    if len(entries) and int(entries["offset"].max()) > len(records) - _HEAD.itemsize:
         raise BagError("a message index points outside its chunk")
-    starts = offsets.astype(np.int64)
+    starts = entries["offset"].astype(np.int64)
     heads = _heads(records, starts)
-    sizes = [len(found) for _, found in indexes]
-    keys = np.repeat(np.array([key for key, _ in indexes], np.uint16), sizes)
+    keys = np.repeat(np.array([key for key, _ in wanted], np.uint16), [len(index) for index in indexes])
     fits = (heads["op"] == Op.MESSAGE) & (heads["channel"] == keys) & (heads["time"] == entries["time"])
     if not bool((fits & _within(heads, starts, len(records))).all()):
         raise BagError("a message index does not point at its messages")
-    first = 0
-    for (key, _), size in zip(indexes, sizes, strict=True):
-        rows = slice(first, first + size)
-        _add(key, records, heads[rows], starts[rows], piece.offset, want, loaded)
-        first += size
+    edges = np.cumsum([0, *(len(index) for index in indexes)]).tolist()
+    rows = [slice(begin, end) for begin, end in pairwise(edges)]
+    return [_slab(key, records, heads[r], starts[r], piece) for (key, _), r in zip(wanted, rows, strict=True)]
 
 
-def _scan(
-    records: NDArray[np.uint8], offset: int, want: Want, loaded: Loaded, *, where: int | None = None
-) -> None:
-    """Add the wanted messages record by record, up to the first that does not fit; `where` counts offsets from there."""
-    data = memoryview(records)
+def _scan(data: bytes | memoryview, piece: Piece, want: Want, loaded: Loaded) -> None:
+    """Add the wanted messages record by record, up to the first that does not fit."""
     found: list[int] = []
     at = 0
     while at < len(data):
@@ -213,18 +210,18 @@ def _scan(
         end = at + RECORD.size + length
         if op == 0 or end > len(data) or (op == Op.MESSAGE and length < _FIXED_BYTES):
             reason = f"no whole record at byte {at} of {len(data)}; the rest is not read"
-            loaded.holes.append(Hole(offset, reason))
+            loaded.holes.append(Hole(piece.offset, reason))
             break
         if op == Op.MESSAGE:
             found.append(at)
         at = end
-    starts = np.array(found, np.int64)
+    records, starts = np.frombuffer(data, np.uint8), np.array(found, np.int64)
     heads = _heads(records, starts)
     for key, rows in by_key(heads["channel"], want.keys):
-        _add(key, records, heads[rows], starts[rows], offset, want, loaded, where=where)
+        keep(_slab(key, records, heads[rows], starts[rows], piece), want, loaded)
 
 
-def _heads(records: NDArray[np.uint8], starts: NDArray[np.int64]) -> NDArray[np.void]:
+def _heads(records: Bytes, starts: NDArray[np.int64]) -> NDArray[np.void]:
     if not len(starts):
         return np.empty(0, _HEAD)
     return stretches(records, starts, _HEAD.itemsize).view(_HEAD).reshape(-1)
@@ -236,20 +233,8 @@ def _within(heads: NDArray[np.void], starts: NDArray[np.int64], size: int) -> ND
     return (length >= _FIXED_BYTES) & (length <= room)
 
 
-def _add(
-    key: int,
-    records: NDArray[np.uint8],
-    heads: NDArray[np.void],
-    starts: NDArray[np.int64],
-    offset: int,
-    want: Want,
-    loaded: Loaded,
-    *,
-    where: int | None = None,
-) -> None:
-    offsets = np.full(len(starts), offset, np.int64) if where is None else starts + where
+def _slab(key: int, records: Bytes, heads: NDArray[np.void], starts: NDArray[np.int64], piece: Piece) -> Slab:
+    """Return messages whose records have been checked; each is told by its chunk, or by its own place outside chunks."""
+    offsets = np.full(len(starts), piece.offset, np.int64) if piece.is_chunk else starts + piece.offset
     lengths = heads["length"].astype(np.int64) - _FIXED_BYTES
-    times = np.ascontiguousarray(heads["time"])
-    slab = wanted(Slab(key, times, records, starts + _HEAD.itemsize, lengths, offsets), want, loaded.holes)
-    if len(slab):
-        loaded.slabs.append(slab)
+    return Slab(key, np.ascontiguousarray(heads["time"]), records, starts + _HEAD.itemsize, lengths, offsets)

@@ -110,10 +110,11 @@ class Part(Protocol):
     """The file as it was named, not a copy that had to be made."""
     container: str
     streams: tuple[Stream, ...]
+    message_count: int | None
+    """How many messages the index promises."""
     start_ns: int | None
     end_ns: int | None
     """The last message's time, inclusive."""
-    message_count: int | None
     holes: list[Hole]
     """What was found broken while opening."""
     notes: list[str]

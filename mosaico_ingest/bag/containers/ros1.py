@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.containers.compression import inflate, inflate_some
-from mosaico_ingest.bag.containers.part import LATEST_NS, Block, Hole, Loaded, Slab, Stream, Want
+from mosaico_ingest.bag.containers.part import Block, Hole, Loaded, Slab, Stream, Want
 from mosaico_ingest.bag.containers.ros1_index import MAGIC, Piece, Ros1Index, read_index
 from mosaico_ingest.bag.containers.ros1_records import (
     Op,
@@ -23,7 +24,7 @@ from mosaico_ingest.bag.containers.ros1_records import (
     time_of,
     times_of,
 )
-from mosaico_ingest.bag.containers.slab import by_key, stretches, wanted
+from mosaico_ingest.bag.containers.slab import Bytes, by_key, keep, stretches
 from mosaico_ingest.bag.containers.source import FileSource
 from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.errors import BagError
@@ -74,7 +75,7 @@ class Ros1Part:
         raw = self._source.read(piece.offset, piece.stop - piece.offset)
         loaded = Loaded([], [])
         if not piece.is_chunk:
-            _scan(raw, piece.offset, want, loaded, where=piece.offset)
+            _scan(raw, piece, want, loaded)
             return loaded
         try:
             data, after = _chunk(raw, piece, loaded)
@@ -83,15 +84,8 @@ class Ros1Part:
                 reason = f"broken chunk: {err.what}"
                 loaded.holes.append(Hole(piece.offset, reason, key=key, count=piece.counts[key]))
             return loaded
-        if not piece.is_cut:
-            try:
-                _by_index(np.frombuffer(data, np.uint8), raw[after:], piece, want, loaded)
-            except BagError as err:
-                reason = f"{err.what}; the chunk was read record by record"
-                loaded.holes.append(Hole(piece.offset, reason, count=0))
-            else:
-                return loaded
-        _scan(data, piece.offset, want, loaded)
+        if piece.is_cut or not _by_index(data, raw[after:], piece, want, loaded):
+            _scan(data, piece, want, loaded)
         return loaded
 
 
@@ -126,121 +120,135 @@ def _chunk(raw: bytes, piece: Piece, loaded: Loaded) -> tuple[bytes | memoryview
     return inflate(packed, head.compression, head.size), head.end
 
 
-def _by_index(records: NDArray[np.uint8], after: bytes, piece: Piece, want: Want, loaded: Loaded) -> None:
-    """Add the wanted messages that the index records behind the chunk name.
+def _by_index(data: bytes | memoryview, after: bytes, piece: Piece, want: Want, loaded: Loaded) -> bool:
+    """Add the wanted messages that the index records behind the chunk name; return whether they could be trusted."""
+    keys = {key for key, count in piece.counts.items() if count and key in want.keys}
+    records = np.frombuffer(data, np.uint8)
+    try:
+        found = _indexes(after, piece, keys)
+        slabs = [_indexed(records, data, key, entries, piece) for key, entries in found.items()]
+    except BagError as err:
+        loaded.holes.append(Hole(piece.offset, f"{err.what}; the chunk was read record by record", count=0))
+        return False
+    for slab in slabs:
+        keep(slab, want, loaded)
+    return True
+
+
+def _indexes(after: bytes, piece: Piece, keys: set[int]) -> dict[int, NDArray[np.void]]:
+    """Return the entries of the wanted connections.
 
     Raises:
-        BagError: There is no index for them, or it does not agree with the records.
+        BagError: Some are missing, or are not as many as promised.
     """
     found: dict[int, NDArray[np.void]] = {}
-    missing = {key for key in piece.counts.keys() & want.keys if piece.counts[key]}
-    if not missing:
-        return
-    for record in records_in(after):
-        if record.op != Op.INDEX:
-            continue
-        key, entries = index_entries(record, after)
-        if key in missing and len(entries) == piece.counts[key]:
-            found[key] = entries
-        if found.keys() >= missing:
-            break
-    if found.keys() != missing:
+    for record in records_in(after) if keys else ():
+        if record.op == Op.INDEX:
+            key, entries = index_entries(record, after)
+            if key in keys and len(entries) == piece.counts[key]:
+                found[key] = entries
+            if found.keys() == keys:
+                break
+    if found.keys() != keys:
         raise BagError("an index record is missing")
-    slabs = [_indexed(records, key, entries, piece.offset) for key, entries in found.items()]
-    for slab in slabs:
-        _keep(slab, want, loaded)
+    return found
 
 
-def _indexed(records: NDArray[np.uint8], key: int, entries: NDArray[np.void], offset: int) -> Slab:
-    """Return the messages of one index record; those whose headers are laid out alike are checked together."""
-    at = entries["offset"].astype(np.int64)
-    times = times_of(entries)
+def _indexed(
+    records: Bytes, data: bytes | memoryview, key: int, entries: NDArray[np.void], piece: Piece
+) -> Slab:
+    """Return the messages of one index record; those whose headers are laid out alike are checked together.
+
+    Raises:
+        BagError: The index does not agree with the records.
+    """
+    at, times = entries["offset"].astype(np.int64), times_of(entries)
     starts, lengths = np.empty_like(at), np.empty_like(at)
     left = np.arange(len(at))
-    memory = memoryview(records)
     for _ in range(_LAYOUTS):
         if not len(left):
-            return Slab(key, times, records, starts, lengths, np.full(len(at), offset, np.int64))
-        alike = _alike(records, memory, key, at[left], times[left], starts, lengths, left)
+            return Slab(key, times, records, starts, lengths, np.full(len(at), piece.offset, np.int64))
+        layout = _layout(data, int(at[left[0]]))
+        alike, starts[left], lengths[left] = _alike(records, layout, key, at[left], times[left])
+        if not alike[0]:
+            break
         left = left[~alike]
     raise BagError("an index record does not point at its messages")
 
 
 def _alike(
-    records: NDArray[np.uint8],
-    memory: memoryview,
-    key: int,
-    at: NDArray[np.int64],
-    times: NDArray[np.int64],
-    starts: NDArray[np.int64],
-    lengths: NDArray[np.int64],
-    rows: NDArray[np.int64],
-) -> NDArray[np.bool_]:
-    """Fill in the messages whose headers look like the first one's; return which they are.
+    records: Bytes, layout: _Layout, key: int, at: NDArray[np.int64], times: NDArray[np.int64]
+) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
+    """Return which messages have this layout and are what the index says, their payloads' starts and lengths.
 
     Raises:
-        BagError: The first is not the message that the index names.
+        BagError: One would lie outside the chunk.
     """
-    skipped, size, fixed, conn_at, time_at = _layout(memory, int(at[0]))
-    begin = at + skipped
-    if int(begin.max()) > len(records) - size:
+    begin = at + layout.skipped
+    if int(begin.max()) > len(records) - layout.size:
         raise BagError("an index record points outside its chunk")
-    heads = stretches(records, begin, size)
-    alike = (heads[:, fixed] == heads[0, fixed]).all(axis=1)
-    conns = np.ascontiguousarray(heads[:, conn_at : conn_at + 4]).view("<u4").reshape(-1)
-    stamps = np.ascontiguousarray(heads[:, time_at : time_at + 8]).view("<u4").astype(np.int64)
-    sizes = np.ascontiguousarray(heads[:, -4:]).view("<u4").reshape(-1).astype(np.int64)
-    alike &= (conns == key) & (stamps[:, 0] * 1_000_000_000 + stamps[:, 1] == times)
-    alike &= begin + size + sizes <= len(records)
-    if not alike[0]:
-        raise BagError("an index record does not point at its messages")
-    starts[rows[alike]] = begin[alike] + size
-    lengths[rows[alike]] = sizes[alike]
-    return alike
+    heads = stretches(records, begin, layout.size)
+    alike = (heads[:, layout.fixed] == heads[0, layout.fixed]).all(axis=1)
+    stamps = _words(heads, layout.time_at, 2).astype(np.int64)
+    lengths = _words(heads, layout.size - 4, 1).astype(np.int64).reshape(-1)
+    alike &= _words(heads, layout.conn_at, 1).reshape(-1) == key
+    alike &= stamps[:, 0] * 1_000_000_000 + stamps[:, 1] == times
+    alike &= begin + layout.size + lengths <= len(records)
+    return alike, begin + layout.size, lengths
 
 
-def _layout(data: memoryview, at: int) -> tuple[int, int, NDArray[np.bool_], int, int]:
-    """Return how far behind `at` the message begins, the bytes before its payload, and where in them what is."""
+def _words(heads: Bytes, at: int, count: int) -> NDArray[np.uint32]:
+    return np.ascontiguousarray(heads[:, at : at + 4 * count]).view("<u4")
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """How a message record begins: what lies where before its payload."""
+
+    skipped: int
+    """Bytes of connection records between where the index points and the message."""
+    size: int
+    fixed: NDArray[np.bool_]
+    """Which of the bytes are the same in every message of this layout."""
+    conn_at: int
+    time_at: int
+
+
+def _layout(data: bytes | memoryview, at: int) -> _Layout:
+    """Return the layout of the message at `at`.
+
+    Raises:
+        BagError: None is there.
+    """
     skipped = 0
-    for record in records_in(data[at:]):
+    for record in records_in(memoryview(data)[at:]):
         if record.op == Op.MESSAGE:
             break
         skipped = record.end
     else:
         raise BagError("an index record points at no message")
-    size = record.begin - record.at
-    head = bytes(data[at + record.at : at + record.begin])
-    conn_at, time_at = head.find(b"conn=") + 5, head.find(b"time=") + 5
-    fixed = np.ones(size, np.bool_)
-    fixed[conn_at : conn_at + 4] = False
-    fixed[time_at : time_at + 8] = False
-    fixed[-4:] = False
     number(record.header, b"conn", 4)
     time_of(record.header, b"time")
-    return skipped, size, fixed, conn_at, time_at
+    head = bytes(data[at + record.at : at + record.begin])
+    conn_at, time_at = head.find(b"conn=") + 5, head.find(b"time=") + 5
+    fixed = np.ones(len(head), np.bool_)
+    for begin, size in ((conn_at, 4), (time_at, 8), (len(head) - 4, 4)):
+        fixed[begin : begin + size] = False
+    return _Layout(skipped, len(head), fixed, conn_at, time_at)
 
 
-def _scan(
-    data: bytes | memoryview, offset: int, want: Want, loaded: Loaded, *, where: int | None = None
-) -> None:
+def _scan(data: bytes | memoryview, piece: Piece, want: Want, loaded: Loaded) -> None:
     """Add the wanted messages record by record, up to the first that does not fit."""
     found: list[tuple[int, int, int, int, int]] = []
     try:
         for message in messages_in(data):
-            if message.connection in want.keys and message.time_ns <= LATEST_NS:
-                found.append((message.connection, message.time_ns, message.begin, message.end, message.at))
+            found.append((message.connection, message.time_ns, message.begin, message.end, message.at))  # noqa: PERF401 - what came before an error counts
     except BagError as err:
-        loaded.holes.append(Hole(offset, f"{err.what}; the rest is not read"))
+        loaded.holes.append(Hole(piece.offset, f"{err.what}; the rest is not read"))
     columns = np.array(found, np.int64).reshape(-1, 5)
     keys, times, begins, ends, ats = columns.T
-    offsets = np.full(len(ats), offset, np.int64) if where is None else ats + where
-    slab = Slab(0, times, np.frombuffer(data, np.uint8), begins, ends - begins, offsets)
+    offsets = np.full(len(ats), piece.offset, np.int64) if piece.is_chunk else ats + piece.offset
+    records = np.frombuffer(data, np.uint8)
     for key, rows in by_key(keys, want.keys):
-        part = slab.rows(rows)
-        _keep(Slab(key, part.log_times, part.data, part.starts, part.lengths, part.offsets), want, loaded)
-
-
-def _keep(slab: Slab, want: Want, loaded: Loaded) -> None:
-    slab = wanted(slab, want, loaded.holes)
-    if len(slab):
-        loaded.slabs.append(slab)
+        slab = Slab(key, times[rows], records, begins[rows], (ends - begins)[rows], offsets[rows])
+        keep(slab, want, loaded)

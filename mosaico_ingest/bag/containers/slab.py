@@ -7,9 +7,9 @@ from collections.abc import Collection, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from mosaico_ingest.bag.containers.part import LATEST_NS, Hole, Slab, Want
+from mosaico_ingest.bag.containers.part import LATEST_NS, Hole, Loaded, Slab, Want
 
-__all__ = ["by_key", "in_time", "pack", "stretches", "wanted"]
+__all__ = ["Bytes", "by_key", "in_time", "keep", "pack", "stretches"]
 
 _FEW_ROWS = 8
 """With fewer rows to a length on average, one index for every byte is cheaper than one step for every length."""
@@ -37,7 +37,14 @@ def by_key(keys: NDArray[np.integer], wanted_keys: Collection[int]) -> Iterator[
             yield key, rows
 
 
-def wanted(slab: Slab, want: Want, holes: list[Hole]) -> Slab:
+def keep(slab: Slab, want: Want, loaded: Loaded) -> None:
+    """Add the messages within the wanted time."""
+    slab = _wanted(slab, want, loaded.holes)
+    if len(slab):
+        loaded.slabs.append(slab)
+
+
+def _wanted(slab: Slab, want: Want, holes: list[Hole]) -> Slab:
     """Return the messages within the wanted time; those after 2262 are noted as lost."""
     times = slab.log_times
     if not len(times):
@@ -48,7 +55,7 @@ def wanted(slab: Slab, want: Want, holes: list[Hole]) -> Slab:
         offset = int(slab.offsets[int(broken.argmax())])
         reason = f"recorded at {int(times.view(np.uint64).max())} ns, which is after the year 2262"
         holes.append(Hole(offset, reason, key=slab.key, count=int(broken.sum())))
-        return wanted(slab.rows(~broken), want, holes)
+        return _wanted(slab.rows(~broken), want, holes)
     if first >= want.start_ns and last < want.end_ns:
         return slab
     keep = times >= want.start_ns

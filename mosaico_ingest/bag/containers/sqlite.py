@@ -52,6 +52,8 @@ class SqlitePart:
             self._connection = _open(path, self._stack, self.notes)
             self._columns = _columns(self._connection)
             self.streams: tuple[Stream, ...] = self._read_streams()
+            counts = [stream.count for stream in self.streams]
+            self.message_count = None if None in counts else sum(count or 0 for count in counts)
             self.start_ns, self.end_ns = self._read_bounds()
         except sqlite3.Error as err:
             self._stack.close()
@@ -59,12 +61,6 @@ class SqlitePart:
         except BaseException:
             self._stack.close()
             raise
-
-    @property
-    def message_count(self) -> int | None:
-        """How many messages the table holds."""
-        counts = [stream.count for stream in self.streams]
-        return None if None in counts else sum(count or 0 for count in counts)
 
     def blocks(self, want: Want) -> Iterator[Block]:
         """Yield pages of rows by time stamp; past a damaged page, of the rows that can still be found."""
