@@ -29,7 +29,8 @@ __all__ = ["CustomMessages", "TypeResolver"]
 CustomMessages = tuple[str, Path, Stores | str | None]
 """A package, the directory of its `.msg` files (or one file), and the distro it is for (None: all)."""
 
-_LANGUAGES = frozenset({"ros1msg", "ros2msg", "ros2idl", "omgidl", "idl", "msg", "unknown", ""})
+_UNSAID = frozenset({"unknown", ""})
+_LANGUAGES = frozenset({"ros1msg", "ros2msg", "ros2idl", "omgidl", "idl", "msg"}) | _UNSAID
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,10 +139,12 @@ class TypeResolver:
             places += self._agreements(embedded, version)
         elif ros_version(distro) == version:
             places.append(_Place(distro.value, Source.DISTRO, lambda name: distro_type(distro, name)))
-        if embedded and not embedded.text.strip():
-            # An empty text is a type without fields, unless the type is known: recorders that lack a definition
-            # write an empty one.
-            places.append(_Place("the recording's empty text", Source.BAG, {root: MessageType(root, ())}.get))
+        if embedded and embedded.encoding not in _UNSAID and not embedded.text.strip():
+            # An empty text is a type without fields, unless a distro knows the type: recorders that lack a
+            # definition write an empty one.
+            known = any(distro_type(distro, root) for distro in (ROS1 if version == 1 else ROS2))
+            empty = {} if known else {root: MessageType(root, ())}
+            places.append(_Place("the recording's empty text", Source.BAG, empty.get))
         return places
 
     def _embedded(self, root: str, embedded: Embedded | None) -> Mapping[str, MessageType]:

@@ -86,9 +86,21 @@ class TestOrder:
         found = resolve(TypeResolver(), "example_interfaces/srv/AddTwoInts_Event", text)
         assert found.message.fields[1].type == "example_interfaces/srv/AddTwoInts_Request"
 
+    def test_a_service_event_recorded_with_its_srv_text_is_assembled(self) -> None:
+        text = f"int64 a\nThing thing\n---\nint64 sum\n{BAR}\nMSG: mine/Thing\nint8 x\n"
+        found = resolve(TypeResolver(), "mine/srv/Add_Event", text)
+        assert [(f.name, f.type, f.size) for f in found.message.fields] == [
+            ("info", "service_msgs/msg/ServiceEventInfo", 0),
+            ("request", "mine/srv/Add_Request", 1),
+            ("response", "mine/srv/Add_Response", 1),
+        ]
+        assert [f.type for f in found.types["mine/srv/Add_Request"].fields] == ["int64", "mine/msg/Thing"]
+
     def test_an_empty_text_is_a_type_without_fields_unless_the_type_is_known(self) -> None:
         assert resolve(TypeResolver(), "mine/msg/Signal", "").message.fields == ()
         assert resolve(TypeResolver(), "std_msgs/msg/String", "").message.fields[0].name == "data"
+        with pytest.raises(BagError, match="mine/msg/Signal is not known"):
+            TypeResolver().resolve("mine/msg/Signal", Embedded("unknown", ""), ros_version=2)
 
 
 class TestWithoutADistro:
@@ -97,6 +109,13 @@ class TestWithoutADistro:
         assert resolve(resolver, "geometry_msgs/msg/Pose").source is Source.DISTRO
         (finding,) = resolver.findings
         assert "geometry_msgs/msg/Pose" in finding.message
+
+    def test_a_recording_without_definitions_is_from_before_iron(self) -> None:
+        resolver = TypeResolver()
+        assert len(resolve(resolver, "sensor_msgs/msg/Range").message.fields) == 6
+        assert any("until Humble" in finding.message for finding in resolver.findings)
+        with pytest.raises(BagError, match="not known"):
+            resolve(resolver, "sensor_msgs/msg/Range", "")
 
     def test_what_they_do_not_agree_on_is_not_guessed(self) -> None:
         with pytest.raises(BagError, match=r"not known.*searched.*set ros_distro"):
