@@ -122,6 +122,8 @@ def reasons_of(report: Report) -> Iterator[str]:
         for rejection in topic.rejections:
             yield f"{topic.topic}: {rejection.count} by {rejection.rule}: {rejection.reason}"
     for loss in report.losses:
+        if loss.count == 0:
+            continue  # nothing is missing: it could be had another way
         yield f"lost {loss.count if loss.count is not None else '?'}: {loss.reason}"
 
 
