@@ -27,7 +27,17 @@ from mosaico_ingest.bag.containers.mcap_index import (
     read_index,
     read_loose,
 )
-from mosaico_ingest.bag.containers.part import Block, Hole, Loaded, Slab, Stream, Want
+from mosaico_ingest.bag.containers.part import (
+    EARLIEST_NS,
+    LATEST_NS,
+    Block,
+    Hole,
+    Loaded,
+    Slab,
+    Stream,
+    Want,
+    orphans,
+)
 from mosaico_ingest.bag.containers.slab import Bytes, by_key, keep, stretches
 from mosaico_ingest.bag.containers.source import FileSource
 from mosaico_ingest.bag.definition import Embedded
@@ -71,20 +81,20 @@ class McapPart:
         self.start_ns: int | None = index.start_ns
         self.end_ns: int | None = index.end_ns
         self.message_count: int | None = sum(index.counts.values()) if index.counts is not None else None
-        self.holes: list[Hole] = index.holes
+        self.holes: list[Hole] = [*index.holes, *orphans(index.counts, index.channels)]
         self.notes: list[str] = []
 
     def blocks(self, want: Want) -> Iterator[Block]:
         """Yield the chunks, and the stretches between chunks, that may hold wanted messages."""
         index = read_loose(self._source, self._index)
         keys = frozenset(want.keys)
-        losses = index.holes[len(self.holes) :]
+        losses = index.holes[len(self._index.holes) :]
         if losses:
-            yield Block(0, lambda: Loaded([], losses))
+            yield Block(EARLIEST_NS, lambda: Loaded([], losses))
         for piece in sorted(index.pieces, key=lambda piece: piece.start_ns):
             named = {key for key, _ in piece.index_offsets()}
             if want.times(piece.start_ns, piece.end_ns) and (not named or named & keys):
-                yield Block(piece.start_ns, partial(self._load, piece, want))
+                yield Block(min(piece.start_ns, LATEST_NS), partial(self._load, piece, want))
 
     def close(self) -> None:
         """Let go of the file."""
@@ -94,7 +104,7 @@ class McapPart:
         raw = self._source.read(piece.offset, piece.stop - piece.offset)
         loaded = Loaded([], [])
         if not piece.is_chunk:
-            _scan(raw, piece, want, loaded)
+            self._scan(raw, piece, want, loaded)
             return loaded
         try:
             head = chunk_head(raw)
@@ -103,8 +113,19 @@ class McapPart:
             loaded.holes.extend(_whole_chunk(piece, raw, want, f"broken chunk: {err.what}"))
             return loaded
         if not piece.indexes or not _by_index(data, raw, piece, want, loaded):
-            _scan(data, piece, want, loaded)
+            self._scan(data, piece, want, loaded)
         return loaded
+
+    def _scan(self, data: bytes | memoryview, piece: Piece, want: Want, loaded: Loaded) -> None:
+        """Add the wanted messages record by record, up to the first that does not fit."""
+        starts = _message_starts(data, piece, loaded)
+        records = np.frombuffer(data, np.uint8)
+        heads = _heads(records, starts)
+        for key, rows in by_key(heads["channel"]):
+            if key in want.keys:
+                keep(_slab(key, records, heads[rows], starts[rows], piece), want, loaded)
+            elif self._index.counts is None:
+                loaded.holes.extend(orphans({key: len(rows)}, self._index.channels))
 
 
 def _stream(key: int, channel: McapChannel, index: McapIndex) -> Stream:
@@ -201,8 +222,8 @@ def _indexed(records: Bytes, raw: bytes, piece: Piece, want: Want) -> list[Slab]
     return [_slab(key, records, heads[r], starts[r], piece) for (key, _), r in zip(wanted, rows, strict=True)]
 
 
-def _scan(data: bytes | memoryview, piece: Piece, want: Want, loaded: Loaded) -> None:
-    """Add the wanted messages record by record, up to the first that does not fit."""
+def _message_starts(data: bytes | memoryview, piece: Piece, loaded: Loaded) -> NDArray[np.int64]:
+    """Return where messages begin, up to the first record that does not fit."""
     found: list[int] = []
     at = 0
     while at < len(data):
@@ -215,10 +236,7 @@ def _scan(data: bytes | memoryview, piece: Piece, want: Want, loaded: Loaded) ->
         if op == Op.MESSAGE:
             found.append(at)
         at = end
-    records, starts = np.frombuffer(data, np.uint8), np.array(found, np.int64)
-    heads = _heads(records, starts)
-    for key, rows in by_key(heads["channel"], want.keys):
-        keep(_slab(key, records, heads[rows], starts[rows], piece), want, loaded)
+    return np.array(found, np.int64)
 
 
 def _heads(records: Bytes, starts: NDArray[np.int64]) -> NDArray[np.void]:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 from mosaico_ingest.bag.containers.compression import inflate_some
-from mosaico_ingest.bag.containers.part import Hole
+from mosaico_ingest.bag.containers.part import LATEST_NS, Hole
 from mosaico_ingest.bag.containers.source import Fields, FileSource, Window
 from mosaico_ingest.errors import BagError
 
@@ -242,6 +242,8 @@ def _statistics(fields: Fields, index: McapIndex) -> int:
     chunks = fields.u32()
     start_ns, end_ns = fields.u64(), fields.u64()
     index.counts = {channel: count for channel, count in fields.pairs("<HQ") if count}
+    if max(start_ns, end_ns) > LATEST_NS:
+        raise BagError(f"messages from {start_ns} to {end_ns} ns, which is after the year 2262")
     if total != sum(index.counts.values()):
         raise BagError(f"{total} messages in all, {sum(index.counts.values())} by channel")
     if total:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.definition import Embedded
 
-__all__ = ["EARLIEST_NS", "LATEST_NS", "Block", "Hole", "Loaded", "Part", "Slab", "Stream", "Want"]
+__all__ = ["EARLIEST_NS", "LATEST_NS", "Block", "Hole", "Loaded", "Part", "Slab", "Stream", "Want", "orphans"]
 
 EARLIEST_NS, LATEST_NS = -(2**63), 2**63 - 1
 """The first and last time stamps there are; the last is in the year 2262."""
@@ -72,6 +72,15 @@ class Hole:
     reason: str
     key: int | None = None
     count: int | None = None
+
+
+def orphans(counts: Mapping[int, int] | None, known: Collection[int]) -> list[Hole]:
+    """Return the messages whose stream the file does not describe."""
+    strangers = {key: count for key, count in (counts or {}).items() if count and key not in known}
+    return [
+        Hole(0, f"{count} messages of connection {key}, which the file does not describe", count=count)
+        for key, count in strangers.items()
+    ]
 
 
 @dataclass(frozen=True, slots=True)

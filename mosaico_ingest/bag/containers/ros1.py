@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.containers.compression import inflate, inflate_some
-from mosaico_ingest.bag.containers.part import Block, Hole, Loaded, Slab, Stream, Want
+from mosaico_ingest.bag.containers.part import Block, Hole, Loaded, Slab, Stream, Want, orphans
 from mosaico_ingest.bag.containers.ros1_index import MAGIC, Piece, Ros1Index, read_index
 from mosaico_ingest.bag.containers.ros1_records import (
     Op,
@@ -57,7 +57,7 @@ class Ros1Part:
         self.start_ns: int | None = min((piece.start_ns for piece in filled), default=None)
         self.end_ns: int | None = max((piece.end_ns for piece in filled), default=None)
         self.message_count: int | None = sum(counts.values())
-        self.holes: list[Hole] = self._index.holes
+        self.holes: list[Hole] = [*self._index.holes, *orphans(counts, self._index.connections)]
         self.notes: list[str] = []
 
     def blocks(self, want: Want) -> Iterator[Block]:
@@ -249,6 +249,7 @@ def _scan(data: bytes | memoryview, piece: Piece, want: Want, loaded: Loaded) ->
     keys, times, begins, ends, ats = columns.T
     offsets = np.full(len(ats), piece.offset, np.int64) if piece.is_chunk else ats + piece.offset
     records = np.frombuffer(data, np.uint8)
-    for key, rows in by_key(keys, want.keys):
-        slab = Slab(key, times[rows], records, begins[rows], (ends - begins)[rows], offsets[rows])
-        keep(slab, want, loaded)
+    for key, rows in by_key(keys):
+        if key in want.keys:
+            slab = Slab(key, times[rows], records, begins[rows], (ends - begins)[rows], offsets[rows])
+            keep(slab, want, loaded)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,15 +26,13 @@ def stretches(data: Bytes, starts: Longs, size: int) -> Bytes:
     return windows[starts]
 
 
-def by_key(keys: NDArray[np.integer], wanted_keys: Collection[int]) -> Iterator[tuple[int, Longs]]:
-    """Yield each wanted key with the rows that have it, in their order."""
+def by_key(keys: NDArray[np.integer]) -> Iterator[tuple[int, Longs]]:
+    """Yield each key with the rows that have it, in their order."""
     order = np.argsort(keys, kind="stable")
     ranked = keys[order]
     edges = np.flatnonzero(np.diff(ranked)) + 1
     for rows in np.split(order, edges) if len(order) else []:
-        key = int(keys[rows[0]])
-        if key in wanted_keys:
-            yield key, rows
+        yield int(keys[rows[0]]), rows
 
 
 def keep(slab: Slab, want: Want, loaded: Loaded) -> None:

@@ -15,8 +15,19 @@ from typing import Any
 import numpy as np
 
 from mosaico_ingest.bag.batch import Encoding
-from mosaico_ingest.bag.containers.part import EARLIEST_NS, LATEST_NS, Block, Hole, Loaded, Slab, Stream, Want
+from mosaico_ingest.bag.containers.part import (
+    EARLIEST_NS,
+    LATEST_NS,
+    Block,
+    Hole,
+    Loaded,
+    Slab,
+    Stream,
+    Want,
+    orphans,
+)
 from mosaico_ingest.bag.containers.slab import by_key
+from mosaico_ingest.bag.containers.sqlite_salvage import Row, Salvage
 from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.errors import BagError
 
@@ -25,8 +36,25 @@ __all__ = ["MAGIC", "SqlitePart"]
 MAGIC = b"SQLite format 3\x00"
 _PAGE_BYTES = 4 << 20
 _PAGE_ROWS = 1 << 16
+_ROW_TYPES = [int, int, int, bytes]
 
-Row = tuple[int, int, int, bytes]
+
+@dataclass(frozen=True, slots=True)
+class _Done:
+    """How far reading by time has come: up to `time_ns`, and of that very time these rows."""
+
+    time_ns: int
+    rows: set[int]
+
+    def after(self, page: list[Row]) -> _Done:
+        """Return the state with one more page."""
+        last = int(page[-1][2])
+        rows = {row[0] for row in page if row[2] == last}
+        return _Done(last, rows | self.rows if last == self.time_ns else rows)
+
+    def leaves(self, row: Row) -> bool:
+        """Return whether the row has not been read."""
+        return row[2] > self.time_ns or (row[2] == self.time_ns and row[0] not in self.rows)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +79,10 @@ class SqlitePart:
         try:
             self._connection = _open(path, self._stack, self.notes)
             self._columns = _columns(self._connection)
+            self._counts = self._read_counts()
             self.streams: tuple[Stream, ...] = self._read_streams()
-            counts = [stream.count for stream in self.streams]
-            self.message_count = None if None in counts else sum(count or 0 for count in counts)
+            self.message_count: int | None = None if self._counts is None else sum(self._counts.values())
+            self.holes.extend(orphans(self._counts, {stream.key for stream in self.streams}))
             self.start_ns, self.end_ns = self._read_bounds()
         except sqlite3.Error as err:
             self._stack.close()
@@ -63,22 +92,37 @@ class SqlitePart:
             raise
 
     def blocks(self, want: Want) -> Iterator[Block]:
-        """Yield pages of rows by time stamp; past a damaged page, of the rows that can still be found."""
+        """Yield pages of rows by time stamp; where a page of the file is damaged, what can still be found."""
         keys = ",".join(str(int(key)) for key in want.keys)
-        bounds = (max(want.start_ns, EARLIEST_NS), min(want.end_ns - 1, LATEST_NS))
         query = (
             "SELECT rowid, topic_id, timestamp, data FROM messages "  # noqa: S608 - the keys are numbers
-            f"WHERE topic_id IN ({keys}) AND timestamp >= ? AND timestamp <= ? ORDER BY timestamp"
+            f"WHERE topic_id IN ({keys}) AND timestamp BETWEEN ? AND ? ORDER BY timestamp"
         )
-        for page in _pages(self._connection.execute(query, bounds)):
-            yield Block(page[0][2], partial(_load, page))
+        bounds = (max(want.start_ns, EARLIEST_NS), min(want.end_ns - 1, LATEST_NS))
+        done = _Done(bounds[0], set())
+        try:
+            for page in _pages(self._connection.execute(query, bounds)):
+                done = done.after(page)
+                yield Block(int(page[0][2]), partial(_load, page))
+        except sqlite3.DatabaseError as err:
+            yield from self._salvaged(want, done, str(err))
+
+    def _salvaged(self, want: Want, done: _Done, reason: str) -> Iterator[Block]:
+        """Yield the rows that reading by time did not reach, in whatever order they are."""
+        salvage = Salvage(self._connection)
+        wanted = (
+            row for row in salvage.rows() if row[1] in want.keys and row[2] < want.end_ns and done.leaves(row)
+        )
+        for page in _pages(wanted):
+            yield Block(done.time_ns, partial(_load, page))
+        holes = salvage.holes or [Hole(0, f"{reason}; every row could be read in another way", count=0)]
+        yield Block(done.time_ns, lambda: Loaded([], holes))
 
     def close(self) -> None:
         """Let go of the file and of the copy, if there had to be one."""
         self._stack.close()
 
     def _read_streams(self) -> tuple[Stream, ...]:
-        counts = self._read_counts()
         definitions = self._read_definitions()
         names = [
             "id",
@@ -90,7 +134,7 @@ class SqlitePart:
         ]
         present = [name for name in names if name in self._columns.topics]
         rows = self._connection.execute(f"SELECT {','.join(present)} FROM topics ORDER BY id")  # noqa: S608 - constants
-        return tuple(_stream(dict(zip(present, row, strict=True)), counts, definitions) for row in rows)
+        return tuple(_stream(dict(zip(present, row, strict=True)), self._counts, definitions) for row in rows)
 
     def _read_counts(self) -> dict[int, int] | None:
         try:
@@ -182,18 +226,32 @@ def _pages(rows: Iterator[Row]) -> Iterator[list[Row]]:
     """Yield rows in lists of a few megabytes; one is read at a time, as its size is known only then."""
     page: list[Row] = []
     size = 0
-    for row in rows:
-        page.append(row)
-        size += len(row[3])
-        if size >= _PAGE_BYTES or len(page) >= _PAGE_ROWS:
+    try:
+        for row in rows:
+            page.append(row)
+            size += len(row[3]) if isinstance(row[3], bytes) else 0
+            if size >= _PAGE_BYTES or len(page) >= _PAGE_ROWS:
+                yield page
+                page, size = [], 0
+    except sqlite3.DatabaseError:
+        if page:
             yield page
-            page, size = [], 0
+        raise
     if page:
         yield page
 
 
 def _load(page: list[Row]) -> Loaded:
-    ids, topics, times, blobs = zip(*page, strict=True)
+    """Return a page's rows by topic; SQLite keeps any value in any column, so the types are looked at."""
+    good = [row for row in page if [type(value) for value in row] == _ROW_TYPES]
+    holes = [
+        Hole(row[0], "a row whose values have the wrong types", key=row[1], count=1)
+        for row in page
+        if len(good) < len(page) and [type(value) for value in row] != _ROW_TYPES
+    ]
+    if not good:
+        return Loaded([], holes)
+    ids, topics, times, blobs = zip(*good, strict=True)
     data = np.frombuffer(b"".join(blobs), np.uint8)
     lengths = np.fromiter(map(len, blobs), np.int64, len(blobs))
     starts = np.cumsum(lengths) - lengths
@@ -201,6 +259,6 @@ def _load(page: list[Row]) -> Loaded:
     keys = np.array(topics, np.int64)
     slabs = [
         Slab(key, all_times[rows], data, starts[rows], lengths[rows], all_ids[rows])
-        for key, rows in by_key(keys, set(topics))
+        for key, rows in by_key(keys)
     ]
-    return Loaded(slabs, [])
+    return Loaded(slabs, holes)
