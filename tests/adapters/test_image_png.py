@@ -40,10 +40,13 @@ def test_the_bytes_come_back(data: st.DataObject, width: int, height: int) -> No
 
 
 @pytest.fixture
-def images(define: Callable[..., Definition], adapt: Callable[..., Adapted]) -> Callable[..., list[dict[str, Any]]]:
+def images(
+    define: Callable[..., Definition], adapt: Callable[..., Adapted]
+) -> Callable[..., list[dict[str, Any]]]:
     def run(*messages: dict[str, Any]) -> list[dict[str, Any]]:
         spec = PngImageSpec(BY_NAME["ImageAdapter"])
-        return adapt(spec, define("sensor_msgs/msg/Image"), messages).rows.to_pylist()
+        given = [{"encoding": "mono8", **message} for message in messages]
+        return adapt(spec, define("sensor_msgs/msg/Image"), given).rows.to_pylist()
 
     return run
 
@@ -66,7 +69,11 @@ def test_a_buffer_of_another_size_stays_raw(images: Callable[..., list[dict[str,
     assert good["format"] == "png"
 
 
-def test_other_ontologies_are_left_alone(define: Callable[..., Definition], adapt: Callable[..., Adapted]) -> None:
+def test_other_ontologies_are_left_alone(
+    define: Callable[..., Definition], adapt: Callable[..., Adapted]
+) -> None:
     definition = define("sensor_msgs/msg/Imu")
-    plain = adapt(BY_NAME["IMUAdapter"], definition, [{}])
-    assert adapt(PngImageSpec(BY_NAME["IMUAdapter"]), definition, [{}]).rows.equals(plain.rows)
+    row = {"linear_acceleration": {"x": 1.0}, "angular_velocity": {"x": 2.0}}
+    plain = adapt(BY_NAME["IMUAdapter"], definition, [row])
+    assert len(plain.rows) == 1
+    assert adapt(PngImageSpec(BY_NAME["IMUAdapter"]), definition, [row]).rows.equals(plain.rows)

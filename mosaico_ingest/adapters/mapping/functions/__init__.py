@@ -1,9 +1,18 @@
 """The functions of the language, one file a subject; Arrow columns in, Arrow columns out, no state."""
 
-from mosaico_ingest.adapters.mapping.functions import lists, numeric, operators, ros, rotation, text, time
+from mosaico_ingest.adapters.mapping.functions import (
+    clouds,
+    lists,
+    numeric,
+    operators,
+    ros,
+    rotation,
+    text,
+    time,
+)
 from mosaico_ingest.adapters.mapping.functions.registry import Function, function, functions, lookup
 
 __all__ = ["SUBJECTS", "Function", "function", "functions", "lookup"]
 
-SUBJECTS = (operators, numeric, lists, text, time, rotation, ros)
+SUBJECTS = (operators, numeric, lists, text, time, rotation, ros, clouds)
 """Where the functions come from, in the order of the documentation."""

@@ -25,6 +25,11 @@ def _halves(*angles: Array) -> tuple[NDArray[np.float64], list[NDArray[np.float6
     return absent, [np.broadcast_to(p, absent.shape) / 2 for p in plain]
 
 
+def _sin_cos(half: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    with np.errstate(invalid="ignore"):  # of an infinite angle both are NaN
+        return np.sin(half), np.cos(half)
+
+
 def _quaternions(parts: tuple[NDArray[np.float64], ...], absent: NDArray[np.bool_]) -> Array:
     children = [arrays.array(np.ascontiguousarray(part)) for part in parts]
     mask = arrays.array(absent) if absent.any() else None
@@ -35,7 +40,7 @@ def _quaternions(parts: tuple[NDArray[np.float64], ...], absent: NDArray[np.bool
 def quaternion_from_rpy(roll: Array, pitch: Array, yaw: Array) -> Array:
     """Rotation about the fixed axes x, then y, then z."""
     absent, (r, p, y) = _halves(roll, pitch, yaw)
-    (sr, cr), (sp, cp), (sy, cy) = ((np.sin(half), np.cos(half)) for half in (r, p, y))
+    (sr, cr), (sp, cp), (sy, cy) = (_sin_cos(half) for half in (r, p, y))
     return _quaternions(
         (
             sr * cp * cy - cr * sp * sy,
@@ -52,7 +57,7 @@ def quaternion_from_yaw(yaw: Array) -> Array:
     """Rotation in the plane, about z."""
     absent, (y,) = _halves(yaw)
     zero = np.zeros(len(y))
-    return _quaternions((zero, zero, np.sin(y), np.cos(y)), absent)
+    return _quaternions((zero, zero, *_sin_cos(y)), absent)
 
 
 @function(_QUATERNION, gives=arrays.float64())
