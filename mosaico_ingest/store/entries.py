@@ -13,9 +13,21 @@ from mosaico_ingest.errors import SequenceExists, SinkError
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.sink import check_same_type
+from mosaico_ingest.store.faults import NotInStore
 from mosaico_ingest.store.segment import Segment
 
-__all__ = ["Claim", "NewNote", "NewSession", "NewTopic", "claim", "commit", "ontology_of", "release"]
+__all__ = [
+    "Claim",
+    "NewNote",
+    "NewSession",
+    "NewTopic",
+    "claim",
+    "commit",
+    "create",
+    "note",
+    "ontology_of",
+    "release",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +92,27 @@ def claim(
         return Claim(sequence, if_exists, None, (), {})
     types = _types(db, row["id"]) if if_exists is IfExists.APPEND else {}
     return Claim(sequence, if_exists, row["id"], _sessions(db, row["id"]), types)
+
+
+def create(db: sqlite3.Connection, sequence: str, metadata: str) -> None:
+    """Enter a sequence without a session."""
+    if db.execute("SELECT 1 FROM sequences WHERE name = ?", (sequence,)).fetchone() is not None:
+        raise _taken(sequence)
+    db.execute(
+        "INSERT INTO sequences (name, metadata, created_ns) VALUES (?, ?, ?)",
+        (sequence, metadata, time.time_ns()),
+    )
+
+
+def note(db: sqlite3.Connection, sequence: str, new: NewNote) -> None:
+    """Attach a note to a sequence that is there."""
+    entered = db.execute(
+        "INSERT INTO notes (sequence_id, topic, message, created_ns)"
+        " SELECT id, ?, ?, ? FROM sequences WHERE name = ?",
+        (new.topic, new.message, new.created_ns, sequence),
+    )
+    if not entered.rowcount:
+        raise NotInStore(f"there is no sequence {sequence!r}")
 
 
 def release(db: sqlite3.Connection, session: str) -> None:

@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from mosaico_ingest.errors import SinkError, SinkUnavailable
 
-__all__ = ["explained"]
+__all__ = ["NotInStore", "explained"]
 
 _HINTS = {
     errno.ENOSPC: "free some space, or choose another target.store",
@@ -24,6 +24,10 @@ _HINTS = {
     errno.EMFILE: "raise the limit of open files (ulimit -n)",
     errno.ENOENT: "the store was changed by something else; check it and run again",
 }
+
+
+class NotInStore(SinkError):  # noqa: N818 - the condition, as in `errors`
+    """There is no sequence, topic or session of that name."""
 
 
 @contextmanager

@@ -5,9 +5,9 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Collection
 
-from mosaico_ingest.errors import SinkError
+from mosaico_ingest.store.faults import NotInStore
 
-__all__ = ["forget", "sequence", "session", "topic"]
+__all__ = ["forget", "notes", "sequence", "session", "topic"]
 
 
 def sequence(db: sqlite3.Connection, name: str) -> list[str]:
@@ -23,9 +23,10 @@ def topic(db: sqlite3.Connection, sequence_name: str, name: str) -> list[str]:
     owner = _sequence_id(db, sequence_name)
     row = db.execute("SELECT id FROM topics WHERE sequence_id = ? AND name = ?", (owner, name)).fetchone()
     if row is None:
-        raise SinkError(f"there is no topic {name!r}", where=sequence_name)
+        raise NotInStore(f"there is no topic {name!r}", where=sequence_name)
     paths = _paths(db, "topic_id = ?", row["id"])
     db.execute("DELETE FROM topics WHERE id = ?", (row["id"],))
+    db.execute("DELETE FROM notes WHERE sequence_id = ? AND topic = ?", (owner, name))
     return paths
 
 
@@ -34,11 +35,17 @@ def session(db: sqlite3.Connection, sequence_name: str, session_id: str) -> list
     owner = _sequence_id(db, sequence_name)
     paths = _paths(db, "session_id = ?", session_id)
     if not db.execute("DELETE FROM sessions WHERE id = ? AND sequence_id = ?", (session_id, owner)).rowcount:
-        raise SinkError(f"there is no session {session_id!r}", where=sequence_name)
+        raise NotInStore(f"there is no session {session_id!r}", where=sequence_name)
     db.execute(
         "DELETE FROM topics WHERE session_id = ? AND id NOT IN (SELECT topic_id FROM segments)", (session_id,)
     )
     return paths
+
+
+def notes(db: sqlite3.Connection, sequence_name: str, topic_name: str | None) -> None:
+    """Remove the notes of a sequence, or those of one of its topics."""
+    owner = _sequence_id(db, sequence_name)
+    db.execute("DELETE FROM notes WHERE sequence_id = ? AND topic IS ?", (owner, topic_name))
 
 
 def forget(db: sqlite3.Connection, live: Collection[str]) -> set[str]:
@@ -52,7 +59,7 @@ def forget(db: sqlite3.Connection, live: Collection[str]) -> set[str]:
 def _sequence_id(db: sqlite3.Connection, name: str) -> int:
     row = db.execute("SELECT id FROM sequences WHERE name = ?", (name,)).fetchone()
     if row is None:
-        raise SinkError(f"there is no sequence {name!r}")
+        raise NotInStore(f"there is no sequence {name!r}")
     return int(row["id"])
 
 

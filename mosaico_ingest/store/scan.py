@@ -13,7 +13,7 @@ from mosaico_ingest.store.faults import explained
 from mosaico_ingest.store.model import SegmentInfo
 from mosaico_ingest.store.segment import sorted_rows, time_span
 
-__all__ = ["Window", "scan"]
+__all__ = ["Window", "count", "scan"]
 
 _BATCH_ROWS = 1 << 16
 
@@ -31,6 +31,12 @@ class Window:
         late = self.end_ns is not None and start_ns >= self.end_ns
         return not early and not late
 
+    def covers(self, start_ns: int, end_ns: int) -> bool:
+        """Return whether rows from `start_ns` to `end_ns`, both in, are all inside."""
+        early = self.start_ns is not None and start_ns < self.start_ns
+        late = self.end_ns is not None and end_ns >= self.end_ns
+        return not early and not late
+
     def cut(self, batch: pa.RecordBatch) -> pa.RecordBatch:
         """Return the rows inside; the batch is sorted and is not copied."""
         times = batch.column(0).to_numpy()
@@ -45,6 +51,23 @@ def scan(segments: Sequence[SegmentInfo], schema: pa.Schema, window: Window) -> 
     for together in _overlapping(wanted):
         streams = [_read(segment, schema, window) for segment in together]
         yield from streams[0] if len(streams) == 1 else _merge(streams, schema)
+
+
+def count(
+    segments: Sequence[SegmentInfo], schema: pa.Schema, window: Window
+) -> tuple[int, int | None, int | None]:
+    """Return how many rows are inside, and the first and the last of their time stamps."""
+    times = pa.schema([schema.field(0)])
+    rows, stamps = 0, list[int]()
+    for segment in segments:
+        if window.covers(segment.start_ns, segment.end_ns):
+            rows += segment.rows
+            stamps += [segment.start_ns, segment.end_ns]
+            continue
+        for batch in scan([segment], times, window):
+            rows += batch.num_rows
+            stamps += [batch.column(0)[0].as_py(), batch.column(0)[-1].as_py()]
+    return rows, min(stamps, default=None), max(stamps, default=None)
 
 
 def _overlapping(segments: Iterable[SegmentInfo]) -> Iterator[list[SegmentInfo]]:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 
+from mosaico_ingest import wire
 from mosaico_ingest.errors import SinkError
-from mosaico_ingest.store import queries, removal
+from mosaico_ingest.store import entries, queries, removal
 from mosaico_ingest.store.catalog import Catalog
-from mosaico_ingest.store.faults import explained
+from mosaico_ingest.store.faults import NotInStore, explained
 from mosaico_ingest.store.layout import Layout
 from mosaico_ingest.store.lease import is_live
 from mosaico_ingest.store.model import Collected, SequenceInfo, TopicInfo
@@ -61,7 +63,7 @@ class Store:
             info = queries.sequence(db, name, self.path)
             known = queries.names(db) if info is None else []
         if info is None:
-            raise SinkError(f"there is no sequence {name!r}", where=str(self.path), hint=_listed(known))
+            raise NotInStore(f"there is no sequence {name!r}", where=str(self.path), hint=_listed(known))
         return info
 
     def topic(self, sequence: str, topic: str) -> TopicInfo:
@@ -73,8 +75,29 @@ class Store:
         topics = {info.name: info for info in self.sequence(sequence).topics}
         name = f"/{topic.removeprefix('/')}"
         if name not in topics:
-            raise SinkError(f"there is no topic {name!r}", where=sequence, hint=_listed(list(topics)))
+            raise NotInStore(f"there is no topic {name!r}", where=sequence, hint=_listed(list(topics)))
         return topics[name]
+
+    def create_sequence(self, sequence: str, metadata: Mapping[str, Any]) -> None:
+        """Enter a sequence that sessions will be added to; a `StoreSink` does it with its first session.
+
+        Raises:
+            SequenceExists: There is one of that name.
+            SinkError: The name or the metadata is refused.
+        """
+        described = wire.check_metadata(metadata, where=sequence)
+        with self.catalog.write() as db:
+            entries.create(db, wire.check_sequence_name(sequence), described)
+
+    def add_note(self, sequence: str, message: str, *, topic: str | None = None) -> None:
+        """Attach an error to a sequence, or to one of its topics."""
+        with self.catalog.write() as db:
+            entries.note(db, sequence, entries.NewNote(topic, message, time.time_ns()))
+
+    def delete_notes(self, sequence: str, *, topic: str | None = None) -> None:
+        """Remove the notes of a sequence itself, or those of one topic."""
+        with self.catalog.write() as db:
+            removal.notes(db, sequence, topic)
 
     def paths(self, sequence: str, topic: str) -> tuple[Path, ...]:
         """Return the Parquet files of a topic, each sorted by `timestamp_ns`."""
