@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import pyarrow as pa
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from mosaico_ingest.cli.tables import print_json
+from mosaico_ingest.cli.tables import open_console, print_json
 from mosaico_ingest.cli.units import bytes_text, count_text, seconds_text, time_text
 from mosaico_ingest.store import SequenceInfo, TopicInfo
 
@@ -27,7 +26,7 @@ def print_sequences(sequences: Sequence[SequenceInfo], *, as_json: bool) -> None
         print_json(json.dumps([_sequence_json(info) for info in sequences], indent=2))
         return
     if not sequences:
-        Console().print("no sequences")
+        open_console().print("no sequences")
         return
     table = _table("sequence", topics=True, rows=True, size=True, start=False, duration=True)
     for info in sequences:
@@ -40,7 +39,7 @@ def print_sequences(sequences: Sequence[SequenceInfo], *, as_json: bool) -> None
             time_text(info.start_ns),
             _span(info),
         )
-    Console().print(table)
+    open_console().print(table)
 
 
 def print_sequence(info: SequenceInfo, *, as_json: bool) -> None:
@@ -49,7 +48,7 @@ def print_sequence(info: SequenceInfo, *, as_json: bool) -> None:
         topics = [_topic_json(topic) for topic in info.topics]
         print_json(json.dumps({**_sequence_json(info), "topics": topics}, indent=2))
         return
-    console = Console()
+    console = open_console()
     console.print(Text(info.name, style="bold"))
     for key, value in info.metadata.items():
         console.print(f"  {key}: {value}", highlight=False, markup=False)
@@ -78,7 +77,7 @@ def print_topic(info: TopicInfo, reader: pa.RecordBatchReader, *, rows: int, as_
     if as_json:
         print_json(json.dumps({**_topic_json(info), "first_rows": first}, indent=2, default=_plain))
         return
-    console = Console()
+    console = open_console()
     console.print(Text(f"{info.sequence}{info.name}", style="bold"))
     facts = f"{info.ontology.tag}, {count_text(info.rows)} rows, {bytes_text(info.stored_bytes)}"
     console.print(f"{facts}, {time_text(info.start_ns)} .. {time_text(info.end_ns)} UTC", highlight=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 
 from rich.console import Console
@@ -14,7 +13,15 @@ from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.inspection import Inspection
 from mosaico_ingest.report.model import Report, RunReport, TopicReport
 
-__all__ = ["print_inspection", "print_json", "print_report"]
+__all__ = ["open_console", "print_inspection", "print_json", "print_report"]
+
+WIDE = 240
+"""Columns of output that goes to a file or a pipe, where nothing needs to be folded."""
+
+
+def open_console() -> Console:
+    """Return standard output as wide as it is, or wide enough where it is no terminal."""
+    return Console() if sys.stdout.isatty() else Console(width=WIDE)
 
 
 def print_json(text: str) -> None:
@@ -27,7 +34,7 @@ def print_inspection(found: Inspection, *, as_json: bool) -> None:
     if as_json:
         print_json(found.model_dump_json(indent=2))
         return
-    console = Console()
+    console = open_console()
     span = f"{time_text(found.start_ns)} .. {time_text(found.end_ns)} UTC"
     if found.duration_s is not None:
         span += f" ({seconds_text(found.duration_s)})"
@@ -74,7 +81,7 @@ def print_report(report: RunReport, *, quiet: bool) -> None:
     errors = Console(stderr=True)
     for recording in report.recordings:
         if not quiet:
-            _print_recording(recording, Console())
+            _print_recording(recording, open_console())
         if recording.error is not None:
             errors.print(Text(f"error: {recording.error}", style="red"), soft_wrap=True)
 
@@ -143,8 +150,3 @@ def _print_totals(report: Report, console: Console) -> None:
     console.print(
         Text(f"{report.sequence} in {report.destination}: {', '.join(parts)}", style=style), soft_wrap=True
     )
-
-
-def print_table_json(rows: object) -> None:
-    """Print any plain value as JSON."""
-    print_json(json.dumps(rows, indent=2, default=str))

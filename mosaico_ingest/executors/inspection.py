@@ -58,7 +58,7 @@ def _topic(
         count=channel.count,
         rate_hz=rate,
         definition=source,
-        adapter="" if left else f"{outcome.adapter.name} ({outcome.why})",
+        adapter="" if left else outcome.adapter.name,
         ontology=None if left else outcome.ontology.tag,
         problem=outcome.why if left else None,
     )

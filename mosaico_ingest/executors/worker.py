@@ -96,9 +96,10 @@ def run_config(config: ROSInjectionConfig, observe: Observer) -> Report:
         plan = make_plan(config)
     except IngestError as error:
         collector = Collector()
-        for event in (_unplanned(config), _failed(error)):
-            collector(event)
-            observe(event)
+        collector(_unplanned(config))
+        failed = _failed(error)
+        collector(failed)
+        observe(failed)
         return collector.report()
     report, _ = execute(plan, observe)
     return report

@@ -24,7 +24,7 @@ class InspectedTopic(_Part):
     definition: str
     """Where the definition was found: bag, custom, distro or none."""
     adapter: str
-    """The adapter it would get, and why."""
+    """The adapter it would get."""
     ontology: str | None
     """The ontology tag it would have; None where it cannot be ingested."""
     problem: str | None = None
