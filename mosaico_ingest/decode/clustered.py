@@ -65,25 +65,23 @@ def _split(layout: Layout, frame: Frame, rows: Int64s) -> Iterator[Located]:
 class _Sample:
     """One message that was walked."""
 
-    __slots__ = ("_frame", "_nuls", "_places", "fits", "words")
+    __slots__ = ("_frame", "_places", "fits", "words")
 
     def __init__(self, layout: Layout, frame: Frame, row: int) -> None:
         stepper, notes = Stepper(layout, frame), Notes(layout.body)
         self._frame = frame.take(np.array([row]))
         self.fits = stepper.message(row, notes)
         self.words = np.array(stepper.words, np.int64) - frame.origins[row]
-        self._nuls = np.array(stepper.nuls, np.int64) - frame.origins[row]
         self._places = notes.places()
 
     def compare(self, frame: Frame) -> NDArray[np.bool_]:
-        """Return which messages, all of the sample's length, have its length words and closing NULs."""
+        """Return which messages, all of the sample's length, have its length words."""
         if not self.fits:
             return np.zeros(len(frame), bool)
         words = frame.words()
         expected = words[self._frame.origins + self.words]
         found = words[frame.origins[:, None] + self.words]
-        ends = frame.data[frame.origins[:, None] + self._nuls]
-        return (found == expected).all(axis=1) & ~ends.any(axis=1)
+        return (found == expected).all(axis=1)
 
     def spread(self, origins: Int64s) -> Places:
         """Return the places in messages that compared equal."""

@@ -138,12 +138,25 @@ class _Builder:
 
     def _texts(self, kind: pa.DataType, inst: _Instances, number: int) -> Array:
         step, place = inst.steps[number], inst.places[number]
-        unit = step.unit if isinstance(step, Text) else 1
-        data = spans(self._data, place.at, place.counts)
+        sizes, unit = place.counts, 1
+        if isinstance(step, Text):
+            sizes, unit = (self._open(inst, place) if step.closed else sizes * step.unit), step.unit
+        data = spans(self._data, place.at, sizes)
         if unit == 1:
-            texts, wrong = utf8_texts(kind, place.counts, data)
+            texts, wrong = utf8_texts(kind, sizes, data)
         else:
-            texts, wrong = wide_texts(kind, place.counts // unit, data.view(f"{self._order}u{unit}"))
+            texts, wrong = wide_texts(kind, place.counts, data.view(f"{self._order}u{unit}"))
+        self._leave(inst, wrong)
+        return texts
+
+    def _open(self, inst: _Instances, place: Place) -> Int64s:
+        """Return the sizes of texts without the NUL that ends them; one of size 0 has none."""
+        sizes = np.maximum(place.counts - 1, 0)
+        open_ended = (self._data[np.maximum(place.at + place.counts - 1, 0)] != 0) & (place.counts > 0)
+        self._leave(inst, np.flatnonzero(open_ended))
+        return sizes
+
+    def _leave(self, inst: _Instances, wrong: Int64s) -> None:
+        """Leave the messages of some instances to the row-wise decoder."""
         if len(wrong):
             self.unread = np.union1d(self.unread, inst.messages(wrong))
-        return texts

@@ -32,6 +32,7 @@ __all__ = [
     "Text",
     "Words",
     "compile_layout",
+    "least_bytes",
 ]
 
 WORD = 4
@@ -50,10 +51,12 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """A length word and that many units of text; CDR ends a `string` in a NUL and counts it."""
+    """A length word and that many units of text."""
 
     unit: int
     """Bytes of a unit: 1 for `string`, 4 for `wstring`."""
+    closed: bool = False
+    """Whether a NUL ends the text and is counted, as in a CDR `string`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,10 +216,23 @@ class _Compiler:
         if field.is_message:
             return self.struct(self.definition.types[field.type], draft)
         if field.type in TEXTS:
-            return Words(draft.add(Text(_UNITS[field.type])))
+            return Words(draft.add(Text(_UNITS[field.type], closed=self.aligned and field.type == "string")))
         size = np.dtype(NUMBERS[field.type]).itemsize
         step, offset = draft.place(size if self.aligned else 1, size)
         return Leaf(step, offset, field.type)
+
+
+def least_bytes(step: Step) -> int:
+    """Return how many bytes each thing that a step counts takes at least; 1 where it could be none."""
+    match step:
+        case Text(unit=unit):
+            return unit
+        case Run(cell=cell):
+            return max(cell.size, 1)
+        case Loop(body=body):
+            return max(body.least, 1)
+        case Block():
+            return 1
 
 
 def _single_block(body: Body) -> Block | None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mosaico_ingest.bag.batch import Encoding
-from mosaico_ingest.decode.layout import WORD, Block, Body, Layout, Loop, Run, Step, Text
+from mosaico_ingest.decode.layout import WORD, Block, Body, Layout, Loop, Run, Step, Text, least_bytes
 from mosaico_ingest.decode.places import Frame, Int64s, Located, Place, Places, expand, join
 from mosaico_ingest.decode.stepwise import Notes, Stepper
 
@@ -92,15 +92,18 @@ class _Walk:
                 at = cursor.pos
                 cursor.pos = at + size
                 return Place(at)
-            case Text():
-                return self._text(step, cursor)
+            case Text(unit=unit):
+                count = self._count(cursor, step)
+                at = cursor.pos
+                cursor.pos = at + count * unit
+                return Place(at, count)
             case Run():
                 return self._run(step, cursor)
             case Loop():
                 return self._loop(step, cursor)
 
     def _run(self, step: Run, cursor: _Cursor) -> Place:
-        count = self._count(cursor, step.cell.size, step.bound)
+        count = self._count(cursor, step, step.bound)
         if step.cell.align > WORD:  # an empty run is not aligned
             behind = cursor.pos
             cursor.align(step.cell.align)
@@ -110,20 +113,9 @@ class _Walk:
         cursor.pos = at + (np.maximum(count * step.stride - padding, 0) if padding else count * step.stride)
         return Place(at, count)
 
-    def _text(self, step: Text, cursor: _Cursor) -> Place:
-        count = self._count(cursor, step.unit, 0)
-        at = cursor.pos
-        if step.unit > 1 or not self._aligned:
-            size = count * step.unit
-            cursor.pos = at + size
-            return Place(at, size)
-        cursor.pos = at + count
-        self._drop(cursor, (count > 0) & (self._data[cursor.pos - 1] != 0))
-        return Place(at, np.maximum(count - 1, 0))
-
     def _loop(self, step: Loop, cursor: _Cursor) -> Place:
         if step.count is None:
-            count = self._count(cursor, step.body.least, step.bound)
+            count = self._count(cursor, step, step.bound)
         else:
             count = np.full(len(cursor.pos), step.count, np.int64)
         at = cursor.pos
@@ -160,32 +152,30 @@ class _Walk:
         for index in active.tolist():
             left = int(count[index] - done[index])
             row, pos = int(cursor.row[index]), int(cursor.pos[index])
-            fit, end = stepper.elements(row, body, notes, pos=pos, count=left)
+            fit, end = stepper.elements(row, notes, pos=pos, count=left)
             done[index] += fit
             cursor.pos[index] = end
             if fit < left:
                 self._drop(cursor, np.arange(len(count)) == index)
         return notes.places()
 
-    def _count(self, cursor: _Cursor, least: int, bound: int) -> Int64s:
+    def _count(self, cursor: _Cursor, step: Step, bound: int = 0) -> Int64s:
         """Read a length word each, and check it against the bytes left."""
         if self._aligned:
             cursor.align(WORD)
-        self._drop(cursor, cursor.pos + WORD > cursor.end)
-        count = self._words[cursor.pos].astype(np.int64)
+        # A word beyond the message's end is out of bounds below, as less than nothing is left behind it.
+        count = self._words[np.minimum(cursor.pos, len(self._words) - 1)].astype(np.int64)
         cursor.pos = cursor.pos + WORD
-        over = count * max(least, 1) > cursor.end - cursor.pos
+        over = count * least_bytes(step) > cursor.end - cursor.pos
         if bound:
             over |= count > bound
-        if self._drop(cursor, over):
+        if over.any():
             count[over] = 0
+            self._drop(cursor, over)
         return count
 
-    def _drop(self, cursor: _Cursor, wrong: NDArray[np.bool_]) -> bool:
+    def _drop(self, cursor: _Cursor, wrong: NDArray[np.bool_]) -> None:
         """Mark messages as broken and park them at their origin, with no bytes left."""
-        if not wrong.any():
-            return False
         self.broken[cursor.row[wrong]] = True
         cursor.pos = np.where(wrong, cursor.origin, cursor.pos)
         cursor.end = np.where(wrong, cursor.origin, cursor.end)
-        return True

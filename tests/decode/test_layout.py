@@ -30,14 +30,14 @@ def layout_of(
 def test_an_imu_message_is_two_blocks_around_a_text() -> None:
     definition = TypeResolver(Stores.ROS2_HUMBLE).resolve("sensor_msgs/msg/Imu", None, ros_version=2)
     layout = compile_layout(definition, Encoding.CDR)
-    assert layout.body.steps == (Block(8, 8), Text(1), Block(8, 37 * 8))
+    assert layout.body.steps == (Block(8, 8), Text(1, closed=True), Block(8, 37 * 8))
 
 
 def test_a_new_block_begins_where_the_padding_depends_on_the_message() -> None:
     layout = layout_of(
         Field("name", "string"), Field("a", "uint8"), Field("b", "uint32"), Field("c", "uint8")
     )
-    assert layout.body.steps == (Text(1), Block(1, 1), Block(4, 5))
+    assert layout.body.steps == (Text(1, closed=True), Block(1, 1), Block(4, 5))
     assert layout.record == Record((Words(0), Leaf(1, 0, "uint8"), Leaf(2, 0, "uint32"), Leaf(2, 4, "uint8")))
 
 
@@ -64,7 +64,7 @@ def test_structs_of_fixed_size_run_and_others_loop() -> None:
     run, loop = layout.body.steps
     assert run == Run(Block(8, 9), stride=16, bound=5)
     assert isinstance(loop, Loop)
-    assert loop.body.steps == (Text(1),)
+    assert loop.body.steps == (Text(1, closed=True),)
     assert layout.record.children[1] == Items(1, Record((Words(0),)))
 
 
