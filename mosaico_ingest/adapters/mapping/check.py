@@ -26,6 +26,7 @@ from mosaico_ingest.adapters.mapping.functions.registry import check, nearest
 from mosaico_ingest.adapters.mapping.kinds import (
     Kind,
     Unfit,
+    is_list,
     is_number,
     join,
     kind_of,
@@ -121,30 +122,20 @@ class Checker:
         self._scope = scope
         self._report = report
         self._text = text
+        self._readers: dict[type[Any], Callable[[Any], Typed | None]] = {
+            Literal: lambda node: constant(node.value, self._source(node)),
+            Name: self._name,
+            Attribute: self._attribute,
+            Each: self._each,
+            Item: self._item,
+            ListOf: self._list,
+            Choice: self._choice,
+            Call: self._call,
+        }
 
     def infer(self, node: Node) -> Typed | None:
         """Return the typed expression, or None after a report."""
-        match node:
-            case Literal():
-                return constant(node.value, self._source(node))
-            case Name():
-                return self._name(node)
-            case Attribute():
-                return self._attribute(node)
-            case Each():
-                return self._each(node)
-            case Item():
-                return self._item(node)
-            case ListOf():
-                return self._list(node)
-            case Choice():
-                return self._choice(node)
-            case Call(name="cast"):
-                return self._cast(node)
-            case Call(name="either"):
-                return self._either(node)
-            case Call():
-                return self._call(node)
+        return self._readers[type(node)](node)
 
     def _fail(self, message: str, place: Place, hint: str | None = None) -> None:
         self._report(message, place, hint)
@@ -173,7 +164,7 @@ class Checker:
             return None
         element = of.kind.element
         if not pt.is_struct(element.type):
-            hint = f"write {of.text}[].{node.name}" if _is_list(element) else None
+            hint = f"write {of.text}[].{node.name}" if is_list(element.type) else None
             self._fail(f"`{of.text}` is {spell(element)}, it has no fields", node.name_at, hint)
             return None
         field = self._scope.field(of.kind, node.name)
@@ -188,7 +179,7 @@ class Checker:
 
     def _listed(self, node: Each | Item) -> Typed | None:
         of = self.infer(node.of)
-        if of is not None and not _is_list(of.kind):
+        if of is not None and not is_list(of.kind.type):
             self._fail(f"`{of.text}` is {spell(of.kind.element)}, not a list", node.at)
             return None
         return of
@@ -279,11 +270,13 @@ class Checker:
 
     def _either(self, node: Call) -> Typed | None:
         """Take the first argument whose fields exist; where none does, the last says what is there."""
-        quiet = Checker(self._scope, lambda *_: None, self._text)
+        quiet = Checker(self._scope, _say_nothing, self._text)
         found = (quiet.infer(argument) for argument in node.arguments[:-1])
         return next((typed for typed in found if typed is not None), None) or self.infer(node.arguments[-1])
 
     def _call(self, node: Call) -> Typed | None:
+        if node.name in {"cast", "either"}:
+            return self._cast(node) if node.name == "cast" else self._either(node)
         function = lookup(node.name)
         arguments = self._all(node.arguments)
         if function is None or arguments is None:
@@ -303,8 +296,8 @@ class Checker:
         return Apply(node.name, function, arguments, kind, self._source(node))
 
 
-def _is_list(kind: Kind) -> bool:
-    return pt.is_list(kind.type) or pt.is_fixed_size_list(kind.type)
+def _say_nothing(message: str, place: Place, hint: str | None) -> None:
+    """Try an expression without a word."""
 
 
 def _folded(value: Typed, takes: Callable[[Kind], bool]) -> Typed:

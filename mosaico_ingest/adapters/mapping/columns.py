@@ -22,6 +22,7 @@ __all__ = [
     "open_list",
     "repeat",
     "struct_of",
+    "true_where",
     "var_list",
 ]
 
@@ -102,6 +103,11 @@ def repeat(scalar: Scalar, length: int) -> Array:
 def nulls(array: Array) -> Mask | None:
     """Return where an array is null, or None where it never is."""
     return np.asarray(array.is_null()) if array.null_count else None
+
+
+def true_where(values: Array, *, null: bool = False) -> Mask:
+    """Return where a boolean column holds; `null` stands for what is null."""
+    return np.asarray(pc.fill_null(values, null))
 
 
 def field_of(rows: Array, name: str) -> Array:

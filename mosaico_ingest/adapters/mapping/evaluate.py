@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import TypeAlias
 
@@ -20,6 +20,7 @@ from mosaico_ingest.adapters.mapping.columns import (
     one_type,
     open_list,
     repeat,
+    true_where,
 )
 from mosaico_ingest.adapters.mapping.fit import to_number
 from mosaico_ingest.adapters.mapping.functions.registry import Refuse
@@ -84,10 +85,10 @@ class Evaluation:
     def mask(self, typed: Typed) -> Mask:
         """Return where a condition without open lists holds."""
         values = self.of(typed).array(len(self))
-        return np.asarray(pc.fill_null(pc.cast(values, arrays.bool_()), False))
+        return true_where(pc.cast(values, arrays.bool_()))
 
     @contextmanager
-    def within(self, condition: Column) -> Iterator[None]:
+    def within(self, condition: Column) -> Generator[None]:
         """Let only rows that take a branch reject themselves."""
         self._taken.append(condition)
         try:
@@ -122,7 +123,7 @@ class Evaluation:
         for condition in self._taken:
             if len(condition.axes) <= len(axes) and all(map(Axis.like, condition.axes, axes)):
                 values = condition.over(axes).array(len(bad))
-                bad = bad & np.asarray(pc.fill_null(values, False))
+                bad = bad & true_where(values)
         return bad
 
     def _compute(self, typed: Typed) -> Column:
@@ -131,29 +132,29 @@ class Evaluation:
                 return Column(self.rows)
             case Const():
                 return Column(_scalar(typed))
+            case Apply():
+                return self._apply(typed)
+            case ListValue():
+                return self._list(typed)
+            case ChoiceOf():
+                return self._choice(typed)
+            case _:
+                return self._derived(typed, self.of(typed.of))
+
+    def _derived(self, typed: FieldOf | EachOf | Fold | ItemOf | Cast, of: Column) -> Column:
+        """Return what is made of one other column."""
+        match typed:
             case FieldOf():
-                of = self.of(typed.of)
                 return Column(field_of(of.array(len(self)), typed.name), of.axes)
             case EachOf():
-                of = self.of(typed.of)
                 elements, axis = open_list(of.array(len(self)))
                 return Column(elements, (*of.axes, axis))
             case Fold():
-                return self.of(typed.of).folded()
+                return of.folded()
             case ItemOf():
-                of = self.of(typed.of)
                 return Column(_items(of.array(len(self)), typed.index), of.axes)
-            case ListValue():
-                return self._list(typed)
             case Cast():
-                of = self.of(typed.of)
-                refuse = self.refuser(of.axes, typed.text)
-                values = to_number(_array(of), typed.type, refuse)
-                return _like(of, values)
-            case Apply():
-                return self._apply(typed)
-            case ChoiceOf():
-                return self._choice(typed)
+                return _like(of, to_number(_array(of), typed.type, self.refuser(of.axes, typed.text)))
 
     def _aligned(self, columns: list[Column], text: str) -> tuple[list[Column], tuple[Axis, ...]]:
         """Return the columns over the same elements; lists side by side must be of equal length."""

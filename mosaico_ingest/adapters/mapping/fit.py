@@ -26,6 +26,7 @@ from mosaico_ingest.adapters.mapping.kinds import (
     Unfit,
     float_of,
     int_bounds,
+    is_list,
     is_number,
     kind_of,
     spell,
@@ -42,7 +43,7 @@ def peel(target: DataType, axes: tuple[int | None, ...]) -> DataType:
         Unfit: The target has fewer lists, or lists of another length.
     """
     for size in axes:
-        if not _is_list(target):
+        if not is_list(target):
             raise Unfit(
                 f"a list for {spell(target)}",
                 hint="a[0] is one element, len sum mean least greatest are one value",
@@ -66,7 +67,7 @@ def _demand(kind: Kind, target: DataType) -> None:
     source = kind.type
     if source == target or pt.is_null(source):
         return
-    if _is_list(source) and _is_list(target):
+    if is_list(source) and is_list(target):
         if pt.is_fixed_size_list(source) and pt.is_fixed_size_list(target):
             peel(target, (source.list_size,))
         _demand(kind_of(source.value_type, msgtype=kind.msgtype), target.value_type)
@@ -98,9 +99,9 @@ def _remedy(source: DataType, target: DataType) -> str | None:
         return "text(…) spells a number" if computes else None
     if is_number(target) and pt.is_string(source):
         return "cast(number(…)) reads it"
-    if pt.is_binary(target) and _is_list(source):
+    if pt.is_binary(target) and is_list(source):
         return "bytes(…) if it is a list of uint8"
-    if _is_list(target) and not _is_list(source):
+    if is_list(target) and not is_list(source):
         return "[x] is a list of one" if computes else None
     return "name one of its fields" if pt.is_struct(source) else None
 
@@ -133,17 +134,13 @@ def _special(source: DataType, target: DataType) -> Callable[[Refuse, Array], Ar
     return None
 
 
-def _is_list(type_: DataType) -> bool:
-    return pt.is_list(type_) or pt.is_fixed_size_list(type_)
-
-
 def convert(array: Array, target: DataType, refuse: Refuse) -> Array:
     """Return the column in exactly the target's type; what fits as it is, is not copied."""
     if array.type == target:
         return array
     if pt.is_null(array.type):
         return arrays.nulls(len(array), target)
-    if _is_list(target):
+    if is_list(target):
         return _convert_list(array, target, refuse)
     if pt.is_struct(target):
         return _convert_struct(array, target, refuse)
@@ -154,7 +151,9 @@ def _convert_list(array: Array, target: DataType, refuse: Refuse) -> Array:
     elements, axis = open_list(array)
     if pt.is_fixed_size_list(target) and axis.size is None:
         size = target.list_size
-        wrong = (axis.lengths != size) & ~(axis.null if axis.null is not None else False)
+        wrong = axis.lengths != size
+        if axis.null is not None:
+            wrong &= ~axis.null
         if wrong.any():
             refuse(wrong, "length", lambda i: f"the list has {axis.lengths[i]} elements, not {size}")
         elements, axis = _stretched(elements, axis, size)

@@ -41,12 +41,12 @@ def make_type(inline: InlineType, report: Report) -> OntologyType:
     return OntologyType(inline.tag, pa.struct(_fields(inline.fields, path, report)), inline.format)
 
 
-def _fields(fields: Mapping[str, FieldType], path: Path, report: Report) -> list[pa.Field]:
+def _fields(fields: Mapping[str, FieldType], path: Path, report: Report) -> list[DataType]:
     made = (_field(name, field, (*path, name), report) for name, field in fields.items())
     return [field for field in made if field is not None]
 
 
-def _field(name: str, field: FieldType, path: Path, report: Report) -> pa.Field | None:
+def _field(name: str, field: FieldType, path: Path, report: Report) -> DataType | None:
     typed = TypedField(type=field) if isinstance(field, str) else field
     if (typed.type is None) == (typed.fields is None):
         report(path, f"the field {name!r} needs either type or fields", "as {type: float64}")

@@ -14,6 +14,7 @@ __all__ = [
     "Unfit",
     "float_of",
     "int_bounds",
+    "is_list",
     "is_number",
     "join",
     "kind_of",
@@ -86,6 +87,11 @@ def int_bounds(type_: DataType) -> Bounds | None:
         return None
     bits = type_.bit_width
     return (0, 2**bits - 1) if pt.is_unsigned_integer(type_) else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+
+
+def is_list(type_: DataType) -> bool:
+    """Return whether it is a list, of fixed length or not."""
+    return pt.is_list(type_) or pt.is_fixed_size_list(type_)
 
 
 def is_number(type_: DataType) -> bool:

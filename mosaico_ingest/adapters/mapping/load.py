@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,8 @@ from mosaico_ingest.adapters.adapter import Adapted, Envelope
 from mosaico_ingest.adapters.mapping.build import Filled, fill
 from mosaico_ingest.adapters.mapping.check import Scope
 from mosaico_ingest.adapters.mapping.compile import AdapterLookup, Compiler
-from mosaico_ingest.adapters.mapping.evaluate import Evaluation, RowsRefused
+from mosaico_ingest.adapters.mapping.desk import Desk
+from mosaico_ingest.adapters.mapping.evaluate import Evaluation, Refusal, RowsRefused
 from mosaico_ingest.adapters.mapping.inline_type import make_type
 from mosaico_ingest.adapters.mapping.kinds import Kind
 from mosaico_ingest.adapters.mapping.model import InlineType, MappingFile
@@ -47,21 +48,23 @@ class MappingAdapter:
 
     def adapt(self, rows: pa.StructArray, envelope: Envelope) -> Adapted:
         """Adapt a whole batch; a row that does not fit is a failure, the others go on."""
-        index = np.arange(len(rows), dtype=np.int64)
-        failures: list[RowFailure] = []
-        while True:
-            try:
-                adapted = fill(Evaluation(rows, envelope), self.record)
-            except RowsRefused as refused:
-                for row, (rule, reason) in refused.refusals.items():
-                    failures.append(RowFailure(int(index[row]), rule, reason))
-                good = np.ones(len(rows), bool)
-                good[list(refused.refusals)] = False
-                rows, index = rows.filter(pa.array(good)), index[good]
-                envelope = Envelope(envelope.topic, envelope.msgtype, envelope.log_times[good])
-            else:
-                failures.sort(key=lambda failure: failure.row)
-                return Adapted(adapted, index, tuple(failures))
+        try:
+            adapted = fill(Evaluation(rows, envelope), self.record)
+        except RowsRefused as refused:
+            return self._adapt_others(rows, envelope, refused.refusals)
+        return Adapted(adapted, np.arange(len(rows), dtype=np.int64), ())
+
+    def _adapt_others(self, rows: Any, envelope: Envelope, refusals: dict[int, Refusal]) -> Adapted:  # noqa: ANN401 - an Arrow array
+        """Adapt the rows that were not refused; each round finds at least one of what is wrong with a batch."""
+        good = np.ones(len(rows), bool)
+        good[list(refusals)] = False
+        others = replace(envelope, log_times=envelope.log_times[good])
+        adapted = self.adapt(rows.filter(pa.array(good)), others)
+        index = np.flatnonzero(good).astype(np.int64)
+        failures = [RowFailure(row, rule, reason) for row, (rule, reason) in refusals.items()]
+        failures += [replace(failure, row=int(index[failure.row])) for failure in adapted.failures]
+        failures.sort(key=lambda failure: failure.row)
+        return Adapted(adapted.rows, index[adapted.index], tuple(failures))
 
     def topic_metadata(self, first_row: pa.StructScalar | None) -> dict[str, Any]:
         """Return the values of `schema_metadata` for one row; {} without one, or where it does not fit."""
@@ -137,13 +140,14 @@ class MappingSpec:
     def _compiled(
         self, definition: Definition, shape: pa.StructType, variant: str
     ) -> tuple[MappingAdapter | None, tuple[Finding, ...]]:
-        compiler = Compiler(self.source, definition, self.adapters)
+        desk = Desk(self.source)
+        compiler = Compiler(desk, definition, self.adapters)
         scope = Scope(Kind(shape, msgtype=definition.root), definition.types)
         record = compiler.record(self.model, self.ontology, scope, variant)
         metadata = compiler.metadata(self.model.schema_metadata, scope)
         if record is None:
-            return None, tuple(compiler.findings)
-        return MappingAdapter(self.ontology, record, metadata, definition.root), tuple(compiler.findings)
+            return None, tuple(desk.findings)
+        return MappingAdapter(self.ontology, record, metadata, definition.root), tuple(desk.findings)
 
 
 def load_adapter(
@@ -174,26 +178,27 @@ def _read(source: Source, adapters: AdapterLookup | None) -> tuple[MappingSpec |
         model = MappingFile.model_validate(source.value)
     except ValidationError as error:
         return None, tuple(finding for _, finding in explain(error, source=source, schema=adapter_schema()))
-    compiler = Compiler(source, None, adapters)
+    desk = Desk(source)
     if (model.ros_type is None) == (model.variants is None):
-        compiler.report(
+        desk.report(
             ("adapter",), "either ros_type or variants says what the adapter takes", "give one of them"
         )
-    ontology = _ontology(model, compiler)
+    ontology = _ontology(model, desk)
     if ontology is None:
-        return None, tuple(compiler.findings)
+        return None, tuple(desk.findings)
+    compiler = Compiler(desk, None, adapters)
     compiler.record(model, ontology, None, None)
     compiler.metadata(model.schema_metadata, None)
-    return MappingSpec(model, source, ontology, adapters), tuple(compiler.findings)
+    return MappingSpec(model, source, ontology, adapters), tuple(desk.findings)
 
 
-def _ontology(model: MappingFile, compiler: Compiler) -> OntologyType | None:
+def _ontology(model: MappingFile, desk: Desk) -> OntologyType | None:
     if isinstance(model.ontology, InlineType):
-        return make_type(model.ontology, compiler.report)
+        return make_type(model.ontology, desk.report)
     try:
         return ontology_type(model.ontology)
     except UnknownTag as unknown:
-        compiler.report(("ontology",), unknown.what, unknown.hint, rule="unknown-tag")
+        desk.report(("ontology",), unknown.what, unknown.hint, rule="unknown-tag")
         return None
 
 

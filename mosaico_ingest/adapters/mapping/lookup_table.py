@@ -3,79 +3,54 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol
+from dataclasses import replace
 
 from mosaico_ingest.adapters.mapping.arrow import DataType, arrays, pt
 from mosaico_ingest.adapters.mapping.build import Looked
-from mosaico_ingest.adapters.mapping.check import Scope, constant
-from mosaico_ingest.adapters.mapping.fit import demand, peel
-from mosaico_ingest.adapters.mapping.kinds import Kind, Unfit, join, spell, within
+from mosaico_ingest.adapters.mapping.check import constant
+from mosaico_ingest.adapters.mapping.desk import Desk, Slot
+from mosaico_ingest.adapters.mapping.fit import demand
+from mosaico_ingest.adapters.mapping.kinds import Unfit, join, spell, within
 from mosaico_ingest.adapters.mapping.model import Form, Scalar
-from mosaico_ingest.adapters.mapping.typed import Const, FieldOf, Typed, Written
+from mosaico_ingest.adapters.mapping.typed import FieldOf, Typed, Written
 from mosaico_ingest.manifest.source import Path
 
-__all__ = ["Desk", "compile_lookup"]
+__all__ = ["compile_lookup"]
 
 
-class Desk(Protocol):
-    """What the compiler lends: reading expressions, noting mistakes."""
-
-    def scalar(self, path: Path, value: Scalar, scope: Scope | None) -> Written | Const | None:
-        """Compile a plain value or an expression."""
-        ...
-
-    def demand(self, at: Written | Path, kind: Kind, target: DataType) -> bool:
-        """Check that values fit a column."""
-        ...
-
-    def report(self, path: Path, message: str, help_: str | None = None, *, rule: str = "mapping") -> None:
-        """Note a mistake."""
-        ...
-
-
-def compile_lookup(
-    desk: Desk, form: Form, path: Path, target: DataType, scope: Scope | None
-) -> Looked | None:
+def compile_lookup(desk: Desk, form: Form, slot: Slot) -> Looked | None:
     """Return the compiled table, or None after a finding or where there is no message."""
-    value = desk.scalar((*path, "value"), form.value, scope)
+    value = desk.scalar((*slot.path, "value"), form.value, slot.scope)
     typed = value.typed if isinstance(value, Written) else value
     default = None
-    if form.otherwise not in ("error", "keep"):
-        default = desk.scalar((*path, "else"), form.otherwise, scope)
+    if form.otherwise not in {"error", "keep"}:
+        default = desk.scalar((*slot.path, "else"), form.otherwise, slot.scope)
         if default is None:
             return None
-    if typed is None or scope is None:
+    if typed is None or slot.scope is None:
         return None
-    try:
-        element = peel(target, typed.kind.axes)
-    except Unfit as unfit:
-        desk.report((*path, "value"), str(unfit), unfit.hint, rule="misfit")
+    element = desk.peeled((*slot.path, "value"), typed.kind, slot.type)
+    if element is None:
         return None
-    table = _table(desk, form.map or {}, (*path, "map"), typed, element, scope)
+    table = _table(desk, form.map or {}, typed, replace(slot.at("map"), type=element))
     rest = typed if form.otherwise == "keep" else default.typed if isinstance(default, Written) else default
-    where = (*path, "value" if form.otherwise == "keep" else "else")
+    where = (*slot.path, "value" if form.otherwise == "keep" else "else")
     if table is None or (rest is not None and not desk.demand(where, rest.kind.element, element)):
         return None
-    keys, values = table
-    return Looked(typed, arrays.array(keys, typed.kind.type), arrays.array(values, element), rest)
+    return Looked(typed, arrays.array(table[0], typed.kind.type), arrays.array(table[1], element), rest)
 
 
 def _table(
-    desk: Desk, entries: Mapping[Scalar, Scalar], path: Path, typed: Typed, target: DataType, scope: Scope
+    desk: Desk, entries: Mapping[Scalar, Scalar], typed: Typed, slot: Slot
 ) -> tuple[list[Scalar], list[Scalar]] | None:
     """Return keys and values that have the right types; None after a finding."""
-    if pt.is_nested(target) or pt.is_nested(typed.kind.type):
-        desk.report(
-            path, f"a map is between plain values, not {spell(typed.kind.element)} and {spell(target)}"
-        )
+    if pt.is_nested(slot.type) or pt.is_nested(typed.kind.type):
+        message = f"a map is between plain values, not {spell(typed.kind.element)} and {spell(slot.type)}"
+        desk.report(slot.path, message, rule="misfit")
         return None
-    keys: list[Scalar] = []
-    good = True
-    for key, value in entries.items():
-        found = _key(desk, key, (*path, key), typed, scope)
-        good = found is not None and _value_fits(desk, value, (*path, key), target) and good
-        keys.append(found)
-    return (keys, list(entries.values())) if good else None
+    keys = [_key(desk, key, typed, slot) for key in entries]
+    fitting = [_value_fits(desk, value, (*slot.path, key), slot.type) for key, value in entries.items()]
+    return (keys, list(entries.values())) if all(fitting) and None not in keys else None
 
 
 def _value_fits(desk: Desk, value: Scalar, path: Path, target: DataType) -> bool:
@@ -87,8 +62,11 @@ def _value_fits(desk: Desk, value: Scalar, path: Path, target: DataType) -> bool
     return True
 
 
-def _key(desk: Desk, key: Scalar, path: Path, typed: Typed, scope: Scope) -> Scalar:
+def _key(desk: Desk, key: Scalar, typed: Typed, slot: Slot) -> Scalar:
     """Return what a key stands for; None after a finding."""
+    path, scope = (*slot.path, key), slot.scope
+    if scope is None:
+        return None
     kind, owner = typed.kind.element, typed.of.kind if isinstance(typed, FieldOf) else scope.kind
     if isinstance(key, str) and not pt.is_string(kind.type):
         value = scope.constant(owner, key)

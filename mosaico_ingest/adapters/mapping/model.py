@@ -57,7 +57,7 @@ class Form(_Strict):
     """An expression: the nested message (`a.b`), or the messages of a list (`a[]`)."""
     fields: Mapping[str, Value] | None = None
     """Field of the struct → value; names are read inside `of` where that is given."""
-    replaced: Annotated[Mapping[str, Value] | None, Field(alias="with", default=None)]
+    replaced: Annotated[Mapping[str, Value] | None, Field(alias="with")] = None
     """Fields of the resulting struct that come from elsewhere; names are read outside `of`."""
     when: str | None = None
     """A condition; where it does not hold, the whole value is null."""

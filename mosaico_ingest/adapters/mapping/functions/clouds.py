@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -31,7 +32,7 @@ class _Clouds:
     """The columns of a batch of clouds as numpy arrays."""
 
     def __init__(self, cloud: Array) -> None:
-        columns = {name: np.asarray(field_of(cloud, name).fill_null(0)) for name in _NUMBERS}
+        columns = {name: _plain(field_of(cloud, name)) for name in _NUMBERS}
         self.heights, self.widths = columns["height"].astype(np.int64), columns["width"].astype(np.int64)
         self.steps, self.row_steps = columns["point_step"].astype(int), columns["row_step"].astype(int)
         self.big_endian = columns["is_bigendian"].astype(bool)
@@ -42,42 +43,39 @@ class _Clouds:
         entries, axis = open_list(field_of(cloud, "fields"))
         self.first, self.entry_counts = axis.offsets[:-1], axis.lengths
         self.names = field_of(entries, "name").to_pylist()
-        kinds = (np.asarray(field_of(entries, name)) for name in ("offset", "datatype", "count"))
+        kinds = (_plain(field_of(entries, name)) for name in ("offset", "datatype", "count"))
         self.offsets, self.datatypes, self.counts = kinds
-
-    @property
-    def point_counts(self) -> NDArray[np.int64]:
-        return self.heights * self.widths
 
     def alike(self) -> bool:
         """Whether all rows are laid out like the first, without padding, so that their bytes are one block."""
         per_row = (self.steps, self.big_endian, self.entry_counts)
-        if not len(self.steps) or any((column != column[0]).any() for column in per_row):
+        if any((column != column[:1]).any() for column in per_row) or not self.steps.all():
             return False
         entries = int(self.entry_counts[0])
         per_entry = (np.asarray(self.names, object), self.offsets, self.datatypes, self.counts)
         tables = [column.reshape(-1, entries) for column in per_entry] if entries else []
-        same = all((table == table[0]).all() for table in tables)
-        return same and bool((self.lengths == self.point_counts * self.steps).all())
+        needed = self.heights.astype(np.float64) * self.widths * self.steps  # cannot wrap around
+        return all((table == table[0]).all() for table in tables) and bool((self.lengths == needed).all())
 
     def block(self) -> Numbers:
         """Return the points of rows that are alike, shape (all points, step)."""
         start, end = int(self.starts[0]), int(self.starts[-1] + self.lengths[-1])
-        return self.octets[start:end].reshape(-1, max(int(self.steps[0]), 1))
+        return self.octets[start:end].reshape(-1, int(self.steps[0]))
 
     def points(self, row: int) -> Numbers:
         """Return the points of one row, shape (points, step), without the padding behind each line."""
         height, width, step = int(self.heights[row]), int(self.widths[row]), int(self.steps[row])
-        start, length = int(self.starts[row]), int(self.lengths[row])
-        line = int(self.row_steps[row])
-        if length == height * width * step or height <= 1:
+        start, length, line = int(self.starts[row]), int(self.lengths[row]), int(self.row_steps[row])
+        if not height * width:
+            return np.empty((0, step), np.uint8)
+        if length == height * width * step or height == 1:
             line = width * step  # some drivers leave row_step at zero where nothing is padded
-        if line < width * step or length < height * line:
+        if not step or line < width * step or length < height * line:
             raise _Misfit(
                 f"{height} x {width} points of {step} bytes, row_step {line}, do not fit {length} bytes of data"
             )
-        lines = self.octets[start : start + height * line].reshape(height, max(line, 1))
-        return lines[:, : width * step].reshape(-1, max(step, 1))
+        lines = self.octets[start : start + height * line].reshape(height, line)
+        return lines[:, : width * step].reshape(-1, step)
 
     def place(self, row: int, name: str) -> tuple[int, np.dtype[Any]] | None:
         """Return where a field lies in a point and its type there; None where the cloud has none of that name."""
@@ -91,9 +89,14 @@ class _Clouds:
         dtype = np.dtype(_DATATYPES[datatype]).newbyteorder(">" if self.big_endian[row] else "<")
         if count > 1:
             raise _Misfit(f"field {name} has {count} values a point")
-        if offset + dtype.itemsize > self.steps[row] and self.point_counts[row]:
+        if offset + dtype.itemsize > self.steps[row] and self.heights[row] and self.widths[row]:
             raise _Misfit(f"field {name} ends at byte {offset + dtype.itemsize} of {self.steps[row]}")
         return offset, dtype
+
+
+def _plain(column: Array) -> Numbers:
+    """Return numbers or booleans, zero where there is none."""
+    return np.asarray(column.fill_null(arrays.scalar(0).cast(column.type)) if column.null_count else column)
 
 
 def _read(points: Numbers, place: tuple[int, np.dtype[Any]]) -> Numbers:
@@ -129,18 +132,17 @@ def _bits(values: Numbers) -> Numbers:
 
 def _columns(refuse: Refuse, cloud: Array, name: str, dtype: np.dtype[Any], convert: Convert) -> Array:
     clouds = _Clouds(cloud)
-    lengths = clouds.point_counts.copy()
+    lengths = np.zeros(len(cloud), np.int64)
     absent = np.zeros(len(cloud), bool)
     misfits: dict[int, str] = {}
     parts: list[Numbers] = []
-    if clouds.alike():
-        try:
+    if len(cloud) and clouds.alike():
+        with suppress(_Misfit):  # which row it is comes out one by one
             place = clouds.place(0, name)
             if place is not None:
                 values = convert(_read(clouds.block(), place))
-                return var_list(arrays.array(values), np.append(0, np.cumsum(lengths)), nulls(cloud))
-        except _Misfit:
-            pass  # which row it is comes out one by one
+                offsets = np.append(0, np.cumsum(clouds.heights * clouds.widths))
+                return var_list(arrays.array(values), offsets, nulls(cloud))
     for row in range(len(cloud)):
         try:
             place = clouds.place(row, name)

@@ -22,11 +22,15 @@ _NEAR_OVERFLOW = 2.0**62
 """Below this a float sum of integers proves that the integer sum is exact."""
 
 
+def _count(_: Kind) -> Kind:
+    return whole(0, _MOST_ELEMENTS)
+
+
 def _len_accepts(kind: Kind) -> bool:
     return any(test(kind.type) for test in (pt.is_list, pt.is_fixed_size_list, pt.is_string, pt.is_binary))
 
 
-@function(Take("a list, text or bytes", _len_accepts), gives=lambda _: whole(0, _MOST_ELEMENTS))
+@function(Take("a list, text or bytes", _len_accepts), gives=_count)
 def len_(x: Array) -> Array:
     """Elements of a list, characters of text, bytes of binary."""
     if pt.is_string(x.type):
@@ -36,6 +40,10 @@ def len_(x: Array) -> Array:
 
 def _element(kind: Kind) -> Kind:
     return kind_of(kind.type.value_type) if not pt.is_null(kind.type) else kind
+
+
+def _mean_kind(kind: Kind) -> Kind:
+    return computed(_element(kind))
 
 
 def _total(kind: Kind) -> Kind:
@@ -79,7 +87,7 @@ def sum_(refuse: Refuse, x: Array) -> Array:
     return arrays.array(total, mask=_absent(elements, axis))
 
 
-@function(NUMBERS, gives=lambda kind: computed(_element(kind)))
+@function(NUMBERS, gives=_mean_kind)
 def mean(x: Array) -> Array:
     """Mean of the elements; null where there are none."""
     elements, axis = open_list(x)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from mosaico_ingest.adapters.mapping.arrow import Array, arrays, pc, pt
-from mosaico_ingest.adapters.mapping.columns import one_type
+from mosaico_ingest.adapters.mapping.columns import one_type, open_list, true_where, var_list
 from mosaico_ingest.adapters.mapping.functions.operators import comparable, computed, numbers, whole
 from mosaico_ingest.adapters.mapping.functions.registry import ANY, FLOAT, NUMBER, Refuse, function
 from mosaico_ingest.adapters.mapping.kinds import Kind, Unfit, join
@@ -48,7 +49,7 @@ def coalesce(a: Array, *others: Array) -> Array:
 @function(ANY, ANY, gives=_null_if)
 def null_if(x: Array, value: Array) -> Array:
     """Null where x equals value."""
-    same = pc.fill_null(pc.equal(*comparable(x, value)), False)
+    same = arrays.array(true_where(pc.equal(*comparable(x, value))))
     return pc.if_else(same, arrays.scalar(None, x.type), x)
 
 
@@ -70,11 +71,12 @@ def _empty_kind(kind: Kind) -> Kind:
 def empty_to_null(x: Array) -> Array:
     """Null where the text, bytes or list is empty."""
     length = pc.list_value_length(x) if pt.is_list(x.type) else pc.binary_length(x)
-    empty = np.asarray(pc.fill_null(pc.equal(length, 0), True))
+    empty = true_where(pc.equal(length, 0), null=True)
     if not empty.any():
         return x
     if pt.is_list(x.type):
-        return arrays.ListArray.from_arrays(x.offsets, x.values, mask=arrays.array(empty))
+        elements, axis = open_list(x)
+        return var_list(elements, axis.offsets, empty)
     return pc.if_else(arrays.array(empty), arrays.scalar(None, x.type), x)
 
 
@@ -103,13 +105,17 @@ def abs_(refuse: Refuse, x: Array) -> Array:
     (x,) = numbers(refuse, x)
     if not pt.is_integer(x.type):
         return pc.abs(x)
-    lowest = np.asarray(pc.fill_null(pc.equal(x, -(2**63)), False))
+    lowest = true_where(pc.equal(x, -(2**63)))
     if lowest.any():
         refuse(lowest, "overflow", lambda _: "abs(-2 ** 63) has more than 64 bits")
     return pc.abs(x)
 
 
-@function(NUMBER, gives=lambda kind: whole(-1, 1) if kind.bounds is not None else computed(kind))
+def _sign_kind(kind: Kind) -> Kind:
+    return whole(-1, 1) if kind.bounds is not None else computed(kind)
+
+
+@function(NUMBER, gives=_sign_kind)
 def sign(x: Array) -> Array:
     """-1, 0 or 1."""
     signs = pc.sign(x)
@@ -135,14 +141,14 @@ for _name, _run, _summary in (
     ("asin", pc.asin, "Arc sine in rad; NaN outside -1 … 1."),
     ("acos", pc.acos, "Arc cosine in rad; NaN outside -1 … 1."),
     ("atan", pc.atan, "Arc tangent in rad."),
-    ("degrees", lambda x: pc.multiply(x, 180 / np.pi), "rad as degrees."),
-    ("radians", lambda x: pc.multiply(x, np.pi / 180), "Degrees as rad."),
+    ("degrees", partial(pc.multiply, 180 / np.pi), "rad as degrees."),
+    ("radians", partial(pc.multiply, np.pi / 180), "Degrees as rad."),
     ("floor", pc.floor, "The whole number below; still a float."),
     ("ceil", pc.ceil, "The whole number above; still a float."),
     ("trunc", pc.trunc, "x without its fraction; still a float."),
     (
         "round",
-        lambda x: pc.round(x, round_mode="half_to_even"),
+        partial(pc.round, round_mode="half_to_even"),
         "The nearest whole number, half to even; still a float.",
     ),
 ):

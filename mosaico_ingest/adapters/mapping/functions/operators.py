@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mosaico_ingest.adapters.mapping.arrow import Array, arrays, pc, pt
+from mosaico_ingest.adapters.mapping.columns import true_where
 from mosaico_ingest.adapters.mapping.functions.registry import (
     ANY,
     BOOLEAN,
@@ -79,9 +80,7 @@ def _ordered(left: Kind, right: Kind) -> Kind:
 def _to_int64(refuse: Refuse, values: Array) -> Array:
     if values.type != arrays.uint64():
         return values if values.type == arrays.int64() else pc.cast(values, arrays.int64())
-    bad = np.atleast_1d(
-        np.asarray(pc.fill_null(pc.greater(values, arrays.scalar(INT64[1], arrays.uint64())), False))
-    )
+    bad = np.atleast_1d(true_where(pc.greater(values, arrays.scalar(INT64[1], arrays.uint64()))))
     if bad.any():
         refuse(bad, "overflow", lambda i: f"{values[i]} has more than 63 bits")
         values = nullified(values, bad)
@@ -145,11 +144,11 @@ def _overflows(sign: str, left: int | None, right: int | None) -> bool:
     return not INT64[0] <= _EXACT[sign](left, right) <= INT64[1]
 
 
-def _arithmetic(sign: str, checked: Any, plain: Any, refuse: Refuse, left: Array, right: Array) -> Array:  # noqa: ANN401 - pyarrow's functions
+def _arithmetic(sign: str, name: str, refuse: Refuse, left: Array, right: Array) -> Array:
     left, right = numbers(refuse, left, right)
     if pt.is_integer(left.type):
-        return _checked(refuse, sign, checked, left, right)
-    return plain(left, right)
+        return _checked(refuse, sign, getattr(pc, f"{name}_checked"), left, right)
+    return getattr(pc, name)(left, right)
 
 
 @function(ANY, ANY, gives=_sum_kind, name="+", scalars=True)
@@ -158,19 +157,19 @@ def add(refuse: Refuse, left: Array, right: Array) -> Array:
     if pt.is_string(left.type) or pt.is_string(right.type):
         both = (pc.cast(left, arrays.string()), pc.cast(right, arrays.string()))
         return pc.binary_join_element_wise(*both, "")
-    return _arithmetic("+", pc.add_checked, pc.add, refuse, left, right)
+    return _arithmetic("+", "add", refuse, left, right)
 
 
 @function(NUMBER, NUMBER, gives=_spread(operator.sub), name="-", scalars=True)
 def subtract(refuse: Refuse, left: Array, right: Array) -> Array:
     """Difference."""
-    return _arithmetic("-", pc.subtract_checked, pc.subtract, refuse, left, right)
+    return _arithmetic("-", "subtract", refuse, left, right)
 
 
 @function(NUMBER, NUMBER, gives=_spread(operator.mul), name="*", scalars=True)
 def multiply(refuse: Refuse, left: Array, right: Array) -> Array:
     """Product."""
-    return _arithmetic("*", pc.multiply_checked, pc.multiply, refuse, left, right)
+    return _arithmetic("*", "multiply", refuse, left, right)
 
 
 @function(FLOAT, FLOAT, gives=computed, name="/", scalars=True)
@@ -183,9 +182,9 @@ def _floored(refuse: Refuse, sign: str, run: Any, left: Array, right: Array) -> 
     left, right = numbers(refuse, left, right)
     n = _length(left, right)
     if pt.is_integer(left.type):
-        zero = np.broadcast_to(np.asarray(pc.fill_null(pc.equal(right, 0), False)), n)
+        zero = np.broadcast_to(true_where(pc.equal(right, 0)), n)
         lowest = pc.and_kleene(pc.equal(left, INT64[0]), pc.equal(right, -1))
-        bad = zero | (np.broadcast_to(np.asarray(pc.fill_null(lowest, False)), n) & (sign == "//"))
+        bad = zero | (np.broadcast_to(true_where(lowest), n) & (sign == "//"))
         if bad.any():
             pairs = _listed(left, n), _listed(right, n)
             refuse(bad, "division", lambda i: f"{pairs[0][i]} {sign} {pairs[1][i]} has no result")
@@ -252,7 +251,11 @@ def negative(refuse: Refuse, x: Array) -> Array:
     return _checked(refuse, "-", pc.subtract_checked, zero, x) if pt.is_integer(x.type) else pc.negate(x)
 
 
-@function(NUMBER, gives=lambda of: of)
+def _same(kind: Kind) -> Kind:
+    return kind
+
+
+@function(NUMBER, gives=_same)
 def positive(x: Array) -> Array:
     """+x."""
     return x

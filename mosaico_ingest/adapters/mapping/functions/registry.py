@@ -12,7 +12,7 @@ import numpy as np
 
 from mosaico_ingest.adapters.mapping.arrow import Array, DataType, arrays, pc, pt
 from mosaico_ingest.adapters.mapping.columns import Mask
-from mosaico_ingest.adapters.mapping.kinds import Kind, Unfit, is_number, kind_of, spell
+from mosaico_ingest.adapters.mapping.kinds import Kind, Unfit, is_list, is_number, kind_of, spell
 
 __all__ = [
     "ANY",
@@ -130,7 +130,7 @@ def function(
         _FUNCTIONS[spelled] = Function(
             name=spelled,
             takes=takes,
-            gives=gives if callable(gives) else _constant(gives),
+            gives=_constant(gives) if isinstance(gives, arrays.DataType) else gives,
             apply=apply,
             optional=optional,
             variadic=variadic,
@@ -185,17 +185,13 @@ def _typed(type_: DataType) -> Callable[[Array], Array]:
     return prepare
 
 
-def _is_list(kind: Kind) -> bool:
-    return pt.is_list(kind.type) or pt.is_fixed_size_list(kind.type)
-
-
 FLOAT = Take("a number", lambda kind: is_number(kind.type), _as_float)
 NUMBER = Take("a number", lambda kind: is_number(kind.type), _typed(arrays.int64()))
 INTEGER = Take("an integer", lambda kind: pt.is_integer(kind.type), _typed(arrays.int64()))
 BOOLEAN = Take("true or false", lambda kind: pt.is_boolean(kind.type), _typed(arrays.bool_()))
 TEXT = Take("text", lambda kind: pt.is_string(kind.type), _typed(arrays.string()))
 BINARY = Take("bytes", lambda kind: pt.is_binary(kind.type), _typed(arrays.binary()))
-LIST = Take("a list", _is_list)
+LIST = Take("a list", lambda kind: is_list(kind.type))
 STRUCT = Take("a message", lambda kind: pt.is_struct(kind.type))
 ANY = Take("a value", lambda _: True)
 TEXT_LITERAL = Take("a text in quotes", lambda kind: pt.is_string(kind.type), literal=True)
@@ -213,7 +209,7 @@ def struct_with(words: str, *choices: tuple[str, ...]) -> Take:
 
 def list_of(words: str, accepts: Callable[[DataType], bool]) -> Take:
     """Return a parameter for lists whose elements are accepted."""
-    return Take(words, lambda kind: _is_list(kind) and accepts(kind.type.value_type))
+    return Take(words, lambda kind: is_list(kind.type) and accepts(kind.type.value_type))
 
 
 def check(called: Function, kinds: list[Kind]) -> Kind:

@@ -7,7 +7,15 @@ import re
 import numpy as np
 
 from mosaico_ingest.adapters.mapping.arrow import Array, DataType, arrays, pc, pt
-from mosaico_ingest.adapters.mapping.columns import Mask, field_of, fixed_list, nulls, open_list, var_list
+from mosaico_ingest.adapters.mapping.columns import (
+    Mask,
+    field_of,
+    fixed_list,
+    nulls,
+    open_list,
+    true_where,
+    var_list,
+)
 from mosaico_ingest.adapters.mapping.functions.lists import NUMBERS
 from mosaico_ingest.adapters.mapping.functions.operators import computed
 from mosaico_ingest.adapters.mapping.functions.registry import FLOAT, TEXT, Refuse, function, struct_with
@@ -39,11 +47,11 @@ def as_header(refuse: Refuse, h: Array, *, collapse: bool = True) -> Array:
 
 
 def _is_silent(stamp: Array, frame: Array) -> Mask:
-    unnamed = np.asarray(pc.fill_null(pc.equal(pc.binary_length(frame), 0), True))
+    unnamed = true_where(pc.equal(pc.binary_length(frame), 0), null=True)
     if not unnamed.any():
         return unnamed
     parts = (field_of(stamp, name) for name in ("sec", "nanosec"))
-    zero = [np.asarray(pc.fill_null(pc.equal(part, 0), True)) for part in parts]
+    zero = [true_where(pc.equal(part, 0), null=True) for part in parts]
     return unnamed & zero[0] & zero[1]
 
 
@@ -53,17 +61,23 @@ def ros_header(refuse: Refuse, h: Array) -> Array:
     return as_header(refuse, h)
 
 
-@function(NUMBERS, gives=lambda kind: Kind(kind.type))
+def _same(kind: Kind) -> Kind:
+    return kind
+
+
+@function(NUMBERS, gives=_same)
 def covariance(c: Array) -> Array:
     """The list, or null unless an element is > 0."""
     elements, axis = open_list(c)
-    positive = np.asarray(pc.fill_null(pc.greater(elements, 0), False))
+    positive = true_where(pc.greater(elements, 0))
     if axis.size is not None:
-        known = positive.reshape(-1, axis.size).any(axis=1) if axis.size else np.zeros(len(c), bool)
+        known: Mask = positive.reshape(len(c), axis.size).any(axis=1)
     else:
         known = np.zeros(len(c), bool)
         known[axis.parents[positive]] = True
-    absent = ~known if axis.null is None else axis.null | ~known
+    absent = ~known
+    if axis.null is not None:
+        absent |= axis.null
     if not absent.any():
         return c
     if axis.size is not None:

@@ -16,7 +16,7 @@ QUATERNION_TYPE: DataType = arrays.struct([(axis, arrays.float64()) for axis in 
 _QUATERNION = struct_with("a quaternion {x, y, z, w}", _AXES)
 
 
-def _halves(*angles: Array) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
+def _halves(*angles: Array) -> tuple[NDArray[np.bool_], list[NDArray[np.float64]]]:
     """Return half the angles, broadcast, with NaN for null; and where one of them is null."""
     plain = [np.asarray(pc.fill_null(angle, np.nan), np.float64) for angle in angles]
     absent = np.zeros(np.broadcast_shapes(*(p.shape for p in plain)), bool)

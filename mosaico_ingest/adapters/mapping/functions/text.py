@@ -22,14 +22,15 @@ from mosaico_ingest.adapters.mapping.kinds import Kind, is_number
 
 __all__: list[str] = []
 
-_OCTETS = list_of("bytes or a list of uint8", pt.is_uint8)
-_BYTES = Take(_OCTETS.words, lambda kind: pt.is_binary(kind.type) or _OCTETS.accepts(kind))
-_SPELLED = Take("a number, text, true or false", lambda kind: _is_spelled(kind))
-_NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|nan)\s*")
-
 
 def _is_spelled(kind: Kind) -> bool:
     return is_number(kind.type) or pt.is_boolean(kind.type) or pt.is_string(kind.type)
+
+
+_OCTETS = list_of("bytes or a list of uint8", pt.is_uint8)
+_BYTES = Take(_OCTETS.words, lambda kind: pt.is_binary(kind.type) or _OCTETS.accepts(kind))
+_SPELLED = Take("a number, text, true or false", _is_spelled)
+_NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|nan)\s*")
 
 
 @function(TEXT, gives=arrays.string())

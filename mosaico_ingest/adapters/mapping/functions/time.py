@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mosaico_ingest.adapters.mapping.arrow import Array, DataType, arrays, pc
-from mosaico_ingest.adapters.mapping.columns import field_of, nulls
+from mosaico_ingest.adapters.mapping.columns import field_of, nulls, true_where
 from mosaico_ingest.adapters.mapping.functions.operators import numbers, whole
 from mosaico_ingest.adapters.mapping.functions.registry import (
     INTEGER,
@@ -14,6 +14,7 @@ from mosaico_ingest.adapters.mapping.functions.registry import (
     nullified,
     struct_with,
 )
+from mosaico_ingest.adapters.mapping.kinds import Kind
 
 __all__ = ["STAMP", "STAMP_TYPE", "as_stamp"]
 
@@ -37,7 +38,7 @@ def _parts(t: Array) -> tuple[Array, Array]:
 def as_stamp(refuse: Refuse, t: Array) -> Array:
     """Return `{sec, nanosec}` as the ontology's time; the fields are shared where their types agree."""
     sec, nanosec = _parts(t)
-    over = np.asarray(pc.fill_null(pc.greater_equal(nanosec, SECOND_NS), False))
+    over = true_where(pc.greater_equal(nanosec, SECOND_NS))
     if over.any():
         refuse(over, "nanosec", lambda i: f"nanosec is {nanosec[i]}; it must be below 1e9")
         nanosec = nullified(nanosec, over)
@@ -61,7 +62,11 @@ def seconds(t: Array) -> Array:
     return pc.add(pc.cast(sec, arrays.float64()), fraction)
 
 
-@function(STAMP, gives=lambda _: whole())
+def _whole(_: Kind) -> Kind:
+    return whole()
+
+
+@function(STAMP, gives=_whole)
 def nanoseconds(t: Array) -> Array:
     """A time or duration in ns."""
     sec, nanosec = (pc.cast(part, arrays.int64()) for part in _parts(t))
