@@ -1,1 +1,1 @@
-"""A Mosaico server as a destination."""
+"""A Mosaico server as a destination: batches in, DoPut streams out; it never sees a message or a recording."""

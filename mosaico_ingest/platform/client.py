@@ -1,0 +1,239 @@
+"""This file is a connection to a Mosaico server: handshake, actions, questions, uploads."""
+
+from __future__ import annotations
+
+import ssl
+import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, TypeVar, cast
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.flight as fl
+
+from mosaico_ingest.config import ServerTarget
+from mosaico_ingest.errors import SinkError, SinkUnavailable
+from mosaico_ingest.platform.faults import Address, Refused, reraise
+from mosaico_ingest.wire import bodies
+from mosaico_ingest.wire.actions import API_KEY_HEADER, INFO, VERSION, Action, Permission
+from mosaico_ingest.wire.bodies import Body
+from mosaico_ingest.wire.codec import JSON, Codec, Malformed
+from mosaico_ingest.wire.conditions import Condition, condition_of
+
+__all__ = ["PlatformClient", "Uploaded", "connect"]
+
+_ANSWER_S = 120.0
+_DELAYS_S = (0.2, 0.6, 1.8)
+_CHANNEL: list[tuple[str, Any]] = [
+    ("grpc.initial_reconnect_backoff_ms", 100),
+    ("grpc.max_reconnect_backoff_ms", 1000),
+]
+_UNKNOWN = frozenset({Condition.UNIMPLEMENTED, Condition.INVALID, Condition.NOT_FOUND})
+
+_Question = TypeVar("_Question", bound=Body)
+_Answer = TypeVar("_Answer", bound=Body)
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True, slots=True)
+class Uploaded:
+    """What a server says it holds of a topic."""
+
+    rows: int
+    start_ns: int | None
+    end_ns: int | None
+    """Inclusive."""
+    stored_bytes: int
+
+
+class PlatformClient:
+    """A server that answered; made by `connect`."""
+
+    def __init__(self, flight: fl.FlightClient, address: Address, codec: Codec, answer_s: float) -> None:
+        self.address = address
+        self.version = "unknown"
+        self.message_bytes = bodies.DEFAULT_DECODE_BYTES
+        """The most the server takes in one message."""
+        self._flight = flight
+        self._codec = codec
+        key = [(API_KEY_HEADER.encode(), address.key.encode())] if address.key else []
+        headers = cast("list[tuple[str, str]]", key)  # what the stubs want; Flight wants bytes
+        self._upload = fl.FlightCallOptions(headers=headers)
+        self._answer = fl.FlightCallOptions(headers=headers, timeout=answer_s)
+
+    def handshake(self) -> None:
+        """Ask what the server is and takes; one that does not know `info` is asked for its version.
+
+        Raises:
+            SinkError: There is no Mosaico server that lets this key in.
+        """
+        try:
+            info = self.act(INFO, bodies.Empty())
+        except Refused as refusal:
+            if refusal.condition not in _UNKNOWN:
+                raise
+            self.version = self._old_version()
+        else:
+            self.version = info.version
+            self.message_bytes = info.config.grpc_max_decode_message_size
+
+    def act(self, action: Action[_Question, _Answer], question: _Question) -> _Answer:
+        """Ask the server to do something.
+
+        Raises:
+            Refused: It said no.
+            SinkUnavailable: It did not answer.
+        """
+
+        def call() -> bytes:
+            request = fl.Action(action.name, self._codec.encode(question))
+            return b"".join(
+                result.body.to_pybytes() for result in self._flight.do_action(request, self._answer)
+            )
+
+        data = self._call(call, action.name, action.permission, repeatable=action.repeatable)
+        try:
+            return self._codec.decode_answer(action, data)
+        except Malformed as error:
+            raise SinkError(
+                f"the answer to {action.name} is not understood: {error}",
+                where=str(self.address),
+                hint="is it a Mosaico server of version 0.5 to 0.7?",
+            ) from error
+
+    def find(self, sequence: str) -> bodies.SequenceInfo | None:
+        """Return what the server knows of a sequence, None where there is none."""
+        try:
+            info = self._info(sequence)
+        except Refused as refusal:
+            if refusal.condition is Condition.NOT_FOUND:
+                return None
+            raise
+        return self._codec.decode(bodies.SequenceInfo, _bytes(info.app_metadata))
+
+    def uploaded(self, locator: str) -> Uploaded:
+        """Return what the server holds of a topic; one that does not say is read and counted."""
+        endpoint = self._info(locator).endpoints[0]
+        try:
+            held = self._codec.decode(bodies.TopicInfo, _bytes(endpoint.app_metadata)).data_info
+        except Malformed:
+            return self._counted(endpoint.ticket)
+        span = held.interval
+        return Uploaded(
+            held.total_row_count,
+            span and span.start_ns,
+            span and span.end_ns,
+            held.total_bytes,
+        )
+
+    def put(self, put: bodies.Put, schema: pa.Schema) -> fl.FlightStreamWriter:
+        """Begin an upload."""
+        descriptor = fl.FlightDescriptor.for_command(self._codec.encode(put))
+
+        def call() -> fl.FlightStreamWriter:
+            return self._flight.do_put(descriptor, schema, self._upload)[0]
+
+        return self._call(call, "do_put", Permission.WRITE, repeatable=False)
+
+    def _info(self, locator: str) -> fl.FlightInfo:
+        question = bodies.GetInfo(resource_locator=locator)
+        descriptor = fl.FlightDescriptor.for_command(self._codec.encode(question))
+        return self._call(
+            lambda: self._flight.get_flight_info(descriptor, self._answer),
+            "get_flight_info",
+            Permission.READ,
+            repeatable=True,
+        )
+
+    def _counted(self, ticket: fl.Ticket) -> Uploaded:
+        def call() -> Uploaded:
+            rows = size = 0
+            bounds: list[int] = []
+            for batch in self._flight.do_get(ticket, self._upload).to_reader():
+                span = pc.min_max(batch.column("timestamp_ns"))
+                rows += batch.num_rows
+                size += batch.nbytes
+                bounds += [at for at in (span["min"].as_py(), span["max"].as_py()) if at is not None]
+            return Uploaded(rows, min(bounds, default=None), max(bounds, default=None), size)
+
+        return self._call(call, "do_get", Permission.READ, repeatable=True)
+
+    def _old_version(self) -> str:
+        try:
+            return self.act(VERSION, bodies.Empty()).version
+        except Refused as refusal:
+            if refusal.condition in _UNKNOWN:
+                raise SinkError(
+                    "a Flight server answers, but it is no Mosaico server",
+                    where=str(self.address),
+                    hint="check target.host and target.port",
+                ) from refusal
+            raise
+
+    def _call(
+        self, call: Callable[[], _Result], doing: str, needs: Permission, *, repeatable: bool
+    ) -> _Result:
+        """Call, and again after a while where the server was away and a repetition does no harm."""
+        for delay_s in _DELAYS_S if repeatable else ():
+            try:
+                return self._once(call, doing, needs)
+            except SinkUnavailable as error:
+                if condition_of(error.__cause__ or error) is Condition.TIMED_OUT:
+                    raise
+            time.sleep(delay_s)
+        return self._once(call, doing, needs)
+
+    def _once(self, call: Callable[[], _Result], doing: str, needs: Permission) -> _Result:
+        try:
+            return call()
+        except pa.ArrowException as error:
+            reraise(error, self.address, doing=doing, needs=needs)
+
+
+@contextmanager
+def connect(
+    target: ServerTarget, *, codec: Codec = JSON, answer_s: float = _ANSWER_S
+) -> Generator[PlatformClient, None, None]:
+    """Connect to a server, shake hands, and let go of it at the end.
+
+    Raises:
+        SinkError: There is no server, or it does not let us in; says which.
+    """
+    address = _address(target)
+    flight = fl.FlightClient(str(address), tls_root_certs=address.roots, generic_options=_CHANNEL)
+    with flight:
+        client = PlatformClient(flight, address, codec, answer_s)
+        client.handshake()
+        yield client
+
+
+def _address(target: ServerTarget) -> Address:
+    key = target.api_key
+    if key and not (key.isascii() and key.isprintable() and " " not in key):
+        raise SinkError(
+            "the API key has characters no key has", hint="check for blanks and line breaks around it"
+        )
+    return Address(target.host, target.port, target.tls or target.tls_cert is not None, _roots(target), key)
+
+
+def _roots(target: ServerTarget) -> str | None:
+    if target.tls_cert is None:
+        return None
+    try:
+        roots = target.tls_cert.read_text("ascii")
+        ssl.create_default_context(cadata=roots)
+    except OSError as error:
+        what = error.strerror or "it holds no certificate"
+    except ValueError:
+        what = "it holds no certificate"
+    else:
+        return roots
+    raise SinkError(
+        f"the certificate file cannot be used: {what}", where=str(target.tls_cert), hint="PEM is wanted"
+    )
+
+
+def _bytes(metadata: bytes | str) -> bytes:
+    return metadata.encode() if isinstance(metadata, str) else metadata

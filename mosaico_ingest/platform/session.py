@@ -1,0 +1,197 @@
+"""This file is a writing session on a server: what it wrote becomes visible when it is finalized, or is deleted."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from mosaico_ingest import wire
+from mosaico_ingest.config import ServerTarget
+from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
+from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.platform.client import PlatformClient, connect
+from mosaico_ingest.platform.faults import Refused
+from mosaico_ingest.platform.upload import Memory, Upload
+from mosaico_ingest.policies import IfExists
+from mosaico_ingest.sink import StoredTopic
+from mosaico_ingest.wire import actions, bodies
+from mosaico_ingest.wire.actions import Action
+from mosaico_ingest.wire.bodies import topic_locator
+from mosaico_ingest.wire.conditions import Condition
+
+__all__ = ["PlatformSession"]
+
+_FILL = 0.9
+"""How full a message may be; the rest is left to what Flight and gRPC add."""
+
+
+class PlatformSession:
+    """One writing session; `commit` or `discard` ends it."""
+
+    def __init__(
+        self,
+        target: ServerTarget,
+        client: PlatformClient,
+        sequence: str,
+        metadata: str,
+        *,
+        if_exists: IfExists,
+        buffer_bytes: int,
+    ) -> None:
+        self._target = target
+        self._client = client
+        self._sequence = sequence
+        self._memory = Memory(most_bytes=buffer_bytes)
+        self._uploads: dict[str, Upload] = {}
+        self._given: dict[str, str] = {}
+        self._notes: list[tuple[str | None, str]] = []
+        self._session: bodies.SessionCreated | None = None
+        old = client.find(sequence)
+        self._held = _topics_of(old) if old and if_exists is IfExists.APPEND else frozenset[str]()
+        self._created = old is None or if_exists is not IfExists.APPEND
+        if old is not None and if_exists in {IfExists.FAIL, IfExists.SKIP}:
+            raise _taken(sequence)
+        if old is not None and if_exists is IfExists.REPLACE:
+            client.act(actions.SEQUENCE_DELETE, bodies.Located(locator=sequence))
+        if self._created:
+            self._create(metadata)
+
+    def topic(self, name: str, ontology: OntologyType, metadata: Mapping[str, Any]) -> Upload:
+        """Open a topic; see `Session.topic`."""
+        path = wire.check_topic_name(name)
+        described: dict[str, Any] = json.loads(wire.check_metadata(metadata, where=name))
+        if path in self._uploads:
+            raise SinkError("the topic is open already", where=name)
+        locator = topic_locator(self._sequence, path)
+        if locator in self._held:
+            hint = "rename it in topic_settings, or replace the sequence"
+            raise SinkError(
+                "the sequence has this topic, and a server adds no rows to one", where=name, hint=hint
+            )
+        question = bodies.TopicCreate(
+            session_uuid=self._open_session().uuid,
+            locator=locator,
+            serialization_format=ontology.serialization_format,
+            ontology_tag=ontology.tag,
+            user_metadata=described,
+        )
+        created = self._client.act(actions.TOPIC_CREATE, question)
+        put = bodies.Put(resource_locator=locator, topic_uuid=created.uuid)
+        upload = Upload(
+            name,
+            ontology,
+            lambda schema: self._client.put(put, schema),
+            message_bytes=int(self._client.message_bytes * _FILL),
+            memory=self._memory,
+            address=self._client.address,
+        )
+        self._uploads[path] = upload
+        self._given[name] = path
+        return upload
+
+    def note_error(self, message: str, *, topic: str | None = None) -> None:
+        """Attach an error; see `Session.note_error`. It is sent with the commit."""
+        self._notes.append((None if topic is None else wire.check_topic_name(topic), message))
+
+    def stored(self) -> tuple[StoredTopic, ...]:
+        """Return what the server says over a new connection; see `Session.stored`."""
+        with connect(self._target) as client:
+            return tuple(self._stored(client, name, path) for name, path in self._given.items())
+
+    def commit(self) -> None:
+        """Wait until the server has every topic, then make them visible at once."""
+        self._drop_broken()
+        for upload in self._uploads.values():
+            upload.close()
+        for path, message in self._notes:
+            self._send_note(path, message)
+        session = self._session
+        if session is None:
+            return
+        if self._uploads:
+            question = bodies.SessionFinalize(session_uuid=session.uuid)
+            self._surely(actions.SESSION_FINALIZE, question, lambda: self._is_final(session))
+        else:
+            self._delete_session(session)
+
+    def discard(self) -> str | None:
+        """Leave no trace; return what had to stay behind and why, None where nothing did."""
+        for upload in self._uploads.values():
+            upload.abandon()
+        try:
+            if self._session is not None:
+                self._delete_session(self._session)
+            if self._created:
+                self._client.act(actions.SEQUENCE_DELETE, bodies.Located(locator=self._sequence))
+        except Refused as refusal:
+            if refusal.condition is not Condition.NOT_FOUND:
+                return f"an unfinished session of {self._sequence} stays on the server ({refusal.what})"
+        except SinkError as error:
+            return f"an unfinished session of {self._sequence} may stay on the server ({error.what})"
+        return None
+
+    def _create(self, metadata: str) -> None:
+        question = bodies.SequenceCreate(locator=self._sequence, user_metadata=json.loads(metadata))
+        try:
+            self._surely(
+                actions.SEQUENCE_CREATE, question, lambda: self._client.find(self._sequence) is not None
+            )
+        except Refused as refusal:
+            if refusal.condition is Condition.EXISTS:
+                raise _taken(self._sequence) from refusal
+            raise
+
+    def _open_session(self) -> bodies.SessionCreated:
+        """Create the session with its first topic, since a server refuses to finalize an empty one."""
+        if self._session is None:
+            self._session = self._client.act(actions.SESSION_CREATE, bodies.Located(locator=self._sequence))
+        return self._session
+
+    def _drop_broken(self) -> None:
+        """Delete the topics whose streams broke, as their errors were raised; the others stay."""
+        for path, upload in tuple(self._uploads.items()):
+            if upload.broken is not None:
+                del self._uploads[path]
+                self._memory.uploads.remove(upload)
+                locator = topic_locator(self._sequence, path)
+                self._client.act(actions.TOPIC_DELETE, bodies.Located(locator=locator))
+
+    def _send_note(self, path: str | None, message: str) -> None:
+        if path in self._uploads:
+            locator = topic_locator(self._sequence, path)
+            note = bodies.NotificationCreate(locator=locator, msg=message)
+            self._client.act(actions.TOPIC_NOTIFICATION_CREATE, note)
+        else:
+            text = f"{path}: {message}" if path else message
+            note = bodies.NotificationCreate(locator=self._sequence, msg=text)
+            self._client.act(actions.SEQUENCE_NOTIFICATION_CREATE, note)
+
+    def _surely(self, action: Action[Any, Any], question: bodies.Body, is_done: Callable[[], bool]) -> None:
+        """Act; where the answer was lost, look whether it happened before asking again."""
+        try:
+            self._client.act(action, question)
+        except SinkUnavailable:
+            if not is_done():
+                self._client.act(action, question)
+
+    def _is_final(self, session: bodies.SessionCreated) -> bool:
+        found = self._client.find(self._sequence)
+        return found is not None and any(s.locked for s in found.sessions if s.locator == session.locator)
+
+    def _delete_session(self, session: bodies.SessionCreated) -> None:
+        self._client.act(actions.SESSION_DELETE, bodies.Located(locator=session.locator))
+
+    def _stored(self, client: PlatformClient, name: str, path: str) -> StoredTopic:
+        if path not in self._uploads:
+            return StoredTopic(name, 0, None, None, 0)
+        held = client.uploaded(topic_locator(self._sequence, path))
+        return StoredTopic(name, held.rows, held.start_ns, held.end_ns, held.stored_bytes)
+
+
+def _topics_of(sequence: bodies.SequenceInfo) -> frozenset[str]:
+    return frozenset(locator for session in sequence.sessions for locator in session.topics)
+
+
+def _taken(sequence: str) -> SequenceExists:
+    return SequenceExists("the sequence exists", where=sequence, hint="choose sequence.if_exists")
