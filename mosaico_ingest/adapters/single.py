@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from functools import cache
 from typing import Any, cast
 
@@ -10,6 +11,8 @@ import numpy as np
 import pyarrow as pa
 
 from mosaico_ingest.adapters.adapter import Adapter, AdapterSpec, Envelope
+from mosaico_ingest.adapters.builtin import Builtin
+from mosaico_ingest.adapters.mapping.load import MappingSpec
 from mosaico_ingest.adapters.python_adapter import PythonAdapterSpec
 from mosaico_ingest.bag.definition import Definition
 from mosaico_ingest.bag.message import ROSMessage
@@ -26,7 +29,6 @@ __all__ = ["adapt_dict", "metadata_of", "translate"]
 
 _DISTROS = (Stores.LATEST, Stores.ROS2_HUMBLE, Stores.ROS2_FOXY, Stores.ROS1_NOETIC)
 """Where the definition of a dict is looked for: the first whose fields include the dict's is taken."""
-_NAMES_LISTED = 3
 
 
 def translate(spec: AdapterSpec, msg: ROSMessage) -> Message:
@@ -63,27 +65,35 @@ def metadata_of(spec: AdapterSpec, ros_data: Mapping[str, Any], msgtype: str | N
 def _bind(
     spec: AdapterSpec, ros_data: Mapping[str, Any], msgtype: str | None
 ) -> tuple[Adapter, pa.StructArray, str]:
-    names = spec.ros_types if msgtype is None else (normalize_msgtype(msgtype),)
-    misfit = f"no version of {', '.join(names[:_NAMES_LISTED])} is known"
-    for definition in (one for name in names for one in _versions(name)):
+    own = () if msgtype is None else (normalize_msgtype(msgtype),)
+    misfits: list[str] = []
+    for definition in _candidates(spec, own):
         shape = ros_shape(definition)
         unknown = next(_unknown(ros_data, shape, ""), None)
         if unknown is None:
             return spec.bind(definition, shape), _row(ros_data, shape, spec.name), definition.root
-        misfit = f"{definition.root} has no field {unknown}"
-    raise AdapterError(f"{spec.name}: {misfit}")
+        misfits.append(f"{definition.root} has no field {unknown}")
+    known = f"no distro knows {', '.join(own or spec.ros_types)}"
+    raise AdapterError(f"{spec.name}: {misfits[0] if misfits else known}")
+
+
+def _candidates(spec: AdapterSpec, own: tuple[str, ...]) -> Iterator[Definition]:
+    """Yield what the message may look like: its own type in any distro, then the other types the adapter takes."""
+    mapping = spec.mapping if isinstance(spec, Builtin) else spec
+    text = mapping.model.definition if isinstance(mapping, MappingSpec) else None
+    for name in dict.fromkeys((*own, *spec.ros_types)):
+        yield from _versions(name, text if name == spec.ros_types[0] else None)
 
 
 @cache
-def _versions(msgtype: str) -> tuple[Definition, ...]:
-    """Return what a type looked like in the distros that have it."""
+def _versions(msgtype: str, text: str | None) -> tuple[Definition, ...]:
+    """Return a type as the distros have it, or as an adapter's own text says."""
     found: list[Definition] = []
     for distro in _DISTROS:
         version = 1 if distro is Stores.ROS1_NOETIC else 2
-        try:
-            found.append(TypeResolver(distro).resolve(msgtype, None, ros_version=version))
-        except BagError:
-            continue
+        own = {msgtype: text} if text else None
+        with suppress(BagError):
+            found.append(TypeResolver(distro, types=own).resolve(msgtype, None, ros_version=version))
     return tuple(found)
 
 

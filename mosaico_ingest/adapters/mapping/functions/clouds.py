@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mosaico_ingest.adapters.mapping.arrow import Array, arrays
+from mosaico_ingest.adapters.mapping.arrow import Array, DataType, arrays
 from mosaico_ingest.adapters.mapping.columns import field_of, nulls, open_list, var_list
 from mosaico_ingest.adapters.mapping.functions.registry import TEXT_LITERAL, Refuse, function, struct_with
 
@@ -139,6 +139,8 @@ def _columns(refuse: Refuse, cloud: Array, name: str, dtype: np.dtype[Any], conv
     if len(cloud) and clouds.alike():
         with suppress(_Misfit):  # which row it is comes out one by one
             place = clouds.place(0, name)
+            if place is None and clouds.entry_counts[0]:
+                return arrays.nulls(len(cloud), _list_of(dtype))
             if place is not None:
                 values = convert(_read(clouds.block(), place))
                 offsets = np.append(0, np.cumsum(clouds.heights * clouds.widths))
@@ -163,39 +165,39 @@ def _columns(refuse: Refuse, cloud: Array, name: str, dtype: np.dtype[Any], conv
     return var_list(arrays.array(flat.astype(dtype)), np.append(0, np.cumsum(lengths)), absent)
 
 
-def _list_of(name: str) -> Any:  # noqa: ANN401 - a pyarrow type
-    return arrays.list_(arrays.from_numpy_dtype(np.dtype(name)))
+def _list_of(dtype: np.dtype[Any]) -> DataType:
+    return arrays.list_(arrays.from_numpy_dtype(dtype))
 
 
-@function(_CLOUD, TEXT_LITERAL, gives=_list_of("f4"))
+@function(_CLOUD, TEXT_LITERAL, gives=_list_of(np.dtype(np.float32)))
 def points_float32(refuse: Refuse, cloud: Array, field: str) -> Array:
     """A field of every point of a PointCloud2 as float32; null where the cloud has no such field."""
     dtype = np.dtype(np.float32)
     return _columns(refuse, cloud, field, dtype, _cast_to(dtype))
 
 
-@function(_CLOUD, TEXT_LITERAL, gives=_list_of("f8"))
+@function(_CLOUD, TEXT_LITERAL, gives=_list_of(np.dtype(np.float64)))
 def points_float64(refuse: Refuse, cloud: Array, field: str) -> Array:
     """The same as float64."""
     dtype = np.dtype(np.float64)
     return _columns(refuse, cloud, field, dtype, _cast_to(dtype))
 
 
-@function(_CLOUD, TEXT_LITERAL, gives=_list_of("u1"))
+@function(_CLOUD, TEXT_LITERAL, gives=_list_of(np.dtype(np.uint8)))
 def points_uint8(refuse: Refuse, cloud: Array, field: str) -> Array:
     """The same as uint8; a value that is none rejects the row."""
     dtype = np.dtype(np.uint8)
     return _columns(refuse, cloud, field, dtype, _cast_to(dtype))
 
 
-@function(_CLOUD, TEXT_LITERAL, gives=_list_of("u2"))
+@function(_CLOUD, TEXT_LITERAL, gives=_list_of(np.dtype(np.uint16)))
 def points_uint16(refuse: Refuse, cloud: Array, field: str) -> Array:
     """The same as uint16; a value that is none rejects the row."""
     dtype = np.dtype(np.uint16)
     return _columns(refuse, cloud, field, dtype, _cast_to(dtype))
 
 
-@function(_CLOUD, TEXT_LITERAL, gives=_list_of("f4"))
+@function(_CLOUD, TEXT_LITERAL, gives=_list_of(np.dtype(np.float32)))
 def points_packed(refuse: Refuse, cloud: Array, field: str) -> Array:
     """A packed colour of every point: its four bytes as float32, the way PCL stores rgb, also where it says uint32."""
     return _columns(refuse, cloud, field, np.dtype(np.float32), _bits)
