@@ -17,6 +17,7 @@ from mosaico_ingest.decode.choose import decoder_for
 from mosaico_ingest.decode.decoder import Decoder
 from mosaico_ingest.diagnostics import RowFailure, Stage
 from mosaico_ingest.errors import AdapterError, BagError, DecodeError, IngestError, SinkError
+from mosaico_ingest.ontology.required import fill_required
 from mosaico_ingest.plan.model import TopicPlan
 from mosaico_ingest.policies import LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.report.events import Observer, Rejected, TopicProgress, TopicStatus
@@ -245,4 +246,5 @@ def _take(batch: RawBatch, keep: NDArray[np.int64]) -> RawBatch:
 def _record_batch(log_times: NDArray[np.int64], rows: pa.StructArray) -> pa.RecordBatch:
     """Put the time stamps before the ontology's columns."""
     schema = pa.schema([ENVELOPE, *rows.type])
-    return pa.RecordBatch.from_arrays([pa.array(log_times), *rows.flatten()], schema=schema)
+    columns = fill_required(rows).flatten()
+    return pa.RecordBatch.from_arrays([pa.array(log_times), *columns], schema=schema)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from contextlib import contextmanager
+from os.path import normpath
 from pathlib import Path
 
 from mosaico_ingest.bag.recording import Recording, open_recording
@@ -134,7 +135,7 @@ def _unplanned(config: ROSInjectionConfig) -> RunStarted:
 
 def place(target: StoreTarget | ServerTarget) -> str:
     """Return a target as people write it, without its key."""
-    return str(target.path) if isinstance(target, StoreTarget) else f"{target.host}:{target.port}"
+    return normpath(target.path) if isinstance(target, StoreTarget) else f"{target.host}:{target.port}"
 
 
 def _failed(error: IngestError) -> RunFinished:

@@ -1,0 +1,67 @@
+"""Rows with absent structs go through Parquet unchanged, whatever is required inside."""
+
+from __future__ import annotations
+
+import io
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mosaico_ingest.ontology.required import fill_required
+
+STAMP = pa.struct(
+    [pa.field("sec", pa.int32(), nullable=False), pa.field("frame", pa.string(), nullable=False)]
+)
+ROW = pa.struct(
+    [
+        pa.field("header", pa.struct([pa.field("stamp", STAMP), pa.field("seq", pa.uint64())])),
+        pa.field("pair", pa.list_(pa.field("item", STAMP), 2)),
+        pa.field("many", pa.list_(pa.field("item", STAMP))),
+        pa.field("inner", pa.struct([pa.field("deep", STAMP, nullable=False)])),
+        pa.field("flags", pa.struct([pa.field("list", pa.list_(pa.int8()), nullable=False)])),
+    ]
+)
+
+stamps = st.none() | st.fixed_dictionaries({"sec": st.integers(0, 9), "frame": st.sampled_from(["", "map"])})
+rows = st.fixed_dictionaries(
+    {
+        "header": st.none() | st.fixed_dictionaries({"stamp": stamps, "seq": st.none() | st.integers(0, 9)}),
+        "pair": st.lists(stamps, min_size=2, max_size=2),
+        "many": st.none() | st.lists(stamps, max_size=3),
+        "inner": st.none() | st.fixed_dictionaries({"deep": stamps.filter(bool)}),
+        "flags": st.none() | st.fixed_dictionaries({"list": st.lists(st.integers(0, 9), max_size=2)}),
+    }
+)
+
+
+@given(st.lists(rows, max_size=8), st.integers(0, 3), st.integers(0, 3))
+def test_rows_are_the_same_and_parquet_takes_them(given_rows: list[dict], front: int, back: int) -> None:
+    array = pa.array(given_rows, ROW)
+    array = array[front : max(front, len(array) - back)]
+    filled = fill_required(array)
+    assert filled.to_pylist() == array.to_pylist()
+    table = pa.Table.from_arrays(filled.flatten(), schema=pa.schema(list(ROW)))
+    table.validate(full=True)
+    file = io.BytesIO()
+    pq.write_table(table, file)
+    assert pq.read_table(file).to_pylist() == array.to_pylist()
+
+
+def test_a_column_without_required_fields_is_not_touched() -> None:
+    array = pa.array([{"a": None}, None], pa.struct([pa.field("a", pa.int32())]))
+    assert fill_required(array) is array
+
+
+def test_without_absent_structs_nothing_is_copied() -> None:
+    array = pa.array([{"stamp": {"sec": 1, "frame": ""}}], pa.struct([pa.field("stamp", STAMP)]))
+    assert fill_required(array) is array
+
+
+@pytest.mark.parametrize("kind", [pa.bool_(), pa.float32(), pa.binary(), pa.string(), pa.uint8()])
+def test_every_kind_of_value_has_a_zero(kind: pa.DataType) -> None:
+    struct = pa.struct([pa.field("x", pa.struct([pa.field("y", kind, nullable=False)]))])
+    filled = fill_required(pa.array([{"x": None}], struct))
+    assert filled.field(0).field(0).null_count == 0
