@@ -222,12 +222,12 @@ def _roots(target: ServerTarget) -> str | None:
     if target.tls_cert is None:
         return None
     try:
-        roots = target.tls_cert.read_text("ascii")
+        roots = target.tls_cert.read_text("ascii", errors="ignore")  # bundles carry comments in any script
         ssl.create_default_context(cadata=roots)
-    except OSError as error:
-        what = error.strerror or "it holds no certificate"
-    except ValueError:
+    except (ssl.SSLError, ValueError):
         what = "it holds no certificate"
+    except OSError as error:
+        what = error.strerror or str(error)
     else:
         return roots
     raise SinkError(
