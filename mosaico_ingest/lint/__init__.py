@@ -1,1 +1,1 @@
-"""Judges manifests, adapters and message definitions without opening a recording or a socket."""
+"""Judges job manifests, adapter files and `.msg` files without opening a recording or a socket; writes nothing but fixes."""

@@ -105,7 +105,12 @@ class Composer:
     def _node(self, event: yaml.Event, *, depth: int) -> _Node:
         if depth > MAX_DEPTH:
             raise LimitExceeded(
-                self._finding("yaml-depth", f"values nest deeper than {MAX_DEPTH} levels", self._span(event))
+                self._finding(
+                    "yaml-depth",
+                    f"values nest deeper than {MAX_DEPTH} levels",
+                    self._span(event),
+                    "flatten it",
+                )
             )
         if isinstance(event, yaml.AliasEvent):
             return self._count(self._alias(event), event)
@@ -125,7 +130,7 @@ class Composer:
         self._nodes += node.size if size is None else size
         if self._nodes > MAX_NODES:
             message = f"more than {MAX_NODES} values, aliases counted with what they stand for"
-            raise LimitExceeded(self._finding("yaml-size", message, self._span(event)))
+            raise LimitExceeded(self._finding("yaml-size", message, self._span(event), "use fewer aliases"))
         return node
 
     def _anchor(self, name: str, node: _Node, event: yaml.Event) -> None:

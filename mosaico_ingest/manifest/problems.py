@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any
@@ -14,7 +15,7 @@ from pydantic_core import ErrorDetails
 from mosaico_ingest.diagnostics import Edit, Finding, Severity, Span
 from mosaico_ingest.manifest.source import Path, Source, Value, member
 
-__all__ = ["explain", "keys_at", "nearest"]
+__all__ = ["explain", "keys_at", "nearest", "place_of"]
 
 _EXPECTED = {
     "string_type": "text",
@@ -69,6 +70,16 @@ def explain(error: ValidationError, *, source: Source, schema: dict[str, Any]) -
     ]
 
 
+def place_of(location: Path, value: Value) -> Path:
+    """Follow an error's location through the document; what is not there (a union's branch) is no part of the path."""
+    path: Path = ()
+    for part in location:
+        with suppress(LookupError):
+            value = member(value, part)
+            path = (*path, part)
+    return path
+
+
 def nearest(word: str, known: Iterable[str]) -> str | None:
     """Return the known word that `word` was probably meant to be: same letters, a missing prefix, or a slip."""
     words = list(known)
@@ -104,16 +115,8 @@ def _plain(word: str) -> str:
 
 
 def _problem(details: ErrorDetails, source: Source, schema: dict[str, Any]) -> _Problem:
-    """Follow the error's location through the document; what is not there (a union's branch) is no part of the path."""
-    value = source.value
-    path: Path = ()
-    for part in details["loc"]:
-        try:
-            value = member(value, part)
-        except LookupError:
-            continue
-        path = (*path, part)
-    return _Problem(details, path, value, source, schema)
+    path = place_of(details["loc"], source.value)
+    return _Problem(details, path, source.at(path), source, schema)
 
 
 def _descend(node: dict[str, Any], part: object) -> dict[str, Any]:

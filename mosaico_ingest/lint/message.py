@@ -1,0 +1,76 @@
+"""This file is a `.msg` file as the rules see it: its declarations with their places, and its neighbours."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from mosaico_ingest.diagnostics import Span
+
+__all__ = ["Declaration", "MessageFile", "read_message"]
+
+_DECLARATION = re.compile(
+    r"\s*(?P<type>[A-Za-z]\w*(?:/\w+)*)(?P<bound><=\d+)?(?P<array>\[(?:<=)?\d*\])?\s+(?P<name>\w+)\s*(?P<rest>.*)"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Declaration:
+    """One line: a field or a constant."""
+
+    type: str
+    name: str
+    constant: bool
+    value: str
+    type_span: Span
+    name_span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class MessageFile:
+    """A definition text."""
+
+    file: str
+    text: str
+    declarations: tuple[Declaration, ...]
+    path: Path | None = None
+    """The file on disk, if there is one."""
+
+    @property
+    def name(self) -> str:
+        """The type's own name: the file's, without `.msg`."""
+        return Path(self.file).stem
+
+    def lines(self) -> Iterator[tuple[Span, str]]:
+        """Yield every line that is not blank, with its place."""
+        for number, line in enumerate(self.text.splitlines(), 1):
+            if line.strip():
+                start = len(line) - len(line.lstrip()) + 1
+                yield Span(self.file, number, start, number, len(line.rstrip()) + 1), line
+
+
+def read_message(text: str, *, file: str, path: Path | None = None) -> MessageFile:
+    """Read a definition; never raises."""
+    matches = (
+        (number, _DECLARATION.fullmatch(_code(line))) for number, line in enumerate(text.splitlines(), 1)
+    )
+    declarations = (_declaration(match, file, number) for number, match in matches if match is not None)
+    return MessageFile(file, text, tuple(declarations), path)
+
+
+def _code(line: str) -> str:
+    """Return a line without its comment; a constant's text may hold a `#`."""
+    before = line.split("#", 1)[0]
+    return (line if "=" in before else before).rstrip()
+
+
+def _declaration(match: re.Match[str], file: str, number: int) -> Declaration:
+    def span(group: str) -> Span:
+        return Span(file, number, match.start(group) + 1, number, match.end(group) + 1)
+
+    rest = match["rest"]
+    constant = rest.startswith("=")
+    value = rest.removeprefix("=").strip()
+    return Declaration(match["type"], match["name"], constant, value, span("type"), span("name"))

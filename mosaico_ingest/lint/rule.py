@@ -1,0 +1,65 @@
+"""This file is what a rule is: a code, a name, a page, and a check of a job or of a message definition."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from textwrap import dedent
+
+from mosaico_ingest.diagnostics import Edit, Finding, Severity, Span
+from mosaico_ingest.lint.job import Job
+from mosaico_ingest.lint.message import MessageFile
+
+__all__ = ["Problem", "Rule"]
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """What a rule found; the engine adds the rule's name and severity."""
+
+    message: str
+    span: Span
+    help: str | None = None
+    fix: Edit | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """A rule; without a check of its own it names what is found while the text is read."""
+
+    code: str
+    module: str
+    severity: Severity
+    page: str | None
+    """The module's docstring: what, why, a bad and a good example."""
+    job: Callable[[Job], Iterable[Problem]] | None = None
+    message: Callable[[MessageFile], Iterable[Problem]] | None = None
+
+    @property
+    def name(self) -> str:
+        """Its name, as `yaml-tag`; the file is called the same."""
+        return self.module.rpartition(".")[2].replace("_", "-")
+
+    @property
+    def title(self) -> str:
+        """Its page's first line without the name: what it finds, in a few words."""
+        first = (self.page or "").strip("\n").splitlines()[0]
+        return first.partition(": ")[2]
+
+    def finding(self, problem: Problem) -> Finding:
+        """Return a problem as a finding of this rule."""
+        return Finding(self.name, self.severity, problem.message, problem.span, problem.help, problem.fix)
+
+    def examples(self, heading: str) -> list[str]:
+        r"""Return the blocks of the page under `Bad:` or `Good:`; a `\t` in them is a tab."""
+        blocks: list[str] = []
+        block: list[str] | None = None
+        for line in (self.page or "").strip("\n").replace("\\t", "\t").splitlines():
+            if line == f"{heading}:":
+                block = []
+            elif block is not None and (not line or line.startswith("    ")):
+                block.append(line)
+            elif block is not None:
+                blocks.append(dedent("\n".join(block)).strip("\n") + "\n")
+                block = None
+        return blocks if block is None else [*blocks, dedent("\n".join(block)).strip("\n") + "\n"]

@@ -1,0 +1,38 @@
+"""`distro-missing`: a `.db3` recording without a distro.
+
+SQLite recordings of most distros carry no definitions of their messages. Types that changed between distros then
+cannot be read.
+
+Bad:
+    bag: {path: data/run.db3}
+
+Good:
+    bag: {path: data/run.db3, ros_distro: ros2_humble}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.lint.job import Job
+from mosaico_ingest.lint.places import recording_paths
+from mosaico_ingest.lint.rule import Problem, Rule
+
+
+def check(job: Job) -> Iterator[Problem]:
+    """Yield a problem if a part is a `.db3` file and neither a distro nor definitions are named."""
+    bag = job.manifest.bag
+    if bag.ros_distro is not None or job.given("bag", "ros_distro"):
+        return
+    for place, path in recording_paths(job):
+        if path.lower().endswith(".db3"):
+            yield Problem(
+                f"{path} may carry no definitions",
+                job.source.span(place),
+                "add bag.ros_distro, as ros2_humble",
+            )
+            return
+
+
+RULE = Rule("ING212", __name__, Severity.WARNING, __doc__, job=check)

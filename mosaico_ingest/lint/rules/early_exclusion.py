@@ -1,0 +1,35 @@
+"""`early-exclusion`: an exclusion before anything is included.
+
+With a plain pattern in the list, the start is no topic at all. An exclusion above the first plain pattern has nothing
+to leave out.
+
+Bad:
+    bag: {path: data/run.mcap}
+    topics: ["!/camera/debug", /imu]
+
+Good:
+    bag: {path: data/run.mcap}
+    topics: [/imu]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.lint.globs import bare, covers
+from mosaico_ingest.lint.job import Job
+from mosaico_ingest.lint.rule import Problem, Rule
+
+
+def check(job: Job) -> Iterator[Problem]:
+    """Yield a problem for each exclusion that comes before the first inclusion, unless that undoes it."""
+    patterns = job.manifest.topics
+    first = next((i for i, pattern in enumerate(patterns) if not pattern.startswith("!")), None)
+    for i in range(first or 0):
+        if not any(covers(later, bare(patterns[i])) for later in patterns[i + 1 :] if later[:1] != "!"):
+            message = f"{patterns[i]!r} has nothing to leave out: no pattern above it includes anything"
+            yield Problem(message, job.span("topics", i), "put it below what it is an exception of")
+
+
+RULE = Rule("ING205", __name__, Severity.WARNING, __doc__, job=check)

@@ -1,0 +1,38 @@
+"""`metadata-number`: a number that JSON cannot hold.
+
+Metadata is kept as JSON, which has no infinity and no NaN.
+
+Bad:
+    bag: {path: data/run.mcap}
+    sequence:
+      metadata: {max_range: .inf}
+
+Good:
+    bag: {path: data/run.mcap}
+    sequence:
+      metadata: {max_range: null}
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.lint.job import Job
+from mosaico_ingest.lint.places import metadata_places, values_below
+from mosaico_ingest.lint.rule import Problem, Rule
+
+
+def check(job: Job) -> Iterator[Problem]:
+    """Yield a problem for each infinite number or NaN in metadata."""
+    for place in metadata_places(job):
+        for path in values_below(job.source.at(place), place):
+            value = job.source.at(path)
+            if isinstance(value, float) and not math.isfinite(value):
+                yield Problem(
+                    f"{value} cannot be kept as JSON", job.source.span(path), "write null, or a text"
+                )
+
+
+RULE = Rule("ING210", __name__, Severity.ERROR, __doc__, job=check)

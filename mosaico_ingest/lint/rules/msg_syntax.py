@@ -1,0 +1,41 @@
+"""`msg-syntax`: a line that declares nothing.
+
+A line of a `.msg` file is `type name`, `type NAME=value`, or a comment. The whole type cannot be used otherwise.
+
+Bad:
+    float64 voltage
+    current
+
+Good:
+    float64 voltage
+    float64 current
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from mosaico_ingest.bag.msgtext import parse_msg
+from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.errors import BagError
+from mosaico_ingest.lint.message import MessageFile
+from mosaico_ingest.lint.rule import Problem, Rule
+
+
+def check(message: MessageFile) -> Iterator[Problem]:
+    """Yield a problem for each line the parser of definitions refuses."""
+    for span, line in message.lines():
+        fault = _fault(line, message.name)
+        if fault is not None:
+            yield Problem(fault, span, "a line is `type name`, `type NAME=value` or a comment")
+
+
+def _fault(line: str, name: str) -> str | None:
+    try:
+        parse_msg(line, name)
+    except BagError as error:
+        return error.what
+    return None
+
+
+RULE = Rule("ING301", __name__, Severity.ERROR, __doc__, message=check)

@@ -1,0 +1,38 @@
+"""`msg-unknown-type`: a field of a type that is nowhere.
+
+It is no primitive, no file beside this one, and in no distro. Bags that carry it cannot be read with this definition.
+
+Bad:
+    geometry_msgs/Pose pose
+    CellState[] cells
+
+Good:
+    geometry_msgs/Pose pose
+    Cell[] cells
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from mosaico_ingest.bag.msgtext import PRIMITIVES
+from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.lint.definitions import is_known
+from mosaico_ingest.lint.message import MessageFile
+from mosaico_ingest.lint.rule import Problem, Rule
+
+
+def check(message: MessageFile) -> Iterator[Problem]:
+    """Yield a problem for each type that cannot be found."""
+    for declaration in message.declarations:
+        kind = declaration.type
+        if declaration.constant or kind in PRIMITIVES or kind in _SPECIAL or is_known(kind, message.path):
+            continue
+        remedy = "put its .msg file beside this one" if "/" not in kind else "define it under bag.custom_msgs"
+        yield Problem(f"there is no type {kind!r}", declaration.type_span, remedy)
+
+
+_SPECIAL = {"time", "duration", "Header"}
+
+
+RULE = Rule("ING302", __name__, Severity.ERROR, __doc__, message=check)

@@ -1,0 +1,37 @@
+"""`name-without-placeholder`: one name for every match of a glob.
+
+A glob is one sequence for each recording it matches; with a fixed name the second one finds it taken.
+
+Bad:
+    bag: {path: "data/*.mcap"}
+    sequence: {name: run}
+
+Good:
+    bag: {path: "data/*.mcap"}
+    sequence: {name: "run_{stem}"}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.lint.globs import is_glob
+from mosaico_ingest.lint.job import Job
+from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.manifest.placeholders import placeholders_in
+
+
+def check(job: Job) -> Iterator[Problem]:
+    """Yield a problem if the path is a glob and the name the same for all."""
+    path, name = job.manifest.bag.path, job.manifest.sequence.name
+    varying = any(
+        placeholder.name in {"stem", "name", "index", "parent"} for placeholder in placeholders_in(name)
+    )
+    if isinstance(path, str) and is_glob(path) and job.known(name) and not varying:
+        span = job.span("sequence", "name")
+        message = f"every recording that {path} matches would be named {name!r}"
+        yield Problem(message, span, "put {stem} or {index} into it")
+
+
+RULE = Rule("ING208", __name__, Severity.ERROR, __doc__, job=check)

@@ -1,0 +1,40 @@
+"""`overwritten-input`: a report that would overwrite an input.
+
+The report's path is that of a file the job reads.
+
+Bad:
+    bag: {path: data/run.mcap}
+    sequence: {metadata_file: metadata.json}
+    run: {report: metadata.json}
+
+Good:
+    bag: {path: data/run.mcap}
+    sequence: {metadata_file: metadata.json}
+    run: {report: report.json}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from os.path import normpath
+
+from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.lint.job import Job
+from mosaico_ingest.lint.places import recording_paths
+from mosaico_ingest.lint.rule import Problem, Rule
+
+
+def check(job: Job) -> Iterator[Problem]:
+    """Yield a problem if the report is also a recording, the metadata or the manifest."""
+    report = job.manifest.run.report
+    if report is None:
+        return
+    inputs = [path for _, path in recording_paths(job)]
+    inputs += [path for path in (job.manifest.sequence.metadata_file, job.source.file) if path is not None]
+    if normpath(report) in {normpath(path) for path in inputs}:
+        yield Problem(
+            f"{report} is read by this job", job.span("run", "report"), "write the report elsewhere"
+        )
+
+
+RULE = Rule("ING234", __name__, Severity.ERROR, __doc__, job=check)

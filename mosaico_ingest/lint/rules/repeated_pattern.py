@@ -1,0 +1,39 @@
+"""`repeated-pattern`: a pattern that another one contains.
+
+Everything it matches is matched by another pattern of the same kind, with nothing in between that would matter.
+
+Bad:
+    bag: {path: data/run.mcap}
+    topics: [/camera/*, /camera/front]
+
+Good:
+    bag: {path: data/run.mcap}
+    topics: [/camera/*]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.lint.globs import bare, covers
+from mosaico_ingest.lint.job import Job
+from mosaico_ingest.lint.rule import Problem, Rule
+
+
+def check(job: Job) -> Iterator[Problem]:
+    """Yield a problem for each pattern that repeats an earlier one."""
+    patterns = job.manifest.topics
+    for i, pattern in enumerate(patterns):
+        for j in range(i - 1, -1, -1):
+            earlier = patterns[j]
+            if earlier.startswith("!") != pattern.startswith("!"):
+                break  # the order matters here
+            if covers(bare(earlier), bare(pattern)):
+                line = job.span("topics", j).line
+                message = f"{pattern!r} adds nothing to {earlier!r} in line {line}"
+                yield Problem(message, job.span("topics", i), "remove it")
+                break
+
+
+RULE = Rule("ING204", __name__, Severity.WARNING, __doc__, job=check)

@@ -1,0 +1,51 @@
+"""`sequence-name`: a sequence name the platform refuses.
+
+Names go into paths and queries: ASCII, no blank, no slash, none of ``! " ' * $ % & . :``. What placeholders stand for is
+made to fit, what is written is not.
+
+Bad:
+    bag: {path: data/run.mcap}
+    sequence: {name: "run 1.2"}
+
+Good:
+    bag: {path: data/run.mcap}
+    sequence: {name: run_1_2}
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.errors import SinkError
+from mosaico_ingest.lint.job import Job
+from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.manifest.placeholders import placeholders_in
+from mosaico_ingest.wire import check_sequence_name
+
+
+def check(job: Job) -> Iterator[Problem]:
+    """Yield a problem if the name, with any placeholder filled in, is refused."""
+    name = job.manifest.sequence.name
+    if not job.known(name):
+        return
+    plain = name
+    for placeholder in reversed(list(placeholders_in(name))):
+        plain = (
+            plain[: placeholder.start]
+            + "x" * (placeholder.end - placeholder.start)
+            + plain[placeholder.end :]
+        )
+    try:
+        check_sequence_name(plain)
+    except SinkError:
+        allowed = re.compile(r"[^A-Za-z0-9_-]").search(plain)
+        start = allowed.start() if allowed else 0
+        span = job.source.inner_span(("sequence", "name"), start, start + 1)
+        yield Problem(
+            f"{plain[start]!r} cannot be in the name of a sequence", span, "use letters, digits, _ and -"
+        )
+
+
+RULE = Rule("ING206", __name__, Severity.ERROR, __doc__, job=check)

@@ -1,0 +1,40 @@
+"""`unknown-placeholder`: a placeholder that nothing stands for.
+
+The placeholders are {stem}, {name}, {parent}, {date} and {index}; `{index:03}` writes the index with leading zeros.
+
+Bad:
+    bag: {path: data/run.mcap}
+    sequence: {name: "{file}_raw"}
+
+Good:
+    bag: {path: data/run.mcap}
+    sequence: {name: "{stem}_raw"}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.lint.job import Job
+from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.manifest.placeholders import PLACEHOLDERS, placeholders_in
+from mosaico_ingest.manifest.problems import nearest
+
+
+def check(job: Job) -> Iterator[Problem]:
+    """Yield a problem for each unknown placeholder of the name."""
+    name = job.manifest.sequence.name
+    for placeholder in placeholders_in(name):
+        if placeholder.known or name[placeholder.start - 1 : placeholder.start] == "$":
+            continue
+        close = nearest(placeholder.name, PLACEHOLDERS)
+        span = job.source.inner_span(("sequence", "name"), placeholder.start, placeholder.end)
+        known = ", ".join(f"{{{known}}}" for known in PLACEHOLDERS)
+        hint = f"did you mean {{{close}}}? " if close else ""
+        yield Problem(
+            f"nothing stands for {name[placeholder.start : placeholder.end]}", span, f"{hint}known: {known}"
+        )
+
+
+RULE = Rule("ING207", __name__, Severity.ERROR, __doc__, job=check)

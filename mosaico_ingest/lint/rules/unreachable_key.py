@@ -1,0 +1,44 @@
+"""`unreachable-key`: a glob that an earlier glob hides.
+
+An exact name comes before every glob, and of the globs the first that matches counts. Every topic this one matches is
+taken by a glob above it.
+
+Bad:
+    bag: {path: data/run.mcap}
+    topic_settings:
+      "/camera/*": {every: 2}
+      "/camera/front/*": {every: 5}
+
+Good:
+    bag: {path: data/run.mcap}
+    topic_settings:
+      "/camera/front/*": {every: 5}
+      "/camera/*": {every: 2}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.lint.globs import covers, is_glob
+from mosaico_ingest.lint.job import Job
+from mosaico_ingest.lint.places import keyed_patterns
+from mosaico_ingest.lint.rule import Problem, Rule
+
+
+def check(job: Job) -> Iterator[Problem]:
+    """Yield a problem for each key that is a glob and is covered by a glob above it."""
+    above: list[tuple[str, str, int]] = []
+    for section, pattern, span in keyed_patterns(job):
+        if not is_glob(pattern):
+            continue
+        for earlier_section, earlier, line in above:
+            if earlier_section == section and covers(earlier, pattern):
+                message = f"{pattern!r} is never used: {earlier!r} in line {line} takes all its topics"
+                yield Problem(message, span, "put it above")
+                break
+        above.append((section, pattern, span.line))
+
+
+RULE = Rule("ING221", __name__, Severity.WARNING, __doc__, job=check)

@@ -1,0 +1,29 @@
+"""A project folder with every file that the examples of the rules speak of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+ADAPTER = """\
+version: 1
+adapter: PackAdapter
+ros_type: sensor_msgs/msg/Temperature
+ontology: Temperature
+fields:
+  header: header
+  value: temperature
+"""
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    for folder in ("data", "msgs", "adapters", ".git"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "msgs" / "BatteryPack.msg").write_text("float64 voltage\n")
+    (tmp_path / "msgs" / "Cell.msg").write_text("float64 voltage\n")
+    (tmp_path / "metadata.json").write_text("{}")
+    (tmp_path / "adapters" / "pack.yaml").write_text(ADAPTER)
+    (tmp_path / "adapters" / "wheel.py").write_text("class WheelAdapter(Base):\n    pass\n")
+    return tmp_path
