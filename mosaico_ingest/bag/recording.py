@@ -14,7 +14,7 @@ from mosaico_ingest.bag.batch import Channel, Encoding, Loss, RawBatch
 from mosaico_ingest.bag.channels import ChannelTable
 from mosaico_ingest.bag.containers.opening import open_part
 from mosaico_ingest.bag.containers.packed import inflate_messages
-from mosaico_ingest.bag.containers.part import EARLIEST_NS, LATEST_NS, Hole, Part, Slab, Want
+from mosaico_ingest.bag.containers.part import EARLIEST_NS, LATEST_NS, Block, Hole, Loaded, Part, Slab, Want
 from mosaico_ingest.bag.definition import Resolver
 from mosaico_ingest.bag.discover import Found, discover
 from mosaico_ingest.bag.findings import compare
@@ -146,7 +146,7 @@ class Recording:
     def _steps(self, wants: Sequence[Want]) -> Iterator[_Step]:
         """Load block after block; runs in the prefetching thread."""
         sources = [
-            (part.start_ns, partial(part.blocks, want))
+            (part.start_ns, partial(_blocks, part, want))
             for part, want in zip(self._parts, wants, strict=True)
             if want.keys
         ]
@@ -172,3 +172,12 @@ class Recording:
             channel = None if hole.key is None else self._table.channel_id(number, hole.key)
             loss = Loss(str(self._parts[number].path), hole.offset, hole.reason, channel, hole.count)
             self._losses[loss] = None
+
+
+def _blocks(part: Part, want: Want) -> Iterator[Block]:
+    """Yield the blocks of a part; where it can tell of no more, that is a hole and not the end of the recording."""
+    try:
+        yield from part.blocks(want)
+    except BagError as err:
+        hole = Hole(0, err.what)
+        yield Block(LATEST_NS, lambda: Loaded([], [hole]))

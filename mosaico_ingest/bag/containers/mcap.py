@@ -25,7 +25,7 @@ from mosaico_ingest.bag.containers.mcap_index import (
     Schema,
     chunk_head,
     read_index,
-    read_loose,
+    read_pieces,
 )
 from mosaico_ingest.bag.containers.part import (
     EARLIEST_NS,
@@ -83,17 +83,17 @@ class McapPart:
         self.message_count: int | None = sum(index.counts.values()) if index.counts is not None else None
         self.holes: list[Hole] = [*index.holes, *orphans(index.counts, index.channels)]
         self.notes: list[str] = []
+        self._pieces: tuple[list[Piece], list[Hole]] | None = None
 
     def blocks(self, want: Want) -> Iterator[Block]:
         """Yield the chunks, and the stretches between chunks, that may hold wanted messages."""
-        index = read_loose(self._source, self._index)
-        keys = frozenset(want.keys)
-        losses = index.holes[len(self._index.holes) :]
-        if losses:
-            yield Block(EARLIEST_NS, lambda: Loaded([], losses))
-        for piece in sorted(index.pieces, key=lambda piece: piece.start_ns):
-            named = {key for key, _ in piece.index_offsets()}
-            if want.times(piece.start_ns, piece.end_ns) and (not named or named & keys):
+        if self._pieces is None:
+            self._pieces = read_pieces(self._source, self._index)
+        pieces, holes = self._pieces
+        if holes:
+            yield Block(EARLIEST_NS, lambda: Loaded([], list(holes)))
+        for piece in pieces:
+            if want.times(piece.start_ns, piece.end_ns) and piece.has_any(want.keys):
                 yield Block(min(piece.start_ns, LATEST_NS), partial(self._load, piece, want))
 
     def close(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
 
 from mosaico_ingest.bag.containers.compression import inflate_some
@@ -21,7 +21,7 @@ __all__ = [
     "Piece",
     "chunk_head",
     "read_index",
-    "read_loose",
+    "read_pieces",
 ]
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -73,6 +73,10 @@ class Piece:
     """Channel (u16) and file offset (u64) of each message index; empty where there is none."""
     is_chunk: bool = True
     is_cut: bool = False
+
+    def has_any(self, keys: Collection[int]) -> bool:
+        """Return whether there may be messages of these channels."""
+        return not self.indexes or any(key in keys for key, _ in self.index_offsets())
 
     def index_offsets(self) -> list[tuple[int, int]]:
         """Return channel and file offset of each message index."""
@@ -141,31 +145,19 @@ def read_index(source: FileSource) -> McapIndex:
     return index
 
 
-def read_loose(source: FileSource, index: McapIndex) -> McapIndex:
-    """Return the index with what the summary does not name: messages and chunks between its chunks."""
-    if index.walked:
-        return index
-    found = McapIndex(dict(index.schemas), dict(index.channels), [], index.counts, walked=True)
-    walk = _Walk(source, found)
-    at = len(MAGIC)
+def read_pieces(source: FileSource, index: McapIndex) -> tuple[list[Piece], list[Hole]]:
+    """Return all pieces by time, also those that the summary does not name, and what is broken between its chunks."""
     known = sorted(index.pieces, key=lambda piece: piece.offset)
-    for piece in known:
-        if piece.offset > at:
-            walk.over(at, piece.offset)
-        at = max(at, piece.stop)
-    walk.over(at, index.data_end)
-    pieces = known + found.pieces
-    return McapIndex(
-        found.schemas,
-        found.channels,
-        pieces,
-        index.counts,
-        index.start_ns,
-        index.end_ns,
-        index.data_end,
-        index.holes + found.holes,
-        walked=True,
-    )
+    found = McapIndex()
+    at = len(MAGIC)
+    if not index.walked:
+        walk = _Walk(source, found)
+        for piece in known:
+            if piece.offset > at:
+                walk.over(at, piece.offset)
+            at = max(at, piece.stop)
+        walk.over(at, index.data_end)
+    return sorted(known + found.pieces, key=lambda piece: piece.start_ns), found.holes
 
 
 def _summary(source: FileSource) -> McapIndex | None:

@@ -48,6 +48,7 @@ class Ros1Part:
         except BaseException:
             self._source.close()
             raise
+        self._pieces = sorted(self._index.pieces, key=lambda piece: piece.start_ns)
         counts: dict[int, int] = {}
         for piece in self._index.pieces:
             for key, count in piece.counts.items():
@@ -63,7 +64,7 @@ class Ros1Part:
     def blocks(self, want: Want) -> Iterator[Block]:
         """Yield the chunks that may hold wanted messages."""
         keys = frozenset(want.keys)
-        for piece in sorted(self._index.pieces, key=lambda piece: piece.start_ns):
+        for piece in self._pieces:
             if piece.is_cut or (want.times(piece.start_ns, piece.end_ns) and piece.counts.keys() & keys):
                 yield Block(piece.start_ns, partial(self._load, piece, want))
 

@@ -37,15 +37,23 @@ class FileSource:
             raise BagError(
                 f"{size} bytes expected at {offset}, the file ends at {self.size}", where=str(self.path)
             )
+        data = self.read_some(offset, size)
+        if len(data) < size:
+            raise BagError(
+                f"{size} bytes expected at {offset}, {len(data)} found: the file became shorter",
+                where=str(self.path),
+            )
+        return data
+
+    def read_some(self, offset: int, size: int) -> bytes:
+        """Return up to `size` bytes from `offset` on, fewer only where the file ends.
+
+        Raises:
+            BagError: The disk refuses.
+        """
         try:
             data = os.pread(self._fd, size, offset)
-            while len(data) < size:
-                more = os.pread(self._fd, size - len(data), offset + len(data))
-                if not more:
-                    raise BagError(
-                        f"{size} bytes expected at {offset}, {len(data)} found: the file became shorter",
-                        where=str(self.path),
-                    )
+            while len(data) < size and (more := os.pread(self._fd, size - len(data), offset + len(data))):
                 data += more
         except OSError as err:
             raise BagError(f"cannot be read at {offset}: {err.strerror}", where=str(self.path)) from err
@@ -71,7 +79,7 @@ class Window:
         begin = offset - self._at
         if begin < 0 or begin + size > len(self._data):
             left = max(self._source.size - offset, 0)
-            self._data = self._source.read(offset, min(max(size, _WINDOW_BYTES), left))
+            self._data = self._source.read_some(offset, min(max(size, _WINDOW_BYTES), left))
             self._at, begin = offset, 0
         return self._data[begin : begin + size]
 
