@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from mosaico_ingest.cli import bag, inspect, run, store
+from mosaico_ingest.cli import bag, inspect, lint, run, store
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.version import __version__
 
@@ -21,6 +21,7 @@ COMMANDS: tuple[tuple[str, Callable[..., Any]], ...] = (
     ("run", run.run),
     ("bag", bag.bag),
     ("inspect", inspect.inspect),
+    ("lint", lint.lint),
 )
 """In the order `--help` lists them."""
 
