@@ -223,7 +223,7 @@ def _roots(target: ServerTarget) -> str | None:
         return None
     try:
         roots = target.tls_cert.read_text("ascii", errors="ignore")  # bundles carry comments in any script
-        ssl.create_default_context(cadata=roots)
+        ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_verify_locations(cadata=roots)
     except (ssl.SSLError, ValueError):
         what = "it holds no certificate"
     except OSError as error:
