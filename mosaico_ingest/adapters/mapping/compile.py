@@ -118,7 +118,7 @@ class Compiler:
             return None
         replaced = self._with(form.replaced, slot.at("with")) if form.replaced else ()
         when = self._condition(form.when, slot.at("when")) if form.when else None
-        source = self._source(form, slot if form is not value else slot.at("value"))
+        source = self._source(form, slot, slot if form is not value else slot.at("value"))
         if not field.nullable and isinstance(source, Absent):
             message = f"{slot.name} is required, it cannot be null"
             self._desk.report(slot.path, message, "give it a value", rule="missing-target")
@@ -127,14 +127,14 @@ class Compiler:
             return None
         return Filled(slot.name, field.name, field.type, field.nullable, source, replaced, when)
 
-    def _source(self, form: Form, slot: Slot) -> Source | None:
+    def _source(self, form: Form, slot: Slot, written: Slot) -> Source | None:
         if form.use is not None:
             return self._by_adapter(form.use, slot, form.of or "self")
         if form.fields is not None:
             return self._by_fields(form.fields, slot, form.of, set(form.replaced or ()))
         if form.map is not None:
             return compile_lookup(self._desk, form, slot)
-        return self._computed(form.value, slot)
+        return self._computed(form.value, written)
 
     def _computed(self, value: Scalar, slot: Slot) -> Source | None:
         if value is None:

@@ -130,7 +130,6 @@ _OPERATORS: dict[type[ast.AST], str] = {
     ast.LtE: "<=",
     ast.Gt: ">",
     ast.GtE: ">=",
-    ast.In: "in",
     ast.And: "and",
     ast.Or: "or",
     ast.Not: "not",
@@ -200,7 +199,8 @@ def _spell_each(text: str) -> tuple[str, list[int]]:
 
 
 def _syntax_error(error: SyntaxError, text: str, moved: list[int], lead: int) -> ExpressionError:
-    at = min(_original(max((error.offset or 1) - 1, 0) + lead, moved), max(len(text) - 1, 0))
+    last = max(len(text) - 1, 0)
+    at = min(_original(error.offset - 1 + lead, moved), last) if error.offset else last
     return ExpressionError(
         f"this is not an expression ({error.msg})",
         (at, at + 1),
@@ -325,15 +325,28 @@ class _Reader:
     def _compare(self, node: ast.Compare, depth: int) -> Node:
         """`a < b < c` is `a < b and b < c`."""
         place = self._place(node)
-        sides = [self.read(side, depth) for side in (node.left, *node.comparators)]
-        pairs = [
-            self._operation(operator, (left, right), place)
-            for operator, left, right in zip(node.ops, sides, sides[1:], strict=False)
-        ]
+        left, result = node.left, None
+        for operator, right in zip(node.ops, node.comparators, strict=True):
+            if isinstance(operator, (ast.In, ast.NotIn)):
+                pair = self._member(operator, left, right, depth)
+            else:
+                pair = self._operation(operator, (self.read(left, depth), self.read(right, depth)), place)
+            result = pair if result is None else Call("and", (result, pair), place, place)
+            left = right
+        return result or self.read(left, depth)
+
+    def _member(self, operator: ast.cmpop, left: ast.expr, right: ast.expr, depth: int) -> Node:
+        """`a in [b, c]` is `a == b or a == c`."""
+        if not isinstance(right, ast.List) or not right.elts:
+            hint = "as status in [1, 2]; any(a[] == b) looks into a list"
+            raise ExpressionError("`in` needs a list of values", self._place(right), hint)
+        place = (self._place(left)[0], self._place(right)[1])
+        value = self.read(left, depth)
+        pairs = [Call("==", (value, self.read(item, depth)), place, place) for item in right.elts]
         result = pairs[0]
         for pair in pairs[1:]:
-            result = Call("and", (result, pair), place, place)
-        return result
+            result = Call("or", (result, pair), place, place)
+        return Call("not", (result,), place, place) if isinstance(operator, ast.NotIn) else result
 
     def _operation(self, operator: ast.AST, arguments: tuple[Node, ...], place: Place) -> Node:
         name = _OPERATORS.get(type(operator))
@@ -341,7 +354,7 @@ class _Reader:
             raise ExpressionError(
                 "this operator is not part of the language",
                 place,
-                "there are + - * / // % ** == != < <= > >= in and or not; for null: is_null(x)",
+                "there are + - * / // % ** == != < <= > >= in and or not; is_null(x) for null",
             )
         return Call(name, arguments, place, place)
 

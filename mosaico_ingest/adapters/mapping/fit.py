@@ -84,9 +84,14 @@ def _surely(kind: Kind, target: DataType) -> bool:
 
 
 def _misfit(kind: Kind, target: DataType) -> str:
-    if is_number(kind.type) and is_number(target):
+    if not (is_number(kind.type) and is_number(target)):
+        return f"{spell(kind)} for {spell(target)}"
+    if kind.bounds is None or kind.bounds == int_bounds(kind.type):
         return f"{spell(kind)} may not fit {spell(target)}"
-    return f"{spell(kind)} for {spell(target)}"
+    low, high = kind.bounds
+    if low == high:
+        return f"{low} does not fit {spell(target)}"
+    return f"{spell(kind)} from {low} to {high} may not fit {spell(target)}"
 
 
 def _remedy(source: DataType, target: DataType) -> str | None:

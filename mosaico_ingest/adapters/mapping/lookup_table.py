@@ -57,7 +57,7 @@ def _value_fits(desk: Desk, value: Scalar, path: Path, target: DataType) -> bool
     try:
         demand(constant(value).kind, target)
     except Unfit as unfit:
-        desk.report(path, f"{value!r} → {unfit}", "map values are plain: text is text here", rule="misfit")
+        desk.misfit(path, unfit)
         return False
     return True
 

@@ -58,10 +58,9 @@ def _sum_kind(left: Kind, right: Kind) -> Kind:
         return Kind(arrays.string())
     for position, kind in enumerate((left, right)):
         if not (is_number(kind.type) or pt.is_null(kind.type)):
-            wanted = "text" if any(texts) else "a number"
-            raise Unfit(f"+ takes numbers or texts, {spell(kind)} is not {wanted}", argument=position)
-    if any(texts):
-        raise Unfit("+ takes two numbers or two texts", argument=0, hint="text(x) makes a number text")
+            hint = "text(x) makes a number text" if pt.is_string(kind.type) else None
+            what = f"+ takes two numbers or two texts, not {spell(left)} and {spell(right)}"
+            raise Unfit(what, argument=position, hint=hint)
     return _spread(operator.add)(left, right)
 
 

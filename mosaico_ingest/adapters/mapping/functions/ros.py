@@ -71,7 +71,7 @@ def covariance(c: Array) -> Array:
     elements, axis = open_list(c)
     positive = true_where(pc.greater(elements, 0))
     if axis.size is not None:
-        known: Mask = positive.reshape(len(c), axis.size).any(axis=1)
+        known: Mask = np.logical_or.reduce(positive.reshape(len(c), axis.size), axis=1)
     else:
         known = np.zeros(len(c), bool)
         known[axis.parents[positive]] = True

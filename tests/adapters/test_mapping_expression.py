@@ -1,0 +1,114 @@
+from __future__ import annotations
+
+import pytest
+
+from mosaico_ingest.adapters.mapping.expression import (
+    Attribute,
+    Call,
+    Choice,
+    Each,
+    ExpressionError,
+    Item,
+    ListOf,
+    Literal,
+    Name,
+    parse,
+)
+
+AT = (0, 0)
+
+
+def refused(text: str) -> tuple[str, str]:
+    with pytest.raises(ExpressionError) as caught:
+        parse(text)
+    start, end = caught.value.place
+    return text[start:end], str(caught.value)
+
+
+def test_names_attributes_and_lists_are_read() -> None:
+    assert parse("a.b[].c") == Attribute(Each(Attribute(Name("a", AT), "b", AT, AT), AT), "c", AT, AT)
+    assert parse("a[-1]") == Item(Name("a", AT), -1, AT)
+    assert parse("[]") == ListOf((), AT)
+    assert parse("self['from']") == Attribute(Name("self", AT), "from", AT, AT)
+
+
+def test_yaml_words_are_values() -> None:
+    assert parse("null") == Literal(None, AT)
+    assert parse("true") == Literal(value=True, at=AT)
+    assert parse("-1.5") == Literal(-1.5, AT)
+
+
+def test_operators_are_calls() -> None:
+    assert parse("a + 1") == Call("+", (Name("a", AT), Literal(1, AT)), AT, AT)
+    assert parse("a < b < c") == parse("a < b and b < c")
+    assert parse("a in [1, 2]") == parse("a == 1 or a == 2")
+    assert parse("a not in [1]") == parse("not (a == 1)")
+
+
+def test_if_else_is_the_conditional() -> None:
+    assert parse("if_else(a, b, c)") == parse("b if a else c")
+    assert isinstance(parse("b if a else c"), Choice)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "lambda x: x",
+        "[x for x in y]",
+        "{1: 2}",
+        "(a, b)",
+        "f'{a}'",
+        "(a := 1)",
+        "b'bytes'",
+        "...",
+        "*a",
+        "1j",
+        "a @ b",
+        "a is b",
+        "a & b",
+        "a[1:2]",
+        "a[b]",
+        "a[True]",
+        "a.b()",
+        "f(x=1)",
+        "f(*a)",
+        "await a",
+        "",
+        "   ",
+        "1 +",
+        "a b",
+        "a.from",
+        "36893488147419103232",
+        "(" * 500 + ")" * 500,
+        "a + " * 200 + "a" + " " * 4000,
+        "-" * 100 + "a",
+        "\0",
+    ],
+)
+def test_what_the_language_does_not_have_is_refused(text: str) -> None:
+    refused(text)
+
+
+def test_the_place_is_the_offending_part() -> None:
+    assert refused("cells[].x + (lambda: 1)")[0] == "lambda: 1"
+    assert refused("'ü€' + b'x'")[0] == "b'x'"
+    assert refused("f(a[], b[c])")[0] == "c"
+    assert refused("x.y(1)")[0] == "x.y"
+    assert refused("1 +")[0] == "+"
+
+
+def test_places_count_characters_as_written() -> None:
+    text = "a[].b + 'ü' + c[].d"
+    node = parse(text)
+    assert isinstance(node, Call)
+    last = node.arguments[1]
+    assert text[last.at[0] : last.at[1]] == "c[].d"
+
+
+def test_brackets_in_text_are_left_alone() -> None:
+    assert parse("'a[]'") == Literal("a[]", AT)
+    assert parse(r"extract(s, '\d[]]')").arguments[1].value == r"\d[]]"  # type: ignore[union-attr]  # it is a call
+
+
+def test_lines_of_a_folded_text_are_one_expression() -> None:
+    assert parse("a +\n  b") == parse("a + b")
