@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections import defaultdict
+from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 
 from mosaico_ingest.store.entries import ontology_of
 from mosaico_ingest.store.model import Note, SegmentInfo, SequenceInfo, SessionInfo, TopicInfo
 
-__all__ = ["names", "sequence"]
+__all__ = ["bounds", "names", "sequence"]
 
 
 def names(db: sqlite3.Connection) -> list[str]:
@@ -33,6 +35,23 @@ def sequence(db: sqlite3.Connection, name: str, root: Path) -> SequenceInfo | No
         topics=_topics(db, row["id"], name, root),
         notes=_notes(db, row["id"]),
     )
+
+
+def bounds(
+    db: sqlite3.Connection, topic: TopicInfo, columns: Collection[str], root: Path
+) -> dict[Path, dict[str, tuple[Any, Any]]]:
+    """Return the known bounds of the columns asked for, by the path of the segment."""
+    found: dict[Path, dict[str, tuple[Any, Any]]] = defaultdict(dict)
+    rows = db.execute(
+        "SELECT path, column_path, low, high FROM bounds JOIN segments ON segments.id = segment_id"
+        " JOIN topics ON topics.id = topic_id JOIN sequences ON sequences.id = sequence_id"
+        " WHERE sequences.name = ? AND topics.name = ?",
+        (topic.sequence, topic.name),
+    )
+    for row in rows:
+        if row["column_path"] in columns:
+            found[root / row["path"]][row["column_path"]] = (row["low"], row["high"])
+    return found
 
 
 def _sessions(db: sqlite3.Connection, sequence_id: int) -> tuple[SessionInfo, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,16 @@ class Store:
         with self.catalog.read() as db:
             found = (queries.sequence(db, name, self.path) for name in queries.names(db))
             return tuple(info for info in found if info is not None)
+
+    def names(self) -> tuple[str, ...]:
+        """Return the names of all sequences, sorted."""
+        with self.catalog.read() as db:
+            return tuple(queries.names(db))
+
+    def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[Path, dict[str, tuple[Any, Any]]]:
+        """Return the smallest and largest value of columns, as `pose.x`, by segment, where they are known."""
+        with self.catalog.read() as db:
+            return queries.bounds(db, topic, columns, self.path)
 
     def sequence(self, name: str) -> SequenceInfo:
         """Return one sequence.

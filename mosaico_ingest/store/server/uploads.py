@@ -1,0 +1,213 @@
+"""This file is the sessions that are open: their topics, how far each upload is, and how they end."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from enum import Enum
+from uuid import uuid4
+
+import pyarrow as pa
+
+from mosaico_ingest import wire
+from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.policies import IfExists
+from mosaico_ingest.sink import ENVELOPE
+from mosaico_ingest.store.faults import NotInStore
+from mosaico_ingest.store.server.refusals import Refusal, checked
+from mosaico_ingest.store.session import StoreSession
+from mosaico_ingest.store.store import Store
+from mosaico_ingest.store.topic import StoreTopic
+from mosaico_ingest.wire import bodies
+from mosaico_ingest.wire.conditions import Condition
+
+__all__ = ["OpenSession", "Uploads"]
+
+_BUFFER_BYTES = 96 << 20
+
+
+class _State(Enum):
+    CREATED = "was never uploaded"
+    UPLOADING = "is still being uploaded"
+    BROKEN = "broke off in the middle of its upload"
+    DONE = "is uploaded"
+
+
+@dataclass(slots=True)
+class _Topic:
+    name: str
+    question: bodies.TopicCreate
+    state: _State = _State.CREATED
+
+
+@dataclass(slots=True)
+class OpenSession:
+    """A session that takes topics."""
+
+    uuid: str
+    sequence: str
+    session: StoreSession
+    topics: dict[str, _Topic] = field(default_factory=dict[str, _Topic])
+    """By the UUID each upload names."""
+
+    @property
+    def locator(self) -> str:
+        """As `drive:01J…`."""
+        return bodies.session_locator(self.sequence, self.session.id)
+
+
+class Uploads:
+    """All open sessions of a server."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._sessions: dict[str, OpenSession] = {}
+        self._finalized: set[str] = set()
+        self._lock = threading.RLock()
+
+    def of_sequence(self, sequence: str) -> tuple[OpenSession, ...]:
+        """Return the open sessions of a sequence."""
+        with self._lock:
+            return tuple(each for each in self._sessions.values() if each.sequence == sequence)
+
+    def open(self, sequence: str) -> OpenSession:
+        """Open a session of a sequence that is there."""
+        self._store.sequence(sequence)
+        session = StoreSession(
+            self._store.layout,
+            self._store.catalog,
+            sequence,
+            "{}",
+            if_exists=IfExists.APPEND,
+            buffer_bytes=_BUFFER_BYTES,
+        )
+        opened = OpenSession(str(uuid4()), sequence, session)
+        with self._lock:
+            self._sessions[opened.uuid] = opened
+        return opened
+
+    def add_topic(self, question: bodies.TopicCreate) -> str:
+        """Announce a topic and return the UUID its upload must name."""
+        sequence, _, path = question.locator.partition("/")
+        with checked():
+            name = wire.check_topic_name(path)
+            wire.check_metadata(question.user_metadata, where=question.locator)
+        held = {topic.name for topic in self._store.sequence(sequence).topics}
+        with self._lock:
+            opened = self._session(question.session_uuid)
+            if opened.sequence != sequence:
+                raise Refusal(
+                    Condition.PERMISSION, f"the session writes {opened.sequence!r}, not {sequence!r}"
+                )
+            pending = {topic.name for each in self.of_sequence(sequence) for topic in each.topics.values()}
+            if name in held | pending:
+                raise Refusal(Condition.EXISTS, f"topic {question.locator!r} already exists")
+            uuid = str(uuid4())
+            opened.topics[uuid] = _Topic(name, question)
+            return uuid
+
+    def receive(self, put: bodies.Put, schema: pa.Schema, batches: Iterable[pa.RecordBatch]) -> None:
+        """Take the one upload of a topic."""
+        ontology_columns = _payload(schema)
+        with self._lock:
+            topic, writer = self._begin(put, ontology_columns)
+        try:
+            for batch in batches:
+                columns = [batch.column(name) for name in writer.schema.names]
+                writer.write(pa.RecordBatch.from_arrays(columns, schema=writer.schema))
+            writer.close()
+        except BaseException:
+            topic.state = _State.BROKEN
+            raise
+        topic.state = _State.DONE
+
+    def finalize(self, uuid: str) -> None:
+        """Make a session visible."""
+        with self._lock:
+            opened = self._session(uuid)
+            if not opened.topics:
+                raise Refusal(Condition.PRECONDITION, "the session is empty")
+            for topic in opened.topics.values():
+                if topic.state is not _State.DONE:
+                    text = f"topic {topic.question.locator!r} {topic.state.value}"
+                    raise Refusal(Condition.PRECONDITION, text)
+            del self._sessions[uuid]
+            self._finalized.add(uuid)
+        try:
+            opened.session.commit()
+        except BaseException:
+            opened.session.discard()
+            raise
+
+    def discard_session(self, locator: str) -> bool:
+        """Drop the open session at `locator`; return whether there is one."""
+        with self._lock:
+            found = [each for each in self._sessions.values() if each.locator == locator]
+            return self._drop(found)
+
+    def discard_sequence(self, sequence: str) -> bool:
+        """Drop the open sessions of a sequence; return whether there are any."""
+        with self._lock:
+            return self._drop(self.of_sequence(sequence))
+
+    def discard_topic(self, sequence: str, name: str) -> bool:
+        """Forget a topic that was announced and never uploaded; return whether there is one."""
+        with self._lock:
+            for opened in self.of_sequence(sequence):
+                for uuid, topic in tuple(opened.topics.items()):
+                    if topic.name == name:
+                        if topic.state is not _State.CREATED:
+                            raise Refusal(Condition.PRECONDITION, f"topic {name!r} {topic.state.value}")
+                        del opened.topics[uuid]
+                        return True
+        return False
+
+    def has_topic(self, sequence: str, name: str) -> bool:
+        """Return whether an open session has announced the topic."""
+        return any(
+            topic.name == name for each in self.of_sequence(sequence) for topic in each.topics.values()
+        )
+
+    def close(self) -> None:
+        """Drop every open session."""
+        with self._lock:
+            self._drop(tuple(self._sessions.values()))
+
+    def _begin(self, put: bodies.Put, payload: pa.StructType) -> tuple[_Topic, StoreTopic]:
+        owners = [each for each in self._sessions.values() if put.topic_uuid in each.topics]
+        if not owners:
+            raise NotInStore(f"there is no topic with the UUID {put.topic_uuid}")
+        topic = owners[0].topics[put.topic_uuid]
+        if topic.question.locator != put.resource_locator:
+            raise Refusal(Condition.PERMISSION, f"the UUID is that of {topic.question.locator!r}")
+        if topic.state is not _State.CREATED:
+            raise Refusal(Condition.PRECONDITION, f"topic {put.resource_locator!r} {topic.state.value}")
+        ontology = OntologyType(topic.question.ontology_tag, payload, topic.question.serialization_format)
+        with checked():
+            writer = owners[0].session.topic(topic.name, ontology, topic.question.user_metadata)
+        topic.state = _State.UPLOADING
+        return topic, writer
+
+    def _session(self, uuid: str) -> OpenSession:
+        if uuid in self._finalized:
+            raise Refusal(Condition.PRECONDITION, "the session is finalized already")
+        if uuid not in self._sessions:
+            raise NotInStore(f"there is no open session {uuid}")
+        return self._sessions[uuid]
+
+    def _drop(self, sessions: Iterable[OpenSession]) -> bool:
+        dropped = False
+        for opened in sessions:
+            del self._sessions[opened.uuid]
+            opened.session.discard()
+            dropped = True
+        return dropped
+
+
+def _payload(schema: pa.Schema) -> pa.StructType:
+    """Return the columns beside the envelope's, which must be there."""
+    with checked():
+        if schema.get_field_index(ENVELOPE.name) < 0 or schema.field(ENVELOPE.name).type != ENVELOPE.type:
+            raise pa.ArrowInvalid("the schema has no column timestamp_ns of int64")
+    return pa.struct([column for column in schema if column.name != ENVELOPE.name])
