@@ -139,16 +139,16 @@ class TypeResolver:
             places += self._agreements(embedded, version)
         elif ros_version(distro) == version:
             places.append(_Place(distro.value, Source.DISTRO, lambda name: distro_type(distro, name)))
-        if embedded and embedded.encoding not in _UNSAID and not embedded.text.strip():
-            # An empty text is a type without fields, unless a distro knows the type: recorders that lack a
-            # definition write an empty one.
+        if embedded and embedded.encoding not in _UNSAID and _is_empty(embedded.text):
+            # A text without fields is such a type, unless a distro knows the type: recorders that lack a definition
+            # write an empty one, or a comment.
             known = any(distro_type(distro, root) for distro in (ROS1 if version == 1 else ROS2))
             empty = {} if known else {root: MessageType(root, ())}
             places.append(_Place("the recording's empty text", Source.BAG, empty.get))
         return places
 
     def _embedded(self, root: str, embedded: Embedded | None) -> Mapping[str, MessageType]:
-        if embedded is None or not embedded.text.strip():
+        if embedded is None or _is_empty(embedded.text):
             return {}
         if embedded.encoding.lower() not in _LANGUAGES:
             raise BagError(f"a schema in {embedded.encoding!r} is no ROS definition", where=root)
@@ -185,6 +185,10 @@ class TypeResolver:
             return f"{searched}; the recording is ROS {version}, ros_distro is {self.distro.value}; set the right one"
         remedy = "give it with custom_msgs" if self.distro else "set ros_distro, or give it with custom_msgs"
         return f"{searched}; {remedy}"
+
+
+def _is_empty(text: str) -> bool:
+    return all(not line.strip() or line.lstrip().startswith("#") for line in text.split("\n"))
 
 
 def _by_name(entries: Iterable[Registered]) -> dict[str, MessageType]:

@@ -98,7 +98,8 @@ class TestOrder:
 
     def test_an_empty_text_is_a_type_without_fields_unless_the_type_is_known(self) -> None:
         assert resolve(TypeResolver(), "mine/msg/Signal", "").message.fields == ()
-        assert resolve(TypeResolver(), "std_msgs/msg/String", "").message.fields[0].name == "data"
+        for text in ("", "# a placeholder\n"):
+            assert resolve(TypeResolver(), "std_msgs/msg/String", text).message.fields[0].name == "data"
         with pytest.raises(BagError, match="mine/msg/Signal is not known"):
             TypeResolver().resolve("mine/msg/Signal", Embedded("unknown", ""), ros_version=2)
 

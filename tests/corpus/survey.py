@@ -12,7 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from mosaico_ingest.api import run
@@ -170,9 +170,10 @@ def main() -> int:
     sys.stdout.write(totals(rows))
     if given.out:
         with given.out.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, delimiter="\t")
-            writer.writerow([field.name for field in fields(Row)])
-            writer.writerows(astuple(done) for done in rows)
+            writer = csv.writer(file, delimiter="\t", lineterminator="\n")
+            names = [field.name for field in fields(Row) if field.name != "seconds"]
+            writer.writerow(names)
+            writer.writerows([getattr(done, name) for name in names] for done in rows)
     return 1 if any(done.wrong for done in rows) else 0
 
 
