@@ -52,14 +52,14 @@ def bag(
 
     config = api.quick_config(
         path,
-        name=name,
+        sequence_name=name,
         topics=[*(topics or ()), *(more_topics or ())],
         metadata=metadata,
         ros_distro=ros_distro,
         host=host,
         port=port,
         api_key=api_key,
-        tls_cert=tls_cert,
+        tls_cert_path=tls_cert,
         store=store,
     )
     run_configs([config], report=report, quiet=quiet, log=log)

@@ -100,8 +100,11 @@ def _print_recording(report: Report, console: Console) -> None:
         if topic.status is not TopicStatus.LEFT_OUT:
             table.add_row(*_cells(topic))
     console.print(table)
+    _print_left_out(report, console)
     for topic in report.topics:
-        _print_trouble(topic, console)
+        for rejection in topic.rejections:
+            line = f"{topic.target}: {count_text(rejection.count)} rejected [{rejection.rule}]: {rejection.reason}"
+            console.print(Text(line, style="yellow"), soft_wrap=True)
     _print_totals(report, console)
 
 
@@ -120,16 +123,24 @@ def _cells(topic: TopicReport) -> tuple[str | Text, ...]:
     )
 
 
-def _print_trouble(topic: TopicReport, console: Console) -> None:
-    if topic.status is TopicStatus.LEFT_OUT:
-        console.print(
-            Text(f"left out {topic.topic} ({topic.msgtype}): {topic.why}", style="dim"), soft_wrap=True
-        )
-    for rejection in topic.rejections:
-        line = (
-            f"{topic.target}: {count_text(rejection.count)} rejected [{rejection.rule}]: {rejection.reason}"
-        )
-        console.print(Text(line, style="yellow"), soft_wrap=True)
+def _print_left_out(report: Report, console: Console) -> None:
+    """Print the topics that were not read, those with the same reason together."""
+    reasons: dict[str, list[str]] = {}
+    for topic in report.topics:
+        if topic.status is TopicStatus.LEFT_OUT:
+            reasons.setdefault(topic.why, []).append(topic.topic)
+    for why, topics in reasons.items():
+        console.print(Text(f"left out {', '.join(topics)}: {why}", style="dim"), soft_wrap=True)
+
+
+def _sizes(report: Report) -> str:
+    """Compare what is stored with the source where all of it was taken, else with the messages read."""
+    stored = report.totals.stored_bytes
+    partial = any(topic.status is TopicStatus.LEFT_OUT for topic in report.topics)
+    before = report.totals.payload_bytes if partial else report.source_bytes
+    what = " of messages" if partial else ""
+    change = f", {stored / before:.0%}" if before else ""
+    return f"{bytes_text(before)}{what} stored in {bytes_text(stored)}{change}"
 
 
 def _print_totals(report: Report, console: Console) -> None:
