@@ -52,7 +52,8 @@ class PlatformSession:
         self._created = old is None or if_exists is not IfExists.APPEND
         if old is not None and if_exists in {IfExists.FAIL, IfExists.SKIP}:
             raise _taken(sequence)
-        if old is not None and if_exists is IfExists.REPLACE:
+        self._replaced = old is not None and if_exists is IfExists.REPLACE
+        if self._replaced:
             client.act(actions.SEQUENCE_DELETE, bodies.Located(locator=sequence))
         if self._created:
             self._create(metadata)
@@ -116,9 +117,15 @@ class PlatformSession:
             self._delete_session(session)
 
     def discard(self) -> str | None:
-        """Leave no trace; return what had to stay behind and why, None where nothing did."""
+        """Leave no trace; return what had to stay behind or is lost, None where nothing is."""
         for upload in self._uploads.values():
             upload.abandon()
+        remarks = [self._remove()]
+        if self._replaced:
+            remarks.append("the old sequence is deleted")
+        return "; ".join(remark for remark in remarks if remark) or None
+
+    def _remove(self) -> str | None:
         try:
             if self._session is not None:
                 self._delete_session(self._session)

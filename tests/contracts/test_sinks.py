@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import pyarrow as pa
 import pytest
+from mosaicod import Mosaicod, running
 
+from mosaico_ingest.config import ServerTarget
 from mosaico_ingest.errors import SequenceExists, SinkError
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
+from mosaico_ingest.platform.sink import PlatformSink
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.sink import MemorySink, Sink, topic_schema
 from mosaico_ingest.store import Store, StoreSink
@@ -31,6 +35,9 @@ FLAG = OntologyType("Flag", pa.struct([pa.field("on", pa.bool_())]))
 class Destination(Protocol):
     """A sink, and the way a reader looks at what it wrote."""
 
+    keeps_old: ClassVar[bool]
+    """Whether `append` adds rows to a topic, and `replace` keeps the old sequence until the commit."""
+
     @property
     def sink(self) -> Sink: ...
     def sequences(self) -> Sequence[str]: ...
@@ -41,7 +48,9 @@ class Destination(Protocol):
 
 
 class InMemory:
-    def __init__(self, _: Path) -> None:
+    keeps_old = True
+
+    def __init__(self) -> None:
         self.sink = MemorySink()
 
     def sequences(self) -> Sequence[str]:
@@ -62,6 +71,8 @@ class InMemory:
 
 
 class InStore:
+    keeps_old = True
+
     def __init__(self, folder: Path) -> None:
         self.store = Store.open(folder / "mosaico")
         self.sink = StoreSink(self.store)
@@ -83,12 +94,71 @@ class InStore:
         return [(note.topic, note.message) for note in self.store.sequence(sequence).notes]
 
 
-DESTINATIONS: tuple[Callable[[Path], Destination], ...] = (InMemory, InStore)
+class OnServer:
+    keeps_old = False
+
+    def __init__(self, server: Mosaicod) -> None:
+        self.server = server
+        self.sink = PlatformSink(ServerTarget("127.0.0.1", server.port))
+
+    def sequences(self) -> Sequence[str]:
+        open_ones = {session.sequence for session in self.server.sessions.values() if not session.final}
+        return sorted(set(self.server.sequences) - open_ones)
+
+    def metadata(self, sequence: str) -> Mapping[str, Any]:
+        return self.server.sequences[sequence]
+
+    def topics(self, sequence: str) -> Mapping[str, tuple[OntologyType, Mapping[str, Any]]]:
+        return {
+            name.removeprefix(sequence): (
+                OntologyType(
+                    topic.tag, pa.struct(list(topic.table().schema)[1:]), SerializationFormat(topic.format)
+                ),
+                topic.metadata,
+            )
+            for name, topic in self.server.topics.items()
+            if name.startswith(f"{sequence}/")
+        }
+
+    def rows(self, sequence: str, topic: str) -> pa.Table:
+        return self.server.topics[f"{sequence}{topic}"].table().sort_by("timestamp_ns")
+
+    def errors(self, sequence: str) -> Sequence[tuple[str | None, str]]:
+        return [
+            (locator.removeprefix(sequence) or None, message)
+            for locator, messages in self.server.notes.items()
+            for message in messages
+        ]
 
 
-@pytest.fixture(params=DESTINATIONS, ids=lambda make: make.__name__)
-def there(request: pytest.FixtureRequest, tmp_path: Path) -> Destination:
-    return request.param(tmp_path)
+@contextmanager
+def in_memory(_: Path) -> Generator[Destination, None, None]:
+    yield InMemory()
+
+
+@contextmanager
+def in_store(folder: Path) -> Generator[Destination, None, None]:
+    yield InStore(folder)
+
+
+@contextmanager
+def on_server(_: Path) -> Generator[Destination, None, None]:
+    with running(Mosaicod()) as server:
+        yield OnServer(server)
+
+
+@pytest.fixture(params=(in_memory, in_store, on_server), ids=lambda make: make.__name__)
+def there(request: pytest.FixtureRequest, tmp_path: Path) -> Generator[Destination, None, None]:
+    made: AbstractContextManager[Destination] = request.param(tmp_path)
+    with made as destination:
+        yield destination
+
+
+@pytest.fixture
+def keeping(there: Destination) -> Destination:
+    if not there.keeps_old:
+        pytest.skip("a server adds no rows to a topic that is there, and has no way to swap sequences")
+    return there
 
 
 class CrashError(Exception):
@@ -169,14 +239,32 @@ def test_a_taken_name_is_refused_at_once(there: Destination, if_exists: IfExists
     assert there.rows("drive", "/gps/fix").num_rows == 1
 
 
-def test_append_adds_a_session(there: Destination) -> None:
-    write(there, 1, 4)
-    with there.sink.open("drive", {"car": 8}, if_exists=IfExists.APPEND) as session:
+def test_append_adds_a_session(keeping: Destination) -> None:
+    write(keeping, 1, 4)
+    with keeping.sink.open("drive", {"car": 8}, if_exists=IfExists.APPEND) as session:
         session.topic("/gps/fix", POINT, {}).write(points(2, 3))
         session.topic("/flag", FLAG, {})
-    assert there.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(1, 2, 3, 4)]))
-    assert there.metadata("drive") == {"car": 7}
+    assert keeping.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(1, 2, 3, 4)]))
+    assert keeping.metadata("drive") == {"car": 7}
     assert [topic.rows for topic in session.stored()] == [2, 0]
+
+
+def test_append_adds_topics(there: Destination) -> None:
+    write(there, 1)
+    with there.sink.open("drive", {"car": 8}, if_exists=IfExists.APPEND) as session:
+        session.topic("/flag", FLAG, {})
+    assert there.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(1)]))
+    assert set(there.topics("drive")) == {"/gps/fix", "/flag"}
+    assert there.metadata("drive") == {"car": 7}
+    assert [topic.rows for topic in session.stored()] == [0]
+
+
+def test_replace_leaves_the_new_after_the_commit(there: Destination) -> None:
+    write(there, 1)
+    with there.sink.open("drive", {"car": 8}, if_exists=IfExists.REPLACE) as session:
+        session.topic("/flag", FLAG, {})
+    assert list(there.topics("drive")) == ["/flag"]
+    assert there.metadata("drive") == {"car": 8}
 
 
 def test_append_creates_what_is_not_there(there: Destination) -> None:
@@ -184,30 +272,30 @@ def test_append_creates_what_is_not_there(there: Destination) -> None:
     assert there.sequences() == ["drive"]
 
 
-def test_append_refuses_another_type_for_the_same_topic(there: Destination) -> None:
-    write(there, 1)
+def test_append_refuses_another_type_for_the_same_topic(keeping: Destination) -> None:
+    write(keeping, 1)
     with (
         pytest.raises(SinkError, match=r"/gps/fix.*Point.*Flag"),
-        there.sink.open("drive", {}, if_exists=IfExists.APPEND) as session,
+        keeping.sink.open("drive", {}, if_exists=IfExists.APPEND) as session,
     ):
         session.topic("/gps/fix", FLAG, {})
 
 
-def test_replace_swaps_at_the_commit(there: Destination) -> None:
-    write(there, 1)
-    with there.sink.open("drive", {"car": 8}, if_exists=IfExists.REPLACE) as session:
+def test_replace_swaps_at_the_commit(keeping: Destination) -> None:
+    write(keeping, 1)
+    with keeping.sink.open("drive", {"car": 8}, if_exists=IfExists.REPLACE) as session:
         session.topic("/gps/fix", POINT, {}).write(points(2, 3))
-        assert there.rows("drive", "/gps/fix").num_rows == 1
-    assert there.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(2, 3)]))
-    assert there.metadata("drive") == {"car": 8}
+        assert keeping.rows("drive", "/gps/fix").num_rows == 1
+    assert keeping.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(2, 3)]))
+    assert keeping.metadata("drive") == {"car": 8}
 
 
-def test_a_failed_replace_keeps_the_old(there: Destination) -> None:
-    write(there, 1)
-    with pytest.raises(CrashError), there.sink.open("drive", {}, if_exists=IfExists.REPLACE) as session:
+def test_a_failed_replace_keeps_the_old(keeping: Destination) -> None:
+    write(keeping, 1)
+    with pytest.raises(CrashError), keeping.sink.open("drive", {}, if_exists=IfExists.REPLACE) as session:
         session.topic("/gps/fix", POINT, {}).write(points(2, 3))
         raise CrashError
-    assert there.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(1)]))
+    assert keeping.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(1)]))
 
 
 def test_errors_are_kept_with_the_sequence(there: Destination) -> None:

@@ -176,6 +176,12 @@ def test_replace_deletes_the_old_sequence(server: Mosaicod) -> None:
     write(server, 1)
     write(server, 2, 3, if_exists=IfExists.REPLACE, topic="/m")
     assert set(server.topics) == {"seq/m"}
+    sink = PlatformSink(target(server))
+    with (
+        pytest.raises(SinkError, match="enough — the old sequence is deleted"),
+        sink.open("seq", {}, if_exists=IfExists.REPLACE),
+    ):
+        raise SinkError("enough")
 
 
 def test_a_name_taken_meanwhile_is_taken(server: Mosaicod) -> None:
