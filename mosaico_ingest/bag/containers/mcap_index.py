@@ -260,11 +260,16 @@ class _Walk:
             head = self._window.peek(at, RECORD.size)
             op, length = RECORD.unpack(head) if len(head) == RECORD.size else (0, 0)
             end = at + RECORD.size + length
-            if op in (0, Op.DATA_END, Op.FOOTER) or end > stop:
+            if op in (Op.DATA_END, Op.FOOTER) and end <= stop:
+                break
+            if op == 0 or end > stop:
+                self._doubt_last_chunk(at)
                 self._ending(op, at, end, stop)
                 break
             self._record(op, at, end)
             at = end
+        else:
+            self._doubt_last_chunk(at)
         self._finish_run()
         self._index.data_end = at
         self._summarise()
@@ -287,8 +292,6 @@ class _Walk:
 
     def _ending(self, op: int, at: int, end: int, stop: int) -> None:
         """Say why the walk ends before its time; a chunk that is cut off may still hold messages."""
-        if op in (Op.DATA_END, Op.FOOTER) and end <= stop:
-            return
         if op == Op.CHUNK:
             try:
                 head = chunk_head(self._source.read(at, min(stop - at, 1 << 12)))
@@ -300,13 +303,17 @@ class _Walk:
                 self._counts = None
                 self._learn(piece)
                 return
-        pieces = self._index.pieces
-        if op == Op.MESSAGE_INDEX and pieces and pieces[-1].stop == at:
-            pieces[-1] = replace(pieces[-1], indexes=b"")  # it does not name all messages of its chunk
-            self._learn(pieces[-1])
         found = f"a record of kind {op} with {end - at} bytes" if op else "no record"
         self._index.holes.append(Hole(at, f"{found} where {stop - at} bytes are left; they are not read"))
         self._counts = None
+
+    def _doubt_last_chunk(self, at: int) -> None:
+        """Forget the message indexes that end at `at`, where the file may have been cut off: some may be missing."""
+        pieces = self._index.pieces
+        if pieces and pieces[-1].stop == at and pieces[-1].is_chunk:
+            pieces[-1] = replace(pieces[-1], indexes=b"")
+            self._counts = None
+            self._learn(pieces[-1])
 
     def _message(self, at: int, end: int) -> None:
         fixed = self._window.peek(at + RECORD.size, _MESSAGE.size)

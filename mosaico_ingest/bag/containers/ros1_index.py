@@ -142,6 +142,7 @@ class _Walk:
             try:
                 record = record_at(self._window, at, stop)
             except BagError as err:
+                self._doubt_last_chunk(at)
                 self._ending(at, stop, err.what)
                 return
             try:
@@ -149,6 +150,13 @@ class _Walk:
             except BagError as err:
                 self._index.holes.append(Hole(at, f"a damaged record of kind {record.op}: {err.what}"))
             at = record.end
+        self._doubt_last_chunk(at)
+
+    def _doubt_last_chunk(self, at: int) -> None:
+        """Count messages, not index entries, where the file may have been cut off: some indexes may be missing."""
+        pieces = self._index.pieces
+        if pieces and pieces[-1].is_chunk and pieces[-1].stop == at:
+            pieces[-1] = self._by_messages(pieces[-1])
 
     def _record(self, record: Record) -> None:
         pieces = self._index.pieces
