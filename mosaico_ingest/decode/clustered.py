@@ -17,13 +17,14 @@ from mosaico_ingest.decode.stepwise import Notes, Stepper
 
 __all__ = ["locate_clustered"]
 
-_SMALLEST = 16
-"""Messages a cluster has at least; walking one costs about as much as this many in lockstep."""
+_SMALLEST = 4
+"""Messages a cluster has at least."""
 
-_STEPWISE_NS, _CLUSTER_NS, _CHECK_NS = 2_000, 60_000, 10
-_VECTOR_NS, _LOCKSTEP_NS = 25_000, 60
-"""What a length word costs in the walked message, a cluster in itself, a word in a checked message; and in
-lockstep a word for the batch and for each message. Measured once; only the ratios matter."""
+_CLUSTER_NS, _CHECK_NS = 120_000, 10
+_STEP_NS = 1_200
+_TOGETHER_NS, _LOCKSTEP_NS = 15_000, 60
+"""What things cost: a cluster in itself, and each length word of a message that is checked; a word that is walked
+stepwise; a word of all messages in lockstep, and of each. Measured once; only their ratios matter."""
 
 
 def locate_clustered(layout: Layout, frame: Frame) -> list[Located]:
@@ -33,20 +34,20 @@ def locate_clustered(layout: Layout, frame: Frame) -> list[Located]:
         return []
     words = len(_Sample(layout, frame, int(groups[0][0])).words)
     members = sum(map(len, groups))
-    clustered = len(groups) * (_CLUSTER_NS + words * _STEPWISE_NS) + members * words * _CHECK_NS
-    if clustered > words * (_VECTOR_NS + members * _LOCKSTEP_NS):
+    clustered = len(groups) * (_CLUSTER_NS + words * _STEP_NS) + members * words * _CHECK_NS
+    if clustered > words * min(members * _STEP_NS, _TOGETHER_NS + members * _LOCKSTEP_NS):
         return []
     return [cluster for rows in groups for cluster in _split(layout, frame, rows)]
 
 
 def _same_length(lengths: Int64s) -> Iterator[Int64s]:
     """Yield the positions of each length that is frequent enough."""
-    if lengths.min() == lengths.max():
-        yield np.arange(len(lengths))
+    if len(lengths) < _SMALLEST:
         return
     order = np.argsort(lengths, kind="stable")
-    borders = np.flatnonzero(np.diff(lengths[order])) + 1
-    yield from (rows for rows in np.split(order, borders) if len(rows) >= _SMALLEST)
+    borders = np.flatnonzero(np.diff(lengths[order], prepend=-1, append=-1))
+    for group in np.flatnonzero(np.diff(borders) >= _SMALLEST).tolist():
+        yield order[borders[group] : borders[group + 1]]
 
 
 def _split(layout: Layout, frame: Frame, rows: Int64s) -> Iterator[Located]:

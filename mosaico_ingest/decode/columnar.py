@@ -20,6 +20,8 @@ __all__ = ["ColumnarDecoder"]
 
 _HEADER = 4
 _LARGEST = 2**31 - 1
+_FEW, _SMALL = 8, 4096
+"""Messages, and bytes in all, up to which building columns costs more than it saves."""
 _ORDERS = {">": 0, "<": 1}
 """The second byte of the encapsulation header of plain CDR."""
 
@@ -46,13 +48,16 @@ class ColumnarDecoder:
         Raises:
             DecodeError: The batch is larger than the 2 GiB a column can hold.
         """
-        if int(batch.lengths.sum()) > _LARGEST:
+        total = int(batch.lengths.sum())
+        if total > _LARGEST:
             raise DecodeError(
-                f"a batch of {int(batch.lengths.sum())} bytes, columns hold {_LARGEST}",
+                f"a batch of {total} bytes, columns hold {_LARGEST}",
                 rule="batch-size",
                 where=batch.channel.topic,
                 hint="read smaller batches",
             )
+        if len(batch) <= _FEW and total <= _SMALL:
+            return self._rowwise.decode(batch)
         left = np.ones(len(batch), bool)
         parts: list[tuple[Int64s, pa.StructArray]] = []
         for order, rows in self._by_order(batch):

@@ -17,14 +17,12 @@ def locate(layout: Layout, frame: Frame) -> Located:
     """Find where everything lies in the messages that fit the layout."""
     if all(isinstance(step, Block) for step in layout.body.steps):
         return locate_lockstep(layout, frame)  # nothing in a message depends on its bytes
-    if len(frame) <= FEW:
-        return locate_stepwise(layout, frame)
     parts = locate_clustered(layout, frame)
     left = np.ones(len(frame), bool)
     for part in parts:
         left[part.rows] = False
     rest = np.flatnonzero(left)
-    if len(rest):
+    if len(rest) or not parts:
         walk = locate_stepwise if len(rest) <= FEW else locate_lockstep
         found = walk(layout, frame.take(rest))
         parts.append(Located(rest[found.rows], found.places))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import pytest
 
 from mosaico_ingest.bag.batch import Channel, Encoding, RawBatch
 from mosaico_ingest.bag.definition import Definition
+from mosaico_ingest.decode import columnar
 from mosaico_ingest.decode.columnar import ColumnarDecoder
 from mosaico_ingest.decode.decoder import Decoded
 from mosaico_ingest.decode.rowwise import RowwiseDecoder
@@ -47,6 +48,14 @@ def check_same(fast: Decoded, slow: Decoded) -> None:
     assert fast.index.tolist() == slow.index.tolist()
     assert fast.failures == slow.failures
     assert bits(fast.rows) == bits(slow.rows)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def small_batches_by_columns() -> Iterator[None]:
+    """Small batches are decoded by columns too, or most random cases would compare rows with rows."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(columnar, "_FEW", -1)
+        yield
 
 
 @pytest.fixture(scope="session")
