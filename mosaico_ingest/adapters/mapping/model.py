@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag
+from pydantic_core import PydanticCustomError
 
 from mosaico_ingest.ontology.types import SerializationFormat
 
@@ -21,8 +22,18 @@ __all__ = [
     "Value",
 ]
 
-Scalar: TypeAlias = "bool | int | float | str | None"
-TypeName: TypeAlias = Annotated[str, Field(pattern=r"^[A-Za-z]\w*/(msg/)?[A-Za-z]\w*$")]
+
+def _plain(value: object) -> object:
+    """Refuse what is no plain value, once and not once for each type it is not."""
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise PydanticCustomError("plain_value", "it is an expression, a number, true, false or null")
+
+
+Scalar: TypeAlias = Annotated[bool | int | float | str | None, BeforeValidator(_plain)]
+TypeName: TypeAlias = Annotated[
+    str, Field(pattern=r"^[A-Za-z]\w*/(msg/)?[A-Za-z]\w*$", examples=["sensor_msgs/msg/Imu"])
+]
 _NAME = r"^[A-Za-z_]\w*$"
 
 
@@ -34,6 +45,10 @@ class _Strict(BaseModel):
 
 def _form_or_scalar(value: object) -> str:
     return "form" if isinstance(value, (Mapping, BaseModel)) else "scalar"
+
+
+def _one_or_many(value: object) -> str:
+    return "many" if isinstance(value, Sequence) and not isinstance(value, str) else "one"
 
 
 def _type_or_text(value: object) -> str:
@@ -124,6 +139,12 @@ class Case(_Strict):
     """The row must be rejected, for a reason that contains this."""
 
 
+TypeNames: TypeAlias = Annotated[
+    Annotated[TypeName, Tag("one")] | Annotated[Sequence[TypeName], Field(min_length=1), Tag("many")],
+    Discriminator(_one_or_many),
+]
+
+
 class MappingFile(_Strict):
     """How messages of one or more ROS types become records of one ontology type."""
 
@@ -133,7 +154,7 @@ class MappingFile(_Strict):
     """The adapter's name, for `adapters.override` and `use`."""
     description: str | None = None
     """One line for lists of adapters."""
-    ros_type: Annotated[TypeName | Sequence[TypeName] | None, Field(examples=["sensor_msgs/msg/Imu"])] = None
+    ros_type: TypeNames | None = None
     """The message type, or types that all have the fields that are named."""
     variants: Annotated[Mapping[TypeName, Mapping[str, Value] | None], Field(min_length=1)] | None = None
     """Instead of `ros_type`: types that wrap the same payload. `of` says where it is; other keys are fields."""
