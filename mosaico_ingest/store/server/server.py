@@ -31,8 +31,9 @@ class Tls:
 class Server:
     """A running server; leaving it as a context shuts it down."""
 
-    def __init__(self, service: Service, host: str, *, scheme: str) -> None:
+    def __init__(self, service: Service, store: Store, host: str, *, scheme: str) -> None:
         self._service = service
+        self.store_path = store.path
         self.host = host
         self.port = service.port
         self.location = f"{scheme}://{host}:{self.port}"
@@ -79,7 +80,7 @@ def serve(
     except (OSError, pa.ArrowException) as err:
         text = str(err).splitlines()[0]
         raise SinkError(f"cannot listen: {text}", where=f"{host}:{port}", hint="is the port taken?") from err
-    return Server(service, host, scheme=scheme)
+    return Server(service, store, host, scheme=scheme)
 
 
 def _read(path: Path) -> bytes:

@@ -1,0 +1,448 @@
+"""Every call a client makes, and the status of every one that is refused."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.flight as fl
+import pytest
+
+from mosaico_ingest.errors import SinkError
+from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.store import Store, StoreSink
+from mosaico_ingest.store.server import Keyring, Server, Tls, serve
+from mosaico_ingest.wire.actions import ACTIONS, API_KEY_HEADER, Permission
+from mosaico_ingest.wire.conditions import Condition, condition_of, text_of
+
+Rows = Callable[..., pa.RecordBatch]
+
+
+class Client:
+    """A client that says what goes over the wire and nothing else."""
+
+    def __init__(self, server: Server, key: str | None = None, **options: Any) -> None:
+        self.flight = fl.connect(server.location, **options)
+        headers = [] if key is None else [(API_KEY_HEADER.encode(), key.encode())]
+        self.options = fl.FlightCallOptions(headers=headers, timeout=20)
+
+    def __enter__(self) -> Client:  # noqa: PYI034 - Self comes with Python 3.11
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.flight.close()
+
+    def call(self, name: str, **question: Any) -> Any:
+        action = fl.Action(name, json.dumps(question).encode())
+        answer = b"".join(result.body.to_pybytes() for result in self.flight.do_action(action, self.options))
+        told = json.loads(answer)
+        assert told["action"] == name
+        return told["response"]
+
+    def put(self, locator: str, uuid: str, *batches: pa.RecordBatch, schema: pa.Schema | None = None) -> None:
+        descriptor = descriptor_of(resource_locator=locator, topic_uuid=uuid)
+        writer, _ = self.flight.do_put(descriptor, schema or batches[0].schema, self.options)
+        for batch in batches:
+            writer.write_batch(batch)
+        writer.done_writing()
+        writer.close()
+
+    def info(self, locator: str, **more: Any) -> tuple[Any, list[Any]]:
+        info = self.flight.get_flight_info(descriptor_of(resource_locator=locator, **more), self.options)
+        endpoints = [json.loads(endpoint.app_metadata) for endpoint in info.endpoints]
+        return json.loads(info.app_metadata or b"null"), endpoints
+
+    def rows(self, locator: str, **more: Any) -> list[int]:
+        info = self.flight.get_flight_info(descriptor_of(resource_locator=locator, **more), self.options)
+        (endpoint,) = info.endpoints
+        return self.flight.do_get(endpoint.ticket, self.options).read_all()["timestamp_ns"].to_pylist()
+
+    def upload(self, sequence: str, topic: str, *batches: pa.RecordBatch, tag: str = "Sample") -> None:
+        session = self.call("session_create", locator=sequence)["uuid"]
+        uuid = self.create_topic(session, f"{sequence}{topic}", tag=tag)
+        self.put(f"{sequence}{topic}", uuid, *batches)
+        self.call("session_finalize", session_uuid=session)
+
+    def create_topic(self, session: str, locator: str, *, tag: str = "Sample", **metadata: Any) -> str:
+        return self.call(
+            "topic_create",
+            session_uuid=session,
+            locator=locator,
+            serialization_format="default",
+            ontology_tag=tag,
+            user_metadata=metadata,
+        )["uuid"]
+
+
+def descriptor_of(**command: Any) -> fl.FlightDescriptor:
+    return fl.FlightDescriptor.for_command(json.dumps(command).encode())
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Server]:
+    with serve(tmp_path / "served", port=0) as running:
+        yield running
+
+
+@pytest.fixture
+def client(server: Server) -> Iterator[Client]:
+    with Client(server) as connected:
+        yield connected
+
+
+class refused:  # noqa: N801 - reads as a statement, as pytest.raises
+    """Expect a call to be refused with a status and, maybe, a word of explanation."""
+
+    def __init__(self, condition: Condition, word: str = "") -> None:
+        self.condition = condition
+        self.word = word
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> bool:
+        assert error is not None, f"expected {self.condition}"
+        assert (condition_of(error), self.word in text_of(error)) == (self.condition, True), str(error)
+        return True
+
+
+def test_the_handshake_says_what_is_spoken_and_what_fits(client: Client) -> None:
+    info = client.call("info")
+    assert info["semver"] == {"major": 0, "minor": 7, "patch": 0, "pre": None}
+    assert info["config"]["grpc_max_decode_message_size"] == 50 << 20
+    assert client.call("version") == {"version": "0.7.0"}
+
+
+def test_a_sequence_is_written_listed_described_and_read(client: Client, rows: Rows) -> None:
+    assert client.call("sequence_create", locator="drive", user_metadata={"car": [7]}) is None
+    session = client.call("session_create", locator="drive")
+    assert set(session) == {"uuid", "locator"}
+    uuid = client.create_topic(session["uuid"], "drive/front/imu", mount="roof")
+    client.put("drive/front/imu", uuid, rows([3, 1]), rows([2, 9]))
+    empty = client.create_topic(session["uuid"], "drive/empty")
+    client.put("drive/empty", empty, schema=rows([]).schema)
+    opened, _ = client.info("drive")
+    assert [(each["locator"], each["locked"]) for each in opened["sessions"]] == [(session["locator"], False)]
+    assert client.call("session_finalize", session_uuid=session["uuid"]) is None
+
+    assert [info.descriptor.path for info in client.flight.list_flights()] == [[b"drive"]]
+    described, (nothing, imu) = client.info("drive")
+    assert (described["resource_locator"], described["user_metadata"]) == ("drive", {"car": [7]})
+    (finalized,) = described["sessions"]
+    assert (finalized["locator"], finalized["locked"]) == (session["locator"], True)
+    assert sorted(finalized["topics"]) == ["drive/empty", "drive/front/imu"]
+    assert (imu["resource_locator"], imu["ontology_tag"]) == ("drive/front/imu", "Sample")
+    assert (imu["serialization_format"], imu["user_metadata"]) == ("default", {"mount": "roof"})
+    assert (imu["locked"], imu["time_window_info"]) == (True, None)
+    assert imu["data_info"]["interval"] == {"start_ns": 1, "end_ns": 9}
+    assert (imu["data_info"]["total_row_count"], nothing["data_info"]["total_row_count"]) == (4, 0)
+    assert nothing["data_info"]["interval"] is None
+    assert client.rows("drive/front/imu") == [1, 2, 3, 9]
+    assert client.rows("drive/empty") == []
+    schema = client.flight.get_schema(descriptor_of(resource_locator="drive/front/imu")).schema
+    assert schema.equals(rows([]).schema)
+
+
+def test_a_time_range_has_its_start_inside_and_its_end_outside(client: Client, rows: Rows) -> None:
+    client.call("sequence_create", locator="drive", user_metadata={})
+    client.upload("drive", "/imu", rows(range(100)))
+    window = {"timestamp_ns_start": 10, "timestamp_ns_end": 13}
+    _, (endpoint,) = client.info("drive/imu", **window)
+    assert endpoint["time_window_info"] == {"interval": {"start_ns": 10, "end_ns": 12}, "row_count": 3}
+    assert endpoint["data_info"]["total_row_count"] == 100
+    assert client.rows("drive/imu", **window) == [10, 11, 12]
+    assert client.rows("drive/imu", timestamp_ns_start=98) == [98, 99]
+    _, (outside,) = client.info("drive/imu", timestamp_ns_start=1000)
+    assert outside["time_window_info"] == {"interval": None, "row_count": 0}
+    with refused(Condition.INVALID, "empty"):
+        client.info("drive/imu", timestamp_ns_start=5, timestamp_ns_end=5)
+
+
+def test_large_rows_come_in_messages_of_a_moderate_size(server: Server, client: Client) -> None:
+    store = Store.open(server.store_path)
+    raw = OntologyType("Raw", pa.struct([pa.field("data", pa.binary())]))
+    with StoreSink(store).open("s", {}) as session:
+        topic = session.topic("/raw", raw, {})
+        blob = bytes(1 << 20)
+        topic.write(
+            pa.RecordBatch.from_arrays([pa.array(range(40)), pa.array([blob] * 40)], schema=topic.schema)
+        )
+    info = client.flight.get_flight_info(descriptor_of(resource_locator="s/raw"))
+    sizes = [chunk.data.num_rows for chunk in client.flight.do_get(info.endpoints[0].ticket)]
+    assert sum(sizes) == 40
+    assert max(sizes) <= 16
+
+
+def test_notifications_are_kept_listed_and_purged(client: Client, rows: Rows) -> None:
+    client.call("sequence_create", locator="drive", user_metadata={})
+    session = client.call("session_create", locator="drive")
+    uuid = client.create_topic(session["uuid"], "drive/imu")
+    note = {"notification_type": "error"}
+    client.call("topic_notification_create", locator="drive/imu", msg="early", **note)
+    client.put("drive/imu", uuid, rows([1]))
+    client.call("session_finalize", session_uuid=session["uuid"])
+    client.call("topic_notification_create", locator="drive/imu", msg="late", **note)
+    client.call("sequence_notification_create", locator="drive", msg="all", **note)
+    told = client.call("topic_notification_list", locator="drive/imu")["notifications"]
+    assert [(each["name"], each["notification_type"], each["msg"]) for each in told] == [
+        ("drive/imu", "error", "early"),
+        ("drive/imu", "error", "late"),
+    ]
+    assert datetime.fromisoformat(told[0]["created_datetime"]).tzinfo is not None
+    assert len(client.call("sequence_notification_list", locator="drive")["notifications"]) == 1
+    client.call("topic_notification_purge", locator="drive/imu")
+    client.call("sequence_notification_purge", locator="drive")
+    assert client.call("topic_notification_list", locator="drive/imu")["notifications"] == []
+    assert client.call("sequence_notification_list", locator="drive")["notifications"] == []
+
+
+def test_sessions_topics_and_sequences_are_deleted(server: Server, client: Client, rows: Rows) -> None:
+    client.call("sequence_create", locator="drive", user_metadata={})
+    client.upload("drive", "/a", rows([1]))
+    client.upload("drive", "/b", rows([1]))
+    opened = client.call("session_create", locator="drive")
+    uuid = client.create_topic(opened["uuid"], "drive/c")
+    client.put("drive/c", uuid, rows([1]))
+    client.call("session_delete", locator=opened["locator"])
+    described, _ = client.info("drive")
+    _, second = described["sessions"]
+    client.call("session_delete", locator=second["locator"])
+    _, endpoints = client.info("drive")
+    assert [each["resource_locator"] for each in endpoints] == ["drive/a"]
+    client.call("topic_delete", locator="drive/a")
+    assert client.info("drive")[1] == []
+    client.call("sequence_delete", locator="drive")
+    assert list(client.flight.list_flights()) == []
+    assert list(Path(server.store_path).rglob("*.parquet")) == []
+
+
+def test_a_topic_that_was_announced_only_can_be_taken_back(client: Client, rows: Rows) -> None:
+    client.call("sequence_create", locator="drive", user_metadata={})
+    session = client.call("session_create", locator="drive")["uuid"]
+    client.create_topic(session, "drive/a")
+    with refused(Condition.PRECONDITION, "never uploaded"):
+        client.call("session_finalize", session_uuid=session)
+    client.call("topic_delete", locator="drive/a")
+    with refused(Condition.PRECONDITION, "empty"):
+        client.call("session_finalize", session_uuid=session)
+    client.put("drive/a", client.create_topic(session, "drive/a"), rows([1]))
+    with refused(Condition.PRECONDITION, "is uploaded"):
+        client.call("topic_delete", locator="drive/a")
+    client.call("session_finalize", session_uuid=session)
+
+
+def test_what_is_taken_missing_or_malformed_is_refused(client: Client, rows: Rows) -> None:
+    client.call("sequence_create", locator="drive", user_metadata={})
+    client.call("sequence_create", locator="other", user_metadata={})
+    client.upload("drive", "/imu", rows([1]))
+    session = client.call("session_create", locator="drive")["uuid"]
+    with refused(Condition.EXISTS, "drive"):
+        client.call("sequence_create", locator="drive", user_metadata={})
+    with refused(Condition.EXISTS, "drive/imu"):
+        client.create_topic(session, "drive/imu")
+    with refused(Condition.PERMISSION, "other"):
+        client.create_topic(session, "other/imu")
+    for name, question in (
+        ("session_create", {"locator": "nowhere"}),
+        ("session_finalize", {"session_uuid": "nothing"}),
+        ("sequence_delete", {"locator": "nowhere"}),
+        ("session_delete", {"locator": "drive:01ABC"}),
+        ("topic_delete", {"locator": "drive/nothing"}),
+        ("topic_notification_list", {"locator": "drive/nothing"}),
+        ("sequence_notification_create", {"locator": "nowhere", "notification_type": "error", "msg": "x"}),
+    ):
+        with refused(Condition.NOT_FOUND):
+            client.call(name, **question)
+    for name, question in (
+        ("sequence_create", {"locator": "a b", "user_metadata": {}}),
+        ("sequence_create", {"locator": "a", "user_metadata": {"x.y": 1}}),
+        ("sequence_create", {"locator": "a"}),
+        ("sequence_create", {"locator": "a", "user_metadata": None}),
+        ("sequence_delete", {"locator": "drive/imu"}),
+        ("topic_delete", {"locator": "drive"}),
+        ("session_create", {}),
+    ):
+        with refused(Condition.INVALID):
+            client.call(name, **question)
+    with refused(Condition.INVALID):
+        client.create_topic(session, "drive/a.b")
+    for locator in ("drive/nothing", "nowhere"):
+        with refused(Condition.NOT_FOUND):
+            client.info(locator)
+    for locator in ("drive:01ABC", "", "/drive"):
+        with refused(Condition.INVALID):
+            client.info(locator)
+    with refused(Condition.INVALID):
+        client.flight.get_schema(descriptor_of(resource_locator="drive"))
+    with refused(Condition.INVALID):
+        client.flight.get_flight_info(fl.FlightDescriptor.for_path("drive"))
+    with refused(Condition.INVALID):
+        list(client.flight.do_action(fl.Action("info", b"{")))
+    with refused(Condition.INVALID):
+        client.flight.do_get(fl.Ticket(b"\xff\x00")).read_all()
+    with refused(Condition.UNIMPLEMENTED, "topic_filter_clusterize"):
+        client.call("topic_filter_clusterize")
+
+
+def test_a_topic_is_put_once_by_its_uuid_with_a_time_column(client: Client, rows: Rows) -> None:
+    client.call("sequence_create", locator="drive", user_metadata={})
+    session = client.call("session_create", locator="drive")["uuid"]
+    uuid = client.create_topic(session, "drive/imu")
+    with refused(Condition.PERMISSION):
+        client.put("drive/gps", uuid, rows([1]))
+    with refused(Condition.NOT_FOUND):
+        client.put("drive/imu", "no-such-uuid", rows([1]))
+    with refused(Condition.INVALID, "timestamp_ns"):
+        client.put("drive/imu", uuid, pa.record_batch({"x": [1]}))
+    client.put("drive/imu", uuid, rows([1]))
+    with refused(Condition.PRECONDITION, "is uploaded"):
+        client.put("drive/imu", uuid, rows([1]))
+    client.call("session_finalize", session_uuid=session)
+    with refused(Condition.PRECONDITION, "finalized"):
+        client.call("session_finalize", session_uuid=session)
+    with refused(Condition.PRECONDITION, "finalized"):
+        client.create_topic(session, "drive/gps")
+
+
+def test_columns_are_put_in_order_and_the_time_column_may_be_nullable(client: Client) -> None:
+    client.call("sequence_create", locator="drive", user_metadata={})
+    client.upload("drive", "/imu", pa.record_batch({"x": [1.5, 2.5], "timestamp_ns": [2, 1]}))
+    schema = client.flight.get_schema(descriptor_of(resource_locator="drive/imu")).schema
+    assert str(schema) == "timestamp_ns: int64 not null\nx: double"
+    assert client.rows("drive/imu") == [1, 2]
+    session = client.call("session_create", locator="drive")["uuid"]
+    uuid = client.create_topic(session, "drive/bad")
+    with refused(Condition.INTERNAL, "timestamp_ns"):
+        client.put("drive/bad", uuid, pa.record_batch({"timestamp_ns": pa.array([None], pa.int64())}))
+    with refused(Condition.PRECONDITION, "broke off"):
+        client.call("session_finalize", session_uuid=session)
+
+
+def test_many_clients_write_and_read_at_once(server: Server, rows: Rows) -> None:
+    start = threading.Barrier(6)
+
+    def work(number: int) -> list[int]:
+        with Client(server) as client:
+            start.wait(20)
+            client.call("sequence_create", locator=f"s{number}", user_metadata={})
+            client.upload(f"s{number}", "/t", *(rows([step * 10 + number]) for step in range(20)))
+            return client.rows(f"s{number}/t")
+
+    with ThreadPoolExecutor(6) as pool:
+        found = list(pool.map(work, range(6)))
+    assert found == [[step * 10 + number for step in range(20)] for number in range(6)]
+
+
+def test_what_was_not_finalized_goes_with_the_server(tmp_path: Path, rows: Rows) -> None:
+    with serve(tmp_path / "served", port=0) as running, Client(running) as client:
+        client.call("sequence_create", locator="drive", user_metadata={})
+        session = client.call("session_create", locator="drive")["uuid"]
+        client.put("drive/imu", client.create_topic(session, "drive/imu"), rows([1]))
+    store = Store.open(tmp_path / "served")
+    assert store.sequence("drive").topics == ()
+    assert list(store.path.rglob("*.parquet")) == []
+
+
+def test_a_key_may_do_what_its_permission_includes(tmp_path: Path, rows: Rows) -> None:
+    ring = Keyring(tmp_path / "keys.json")
+    keys = {permission: ring.add(permission) for permission in Permission}
+    with serve(tmp_path / "served", port=0, keys=Keyring(tmp_path / "keys.json")) as running:
+        with Client(running, keys[Permission.WRITE]) as writer:
+            writer.call("info")
+            writer.call("sequence_create", locator="drive", user_metadata={})
+            writer.upload("drive", "/imu", rows([1]))
+            with refused(Condition.PERMISSION, "delete"):
+                writer.call("sequence_delete", locator="drive")
+        with Client(running, keys[Permission.READ]) as reader:
+            assert reader.rows("drive/imu") == [1]
+            assert len(list(reader.flight.list_flights(options=reader.options))) == 1
+            with refused(Condition.PERMISSION, "write"):
+                reader.call("session_create", locator="drive")
+            with refused(Condition.PERMISSION, "write"):
+                reader.put("drive/imu", "x", rows([1]))
+        with Client(running, keys[Permission.MANAGE]) as manager:
+            manager.call("sequence_delete", locator="drive")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "word"),
+    [
+        (lambda _: None, "needs an API key"),
+        (lambda _: "secret", "malformed"),
+        (lambda key: key[:-1] + ("0" if key[-1] != "0" else "1"), "checksum"),
+        (lambda _: "msco_" + "a" * 32 + "_d25389d7", "malformed"),
+    ],
+    ids=["none", "no key at all", "a typing mistake", "somebody else's"],
+)
+def test_a_call_without_a_good_key_is_refused(
+    tmp_path: Path, spoil: Callable[[str], str | None], word: str
+) -> None:
+    ring = Keyring(tmp_path / "keys.json")
+    key = spoil(ring.add(Permission.MANAGE))
+    with serve(tmp_path / "served", port=0, keys=ring) as running, Client(running, key) as client:
+        for name in ACTIONS:
+            with refused(Condition.UNAUTHENTICATED, word):
+                client.call(name)
+        with refused(Condition.UNAUTHENTICATED, word):
+            list(client.flight.list_flights(options=client.options))
+        with refused(Condition.UNAUTHENTICATED, word):
+            client.info("drive")
+
+
+def test_a_key_ring_keeps_hashes_and_expiry(tmp_path: Path) -> None:
+    path = tmp_path / "keys.json"
+    now = datetime.now(timezone.utc)
+    good = Keyring(path).add(Permission.READ, description="dashboard", expires=now + timedelta(days=1))
+    old = Keyring(path).add(Permission.READ, expires=now - timedelta(days=1))
+    ring = Keyring(path)
+    assert ring.permission_of(good) is Permission.READ
+    with pytest.raises(PermissionError, match="expired on"):
+        ring.permission_of(old)
+    assert [key.description for key in ring.keys] == ["dashboard", ""]
+    assert good not in path.read_text()
+    assert path.stat().st_mode & 0o077 == 0
+    with pytest.raises(SinkError, match="time zone"):
+        ring.add(Permission.READ, expires=datetime(2030, 1, 1))  # noqa: DTZ001 - what the test is about
+    path.write_text('{"keys": [{}]}')
+    with pytest.raises(SinkError, match="key ring"):
+        Keyring(path)
+
+
+def test_a_server_with_a_certificate_speaks_tls_only(tmp_path: Path, rows: Rows) -> None:
+    certificate, key = tmp_path / "cert.pem", tmp_path / "key.pem"
+    made = [
+        "openssl",
+        "req",
+        "-x509",
+        "-newkey",
+        "rsa:2048",
+        "-nodes",
+        "-days",
+        "2",
+        "-subj",
+        "/CN=localhost",
+    ]
+    made += ["-addext", "subjectAltName=DNS:localhost", "-keyout", str(key), "-out", str(certificate)]
+    try:
+        subprocess.run(made, check=True, capture_output=True)  # noqa: S603 - fixed arguments
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("openssl is not here")
+    with serve(tmp_path / "served", "localhost", 0, tls=Tls(certificate, key)) as running:
+        with Client(running, tls_root_certs=certificate.read_bytes()) as client:
+            client.call("sequence_create", locator="drive", user_metadata={})
+            client.upload("drive", "/imu", rows([1]))
+        plain = fl.connect(f"grpc://localhost:{running.port}")
+        with refused(Condition.UNAVAILABLE):
+            list(plain.do_action(fl.Action("info", b"{}"), fl.FlightCallOptions(timeout=5)))
+        plain.close()
+
+
+def test_a_port_that_is_taken_is_said_so(server: Server, tmp_path: Path) -> None:
+    with pytest.raises(SinkError, match=f"{server.port}.*port taken"):
+        serve(tmp_path / "another", port=server.port)
