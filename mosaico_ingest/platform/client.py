@@ -113,20 +113,15 @@ class PlatformClient:
             raise
         return self._codec.decode(bodies.SequenceInfo, _bytes(info.app_metadata))
 
-    def uploaded(self, locator: str) -> Uploaded:
-        """Return what the server holds of a topic; one that does not say is read and counted."""
-        endpoint = self._info(locator).endpoints[0]
-        try:
-            held = self._codec.decode(bodies.TopicInfo, _bytes(endpoint.app_metadata)).data_info
-        except Malformed:
-            return self._counted(endpoint.ticket)
-        span = held.interval
-        return Uploaded(
-            held.total_row_count,
-            span and span.start_ns,
-            span and span.end_ns,
-            held.total_bytes,
-        )
+    def uploaded(self, sequence: str) -> dict[str, Uploaded]:
+        """Return what the server holds of each topic of a sequence, by locator, as far as it says so."""
+        found = (self._about(endpoint) for endpoint in self._info(sequence).endpoints)
+        return {about.resource_locator: _uploaded(about.data_info) for about in found if about is not None}
+
+    def counted(self, locator: str) -> Uploaded:
+        """Return what the server holds of a topic by reading it, for servers that do not say."""
+        ticket = self._info(locator).endpoints[0].ticket
+        return self._call(lambda: self._read(ticket), "do_get", Permission.READ, repeatable=True)
 
     def put(self, put: bodies.Put, schema: pa.Schema) -> fl.FlightStreamWriter:
         """Begin an upload."""
@@ -147,18 +142,21 @@ class PlatformClient:
             repeatable=True,
         )
 
-    def _counted(self, ticket: fl.Ticket) -> Uploaded:
-        def call() -> Uploaded:
-            rows = size = 0
-            bounds: list[int] = []
-            for batch in self._flight.do_get(ticket, self._upload).to_reader():
-                span = pc.min_max(batch.column("timestamp_ns"))
-                rows += batch.num_rows
-                size += batch.nbytes
-                bounds += [at for at in (span["min"].as_py(), span["max"].as_py()) if at is not None]
-            return Uploaded(rows, min(bounds, default=None), max(bounds, default=None), size)
+    def _about(self, endpoint: fl.FlightEndpoint) -> bodies.TopicInfo | None:
+        try:
+            return self._codec.decode(bodies.TopicInfo, _bytes(endpoint.app_metadata))
+        except Malformed:
+            return None
 
-        return self._call(call, "do_get", Permission.READ, repeatable=True)
+    def _read(self, ticket: fl.Ticket) -> Uploaded:
+        rows = size = 0
+        bounds: list[int] = []
+        for batch in self._flight.do_get(ticket, self._upload).to_reader():
+            span = pc.min_max(batch.column("timestamp_ns"))
+            rows += batch.num_rows
+            size += batch.nbytes
+            bounds += [at for at in (span["min"].as_py(), span["max"].as_py()) if at is not None]
+        return Uploaded(rows, min(bounds, default=None), max(bounds, default=None), size)
 
     def _old_version(self) -> str:
         try:
@@ -233,6 +231,11 @@ def _roots(target: ServerTarget) -> str | None:
     raise SinkError(
         f"the certificate file cannot be used: {what}", where=str(target.tls_cert), hint="PEM is wanted"
     )
+
+
+def _uploaded(held: bodies.DataInfo) -> Uploaded:
+    span = held.interval
+    return Uploaded(held.total_row_count, span and span.start_ns, span and span.end_ns, held.total_bytes)
 
 
 def _bytes(metadata: bytes | str) -> bytes:

@@ -10,7 +10,7 @@ from mosaico_ingest import wire
 from mosaico_ingest.config import ServerTarget
 from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.platform.client import PlatformClient, connect
+from mosaico_ingest.platform.client import PlatformClient, Uploaded, connect
 from mosaico_ingest.platform.faults import Refused
 from mosaico_ingest.platform.upload import Memory, Upload
 from mosaico_ingest.policies import IfExists
@@ -98,7 +98,8 @@ class PlatformSession:
     def stored(self) -> tuple[StoredTopic, ...]:
         """Return what the server says over a new connection; see `Session.stored`."""
         with connect(self._target) as client:
-            return tuple(self._stored(client, name, path) for name, path in self._given.items())
+            held = client.uploaded(self._sequence) if self._uploads else {}
+            return tuple(self._stored(client, held, name, path) for name, path in self._given.items())
 
     def commit(self) -> None:
         """Wait until the server has every topic, then make them visible at once."""
@@ -189,11 +190,14 @@ class PlatformSession:
     def _delete_session(self, session: bodies.SessionCreated) -> None:
         self._client.act(actions.SESSION_DELETE, bodies.Located(locator=session.locator))
 
-    def _stored(self, client: PlatformClient, name: str, path: str) -> StoredTopic:
+    def _stored(
+        self, client: PlatformClient, held: Mapping[str, Uploaded], name: str, path: str
+    ) -> StoredTopic:
         if path not in self._uploads:
             return StoredTopic(name, 0, None, None, 0)
-        held = client.uploaded(topic_locator(self._sequence, path))
-        return StoredTopic(name, held.rows, held.start_ns, held.end_ns, held.stored_bytes)
+        locator = topic_locator(self._sequence, path)
+        found = held[locator] if locator in held else client.counted(locator)
+        return StoredTopic(name, found.rows, found.start_ns, found.end_ns, found.stored_bytes)
 
 
 def _topics_of(sequence: bodies.SequenceInfo) -> frozenset[str]:
