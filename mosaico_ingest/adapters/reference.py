@@ -135,7 +135,7 @@ def _also_searched(folder: Path) -> Generator[None]:
 
 
 def _broken(name: str, error: Exception) -> AdapterError:
-    """Say where an import failed: the deepest line that is not Python's own machinery."""
+    """Say where an import failed: in the deepest line that is the user's own, if one is."""
     if isinstance(error, SyntaxError) and error.filename:
         place = f"{error.filename}:{error.lineno}"
     else:
@@ -144,7 +144,8 @@ def _broken(name: str, error: Exception) -> AdapterError:
             for frame in traceback.extract_tb(error.__traceback__)
             if "importlib" not in frame.filename and frame.filename != __file__
         ]
-        place = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else name
+        own = [frame for frame in frames if "site-packages" not in frame.filename] or frames
+        place = f"{own[-1].filename}:{own[-1].lineno}" if own else name
     text = " ".join(str(error).split())
     return AdapterError(f"importing {name} failed: {type(error).__name__}: {text}", where=place)
 

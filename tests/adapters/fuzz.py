@@ -10,7 +10,18 @@ from mosaico_ingest.bag.names import TIME
 
 _SPECIAL_FLOATS = (0.0, 0.0, 1.0, -1.0, 0.5, float("nan"), float("inf"), float("-inf"))
 _TEXTS = ("", "", "map", "base_link", "überall", "bgr8; jpeg compressed bgr8", "png")
-_BITS = {"uint8": 8, "byte": 8, "char": 8, "uint16": 16, "uint32": 32, "uint64": 64, "int8": -8, "int16": -16, "int32": -32, "int64": -64}
+_BITS = {
+    "uint8": 8,
+    "byte": 8,
+    "char": 8,
+    "uint16": 16,
+    "uint32": 32,
+    "uint64": 64,
+    "int8": -8,
+    "int16": -16,
+    "int32": -32,
+    "int64": -64,
+}
 _DYADIC = 1024
 """Floats with few bits are equal in both widths."""
 
@@ -46,7 +57,9 @@ def _one(definition: Definition, field: Field, random: Random) -> Any:
     if field.type in {"string", "wstring"}:
         return random.choice(_TEXTS)
     if field.type.startswith("float"):
-        return random.choice((*_SPECIAL_FLOATS, *(random.randrange(-(2**20), 2**20) / _DYADIC for _ in range(8))))
+        return random.choice(
+            (*_SPECIAL_FLOATS, *(random.randrange(-(2**20), 2**20) / _DYADIC for _ in range(8)))
+        )
     return _integer(_BITS[field.type], random)
 
 

@@ -44,7 +44,9 @@ class SpeedAdapter(ROSAdapterBase[Speed]):
 @pytest.fixture
 def floats(define: Callable[..., Definition], adapt: Callable[..., Adapted]) -> Callable[..., Adapted]:
     def run(adapter: type[Any], *values: float) -> Adapted:
-        return adapt(PythonAdapterSpec(adapter), define("std_msgs/msg/Float64"), [{"data": v} for v in values])
+        return adapt(
+            PythonAdapterSpec(adapter), define("std_msgs/msg/Float64"), [{"data": v} for v in values]
+        )
 
     return run
 
@@ -113,7 +115,9 @@ def test_columns_are_adapted_by_from_batch(floats: Callable[..., Adapted]) -> No
             values = rows.field("data")
             columns = [values, pa.nulls(len(rows), pa.string())]
             missing = pa.array(np.asarray(values) == 7)
-            return pa.StructArray.from_arrays(columns, fields=list(Speed.ontology_type().struct), mask=missing)
+            return pa.StructArray.from_arrays(
+                columns, fields=list(Speed.ontology_type().struct), mask=missing
+            )
 
     adapted = floats(ByColumns, 1, 7, 3)
     assert ByColumns.calls == 1
@@ -133,7 +137,9 @@ def test_a_batch_that_raises_is_halved_until_the_rows_are_found(floats: Callable
 
     adapted = floats(Picky, *range(20))
     assert adapted.index.tolist() == [*range(13), *range(14, 20)]
-    assert [(failure.row, failure.reason) for failure in adapted.failures] == [(13, "Picky: ValueError: thirteen")]
+    assert [(failure.row, failure.reason) for failure in adapted.failures] == [
+        (13, "Picky: ValueError: thirteen")
+    ]
 
 
 def test_columns_of_another_type_break_the_adapter(floats: Callable[..., Adapted]) -> None:
@@ -142,7 +148,9 @@ def test_columns_of_another_type_break_the_adapter(floats: Callable[..., Adapted
         def from_batch(cls, rows: pa.StructArray) -> pa.Array:
             return rows.field("data")
 
-    with pytest.raises(AdapterError, match=r"Broken.from_batch returned 1 rows of double, expected 1 rows of Speed"):
+    with pytest.raises(
+        AdapterError, match=r"Broken.from_batch returned 1 rows of double, expected 1 rows of Speed"
+    ):
         floats(Broken, 1)
 
 
@@ -167,7 +175,9 @@ def test_registering_makes_a_class_the_default_of_its_types() -> None:
 
     class Other(SpeedAdapter): ...
 
-    with pytest.raises(AdapterError, match=r"Other and .*SpeedAdapter both register as the default for std_msgs/msg/Float64"):
+    with pytest.raises(
+        AdapterError, match=r"Other and .*SpeedAdapter both register as the default for std_msgs/msg/Float64"
+    ):
         register_default_adapter(Other)
 
 
@@ -185,7 +195,7 @@ def test_a_class_without_its_parts_says_which_is_missing(define: Callable[..., D
         ontology_of(int)
 
 
-_FILE = '''
+_FILE = """
 from mosaico_ingest.adapters import ROSAdapterBase
 from mosaico_ingest.ontology import Serializable
 from beside import FACTOR
@@ -200,7 +210,7 @@ class {name}(ROSAdapterBase[{name}Row]):
     @classmethod
     def from_dict(cls, ros_data):
         return {name}Row(value=FACTOR * ros_data["data"])
-'''
+"""
 
 
 def test_a_file_beside_the_manifest_is_loaded_and_survives_pickling(tmp_path: Path) -> None:

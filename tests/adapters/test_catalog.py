@@ -7,6 +7,7 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -79,10 +80,8 @@ def _definitions(define: Define, msgtype: str) -> list[Definition]:
     """Return the type as ROS 1 and ROS 2 have it, those there are."""
     found: list[Definition] = []
     for distro in (Stores.LATEST, Stores.ROS2_FOXY, Stores.ROS1_NOETIC):
-        try:
+        with suppress(BagError):
             found.append(define(msgtype, distro))
-        except BagError:
-            continue
     assert found
     return found
 

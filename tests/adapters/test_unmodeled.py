@@ -60,7 +60,10 @@ def test_the_spec_is_picklable_and_carries_the_layout() -> None:
     spec = UnmodeledSpec(serialization_format=SerializationFormat.RAGGED)
     assert pickle.loads(pickle.dumps(spec)) == spec  # noqa: S301 - what was just pickled
     definition = _defined("int8 a\n")
-    assert spec.bind(definition, ros_shape(definition)).ontology.serialization_format is SerializationFormat.RAGGED
+    assert (
+        spec.bind(definition, ros_shape(definition)).ontology.serialization_format
+        is SerializationFormat.RAGGED
+    )
 
 
 def test_the_origin_names_type_constants_definition_and_file() -> None:
@@ -73,5 +76,7 @@ def test_the_origin_names_type_constants_definition_and_file() -> None:
 
 
 def test_constants_without_a_number_in_json_are_spelled_out() -> None:
-    enums = ros_metadata(_defined("float64 A=nan\nfloat64 B=inf\nfloat64 C=-inf\nfloat64 D=0.5\n"), "f")["_ros_"]["enums"]
+    enums = ros_metadata(_defined("float64 A=nan\nfloat64 B=inf\nfloat64 C=-inf\nfloat64 D=0.5\n"), "f")[
+        "_ros_"
+    ]["enums"]
     assert enums == {"A": "NaN", "B": "Infinity", "C": "-Infinity", "D": 0.5}

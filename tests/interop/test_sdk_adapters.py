@@ -1,0 +1,86 @@
+"""Adapters written for the official SDK run as they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from mosaico_ingest.adapters.adapter import Adapted, Envelope
+from mosaico_ingest.adapters.reference import load_adapter_reference
+from mosaico_ingest.bag.shape import ros_shape
+from mosaico_ingest.bag.types import TypeResolver
+from mosaico_ingest.bridge import ROSBridge
+from mosaico_ingest.policies import Stores
+
+pytestmark = pytest.mark.interop
+pytest.importorskip("mosaicolabs.bridges.ros", reason="the official SDK is not installed")
+
+WRITTEN_FOR_THE_SDK = """
+from mosaicolabs import Message
+from mosaicolabs.bridges.ros import ROSAdapterBase, ROSMessage
+from mosaicolabs.models.data import Vector3d
+from mosaicolabs.models.core import Serializable
+
+class SdkSpeed(Serializable):
+    value: float
+    frame: str
+
+class SpeedAdapter(ROSAdapterBase[SdkSpeed]):
+    ros_msgtype = ("geometry_msgs/msg/TwistStamped",)
+    __mosaico_ontology_type__ = SdkSpeed
+
+    @classmethod
+    def from_dict(cls, ros_data: dict) -> SdkSpeed:
+        return SdkSpeed(value=1.0 / ros_data["twist"]["linear"]["x"], frame=ros_data["header"]["frame_id"])
+
+class LateAdapter(SpeedAdapter):
+    @classmethod
+    def translate(cls, msg: ROSMessage, **kwargs) -> Message:
+        message = super().translate(msg, **kwargs)
+        stamp = msg.header.stamp
+        return Message(timestamp_ns=stamp.seconds * 10**9 + stamp.nanoseconds, data=message.data)
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One file for all tests: the SDK refuses a second model of the same name."""
+    path = tmp_path_factory.mktemp("sdk")
+    (path / "theirs.py").write_text(WRITTEN_FOR_THE_SDK)
+    return path
+
+
+def _adapt(ref: str, folder: Path, *speeds: float) -> Adapted:
+    definition = TypeResolver(Stores.LATEST).resolve("geometry_msgs/msg/TwistStamped", None, ros_version=2)
+    shape = ros_shape(definition)
+    header = {"stamp": {"sec": 5, "nanosec": 6}, "frame_id": "base"}
+    rows = pa.array([{"header": header, "twist": {"linear": {"x": x}}} for x in speeds], shape)
+    envelope = Envelope("/speed", definition.root, np.arange(len(speeds), dtype=np.int64))
+    return load_adapter_reference(ref, folder).bind(definition, shape).adapt(rows, envelope)
+
+
+def test_from_dict_fills_the_sdks_own_model(folder: Path) -> None:
+    adapted = _adapt("theirs.py:SpeedAdapter", folder, 2.0, 0.0, 4.0)
+    assert adapted.rows.to_pylist() == [{"value": 0.5, "frame": "base"}, {"value": 0.25, "frame": "base"}]
+    assert adapted.failures[0].reason == "SpeedAdapter: ZeroDivisionError: float division by zero"
+
+
+def test_translate_gets_the_sdks_own_message(folder: Path) -> None:
+    adapted = _adapt("theirs.py:LateAdapter", folder, 2.0)
+    assert adapted.rows.field("value").to_pylist() == [0.5]
+    assert adapted.log_times is not None
+    assert adapted.log_times.tolist() == [5_000_000_006]
+
+
+def test_a_built_in_adapter_of_the_sdk_can_be_named(folder: Path) -> None:
+    bridge = ROSBridge(
+        overrides={"/imu": "mosaicolabs.bridges.ros.adapters.sensor_msgs:IMUAdapter"}, base_dir=folder
+    )
+    found = bridge.resolve("/imu", "sensor_msgs/msg/Imu")
+    definition = TypeResolver(Stores.LATEST).resolve("sensor_msgs/msg/Imu", None, ros_version=2)
+    bound: Any = found.spec.bind(definition, ros_shape(definition))
+    assert (bound.ontology.tag, bound.ontology.fingerprint) == ("IMU", "2d6a4121b0")
