@@ -16,6 +16,7 @@ __all__ = ["Document", "Kind", "documents_in", "kind_of"]
 
 _JOB = re.compile(r"^(bag|\"bag\"|'bag') *:|^ *\{ *\"?bag\"? *:", re.MULTILINE)
 _ADAPTER = re.compile(r"^(adapter|ros_type|variants) *:", re.MULTILINE)
+_NAMED = re.compile(r"^adapter *:", re.MULTILINE)
 _FENCE = re.compile(r"^(?P<indent> *)(?P<fence>```+|~~~+) *(?P<language>\w*)[^\n]*$")
 
 
@@ -39,6 +40,8 @@ class Document:
     """Where its relative paths start."""
     path: Path | None = None
     """The file on disk, if it is one of its own."""
+    example: bool = False
+    """Whether it is an example on a page, so that nothing beside it has to be there."""
 
 
 def kind_of(text: str, *, suffix: str = ".yaml") -> Kind | None:
@@ -59,8 +62,9 @@ def documents_in(text: str, *, file: str, path: Path | None, folder: Path, named
     if suffix in {".md", ".markdown"}:
         for block in _blocks(text):
             kind = kind_of(block)
-            if kind is not None and f"{MARKER} skip" not in block:
-                yield Document(file, block, kind, folder)
+            whole = kind is not Kind.ADAPTER or _NAMED.search(block) is not None
+            if kind is not None and whole and f"{MARKER} skip" not in block:
+                yield Document(file, block, kind, folder, example=True)
         return
     kind = kind_of(text, suffix=suffix) or (Kind.JOB if named else None)
     if kind is not None:

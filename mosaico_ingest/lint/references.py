@@ -17,6 +17,7 @@ __all__ = [
     "PythonReference",
     "adapter_references",
     "find_module",
+    "is_mapping_file",
     "loaded_names",
     "python_reference",
     "read_classes",
@@ -45,24 +46,29 @@ def adapter_references(job: Job) -> Iterator[tuple[Place, str]]:
         yield ("adapters", "override", topic), reference
 
 
-def loaded_names(job: Job) -> set[str]:
-    """Return what the adapters of `adapters.load` are called, so that an override may name them."""
+def loaded_names(job: Job) -> set[str] | None:
+    """Return what the adapters of `adapters.load` are called; None if one of them cannot be read."""
     names: set[str] = set()
     for reference in job.manifest.adapters.load:
         python = python_reference(reference)
-        if python is not None:
-            names.add(python.name.rpartition(".")[2])
-        elif reference.endswith((".yaml", ".yml")):
-            names |= _adapter_name(job.resolve(reference))
+        name = python.name.rpartition(".")[2] if python is not None else _adapter_name(job.resolve(reference))
+        if name is None:
+            return None
+        names.add(name)
     return names
 
 
-def _adapter_name(file: Path) -> set[str]:
+def _adapter_name(file: Path) -> str | None:
     try:
         name = load_source(file.read_text("utf-8"), file=str(file)).at(("adapter",))
     except (OSError, UnicodeDecodeError):
-        return set()
-    return {name} if isinstance(name, str) else set()
+        return None
+    return name if isinstance(name, str) else None
+
+
+def is_mapping_file(reference: str) -> bool:
+    """Say whether a reference is the path of an adapter file."""
+    return reference.endswith((".yaml", ".yml"))
 
 
 def python_reference(reference: str) -> PythonReference | None:

@@ -34,6 +34,8 @@ class Rule:
     """The module's docstring: what, why, a bad and a good example."""
     job: Callable[[Job], Iterable[Problem]] | None = None
     message: Callable[[MessageFile], Iterable[Problem]] | None = None
+    disk: bool = False
+    """Whether it looks at files beside the document; such a rule says nothing about the examples of a page."""
 
     @property
     def name(self) -> str:

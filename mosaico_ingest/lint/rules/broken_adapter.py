@@ -55,4 +55,4 @@ def _fault(file: Path, name: str) -> tuple[str, str] | None:
     return None
 
 
-RULE = Rule("ING220", __name__, Severity.ERROR, __doc__, job=check)
+RULE = Rule("ING220", __name__, Severity.ERROR, __doc__, job=check, disk=True)

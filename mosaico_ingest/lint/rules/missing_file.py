@@ -32,4 +32,4 @@ def check(job: Job) -> Iterator[Problem]:
             yield Problem(f"there is no file {job.resolve(path)}", job.source.span(place), remedy)
 
 
-RULE = Rule("ING232", __name__, Severity.ERROR, __doc__, job=check)
+RULE = Rule("ING232", __name__, Severity.ERROR, __doc__, job=check, disk=True)

@@ -28,4 +28,4 @@ def check(job: Job) -> Iterator[Problem]:
         yield Problem(message, job.span("run", "report"), "make it, or write the report elsewhere")
 
 
-RULE = Rule("ING233", __name__, Severity.WARNING, __doc__, job=check)
+RULE = Rule("ING233", __name__, Severity.WARNING, __doc__, job=check, disk=True)

@@ -39,4 +39,4 @@ def check(job: Job) -> Iterator[Problem]:
             yield Problem(f"{path} has no .msg or .idl file", span, "name the directory they are in")
 
 
-RULE = Rule("ING217", __name__, Severity.ERROR, __doc__, job=check)
+RULE = Rule("ING217", __name__, Severity.ERROR, __doc__, job=check, disk=True)

@@ -36,4 +36,4 @@ def _ancestors(folder: Path) -> list[Path]:
     return [folder.resolve(), *folder.resolve().parents]
 
 
-RULE = Rule("ING235", __name__, Severity.WARNING, __doc__, job=check)
+RULE = Rule("ING235", __name__, Severity.WARNING, __doc__, job=check, disk=True)

@@ -32,4 +32,4 @@ def check(job: Job) -> Iterator[Problem]:
         yield Problem(message, job.key_span("target", "api_key"), f"chmod 600 {job.file}")
 
 
-RULE = Rule("ING228", __name__, Severity.ERROR, __doc__, job=check)
+RULE = Rule("ING228", __name__, Severity.ERROR, __doc__, job=check, disk=True)

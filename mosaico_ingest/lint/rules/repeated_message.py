@@ -40,4 +40,4 @@ def check(job: Job) -> Iterator[Problem]:
         first.update({key: line for key in keys if key not in first})
 
 
-RULE = Rule("ING218", __name__, Severity.ERROR, __doc__, job=check)
+RULE = Rule("ING218", __name__, Severity.ERROR, __doc__, job=check, disk=True)

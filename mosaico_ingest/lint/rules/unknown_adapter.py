@@ -1,7 +1,7 @@
-"""`unknown-adapter`: an adapter that cannot be found.
+"""`unknown-adapter`: a name that no adapter has.
 
-It is called by the name of a built-in adapter, by the path of a YAML file, or by `module:Class` or `file.py:Class`.
-There is none of this name, no such file or no such module.
+An adapter is called by the name of a built-in or a loaded one, by the path of its YAML file, or by `module:Class` or
+`file.py:Class`.
 
 Bad:
     bag: {path: data/run.mcap}
@@ -22,44 +22,27 @@ from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.adapters.unmodeled import UnmodeledSpec
 from mosaico_ingest.diagnostics import Severity
 from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.references import adapter_references, find_module, loaded_names, python_reference
+from mosaico_ingest.lint.references import adapter_references, is_mapping_file, loaded_names, python_reference
 from mosaico_ingest.lint.rule import Problem, Rule
 from mosaico_ingest.manifest.problems import nearest
 
+_UNMODELED = UnmodeledSpec().name
+
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem for each adapter that is nowhere."""
-    known = {*BY_NAME, UNMODELED, *loaded_names(job)}
+    """Yield a problem for each name that no adapter has."""
+    loaded = loaded_names(job)
+    if loaded is None:
+        return  # one that is loaded cannot be read, which is said elsewhere; it may have the name
+    known = {*BY_NAME, _UNMODELED, *loaded}
     for place, reference in adapter_references(job):
-        if job.known(reference) and reference not in known:
-            missing = _missing(job, reference)
-            if missing is not None:
-                yield Problem(missing[0], job.source.span(place), missing[1])
-
-
-def _missing(job: Job, reference: str) -> tuple[str, str] | None:
-    """Return what is not there and what to do about it."""
-    starts = "paths start at the manifest's folder"
-    python = python_reference(reference)
-    if reference.endswith((".yaml", ".yml")):
-        return (
-            None
-            if job.resolve(reference).is_file()
-            else (f"there is no file {job.resolve(reference)}", starts)
-        )
-    if python is None:
-        close = nearest(reference, BY_NAME)
-        hint = f"did you mean {close}?" if close else "name a built-in adapter, a YAML file, or module:Class"
-        return f"no adapter is called {reference!r}", hint
-    if python.is_file:
-        there = job.resolve(python.module).is_file()
-        return None if there else (f"there is no file {job.resolve(python.module)}", starts)
-    if find_module(python.module, job.folder) is None:
-        return f"there is no module {python.module}", f"install it, or put it into {job.folder}"
-    return None
-
-
-UNMODELED = UnmodeledSpec().name
+        is_name = python_reference(reference) is None and not is_mapping_file(reference)
+        if is_name and job.known(reference) and reference not in known:
+            close = nearest(reference, known)
+            hint = (
+                f"did you mean {close}?" if close else "name a built-in adapter, a YAML file, or module:Class"
+            )
+            yield Problem(f"no adapter is called {reference!r}", job.source.span(place), hint)
 
 
 RULE = Rule("ING219", __name__, Severity.ERROR, __doc__, job=check)

@@ -1,0 +1,280 @@
+"""Files and folders are judged whole: comments, settings, Markdown, fixes, and nothing is ever a traceback."""
+
+from __future__ import annotations
+
+import os
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Literal
+
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from mosaico_ingest.errors import ManifestError, NothingMatched
+from mosaico_ingest.lint.engine import LintReport, lint_paths
+from mosaico_ingest.manifest.load import load_manifest
+from mosaico_ingest.plan.compile import compile_manifest
+
+GOOD = "bag: {path: data/run.mcap}\n"
+TRAP = "bag: {path: data/run.mcap}\nsequence: {metadata: {a: on}}\n"
+
+
+def judged(project: Path, text: str | bytes, name: str = "job.yaml", *, fix: bool = False) -> LintReport:
+    file = project / name
+    file.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return lint_paths([file], env={}, fix=fix)
+
+
+def rules(report: LintReport) -> list[str]:
+    return [finding.rule for finding in report.findings]
+
+
+def test_a_clean_file_is_zero(project: Path) -> None:
+    assert judged(project, GOOD).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        (TRAP, 12),
+        ("bag: {path: data/run.db3}\n", 11),
+        ("bag: {path: data/run.mcap}\nrun: {jobs: 2}\n", 10),
+    ],
+)
+def test_the_worst_severity_is_the_exit_code(project: Path, text: str, code: int) -> None:
+    assert judged(project, text).exit_code == code
+
+
+def test_nothing_to_judge_has_its_own_code(tmp_path: Path) -> None:
+    (tmp_path / "compose.yaml").write_text("services: {}\n")
+    assert lint_paths([tmp_path], env={}).exit_code == 3
+
+
+def test_a_folder_is_judged_with_all_that_is_ours_below_it(project: Path) -> None:
+    (project / "deep").mkdir()
+    (project / "deep" / "job.yml").write_text(TRAP)
+    (project / "deep" / "other.yaml").write_text("services: {a: on}\n")
+    (project / ".git" / "job.yaml").write_text(TRAP)
+    report = lint_paths([project], env={})
+    names = [Path(file.file).relative_to(project).as_posix() for file in report.files]
+    assert names == ["adapters/pack.yaml", "deep/job.yml", "msgs/BatteryPack.msg", "msgs/Cell.msg"]
+    assert rules(report) == ["yaml-boolean"]
+
+
+def test_standard_input_is_a_job() -> None:
+    report = lint_paths(["-"], env={}, stdin=TRAP)
+    assert str(report.findings[0].span) == "-:2:26"
+
+
+@pytest.mark.parametrize(
+    ("content", "rule"),
+    [
+        (b"\xff", "not-utf8"),
+        (b"bag: \0", "yaml-character"),
+        (b"", "empty-manifest"),
+        (b"- a", "not-a-mapping"),
+    ],
+)
+def test_a_file_that_is_no_manifest_is_a_finding(project: Path, content: bytes, rule: str) -> None:
+    assert rules(judged(project, content)) == [rule]
+
+
+def test_a_file_that_is_not_there_is_a_finding(tmp_path: Path) -> None:
+    assert rules(lint_paths([tmp_path / "job.yaml"], env={})) == ["unreadable-file"]
+
+
+def test_what_the_model_refuses_does_not_hide_what_the_rules_find(project: Path) -> None:
+    text = """
+bag: {path: [data/a.mcap, 5], ros_distro: humble, typo: 1}
+sequence: {name: a b}
+topics: [/a, /camera/.*]
+run: {jobs: many}
+"""
+    assert rules(judged(project, text)) == [
+        "wrong-type", "wrong-value", "unknown-key", "sequence-name", "topic-pattern", "wrong-type",
+    ]  # fmt: skip
+
+
+def test_a_missing_recording_does_not_hide_the_rest(project: Path) -> None:
+    assert rules(judged(project, "sequence: {name: a b}\n")) == ["missing-key", "sequence-name"]
+
+
+@pytest.mark.parametrize("word", ["yaml-boolean", "ING007"])
+def test_a_comment_silences_a_rule_on_its_line(project: Path, word: str) -> None:
+    text = f"bag: {{path: data/run.mcap}}\nsequence: {{metadata: {{a: on}}}}  # ingest: ignore[{word}]\n"
+    assert rules(judged(project, text)) == []
+
+
+def test_a_comment_alone_on_a_line_is_about_the_next(project: Path) -> None:
+    text = "bag: {path: data/run.mcap}\n# ingest: ignore[yaml-boolean]\nsequence: {metadata: {a: on}}\n"
+    assert rules(judged(project, text)) == []
+
+
+def test_a_comment_for_the_file_is_about_all_of_it(project: Path) -> None:
+    assert rules(judged(project, f"# ingest: ignore-file[yaml-boolean]\n{TRAP}")) == []
+
+
+def test_settings_change_severities_and_leave_files_out(project: Path) -> None:
+    (project / ".ingest.yaml").write_text(
+        "lint:\n  severity: {ING007: 'off', idle-jobs: error}\n  exclude: [old/*]\n"
+    )
+    (project / "old").mkdir()
+    (project / "old" / "job.yaml").write_text(TRAP)
+    (project / "job.yaml").write_text(TRAP + "run: {jobs: 2}\n")
+    report = lint_paths([project], env={})
+    assert [(finding.rule, finding.severity.value) for finding in report.findings] == [("idle-jobs", "error")]
+
+
+def test_settings_may_stand_in_pyproject(project: Path) -> None:
+    (project / "pyproject.toml").write_text('[tool.ingest.lint]\nseverity = {yaml-boolean = "info"}\n')
+    assert judged(project, TRAP).exit_code == 10
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["lint: {severity: {yaml-bolean: info}}", "lint: {severity: {ING007: loud}}", "lnt: {}", "lint: ["],
+)
+def test_settings_that_mean_nothing_are_refused(project: Path, text: str) -> None:
+    (project / ".ingest.yaml").write_text(text)
+    with pytest.raises(ManifestError):
+        judged(project, GOOD)
+
+
+def test_yaml_blocks_of_a_page_are_judged_at_their_place(project: Path) -> None:
+    page = f"# Title\n\n```yaml\n{TRAP}```\n\n```yaml\nservices: on\n```\n\n```text\nbag: on\n```\n"
+    report = judged(project, page, "page.md")
+    assert [(finding.rule, finding.span and finding.span.line) for finding in report.findings] == [
+        ("yaml-boolean", 5)
+    ]
+
+
+def test_an_example_on_a_page_needs_no_files(project: Path) -> None:
+    page = "```yaml\nbag: {path: data/run.mcap}\nadapters: {load: [nowhere.yaml, x.y:Z]}\n```\n"
+    assert rules(judged(project, page, "page.md")) == []
+
+
+BROKEN = """\
+# A comment stays.
+bag:
+    path:   data/run.mcap   # and so does this
+    ros_distro: Humble
+Sequence:
+  name: {stem}_raw
+topics: [/cam/*, !/cam/debug,   */image]
+run: {jobs: "2"}
+"""
+MENDED = """\
+# A comment stays.
+bag:
+    path:   data/run.mcap   # and so does this
+    ros_distro: ros2_humble
+sequence:
+  name: "{stem}_raw"
+topics: [/cam/*, "!/cam/debug",   "*/image"]
+run: {jobs: 2}
+"""
+
+
+def test_a_fix_keeps_comments_and_layout_and_is_made_once(project: Path) -> None:
+    report = judged(project, BROKEN, fix=True)
+    assert (project / "job.yaml").read_text() == MENDED
+    assert report.exit_code == 10  # idle-jobs, which nobody can mend
+    assert report.files[0].fixed == 6
+    assert lint_paths([project / "job.yaml"], env={}, fix=True).files[0].fixed == 0
+
+
+def test_a_fix_keeps_the_ends_of_lines(project: Path) -> None:
+    judged(project, BROKEN.replace("\n", "\r\n"), fix=True)
+    assert (project / "job.yaml").read_bytes() == MENDED.replace("\n", "\r\n").encode()
+
+
+def test_a_byte_order_mark_does_not_shift_a_fix(project: Path) -> None:
+    judged(project, "\ufeffbag: {path: 5}\n", fix=True)
+    assert (project / "job.yaml").read_text() == 'bag: {path: "5"}\n'
+
+
+def test_without_fix_nothing_is_written(project: Path) -> None:
+    judged(project, BROKEN)
+    assert (project / "job.yaml").read_text() == BROKEN
+
+
+VALUES = st.recursive(
+    st.sampled_from(["on", "/cam/*", "!/x", "${A}", "{stem}", "a b", "", 1, -1, 1.5, True, None]),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.sampled_from(["a", "/imu", "default", "name", "path"]), inner, max_size=3)
+    ),
+    max_leaves=5,
+)
+KEYS = [
+    "path",
+    "ros_distro",
+    "custom_msgs",
+    "time",
+    "name",
+    "metadata",
+    "if_exists",
+    "load",
+    "override",
+    "unmodeled",
+]
+KEYS += [
+    "session",
+    "topic",
+    "message",
+    "store",
+    "host",
+    "port",
+    "api_key",
+    "jobs",
+    "memory",
+    "report",
+    "/imu",
+]
+SECTIONS = st.dictionaries(st.sampled_from(KEYS), VALUES, max_size=4) | VALUES
+JOBS = st.fixed_dictionaries(
+    {"bag": st.just({"path": "data/run.mcap"}) | SECTIONS},
+    optional=dict.fromkeys(
+        ("sequence", "topics", "topic_settings", "adapters", "on_error", "target", "run", "version"), SECTIONS
+    ),
+)
+
+
+@settings(max_examples=80, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(job=JOBS, style=st.sampled_from([None, True, False]))
+def test_whatever_lints_clean_compiles_and_nothing_is_a_traceback(
+    project: Path, job: object, style: Literal[True, False] | None
+) -> None:
+    (project / "data" / "run.mcap").touch()
+    report = judged(project, yaml.safe_dump(job, default_flow_style=style))
+    if report.exit_code < 12:
+        with suppress(NothingMatched):  # the recording is not the linter's business
+            assert compile_manifest(load_manifest(project / "job.yaml", env={}))
+
+
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(text=st.text(alphabet="abg:-[]{}!*&#|>'\"%@`,?\t\n 01.~$_<é", max_size=80))
+def test_any_text_is_judged(project: Path, text: str) -> None:
+    judged(project, f"bag: {{path: data/run.mcap}}\n{text}")
+
+
+@pytest.mark.slow
+def test_five_hundred_manifests_are_judged_in_five_seconds(tmp_path: Path) -> None:
+    example = (Path(__file__).parents[1] / "manifest" / "test_load.py").read_text()
+    text = example.split('FULL = """\\\n')[1].split('"""')[0]
+    for number in range(500):
+        (tmp_path / f"job_{number:03}.yaml").write_text(text)
+    lint_paths([tmp_path / "job_000.yaml"], env=None)
+    start = time.perf_counter()
+    assert len(lint_paths([tmp_path], env=None).files) == 500
+    assert time.perf_counter() - start < 5
+
+
+def test_the_environment_is_looked_at_only_if_given(project: Path) -> None:
+    file = project / "job.yaml"
+    file.write_text("bag: {path: '${NOT_SET_ANYWHERE}'}\n")
+    assert rules(lint_paths([file], env=os.environ)) == ["unset-variable"]
+    assert rules(lint_paths([file], env=None)) == []

@@ -1,0 +1,37 @@
+"""Two globs are compared without any topic, and never wrongly."""
+
+from __future__ import annotations
+
+from fnmatch import fnmatchcase
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mosaico_ingest.lint.globs import covers
+
+PATTERNS = st.text(alphabet="/ab*?", max_size=6)
+NAMES = st.text(alphabet="/ab", max_size=8)
+
+
+@pytest.mark.parametrize(
+    ("general", "special", "expected"),
+    [
+        ("*", "/a", True),
+        ("/a/*", "/a/b/*", True),
+        ("/a/*", "/a/b", True),
+        ("/a?", "/a*", False),
+        ("/a/b", "/a/*", False),
+        ("/*/image", "/front/image", True),
+        ("/a*", "/a", True),
+        ("/a/[bc]", "/a/b", True),
+    ],
+)
+def test_a_glob_that_contains_another_is_known(general: str, special: str, expected: bool) -> None:  # noqa: FBT001
+    assert covers(general, special) is expected
+
+
+@given(PATTERNS, PATTERNS, NAMES)
+def test_what_covers_matches_whatever_the_other_matches(general: str, special: str, name: str) -> None:
+    if covers(general, special) and fnmatchcase(name, special):
+        assert fnmatchcase(name, general)
