@@ -76,7 +76,7 @@ class _Sample:
         self._places = notes.places()
 
     def compare(self, frame: Frame) -> NDArray[np.bool_]:
-        """Return which messages, all of the sample's length, have its length words."""
+        """Return which messages, all of the sample's length, have the words its walk depended on."""
         if not self.fits:
             return np.zeros(len(frame), bool)
         words = frame.words()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pyarrow as pa
 
@@ -60,18 +62,16 @@ class ColumnarDecoder:
             return self._rowwise.decode(batch)
         left = np.ones(len(batch), bool)
         parts: list[tuple[Int64s, pa.StructArray]] = []
-        for order, rows in self._by_order(batch):
-            part = self._decode(_frame(batch, rows, order, self._layout.encoding))
-            left[rows[part[0]]] = False
-            parts.append((rows[part[0]], part[1]))
+        for order, members in self._by_order(batch):
+            found, rows = self._decode(_frame(batch, members, order, self._layout.encoding))
+            left[members[found]] = False
+            parts.append((members[found], rows))
         rest = np.flatnonzero(left)
         failures: tuple[RowFailure, ...] = ()
         if len(rest) or not parts:
             slow = self._rowwise.decode(_take(batch, rest))
             parts.append((rest[slow.index], slow.rows))
-            failures = tuple(
-                RowFailure(int(rest[failure.row]), failure.rule, failure.reason) for failure in slow.failures
-            )
+            failures = tuple(replace(failure, row=int(rest[failure.row])) for failure in slow.failures)
         return _merge(parts, failures)
 
     def _by_order(self, batch: RawBatch) -> list[tuple[str, Int64s]]:
@@ -100,10 +100,9 @@ def _frame(batch: RawBatch, rows: Int64s, order: str, encoding: Encoding) -> Fra
 
 
 def _take(batch: RawBatch, rows: Int64s) -> RawBatch:
-    return RawBatch(
-        channel=batch.channel,
+    return replace(
+        batch,
         log_times=batch.log_times[rows],
-        data=batch.data,
         starts=batch.starts[rows],
         lengths=batch.lengths[rows],
         offsets=batch.offsets[rows],

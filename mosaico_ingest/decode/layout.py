@@ -17,7 +17,9 @@ from mosaico_ingest.bag.definition import Container, Definition, Field, MessageT
 from mosaico_ingest.bag.shape import NUMBERS, TEXTS
 
 __all__ = [
+    "PADDING",
     "WORD",
+    "ZEROS",
     "Block",
     "Body",
     "Column",
@@ -37,6 +39,8 @@ __all__ = [
 
 WORD = 4
 """Bytes of a length word."""
+PADDING, ZEROS = 3, 7
+"""Bytes that CDR may leave behind a message, and that it may if they are zero."""
 _MAX_ALIGN = 8
 _UNITS = {"string": 1, "wstring": 4}
 

@@ -13,7 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mosaico_ingest.bag.batch import Encoding
-from mosaico_ingest.decode.layout import WORD, Block, Body, Layout, Loop, Run, Step, Text, least_bytes
+from mosaico_ingest.decode.layout import (
+    PADDING,
+    WORD,
+    ZEROS,
+    Block,
+    Body,
+    Layout,
+    Loop,
+    Run,
+    Step,
+    Text,
+    least_bytes,
+)
 from mosaico_ingest.decode.places import Frame, Int64s, Located, Place, Places, expand, join
 from mosaico_ingest.decode.stepwise import Notes, Stepper
 
@@ -21,9 +33,6 @@ __all__ = ["FEW", "locate_lockstep"]
 
 FEW = 16
 """So many messages are walked faster one at a time."""
-
-_PADDING = 3
-_ZEROS = 7
 
 
 def locate_lockstep(layout: Layout, frame: Frame) -> Located:
@@ -59,13 +68,13 @@ class _Cursor:
 class _Walk:
     """One pass over the messages of a frame."""
 
-    __slots__ = ("_aligned", "_data", "_frame", "_layout", "_words", "broken")
+    __slots__ = ("_aligned", "_frame", "_last", "_layout", "_words", "broken")
 
     def __init__(self, layout: Layout, frame: Frame) -> None:
         self._layout = layout
         self._frame = frame
-        self._data = frame.data
         self._words = frame.words()
+        self._last = len(self._words) - 1
         self._aligned = layout.encoding is Encoding.CDR
         self.broken = np.zeros(len(frame), bool)
 
@@ -77,8 +86,8 @@ class _Walk:
         if not self._aligned:
             self._drop(cursor, left != 0)
             return
-        self._drop(cursor, (left < 0) | (left > _ZEROS))
-        more = np.flatnonzero((left > _PADDING) & (left <= _ZEROS))
+        self._drop(cursor, (left < 0) | (left > ZEROS))
+        more = np.flatnonzero((left > PADDING) & (left <= ZEROS))
         if len(more):
             first, last = self._words[cursor.pos[more]], self._words[cursor.end[more] - WORD]
             wrong = np.zeros(len(left), bool)
@@ -164,7 +173,7 @@ class _Walk:
         if self._aligned:
             cursor.align(WORD)
         # A word beyond the message's end is out of bounds below, as less than nothing is left behind it.
-        count = self._words[np.minimum(cursor.pos, len(self._words) - 1)].astype(np.int64)
+        count = self._words[np.minimum(cursor.pos, self._last)].astype(np.int64)
         cursor.pos = cursor.pos + WORD
         over = count * least_bytes(step) > cursor.end - cursor.pos
         if bound:
@@ -176,6 +185,8 @@ class _Walk:
 
     def _drop(self, cursor: _Cursor, wrong: NDArray[np.bool_]) -> None:
         """Mark messages as broken and park them at their origin, with no bytes left."""
+        if not wrong.any():
+            return
         self.broken[cursor.row[wrong]] = True
         cursor.pos = np.where(wrong, cursor.origin, cursor.pos)
         cursor.end = np.where(wrong, cursor.origin, cursor.end)

@@ -7,13 +7,22 @@ from struct import Struct
 import numpy as np
 
 from mosaico_ingest.bag.batch import Encoding
-from mosaico_ingest.decode.layout import WORD, Block, Body, Layout, Loop, Run, Step, Text, least_bytes
+from mosaico_ingest.decode.layout import (
+    PADDING,
+    WORD,
+    ZEROS,
+    Block,
+    Body,
+    Layout,
+    Loop,
+    Run,
+    Step,
+    Text,
+    least_bytes,
+)
 from mosaico_ingest.decode.places import Frame, Located, Place, Places
 
 __all__ = ["Notes", "Stepper", "locate_stepwise"]
-
-_PADDING = 3
-_ZEROS = 7
 
 
 class _Misfit(Exception):  # noqa: N818 - control flow inside this file, not an error for anyone
@@ -76,7 +85,7 @@ class Stepper:
         self._word = Struct(f"{frame.order}I").unpack_from
         self._origin = self._end = 0
         self.words: list[int] = []
-        """Where the length words were."""
+        """Where the words were that the walk depended on: lengths, and zeros behind the message."""
 
     def message(self, row: int, notes: Notes) -> bool:
         """Walk one message; False, and nothing noted, where it does not fit."""
@@ -101,9 +110,10 @@ class Stepper:
 
     def _tail_fits(self, pos: int) -> bool:
         left = self._end - pos
-        if not self._aligned:
-            return left == 0
-        return 0 <= left <= _PADDING or (left <= _ZEROS and not any(self._data[pos : self._end]))
+        if not self._aligned or left <= PADDING:
+            return left == 0 or (self._aligned and left >= 0)
+        self.words += [pos, self._end - WORD]  # between them they cover the tail: where they agree, it does
+        return left <= ZEROS and not any(self._data[pos : self._end])
 
     def _walk(self, notes: Notes, pos: int) -> int:
         """Walk one instance of a body, and return the position behind it."""

@@ -87,6 +87,14 @@ def test_padding_and_a_few_zeros_after_a_message_are_no_failure(assert_agree: As
     assert not assert_agree(payloads, STRING, Encoding.CDR).failures
 
 
+def test_a_tail_that_is_not_zero_is_found_among_messages_laid_out_alike(assert_agree: AssertAgree) -> None:
+    payloads = [text(b"abc") + bytes(6)] * 40
+    payloads[33] = text(b"abc") + bytes(5) + b"\1"
+    payloads[34] = text(b"abc") + b"\1" + bytes(5)
+    decoded = assert_agree(payloads, STRING, Encoding.CDR)
+    assert [failure.row for failure in decoded.failures] == [33, 34]
+
+
 def test_text_outside_ascii_and_wide_text_with_surrogates_are_read(assert_agree: AssertAgree) -> None:
     wide = message(Field("v", "wstring", container=Container.SEQUENCE))
     values = [["", "é"], ["𝄞 clef", "plain"], ["漢字"]] * 12
