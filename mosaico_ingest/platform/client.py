@@ -15,7 +15,7 @@ import pyarrow.flight as fl
 
 from mosaico_ingest.config import ServerTarget
 from mosaico_ingest.errors import SinkError, SinkUnavailable
-from mosaico_ingest.platform.faults import Address, Refused, reraise
+from mosaico_ingest.platform.faults import Address, Refused, check_tls, reraise
 from mosaico_ingest.wire import bodies
 from mosaico_ingest.wire.actions import API_KEY_HEADER, INFO, VERSION, Action, Permission
 from mosaico_ingest.wire.bodies import Body
@@ -200,6 +200,8 @@ def connect(
         SinkError: There is no server, or it does not let us in; says which.
     """
     address = _address(target)
+    if address.tls:
+        check_tls(address)
     flight = fl.FlightClient(str(address), tls_root_certs=address.roots, generic_options=_CHANNEL)
     with flight:
         client = PlatformClient(flight, address, codec, answer_s)

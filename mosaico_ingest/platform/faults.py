@@ -12,7 +12,7 @@ from mosaico_ingest.wire.actions import Permission
 from mosaico_ingest.wire.conditions import Condition, condition_of, text_of
 from mosaico_ingest.wire.keys import key_problem
 
-__all__ = ["Address", "Refused", "reraise"]
+__all__ = ["Address", "Refused", "check_tls", "reraise"]
 
 _PATIENCE_S = 3.0
 _WRONG_NAME = frozenset({62, 64})
@@ -44,6 +44,18 @@ class Address:
     def __str__(self) -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{'grpc+tls' if self.tls else 'grpc'}://{host}:{self.port}"
+
+
+def check_tls(address: Address) -> None:
+    """Raise SinkError where a server that answers cannot be trusted; gRPC would say so on the terminal, vaguely."""
+    try:
+        connection = socket.create_connection((address.host, address.port), timeout=_PATIENCE_S)
+    except OSError:
+        return  # perhaps gRPC knows a way, through a proxy; if not, `reraise` says why
+    with connection:
+        fault = _tls_fault(connection, address)
+    if fault is not None:
+        raise fault
 
 
 def reraise(error: Exception, address: Address, *, doing: str, needs: Permission) -> NoReturn:
