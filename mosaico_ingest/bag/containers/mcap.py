@@ -14,18 +14,15 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.containers.compression import inflate, inflate_some
-from mosaico_ingest.bag.containers.mcap_index import (
+from mosaico_ingest.bag.containers.mcap_index import McapIndex, Piece, read_index, read_pieces
+from mosaico_ingest.bag.containers.mcap_records import (
     MAGIC,
     RECORD,
     ChunkHead,
     McapChannel,
-    McapIndex,
     Op,
-    Piece,
     Schema,
     chunk_head,
-    read_index,
-    read_pieces,
 )
 from mosaico_ingest.bag.containers.part import (
     EARLIEST_NS,
@@ -229,12 +226,15 @@ def _message_starts(data: bytes | memoryview, piece: Piece, loaded: Loaded) -> N
     while at < len(data):
         op, length = RECORD.unpack_from(data, at) if at + RECORD.size <= len(data) else (0, 0)
         end = at + RECORD.size + length
-        if op == 0 or end > len(data) or (op == Op.MESSAGE and length < _FIXED_BYTES):
+        if op == 0 or end > len(data):
             reason = f"no whole record at byte {at} of {len(data)}; the rest is not read"
             loaded.holes.append(Hole(piece.offset, reason))
             break
-        if op == Op.MESSAGE:
+        if op == Op.MESSAGE and length >= _FIXED_BYTES:
             found.append(at)
+        elif op == Op.MESSAGE:
+            reason = f"a message record of {length} bytes at byte {at}, too few for its fields"
+            loaded.holes.append(Hole(piece.offset, reason))
         at = end
     return np.array(found, np.int64)
 

@@ -4,61 +4,32 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
 from mosaico_ingest.bag.containers.compression import inflate_some
+from mosaico_ingest.bag.containers.mcap_records import (
+    MAGIC,
+    RECORD,
+    McapChannel,
+    Op,
+    Schema,
+    channel_of,
+    chunk_head,
+    records_in,
+    schema_of,
+)
 from mosaico_ingest.bag.containers.part import LATEST_NS, Hole
 from mosaico_ingest.bag.containers.source import Fields, FileSource, Window
 from mosaico_ingest.errors import BagError
 
-__all__ = [
-    "MAGIC",
-    "RECORD",
-    "ChunkHead",
-    "McapIndex",
-    "Op",
-    "Piece",
-    "chunk_head",
-    "read_index",
-    "read_pieces",
-]
+__all__ = ["McapIndex", "Piece", "read_index", "read_pieces"]
 
-MAGIC = b"\x89MCAP0\r\n"
-RECORD = struct.Struct("<BQ")
-"""Every record begins with its kind and the number of bytes that follow."""
 _FOOTER_BYTES = RECORD.size + 20
 _INDEX_ENTRY_BYTES = 16
 _RUN_BYTES = 4 << 20
 """How much of the messages outside chunks is read at once."""
 _MESSAGE = struct.Struct("<HIQ")
-
-
-class Op:
-    """The kinds of records that matter here, as the MCAP specification numbers them."""
-
-    HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
-    STATISTICS = 0x0B
-    DATA_END = 0x0F
-
-
-@dataclass(frozen=True, slots=True)
-class Schema:
-    """A message type as the file describes it."""
-
-    name: str
-    encoding: str
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class McapChannel:
-    """A channel as the file describes it."""
-
-    schema: int
-    topic: str
-    encoding: str
-    metadata: dict[str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,19 +54,6 @@ class Piece:
         return list(struct.iter_unpack("<HQ", self.indexes))
 
 
-@dataclass(frozen=True, slots=True)
-class ChunkHead:
-    """A chunk's own fields; `begin` and `end` bound its data within the bytes it was read from."""
-
-    start_ns: int
-    end_ns: int
-    size: int
-    crc: int
-    compression: str
-    begin: int
-    end: int
-
-
 @dataclass(slots=True)
 class McapIndex:
     """What is where."""
@@ -112,20 +70,6 @@ class McapIndex:
     holes: list[Hole] = field(default_factory=list[Hole])
     walked: bool = False
     """Whether every record was looked at, and not only the summary."""
-
-
-def chunk_head(data: bytes, at: int = RECORD.size) -> ChunkHead:
-    """Return a chunk's fields from the bytes of its record; its data may be cut off.
-
-    Raises:
-        BagError: The record ends within its fields.
-    """
-    fields = Fields(data, at)
-    start_ns, end_ns, size, crc = fields.u64(), fields.u64(), fields.u64(), fields.u32()
-    compression = fields.text()
-    length = fields.u64()
-    begin = len(data) - fields.left
-    return ChunkHead(start_ns, end_ns, size, crc, compression, begin, begin + length)
 
 
 def read_index(source: FileSource) -> McapIndex:
@@ -182,7 +126,7 @@ def _from_summary(data: bytes, begin: int) -> McapIndex | None:
     """Return the summary's content, or None where it does not say all that is needed."""
     index = McapIndex(data_end=begin)
     chunk_count: int | None = None
-    for op, start, end in _records(data):
+    for op, start, end in records_in(data):
         fields = Fields(data, start, end)
         if op == Op.CHUNK_INDEX:
             index.pieces.append(_indexed_chunk(fields, begin))
@@ -196,27 +140,14 @@ def _from_summary(data: bytes, begin: int) -> McapIndex | None:
     return index
 
 
-def _records(data: bytes) -> Iterator[tuple[int, int, int]]:
-    at = 0
-    while at < len(data):
-        if at + RECORD.size > len(data):
-            raise BagError(f"{len(data) - at} bytes left where a record must begin")
-        op, length = RECORD.unpack_from(data, at)
-        at += RECORD.size
-        if length > len(data) - at:
-            raise BagError(f"a record of {length} bytes with {len(data) - at} left")
-        yield op, at, at + length
-        at += length
-
-
 def _describe(op: int, fields: Fields, index: McapIndex) -> None:
     """Take note of a schema or channel record; others say nothing about what messages are."""
     if op == Op.SCHEMA:
-        key = fields.u16()
-        index.schemas[key] = Schema(fields.text(), fields.text(), fields.text())
+        key, schema = schema_of(fields)
+        index.schemas[key] = schema
     elif op == Op.CHANNEL:
-        key = fields.u16()
-        index.channels[key] = McapChannel(fields.u16(), fields.text(), fields.text(), fields.texts())
+        key, channel = channel_of(fields)
+        index.channels[key] = channel
 
 
 def _indexed_chunk(fields: Fields, data_end: int) -> Piece:
@@ -317,8 +248,12 @@ class _Walk:
 
     def _message(self, at: int, end: int) -> None:
         fixed = self._window.peek(at + RECORD.size, _MESSAGE.size)
-        if end - at < RECORD.size + _MESSAGE.size:
-            return  # too short for its own fields: reading the run will say so
+        if min(len(fixed), end - at - RECORD.size) < _MESSAGE.size:
+            self._finish_run()
+            self._index.holes.append(
+                Hole(at, f"a message record of {end - at} bytes, too few for its fields")
+            )
+            return
         channel, _, time_ns = _MESSAGE.unpack(fixed)
         if self._counts is not None:
             self._counts[channel] = self._counts.get(channel, 0) + 1
@@ -370,7 +305,7 @@ class _Walk:
             data = self._source.read(piece.offset, piece.stop - piece.offset)
             head = chunk_head(data)
             records = inflate_some(data[head.begin : head.end], head.compression, head.size)
-            for op, start, end in _records(records):
+            for op, start, end in records_in(records):
                 _describe(op, Fields(records, start, end), self._index)
         except BagError:
             return  # reading the chunk will say what is wrong with it
