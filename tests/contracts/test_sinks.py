@@ -18,6 +18,7 @@ from mosaico_ingest.platform.sink import PlatformSink
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.sink import MemorySink, Sink, topic_schema
 from mosaico_ingest.store import Store, StoreSink
+from mosaico_ingest.store.server import serve
 
 POINT = OntologyType(
     "Point",
@@ -131,6 +132,20 @@ class OnServer:
         ]
 
 
+class OnServedStore(InStore):
+    """The same server protocol, answered by our own server over a store."""
+
+    keeps_old = False
+
+    def __init__(self, folder: Path, port: int) -> None:
+        super().__init__(folder)
+        self.sink = PlatformSink(ServerTarget("127.0.0.1", port))
+
+    def sequences(self) -> Sequence[str]:
+        written_to = self.store.layout.open_sessions()
+        return [info.name for info in self.store.sequences() if info.sessions or not written_to]
+
+
 @contextmanager
 def in_memory(_: Path) -> Generator[Destination, None, None]:
     yield InMemory()
@@ -147,7 +162,13 @@ def on_server(_: Path) -> Generator[Destination, None, None]:
         yield OnServer(server)
 
 
-@pytest.fixture(params=(in_memory, in_store, on_server), ids=lambda make: make.__name__)
+@contextmanager
+def on_served_store(folder: Path) -> Generator[Destination, None, None]:
+    with serve(folder / "mosaico", port=0) as server:
+        yield OnServedStore(folder, server.port)
+
+
+@pytest.fixture(params=(in_memory, in_store, on_server, on_served_store), ids=lambda make: make.__name__)
 def there(request: pytest.FixtureRequest, tmp_path: Path) -> Generator[Destination, None, None]:
     made: AbstractContextManager[Destination] = request.param(tmp_path)
     with made as destination:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pytest
+from flight_calls import Client
 
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.sink import topic_schema
 from mosaico_ingest.store import Store, StoreSink
+from mosaico_ingest.store.server import Server, serve
 
 SAMPLE = OntologyType("Sample", pa.struct([pa.field("value", pa.float64()), pa.field("source", pa.int32())]))
 
@@ -44,3 +46,15 @@ def store(tmp_path: Path) -> Store:
 @pytest.fixture
 def sink(store: Store) -> StoreSink:
     return StoreSink(store)
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Server]:
+    with serve(tmp_path / "served", port=0) as running:
+        yield running
+
+
+@pytest.fixture
+def client(server: Server) -> Iterator[Client]:
+    with Client(server) as connected:
+        yield connected

@@ -2,114 +2,24 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from datetime import datetime, timedelta, timezone
+from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import pyarrow as pa
 import pyarrow.flight as fl
 import pytest
+from flight_calls import Client, descriptor_of, refused
 
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.store import Store, StoreSink
-from mosaico_ingest.store.server import Keyring, Server, Tls, serve
-from mosaico_ingest.wire.actions import ACTIONS, API_KEY_HEADER, Permission
-from mosaico_ingest.wire.conditions import Condition, condition_of, text_of
+from mosaico_ingest.store.server import Server, serve
+from mosaico_ingest.wire.conditions import Condition
 
 Rows = Callable[..., pa.RecordBatch]
-
-
-class Client:
-    """A client that says what goes over the wire and nothing else."""
-
-    def __init__(self, server: Server, key: str | None = None, **options: Any) -> None:
-        self.flight = fl.connect(server.location, **options)
-        headers = [] if key is None else [(API_KEY_HEADER.encode(), key.encode())]
-        self.options = fl.FlightCallOptions(headers=headers, timeout=20)
-
-    def __enter__(self) -> Client:  # noqa: PYI034 - Self comes with Python 3.11
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.flight.close()
-
-    def call(self, name: str, **question: Any) -> Any:
-        action = fl.Action(name, json.dumps(question).encode())
-        answer = b"".join(result.body.to_pybytes() for result in self.flight.do_action(action, self.options))
-        told = json.loads(answer)
-        assert told["action"] == name
-        return told["response"]
-
-    def put(self, locator: str, uuid: str, *batches: pa.RecordBatch, schema: pa.Schema | None = None) -> None:
-        descriptor = descriptor_of(resource_locator=locator, topic_uuid=uuid)
-        writer, _ = self.flight.do_put(descriptor, schema or batches[0].schema, self.options)
-        for batch in batches:
-            writer.write_batch(batch)
-        writer.done_writing()
-        writer.close()
-
-    def info(self, locator: str, **more: Any) -> tuple[Any, list[Any]]:
-        info = self.flight.get_flight_info(descriptor_of(resource_locator=locator, **more), self.options)
-        endpoints = [json.loads(endpoint.app_metadata) for endpoint in info.endpoints]
-        return json.loads(info.app_metadata or b"null"), endpoints
-
-    def rows(self, locator: str, **more: Any) -> list[int]:
-        info = self.flight.get_flight_info(descriptor_of(resource_locator=locator, **more), self.options)
-        (endpoint,) = info.endpoints
-        return self.flight.do_get(endpoint.ticket, self.options).read_all()["timestamp_ns"].to_pylist()
-
-    def upload(self, sequence: str, topic: str, *batches: pa.RecordBatch, tag: str = "Sample") -> None:
-        session = self.call("session_create", locator=sequence)["uuid"]
-        uuid = self.create_topic(session, f"{sequence}{topic}", tag=tag)
-        self.put(f"{sequence}{topic}", uuid, *batches)
-        self.call("session_finalize", session_uuid=session)
-
-    def create_topic(self, session: str, locator: str, *, tag: str = "Sample", **metadata: Any) -> str:
-        return self.call(
-            "topic_create",
-            session_uuid=session,
-            locator=locator,
-            serialization_format="default",
-            ontology_tag=tag,
-            user_metadata=metadata,
-        )["uuid"]
-
-
-def descriptor_of(**command: Any) -> fl.FlightDescriptor:
-    return fl.FlightDescriptor.for_command(json.dumps(command).encode())
-
-
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[Server]:
-    with serve(tmp_path / "served", port=0) as running:
-        yield running
-
-
-@pytest.fixture
-def client(server: Server) -> Iterator[Client]:
-    with Client(server) as connected:
-        yield connected
-
-
-class refused:  # noqa: N801 - reads as a statement, as pytest.raises
-    """Expect a call to be refused with a status and, maybe, a word of explanation."""
-
-    def __init__(self, condition: Condition, word: str = "") -> None:
-        self.condition = condition
-        self.word = word
-
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, _: object, error: BaseException | None, __: object) -> bool:
-        assert error is not None, f"expected {self.condition}"
-        assert (condition_of(error), self.word in text_of(error)) == (self.condition, True), str(error)
-        return True
 
 
 def test_the_handshake_says_what_is_spoken_and_what_fits(client: Client) -> None:
@@ -347,100 +257,6 @@ def test_what_was_not_finalized_goes_with_the_server(tmp_path: Path, rows: Rows)
     store = Store.open(tmp_path / "served")
     assert store.sequence("drive").topics == ()
     assert list(store.path.rglob("*.parquet")) == []
-
-
-def test_a_key_may_do_what_its_permission_includes(tmp_path: Path, rows: Rows) -> None:
-    ring = Keyring(tmp_path / "keys.json")
-    keys = {permission: ring.add(permission) for permission in Permission}
-    with serve(tmp_path / "served", port=0, keys=Keyring(tmp_path / "keys.json")) as running:
-        with Client(running, keys[Permission.WRITE]) as writer:
-            writer.call("info")
-            writer.call("sequence_create", locator="drive", user_metadata={})
-            writer.upload("drive", "/imu", rows([1]))
-            with refused(Condition.PERMISSION, "delete"):
-                writer.call("sequence_delete", locator="drive")
-        with Client(running, keys[Permission.READ]) as reader:
-            assert reader.rows("drive/imu") == [1]
-            assert len(list(reader.flight.list_flights(options=reader.options))) == 1
-            with refused(Condition.PERMISSION, "write"):
-                reader.call("session_create", locator="drive")
-            with refused(Condition.PERMISSION, "write"):
-                reader.put("drive/imu", "x", rows([1]))
-        with Client(running, keys[Permission.MANAGE]) as manager:
-            manager.call("sequence_delete", locator="drive")
-
-
-@pytest.mark.parametrize(
-    ("spoil", "word"),
-    [
-        (lambda _: None, "needs an API key"),
-        (lambda _: "secret", "malformed"),
-        (lambda key: key[:-1] + ("0" if key[-1] != "0" else "1"), "checksum"),
-        (lambda _: "msco_" + "a" * 32 + "_d25389d7", "malformed"),
-    ],
-    ids=["none", "no key at all", "a typing mistake", "somebody else's"],
-)
-def test_a_call_without_a_good_key_is_refused(
-    tmp_path: Path, spoil: Callable[[str], str | None], word: str
-) -> None:
-    ring = Keyring(tmp_path / "keys.json")
-    key = spoil(ring.add(Permission.MANAGE))
-    with serve(tmp_path / "served", port=0, keys=ring) as running, Client(running, key) as client:
-        for name in ACTIONS:
-            with refused(Condition.UNAUTHENTICATED, word):
-                client.call(name)
-        with refused(Condition.UNAUTHENTICATED, word):
-            list(client.flight.list_flights(options=client.options))
-        with refused(Condition.UNAUTHENTICATED, word):
-            client.info("drive")
-
-
-def test_a_key_ring_keeps_hashes_and_expiry(tmp_path: Path) -> None:
-    path = tmp_path / "keys.json"
-    now = datetime.now(timezone.utc)
-    good = Keyring(path).add(Permission.READ, description="dashboard", expires=now + timedelta(days=1))
-    old = Keyring(path).add(Permission.READ, expires=now - timedelta(days=1))
-    ring = Keyring(path)
-    assert ring.permission_of(good) is Permission.READ
-    with pytest.raises(PermissionError, match="expired on"):
-        ring.permission_of(old)
-    assert [key.description for key in ring.keys] == ["dashboard", ""]
-    assert good not in path.read_text()
-    assert path.stat().st_mode & 0o077 == 0
-    with pytest.raises(SinkError, match="time zone"):
-        ring.add(Permission.READ, expires=datetime(2030, 1, 1))  # noqa: DTZ001 - what the test is about
-    path.write_text('{"keys": [{}]}')
-    with pytest.raises(SinkError, match="key ring"):
-        Keyring(path)
-
-
-def test_a_server_with_a_certificate_speaks_tls_only(tmp_path: Path, rows: Rows) -> None:
-    certificate, key = tmp_path / "cert.pem", tmp_path / "key.pem"
-    made = [
-        "openssl",
-        "req",
-        "-x509",
-        "-newkey",
-        "rsa:2048",
-        "-nodes",
-        "-days",
-        "2",
-        "-subj",
-        "/CN=localhost",
-    ]
-    made += ["-addext", "subjectAltName=DNS:localhost", "-keyout", str(key), "-out", str(certificate)]
-    try:
-        subprocess.run(made, check=True, capture_output=True)  # noqa: S603 - fixed arguments
-    except (OSError, subprocess.CalledProcessError):
-        pytest.skip("openssl is not here")
-    with serve(tmp_path / "served", "localhost", 0, tls=Tls(certificate, key)) as running:
-        with Client(running, tls_root_certs=certificate.read_bytes()) as client:
-            client.call("sequence_create", locator="drive", user_metadata={})
-            client.upload("drive", "/imu", rows([1]))
-        plain = fl.connect(f"grpc://localhost:{running.port}")
-        with refused(Condition.UNAVAILABLE):
-            list(plain.do_action(fl.Action("info", b"{}"), fl.FlightCallOptions(timeout=5)))
-        plain.close()
 
 
 def test_a_port_that_is_taken_is_said_so(server: Server, tmp_path: Path) -> None:
