@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from mosaico_ingest.errors import ManifestError, NothingMatched
 from mosaico_ingest.lint.engine import LintReport, lint_paths
+from mosaico_ingest.lint.settings import NAMES
 from mosaico_ingest.manifest.load import load_manifest
 from mosaico_ingest.plan.compile import compile_manifest
 
@@ -25,7 +26,9 @@ TRAP = "bag: {path: data/run.mcap}\nsequence: {metadata: {a: on}}\n"
 def judged(project: Path, text: str | bytes, name: str = "job.yaml", *, fix: bool = False) -> LintReport:
     file = project / name
     file.write_bytes(text if isinstance(text, bytes) else text.encode())
-    return lint_paths([file], env={}, fix=fix)
+    report = lint_paths([file], env={}, fix=fix)
+    assert {finding.rule for finding in report.findings} <= set(NAMES)
+    return report
 
 
 def rules(report: LintReport) -> list[str]:
