@@ -20,6 +20,7 @@ __all__ = ["message_type", "read_types"]
 _MODULE = re.compile(r"^\s*module\s+\w+\s*\{", re.MULTILINE)
 _DASHES = re.compile(r"^---[ \t\r]*$", re.MULTILINE)
 _SERVICE_PARTS = re.compile(r"(.+/srv/.+)_(?:Event|Request|Response)")
+_NOT_CODE = re.compile(r"//[^\n]*|/\*.*?\*/|\"(?:\\.|[^\"\\])*\"", re.DOTALL)
 _PLACEHOLDER = "structure_needs_at_least_one_member"
 _EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 _CONTAINERS = {Nodetype.ARRAY: Container.ARRAY, Nodetype.SEQUENCE: Container.SEQUENCE}
@@ -77,6 +78,9 @@ def _read_service(name: str, section: Section, dashes: re.Match[str], where: str
 
 
 def _read_idl(section: Section, where: str) -> list[MessageType]:
+    if "<<" in _NOT_CODE.sub("", section.text):
+        # No ROS message shifts, and one line of it could ask for all memory there is.
+        raise BagError("shifts in IDL constants are not read", where=f"{where}:{section.line + 1}")
     try:
         types = get_types_from_idl(section.text)
     except _IDL_ERRORS as error:

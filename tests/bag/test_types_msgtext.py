@@ -126,9 +126,18 @@ def test_idl_is_read_also_when_one_text_has_several() -> None:
     ]
 
 
-def test_broken_idl_is_one_line() -> None:
+@pytest.mark.parametrize(
+    "text",
+    [
+        "module pkg { struct X { double ; }; };",
+        "module pkg { const long A = 1 << 99999999999; };",
+        "module pkg { struct X { " + "sequence<" * 5_000 + "double" + ">" * 5_000 + " x; }; };",
+        "module pkg { struct X { double a[2][3]; }; };",
+    ],
+)
+def test_broken_idl_is_one_line(text: str) -> None:
     with pytest.raises(BagError) as caught:
-        read_types("module pkg { struct X { double ; }; };", "pkg/msg/X", where="X.idl")
+        read_types(text, "pkg/msg/X", where="X.idl")
     assert "\n" not in str(caught.value)
 
 
