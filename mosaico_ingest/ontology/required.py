@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, cast
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.types as pt
@@ -28,17 +29,28 @@ def _filled(array: Any) -> Any:  # noqa: ANN401 - any Arrow array; the stubs hav
         return array
     if pt.is_struct(array.type):
         return _filled_struct(array)
-    values = (
-        _filled(array.values.slice(array.offset * array.type.list_size, len(array) * array.type.list_size))
-        if (pt.is_fixed_size_list(array.type))
-        else _filled(array.values)
-    )
-    if values is array.values:
+    return _filled_fixed(array) if pt.is_fixed_size_list(array.type) else _filled_list(array)
+
+
+def _filled_fixed(array: Any) -> Any:  # noqa: ANN401 - as above
+    size = array.type.list_size
+    values = array.values.slice(array.offset * size, len(array) * size)
+    filled = _filled(values)
+    if filled is values:
         return array
     mask = pc.is_null(array) if array.null_count else None
-    if pt.is_fixed_size_list(array.type):
-        return _arrays.FixedSizeListArray.from_arrays(values, type=array.type, mask=mask)
-    return pa.ListArray.from_arrays(array.offsets, values, type=array.type, mask=mask)
+    return _arrays.FixedSizeListArray.from_arrays(filled, type=array.type, mask=mask)
+
+
+def _filled_list(array: Any) -> Any:  # noqa: ANN401 - as above
+    values = array.values
+    filled = _filled(values)
+    if filled is values:
+        return array
+    # A null offset is a null list; `mask` does not go with a slice.
+    absent = np.append(array.is_null().to_numpy(zero_copy_only=False), False)
+    offsets = pa.array(array.offsets.to_numpy(), pa.int32(), mask=absent)
+    return pa.ListArray.from_arrays(offsets, filled, type=array.type)
 
 
 def _filled_struct(array: Any) -> Any:  # noqa: ANN401 - as above
