@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mosaico_ingest.decode.layout import Layout
-from mosaico_ingest.decode.places import Frame, Int64s, Located, Places
+from mosaico_ingest.decode.places import Frame, Int64s, Located
 from mosaico_ingest.decode.stepwise import Notes, Stepper
 
 __all__ = ["locate_clustered"]
@@ -57,7 +57,7 @@ def _split(layout: Layout, frame: Frame, rows: Int64s) -> Iterator[Located]:
         alike = sample.compare(frame.take(rows))
         members = rows[alike]
         if len(members):
-            yield Located(members, sample.spread(frame.origins[members]))
+            yield sample.spread(frame, members)
         if len(members) * 4 < len(rows):
             return
         rows = rows[~alike]
@@ -66,24 +66,26 @@ def _split(layout: Layout, frame: Frame, rows: Int64s) -> Iterator[Located]:
 class _Sample:
     """One message that was walked."""
 
-    __slots__ = ("_frame", "_places", "fits", "words")
+    __slots__ = ("_frame", "_places", "_tail", "words")
 
     def __init__(self, layout: Layout, frame: Frame, row: int) -> None:
         stepper, notes = Stepper(layout, frame), Notes(layout.body)
         self._frame = frame.take(np.array([row]))
-        self.fits = stepper.message(row, notes)
+        self._tail = stepper.message(row, notes)
         self.words = np.array(stepper.words, np.int64) - frame.origins[row]
         self._places = notes.places()
 
     def compare(self, frame: Frame) -> NDArray[np.bool_]:
         """Return which messages, all of the sample's length, have the words its walk depended on."""
-        if not self.fits:
+        if self._tail is None:
             return np.zeros(len(frame), bool)
         words = frame.words()
         expected = words[self._frame.origins + self.words]
         found = words[frame.origins[:, None] + self.words]
         return (found == expected).all(axis=1)
 
-    def spread(self, origins: Int64s) -> Places:
-        """Return the places in messages that compared equal."""
-        return tuple(place.spread(origins - self._frame.origins) for place in self._places)
+    def spread(self, frame: Frame, rows: Int64s) -> Located:
+        """Return the messages that compared equal, laid out like the sample."""
+        moved = frame.origins[rows] - self._frame.origins
+        tails = np.full(len(rows), self._tail or 0)
+        return Located(rows, tails, tuple(place.spread(moved) for place in self._places))

@@ -11,11 +11,10 @@ from mosaico_ingest.bag.batch import Encoding, RawBatch
 from mosaico_ingest.bag.definition import Definition
 from mosaico_ingest.decode.columns import build_columns
 from mosaico_ingest.decode.decoder import Decoded
-from mosaico_ingest.decode.layout import compile_layout
+from mosaico_ingest.decode.layout import PADDING, compile_layout
 from mosaico_ingest.decode.locate import locate
 from mosaico_ingest.decode.places import Frame, Int64s
 from mosaico_ingest.decode.rowwise import RowwiseDecoder
-from mosaico_ingest.diagnostics import RowFailure
 from mosaico_ingest.errors import DecodeError
 
 __all__ = ["ColumnarDecoder"]
@@ -60,19 +59,13 @@ class ColumnarDecoder:
             )
         if len(batch) <= _FEW and total <= _SMALL:
             return self._rowwise.decode(batch)
+        parts = [self._by_columns(batch, order, rows) for order, rows in self._by_order(batch)]
         left = np.ones(len(batch), bool)
-        parts: list[tuple[Int64s, pa.StructArray]] = []
-        for order, members in self._by_order(batch):
-            found, rows = self._decode(_frame(batch, members, order, self._layout.encoding))
-            left[members[found]] = False
-            parts.append((members[found], rows))
-        rest = np.flatnonzero(left)
-        failures: tuple[RowFailure, ...] = ()
-        if len(rest) or not parts:
-            slow = self._rowwise.decode(_take(batch, rest))
-            parts.append((rest[slow.index], slow.rows))
-            failures = tuple(replace(failure, row=int(rest[failure.row])) for failure in slow.failures)
-        return _merge(parts, failures)
+        for part in parts:
+            left[part.index] = False
+        if left.any() or not parts:
+            parts.append(self._by_rows(batch, np.flatnonzero(left)))
+        return _merge(parts)
 
     def _by_order(self, batch: RawBatch) -> list[tuple[str, Int64s]]:
         """Return the positions of the messages of each byte order, without those of none."""
@@ -83,37 +76,39 @@ class ColumnarDecoder:
         groups = [(order, rows[(first == 0) & (second == kind)]) for order, kind in _ORDERS.items()]
         return [(order, members) for order, members in groups if len(members)]
 
-    def _decode(self, frame: Frame) -> tuple[Int64s, pa.StructArray]:
-        """Return the rows that could be decoded here, ascending positions in the frame, and their values."""
+    def _by_columns(self, batch: RawBatch, order: str, rows: Int64s) -> Decoded:
+        """Decode those of some messages, all of one byte order, that can be vouched for."""
+        skip = _HEADER if self._layout.encoding is Encoding.CDR else 0
+        starts, lengths = batch.starts[rows], batch.lengths[rows]
+        frame = Frame(np.ascontiguousarray(batch.data), order, starts + skip, starts + lengths)
         located = locate(self._layout, frame)
-        rows, unread = build_columns(self._layout, self.shape, frame, located)
+        values, unread = build_columns(self._layout, self.shape, frame, located)
         if len(unread):
             located = located.take(np.delete(np.arange(len(located.rows)), unread))
-            rows, _ = build_columns(self._layout, self.shape, frame, located)
-        return located.rows, rows
+            values, _ = build_columns(self._layout, self.shape, frame, located)
+        return Decoded(values, rows[located.rows], (), int((located.tails > PADDING).sum()))
+
+    def _by_rows(self, batch: RawBatch, rows: Int64s) -> Decoded:
+        """Decode some messages one by one."""
+        taken = replace(
+            batch,
+            log_times=batch.log_times[rows],
+            starts=batch.starts[rows],
+            lengths=batch.lengths[rows],
+            offsets=batch.offsets[rows],
+        )
+        decoded = self._rowwise.decode(taken)
+        failures = tuple(replace(failure, row=int(rows[failure.row])) for failure in decoded.failures)
+        return replace(decoded, index=rows[decoded.index], failures=failures)
 
 
-def _frame(batch: RawBatch, rows: Int64s, order: str, encoding: Encoding) -> Frame:
-    starts = batch.starts[rows]
-    origins = starts + _HEADER if encoding is Encoding.CDR else starts
-    return Frame(np.ascontiguousarray(batch.data), order, origins, starts + batch.lengths[rows])
-
-
-def _take(batch: RawBatch, rows: Int64s) -> RawBatch:
-    return replace(
-        batch,
-        log_times=batch.log_times[rows],
-        starts=batch.starts[rows],
-        lengths=batch.lengths[rows],
-        offsets=batch.offsets[rows],
-    )
-
-
-def _merge(parts: list[tuple[Int64s, pa.StructArray]], failures: tuple[RowFailure, ...]) -> Decoded:
-    filled = [part for part in parts if len(part[0])] or parts[:1]
+def _merge(parts: list[Decoded]) -> Decoded:
+    """Put parts of one batch together in its order; only the last can have failures."""
+    failures, padded = parts[-1].failures, sum(part.padded for part in parts)
+    filled = [part for part in parts if len(part.index)] or parts[:1]
     if len(filled) == 1:
-        return Decoded(filled[0][1], filled[0][0], failures)
-    index = np.concatenate([rows for rows, _ in filled])
+        return Decoded(filled[0].rows, filled[0].index, failures, padded)
+    index = np.concatenate([part.index for part in filled])
     order = np.argsort(index)
-    rows = pa.concat_arrays([values for _, values in filled]).take(order)
-    return Decoded(rows, index[order], failures)
+    rows = pa.concat_arrays([part.rows for part in filled]).take(order)
+    return Decoded(rows, index[order], failures, padded)

@@ -25,6 +25,8 @@ class Decoded:
     """Position in the batch of each row, ascending, shape (len(rows),)."""
     failures: tuple[RowFailure, ...]
     """`row` is the position in the batch; len(index) + len(failures) = len(batch)."""
+    padded: int = 0
+    """How many rows end in 4 to 7 zero bytes which the definition does not account for."""
 
 
 class Decoder(Protocol):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from mosaico_ingest.decode.clustered import locate_clustered
@@ -25,7 +27,7 @@ def locate(layout: Layout, frame: Frame) -> Located:
     if len(rest) or not parts:
         walk = locate_stepwise if len(rest) <= FEW else locate_lockstep
         found = walk(layout, frame.take(rest))
-        parts.append(Located(rest[found.rows], found.places))
+        parts.append(replace(found, rows=rest[found.rows]))
     return _merge(parts)
 
 
@@ -36,4 +38,5 @@ def _merge(parts: list[Located]) -> Located:
     order = np.argsort(rows)
     slots = np.empty(len(rows), np.int64)
     slots[order] = np.arange(len(rows))
-    return Located(rows[order], join([part.places for part in parts], slots))
+    tails = np.concatenate([part.tails for part in parts])
+    return Located(rows[order], tails[order], join([part.places for part in parts], slots))

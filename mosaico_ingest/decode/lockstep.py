@@ -41,8 +41,7 @@ def locate_lockstep(layout: Layout, frame: Frame) -> Located:
     walk = _Walk(layout, frame)
     cursor = _Cursor(frame.origins[whole], frame.ends[whole], frame.origins[whole], whole)
     places = walk.body(layout.body, cursor)
-    walk.check_tail(cursor)
-    located = Located(whole, places)
+    located = Located(whole, walk.tails(cursor), places)
     broken = walk.broken[whole]
     return located.take(np.flatnonzero(~broken)) if broken.any() else located
 
@@ -81,11 +80,12 @@ class _Walk:
     def body(self, body: Body, cursor: _Cursor) -> Places:
         return tuple(self._step(step, cursor) for step in body.steps)
 
-    def check_tail(self, cursor: _Cursor) -> None:
+    def tails(self, cursor: _Cursor) -> Int64s:
+        """Return how many bytes are left of each message, which have to be few or none."""
         left = cursor.end - cursor.pos
         if not self._aligned:
             self._drop(cursor, left != 0)
-            return
+            return left
         self._drop(cursor, (left < 0) | (left > ZEROS))
         more = np.flatnonzero((left > PADDING) & (left <= ZEROS))
         if len(more):
@@ -93,6 +93,7 @@ class _Walk:
             wrong = np.zeros(len(left), bool)
             wrong[more] = (first != 0) | (last != 0)
             self._drop(cursor, wrong)
+        return left
 
     def _step(self, step: Step, cursor: _Cursor) -> Place:
         match step:

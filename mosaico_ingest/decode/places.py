@@ -76,14 +76,17 @@ Places: TypeAlias = tuple[Place, ...]
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """The messages that fit the layout, ascending positions in their frame, and where their steps lie."""
+    """The n messages that fit the layout, and where their steps lie."""
 
     rows: Int64s
+    """Their positions in the frame, ascending, shape (n,)."""
+    tails: Int64s
+    """How many bytes follow what the layout describes, shape (n,)."""
     places: Places
 
     def take(self, index: Int64s) -> Located:
         """Return some of the messages; `index` ascends."""
-        return Located(self.rows[index], tuple(place.take(index) for place in self.places))
+        return Located(self.rows[index], self.tails[index], tuple(place.take(index) for place in self.places))
 
 
 def expand(firsts: Int64s, counts: Int64s, stride: int = 1) -> Int64s:

@@ -39,6 +39,7 @@ class RowwiseDecoder:
         values: list[dict[str, Any]] = []
         index: list[int] = []
         failures: list[RowFailure] = []
+        padded = self._deserializer.padded
         for row in range(len(batch)):
             try:
                 values.append(self._deserializer.to_dict(batch.payload(row)))
@@ -47,4 +48,5 @@ class RowwiseDecoder:
                 failures.append(RowFailure(row, error.rule, error.what))
         # An array of a struct type is one of structs, which the stubs cannot know.
         rows = cast("pa.StructArray", pa.array(values, type=self._shape))
-        return Decoded(rows, np.array(index, np.int64), tuple(failures))
+        padded = self._deserializer.padded - padded
+        return Decoded(rows, np.array(index, np.int64), tuple(failures), padded)

@@ -87,14 +87,14 @@ class Stepper:
         self.words: list[int] = []
         """Where the words were that the walk depended on: lengths, and zeros behind the message."""
 
-    def message(self, row: int, notes: Notes) -> bool:
-        """Walk one message; False, and nothing noted, where it does not fit."""
+    def message(self, row: int, notes: Notes) -> int | None:
+        """Walk one message and return how many bytes follow it; None, and nothing noted, where it does not fit."""
         before = len(notes)
         fit, pos = self.elements(row, notes, pos=int(self._frame.origins[row]), count=1)
         if fit and self._tail_fits(pos):
-            return True
+            return self._end - pos
         notes.forget(before)
-        return False
+        return None
 
     def elements(self, row: int, notes: Notes, *, pos: int, count: int) -> tuple[int, int]:
         """Walk `count` elements of one message's loop; return how many fit, and the position after them."""
@@ -168,5 +168,6 @@ class Stepper:
 def locate_stepwise(layout: Layout, frame: Frame) -> Located:
     """Walk every message of the frame on its own."""
     stepper, notes = Stepper(layout, frame), Notes(layout.body)
-    rows = [row for row in range(len(frame)) if stepper.message(row, notes)]
-    return Located(np.array(rows, np.int64), notes.places())
+    tails = {row: tail for row in range(len(frame)) if (tail := stepper.message(row, notes)) is not None}
+    rows = np.fromiter(tails, np.int64, len(tails))
+    return Located(rows, np.fromiter(tails.values(), np.int64, len(tails)), notes.places())

@@ -47,6 +47,7 @@ def check_same(fast: Decoded, slow: Decoded) -> None:
     assert fast.rows.type.equals(slow.rows.type, check_metadata=True)
     assert fast.index.tolist() == slow.index.tolist()
     assert fast.failures == slow.failures
+    assert fast.padded == slow.padded
     assert bits(fast.rows) == bits(slow.rows)
 
 

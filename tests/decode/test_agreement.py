@@ -148,7 +148,11 @@ def same_place(one: Place, other: Place) -> bool:
 
 
 def same_located(one: Located, other: Located) -> bool:
-    return one.rows.tolist() == other.rows.tolist() and all(map(same_place, one.places, other.places))
+    return (
+        one.rows.tolist() == other.rows.tolist()
+        and one.tails.tolist() == other.tails.tolist()
+        and all(map(same_place, one.places, other.places))
+    )
 
 
 @RELAXED
