@@ -80,9 +80,11 @@ def _directory(path: Path) -> Found:
     findings: tuple[Finding, ...] = ()
     if listing.is_file():
         try:
-            return _listed(read_metadata(listing))
+            metadata = read_metadata(listing)
         except BagError as err:
             findings = (_unreadable(err),)
+        else:
+            return _listed(metadata)
     files = tuple(
         sorted((file for file in path.iterdir() if file.is_file() and is_recording(file)), key=_natural)
     )

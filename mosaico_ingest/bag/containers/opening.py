@@ -57,7 +57,10 @@ def _head(path: Path) -> bytes:
 def _open(path: Path, name: Path, head: bytes, stack: ExitStack) -> Part:
     for magic, kind in _FORMATS:
         if head.startswith(magic):
-            part = kind(path, name)
+            try:
+                part = kind(path, name)
+            except BagError as err:
+                raise err if err.where else BagError(err.what, where=str(name), hint=err.hint) from err
             stack.callback(part.close)
             return part
     if not head:

@@ -1,0 +1,71 @@
+"""Inflating believes the bytes and not what is announced about them."""
+
+from __future__ import annotations
+
+import bz2
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import lz4.frame
+import pytest
+import zstandard
+
+from mosaico_ingest.bag.containers.compression import inflate, inflate_file, inflate_message, inflate_some
+from mosaico_ingest.errors import BagError
+
+PACK: dict[str, Callable[[bytes], bytes]] = {
+    "none": bytes,
+    "zstd": zstandard.compress,
+    "lz4": lz4.frame.compress,
+    "bz2": bz2.compress,
+}
+DATA = os.urandom(50_000).hex().encode() + bytes(50_000)
+
+
+@pytest.mark.parametrize("name", PACK)
+def test_what_was_compressed_comes_back(name: str) -> None:
+    assert bytes(inflate(PACK[name](DATA), name, len(DATA))) == DATA
+    assert inflate_some(PACK[name](DATA), name, len(DATA)) == DATA
+
+
+@pytest.mark.parametrize("name", PACK)
+@pytest.mark.parametrize("size", [0, 10, len(DATA) - 1, len(DATA) + 1, 1 << 50])
+def test_another_size_than_announced_is_an_error(name: str, size: int) -> None:
+    with pytest.raises(BagError, match="announce"):
+        inflate(PACK[name](DATA), name, size)
+
+
+@pytest.mark.parametrize("name", ["zstd", "lz4", "bz2"])
+def test_damage_is_an_error_and_what_comes_before_a_cut_can_be_had(name: str) -> None:
+    packed = PACK[name](DATA)
+    with pytest.raises(BagError):
+        inflate(packed[:4] + b"\xff" * (len(packed) - 4), name, len(DATA))
+    with pytest.raises(BagError):
+        inflate(packed[: len(packed) // 2], name, len(DATA))
+    assert DATA.startswith(inflate_some(packed[: len(packed) // 2], name, len(DATA)))
+
+
+def test_a_bomb_is_noticed_on_the_way() -> None:
+    bomb = zstandard.compress(bytes(64 << 20))
+    with pytest.raises(BagError, match="more found"):
+        inflate(bomb, "zstd", 1 << 20)
+    with pytest.raises(BagError, match="more than 1000 bytes"):
+        inflate_message(bomb, 1000)
+    assert len(inflate_some(bomb, "zstd", 1 << 20)) == 1 << 20
+
+
+def test_an_unknown_compression_is_named() -> None:
+    with pytest.raises(BagError, match="compression 'snappy' is unknown; known are none, zstd, lz4, bz2"):
+        inflate(b"x", "snappy", 1)
+
+
+def test_a_file_of_several_frames_is_one_file(tmp_path: Path) -> None:
+    packed, plain = tmp_path / "a.zstd", tmp_path / "a"
+    packed.write_bytes(zstandard.compress(DATA) + zstandard.compress(b"more"))
+    assert inflate_file(packed, plain) is None
+    assert plain.read_bytes() == DATA + b"more"
+    packed.write_bytes(packed.read_bytes()[:-8])
+    assert inflate_file(packed, plain) == "the zstd file is cut off"
+    packed.write_bytes(zstandard.compress(DATA)[:4] + b"\xff" * 5000)
+    assert str(inflate_file(packed, plain)).startswith("damaged zstd file")
