@@ -171,7 +171,8 @@ def one_type(*values: Array) -> list[Array]:
         return list(values)
     both = known[0]
     if any(t != both for t in known) and not pt.is_nested(both):
-        both = arrays.float64() if any(pt.is_floating(t) for t in known) else arrays.int64()
+        whole = arrays.uint64() if arrays.uint64() in known else arrays.int64()
+        both = arrays.float64() if any(pt.is_floating(t) for t in known) else whole
     return [_in_type(v, both) for v in values]
 
 

@@ -130,12 +130,15 @@ def join(kinds: list[Kind]) -> Kind:
 
 
 def _join_numbers(kinds: list[Kind]) -> Kind:
-    if all(kind.bounds is not None for kind in kinds):
-        bounds = [kind.bounds for kind in kinds if kind.bounds is not None]
-        low, high = min(low for low, _ in bounds), max(high for _, high in bounds)
-        same = all(kind.type == kinds[0].type for kind in kinds)
-        return Kind(kinds[0].type if same else pa.int64(), bounds=(low, high))
-    return Kind(widest_float(*(float_of(kind) for kind in kinds)))
+    bounds = [kind.bounds for kind in kinds if kind.bounds is not None]
+    if len(bounds) < len(kinds):
+        return Kind(widest_float(*(float_of(kind) for kind in kinds)))
+    low, high = min(low for low, _ in bounds), max(high for _, high in bounds)
+    if high > INT64[1] and low < 0:
+        raise Unfit("uint64 and what may be negative have no common type", hint="cast one of them")
+    same = all(kind.type == kinds[0].type for kind in kinds)
+    common = arrays.int64() if high <= INT64[1] else arrays.uint64()
+    return Kind(kinds[0].type if same else common, bounds=(low, high))
 
 
 def spell(kind: Kind | DataType) -> str:

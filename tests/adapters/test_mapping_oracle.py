@@ -1,0 +1,457 @@
+"""Expressions over columns against the same expressions over one message at a time, in plain Python."""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from mosaico_ingest.adapters.adapter import Envelope
+from mosaico_ingest.adapters.mapping.check import Checker, Scope
+from mosaico_ingest.adapters.mapping.evaluate import Evaluation, RowsRefused
+from mosaico_ingest.adapters.mapping.expression import parse
+from mosaico_ingest.adapters.mapping.kinds import Kind
+from mosaico_ingest.adapters.mapping.typed import (
+    Apply,
+    Cast,
+    ChoiceOf,
+    Const,
+    EachOf,
+    FieldOf,
+    Fold,
+    ItemOf,
+    ListValue,
+    Typed,
+    Whole,
+)
+
+INNER = pa.struct([("v", pa.int16()), ("t", pa.string()), ("n", pa.list_(pa.float32()))])
+MESSAGE = pa.struct(
+    [
+        ("b", pa.bool_()),
+        ("i", pa.int8()),
+        ("u", pa.uint8()),
+        ("k", pa.int64()),
+        ("w", pa.uint64()),
+        ("f", pa.float32()),
+        ("d", pa.float64()),
+        ("s", pa.string()),
+        ("x", pa.list_(pa.int32())),
+        ("y", pa.list_(pa.float64(), 3)),
+        ("m", pa.list_(INNER)),
+        ("p", INNER),
+    ]
+)
+
+
+class Refused(Exception):
+    """The row does not fit."""
+
+
+# --- the slow twin -------------------------------------------------------------------------------------------------
+
+
+def interpret(typed: Typed, row: dict[str, Any]) -> Any:
+    """Return the value for one message; open lists are Python lists."""
+    match typed:
+        case Whole():
+            return row
+        case Const():
+            return typed.value
+        case FieldOf():
+            return each(
+                lambda of: None if of is None else of[typed.name], interpret(typed.of, row), depth(typed.of)
+            )
+        case EachOf() | Fold():
+            return interpret(typed.of, row)
+        case ItemOf():
+            return each(lambda of: item(of, typed.index), interpret(typed.of, row), depth(typed.of))
+        case Cast():
+            return each(lambda of: cast(of, typed.type), interpret(typed.of, row), depth(typed.of))
+        case ListValue():
+            return spread(lambda *items: list(items), typed.items, row)
+        case ChoiceOf():
+            return choose(typed, row)
+        case Apply():
+            function = SCALAR[typed.name]
+            whole = all(a.kind.bounds is not None for a in typed.arguments)
+            return spread(lambda *a: function(*a, whole=whole), typed.arguments, row)
+
+
+def depth(typed: Typed) -> int:
+    return len(typed.kind.axes)
+
+
+def each(run: Callable[[Any], Any], value: Any, levels: int) -> Any:
+    if levels == 0 or value is None:
+        return run(value) if levels == 0 else None
+    return [each(run, element, levels - 1) for element in value]
+
+
+def spread(run: Callable[..., Any], arguments: tuple[Typed, ...], row: dict[str, Any]) -> Any:
+    return broadcast(run, [interpret(a, row) for a in arguments], [depth(a) for a in arguments])
+
+
+def broadcast(run: Callable[..., Any], values: list[Any], depths: list[int]) -> Any:
+    lengths = {len(value) for value, levels in zip(values, depths, strict=True) if levels}
+    if not lengths:
+        return run(*values)
+    if len(lengths) > 1:
+        raise Refused
+    return [
+        broadcast(
+            run,
+            [v[k] if levels else v for v, levels in zip(values, depths, strict=True)],
+            [max(levels - 1, 0) for levels in depths],
+        )
+        for k in range(lengths.pop())
+    ]
+
+
+def choose(typed: ChoiceOf, row: dict[str, Any]) -> Any:
+    condition = interpret(typed.condition, row)
+    if depth(typed.condition) == 0 and depth(typed) == 0:
+        return None if condition is None else interpret(typed.then if condition else typed.otherwise, row)
+    parts = (typed.condition, typed.then, typed.otherwise)
+    values = [interpret(part, row) for part in parts]  # the generator puts nothing that refuses in here
+    pick = lambda c, a, b: None if c is None else a if c else b  # noqa: E731 - shorter than its name
+    return broadcast(pick, values, [depth(part) for part in parts])
+
+
+def item(values: list[Any] | None, index: int) -> Any:
+    if values is None or not -len(values) <= index < len(values):
+        return None
+    return values[index]
+
+
+def cast(value: Any, type_: pa.DataType) -> Any:
+    if value is None:
+        return None
+    if pa.types.is_boolean(type_):
+        if value not in {0, 1}:
+            raise Refused
+        return bool(value)
+    if pa.types.is_integer(type_):
+        low, high = np.iinfo(str(type_)).min, np.iinfo(str(type_)).max
+        if not math.isfinite(value) or value != math.trunc(value) or not low <= value <= high:
+            raise Refused
+        return int(value)
+    if type_ == pa.float32():
+        with np.errstate(over="ignore"):
+            narrow = float(np.float32(value))
+        if math.isinf(narrow) and not math.isinf(value):
+            raise Refused
+        return narrow
+    return float(value)
+
+
+def strict(run: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda *a, whole: None if any(v is None for v in a) else run(*a, whole=whole)
+
+
+def arithmetic(run: Callable[[Any, Any], Any]) -> Callable[..., Any]:
+    def compute(a: Any, b: Any, *, whole: bool) -> Any:
+        if isinstance(a, str):
+            return a + b
+        return bounded(run(bounded(a), bounded(b))) if whole else ieee(run, float(a), float(b))
+
+    return strict(compute)
+
+
+def bounded(value: int) -> int:
+    if not -(2**63) <= value < 2**63:
+        raise Refused
+    return value
+
+
+def ieee(run: Callable[[Any, Any], Any], a: float, b: float) -> float:
+    with np.errstate(all="ignore"):
+        return float(run(np.float64(a), np.float64(b)))
+
+
+def floored(run: Callable[[Any, Any], Any]) -> Callable[..., Any]:
+    def compute(a: Any, b: Any, *, whole: bool) -> Any:
+        if whole:
+            if b == 0:
+                raise Refused
+            return bounded(run(bounded(a), bounded(b)))
+        return ieee(run, float(a), float(b))
+
+    return strict(compute)
+
+
+def compared(run: Callable[[Any, Any], bool]) -> Callable[..., Any]:
+    def compare(a: Any, b: Any, *, whole: bool) -> bool:
+        if isinstance(a, float) or isinstance(b, float):
+            a, b = float(a), float(b)
+        return run(a, b)
+
+    return strict(compare)
+
+
+def both(a: Any, b: Any, *, whole: bool) -> Any:
+    if a is False or b is False:
+        return False
+    return None if a is None or b is None else True
+
+
+def one(a: Any, b: Any, *, whole: bool) -> Any:
+    if a is True or b is True:
+        return True
+    return None if a is None or b is None else False
+
+
+def extreme(pick: Callable[..., Any]) -> Callable[..., Any]:
+    def run(*values: Any, whole: bool) -> Any:
+        if whole:
+            return pick(bounded(v) for v in values)
+        numbers = [float(v) for v in values]
+        known = [v for v in numbers if not math.isnan(v)]
+        return pick(known) if known else math.nan
+
+    return strict(run)
+
+
+def folded(run: Callable[[list[Any]], Any], empty: Any) -> Callable[..., Any]:
+    def fold(values: Any, *, whole: bool) -> Any:
+        if any(v is None for v in values):
+            return None
+        return run(values) if values else empty
+
+    return strict(fold)
+
+
+def negative(a: Any, *, whole: bool) -> Any:
+    return bounded(-bounded(a)) if whole else -float(a)
+
+
+SCALAR: dict[str, Callable[..., Any]] = {
+    "+": arithmetic(operator.add),
+    "-": arithmetic(operator.sub),
+    "*": arithmetic(operator.mul),
+    "/": strict(lambda a, b, whole: ieee(operator.truediv, float(a), float(b))),
+    "//": floored(lambda a, b: np.floor_divide(a, b) if isinstance(a, np.floating) else a // b),
+    "%": floored(lambda a, b: np.mod(a, b) if isinstance(a, np.floating) else a % b),
+    "**": strict(
+        lambda a, b, whole: bounded(bounded(a) ** b) if whole else ieee(np.power, float(a), float(b))
+    ),
+    "negative": strict(negative),
+    "==": compared(operator.eq),
+    "!=": compared(operator.ne),
+    "<": compared(operator.lt),
+    "<=": compared(operator.le),
+    ">": compared(operator.gt),
+    ">=": compared(operator.ge),
+    "and": both,
+    "or": one,
+    "not": strict(lambda a, whole: not a),
+    "is_null": lambda a, whole: a is None,
+    "coalesce": lambda *a, whole: next((v for v in a if v is not None), None),
+    "null_if": strict(lambda a, b, whole: None if a == b else a),
+    "nan_to_null": strict(lambda a, whole: None if math.isnan(a) else a),
+    "empty_to_null": strict(lambda a, whole: a or None),
+    "is_nan": strict(lambda a, whole: math.isnan(a)),
+    "min": extreme(min),
+    "max": extreme(max),
+    "len": strict(lambda a, whole: len(a)),
+    "sum": folded(
+        lambda values: bounded(sum(values)) if isinstance(values[0], int) else math.fsum(values), 0
+    ),
+    "mean": folded(lambda values: math.fsum(values) / len(values), None),
+    "any": folded(any, empty=False),
+    "all": folded(all, empty=True),
+    "lower": strict(lambda a, whole: a.lower()),
+    "covariance": strict(lambda a, whole: a if any(v > 0 for v in a) else None),
+    "variance": strict(lambda a, whole: a if a > 0 else None),
+}
+
+
+# --- what is generated ---------------------------------------------------------------------------------------------
+
+FLOATS = st.floats(width=32) | st.sampled_from([0.0, -1.0, 1.0, 0.5, math.inf, math.nan])
+DOUBLES = st.floats(-1e6, 1e6) | st.sampled_from([0.0, math.inf, -math.inf, math.nan])
+TEXTS = st.sampled_from(["", "a", "Ab", "żó", "42"])
+
+
+def integers(low: int, high: int) -> st.SearchStrategy[int]:
+    return st.integers(max(low, -5), min(high, 5)) | st.sampled_from([low, high])
+
+
+def inner() -> st.SearchStrategy[dict[str, Any]]:
+    numbers = st.lists(st.sampled_from([0.0, 1.5, -2.0]), max_size=3)
+    return st.fixed_dictionaries({"v": integers(-(2**15), 2**15 - 1), "t": TEXTS, "n": numbers})
+
+
+ROWS = st.lists(
+    st.fixed_dictionaries(
+        {
+            "b": st.booleans(),
+            "i": integers(-128, 127),
+            "u": integers(0, 255),
+            "k": integers(-(2**63), 2**63 - 1),
+            "w": integers(0, 2**64 - 1),
+            "f": FLOATS,
+            "d": DOUBLES,
+            "s": TEXTS,
+            "x": st.lists(integers(-(2**31), 2**31 - 1), max_size=3),
+            "y": st.lists(st.sampled_from([-1.0, 0.0, 2.5]), min_size=3, max_size=3),
+            "m": st.lists(inner(), max_size=3),
+            "p": inner(),
+        }
+    ),
+    max_size=6,
+)
+
+NUMBERS = st.sampled_from(
+    [
+        "i",
+        "u",
+        "k",
+        "w",
+        "f",
+        "d",
+        "p.v",
+        "x[0]",
+        "y[-1]",
+        "m[0].v",
+        "len(s)",
+        "len(m)",
+        "1",
+        "0",
+        "2",
+        "0.5",
+        "-3",
+        "null",
+    ]
+)
+PER_ELEMENT = st.sampled_from(["m[].v", "x[]", "y[]", "len(m[].t)", "m[].n[]", "m[].n[0]"])
+
+
+def grown(inner_: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
+    sign = st.sampled_from(["+", "-", "*", "/", "//", "%"])
+    compare = st.sampled_from(["==", "!=", "<", "<=", ">", ">="])
+    condition = st.builds(lambda a, c, b: f"({a} {c} {b})", inner_, compare, inner_)
+    conditions = condition | st.builds(
+        lambda a, j, b: f"({a} {j} {b})", condition, st.sampled_from(["and", "or"]), condition | st.just("b")
+    )
+    return st.one_of(
+        st.builds(lambda a, s, b: f"({a} {s} {b})", inner_, sign, inner_),
+        st.builds(lambda a, b: f"({a} ** {b})", inner_, st.sampled_from(["2", "0", "3", "0.5", "u"])),
+        st.builds(lambda a: f"(-{a})", inner_),
+        st.builds(lambda a, b: f"coalesce({a}, {b})", inner_, inner_),
+        st.builds(lambda f, a: f"{f}({a})", st.sampled_from(["nan_to_null", "variance"]), inner_),
+        st.builds(lambda f, a, b: f"{f}({a}, {b})", st.sampled_from(["min", "max"]), inner_, inner_),
+        st.builds(
+            lambda a, t: f"cast({a}, '{t}')", inner_, st.sampled_from(["int8", "uint16", "float32", "int64"])
+        ),
+        st.builds(lambda c, a, b: f"({a} if {c} else {b})", conditions, inner_, inner_),
+        st.builds(lambda c, a: f"(0 if is_null({c}) else {a})", inner_, inner_),
+    )
+
+
+def reduced(inner_: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
+    return st.one_of(
+        grown(inner_),
+        st.builds(lambda f, a: f"{f}({a})", st.sampled_from(["sum", "mean", "covariance"]), PER_ELEMENT),
+        st.builds(
+            lambda f, a, b: f"(1 if {f}({a} > {b}) else 0)",
+            st.sampled_from(["any", "all"]),
+            PER_ELEMENT,
+            NUMBERS,
+        ),
+    )
+
+
+SCALARS = st.recursive(NUMBERS, reduced, max_leaves=6)
+LISTS = st.recursive(
+    PER_ELEMENT | NUMBERS,
+    lambda i: st.builds(lambda a, s, b: f"({a} {s} {b})", i, st.sampled_from(["+", "-", "*"]), i),
+    max_leaves=4,
+)
+OTHERS = st.sampled_from(
+    ["s + '-' + p.t", "lower(m[].t)", "empty_to_null(s)", "empty_to_null(x)", "covariance(y)", "[i, u, 1]", "[x[], 1]", "s == 'a'"]
+)  # fmt: skip
+
+
+def typed_of(text: str) -> Typed | None:
+    scope = Scope(Kind(MESSAGE), {})
+    return Checker(scope, lambda *_: None, text).infer(parse(text))
+
+
+def over_columns(typed: Typed, rows: list[dict[str, Any]]) -> dict[int, Any]:
+    """Return the value of every row that is not refused."""
+    array, index = pa.array(rows, MESSAGE), np.arange(len(rows))
+    while True:
+        envelope = Envelope("", "", np.zeros(len(array), np.int64))
+        try:
+            column = Evaluation(array, envelope).of(typed)
+        except RowsRefused as refused:
+            good = np.ones(len(array), bool)
+            good[list(refused.refusals)] = False
+            array, index = array.filter(pa.array(good)), index[good]
+            continue
+        values = column.closed(len(array))
+        values.validate(full=True)
+        return dict(zip(index.tolist(), values.to_pylist(), strict=True))
+
+
+def over_rows(typed: Typed, rows: list[dict[str, Any]]) -> dict[int, Any]:
+    values: dict[int, Any] = {}
+    for position, row in enumerate(pa.array(rows, MESSAGE).to_pylist()):
+        try:
+            values[position] = interpret(typed, row)
+        except Refused:
+            pass
+    return values
+
+
+def same(left: Any, right: Any) -> bool:
+    if isinstance(left, list) and isinstance(right, list):
+        return len(left) == len(right) and all(map(same, left, right))
+    if isinstance(left, float) and isinstance(right, float | int):
+        if math.isnan(left) or math.isnan(right):
+            return math.isnan(left) and math.isnan(right)
+        return left == right or math.isclose(left, right, rel_tol=1e-9, abs_tol=1e-12)
+    return left == right
+
+
+@settings(max_examples=120, deadline=None)
+@given(text=SCALARS | LISTS | OTHERS, rows=ROWS)
+def test_columns_and_rows_agree(text: str, rows: list[dict[str, Any]]) -> None:
+    typed = typed_of(text)
+    assume(typed is not None)
+    assert typed is not None
+    fast, slow = over_columns(typed, rows), over_rows(typed, rows)
+    assert fast.keys() == slow.keys(), text
+    assert all(same(fast[row], slow[row]) for row in slow), (text, fast, slow)
+
+
+@settings(max_examples=40, deadline=None)
+@given(text=SCALARS | LISTS | OTHERS, rows=ROWS)
+def test_one_row_at_a_time_gives_what_all_rows_give(text: str, rows: list[dict[str, Any]]) -> None:
+    typed = typed_of(text)
+    assume(typed is not None)
+    assert typed is not None
+    together = over_columns(typed, rows)
+    alone = {i: value for i, row in enumerate(rows) for value in over_columns(typed, [row]).values()}
+    assert together.keys() == alone.keys()
+    assert all(same(together[row], alone[row]) for row in together)
+
+
+@settings(max_examples=60, deadline=None)
+@given(text=SCALARS, rows=ROWS)
+def test_integers_stay_within_the_bounds_that_were_promised(text: str, rows: list[dict[str, Any]]) -> None:
+    typed = typed_of(text)
+    assume(typed is not None)
+    assert typed is not None
+    bounds = typed.kind.bounds
+    assume(bounds is not None and not typed.kind.axes)
+    assert bounds is not None
+    for value in over_columns(typed, rows).values():
+        assert value is None or bounds[0] <= value <= bounds[1], text
