@@ -159,6 +159,10 @@ class AdaptersSection(_Section):
     """The adapter for a topic name or glob: one of the above, or the name of a built-in one."""
     unmodeled: Unmodeled = Unmodeled.KEEP
     """What to do with a type that no adapter takes: keep its ROS shape, skip its topics, fail."""
+    serialization_formats: dict[Text, Literal["default", "ragged", "image"]] = Field(
+        default={}, examples=[{"acme_msgs/msg/Scan": "ragged"}]
+    )
+    """How the platform lays out a message type that no adapter takes, by type."""
 
 
 class OnErrorSection(_Section):

@@ -68,6 +68,7 @@ def _fields(loaded: LoadedManifest) -> dict[str, Any]:
         "unmodeled": manifest.adapters.unmodeled,
         "adapters": manifest.adapters.load,
         "adapter_override": dict(manifest.adapters.override),
+        "serialization_formats": dict(manifest.adapters.serialization_formats),
         "base_dir": loaded.path.parent,
         "on_error": manifest.on_error.session,
         "topics_on_error": _topic_policies(loaded),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -52,7 +53,11 @@ bag:
 sequence: {name: "x_{stem}", metadata: {weather: sunny}, metadata_file: metadata.json, if_exists: append}
 topics: [/cam*]
 topic_settings: {/imu: {rename: /sensors/imu, metadata: {mount: roof}}, "/camera/*": {every: 3, image: png}}
-adapters: {load: [a.yaml], override: {/lidar: LidarAdapter}, unmodeled: skip}
+adapters:
+  load: [a.yaml]
+  override: {/lidar: LidarAdapter}
+  unmodeled: skip
+  serialization_formats: {p/msg/Scan: ragged}
 on_error: {session: delete, topic: {default: finalize, /gps: ignore}, message: raise}
 target: {host: h, port: 1, api_key: "${KEY}", tls_cert: ca.pem, tls: true}
 run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
@@ -79,6 +84,7 @@ run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
         adapters=("a.yaml",),
         adapter_override={"/lidar": "LidarAdapter"},
         base_dir=folder,
+        serialization_formats={"p/msg/Scan": "ragged"},
         unmodeled=Unmodeled.SKIP,
         on_error=SessionLevelErrorPolicy.Delete,
         topics_on_error={"default": TopicLevelErrorPolicy.Finalize, "/gps": TopicLevelErrorPolicy.Ignore},
@@ -89,6 +95,14 @@ run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
         jobs=2,
     )
     assert config.where == str(folder / "job.yaml")
+    default = ROSInjectionConfig("a", "b")
+    unsaid = {f.name for f in fields(config) if getattr(config, f.name) == getattr(default, f.name)}
+    assert unsaid == {
+        "update_if_exists",
+        "dry_run",
+        "registry",
+        "store",
+    }  # if_exists, a command, Python's, the host
 
 
 def test_the_smallest_manifest_is_a_job(folder: Path) -> None:
