@@ -62,8 +62,11 @@ def compile_job(manifest: Path) -> tuple[ROSInjectionConfig, ...]:
     Raises:
         ManifestError: Its `findings` say where and what.
         NothingMatched: There is no such recording.
+        AdapterError: An adapter it names is not there or has a mistake.
     """
-    return compile_manifest(load_manifest(manifest))
+    configs = compile_manifest(load_manifest(manifest))
+    ROSBridge.for_config(configs[0])  # the jobs of one manifest share their adapters
+    return configs
 
 
 def run(configs: Sequence[ROSInjectionConfig], *, observe: Observer = ignore_events) -> RunReport:

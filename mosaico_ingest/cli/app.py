@@ -93,18 +93,9 @@ def _with_command(arguments: list[str]) -> list[str]:
 
 
 def _complain(error: IngestError) -> None:
-    """Print an error: its findings with their source lines, else its one line."""
-    from rich.console import Console
-    from rich.text import Text
+    from mosaico_ingest.cli.errors import print_error
 
-    from mosaico_ingest.cli.render import render_findings, texts_of
-    from mosaico_ingest.errors import ManifestError
-
-    console = Console(stderr=True, soft_wrap=True, highlight=False)
-    if isinstance(error, ManifestError) and error.findings:
-        console.print(render_findings(error.findings, texts_of(error.findings)))
-    else:
-        console.print(Text.assemble(("error: ", "bold red"), str(error)))
+    print_error(str(error), error.findings)
 
 
 if __name__ == "__main__":

@@ -11,10 +11,12 @@ from types import FrameType
 import typer
 
 from mosaico_ingest import api
+from mosaico_ingest.cli.errors import print_error
 from mosaico_ingest.cli.progress import display
 from mosaico_ingest.cli.tables import print_report
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.report.events import Event, RunFinished
 from mosaico_ingest.report.write import write_report
 
 __all__ = ["run_configs"]
@@ -26,13 +28,23 @@ def run_configs(
     """Run each configuration in turn; exit with the report's code unless it is 0."""
     _set_up_logging(log or configs[0].log_level)
     signal.signal(signal.SIGTERM, _as_interrupt)
+    failures: list[RunFinished] = []
+
+    def tell(event: Event) -> None:
+        if isinstance(event, RunFinished) and event.error is not None:
+            failures.append(event)
+        observe(event)
+
     with display(quiet=quiet) as observe:
-        result = api.run(configs, observe=observe)
+        result = api.run(configs, observe=tell)
     for target in {
         path for path in (report, *(_report_path(config) for config in configs)) if path is not None
     }:
         write_report(result, target)
-    print_report(result, quiet=quiet)
+    if not quiet:
+        print_report(result)
+    for failure in failures:
+        print_error(failure.error or "", failure.findings)
     if result.exit_code:
         raise typer.Exit(result.exit_code)
 

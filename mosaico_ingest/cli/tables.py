@@ -76,14 +76,11 @@ def print_inspection(found: Inspection, *, as_json: bool) -> None:
         console.print(Text(f"note: {finding}", style="yellow"))
 
 
-def print_report(report: RunReport, *, quiet: bool) -> None:
-    """Print what was done: a table on standard output, errors on standard error."""
-    errors = Console(stderr=True)
+def print_report(report: RunReport) -> None:
+    """Print what was done."""
+    console = open_console()
     for recording in report.recordings:
-        if not quiet:
-            _print_recording(recording, open_console())
-        if recording.error is not None:
-            errors.print(Text(f"error: {recording.error}", style="red"), soft_wrap=True)
+        _print_recording(recording, console)
 
 
 def _print_recording(report: Report, console: Console) -> None:

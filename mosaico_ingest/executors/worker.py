@@ -140,7 +140,7 @@ def place(target: StoreTarget | ServerTarget) -> str:
 
 def _failed(error: IngestError) -> RunFinished:
     status = RunStatus.INTERRUPTED if isinstance(error, Interrupted) else RunStatus.FAILED
-    return RunFinished(status, error.exit_code, str(error))
+    return RunFinished(status, error.exit_code, str(error), error.findings)
 
 
 def _done(collector: Collector) -> RunFinished:

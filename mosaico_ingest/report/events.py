@@ -140,6 +140,8 @@ class RunFinished:
     status: RunStatus
     exit_code: int
     error: str | None = None
+    findings: tuple[Finding, ...] = ()
+    """What the error knows of the places it is about."""
 
 
 Event: TypeAlias = RunStarted | TopicProgress | Rejected | Unreadable | Noted | TopicClosed | RunFinished
