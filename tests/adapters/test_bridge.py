@@ -1,0 +1,234 @@
+"""Which adapter a topic gets, in order of precedence, and what is said about it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from mosaico_ingest import bridge as bridge_module
+from mosaico_ingest.adapters import base
+from mosaico_ingest.adapters.adapter import Envelope
+from mosaico_ingest.adapters.base import ROSAdapterBase, register_default_adapter
+from mosaico_ingest.adapters.builtin import BY_NAME
+from mosaico_ingest.adapters.python_adapter import PythonAdapterSpec
+from mosaico_ingest.bag.definition import Definition
+from mosaico_ingest.bag.message import ROSMessage
+from mosaico_ingest.bag.shape import ros_shape
+from mosaico_ingest.bridge import ROSBridge
+from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.ontology.serializable import Serializable
+from mosaico_ingest.ontology.types import SerializationFormat
+
+IMU, CLOUD = "sensor_msgs/msg/Imu", "sensor_msgs/msg/PointCloud2"
+
+TEN_LINES = """
+version: 1
+adapter: TicksAdapter
+ros_type: std_msgs/msg/Int32
+ontology: {tag: BridgeTicks, fields: {ticks: {type: int32, unit: tick, nullable: false}}}
+fields: {ticks: data}
+tests:
+  - name: nominal
+    given: {data: 3}
+    expect: {ticks: 3}
+"""
+
+
+class BridgeRow(Serializable):
+    """A row of the tests."""
+
+    x: float
+
+
+class MyImuAdapter(ROSAdapterBase[BridgeRow]):
+    ros_msgtype = IMU
+    __mosaico_ontology_type__ = BridgeRow
+
+    @classmethod
+    def from_dict(cls, ros_data: dict[str, Any], **_: Any) -> BridgeRow:
+        return BridgeRow(x=ros_data["linear_acceleration"]["x"])
+
+
+@pytest.fixture(autouse=True)
+def _nothing_stays_registered() -> Iterator[None]:
+    before = dict(base._registered)
+    yield
+    base._registered.clear()
+    base._registered.update(before)
+    bridge_module._installed.cache_clear()
+
+
+@pytest.fixture
+def installed(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Pretend that a package offers an adapter as an entry point."""
+
+    def offer(value: str) -> None:
+        entry = EntryPoint("mine", value, bridge_module.ENTRY_POINTS)
+        monkeypatch.setattr(bridge_module, "entry_points", lambda group: [entry] if group else [])
+        bridge_module._installed.cache_clear()
+
+    return offer
+
+
+def test_the_built_in_adapter_is_what_is_left(tmp_path: Path) -> None:
+    found = ROSBridge(base_dir=tmp_path).resolve("/imu", "sensor_msgs/Imu")
+    assert (found.spec.name, found.reason, found.unmodeled) == ("IMUAdapter", "built-in", False)
+
+
+def test_a_type_without_an_adapter_keeps_its_shape() -> None:
+    bridge = ROSBridge(formats={"visualization_msgs/Marker": "ragged"})
+    found = bridge.resolve("/m", "visualization_msgs/msg/Marker")
+    assert (found.spec.name, found.reason, found.unmodeled) == ("Unmodeled", "unmodeled", True)
+    assert found.spec.serialization_format is SerializationFormat.RAGGED
+    assert found.why == "no adapter takes visualization_msgs/msg/Marker; it keeps its ROS shape"
+
+
+def test_each_source_wins_over_the_ones_below(tmp_path: Path, installed: Callable[[str], None]) -> None:
+    (tmp_path / "imu.yaml").write_text(
+        BY_NAME["IMUAdapter"].path.read_text().replace("IMUAdapter", "LoadedAdapter")
+    )
+    installed(f"{__name__}:MyImuAdapter")
+    sys.modules.setdefault(__name__, sys.modules[MyImuAdapter.__module__])
+    found = ROSBridge().resolve("/imu", IMU)
+    assert (found.spec.name, found.reason) == ("MyImuAdapter", "entry point")
+
+    @register_default_adapter
+    class RegisteredAdapter(MyImuAdapter): ...
+
+    assert ROSBridge().resolve("/imu", IMU).reason == "registered"
+    loaded = ROSBridge(loaded=["imu.yaml"], base_dir=tmp_path)
+    assert loaded.resolve("/imu", IMU).why == "loaded from imu.yaml"
+    assert loaded.resolve("/imu", IMU).spec.name == "LoadedAdapter"
+    both = ROSBridge(loaded=["imu.yaml"], overrides={"/i*": RegisteredAdapter}, base_dir=tmp_path)
+    found = both.resolve("/imu", IMU)
+    assert (found.spec.name, found.reason, found.why) == ("RegisteredAdapter", "override", "override '/i*'")
+    assert both.resolve("/other", IMU).reason == "loaded"
+
+
+def test_an_exact_override_wins_over_a_glob() -> None:
+    bridge = ROSBridge(overrides={"/lidar/*": "LidarAdapter", "/lidar/radar": "RadarAdapter"})
+    assert bridge.resolve("/lidar/top", CLOUD).spec.name == "LidarAdapter"
+    assert bridge.resolve("/lidar/radar", CLOUD).spec.name == "RadarAdapter"
+    assert bridge.resolve("/camera", CLOUD).spec.name == "PointCloudAdapter"
+
+
+@pytest.mark.parametrize("form", ["class", "spec", "name", "module", "file", "yaml", "catalog class"])
+def test_an_override_may_be_given_in_every_form(form: str, tmp_path: Path) -> None:
+    source = Path(__file__).read_text().replace("BridgeRow", "BridgeFileRow")
+    (tmp_path / "a_file_of_adapters.py").write_text(source)
+    (tmp_path / "imu.yaml").write_text(BY_NAME["IMUAdapter"].path.read_text())
+    reference: Any = {
+        "class": MyImuAdapter,
+        "spec": PythonAdapterSpec(MyImuAdapter),
+        "name": "IMUAdapter",
+        "module": "mosaico_ingest.adapters:IMUAdapter",
+        "file": "a_file_of_adapters.py:MyImuAdapter",
+        "yaml": "imu.yaml",
+        "catalog class": BY_NAME["IMUAdapter"],
+    }[form]
+    found = ROSBridge(overrides={"/imu": reference}, base_dir=tmp_path).resolve("/imu", IMU)
+    assert found.reason == "override"
+    assert found.spec.name in {"MyImuAdapter", "IMUAdapter"}
+
+
+def test_an_override_for_another_type_is_an_error_that_names_both() -> None:
+    bridge = ROSBridge(overrides={"/lidar/*": "LidarAdapter"})
+    with pytest.raises(AdapterError) as caught:
+        bridge.resolve("/lidar/imu", IMU)
+    assert str(caught.value) == (
+        "/lidar/imu: the override '/lidar/*' names LidarAdapter, which takes sensor_msgs/msg/PointCloud2; "
+        "the topic carries sensor_msgs/msg/Imu — name an adapter that takes this type, or leave the topic out "
+        "of the override"
+    )
+
+
+def test_a_topic_can_be_kept_in_its_ros_shape() -> None:
+    found = ROSBridge(overrides={"/imu": "Unmodeled"}).resolve("/imu", IMU)
+    assert (found.spec.name, found.reason) == ("Unmodeled", "override")
+
+
+def test_an_override_may_name_an_adapter_that_is_loaded(tmp_path: Path) -> None:
+    (tmp_path / "ticks.yaml").write_text(TEN_LINES.replace("ontology:", "default: false\nontology:"))
+    bridge = ROSBridge(loaded=["ticks.yaml"], overrides={"/ticks": "TicksAdapter"}, base_dir=tmp_path)
+    assert bridge.resolve("/ticks", "std_msgs/msg/Int32").spec.name == "TicksAdapter"
+    assert bridge.resolve("/count", "std_msgs/msg/Int32").spec.name == "Integer32StdAdapter"
+
+
+def test_two_loaded_adapters_for_one_type_are_an_error(tmp_path: Path) -> None:
+    (tmp_path / "one.yaml").write_text(TEN_LINES)
+    (tmp_path / "two.yaml").write_text(TEN_LINES.replace("TicksAdapter", "OtherAdapter"))
+    with pytest.raises(
+        AdapterError,
+        match=r"TicksAdapter \(loaded from one.yaml\) and OtherAdapter .* both take std_msgs/msg/Int32",
+    ):
+        ROSBridge(loaded=["one.yaml", "two.yaml"], base_dir=tmp_path)
+
+
+def test_a_broken_entry_point_is_an_error_that_names_it(installed: Callable[[str], None]) -> None:
+    installed("no_such_module_anywhere:Adapter")
+    with pytest.raises(
+        AdapterError, match="entry point mine of an installed package cannot be used: ModuleNotFoundError"
+    ):
+        ROSBridge().resolve("/imu", IMU)
+
+
+def test_ten_lines_of_yaml_adapt_a_type_to_an_ontology_of_ones_own(
+    tmp_path: Path, define: Callable[..., Definition]
+) -> None:
+    (tmp_path / "ticks.yaml").write_text(TEN_LINES)
+    found = ROSBridge(loaded=["ticks.yaml"], base_dir=tmp_path).resolve("/ticks", "std_msgs/Int32")
+    definition = define("std_msgs/msg/Int32")
+    bound = found.spec.bind(definition, ros_shape(definition))
+    rows = pa.array([{"data": 3}], ros_shape(definition))
+    adapted = bound.adapt(rows, Envelope("/ticks", definition.root, np.zeros(1, np.int64)))
+    assert (bound.ontology.tag, adapted.rows.to_pylist()) == ("BridgeTicks", [{"ticks": 3}])
+
+
+def test_the_image_setting_wraps_whatever_adapter_is_chosen(define: Callable[..., Definition]) -> None:
+    bridge = ROSBridge(images={"/cam/*": "png", "/cam/raw": "raw"})
+    definition = define("sensor_msgs/msg/Image")
+    message = {"height": 1, "width": 1, "step": 1, "encoding": "mono8", "data": b"x"}
+    rows = pa.array([message], ros_shape(definition))
+    envelope = Envelope("/cam", definition.root, np.zeros(1, np.int64))
+    formats = {
+        topic: bridge.resolve(topic, definition.root)
+        .spec.bind(definition, rows.type)
+        .adapt(rows, envelope)
+        .rows[0]["format"]
+        .as_py()
+        for topic in ("/cam/left", "/cam/raw", "/other")
+    }
+    assert formats == {"/cam/left": "png", "/cam/raw": "raw", "/other": "raw"}
+
+
+def test_the_bridge_of_a_job_has_its_settings(tmp_path: Path) -> None:
+    (tmp_path / "ticks.yaml").write_text(TEN_LINES)
+    config = ROSInjectionConfig(
+        file_path=tmp_path / "x.bag",
+        sequence_name="s",
+        adapter_override={"/imu": MyImuAdapter},
+        adapters=["ticks.yaml"],
+        base_dir=tmp_path,
+    )
+    bridge = ROSBridge.for_config(config)
+    assert bridge.resolve("/imu", IMU).reason == "override"
+    assert bridge.resolve("/ticks", "std_msgs/msg/Int32").reason == "loaded"
+
+
+def test_one_message_is_translated() -> None:
+    message = ROSBridge.from_ros_message(ROSMessage(5, "/s", "std_msgs/String", {"data": "hello"}))
+    assert (message.timestamp_ns, message.ontology_tag(), message.data.data) == (5, "String", "hello")
+
+    register_default_adapter(MyImuAdapter)
+    imu = ROSMessage(6, "/imu", IMU, {"linear_acceleration": {"x": 4.0}})
+    assert ROSBridge.from_ros_message(imu).data == BridgeRow(x=4.0)
+    with pytest.raises(AdapterError, match="no adapter takes visualization_msgs/msg/Marker"):
+        ROSBridge.from_ros_message(ROSMessage(0, "/m", "visualization_msgs/msg/Marker", {}))
