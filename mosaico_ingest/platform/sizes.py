@@ -35,6 +35,8 @@ def row_spans(batch: pa.RecordBatch, *, most_bytes: int) -> list[tuple[int, int,
 
     A row that is larger is a piece of its own.
     """
+    if batch.nbytes <= most_bytes:
+        return [(0, batch.num_rows, batch.nbytes)] if batch.num_rows else []
     ends = _batch_bits(batch)
     spans: list[tuple[int, int, int]] = []
     row = 0
@@ -49,7 +51,7 @@ def row_spans(batch: pa.RecordBatch, *, most_bytes: int) -> list[tuple[int, int,
 def encoded_bits(array: pa.Array[Any]) -> NDArray[np.int64]:
     """Return how many bits the rows before each one take when encoded, shape (n + 1,)."""
     rows = np.arange(len(array) + 1, dtype=np.int64)
-    return rows + _value_bits(array, rows)  # one bit of validity a row
+    return rows * _validity_bits(array) + _value_bits(array, rows)
 
 
 def _batch_bits(batch: pa.RecordBatch) -> NDArray[np.int64]:
@@ -61,26 +63,47 @@ def _batch_bits(batch: pa.RecordBatch) -> NDArray[np.int64]:
 
 def _value_bits(array: Any, rows: NDArray[np.int64]) -> NDArray[np.int64]:  # noqa: ANN401 - every array class
     kind = array.type
+    fixed = _fixed_bits(kind)
+    if fixed is not None:
+        return rows * fixed
     if pa.types.is_struct(kind):
         return sum((encoded_bits(array.field(i)) for i in range(kind.num_fields)), np.zeros_like(rows))
     if pa.types.is_fixed_size_list(kind):
-        return _within(encoded_bits(array.values), (rows + array.offset) * kind.list_size)
+        return _within(array.values, (rows + array.offset) * kind.list_size)
     if isinstance(array, pa.ListArray | pa.LargeListArray):
         offsets = array.offsets.to_numpy()
-        return _within(encoded_bits(array.values), offsets) + rows * offsets.itemsize * 8
+        return _within(array.values, offsets) + rows * offsets.itemsize * 8
     if kind in _OFFSETS:
         offsets = _offsets(array, _OFFSETS[kind])
         return (offsets - offsets[0]) * 8 + rows * np.dtype(_OFFSETS[kind]).itemsize * 8
-    try:
-        return rows * kind.bit_width
-    except ValueError:  # a type without a fixed width: its bytes, shared out evenly
-        return rows * (-(-array.nbytes * 8 // max(len(array), 1)))
+    # Any other type of varying width: its bytes, shared out evenly.
+    return rows * (-(-array.nbytes * 8 // max(len(array), 1)))
 
 
-def _within(ends: NDArray[np.int64], offsets: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
-    """Return what lies before each offset, counted from the first."""
-    before = ends[offsets]
+def _within(values: Any, offsets: NDArray[np.integer[Any]]) -> NDArray[np.int64]:  # noqa: ANN401 - every array class
+    """Return what of the values lies before each offset, counted from the first."""
+    each = _fixed_bits(values.type)
+    if each is not None:  # no array as long as the values, which may be millions
+        return (offsets.astype(np.int64) - int(offsets[0])) * (each + _validity_bits(values))
+    before = encoded_bits(values)[offsets]
     return before - before[0]
+
+
+def _validity_bits(array: pa.Array[Any]) -> int:
+    return 1 if array.null_count else 0
+
+
+def _fixed_bits(kind: pa.DataType) -> int | None:
+    """Return how many bits every value takes beside its own validity, None where they differ."""
+    if isinstance(kind, pa.StructType | pa.FixedSizeListType):
+        inner = [_fixed_bits(kind.field(i).type) for i in range(kind.num_fields)]
+        each = [1 + bits for bits in inner if bits is not None]
+        times = kind.list_size if isinstance(kind, pa.FixedSizeListType) else 1
+        return sum(each) * times if len(each) == len(inner) else None
+    try:
+        return kind.bit_width
+    except ValueError:
+        return None
 
 
 def _offsets(array: Any, kind: type[np.integer[Any]]) -> NDArray[np.int64]:  # noqa: ANN401 - string and binary arrays
