@@ -21,7 +21,6 @@ from mosaico_ingest.decode.layout import (
     Record,
     Run,
     Step,
-    Text,
     Words,
 )
 from mosaico_ingest.decode.places import Frame, Int64s, Located, Place, Places, expand
@@ -80,8 +79,8 @@ class _Builder:
         match column:
             case Leaf():
                 return self._leaf(column, kind, inst)
-            case Words(step=step):
-                return self._texts(kind, inst, step)
+            case Words():
+                return self._texts(column, kind, inst)
             case Grid(count=size, item=item):
                 values = self.column(item, kind.field(0).type, inst, count * size)
                 return array_of(kind, count, children=[values])
@@ -112,44 +111,41 @@ class _Builder:
         return inst.blocks[number]
 
     def _items(self, items: Items, kind: pa.DataType, inst: _Instances) -> Array:
-        step, place = inst.steps[items.step], inst.places[items.step]
-        if isinstance(step, Run) and pa.types.is_binary(kind):
+        place = inst.places[items.step]
+        if pa.types.is_binary(kind):
             data = spans(self._data, place.at, place.counts)
             return array_of(kind, inst.count, offsets_of(place.counts), data)
-        inner = self._cells(step, place) if isinstance(step, Run) else self._elements(step, place, inst)
+        inner = self._elements(items.of, place, inst)
         values = self.column(items.item, kind.field(0).type, inner, inner.count)
         if pa.types.is_fixed_size_list(kind):
             return array_of(kind, inst.count, children=[values])
         return array_of(kind, inst.count, offsets_of(place.counts), children=[values])
 
-    def _cells(self, run: Run, place: Place) -> _Instances:
-        """Return the cells of a run as instances of a body that is one block."""
-        counts, size = place.counts, run.cell.size
+    def _elements(self, of: Run | Loop, place: Place, inst: _Instances) -> _Instances:
+        """Return the elements of a loop; those of a run are instances of a body that is one block."""
+        counts = place.counts
         total = int(counts.sum())
-        if run.stride > size or not size:
-            return _Instances((run.cell,), (Place(expand(place.at, counts, run.stride)),), total)
-        inner = _Instances((run.cell,), (place,), total)
+        if isinstance(of, Loop):
+            return _Instances(of.body.steps, place.body, total, (*inst.owners, counts))
+        size = of.cell.size
+        if of.stride > size or not size:
+            return _Instances((of.cell,), (Place(expand(place.at, counts, of.stride)),), total)
+        inner = _Instances((of.cell,), (place,), total)
         inner.blocks[0] = spans(self._data, place.at, counts * size).reshape(total, size)
         return inner
 
-    def _elements(self, step: Step, place: Place, inst: _Instances) -> _Instances:
-        steps = step.body.steps if isinstance(step, Loop) else ()
-        return _Instances(steps, place.body, int(place.counts.sum()), (*inst.owners, place.counts))
-
-    def _texts(self, kind: pa.DataType, inst: _Instances, number: int) -> Array:
-        step, place = inst.steps[number], inst.places[number]
-        sizes, unit = place.counts, 1
-        if isinstance(step, Text):
-            sizes, unit = (self._open(inst, place) if step.closed else sizes * step.unit), step.unit
+    def _texts(self, words: Words, kind: pa.DataType, inst: _Instances) -> Array:
+        text, place = words.text, inst.places[words.step]
+        sizes = self._without_nul(inst, place) if text.closed else place.counts * text.unit
         data = spans(self._data, place.at, sizes)
-        if unit == 1:
+        if text.unit == 1:
             texts, wrong = utf8_texts(kind, sizes, data)
         else:
-            texts, wrong = wide_texts(kind, place.counts, data.view(f"{self._order}u{unit}"))
+            texts, wrong = wide_texts(kind, place.counts, data.view(f"{self._order}u{text.unit}"))
         self._leave(inst, wrong)
         return texts
 
-    def _open(self, inst: _Instances, place: Place) -> Int64s:
+    def _without_nul(self, inst: _Instances, place: Place) -> Int64s:
         """Return the sizes of texts without the NUL that ends them; one of size 0 has none."""
         sizes = np.maximum(place.counts - 1, 0)
         open_ended = (self._data[np.maximum(place.at + place.counts - 1, 0)] != 0) & (place.counts > 0)

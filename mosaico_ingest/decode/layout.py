@@ -110,6 +110,7 @@ class Words:
     """A text."""
 
     step: int
+    text: Text
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +126,7 @@ class Items:
     """The elements of a run or a loop; the leaves of `item` point into the cell or the body."""
 
     step: int
+    of: Run | Loop
     item: Column
 
 
@@ -207,9 +209,10 @@ class _Compiler:
         cell = _single_block(body)
         if field.container is Container.SEQUENCE:
             many = Loop(body, None, field.size) if cell is None else Run(cell, _stride(cell), field.size)
-            return Items(draft.add(many), item)
+            return Items(draft.add(many), many, item)
         if cell is None:
-            return Items(draft.add(Loop(body, field.size)), item)
+            loop = Loop(body, field.size)
+            return Items(draft.add(loop), loop, item)
         if not field.size:
             return Grid(0, item)
         stride = _stride(cell)
@@ -220,7 +223,8 @@ class _Compiler:
         if field.is_message:
             return self.struct(self.definition.types[field.type], draft)
         if field.type in TEXTS:
-            return Words(draft.add(Text(_UNITS[field.type], closed=self.aligned and field.type == "string")))
+            text = Text(_UNITS[field.type], closed=self.aligned and field.type == "string")
+            return Words(draft.add(text), text)
         size = np.dtype(NUMBERS[field.type]).itemsize
         step, offset = draft.place(size if self.aligned else 1, size)
         return Leaf(step, offset, field.type)

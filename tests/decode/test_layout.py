@@ -38,7 +38,9 @@ def test_a_new_block_begins_where_the_padding_depends_on_the_message() -> None:
         Field("name", "string"), Field("a", "uint8"), Field("b", "uint32"), Field("c", "uint8")
     )
     assert layout.body.steps == (Text(1, closed=True), Block(1, 1), Block(4, 5))
-    assert layout.record == Record((Words(0), Leaf(1, 0, "uint8"), Leaf(2, 0, "uint32"), Leaf(2, 4, "uint8")))
+    assert layout.record == Record(
+        (Words(0, Text(1, closed=True)), Leaf(1, 0, "uint8"), Leaf(2, 0, "uint32"), Leaf(2, 4, "uint8"))
+    )
 
 
 def test_a_message_begins_aligned_so_that_its_first_block_spans_the_padding() -> None:
@@ -65,7 +67,7 @@ def test_structs_of_fixed_size_run_and_others_loop() -> None:
     assert run == Run(Block(8, 9), stride=16, bound=5)
     assert isinstance(loop, Loop)
     assert loop.body.steps == (Text(1, closed=True),)
-    assert layout.record.children[1] == Items(1, Record((Words(0),)))
+    assert layout.record.children[1] == Items(1, loop, Record((Words(0, Text(1, closed=True)),)))
 
 
 def test_a_struct_whose_size_depends_on_where_it_begins_is_walked() -> None:

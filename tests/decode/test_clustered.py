@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from mosaico_ingest.bag.batch import Encoding, RawBatch
+from mosaico_ingest.bag.definition import Container, Definition, Field, MessageType, Source
+from mosaico_ingest.bag.serialize import Serializer
+from mosaico_ingest.decode.clustered import locate_clustered
+from mosaico_ingest.decode.layout import compile_layout
+from mosaico_ingest.decode.places import Frame, Located
+
+BatchOf = Callable[[Sequence[bytes], Definition, Encoding], RawBatch]
+
+NAMES = Definition(
+    "test/msg/Names",
+    {
+        "test/msg/Names": MessageType(
+            "test/msg/Names", (Field("names", "string", container=Container.SEQUENCE),)
+        )
+    },
+    Source.BAG,
+    "",
+    2,
+)
+
+
+def clusters_of(batch_of: BatchOf, values: Sequence[Sequence[str]]) -> list[Located]:
+    serializer = Serializer(NAMES, Encoding.CDR)
+    batch = batch_of([serializer.from_dict({"names": names}) for names in values], NAMES, Encoding.CDR)
+    frame = Frame(batch.data, "<", batch.starts + 4, batch.starts + batch.lengths)
+    return locate_clustered(compile_layout(NAMES, Encoding.CDR), frame)
+
+
+def test_messages_with_equal_lengths_everywhere_are_one_cluster(batch_of: BatchOf) -> None:
+    (cluster,) = clusters_of(batch_of, [["left", "right"] * 5, ["LEFT", "RIGHT"] * 5] * 50)
+    assert cluster.rows.tolist() == list(range(100))
+
+
+def test_messages_of_one_size_but_other_lengths_are_told_apart(batch_of: BatchOf) -> None:
+    one, other = ["ab", "abcdef"] * 5, ["abcdef", "ab"] * 5
+    clusters = clusters_of(batch_of, [one, other, other] * 50)
+    found = sorted(cluster.rows.tolist() for cluster in clusters)
+    assert found == [list(range(0, 150, 3)), [row for row in range(150) if row % 3]]
+
+
+def test_messages_that_are_all_laid_out_differently_are_left_alone(batch_of: BatchOf) -> None:
+    random = np.random.default_rng(4)
+    values = [["x" * size for size in random.integers(0, 40, 6).tolist()] for _ in range(300)]
+    assert clusters_of(batch_of, values) == []
