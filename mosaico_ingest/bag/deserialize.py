@@ -13,9 +13,11 @@ The rules a message can break, which failures are counted by:
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from struct import Struct, unpack_from
 from typing import Any
 
+from mosaico_ingest.bag.alternatives import distro_definitions
 from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.definition import Container, Definition, Field, MessageType
 from mosaico_ingest.errors import BagError, DecodeError
@@ -87,6 +89,7 @@ class Deserializer:
         if encoding is Encoding.OTHER:
             raise BagError(f"{definition.root}: only CDR and ROS 1 payloads can be read")
         self._definition = definition
+        self._encoding = encoding
         self._cdr = encoding is Encoding.CDR
         self._read = _message(definition.message, "", definition.types, cdr=self._cdr)
         self.padded = 0
@@ -98,6 +101,21 @@ class Deserializer:
         Raises:
             DecodeError: The bytes do not fit the definition; `rule` says how.
         """
+        try:
+            return self._values(payload)
+        except DecodeError as error:
+            error.hint = self._remedy(payload) if error.rule not in _OTHER_ENCODINGS else None
+            raise
+
+    def fits(self, payload: bytes) -> bool:
+        """Say whether a payload can be read."""
+        try:
+            self._values(payload)
+        except DecodeError:
+            return False
+        return True
+
+    def _values(self, payload: bytes) -> dict[str, Any]:
         order = _byte_order(payload) if self._cdr else "<"
         cursor = _Cursor(payload[4:] if self._cdr else payload, order, cdr=self._cdr)
         if self._definition.message.fields:
@@ -107,6 +125,16 @@ class Deserializer:
             cursor.pos = min(1, cursor.left) if self._cdr else 0
         self._check_tail(cursor)
         return values
+
+    def _remedy(self, payload: bytes) -> str | None:
+        """Name a distro whose definition of the type the bytes would fit."""
+        known = self._definition
+        others = _distro_readers(known.root, known.ros_version, self._encoding)
+        fitting = (
+            distro for distro, types, reader in others if types != known.types and reader.fits(payload)
+        )
+        distro = next(fitting, None)
+        return f"they would fit the definition of {distro}" if distro else None
 
     def _check_tail(self, cursor: _Cursor) -> None:
         left = cursor.left
@@ -122,6 +150,15 @@ class Deserializer:
         )
 
 
+@lru_cache(maxsize=256)
+def _distro_readers(
+    msgtype: str, ros_version: int, encoding: Encoding
+) -> tuple[tuple[str, Mapping[str, MessageType], Deserializer], ...]:
+    known = distro_definitions(msgtype, ros_version)
+    return tuple((distro, other.types, Deserializer(other, encoding)) for distro, other in known)
+
+
+_OTHER_ENCODINGS = frozenset({"encapsulation", "pl-cdr", "xcdr2"})
 _ORIGINS = {"bag": "the recording", "custom": "a custom definition", "distro": "the distro's definitions"}
 
 

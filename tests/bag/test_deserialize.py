@@ -152,6 +152,20 @@ class TestRefusals:
         error = refused("std_msgs/Header header", LITTLE + struct.pack("<iII", 0, 0, 99))
         assert str(error).startswith("header.frame_id: a string of 99 bytes")
 
+    def test_a_distro_whose_definition_the_bytes_fit_is_named(self) -> None:
+        header = {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "f"}
+        values = {"header": header, "radiation_type": 0} | dict.fromkeys(
+            ("field_of_view", "min_range", "max_range", "range", "variance"), 1.5
+        )
+        humble, jazzy = (
+            TypeResolver(distro).resolve("sensor_msgs/msg/Range", None, ros_version=2)
+            for distro in ("ros2_humble", "ros2_jazzy")
+        )
+        with pytest.raises(DecodeError, match="they would fit the definition of ros2_lyrical"):
+            Deserializer(humble, Encoding.CDR).to_dict(Serializer(jazzy, Encoding.CDR).from_dict(values))
+        with pytest.raises(DecodeError, match="they would fit the definition of ros2_humble"):
+            Deserializer(jazzy, Encoding.CDR).to_dict(Serializer(humble, Encoding.CDR).from_dict(values))
+
     def test_a_value_that_does_not_fit_cannot_be_written(self) -> None:
         writer = Serializer(definition("uint8 a\nint8[2] b"), Encoding.CDR)
         for values in ({"a": 256, "b": [1, 2]}, {"a": 1}, {"a": 1, "b": [1]}, {"a": "x", "b": [1, 2]}):
