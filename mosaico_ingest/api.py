@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from mosaico_ingest.bridge import ROSBridge
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.executors.inspection import inspect

@@ -147,14 +147,11 @@ def _print_totals(report: Report, console: Console) -> None:
         parts.append(f"{count_text(totals.rejected)} rejected")
     if totals.downsampled:
         parts.append(f"{count_text(totals.downsampled)} sampled away")
-    if totals.stored_bytes and report.source_bytes:
-        saved = 1 - totals.stored_bytes / report.source_bytes
-        parts.append(
-            f"{bytes_text(report.source_bytes)} -> {bytes_text(totals.stored_bytes)} ({saved:+.0%} saved)"
-        )
+    if totals.stored_bytes:
+        parts.append(_sizes(report))
     rate = totals.read / report.duration_s if report.duration_s else 0
     parts.append(f"{seconds_text(report.duration_s)}, {count_text(round(rate))} msg/s")
-    style = "green" if report.exit_code == 0 else "yellow" if report.exit_code == 4 else "red"  # noqa: PLR2004 - exit code 4: done with rejected messages
+    style = {RunStatus.COMPLETED: "green", RunStatus.REJECTED: "yellow"}.get(report.status, "red")
     console.print(
         Text(f"{report.sequence} in {report.destination}: {', '.join(parts)}", style=style), soft_wrap=True
     )
