@@ -181,7 +181,7 @@ def _by_fields(evaluation: Evaluation, field: Filled, source: ByFields) -> Colum
         inner = Evaluation(rows, _envelope(evaluation.envelope, column.axes, positions))
         return fill_struct(inner, source.fields, element)
 
-    refuse = evaluation.refuser(column.axes, source.of.text)
+    refuse = evaluation.refuser(column.axes, None)
     return Column(_over_valid(column.array(0), element, run, refuse), column.axes)
 
 

@@ -98,9 +98,9 @@ class Desk:
         if len(self.findings) > known:
             return None
         if scope is None:
-            return Written(path, node, None)
+            return Written(path, text, node, None)
         typed = self.checker(path, text, scope).infer(without_cast(node))
-        return None if typed is None else Written(path, node, typed)
+        return None if typed is None else Written(path, text, node, typed)
 
     def scalar(self, path: Path, value: Scalar, scope: Scope | None) -> Written | Const | None:
         """Compile a plain value: text is an expression, anything else itself."""
@@ -126,7 +126,7 @@ class Desk:
             message = f"cast makes numbers and booleans, the target is {spell(element)}"
             self.report_inside(written.path, written.node.at, "misfit", message, None)
             return None
-        checker = self.checker(written.path, written.typed.text, slot.scope)
+        checker = self.checker(written.path, written.text, slot.scope)
         return checker.cast(written.typed, element, written.node)
 
     def inside(self, of: Written | None, scope: Scope | None) -> Scope | None:

@@ -96,8 +96,8 @@ class Evaluation:
         finally:
             self._taken.pop()
 
-    def refuser(self, axes: tuple[Axis, ...], text: str) -> Refuse:
-        """Return a way to reject the rows that elements belong to."""
+    def refuser(self, axes: tuple[Axis, ...], text: str | None) -> Refuse:
+        """Return a way to reject the rows that elements belong to; without `text`, reasons stand as they are."""
         target = self.target
 
         def refuse(bad: Mask, rule: str, says: Callable[[int], str]) -> None:
@@ -106,7 +106,7 @@ class Evaluation:
             live = self._live(np.broadcast_to(bad, count), axes)
             if not live.any():
                 return
-            what = f"{target}: `{text}`: " if text != target else f"{target}: "
+            what = "" if text is None else f"{target}: " if text == target else f"{target}: `{text}`: "
             refusals: dict[int, Refusal] = {}
             positions = np.flatnonzero(live)
             rows = positions

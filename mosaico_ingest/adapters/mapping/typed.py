@@ -129,6 +129,7 @@ class Written:
 
     path: Path
     """Where in the file."""
+    text: str
     node: Node
     typed: Typed | None
 
