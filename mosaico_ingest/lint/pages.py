@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -47,3 +48,7 @@ def _blocks(rule: Rule) -> Iterator[str]:
         for example in rule.examples(heading):
             shown = language if heading == "Good" else "text"
             yield f"\n{heading}:\n\n```{shown}\n{example}```\n"
+
+
+if __name__ == "__main__":
+    write_pages(Path(sys.argv[1]))
