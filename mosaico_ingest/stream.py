@@ -99,9 +99,8 @@ class Stream:
         self._reject(batch, (lost for lost in done.lost if lost.failure.row < end))
         kept = int(np.searchsorted(done.index, end))
         if kept:
-            self._write(
-                _record_batch(batch.log_times[done.index[:kept]], done.rows[:kept]), batch, done.index, buffer
-            )
+            rows = _record_batch(done.log_times[:kept], done.rows[:kept])
+            self._write(rows, batch, done.index, buffer)
         if fatal is not None:
             self._end(fatal, batch, end)
 
@@ -116,9 +115,9 @@ class Stream:
         index = keep[decoded.index]
         envelope = Envelope(self.plan.topic, self.plan.msgtype, batch.log_times[index])
         adapter = self._adapters[batch.channel.id]
-        if self._configuration is None and len(decoded.rows):
-            self._configuration = adapter.topic_metadata(decoded.rows[0])
         try:
+            if self._configuration is None and len(decoded.rows):
+                self._configuration = adapter.topic_metadata(decoded.rows[0])
             adapted = adapter.adapt(decoded.rows, envelope)
         except AdapterError as error:
             broken = tuple(RowFailure(row, "adapter-broken", str(error)) for row in range(len(index)))

@@ -74,11 +74,18 @@ class PythonAdapter:
         return self._by_messages(rows, envelope)
 
     def topic_metadata(self, first_row: pa.StructScalar | None) -> dict[str, Any]:
-        """Return what `schema_metadata` reads from the first message; it has to take the message for that."""
+        """Return what `schema_metadata` reads from the first message; it has to take the message for that.
+
+        Raises:
+            AdapterError: It raised something.
+        """
         method = getattr(self.adapter, "schema_metadata", None)
         if first_row is None or method is None or "ros_data" not in signature(method).parameters:
             return {}
-        return dict(method(first_row.as_py()) or {})
+        try:
+            return dict(method(first_row.as_py()) or {})
+        except Exception as error:
+            raise AdapterError(f"{self.adapter.__name__}.schema_metadata: {_say(error)}") from error
 
     def _by_columns(self, rows: pa.StructArray) -> Adapted:
         results = list(self._columns(rows, first=0))
@@ -191,8 +198,7 @@ class PythonAdapter:
             return _struct_array(part.rows, struct)
 
     def _failure(self, row: int, error: Exception) -> RowFailure:
-        text = " ".join(str(error).split()) or "no message"
-        return RowFailure(row, "adapter", f"{self.adapter.__name__}: {type(error).__name__}: {text}")
+        return RowFailure(row, "adapter", f"{self.adapter.__name__}: {_say(error)}")
 
 
 _MISFITS = (pa.ArrowException, OverflowError, TypeError, ValueError)
@@ -240,6 +246,12 @@ def _message_class(adapter: type[Any]) -> Callable[..., Any]:
     """Return the message class of the base the adapter was written for: ours, or the SDK's beside its base."""
     base = next(base for base in adapter.__mro__ if base.__name__ == _BASE)
     return getattr(sys.modules[base.__module__], "ROSMessage", ROSMessage)
+
+
+def _say(error: Exception) -> str:
+    """Return an exception in one line."""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 def _overrides(adapter: type[Any], method: str) -> bool:

@@ -14,7 +14,7 @@ import pytest
 from mosaico_ingest.adapters import base
 from mosaico_ingest.adapters.adapter import Adapted
 from mosaico_ingest.adapters.base import ROSAdapterBase, register_default_adapter, registered_adapters
-from mosaico_ingest.adapters.python_adapter import PythonAdapterSpec, ontology_of
+from mosaico_ingest.adapters.python_adapter import PythonAdapter, PythonAdapterSpec, ontology_of
 from mosaico_ingest.adapters.reference import adapter_spec, load_adapter_reference
 from mosaico_ingest.bag.definition import Definition
 from mosaico_ingest.bag.message import ROSMessage
@@ -166,6 +166,17 @@ def test_metadata_is_read_from_the_first_message(define: Callable[..., Definitio
     assert bound.topic_metadata(rows[0]) == {"first": 2.0}
     assert bound.topic_metadata(None) == {}
     assert PythonAdapterSpec(SpeedAdapter).bind(definition, rows.type).topic_metadata(rows[0]) == {}
+
+
+def test_metadata_that_cannot_be_read_breaks_the_adapter() -> None:
+    class Failing(SpeedAdapter):
+        @classmethod
+        def schema_metadata(cls, ros_data: dict[str, Any], **_: Any) -> dict[str, Any] | None:
+            return {"first": ros_data["missing"]}
+
+    rows = pa.array([{"data": 2.0}])
+    with pytest.raises(AdapterError, match=r"Failing.schema_metadata: KeyError: 'missing'"):
+        PythonAdapter(Failing, Speed.ontology_type()).topic_metadata(rows[0])
 
 
 def test_registering_makes_a_class_the_default_of_its_types() -> None:
