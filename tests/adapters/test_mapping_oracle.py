@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import operator
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -50,14 +52,14 @@ MESSAGE = pa.struct(
 )
 
 
-class Refused(Exception):
+class RefusedError(Exception):
     """The row does not fit."""
 
 
 # --- the slow twin -------------------------------------------------------------------------------------------------
 
 
-def interpret(typed: Typed, row: dict[str, Any]) -> Any:
+def interpret(typed: Typed, row: dict[str, Any]) -> Any:  # noqa: PLR0911 - a return for each kind of node
     """Return the value for one message; open lists are Python lists."""
     match typed:
         case Whole():
@@ -79,9 +81,11 @@ def interpret(typed: Typed, row: dict[str, Any]) -> Any:
         case ChoiceOf():
             return choose(typed, row)
         case Apply():
-            function = SCALAR[typed.name]
             whole = all(a.kind.bounds is not None for a in typed.arguments)
-            return spread(lambda *a: function(*a, whole=whole), typed.arguments, row)
+            numeric = COMPUTED.get(typed.name)
+            return spread(
+                partial(numeric, whole=whole) if numeric else PLAIN[typed.name], typed.arguments, row
+            )
 
 
 def depth(typed: Typed) -> int:
@@ -103,7 +107,7 @@ def broadcast(run: Callable[..., Any], values: list[Any], depths: list[int]) -> 
     if not lengths:
         return run(*values)
     if len(lengths) > 1:
-        raise Refused
+        raise RefusedError
     return [
         broadcast(
             run,
@@ -135,24 +139,24 @@ def cast(value: Any, type_: pa.DataType) -> Any:
         return None
     if pa.types.is_boolean(type_):
         if value not in {0, 1}:
-            raise Refused
+            raise RefusedError
         return bool(value)
     if pa.types.is_integer(type_):
         low, high = np.iinfo(str(type_)).min, np.iinfo(str(type_)).max
         if not math.isfinite(value) or value != math.trunc(value) or not low <= value <= high:
-            raise Refused
+            raise RefusedError
         return int(value)
     if type_ == pa.float32():
         with np.errstate(over="ignore"):
             narrow = float(np.float32(value))
         if math.isinf(narrow) and not math.isinf(value):
-            raise Refused
+            raise RefusedError
         return narrow
     return float(value)
 
 
 def strict(run: Callable[..., Any]) -> Callable[..., Any]:
-    return lambda *a, whole: None if any(v is None for v in a) else run(*a, whole=whole)
+    return lambda *a, **how: None if any(v is None for v in a) else run(*a, **how)
 
 
 def arithmetic(run: Callable[[Any, Any], Any]) -> Callable[..., Any]:
@@ -166,7 +170,7 @@ def arithmetic(run: Callable[[Any, Any], Any]) -> Callable[..., Any]:
 
 def bounded(value: int) -> int:
     if not -(2**63) <= value < 2**63:
-        raise Refused
+        raise RefusedError
     return value
 
 
@@ -179,7 +183,7 @@ def floored(run: Callable[[Any, Any], Any]) -> Callable[..., Any]:
     def compute(a: Any, b: Any, *, whole: bool) -> Any:
         if whole:
             if b == 0:
-                raise Refused
+                raise RefusedError
             return bounded(run(bounded(a), bounded(b)))
         return ieee(run, float(a), float(b))
 
@@ -187,7 +191,7 @@ def floored(run: Callable[[Any, Any], Any]) -> Callable[..., Any]:
 
 
 def compared(run: Callable[[Any, Any], bool]) -> Callable[..., Any]:
-    def compare(a: Any, b: Any, *, whole: bool) -> bool:
+    def compare(a: Any, b: Any) -> bool:
         if isinstance(a, float) or isinstance(b, float):
             a, b = float(a), float(b)
         return run(a, b)
@@ -195,13 +199,13 @@ def compared(run: Callable[[Any, Any], bool]) -> Callable[..., Any]:
     return strict(compare)
 
 
-def both(a: Any, b: Any, *, whole: bool) -> Any:
+def both(a: Any, b: Any) -> Any:
     if a is False or b is False:
         return False
     return None if a is None or b is None else True
 
 
-def one(a: Any, b: Any, *, whole: bool) -> Any:
+def one(a: Any, b: Any) -> Any:
     if a is True or b is True:
         return True
     return None if a is None or b is None else False
@@ -219,7 +223,7 @@ def extreme(pick: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def folded(run: Callable[[list[Any]], Any], empty: Any) -> Callable[..., Any]:
-    def fold(values: Any, *, whole: bool) -> Any:
+    def fold(values: Any) -> Any:
         if any(v is None for v in values):
             return None
         return run(values) if values else empty
@@ -227,21 +231,30 @@ def folded(run: Callable[[list[Any]], Any], empty: Any) -> Callable[..., Any]:
     return strict(fold)
 
 
+def power(a: Any, b: Any, *, whole: bool) -> Any:
+    if whole and b >= 0:
+        return bounded(bounded(a) ** bounded(b))
+    return ieee(np.power, float(a), float(b))
+
+
 def negative(a: Any, *, whole: bool) -> Any:
     return bounded(-bounded(a)) if whole else -float(a)
 
 
-SCALAR: dict[str, Callable[..., Any]] = {
+COMPUTED: dict[str, Callable[..., Any]] = {
     "+": arithmetic(operator.add),
     "-": arithmetic(operator.sub),
     "*": arithmetic(operator.mul),
-    "/": strict(lambda a, b, whole: ieee(operator.truediv, float(a), float(b))),
     "//": floored(lambda a, b: np.floor_divide(a, b) if isinstance(a, np.floating) else a // b),
     "%": floored(lambda a, b: np.mod(a, b) if isinstance(a, np.floating) else a % b),
-    "**": strict(
-        lambda a, b, whole: bounded(bounded(a) ** b) if whole else ieee(np.power, float(a), float(b))
-    ),
+    "**": strict(power),
     "negative": strict(negative),
+    "min": extreme(min),
+    "max": extreme(max),
+}
+"""What differs for integers and floats."""
+PLAIN: dict[str, Callable[..., Any]] = {
+    "/": strict(lambda a, b: ieee(operator.truediv, float(a), float(b))),
     "==": compared(operator.eq),
     "!=": compared(operator.ne),
     "<": compared(operator.lt),
@@ -250,25 +263,19 @@ SCALAR: dict[str, Callable[..., Any]] = {
     ">=": compared(operator.ge),
     "and": both,
     "or": one,
-    "not": strict(lambda a, whole: not a),
-    "is_null": lambda a, whole: a is None,
-    "coalesce": lambda *a, whole: next((v for v in a if v is not None), None),
-    "null_if": strict(lambda a, b, whole: None if a == b else a),
-    "nan_to_null": strict(lambda a, whole: None if math.isnan(a) else a),
-    "empty_to_null": strict(lambda a, whole: a or None),
-    "is_nan": strict(lambda a, whole: math.isnan(a)),
-    "min": extreme(min),
-    "max": extreme(max),
-    "len": strict(lambda a, whole: len(a)),
-    "sum": folded(
-        lambda values: bounded(sum(values)) if isinstance(values[0], int) else math.fsum(values), 0
-    ),
-    "mean": folded(lambda values: math.fsum(values) / len(values), None),
+    "not": strict(operator.not_),
+    "is_null": lambda a: a is None,
+    "coalesce": lambda *a: next((v for v in a if v is not None), None),
+    "nan_to_null": strict(lambda a: None if math.isnan(a) else a),
+    "empty_to_null": strict(lambda a: a or None),
+    "len": strict(len),
+    "sum": folded(lambda v: bounded(sum(v)) if isinstance(v[0], int) else math.fsum(v), 0),
+    "mean": folded(lambda v: math.fsum(v) / len(v), None),
     "any": folded(any, empty=False),
     "all": folded(all, empty=True),
-    "lower": strict(lambda a, whole: a.lower()),
-    "covariance": strict(lambda a, whole: a if any(v > 0 for v in a) else None),
-    "variance": strict(lambda a, whole: a if a > 0 else None),
+    "lower": strict(str.lower),
+    "covariance": strict(lambda a: a if any(v > 0 for v in a) else None),
+    "variance": strict(lambda a: a if a > 0 else None),
 }
 
 
@@ -404,10 +411,8 @@ def over_columns(typed: Typed, rows: list[dict[str, Any]]) -> dict[int, Any]:
 def over_rows(typed: Typed, rows: list[dict[str, Any]]) -> dict[int, Any]:
     values: dict[int, Any] = {}
     for position, row in enumerate(pa.array(rows, MESSAGE).to_pylist()):
-        try:
+        with contextlib.suppress(RefusedError):
             values[position] = interpret(typed, row)
-        except Refused:
-            pass
     return values
 
 
@@ -421,7 +426,7 @@ def same(left: Any, right: Any) -> bool:
     return left == right
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(text=SCALARS | LISTS | OTHERS, rows=ROWS)
 def test_columns_and_rows_agree(text: str, rows: list[dict[str, Any]]) -> None:
     typed = typed_of(text)
@@ -432,7 +437,7 @@ def test_columns_and_rows_agree(text: str, rows: list[dict[str, Any]]) -> None:
     assert all(same(fast[row], slow[row]) for row in slow), (text, fast, slow)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(text=SCALARS | LISTS | OTHERS, rows=ROWS)
 def test_one_row_at_a_time_gives_what_all_rows_give(text: str, rows: list[dict[str, Any]]) -> None:
     typed = typed_of(text)
@@ -444,7 +449,7 @@ def test_one_row_at_a_time_gives_what_all_rows_give(text: str, rows: list[dict[s
     assert all(same(together[row], alone[row]) for row in together)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(text=SCALARS, rows=ROWS)
 def test_integers_stay_within_the_bounds_that_were_promised(text: str, rows: list[dict[str, Any]]) -> None:
     typed = typed_of(text)
