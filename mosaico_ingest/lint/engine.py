@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -129,11 +130,11 @@ def _run_message(message: MessageFile) -> Iterator[Finding]:
 
 def _collect(folder: Path) -> Iterator[Path]:
     """Yield the files below a folder that may be ours, leaving hidden folders and what is excluded alone."""
-    for path in sorted(folder.rglob("*")):
-        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
-        ours = path.suffix.lower() in _SUFFIXES and path.is_file() and not hidden
-        if ours and not settings_for(path.parent).excludes(path):
-            yield path
+    for inside, folders, names in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        paths = [Path(inside, name) for name in sorted(names) if Path(name).suffix.lower() in _SUFFIXES]
+        settings = settings_for(Path(inside)) if paths else Settings()
+        yield from (path for path in paths if not path.name.startswith(".") and not settings.excludes(path))
 
 
 def _judge_file(path: Path, *, named: bool, env: Mapping[str, str] | None, fix: bool) -> Judged | None:
