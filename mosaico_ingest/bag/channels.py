@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
@@ -87,8 +88,16 @@ def _channel(stream: Stream, definition: Definition | str) -> Channel:
         count=stream.count,
         definition=definition if isinstance(definition, Definition) else None,
         problem=None if is_known else str(definition),
-        latched=stream.latched,
+        latched=stream.latched or _is_transient_local(stream),
         attributes=stream.attributes,
+    )
+
+
+def _is_transient_local(stream: Stream) -> bool:
+    """Return whether late subscribers get old messages too: what ROS 1 called latched."""
+    return (
+        re.search(r"durability:\s*(1|transient_local)\b", stream.attributes.get("offered_qos_profiles", ""))
+        is not None
     )
 
 

@@ -85,17 +85,15 @@ def _directory(path: Path) -> Found:
             findings = (_unreadable(err),)
         else:
             return _listed(metadata)
-    files = tuple(
-        sorted((file for file in path.iterdir() if file.is_file() and is_recording(file)), key=_natural)
-    )
+    files = _recordings(path)
     if not files:
-        held = ", ".join(sorted(entry.name for entry in path.iterdir())[:5])
+        held = ", ".join(sorted(entry.name for entry in _entries(path))[:5])
         raise BagError(
             f"a directory without a recording; it holds {held or 'nothing'}",
             where=str(path),
             hint="name a .bag, .db3 or .mcap file, or a directory with a metadata.yaml",
         )
-    return Found(files, None, findings)
+    return Found(tuple(files), None, findings)
 
 
 def _listed(metadata: Metadata) -> Found:
@@ -109,14 +107,13 @@ def _listed(metadata: Metadata) -> Found:
         else:
             files.append(file)
     if not files:
-        present = sorted((f for f in folder.iterdir() if f.is_file() and is_recording(f)), key=_natural)
-        if not present:
+        files = _recordings(folder)
+        if not files:
             raise BagError(
                 f"none of the files it lists is there: {', '.join(metadata.files) or 'it lists none'}",
                 where=str(metadata.path),
                 hint="restore the files beside it",
             )
-        files = present
     findings = tuple(
         Finding(
             "missing-part",
@@ -127,6 +124,19 @@ def _listed(metadata: Metadata) -> Found:
         for name in missing
     )
     return Found(tuple(files), metadata, findings)
+
+
+def _recordings(folder: Path) -> list[Path]:
+    return sorted(
+        (entry for entry in _entries(folder) if entry.is_file() and is_recording(entry)), key=_natural
+    )
+
+
+def _entries(folder: Path) -> list[Path]:
+    try:
+        return list(folder.iterdir())
+    except OSError as err:
+        raise BagError(f"cannot be listed: {err.strerror}", where=str(folder)) from err
 
 
 def _candidates(folder: Path, name: str) -> Iterator[Path]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 
 from mosaico_ingest.bag.containers.part import EARLIEST_NS, LATEST_NS, Block
@@ -20,7 +20,7 @@ class Turn:
     next_ns: int
 
 
-def in_turn(parts: Iterable[tuple[int | None, Callable[[], Iterator[Block]]]]) -> Iterator[Turn]:
+def in_turn(parts: Iterable[tuple[int | None, Callable[[], Iterator[Block]]]]) -> Generator[Turn, None, None]:
     """Yield the blocks of all parts by `start_ns`; a part is its first time and what gives its blocks."""
     heap: list[tuple[int, int, Block | None, Iterator[Block]]] = []
     for number, (start_ns, blocks) in enumerate(parts):

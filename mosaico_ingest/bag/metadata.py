@@ -25,6 +25,7 @@ class TopicHint:
     count: int
     serialization_format: str
     qos: str
+    """As the storage spells it; empty where this version of the metadata has another form."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,10 +67,11 @@ def read_metadata(path: Path) -> Metadata:
 
 def _topic(entry: dict[str, Any]) -> TopicHint:
     about = entry.get("topic_metadata") or entry["topic_and_type"]
+    qos = about.get("offered_qos_profiles")
     return TopicHint(
         str(about["name"]),
         str(about["type"]),
         int(entry.get("message_count") or 0),
         str(about.get("serialization_format") or ""),
-        str(about.get("offered_qos_profiles") or ""),
+        qos if isinstance(qos, str) else "",
     )

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from collections.abc import Generator, Iterator
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Generic, TypeVar
@@ -27,7 +27,7 @@ class Prefetched(Generic[T]):
     The source runs in one thread, which has ended when the context is left; its errors are raised here.
     """
 
-    def __init__(self, source: Iterable[T], *, ahead: int = 1) -> None:
+    def __init__(self, source: Generator[T, None, None], *, ahead: int = 1) -> None:
         self._source = source
         self._items: queue.Queue[tuple[T] | _End] = queue.Queue(maxsize=ahead)
         self._stop = threading.Event()
@@ -56,9 +56,10 @@ class Prefetched(Generic[T]):
     def _work(self) -> None:
         error: BaseException | None = None
         try:
-            for value in self._source:
-                if not self._put((value,)):
-                    return
+            with closing(self._source):
+                for value in self._source:
+                    if not self._put((value,)):
+                        return
         except BaseException as err:  # noqa: BLE001 - the border of the thread; raised again where it is consumed
             error = err
         self._put(_End(error))

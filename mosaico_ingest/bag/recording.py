@@ -143,7 +143,7 @@ class Recording:
                 yield from gather.settle(step.next_ns)
             yield from gather.rest()
 
-    def _steps(self, wants: Sequence[Want]) -> Iterator[_Step]:
+    def _steps(self, wants: Sequence[Want]) -> Generator[_Step, None, None]:
         """Load block after block; runs in the prefetching thread."""
         sources = [
             (part.start_ns, partial(_blocks, part, want))

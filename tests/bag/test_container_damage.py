@@ -37,7 +37,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory, recordings: Any) -> dict[str
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=60, deadline=5000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, deadline=20_000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_any_damage_gives_batches_losses_or_a_bag_error(
     tmp_path: Path, whole: dict[str, Path], recordings: Any, kind: str, data: st.DataObject

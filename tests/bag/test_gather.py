@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from itertools import pairwise
 
 import numpy as np
@@ -127,7 +127,7 @@ def test_a_part_is_not_opened_before_its_time_has_come() -> None:
 
 
 def test_reading_ahead_gives_the_same_items_and_the_error_at_its_place() -> None:
-    def source() -> Iterator[int]:
+    def source() -> Generator[int, None, None]:
         yield from range(10)
         raise ValueError("here")
 
@@ -139,8 +139,18 @@ def test_reading_ahead_gives_the_same_items_and_the_error_at_its_place() -> None
 
 def test_reading_ahead_stops_with_its_context() -> None:
     made: list[int] = []
+
+    def source() -> Generator[int, None, None]:
+        try:
+            while True:
+                made.append(1)
+                yield 1
+        finally:
+            made.append(0)
+
     before = threading.active_count()
-    with Prefetched(iter(lambda: made.append(1), 0), ahead=2) as items:
+    with Prefetched(source(), ahead=2) as items:
         next(items)
     assert threading.active_count() == before
-    assert len(made) <= 5
+    assert len(made) <= 6
+    assert made[-1] == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import threading
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 from rosbags import rosbag1, rosbag2
 
 from mosaico_ingest.bag.batch import Encoding
+from mosaico_ingest.bag.containers.source import FileSource
 from mosaico_ingest.bag.recording import open_recording
 from mosaico_ingest.errors import BagError
 
@@ -208,3 +210,41 @@ def test_offsets_say_where_a_message_lies(tmp_path: Path, recordings: Any) -> No
         for batch in recording.batches():
             assert all(content[offset] == 5 for offset in batch.offsets.tolist())
             assert batch.offsets.dtype == np.int64
+
+
+def test_a_hundredth_of_the_time_reads_about_a_hundredth_of_the_file(
+    tmp_path: Path, recordings: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    messages = recordings.sent(4000, big=True)
+    path = recordings.mcap(tmp_path / "n.mcap", messages, chunk_messages=20, compression="")
+    read: list[int] = []
+    whole = FileSource.read
+    monkeypatch.setattr(FileSource, "read", lambda self, at, size: read.append(size) or whole(self, at, size))
+    with open_recording(path, resolve=recordings.blind) as recording:
+        start, end = messages[2000].time_ns, messages[2040].time_ns
+        assert len(recordings.received(recording, start_ns=start, end_ns=end)) == 40
+    assert sum(read) < path.stat().st_size // 30
+
+
+@pytest.mark.parametrize("is_read", [True, False])
+def test_what_was_decompressed_to_read_it_is_removed(
+    tmp_path: Path, recordings: Any, monkeypatch: pytest.MonkeyPatch, *, is_read: bool
+) -> None:
+    folder = recordings.rosbag2(tmp_path / "o", recordings.sent(20), storage="sqlite3", compression="file")
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    recording = open_recording(folder, resolve=recordings.blind)
+    assert list((tmp_path / "temporary").iterdir())
+    if is_read:
+        recordings.received(recording)
+    recording.close()
+    assert not list((tmp_path / "temporary").iterdir())
+
+
+def test_a_topic_that_keeps_its_last_message_is_latched(tmp_path: Path, recordings: Any) -> None:
+    folder = recordings.rosbag2(tmp_path / "p", recordings.sent(20), storage="sqlite3")
+    with sqlite3.connect(next(folder.glob("*.db3"))) as writer:
+        writer.execute("UPDATE topics SET offered_qos_profiles = '- durability: 1' WHERE name = '/imu'")
+    writer.close()
+    with open_recording(folder, resolve=recordings.blind) as recording:
+        assert {channel.topic for channel in recording.channels if channel.latched} == {"/imu"}

@@ -39,7 +39,14 @@ def open_part(path: Path, stack: ExitStack) -> Part:
         return _open(path, path, head, stack)
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mosaico-")))
     plain = folder / path.name.removesuffix(".zstd")
-    problem = inflate_file(path, plain)
+    try:
+        problem = inflate_file(path, plain)
+    except OSError as err:
+        raise BagError(
+            f"cannot be decompressed to {folder}: {err.strerror}",
+            where=str(path),
+            hint="decompress it yourself, or point TMPDIR at a larger disk",
+        ) from err
     part = _open(plain, path, _head(plain), stack)
     if problem:
         part.holes.append(Hole(plain.stat().st_size, problem))

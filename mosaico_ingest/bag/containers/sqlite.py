@@ -63,7 +63,6 @@ class _Columns:
 
     topics: frozenset[str]
     has_definitions: bool
-    has_time_index: bool
 
 
 class SqlitePart:
@@ -84,7 +83,7 @@ class SqlitePart:
             self.message_count: int | None = None if self._counts is None else sum(self._counts.values())
             self.holes.extend(orphans(self._counts, {stream.key for stream in self.streams}))
             self.start_ns, self.end_ns = self._read_bounds()
-        except sqlite3.Error as err:
+        except (sqlite3.Error, OSError, TypeError, ValueError) as err:
             self._stack.close()
             raise BagError(f"the SQLite file cannot be read: {err}", where=str(self.path)) from err
         except BaseException:
@@ -197,11 +196,7 @@ def _columns(connection: sqlite3.Connection) -> _Columns:
     missing = ({"id", "name", "type"} - topics) | ({"topic_id", "timestamp", "data"} - messages)
     if missing:
         raise BagError(f"a SQLite file whose tables lack the columns {', '.join(sorted(missing))}")
-    indexes = [row[1] for row in connection.execute("PRAGMA index_list(messages)")]
-    leading = [
-        list(connection.execute("SELECT name FROM pragma_index_info(?) LIMIT 1", (name,))) for name in indexes
-    ]
-    return _Columns(topics, "message_definitions" in tables, [("timestamp",)] in leading)
+    return _Columns(topics, "message_definitions" in tables)
 
 
 def _stream(row: dict[str, Any], counts: dict[int, int] | None, definitions: dict[str, Embedded]) -> Stream:
