@@ -45,7 +45,7 @@ class RowwiseDecoder:
                 values.append(self._deserializer.to_dict(batch.payload(row)))
                 index.append(row)
             except DecodeError as error:  # noqa: PERF203 - a bad row costs a row
-                failures.append(RowFailure(row, error.rule, error.what))
+                failures.append(RowFailure(row, error.rule, str(error)))
         # An array of a struct type is one of structs, which the stubs cannot know.
         rows = cast("pa.StructArray", pa.array(values, type=self._shape))
         padded = self._deserializer.padded - padded
