@@ -100,11 +100,12 @@ def _plain(column: Array) -> Numbers:
 
 
 def _read(points: Numbers, place: tuple[int, np.dtype[Any]]) -> Numbers:
-    """Return one field of every point; the one copy is what aligns it."""
+    """Return one field of every point, unaligned and in place."""
     offset, dtype = place
     if not len(points):
         return np.empty(0, dtype)
-    return np.ascontiguousarray(points[:, offset : offset + dtype.itemsize]).view(dtype)[:, 0]
+    whole = np.ascontiguousarray(points)  # a copy only where lines of one point are padded
+    return np.ndarray((len(whole),), dtype, whole.data, offset, (whole.shape[1],))
 
 
 def _cast_to(dtype: np.dtype[Any]) -> Convert:
@@ -127,7 +128,8 @@ def _bits(values: Numbers) -> Numbers:
     """Return the four bytes of each value as a float32, whichever number type they were declared as."""
     if values.dtype.itemsize != _PACKED_BYTES:
         raise _Misfit(f"a packed colour has 4 bytes, not {values.dtype.itemsize}")
-    return values.view(values.dtype.str[0] + "u4").astype(np.uint32).view(np.float32)
+    words = values.view(np.dtype(np.uint32).newbyteorder(values.dtype.byteorder))
+    return words.astype(np.uint32).view(np.float32)
 
 
 def _columns(refuse: Refuse, cloud: Array, name: str, dtype: np.dtype[Any], convert: Convert) -> Array:
