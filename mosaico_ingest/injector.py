@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mosaico_ingest.bag.recording import Recording
 from mosaico_ingest.diagnostics import Stage
-from mosaico_ingest.errors import Interrupted, VerificationError
+from mosaico_ingest.errors import Interrupted, NothingMatched, VerificationError
 from mosaico_ingest.plan.model import Plan
 from mosaico_ingest.policies import SessionLevelErrorPolicy
 from mosaico_ingest.report.events import Observer, Rejected, TopicClosed, TopicProgress, Unreadable
@@ -29,6 +29,7 @@ def inject(plan: Plan, recording: Recording, sink: Sink, observe: Observer) -> N
             streams = _open_streams(plan, recording, session, observe)
             try:
                 _pump(plan, recording, streams, observe)
+                _check_not_empty(plan, streams)
             except BaseException as error:
                 # Every way to end early, Ctrl-C too, is the session policy's to judge.
                 failure = _named(error)
@@ -44,7 +45,9 @@ def inject(plan: Plan, recording: Recording, sink: Sink, observe: Observer) -> N
     if failure is not None:
         raise failure
     if wrong:
-        raise VerificationError("; ".join(wrong), hint="the destination lost rows; ingest the recording again")
+        raise VerificationError(
+            "; ".join(wrong), hint="the destination lost rows; ingest the recording again"
+        )
 
 
 def _named(error: BaseException) -> BaseException:
@@ -83,6 +86,22 @@ def _pump(plan: Plan, recording: Recording, streams: tuple[Stream, ...], observe
         observe(Unreadable(stream.plan.target if stream else None, loss.count, loss.offset, loss.reason))
 
 
+def _check_not_empty(plan: Plan, streams: tuple[Stream, ...]) -> None:
+    """Refuse to commit a sequence without a row: it would look like one that was ingested."""
+    if any(stream.rows for stream in streams):
+        return
+    read = sum(stream.seen for stream in streams)
+    where = str(plan.files[0])
+    if read == 0:
+        window = plan.read_from_ns is not None or plan.read_until_ns is not None
+        what = (
+            "there is no message in the time window" if window else "there is no message in the topics taken"
+        )
+        raise NothingMatched(what, where=where, hint="nothing was written")
+    why = next((stream.error for stream in streams if stream.error), "see the report for each reason")
+    raise NothingMatched(f"none of {read} messages could be ingested", where=where, hint=why)
+
+
 def _close(
     stored: tuple[StoredTopic, ...],
     streams: tuple[Stream, ...],
@@ -119,6 +138,4 @@ def _take_back(stream: Stream, rows: int, why: str, observe: Observer) -> None:
     """Count rows that were handed over but are not there as rejected."""
     if rows > 0:
         observe(TopicProgress(stream.plan.target, written=-rows))
-        observe(
-            Rejected(stream.plan.target, Stage.WRITE, "not-written", rows, why, stream.start_ns or 0, -1)
-        )
+        observe(Rejected(stream.plan.target, Stage.WRITE, "not-written", rows, why, stream.start_ns or 0, -1))

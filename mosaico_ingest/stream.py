@@ -58,7 +58,10 @@ class Stream:
     on_message_error: LoaderErrorPolicy
     session: Session
     observe: Observer
+    seen: int = 0
+    """Messages read so far."""
     rows: int = 0
+    """Rows handed to the destination so far."""
     start_ns: int | None = None
     end_ns: int | None = None
     status: TopicStatus = TopicStatus.EMPTY
@@ -68,7 +71,6 @@ class Stream:
     _writer: TopicWriter | None = None
     _configuration: dict[str, Any] | None = None
     """What the adapter says of the topic, from its first message."""
-    _seen: int = 0
 
     def bind(self, channel: Channel) -> None:
         """Make the decoder and the adapter of one channel.
@@ -106,8 +108,8 @@ class Stream:
 
     def _translate(self, batch: RawBatch) -> _Translated:
         positions = np.arange(len(batch), dtype=np.int64)
-        taken = (positions + self._seen) % self.plan.every == 0
-        self._seen += len(batch)
+        taken = (positions + self.seen) % self.plan.every == 0
+        self.seen += len(batch)
         keep = positions[taken]
         sampled = batch if taken.all() else _take(batch, keep)
         decoded = self._decoders[batch.channel.id].decode(sampled)
