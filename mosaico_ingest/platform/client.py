@@ -94,14 +94,8 @@ class PlatformClient:
             )
 
         data = self._call(call, action.name, action.permission, repeatable=action.repeatable)
-        try:
+        with self._understood(action.name):
             return self._codec.decode_answer(action, data)
-        except Malformed as error:
-            raise SinkError(
-                f"the answer to {action.name} is not understood: {error}",
-                where=str(self.address),
-                hint="is it a Mosaico server of version 0.5 to 0.7?",
-            ) from error
 
     def find(self, sequence: str) -> bodies.SequenceInfo | None:
         """Return what the server knows of a sequence, None where there is none."""
@@ -111,7 +105,8 @@ class PlatformClient:
             if refusal.condition is Condition.NOT_FOUND:
                 return None
             raise
-        return self._codec.decode(bodies.SequenceInfo, _bytes(info.app_metadata))
+        with self._understood("get_flight_info"):
+            return self._codec.decode(bodies.SequenceInfo, _bytes(info.app_metadata) or b"{}")
 
     def uploaded(self, sequence: str) -> dict[str, Uploaded]:
         """Return what the server holds of each topic of a sequence, by locator, as far as it says so."""
@@ -131,6 +126,17 @@ class PlatformClient:
             return self._flight.do_put(descriptor, schema, self._upload)[0]
 
         return self._call(call, "do_put", Permission.WRITE, repeatable=False)
+
+    @contextmanager
+    def _understood(self, doing: str) -> Generator[None, None, None]:
+        try:
+            yield
+        except Malformed as error:
+            raise SinkError(
+                f"the answer to {doing} is not understood: {error}",
+                where=str(self.address),
+                hint="is it a Mosaico server of version 0.5 to 0.7?",
+            ) from error
 
     def _info(self, locator: str) -> fl.FlightInfo:
         question = bodies.GetInfo(resource_locator=locator)

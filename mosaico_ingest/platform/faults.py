@@ -128,7 +128,9 @@ def _tls_fault(connection: socket.socket, address: Address) -> SinkError | None:
             return SinkError(f"the certificate is not for {address.host!r}", where=where, hint=hint)
         hint = "set target.tls_cert to the certificate of the server's authority"
         return SinkError(f"the certificate is not trusted: {error.verify_message}", where=where, hint=hint)
-    except ssl.SSLError:
+    except ssl.SSLError as error:
+        if "ALERT" in (error.reason or ""):
+            return SinkError(f"the server refuses the TLS handshake: {error.reason}", where=where)
         return SinkError("the server does not speak TLS", where=where, hint="set target.tls: false")
     except OSError:
         return None

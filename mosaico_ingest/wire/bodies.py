@@ -223,11 +223,11 @@ class GetInfo(_OmitsNone):
 
 
 class SessionInfo(Body):
-    """A session as a sequence's application metadata tells it."""
+    """A session as a sequence's application metadata tells it; older servers say less."""
 
-    locator: str
-    created_at_ns: int
-    locked: bool
+    locator: str = ""
+    created_at_ns: int = 0
+    locked: bool = False
     """Whether it is finalized."""
     completed_at_ns: int | None = None
     topics: list[str] = Field(default_factory=list[str])
@@ -235,11 +235,11 @@ class SessionInfo(Body):
 
 
 class SequenceInfo(Body):
-    """A sequence's application metadata."""
+    """A sequence's application metadata; older servers say less."""
 
-    resource_locator: str
-    created_at_ns: int
-    user_metadata: dict[str, Any]
+    resource_locator: str = ""
+    created_at_ns: int = 0
+    user_metadata: dict[str, Any] = Field(default_factory=dict[str, Any])
     sessions: list[SessionInfo] = Field(default_factory=list[SessionInfo])
 
 

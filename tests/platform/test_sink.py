@@ -18,6 +18,7 @@ from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
 from mosaico_ingest.ontology import Integer64
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.platform.client import connect
+from mosaico_ingest.platform.faults import Address
 from mosaico_ingest.platform.sink import PlatformSink
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.sink import topic_schema
@@ -245,6 +246,17 @@ class TestFaults:
                 bad.write(numbers(3))
         assert [(topic.topic, topic.rows) for topic in session.stored()] == [("/good", 2), ("/bad", 0)]
 
+    def test_a_session_whose_only_topic_broke_is_taken_back(self, server: Mosaicod) -> None:
+        server.faults.refuse["do_put"] = [pa.ArrowInvalid("no room")]
+        with PlatformSink(target(server), buffer_bytes=0).open("seq", META) as session:
+            writer = session.topic("/n", NUMBER, {})
+            with pytest.raises(SinkError, match="the upload of /n is refused: no room"):
+                for at in range(200):
+                    writer.write(numbers(at))
+                    time.sleep(0.01)
+        assert (server.sequences, server.sessions, server.topics) == ({"seq": META}, {}, {})
+        assert [topic.rows for topic in session.stored()] == [0]
+
     def test_a_refusal_at_the_end_discards_everything(self, server: Mosaicod) -> None:
         def refuse(topic: str, _: int) -> None:
             raise pa.ArrowInvalid(f"{topic} is odd")
@@ -396,6 +408,27 @@ def test_another_flight_server_is_told_apart() -> None:
         connect(ServerTarget("127.0.0.1", other.port)),
     ):
         pytest.fail("connected")
+
+
+class Babbling(Mosaicod):
+    """Answers the handshake in another language."""
+
+    def do_action(self, context: fl.ServerCallContext, action: fl.Action) -> Iterator[bytes]:  # noqa: ARG002 - Flight's signature
+        yield b"\x0a\x05hello"
+
+
+def test_an_answer_in_another_language_is_told() -> None:
+    with (
+        running(Babbling()) as server,
+        pytest.raises(SinkError, match="the answer to info is not understood: Invalid JSON"),
+        connect(target(server)),
+    ):
+        pytest.fail("connected")
+
+
+def test_an_address_is_spelled_as_a_url() -> None:
+    assert str(Address("::1", 6726, tls=True, key="secret")) == "grpc+tls://[::1]:6726"
+    assert "secret" not in repr(Address("::1", 6726, tls=True, key="secret"))
 
 
 def test_nothing_is_logged(server: Mosaicod, caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:

@@ -217,6 +217,8 @@ class Mosaicod(fl.FlightServerBase):
     ) -> None:
         self.calls.append("do_put")
         self._check_permission(context, "do_put")
+        if self.faults.refuse.get("do_put"):
+            raise self.faults.refuse["do_put"].pop(0)
         command = json.loads(descriptor.command)
         assert set(command) == {"resource_locator", "topic_uuid"}
         topic = self.topics[command["resource_locator"]]
