@@ -93,8 +93,8 @@ class Uploads:
         with checked():
             name = wire.check_topic_name(path)
             wire.check_metadata(question.user_metadata, where=question.locator)
-        held = {topic.name for topic in self._store.sequence(sequence).topics}
         with self._lock:
+            held = {topic.name for topic in self._store.sequence(sequence).topics}
             opened = self._session(question.session_uuid)
             if opened.sequence != sequence:
                 raise Refusal(
