@@ -30,6 +30,7 @@ from mosaico_ingest.policies import Stores
 pytestmark = pytest.mark.interop
 sdk = pytest.importorskip("mosaicolabs.bridges.ros", reason="the official SDK is not installed")
 from mosaicolabs.bridges.ros.adapters import override_msgs  # noqa: E402 - only once it is known to be there
+from mosaicolabs.models.core.serializable import _SCHEMA_REGISTRY as SDK_MODELS  # noqa: E402 - the same
 from PIL import Image  # noqa: E402 - comes with it
 
 ROWS = 200
@@ -99,6 +100,17 @@ def test_the_rows_are_the_sdks(msgtype: str, fuzz: Any) -> None:
     for definition in _definitions(msgtype):
         random = Random(msgtype)  # noqa: S311 - messages, not secrets
         _compare(adapter, BY_TYPE[msgtype], definition, [fuzz(definition, random) for _ in range(ROWS)])
+
+
+@pytest.mark.parametrize("builtin", BUILTIN, ids=lambda builtin: builtin.name)
+def test_the_sdk_reads_every_row_as_its_own_type(builtin: Builtin, fuzz: Any) -> None:
+    model = SDK_MODELS[builtin.tag]
+    for msgtype in builtin.ros_types:
+        for definition in _definitions(msgtype):
+            random = Random(msgtype)  # noqa: S311 - messages, not secrets
+            adapted = _ours(builtin, definition, [fuzz(definition, random) for _ in range(ROWS // 4)])
+            for row in adapted.rows.to_pylist():
+                model.model_validate(row)
 
 
 def test_stored_pictures_are_the_sdks() -> None:
