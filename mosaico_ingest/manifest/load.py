@@ -93,6 +93,10 @@ def read_text(path: Path) -> str:
 
 
 def _refusal(findings: tuple[Finding, ...], where: str) -> ManifestError:
+    if not findings:
+        return ManifestError(
+            "there is no job without its variables", where=where, hint="set them in the environment"
+        )
     first = findings[0]
     if len(findings) == 1:
         return ManifestError(
@@ -132,17 +136,21 @@ def _with_text_keys(value: Value, path: Place, source: Source, findings: list[Fi
 
 def _validate(source: Source, filled: Filled) -> tuple[Manifest | None, list[Finding]]:
     """Validate; a variable may stand for a number, and one that is not known for anything."""
-    explained: list[tuple[Place, Finding]] = []
-    for _ in range(2):
-        try:
-            # As JSON, so that strict means: no text for a number, and lists and names for what they are.
-            return Manifest.model_validate_json(json.dumps(filled.value), strict=True), []
-        except ValidationError as error:
-            explained = explain(error, source=source, schema=_schema())
-        retry = [place for place, _ in explained if place in filled.changed]
-        for place in retry:
+    manifest, mistakes = _attempt(source, filled.value)
+    retry = [place for place, _ in mistakes if place in filled.changed]
+    if retry:
+        for place in dict.fromkeys(retry):
             _reread(filled, place)
-    return None, [finding for place, finding in explained if place not in filled.unknown]
+        manifest, mistakes = _attempt(source, filled.value)
+    return manifest, [finding for place, finding in mistakes if place not in filled.unknown]
+
+
+def _attempt(source: Source, value: Value) -> tuple[Manifest | None, list[tuple[Place, Finding]]]:
+    try:
+        # As JSON, so that strict means: no text for a number, and lists and names for what they are.
+        return Manifest.model_validate_json(json.dumps(value), strict=True), []
+    except ValidationError as error:
+        return None, explain(error, source=source, schema=_schema())
 
 
 def _reread(filled: Filled, place: Place) -> None:

@@ -6,7 +6,7 @@ from typing import Any, cast
 
 from mosaico_ingest.manifest.model import Manifest
 
-__all__ = ["DIALECT", "job_schema"]
+__all__ = ["DIALECT", "job_schema", "tidy"]
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _VARIABLE = {"type": "string", "pattern": r"\$\{[^{}]+\}", "description": "A variable of the environment."}
@@ -14,7 +14,7 @@ _VARIABLE = {"type": "string", "pattern": r"\$\{[^{}]+\}", "description": "A var
 
 def job_schema() -> dict[str, Any]:
     """Return the schema (draft 2020-12) that editors complete and check manifests with."""
-    schema = _tidy(Manifest.model_json_schema())
+    schema = tidy(Manifest.model_json_schema())
     definitions: dict[str, Any] = schema.pop("$defs")
     for model in [schema, *definitions.values()]:
         model["properties"] = {
@@ -42,7 +42,7 @@ def _or_variable(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str,
     }
 
 
-def _tidy(node: dict[str, Any]) -> dict[str, Any]:
+def tidy(node: dict[str, Any]) -> dict[str, Any]:
     """Leave out the titles, which repeat the keys, and the null that stands for a key left out."""
     branches = [branch for branch in node.get("anyOf", ()) if branch != {"type": "null"}]
     if len(branches) == 1:
@@ -56,9 +56,9 @@ def _tidy_member(key: str, value: object) -> object:
         return value
     if key in {"properties", "$defs"}:
         members = cast("dict[str, dict[str, Any]]", value)  # names, not keywords
-        return {name: _tidy(member) for name, member in members.items()}
+        return {name: tidy(member) for name, member in members.items()}
     if isinstance(value, dict):
-        return _tidy(cast("dict[str, Any]", value))
+        return tidy(cast("dict[str, Any]", value))
     if isinstance(value, list):
-        return [_tidy(cast("dict[str, Any]", item)) if isinstance(item, dict) else item for item in value]
+        return [tidy(cast("dict[str, Any]", item)) if isinstance(item, dict) else item for item in value]
     return value

@@ -154,6 +154,16 @@ def test_without_an_environment_no_variable_is_missed() -> None:
     assert check("bag: {path: '${A}'}\ntarget:\n  host: ${B}\n  port: ${C}\n  tls: ${D:?why}\n") == []
 
 
+def test_a_variable_in_the_place_of_a_section_is_not_judged_without_an_environment(tmp_path: Path) -> None:
+    assert check("bag: ${A}\n", env={}) == [("1:6", "unset-variable", "A is not set")]
+    source = load_source("bag: ${A}\n", file="j")
+    assert check_manifest(source, env=None) == (None, ())
+    file = tmp_path / "job.yaml"
+    file.write_text(source.text)
+    with pytest.raises(ManifestError, match="no job without its variables"):
+        load_manifest(file, env=None)
+
+
 def test_a_message_never_shows_what_a_variable_holds() -> None:
     text = (
         "bag: {path: x, ros_distro: '${A}'}\nsequence:\n  if_exists: ${A}\ntarget:\n  host: h\n  port: ${A}\n"
