@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from mosaico_ingest import wire
@@ -104,8 +105,8 @@ class PlatformSession:
     def commit(self) -> None:
         """Wait until the server has every topic, then make them visible at once."""
         self._drop_broken()
-        for upload in self._uploads.values():
-            upload.close()
+        with ThreadPoolExecutor(thread_name_prefix="upload") as pool:
+            list(pool.map(Upload.close, self._uploads.values()))
         for path, message in self._notes:
             self._send_note(path, message)
         session = self._session

@@ -38,6 +38,7 @@ from mosaico_ingest.ontology import (
 )
 from mosaico_ingest.ontology.fields import FixedSize, Float32, Float64, Nullable, UInt8
 from mosaico_ingest.ontology.registry import UnknownTag, model, ontology_type, tags
+from mosaico_ingest.ontology.tags import MODULES
 
 
 class Colour(str, Enum):
@@ -274,6 +275,12 @@ def test_looking_up_one_tag_imports_only_what_it_needs() -> None:
         "assert 'mosaico_ingest.ontology.joy' in names and 'mosaico_ingest.ontology.geometry' not in names"
     )
     subprocess.run([sys.executable, "-c", code], check=True)  # noqa: S603 - our own words
+
+
+def test_every_public_name_is_there() -> None:
+    assert set(MODULES) < set(mosaico_ingest.ontology.__all__) <= set(dir(mosaico_ingest.ontology))
+    for name in mosaico_ingest.ontology.__all__:
+        assert getattr(mosaico_ingest.ontology, name).__name__ == name
 
 
 def test_a_name_that_is_not_there_is_an_attribute_error() -> None:
