@@ -43,10 +43,10 @@ class Compiler:
         if model.variants is None:
             return self._record(model, slot, {})
         if variant is not None:
-            return self._record(model, slot.at("variants", variant), dict(model.variants[variant] or {}))
+            return self._record(model, slot.at("variants", variant), dict(model.variants[variant]))
         for name, wrap in model.variants.items():
             known = len(self._desk.findings)
-            self._record(model, slot.at("variants", name), dict(wrap or {}))
+            self._record(model, slot.at("variants", name), dict(wrap))
             if len(self._desk.findings) > known:  # the same fields would be found wrong with each
                 break
         return None

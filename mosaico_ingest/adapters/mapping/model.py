@@ -121,6 +121,7 @@ class Recorded(_Strict):
     bag: str
     """A recording; relative to the adapter file."""
     topic: str
+    """The topic in it."""
     index: Annotated[int, Field(ge=0)] = 0
     """Which of the topic's messages."""
 
@@ -129,6 +130,7 @@ class Case(_Strict):
     """What must come out of what."""
 
     name: str
+    """What the test shows."""
     ros_type: TypeName | None = None
     """Which of the adapter's types; the first if not said."""
     given: Mapping[str, Any]
@@ -156,7 +158,7 @@ class MappingFile(_Strict):
     """One line for lists of adapters."""
     ros_type: TypeNames | None = None
     """The message type, or types that all have the fields that are named."""
-    variants: Annotated[Mapping[TypeName, Mapping[str, Value] | None], Field(min_length=1)] | None = None
+    variants: Annotated[Mapping[TypeName, Mapping[str, Value]], Field(min_length=1)] | None = None
     """Instead of `ros_type`: types that wrap the same payload. `of` says where it is; other keys are fields."""
     ontology: Annotated[
         Annotated[str, Tag("text")] | Annotated[InlineType, Tag("inline")], Discriminator(_type_or_text)
@@ -171,6 +173,7 @@ class MappingFile(_Strict):
     definition: str | None = None
     """The `.msg` text of a type that no distro knows, so that the tests run without a recording."""
     tests: Sequence[Case] = ()
+    """Messages and what must come out of them."""
 
     @property
     def ros_types(self) -> tuple[str, ...]:

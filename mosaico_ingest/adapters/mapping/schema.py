@@ -6,6 +6,7 @@ from functools import cache
 from typing import Any
 
 from mosaico_ingest.adapters.mapping.model import MappingFile
+from mosaico_ingest.manifest.schema import DIALECT, tidy
 
 __all__ = ["adapter_schema"]
 
@@ -13,9 +14,6 @@ __all__ = ["adapter_schema"]
 @cache
 def adapter_schema() -> dict[str, Any]:
     """Return the schema (draft 2020-12) that editors complete and check adapter files with."""
-    dialect = "https://json-schema.org/draft/2020-12/schema"
-    return {
-        "$schema": dialect,
-        **MappingFile.model_json_schema(by_alias=True),
-        "title": "mosaico-ingest adapter",
-    }
+    schema = tidy(MappingFile.model_json_schema(by_alias=True))
+    takes = [{"required": ["ros_type"]}, {"required": ["variants"]}]
+    return {"$schema": DIALECT, "title": "mosaico-ingest adapter", **schema, "oneOf": takes}

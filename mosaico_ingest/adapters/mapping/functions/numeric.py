@@ -82,7 +82,7 @@ def empty_to_null(x: Array) -> Array:
 
 @function(FLOAT, gives=arrays.bool_())
 def is_nan(x: Array) -> Array:
-    """Whether x is not a number."""
+    """Whether x is not a number (NaN)."""
     return pc.is_nan(x)
 
 
@@ -141,8 +141,8 @@ for _name, _run, _summary in (
     ("asin", pc.asin, "Arc sine in rad; NaN outside -1 … 1."),
     ("acos", pc.acos, "Arc cosine in rad; NaN outside -1 … 1."),
     ("atan", pc.atan, "Arc tangent in rad."),
-    ("degrees", partial(pc.multiply, 180 / np.pi), "rad as degrees."),
-    ("radians", partial(pc.multiply, np.pi / 180), "Degrees as rad."),
+    ("degrees", partial(pc.multiply, 180 / np.pi), "Radians as degrees."),
+    ("radians", partial(pc.multiply, np.pi / 180), "Degrees as radians."),
     ("floor", pc.floor, "The whole number below; still a float."),
     ("ceil", pc.ceil, "The whole number above; still a float."),
     ("trunc", pc.trunc, "x without its fraction; still a float."),
@@ -181,7 +181,7 @@ def max_(refuse: Refuse, a: Array, b: Array, *others: Array) -> Array:
 
 @function(NUMBER, NUMBER, NUMBER, gives=_extreme)
 def clip(refuse: Refuse, x: Array, low: Array, high: Array) -> Array:
-    """X within the bounds; NaN stays NaN."""
+    """The value, brought within the bounds; NaN stays NaN."""
     x, low, high = numbers(refuse, x, low, high)
     clipped = pc.min_element_wise(pc.max_element_wise(x, low, skip_nulls=False), high, skip_nulls=False)
     return pc.if_else(pc.is_nan(x), x, clipped) if pt.is_floating(x.type) else clipped

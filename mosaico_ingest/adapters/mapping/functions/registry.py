@@ -124,7 +124,8 @@ def function(
     """
 
     def add(apply: Callable[..., Any]) -> Callable[..., Any]:
-        parameters = tuple(inspect.signature(apply).parameters)
+        known = inspect.signature(apply).parameters
+        parameters = tuple(name for name, p in known.items() if p.kind is not p.VAR_POSITIONAL)
         refuses = parameters[:1] == ("refuse",)
         spelled = name or apply.__name__.rstrip("_")
         _FUNCTIONS[spelled] = Function(

@@ -75,7 +75,7 @@ def nanoseconds(t: Array) -> Array:
 
 @function(INTEGER, gives=STAMP_TYPE)
 def time_from_ns(refuse: Refuse, n: Array) -> Array:
-    """Ns since the epoch as `{seconds, nanoseconds}`; more seconds than 32 bits hold reject the row."""
+    """Nanoseconds since the epoch as `{seconds, nanoseconds}`; more seconds than 32 bits hold reject the row."""
     (n,) = numbers(refuse, n)
     absent = nulls(n)
     total = np.asarray(pc.fill_null(n, 0))

@@ -1,0 +1,213 @@
+"""Every function of the language, by what it gives for a few values."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from mosaico_ingest.adapters.adapter import Envelope
+from mosaico_ingest.adapters.mapping.check import Checker, Scope
+from mosaico_ingest.adapters.mapping.evaluate import Evaluation
+from mosaico_ingest.adapters.mapping.expression import parse
+from mosaico_ingest.adapters.mapping.functions import SUBJECTS, functions, operators
+from mosaico_ingest.adapters.mapping.functions.ros import HEADER_TYPE
+from mosaico_ingest.adapters.mapping.functions.time import STAMP_TYPE
+from mosaico_ingest.adapters.mapping.kinds import Kind
+from mosaico_ingest.adapters.mapping.reference import with_reference
+from mosaico_ingest.ontology.registry import ontology_type
+
+STAMP = pa.struct([("sec", pa.int32()), ("nanosec", pa.uint32())])
+HEADER = pa.struct([("stamp", STAMP), ("frame_id", pa.string())])
+HEADER_1 = pa.struct([("seq", pa.uint32()), ("stamp", STAMP), ("frame_id", pa.string())])
+NAN, INF = math.nan, math.inf
+
+
+def column(text: str, values: list[Any], type_: pa.DataType, other: list[Any] | None = None) -> list[Any]:
+    """Return an expression of `x` (and `y`) for each value."""
+    shape = pa.struct([("x", type_), ("y", type_)])
+    rows: Any = pa.array([{"x": x, "y": y} for x, y in zip(values, other or values, strict=True)], shape)
+    problems: list[Any] = []
+    typed = Checker(Scope(Kind(shape), {}), lambda *problem: problems.append(problem), text).infer(
+        parse(text)
+    )
+    assert typed is not None, problems
+    array = Evaluation(rows, Envelope("", "", np.zeros(len(rows), np.int64))).of(typed).closed(len(rows))
+    array.validate(full=True)
+    return array.to_pylist()
+
+
+def near(left: Any, right: Any) -> bool:
+    if isinstance(left, dict):
+        return left.keys() == right.keys() and all(near(left[key], right[key]) for key in left)
+    if isinstance(left, float) and isinstance(right, int | float):
+        return math.isclose(left, right, abs_tol=1e-12) or (math.isnan(left) and math.isnan(right))
+    return left == right
+
+
+F8, I4, U1, TEXT, BOOL = pa.float64(), pa.int32(), pa.uint8(), pa.string(), pa.bool_()
+
+CASES = [
+    ("is_null(x)", F8, [1.0, None], [False, True]),
+    ("coalesce(x, 7)", I4, [1, None], [1, 7]),
+    ("coalesce(null, x)", TEXT, ["a", None], ["a", None]),
+    ("null_if(x, 3)", I4, [3, 4, None], [None, 4, None]),
+    ("null_if(x, '')", TEXT, ["", "a"], [None, "a"]),
+    ("nan_to_null(x)", F8, [NAN, 1.0, INF, None], [None, 1.0, INF, None]),
+    ("nan_to_null(x)", I4, [1, None], [1, None]),
+    ("empty_to_null(x)", TEXT, ["", "a", None], [None, "a", None]),
+    ("empty_to_null(x)", pa.binary(), [b"", b"a"], [None, b"a"]),
+    ("empty_to_null(x)", pa.list_(F8), [[], [1.0]], [None, [1.0]]),
+    ("is_nan(x)", F8, [NAN, 1.0, None], [True, False, None]),
+    ("is_finite(x)", F8, [NAN, 1.0, INF], [False, True, False]),
+    ("abs(x)", I4, [-3, 3], [3, 3]),
+    ("abs(x)", F8, [-3.5], [3.5]),
+    ("sign(x)", I4, [-3, 0, 3], [-1, 0, 1]),
+    ("sign(x)", F8, [-3.5], [-1.0]),
+    ("sqrt(x)", F8, [4.0, -1.0, None], [2.0, NAN, None]),
+    ("exp(x)", F8, [0.0], [1.0]),
+    ("log(x)", F8, [1.0, 0.0, -1.0], [0.0, -INF, NAN]),
+    ("log10(x)", F8, [100.0], [2.0]),
+    ("sin(x)", F8, [math.pi / 2], [1.0]),
+    ("cos(x)", F8, [math.pi], [-1.0]),
+    ("tan(x)", F8, [math.pi / 4], [1.0]),
+    ("asin(x)", F8, [1.0, 2.0], [math.pi / 2, NAN]),
+    ("acos(x)", F8, [1.0, 2.0], [0.0, NAN]),
+    ("atan(x)", F8, [1.0], [math.pi / 4]),
+    ("degrees(x)", F8, [math.pi], [180.0]),
+    ("radians(x)", F8, [180.0], [math.pi]),
+    ("floor(x)", F8, [1.5, -1.5], [1.0, -2.0]),
+    ("ceil(x)", F8, [1.5, -1.5], [2.0, -1.0]),
+    ("trunc(x)", F8, [1.5, -1.5], [1.0, -1.0]),
+    ("round(x)", F8, [0.5, 1.5, 2.4], [0.0, 2.0, 2.0]),
+    ("atan2(x, 1)", F8, [1.0], [math.pi / 4]),
+    ("hypot(x, 4)", F8, [3.0], [5.0]),
+    ("min(x, 2)", I4, [1, 3, None], [1, 2, None]),
+    ("max(x, 2, 5)", I4, [1, 9], [5, 9]),
+    ("min(x, 1)", F8, [NAN], [1.0]),
+    ("clip(x, 0, 1)", F8, [-1.0, 0.5, 2.0, NAN], [0.0, 0.5, 1.0, NAN]),
+    ("clip(x, 0, 10)", I4, [-1, 5, 20], [0, 5, 10]),
+    ("len(x)", TEXT, ["", "żó", None], [0, 2, None]),
+    ("len(x)", pa.binary(), [b"abc"], [3]),
+    ("len(x)", pa.list_(I4), [[], [1, 2], None], [0, 2, None]),
+    ("len(x)", pa.list_(I4, 2), [[1, 2]], [2]),
+    ("sum(x)", pa.list_(I4), [[], [1, 2], [None], None], [0, 3, None, None]),
+    ("sum(x)", pa.list_(pa.float32()), [[], [0.5, 1.5]], [0.0, 2.0]),
+    ("sum(x[] * 2)", pa.list_(I4), [[], [1, 2]], [0, 6]),
+    ("mean(x)", pa.list_(I4), [[], [1, 2]], [None, 1.5]),
+    ("least(x)", pa.list_(I4), [[], [3, 1, 2]], [None, 1]),
+    ("greatest(x)", pa.list_(F8, 2), [[1.0, 2.0], None], [2.0, None]),
+    ("any(x)", pa.list_(BOOL), [[], [False, True], [None]], [False, True, None]),
+    ("all(x[] > 0)", pa.list_(I4), [[], [1, 0], [1]], [True, False, True]),
+    ("lower(x)", TEXT, ["ŻÓ"], ["żó"]),
+    ("upper(x)", TEXT, ["a"], ["A"]),
+    ("strip(x)", TEXT, [" a\t"], ["a"]),
+    ("replace(x, 'a', 'b')", TEXT, ["aa", "c"], ["bb", "c"]),
+    ("starts_with(x, 'a')", TEXT, ["ab", "b", None], [True, False, None]),
+    ("ends_with(x, 'b')", TEXT, ["ab", "a"], [True, False]),
+    ("contains(x, 'a.')", TEXT, ["a.b", "ab"], [True, False]),
+    ("split(x, ',')", TEXT, ["a,b", ""], [["a", "b"], [""]]),
+    (r"extract(x, 'v(\d+)')", TEXT, ["v12", "x", None], ["12", None, None]),
+    (r"extract(x, '\((.)\)')", TEXT, ["(a)"], ["a"]),
+    ("text(x)", I4, [12, None], ["12", None]),
+    ("text(x)", BOOL, [True], ["true"]),
+    ("number(x)", TEXT, ["1.5", " 2 ", None], [1.5, 2.0, None]),
+    ("bytes(x)", pa.list_(U1, 2), [[1, 2], [3, 4]], [b"\1\2", b"\3\4"]),
+    ("bytes(x)", pa.list_(U1), [[1, 2], [], None], [b"\1\2", b"", None]),
+    ("bytes(x)", pa.binary(), [b"a"], [b"a"]),
+    ("ros_time(x)", STAMP, [{"sec": 1, "nanosec": 2}, None], [{"seconds": 1, "nanoseconds": 2}, None]),
+    ("seconds(x)", STAMP, [{"sec": -1, "nanosec": 500_000_000}], [-0.5]),
+    ("nanoseconds(x)", STAMP, [{"sec": 2, "nanosec": 5}], [2_000_000_005]),
+    ("nanoseconds(x)", STAMP_TYPE, [{"seconds": 2, "nanoseconds": 5}], [2_000_000_005]),
+    ("time_from_ns(x)", pa.int64(), [-1, None], [{"seconds": -1, "nanoseconds": 999_999_999}, None]),
+    ("yaw(quaternion_from_rpy(0.1, -0.2, x))", F8, [0.3, -3.0, None], [0.3, -3.0, None]),
+    ("quaternion_from_rpy(x, 0, 0)", F8, [math.pi, None], [{"x": 1.0, "y": 0.0, "z": 0.0, "w": 0.0}, None]),
+    ("quaternion_from_yaw(x)", F8, [math.pi], [{"x": 0.0, "y": 0.0, "z": 1.0, "w": 0.0}]),
+    ("quaternion_from_yaw(x).w", F8, [0.0], [1.0]),
+    ("covariance(x)", pa.list_(F8, 2), [[-1.0, 0.0], [0.0, 2.0], None], [None, [0.0, 2.0], None]),
+    ("covariance(x)", pa.list_(F8), [[], [NAN], [-1.0, 2.0]], [None, None, [-1.0, 2.0]]),
+    ("variance(x)", F8, [0.0, -1.0, NAN, 2.0, None], [None, None, None, 2.0, None]),
+    ("x in [1, 2]", I4, [1, 3, None], [True, False, None]),
+    ("x + '!'", TEXT, ["a", None], ["a!", None]),
+    ("[x, 1.5]", I4, [1, None], [[1.0, 1.5], [None, 1.5]]),
+    ("x[-1]", pa.list_(I4), [[1, 2], [], None], [2, None, None]),
+    ("x[1]", pa.list_(I4, 2), [[1, 2], None], [2, None]),
+]  # fmt: skip
+
+FORMATS = [
+    ("", "png"),
+    ("jpeg", "jpeg"),
+    ("JPEG", "jpeg"),
+    ("h265", "hevc"),
+    ("rvl", "raw"),
+    ("bgr8; jpeg compressed bgr8", "jpeg"),
+    ("rgb8; png compressed ", "png"),
+    ("16UC1; compressedDepth png", "png"),
+    ("16UC1; compressedDepth", "png"),
+    ("jpeg compressed bgr8", "jpeg"),
+    ("rgb8; compressed", "raw"),
+    ("a b c d", "raw"),
+]
+
+
+@pytest.mark.parametrize(("text", "type_", "values", "expected"), CASES)
+def test_a_function_gives_what_its_line_says(
+    text: str, type_: Any, values: list[Any], expected: list[Any]
+) -> None:
+    result = column(text, values, type_)
+    assert all(map(near, result, expected)), result
+    assert len(result) == len(expected)
+    assert column(text, [], type_) == []
+
+
+@pytest.mark.parametrize(("said", "stored"), FORMATS)
+def test_a_compressed_image_s_format_is_the_codec_in_it(said: str, stored: str) -> None:
+    assert column("compressed_format(x)", [said, None], TEXT) == [stored, None]
+
+
+def test_a_header_that_says_nothing_is_null() -> None:
+    given = [
+        {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""},
+        {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "map"},
+        {"stamp": {"sec": 0, "nanosec": 1}, "frame_id": ""},
+        None,
+    ]
+    silent, named, stamped, absent = column("ros_header(x)", given, HEADER)
+    assert silent is None
+    assert absent is None
+    assert named == {"timestamp": {"seconds": 0, "nanoseconds": 0}, "frame_id": "map", "sample_counter": None}
+    assert stamped["timestamp"] == {"seconds": 0, "nanoseconds": 1}
+
+
+def test_the_counter_of_a_ros_1_header_is_kept_and_does_not_count_as_saying_something() -> None:
+    given = [
+        {"seq": 7, "stamp": {"sec": 0, "nanosec": 0}, "frame_id": "map"},
+        {"seq": 7, "stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""},
+    ]
+    named, silent = column("ros_header(x)", given, HEADER_1)
+    assert (named["sample_counter"], silent) == (7, None)
+
+
+def test_header_and_time_are_those_of_the_ontology() -> None:
+    assert ontology_type("IMU").struct.field("header").type == HEADER_TYPE
+    assert ontology_type("Time").struct == STAMP_TYPE
+
+
+def test_the_reference_in_the_documentation_is_current() -> None:
+    path = Path(__file__).parents[2] / "docs" / "mapping.md"
+    assert with_reference(path.read_text("utf-8")) == path.read_text("utf-8")
+
+
+def test_every_function_is_documented_and_has_a_case() -> None:
+    tested = " ".join(text for text, *_ in CASES) + " ros_header( compressed_format("
+    for function in functions():
+        if function.apply.__module__ == operators.__name__:
+            continue
+        assert function.summary.endswith("."), function.name
+        assert any(function.apply.__module__ == subject.__name__ for subject in SUBJECTS)
+        if not function.name.startswith("points_"):
+            assert f"{function.name}(" in tested, f"{function.name} has no case"

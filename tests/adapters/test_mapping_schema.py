@@ -1,0 +1,54 @@
+"""The published schema of adapter files: it takes what the model takes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+
+import mosaico_ingest
+from mosaico_ingest.adapters.mapping.schema import adapter_schema
+from mosaico_ingest.manifest.source import load_source
+
+CATALOG = sorted((Path(mosaico_ingest.__file__).parent / "adapters" / "catalog").glob("*.yaml"))
+VALIDATOR = jsonschema.Draft202012Validator(adapter_schema())
+
+
+def plain(value: Any) -> Any:
+    """Return what JSON has of a YAML value: keys are text."""
+    return json.loads(json.dumps(value))
+
+
+def test_the_committed_schema_is_current() -> None:
+    path = Path(__file__).parents[2] / "schemas" / "adapter.schema.json"
+    assert json.loads(path.read_text("utf-8")) == adapter_schema()
+
+
+@pytest.mark.parametrize("path", CATALOG, ids=lambda path: path.stem)
+def test_every_built_in_adapter_satisfies_it(path: Path) -> None:
+    VALIDATOR.validate(plain(load_source(path.read_text("utf-8"), file=path.name).value))
+
+
+def test_every_key_is_described() -> None:
+    schema = adapter_schema()
+    for model in [schema, *schema["$defs"].values()]:
+        for key, node in model.get("properties", {}).items():
+            assert "description" in node or "$ref" in node, key
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{version: 1, adapter: A, ros_type: a/b, ontology: T, fields: {}, extra: 1}",
+        "{version: 2, adapter: A, ros_type: a/b, ontology: T, fields: {}}",
+        "{version: 1, adapter: A, ontology: T, fields: {}}",
+        "{version: 1, adapter: A, ros_type: a/b, variants: {c/d: {}}, ontology: T, fields: {}}",
+        "{version: 1, adapter: A, ros_type: a/b, ontology: T, fields: {x: [1]}}",
+        "{version: 1, adapter: A, ros_type: a/b, ontology: T, fields: {x: {valu: 1}}}",
+    ],
+)
+def test_it_refuses_what_the_model_refuses(text: str) -> None:
+    assert not VALIDATOR.is_valid(plain(load_source(text, file="a.yaml").value))
