@@ -17,6 +17,7 @@ from mosaico_ingest.bag.deserialize import Deserializer
 from mosaico_ingest.bag.message import ROSMessage
 from mosaico_ingest.bag.recording import Recording, open_recording
 from mosaico_ingest.bag.types import CustomMessages, TypeResolver
+from mosaico_ingest.bag.windows import span, windows
 from mosaico_ingest.diagnostics import Finding
 from mosaico_ingest.errors import BagError, DecodeError, NothingMatched
 from mosaico_ingest.patterns import select
@@ -25,9 +26,6 @@ from mosaico_ingest.policies import LoaderErrorPolicy, Stores
 __all__ = ["ROSLoader"]
 
 _LOG = logging.getLogger("mosaico_ingest.bag")
-_WINDOW_BYTES = 32 << 20
-_WINDOW_MESSAGES = 50_000
-_MAX_WINDOWS = 10_000
 
 
 class ROSLoader:
@@ -91,13 +89,7 @@ class ROSLoader:
     @property
     def duration(self) -> int:
         """Time from the first to the last message of the recording, ns; an unindexed one is read for it."""
-        first, last = self._recording.start_ns, self._recording.end_ns
-        if first is None or last is None:
-            times = [batch.log_times for batch in self._recording.batches()]
-            first, last = (
-                min((int(t.min()) for t in times), default=0),
-                max((int(t.max()) for t in times), default=0),
-            )
+        first, last = span(self._recording)
         return last - first
 
     @property
@@ -133,7 +125,7 @@ class ROSLoader:
         self.rejected.clear()
         readers = dict(self._readers())
         unreadable = self._channels.keys() - readers
-        for batches in self._windows():
+        for batches in windows(self._recording, self._channels):
             for batch in batches:
                 if batch.channel.id in unreadable:
                     self.rejected[batch.channel.topic] += len(batch)
@@ -154,27 +146,6 @@ class ROSLoader:
             raise BagError(problem, where=topic)
         if self._policy is LoaderErrorPolicy.LOG_WARN:
             _LOG.warning("%s: %s", topic, problem)
-
-    def _windows(self) -> Iterator[list[RawBatch]]:
-        """Yield all batches of one stretch of time after the other, so that only one has to be put in order."""
-        recording, ids = self._recording, list(self._channels)
-        first, last = recording.start_ns, recording.end_ns
-        if first is None or last is None:
-            yield list(recording.batches(ids))
-            return
-        messages = sum(channel.count or 0 for channel in self._channels.values())
-        pieces = max(recording.size_bytes // _WINDOW_BYTES, messages // _WINDOW_MESSAGES) + 1
-        step = max((last - first) // min(pieces, _MAX_WINDOWS) + 1, 1)
-        starts = range(first, last + 1, step)
-        for start in starts:
-            # Open at both ends: an index may be wrong about the first and last message.
-            yield list(
-                recording.batches(
-                    ids,
-                    start_ns=start if start != starts[0] else None,
-                    end_ns=start + step if start != starts[-1] else None,
-                )
-            )
 
     def _messages(self, batches: list[RawBatch], readers: Mapping[int, Deserializer]) -> Iterator[ROSMessage]:
         if not batches:

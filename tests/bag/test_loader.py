@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -15,8 +16,10 @@ from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.bag.loader import ROSLoader
 from mosaico_ingest.bag.message import ROSHeader, ROSMessage
+from mosaico_ingest.bag.recording import open_recording
 from mosaico_ingest.bag.serialize import Serializer
 from mosaico_ingest.bag.types import TypeResolver
+from mosaico_ingest.bag.windows import windows
 from mosaico_ingest.errors import BagError, DecodeError, NothingMatched
 from mosaico_ingest.policies import LoaderErrorPolicy, Stores
 
@@ -78,6 +81,17 @@ def test_the_header_is_read_where_there_is_one(bag: Path) -> None:
     assert ROSMessage(0, "/t", "a/msg/B", {"header": 5}).header is None
     ros1 = {"header": {"seq": 4, "stamp": {"sec": 1, "nanosec": 2}, "frame_id": "f"}}
     assert ROSMessage(0, "/t", "a/msg/B", ros1).header == ROSHeader(SECOND + 2, "f", 4)
+
+
+@pytest.mark.parametrize("max_bytes", [1, 50, 200])
+def test_stretches_too_large_to_hold_are_halved(bag: Path, max_bytes: int) -> None:
+    with open_recording(bag, resolve=TypeResolver()) as recording:
+        ids = [channel.id for channel in recording.channels]
+        stretches = [batches for batches in windows(recording, ids, max_bytes=max_bytes) if batches]
+        times = [[int(t) for batch in batches for t in batch.log_times] for batches in stretches]
+        assert len(stretches) > 5
+        assert sum(map(len, times)) == 31
+        assert all(max(earlier) < min(later) for earlier, later in pairwise(times))
 
 
 def test_a_loader_can_be_iterated_again(bag: Path) -> None:
