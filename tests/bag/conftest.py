@@ -85,10 +85,13 @@ def write_rosbag2(
     return path
 
 
-def write_ros1(path: Path, messages: Iterable[Sent], *, compression: str = "none") -> Path:
+def write_ros1(
+    path: Path, messages: Iterable[Sent], *, compression: str = "none", chunk_bytes: int = 1 << 20
+) -> Path:
     """Write a ROS 1 bag; `compression` is none, bz2 or lz4."""
     store = get_typestore(Stores.ROS1_NOETIC)
     writer = rosbag1.Writer(path)
+    writer.chunk_threshold = chunk_bytes
     if compression != "none":
         writer.set_compression(rosbag1.Writer.CompressionFormat[compression.upper()])
     with writer:

@@ -219,3 +219,28 @@ def test_times_after_2262_are_lost_messages(tmp_path: Path, recordings: Any) -> 
     with open_recording(path, resolve=recordings.blind) as recording:
         assert recordings.received(recording) == sorted(messages[:29])
         assert [(loss.count, "2262" in loss.reason) for loss in recording.losses] == [(1, True)]
+
+
+@pytest.mark.parametrize("kind", ["mcap zstd", "mcap lz4", "mcap plain", "ros1", "ros1 lz4"])
+def test_without_index_a_hole_in_the_middle_costs_what_lies_in_it(
+    tmp_path: Path, recordings: Any, kind: str
+) -> None:
+    messages, path = recordings.sent(400), tmp_path / "k"
+    if kind.startswith("mcap"):
+        compression = kind.split()[1].replace("plain", "")
+        recordings.mcap(path, messages, chunk_messages=40, compression=compression, summary=False)
+    else:
+        recordings.ros1(path, messages, compression=kind[4:].strip() or "none", chunk_bytes=12_000)
+    content = bytearray(path.read_bytes())
+    if kind.startswith("ros1"):
+        at = content.index(b"index_pos=") + len(b"index_pos=")
+        content[at : at + 8] = bytes(8)
+    middle = len(content) // 2
+    content[middle : middle + 4096] = bytes(4096)
+    path.write_bytes(content)
+    with open_recording(path, resolve=recordings.blind) as recording:
+        found = recordings.received(recording)
+        altered = 8 if kind == "ros1" else 0  # such chunks have no checksum
+        assert len(set(found) - set(messages)) <= altered
+        assert len(messages) - 120 <= len(found) < len(messages)
+        assert recording.losses

@@ -153,7 +153,7 @@ def _chunk(raw: bytes, head: ChunkHead) -> bytes | memoryview:
 
 def _cut_chunk(raw: bytes, head: ChunkHead, piece: Piece, loaded: Loaded) -> bytes:
     data = inflate_some(memoryview(raw)[head.begin : head.end], head.compression, head.size)
-    reason = f"the file ends within this chunk; {len(data)} of its {head.size} bytes could be read"
+    reason = f"this chunk is cut off; {len(data)} of its {head.size} bytes could be read"
     loaded.holes.append(Hole(piece.offset, reason))
     return data
 

@@ -20,6 +20,7 @@ from mosaico_ingest.bag.containers.mcap_records import (
     schema_of,
 )
 from mosaico_ingest.bag.containers.part import LATEST_NS, Hole
+from mosaico_ingest.bag.containers.resume import next_mcap_chunk
 from mosaico_ingest.bag.containers.source import Fields, FileSource, Window
 from mosaico_ingest.errors import BagError
 
@@ -186,7 +187,7 @@ class _Walk:
         index.walked = True
 
     def over(self, at: int, stop: int) -> None:
-        """Look at every record from `at` to `stop`, or to the first that does not fit."""
+        """Look at every record from `at` to `stop`; where one does not fit, go on at the next chunk."""
         while at < stop:
             head = self._window.peek(at, RECORD.size)
             op, length = RECORD.unpack(head) if len(head) == RECORD.size else (0, 0)
@@ -194,9 +195,11 @@ class _Walk:
             if op in (Op.DATA_END, Op.FOOTER) and end <= stop:
                 break
             if op == 0 or end > stop:
+                resumed = next_mcap_chunk(self._source, at + 1, stop)
                 self._doubt_last_chunk(at)
-                self._ending(op, at, end, stop)
-                break
+                self._stray(op, at, end, stop if resumed is None else resumed)
+                at = stop if resumed is None else resumed
+                continue
             self._record(op, at, end)
             at = end
         else:
@@ -221,8 +224,8 @@ class _Walk:
             except BagError as err:
                 self._index.holes.append(Hole(at, f"a damaged record of kind {op}: {err.what}"))
 
-    def _ending(self, op: int, at: int, end: int, stop: int) -> None:
-        """Say why the walk ends before its time; a chunk that is cut off may still hold messages."""
+    def _stray(self, op: int, at: int, end: int, stop: int) -> None:
+        """Say what does not fit; a chunk that is cut off may still hold messages."""
         if op == Op.CHUNK:
             try:
                 head = chunk_head(self._source.read(at, min(stop - at, 1 << 12)))

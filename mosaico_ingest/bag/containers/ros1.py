@@ -113,7 +113,7 @@ def _chunk(raw: bytes, piece: Piece, loaded: Loaded) -> tuple[bytes | memoryview
     packed = memoryview(raw)[head.begin : head.end]
     if piece.is_cut:
         data = inflate_some(packed, head.compression, head.size)
-        reason = f"the file ends within this chunk; {len(data)} of its {head.size} bytes could be read"
+        reason = f"this chunk is cut off; {len(data)} of its {head.size} bytes could be read"
         loaded.holes.append(Hole(piece.offset, reason))
         return data, len(raw)
     if head.end > len(raw):

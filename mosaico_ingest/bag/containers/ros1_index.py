@@ -9,6 +9,7 @@ import numpy as np
 
 from mosaico_ingest.bag.containers.compression import inflate_some
 from mosaico_ingest.bag.containers.part import Hole
+from mosaico_ingest.bag.containers.resume import next_ros1_chunk
 from mosaico_ingest.bag.containers.ros1_records import (
     Connection,
     Op,
@@ -137,14 +138,16 @@ class _Walk:
         self._index = index
 
     def over(self, at: int, stop: int) -> None:
-        """Look at every record up to the first that does not fit."""
+        """Look at every record; where one does not fit, go on at the next chunk."""
         while at < stop:
             try:
                 record = record_at(self._window, at, stop)
             except BagError as err:
+                resumed = next_ros1_chunk(self._source, at + 1, stop)
                 self._doubt_last_chunk(at)
-                self._ending(at, stop, err.what)
-                return
+                self._stray(at, stop if resumed is None else resumed, err.what)
+                at = stop if resumed is None else resumed
+                continue
             try:
                 self._record(record)
             except BagError as err:
@@ -217,9 +220,9 @@ class _Walk:
             pass  # reading the chunk will say what is wrong with it
         return replace(piece, start_ns=first, end_ns=last, counts=counts)
 
-    def _ending(self, at: int, stop: int, reason: str) -> None:
+    def _stray(self, at: int, stop: int, reason: str) -> None:
         piece = self._by_messages(Piece(at, stop, 0, 0, {}, is_cut=True))
         if piece.counts:
             self._index.pieces.append(piece)
         else:
-            self._index.holes.append(Hole(at, f"{reason}; they are not read"))
+            self._index.holes.append(Hole(at, f"{reason}; {stop - at} bytes are not read"))
