@@ -11,6 +11,7 @@ from mosaico_ingest.bag.batch import Encoding, RawBatch
 from mosaico_ingest.bag.definition import Definition
 from mosaico_ingest.decode.columns import build_columns
 from mosaico_ingest.decode.decoder import Decoded
+from mosaico_ingest.decode.gather import array_of
 from mosaico_ingest.decode.layout import PADDING, compile_layout
 from mosaico_ingest.decode.locate import locate
 from mosaico_ingest.decode.places import Frame, Int64s
@@ -110,5 +111,5 @@ def _merge(parts: list[Decoded]) -> Decoded:
         return Decoded(filled[0].rows, filled[0].index, failures, padded)
     index = np.concatenate([part.index for part in filled])
     order = np.argsort(index)
-    rows = pa.concat_arrays([part.rows for part in filled]).take(order)
+    rows = pa.concat_arrays([part.rows for part in filled]).take(array_of(pa.int64(), len(order), order))
     return Decoded(rows, index[order], failures, padded)

@@ -75,7 +75,7 @@ class _Builder:
     def column(self, column: Column, kind: pa.DataType, inst: _Instances, count: int) -> Array:
         """Return `count` values: one for each instance, or one for each place in the grids around it."""
         if not count:
-            return pa.array([], kind)
+            return pa.nulls(0, kind)  # type: ignore[call-overload]  # the stubs know it for extension types only
         match column:
             case Leaf():
                 return self._leaf(column, kind, inst)
@@ -99,7 +99,7 @@ class _Builder:
         number = np.dtype(f"{self._order}{'u1' if leaf.type == 'bool' else NUMBERS[leaf.type]}")
         view = np.ndarray((len(block), *counts), number, block, leaf.offset, (block.shape[1], *strides))
         if leaf.type == "bool":
-            return pa.array((view != 0).reshape(-1))
+            return array_of(kind, view.size, np.packbits(view != 0, bitorder="little"))
         values = np.require(view, number.newbyteorder("="), ["C_CONTIGUOUS", "ALIGNED"])
         return array_of(kind, values.size, values)
 

@@ -62,7 +62,7 @@ def _taken(data: Bytes, at: Int64s, ends: Int64s) -> Bytes:
         at, ends = at[order], ends[order]
     borders = np.stack([at, ends], axis=1).reshape(-1)
     every = array_of(pa.large_binary(), len(borders) - 1, borders, data)
-    taken = every.take(picks).buffers()[-1]
+    taken = every.take(array_of(pa.int64(), len(picks), picks)).buffers()[-1]
     return np.zeros(0, np.uint8) if taken is None else np.frombuffer(memoryview(taken), np.uint8)
 
 
@@ -76,6 +76,9 @@ def offsets_of(counts: Int64s) -> NDArray[np.int32]:
 def array_of(
     kind: pa.DataType, length: int, *buffers: NDArray[Any], children: Sequence[Array] | None = None
 ) -> Array:
-    """Return an Arrow array over the buffers that follow its validity, which no decoded value needs."""
+    """Return an Arrow array over the buffers that follow its validity, which no decoded value needs.
+
+    Unlike `pyarrow.array` it does not look for pandas, whose import takes longer than most batches.
+    """
     parts = [None, *(pa.py_buffer(buffer.data) for buffer in buffers)]
     return pa.Array.from_buffers(kind, length, parts, children=children)

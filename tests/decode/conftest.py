@@ -38,7 +38,9 @@ def bits(array: pa.Array) -> Any:
     if pa.types.is_fixed_size_list(kind):
         return len(array), bits(array.flatten())
     if pa.types.is_floating(kind):
-        return array.to_numpy(zero_copy_only=False).tobytes()
+        values = array.to_numpy(zero_copy_only=False).copy()
+        values[np.isnan(values)] = np.nan  # a Python float cannot keep which NaN it was
+        return values.tobytes()
     return array.to_pylist()
 
 
