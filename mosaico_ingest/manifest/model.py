@@ -124,7 +124,8 @@ class SequenceSection(_Section):
     """What the recording becomes."""
 
     name: Text = Field(default="{stem}", examples=["Test_Run_01", "{parent}_{stem}"])
-    """The sequence's name; placeholders {stem} {name} {parent} {date} {index} are filled in for each recording."""
+    """The sequence's name; filled in for each recording: {stem} and {name}, the file's name without and with its suffix,
+    {parent}, its folder's, {date}, the day it was last changed, {index}, its position from 1, {index:03} padded."""
     metadata: dict[Text, JsonValue] = Field(
         default={}, examples=[{"driver_version": "v2.1", "weather": "sunny"}]
     )
@@ -173,7 +174,8 @@ class OnErrorSection(_Section):
     topic: TopicPolicies = Field(
         default=TopicLevelErrorPolicy.Raise, examples=["raise", {"default": "raise", "/gps/*": "ignore"}]
     )
-    """After an error in a topic: raise (end the run), ignore (reject the message), finalize (close the topic)."""
+    """After an error in a topic: raise (end the run), ignore (reject the message), finalize (close the topic); one word,
+    or one for each name or glob, `default` for the rest."""
     message: LoaderErrorPolicy = LoaderErrorPolicy.LOG_WARN
     """For a message whose bytes do not fit its type: ignore (count it), log_warn (and say so), raise (end the run)."""
 
@@ -216,7 +218,7 @@ class RunSection(_Section):
     report: Text | None = Field(default=None, examples=["report.json"])
     """The file the run's report is written to."""
     memory: SizeText | None = Field(default=None, examples=["512MiB"])
-    """How much memory batches may take, as `512MiB`."""
+    """How much memory batches may take."""
     jobs: Annotated[int, Field(ge=1, le=1024)] = 1
     """How many recordings are ingested at the same time."""
 

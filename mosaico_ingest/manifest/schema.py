@@ -54,6 +54,8 @@ def tidy(node: dict[str, Any]) -> dict[str, Any]:
 def _tidy_member(key: str, value: object) -> object:
     if key in {"default", "examples"}:
         return value
+    if key == "description":
+        return " ".join(str(value).split())
     if key in {"properties", "$defs"}:
         members = cast("dict[str, dict[str, Any]]", value)  # names, not keywords
         return {name: tidy(member) for name, member in members.items()}

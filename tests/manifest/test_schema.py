@@ -9,6 +9,7 @@ from typing import Any
 
 import jsonschema
 
+from mosaico_ingest.manifest.reference import manifest_reference
 from mosaico_ingest.manifest.schema import job_schema
 
 COMMITTED = Path(__file__).parents[2] / "schemas" / "job.schema.json"
@@ -48,3 +49,12 @@ def test_every_example_is_valid() -> None:
 def test_a_variable_may_stand_for_anything_but_a_mapping() -> None:
     manifest = {"bag": {"path": "${A}", "ros_distro": "${B}"}, "target": {"host": "${H}", "port": "${P}"}}
     jsonschema.Draft202012Validator(job_schema()).validate(manifest)
+
+
+def test_the_committed_reference_is_the_current_one() -> None:
+    assert (Path(__file__).parents[2] / "docs" / "manifest.md").read_text() == manifest_reference()
+
+
+def test_the_reference_has_every_key() -> None:
+    page = manifest_reference()
+    assert [key for key, _ in properties(job_schema()) if f"| `{key}` |" not in page] == []
