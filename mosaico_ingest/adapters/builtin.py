@@ -73,6 +73,12 @@ BUILTIN: tuple[Builtin, ...] = (
         "CompressedImageAdapter", "compressed_image", "CompressedImage", ("sensor_msgs/msg/CompressedImage",)
     ),
     Builtin(
+        "CompressedVideoAdapter",
+        "compressed_video",
+        "CompressedImage",
+        ("foxglove_msgs/msg/CompressedVideo",),
+    ),
+    Builtin(
         "DurationAdapter",
         "duration",
         "Duration",
@@ -97,6 +103,9 @@ BUILTIN: tuple[Builtin, ...] = (
         ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"),
     ),
     Builtin("GPSAdapter", "gps", "GPS", ("sensor_msgs/msg/NavSatFix",)),
+    Builtin(
+        "GPSFixAdapter", "gps_fix", "GPS", ("gps_msgs/msg/GPSFix", "gps_common/msg/GPSFix"), default=False
+    ),
     Builtin("GridCellsAdapter", "grid_cells", "GridCells", ("nav_msgs/msg/GridCells",)),
     Builtin("HeaderAdapter", "header", "Header", ("std_msgs/msg/Header",)),
     Builtin("ImageAdapter", "image", "Image", ("sensor_msgs/msg/Image",)),
@@ -131,6 +140,13 @@ BUILTIN: tuple[Builtin, ...] = (
     Builtin("JoyAdapter", "joy", "Joy", ("sensor_msgs/msg/Joy",)),
     Builtin("LaserScanAdapter", "laser_scan", "LaserScan", ("sensor_msgs/msg/LaserScan",)),
     Builtin("LidarAdapter", "lidar", "Lidar", ("sensor_msgs/msg/PointCloud2",), default=False),
+    Builtin(
+        "LivoxAdapter",
+        "livox",
+        "Lidar",
+        ("livox_ros_driver2/msg/CustomMsg", "livox_ros_driver/msg/CustomMsg"),
+        default=False,
+    ),
     Builtin("MagneticFieldAdapter", "magnetic_field", "Magnetometer", ("sensor_msgs/msg/MagneticField",)),
     Builtin("MapMetadataAdapter", "map_metadata", "MapMetadata", ("nav_msgs/msg/MapMetaData",)),
     Builtin(

@@ -13,12 +13,12 @@ import pyarrow as pa
 import pytest
 
 from mosaico_ingest.adapters.adapter import Adapted, AdapterSpec, Envelope
+from mosaico_ingest.adapters.builtin import BUILTIN
 from mosaico_ingest.bag.definition import Definition
 from mosaico_ingest.bag.shape import ros_shape
 from mosaico_ingest.bag.types import TypeResolver
 from mosaico_ingest.policies import Stores
 
-_SENTENCE = "std_msgs/Header header\nstring sentence\n"
 _OLD_TF = "geometry_msgs/TransformStamped[] transforms\n"
 _DATA = {
     "Bool": "bool", "Byte": "byte", "Char": "char", "Float32": "float32", "Float64": "float64",
@@ -26,7 +26,12 @@ _DATA = {
     "UInt8": "uint8", "UInt16": "uint16", "UInt32": "uint32", "UInt64": "uint64", "Time": "time", "Duration": "duration",
 }  # fmt: skip
 _NOT_IN_THE_DISTROS = {
-    "nmea_msgs/msg/Sentence": _SENTENCE,
+    **{
+        name: text.replace(b.ros_types[0].split("/")[0], name.split("/")[0])
+        for b in BUILTIN
+        if (text := b.mapping.model.definition)
+        for name in b.ros_types
+    },
     "tf/msg/tfMessage": _OLD_TF,
     **{f"example_interfaces/msg/{name}": f"{kind} data\n" for name, kind in _DATA.items()},
     **{f"std_msgs/msg/{name}": f"{_DATA[name]} data\n" for name in ("Time", "Duration")},

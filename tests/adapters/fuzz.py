@@ -44,7 +44,7 @@ def _field(definition: Definition, field: Field, random: Random) -> Any:
     count = field.size if field.container is Container.ARRAY else random.choice((0, 1, 2, 5))
     if field.type in {"uint8", "byte", "char"} and field.container is Container.SEQUENCE:
         return random.randbytes(count)
-    if field.container is Container.ARRAY and random.random() < 0.5:
+    if field.container is Container.ARRAY and field.type == "float64" and random.random() < 0.5:
         return [random.choice((0.0, -1.0)) if i == 0 else 0.0 for i in range(count)]
     return [_one(definition, field, random) for _ in range(count)]
 

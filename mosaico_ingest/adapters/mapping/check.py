@@ -63,8 +63,9 @@ CAST_TYPES = {
 """What `cast` makes, by its name in the language."""
 _NUMBERS = {"nan": math.nan, "inf": math.inf, "pi": math.pi}
 
-Report = Callable[[str, Place, "str | None"], None]
-"""Takes a mistake: what, where in the expression, what to do."""
+Report = Callable[[str, str, Place, "str | None"], None]
+"""Takes a mistake: its rule, what, where in the expression, what to do."""
+_UNKNOWN, _TYPE = "unknown-field", "type"
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,8 +138,8 @@ class Checker:
         """Return the typed expression, or None after a report."""
         return self._readers[type(node)](node)
 
-    def _fail(self, message: str, place: Place, hint: str | None = None) -> None:
-        self._report(message, place, hint)
+    def _fail(self, message: str, place: Place, hint: str | None = None, *, rule: str = _TYPE) -> None:
+        self._report(rule, message, place, hint)
 
     def _source(self, node: Node) -> str:
         return self._text[node.at[0] : node.at[1]]
@@ -155,7 +156,7 @@ class Checker:
         if value is not None:
             return constant(value, node.name)
         what = f"no field {node.name!r} in {spell(scope.kind)}"
-        self._fail(what, node.at, scope.describe(scope.kind, node.name))
+        self._fail(what, node.at, scope.describe(scope.kind, node.name), rule=_UNKNOWN)
         return None
 
     def _attribute(self, node: Attribute) -> Typed | None:
@@ -174,7 +175,7 @@ class Checker:
         if value is not None:
             return constant(value, self._source(node))
         what = f"no field {node.name!r} in `{of.text}` ({spell(element)})"
-        self._fail(what, node.name_at, self._scope.describe(element, node.name))
+        self._fail(what, node.name_at, self._scope.describe(element, node.name), rule=_UNKNOWN)
         return None
 
     def _listed(self, node: Each | Item) -> Typed | None:
@@ -270,9 +271,13 @@ class Checker:
 
     def _either(self, node: Call) -> Typed | None:
         """Take the first argument whose fields exist; where none does, the last says what is there."""
-        quiet = Checker(self._scope, _say_nothing, self._text)
-        found = (quiet.infer(argument) for argument in node.arguments[:-1])
-        return next((typed for typed in found if typed is not None), None) or self.infer(node.arguments[-1])
+        for argument in node.arguments[:-1]:
+            mistakes: list[str] = []
+            quiet = Checker(self._scope, lambda rule, *_: mistakes.append(rule), self._text)  # noqa: B023 - used at once
+            typed = quiet.infer(argument)
+            if typed is not None or set(mistakes) != {_UNKNOWN}:
+                return typed or self.infer(argument)
+        return self.infer(node.arguments[-1])
 
     def _call(self, node: Call) -> Typed | None:
         if node.name in {"cast", "either"}:
@@ -292,12 +297,10 @@ class Checker:
             blamed = node if unfit.argument is None else node.arguments[unfit.argument]
             self._fail(str(unfit), blamed.at, unfit.hint)
             return None
+        if pt.is_null(kind.type):
+            return constant(None, self._source(node))
         kind = replace(kind, axes=_deepest(arguments))
         return Apply(node.name, function, arguments, kind, self._source(node))
-
-
-def _say_nothing(message: str, place: Place, hint: str | None) -> None:
-    """Try an expression without a word."""
 
 
 def _folded(value: Typed, takes: Callable[[Kind], bool]) -> Typed:

@@ -109,8 +109,7 @@ class Desk:
     def checker(self, path: Path, text: str, scope: Scope) -> Checker:
         """Return what types expressions at a path."""
 
-        def report(message: str, place: Place, help_: str | None) -> None:
-            rule = "unknown-field" if message.startswith("no field") else "type"
+        def report(rule: str, message: str, place: Place, help_: str | None) -> None:
             self.report_inside(path, place, rule, message, help_)
 
         return Checker(scope, report, text)

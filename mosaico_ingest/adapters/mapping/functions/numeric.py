@@ -34,13 +34,13 @@ def _null_if(kind: Kind, value: Kind) -> Kind:
     return kind.element
 
 
-@function(ANY, gives=arrays.bool_())
+@function(ANY, gives=arrays.bool_(), sees_null=True)
 def is_null(x: Array) -> Array:
     """Whether there is no value; never null itself."""
     return pc.is_null(x)
 
 
-@function(ANY, gives=_joined, variadic=True)
+@function(ANY, gives=_joined, variadic=True, sees_null=True)
 def coalesce(a: Array, *others: Array) -> Array:
     """The first that is not null."""
     return pc.coalesce(*one_type(a, *others))

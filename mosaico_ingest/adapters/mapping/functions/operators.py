@@ -265,7 +265,7 @@ def _add_comparison(sign: str, run: Callable[[Any, Any], Any]) -> None:
         """Compare."""
         return run(*comparable(left, right))
 
-    function(ANY, ANY, gives=_ordered, name=sign, scalars=True)(compare)
+    function(ANY, ANY, gives=_ordered, name=sign, scalars=True, sees_null=True)(compare)
 
 
 for _sign, _run in (
@@ -279,13 +279,13 @@ for _sign, _run in (
     _add_comparison(_sign, _run)
 
 
-@function(BOOLEAN, BOOLEAN, gives=arrays.bool_(), name="and")
+@function(BOOLEAN, BOOLEAN, gives=arrays.bool_(), name="and", sees_null=True)
 def and_(left: Array, right: Array) -> Array:
     """Both."""
     return pc.and_kleene(left, right)
 
 
-@function(BOOLEAN, BOOLEAN, gives=arrays.bool_(), name="or")
+@function(BOOLEAN, BOOLEAN, gives=arrays.bool_(), name="or", sees_null=True)
 def or_(left: Array, right: Array) -> Array:
     """One or both."""
     return pc.or_kleene(left, right)

@@ -78,6 +78,8 @@ class Function:
     variadic: bool = False
     scalars: bool = False
     """Whether literals may come as Arrow scalars; otherwise all arguments are arrays."""
+    sees_null: bool = False
+    """Whether it can give something for null; otherwise a null argument makes the result null."""
     refuses: bool = False
     """Whether `apply` takes a `Refuse` first."""
     parameters: tuple[str, ...] = ()
@@ -117,6 +119,7 @@ def function(
     optional: int = 0,
     variadic: bool = False,
     scalars: bool = False,
+    sees_null: bool = False,
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Add a function to the language; its docstring's first line is its documentation.
 
@@ -136,6 +139,7 @@ def function(
             optional=optional,
             variadic=variadic,
             scalars=scalars,
+            sees_null=sees_null,
             refuses=refuses,
             parameters=parameters[refuses:],
             summary=(apply.__doc__ or "").strip().split("\n", maxsplit=1)[0],
@@ -214,7 +218,7 @@ def list_of(words: str, accepts: Callable[[DataType], bool]) -> Take:
 
 
 def check(called: Function, kinds: list[Kind]) -> Kind:
-    """Return the kind a call gives, for arguments without open lists.
+    """Return the kind a call gives, for arguments without open lists; null where one is and that decides it.
 
     Raises:
         Unfit: An argument is none that the function takes.
@@ -223,6 +227,8 @@ def check(called: Function, kinds: list[Kind]) -> Kind:
         take = called.take(position)
         if not take.takes(kind):
             raise Unfit(f"{called.name} takes {take.words} here, not {spell(kind)}", argument=position)
+    if not called.sees_null and any(pt.is_null(kind.type) for kind in kinds):
+        return Kind(arrays.null())
     return called.gives(*kinds)
 
 
