@@ -7,12 +7,12 @@ import ssl
 from dataclasses import dataclass, field
 from typing import NoReturn
 
-from mosaico_ingest.errors import SinkError, SinkUnavailable
+from mosaico_ingest.errors import IngestError, SinkError, SinkUnavailable
 from mosaico_ingest.wire.actions import Permission
 from mosaico_ingest.wire.conditions import Condition, condition_of, text_of
 from mosaico_ingest.wire.keys import key_problem
 
-__all__ = ["Address", "Refused", "check_tls", "reraise"]
+__all__ = ["Address", "Refused", "add_hint", "check_tls", "reraise"]
 
 _PATIENCE_S = 3.0
 _WRONG_NAME = frozenset({62, 64})
@@ -44,6 +44,11 @@ class Address:
     def __str__(self) -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{'grpc+tls' if self.tls else 'grpc'}://{host}:{self.port}"
+
+
+def add_hint(error: IngestError, hint: str) -> None:
+    """Let an error that is on its way say one thing more."""
+    error.hint = f"{error.hint}; {hint}" if error.hint else hint
 
 
 def check_tls(address: Address) -> None:

@@ -12,7 +12,7 @@ from mosaico_ingest.config import ServerTarget
 from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.platform.client import PlatformClient, Uploaded, connect
-from mosaico_ingest.platform.faults import Refused
+from mosaico_ingest.platform.faults import Refused, add_hint
 from mosaico_ingest.platform.upload import Memory, Upload
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.sink import StoredTopic
@@ -23,6 +23,7 @@ from mosaico_ingest.wire.conditions import Condition
 
 __all__ = ["PlatformSession"]
 
+_OLD_IS_GONE = "the old sequence is deleted"
 _FILL = 0.9
 """How full a message may be; the rest is left to what Flight and gRPC add."""
 
@@ -124,7 +125,7 @@ class PlatformSession:
             upload.abandon()
         remarks = [self._remove()]
         if self._replaced:
-            remarks.append("the old sequence is deleted")
+            remarks.append(_OLD_IS_GONE)
         return "; ".join(remark for remark in remarks if remark) or None
 
     def _remove(self) -> str | None:
@@ -146,9 +147,11 @@ class PlatformSession:
             self._surely(
                 actions.SEQUENCE_CREATE, question, lambda: self._client.find(self._sequence) is not None
             )
-        except Refused as refusal:
-            if refusal.condition is Condition.EXISTS:
-                raise _taken(self._sequence) from refusal
+        except SinkError as error:
+            if isinstance(error, Refused) and error.condition is Condition.EXISTS:
+                raise _taken(self._sequence) from error
+            if self._replaced:
+                add_hint(error, _OLD_IS_GONE)
             raise
 
     def _open_session(self) -> bodies.SessionCreated:

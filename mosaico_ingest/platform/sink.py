@@ -11,6 +11,7 @@ from mosaico_ingest import wire
 from mosaico_ingest.config import ServerTarget
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.platform.client import connect
+from mosaico_ingest.platform.faults import add_hint
 from mosaico_ingest.platform.session import PlatformSession
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.sink import Session
@@ -48,5 +49,5 @@ class PlatformSink:
             except BaseException as error:
                 left = session.discard()
                 if left and isinstance(error, IngestError):
-                    error.hint = f"{error.hint}; {left}" if error.hint else left
+                    add_hint(error, left)
                 raise

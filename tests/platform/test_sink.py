@@ -185,6 +185,13 @@ def test_replace_deletes_the_old_sequence(server: Mosaicod) -> None:
         raise SinkError("enough")
 
 
+def test_a_replacement_that_cannot_begin_says_that_the_old_is_gone(server: Mosaicod) -> None:
+    write(server, 1)
+    server.faults.refuse["sequence_create"] = [pa.ArrowInvalid("odd name")]
+    with pytest.raises(SinkError, match="sequence_create is refused: odd name — the old sequence is deleted"):
+        write(server, 2, if_exists=IfExists.REPLACE)
+
+
 def test_a_name_taken_meanwhile_is_taken(server: Mosaicod) -> None:
     server.faults.refuse["sequence_create"] = [exists("sequence seq")]
     with pytest.raises(SequenceExists, match="seq: the sequence exists"):
