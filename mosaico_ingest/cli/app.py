@@ -21,6 +21,7 @@ COMMANDS: tuple[tuple[str, Callable[..., Any]], ...] = (
     ("run", run.run),
     ("bag", bag.bag),
     ("inspect", inspect.inspect),
+    ("schema", schema.schema),
     ("lint", lint.lint),
     ("schema", schema.schema),
 )

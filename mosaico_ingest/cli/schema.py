@@ -1,8 +1,10 @@
-"""This file is `ingest schema`: the JSON Schemas of what the tool reads and writes."""
+"""This file is `ingest schema`: the JSON Schemas of the files this tool reads and writes."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,61 +13,62 @@ import typer
 __all__ = ["schema"]
 
 
+class Document(str, Enum):
+    """The files that have a schema."""
+
+    JOB = "job"
+    ADAPTER = "adapter"
+    REPORT = "report"
+
+
 def schema(
-    name: Annotated[
-        str | None, typer.Argument(metavar="NAME", help="job, adapter or report; without it, the names.")
-    ] = None,
+    document: Annotated[Document | None, typer.Argument(help="Which file's schema to print.")] = None,
     write: Annotated[
-        Path | None, typer.Option("--write", metavar="DIR", help="Write every schema into a folder.")
+        Path | None,
+        typer.Option("--write", metavar="DIR", help="Write NAME.schema.json into DIR, for editors."),
     ] = None,
     check: Annotated[
         Path | None,
-        typer.Option("--check", metavar="DIR", help="Fail if a schema in a folder is not current."),
+        typer.Option("--check", metavar="DIR", help="Fail where a file in DIR is not up to date."),
     ] = None,
 ) -> None:
-    """Print the JSON Schema (draft 2020-12) of job manifests, adapter files or reports."""
-    texts = {known: _text(make()) for known, make in _schemas().items()}
-    if write is not None:
-        write.mkdir(parents=True, exist_ok=True)
-        for known, text in texts.items():
-            (write / _file_name(known)).write_text(text, encoding="utf-8")
-    elif check is not None:
-        _check(check, texts)
-    elif name is None:
-        typer.echo("\n".join(texts))
-    elif name in texts:
-        typer.echo(texts[name], nl=False)
-    else:
-        raise typer.BadParameter(f"{name!r} is none of {', '.join(texts)}", param_hint="NAME")
+    """Print, write or check the JSON Schemas (draft 2020-12); without a name, of all of them."""
+    wanted = [document] if document else list(Document)
+    if write is None and check is None and document is None:
+        raise typer.BadParameter("name one of " + ", ".join(one.value for one in Document))
+    stale = 0
+    for one in wanted:
+        text = _text(one)
+        if write is not None:
+            write.mkdir(parents=True, exist_ok=True)
+            _file(write, one).write_text(text, encoding="utf-8")
+        elif check is not None:
+            stale += _is_stale(_file(check, one), text)
+        else:
+            typer.echo(text, nl=False)
+    if stale:
+        raise typer.Exit(1)
 
 
-def _schemas() -> dict[str, Callable[[], dict[str, Any]]]:
+def _text(document: Document) -> str:
     from mosaico_ingest.adapters.mapping.schema import adapter_schema
     from mosaico_ingest.manifest.schema import job_schema
     from mosaico_ingest.report.model import report_schema
 
-    return {"job": job_schema, "adapter": adapter_schema, "report": report_schema}
+    makers: dict[Document, Callable[[], dict[str, Any]]] = {
+        Document.JOB: job_schema,
+        Document.ADAPTER: adapter_schema,
+        Document.REPORT: report_schema,
+    }
+    return json.dumps(makers[document](), indent=2, ensure_ascii=False) + "\n"
 
 
-def _check(folder: Path, texts: dict[str, str]) -> None:
-    stale = [known for known, text in texts.items() if _committed(folder / _file_name(known)) != text]
-    if stale:
-        names = ", ".join(_file_name(known) for known in stale)
-        typer.echo(
-            f"error: {folder} is not current: {names} — run `ingest schema --write {folder}`", err=True
-        )
-        raise typer.Exit(1)
+def _file(folder: Path, document: Document) -> Path:
+    return folder / f"{document.value}.schema.json"
 
 
-def _committed(path: Path) -> str | None:
-    return path.read_text(encoding="utf-8") if path.is_file() else None
-
-
-def _file_name(name: str) -> str:
-    return f"{name}.schema.json"
-
-
-def _text(schema: dict[str, Any]) -> str:
-    import json
-
-    return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
+def _is_stale(path: Path, text: str) -> bool:
+    if path.exists() and path.read_text(encoding="utf-8") == text:
+        return False
+    typer.echo(f"{path} is not up to date — run `ingest schema --write {path.parent}`", err=True)
+    return True

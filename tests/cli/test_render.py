@@ -36,6 +36,7 @@ def test_a_secret_is_not_drawn() -> None:
     text = drawn("target: {hst: h, api_key: s3cret}", Span("j", 1, 10, 1, 13))
     assert "s3cret" not in text
     assert "api_key: ******}" in text
+    assert "abcd" not in drawn(f"note: msco_{'abcd' * 8}_12345678", Span("j", 1, 1, 1, 5))
 
 
 def test_a_finding_without_a_place_is_one_line() -> None:
