@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from mosaico_ingest.decode.places import Int64s
+from mosaico_ingest.decode.places import Int64s, expand
 
 __all__ = ["Array", "array_of", "cells", "offsets_of", "spans"]
 
@@ -18,6 +18,8 @@ Bytes: TypeAlias = NDArray[np.uint8]
 
 _LARGE = 4096
 """Bytes from which on a copy of its own is faster than taking the value among others."""
+_FAR = 1 << 28
+"""Bytes from the first to the last value from which on taking, which reserves half as many, could be refused."""
 
 
 def cells(data: Bytes, at: Int64s, size: int) -> Bytes:
@@ -40,6 +42,8 @@ def spans(data: Bytes, at: Int64s, sizes: Int64s) -> Bytes:
     total = int(sizes.sum())
     if total > _LARGE * len(at):
         return _copied(data, at, ends, total)
+    if int(ends.max() - at.min()) > _FAR:
+        return data[expand(at, sizes)]
     return _taken(data, at, ends)[:total]
 
 

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mosaico_ingest.decode import gather
 from mosaico_ingest.decode.gather import cells, spans
 
 DATA = np.random.default_rng(1).integers(0, 256, 60_000).astype(np.uint8)
@@ -20,6 +21,15 @@ def test_spans_are_the_bytes_of_each_span_in_order(data: st.DataObject, largest:
     pairs = data.draw(st.lists(st.tuples(st.integers(0, 40_000), st.integers(0, largest)), max_size=20))
     at, sizes = [start for start, _ in pairs], [size for _, size in pairs]
     found = spans(DATA, np.array(at, np.int64), np.array(sizes, np.int64))
+    assert found.tobytes() == slow_spans(at, sizes)
+
+
+@given(pairs=st.lists(st.tuples(st.integers(0, 40_000), st.integers(0, 300)), max_size=20))
+def test_spans_far_apart_are_found_without_reserving_what_lies_between(pairs: list[tuple[int, int]]) -> None:
+    at, sizes = [start for start, _ in pairs], [size for _, size in pairs]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gather, "_FAR", 100)
+        found = spans(DATA, np.array(at, np.int64), np.array(sizes, np.int64))
     assert found.tobytes() == slow_spans(at, sizes)
 
 
