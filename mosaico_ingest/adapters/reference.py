@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import re
 import sys
 import traceback
 from collections.abc import Generator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from difflib import get_close_matches
 from hashlib import sha1
 from pathlib import Path
@@ -15,7 +17,7 @@ from types import ModuleType
 from typing import cast
 
 from mosaico_ingest.adapters.adapter import AdapterSpec
-from mosaico_ingest.adapters.builtin import BY_NAME, find_builtin
+from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.adapters.mapping.load import load_adapter
 from mosaico_ingest.adapters.python_adapter import PythonAdapterSpec, is_adapter_class
 from mosaico_ingest.adapters.unmodeled import UnmodeledSpec
@@ -59,7 +61,7 @@ def load_adapter_reference(ref: str, base_dir: Path) -> AdapterSpec:
     if ref == UnmodeledSpec().name:
         return UnmodeledSpec()
     if Path(ref).suffix in _MAPPING_SUFFIXES:
-        return load_adapter(base_dir / ref, adapters=find_builtin)
+        return _load_mapping(base_dir / ref)
     place, colon, qualname = ref.rpartition(":")
     if not colon or not place or not qualname:
         near = get_close_matches(ref, BY_NAME, n=1, cutoff=0.6)
@@ -74,6 +76,25 @@ def load_adapter_reference(ref: str, base_dir: Path) -> AdapterSpec:
     if isinstance(spec, PythonAdapterSpec):
         return PythonAdapterSpec(spec.adapter, origin=(load_adapter_reference, (ref, base_dir)))
     return spec
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """Finds the adapters a mapping may use: the built-in ones, and those of the files beside it."""
+
+    folder: Path
+
+    def __call__(self, name: str) -> AdapterSpec | None:
+        if name in BY_NAME:
+            return BY_NAME[name]
+        said = re.compile(rf"^adapter:\s*['\"]?{re.escape(name)}['\"]?\s*(#|$)", re.MULTILINE)
+        files = sorted(path for path in self.folder.iterdir() if path.suffix in _MAPPING_SUFFIXES)
+        found = next((path for path in files if said.search(path.read_text("utf-8", errors="replace"))), None)
+        return None if found is None else _load_mapping(found)
+
+
+def _load_mapping(path: Path) -> AdapterSpec:
+    return load_adapter(path, adapters=_Known(path.parent))
 
 
 def _attribute(module: ModuleType, qualname: str, ref: str) -> object:

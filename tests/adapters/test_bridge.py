@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import sys
 from collections.abc import Callable, Iterator
 from importlib.metadata import EntryPoint
@@ -190,6 +191,27 @@ def test_ten_lines_of_yaml_adapt_a_type_to_an_ontology_of_ones_own(
     rows = pa.array([{"data": 3}], ros_shape(definition))
     adapted = bound.adapt(rows, Envelope("/ticks", definition.root, np.zeros(1, np.int64)))
     assert (bound.ontology.tag, adapted.rows.to_pylist()) == ("BridgeTicks", [{"ticks": 3}])
+
+
+def test_a_mapping_uses_another_one_of_the_same_folder(
+    tmp_path: Path, define: Callable[..., Definition]
+) -> None:
+    (tmp_path / "points.yaml").write_text(
+        "version: 1\nadapter: FlatPointAdapter  # without height\nros_type: geometry_msgs/msg/Point32\n"
+        "ontology: Point3d\nfields: {x: x, y: y, z: 0.0}\n"
+    )
+    (tmp_path / "outline.yaml").write_text(
+        "version: 1\nadapter: OutlineAdapter\nros_type: geometry_msgs/msg/Polygon\nontology: Polygon\n"
+        "fields: {points: {use: FlatPointAdapter, of: 'points[]'}}\n"
+    )
+    found = ROSBridge(loaded=["outline.yaml"], base_dir=tmp_path).resolve("/p", "geometry_msgs/msg/Polygon")
+    spec = pickle.loads(pickle.dumps(found.spec))  # noqa: S301 - what was just pickled
+    definition = define("geometry_msgs/msg/Polygon")
+    rows = pa.array([{"points": [{"x": 1.0, "y": 2.0, "z": 3.0}]}], ros_shape(definition))
+    adapted = spec.bind(definition, rows.type).adapt(
+        rows, Envelope("/p", definition.root, np.zeros(1, np.int64))
+    )
+    assert [(p["x"], p["z"]) for p in adapted.rows[0]["points"].as_py()] == [(1.0, 0.0)]
 
 
 def test_the_image_setting_wraps_whatever_adapter_is_chosen(define: Callable[..., Definition]) -> None:
