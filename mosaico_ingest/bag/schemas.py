@@ -11,7 +11,7 @@ from rosbags.interfaces.typing import FieldDesc, Typesdict
 from rosbags.typesys import TypesysError, get_types_from_idl
 
 from mosaico_ingest.bag.definition import Constant, Container, Field, MessageType
-from mosaico_ingest.bag.msgtext import Section, parse_msg, sections
+from mosaico_ingest.bag.msgtext import SEPARATOR, Section, parse_msg, sections
 from mosaico_ingest.bag.names import normalize_msgtype
 from mosaico_ingest.errors import BagError
 
@@ -45,10 +45,12 @@ def read_types(text: str, root: str, *, where: str | None = None) -> Mapping[str
     Raises:
         BagError: A part cannot be read; names `where` (or the type) and the line.
     """
-    types = dict[str, MessageType]()
-    for section in sections(text):
-        for message in _read_section(section, root, where):
+    types, parts = dict[str, MessageType](), list(sections(text))
+    for part in parts:
+        for message in _read_section(part, root, where):
             types.setdefault(message.name, message)
+    if all(part.kind == "MSG" for part in parts) and not text.partition(SEPARATOR)[0].strip():
+        types.setdefault(root, MessageType(root, ()))  # nothing before the other parts: it has no fields
     return types
 
 

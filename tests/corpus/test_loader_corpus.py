@@ -81,3 +81,16 @@ def test_every_message_rosbags_can_read_is_read_the_same(corpus: Path) -> None:
         left = Counter(topic for (_, topic), rest in theirs.items() if rest)
         assert not left, f"{path}: not read: {left}"
     assert compared > 40_000
+
+
+def test_types_given_with_the_job_open_a_recording_that_has_none(corpus: Path) -> None:
+    types = {
+        "turtlesim/msg/Color": "uint8 r\nuint8 g\nuint8 b",
+        "turtlesim/msg/Pose": "".join(
+            f"float32 {name}\n" for name in ("x", "y", "theta", "linear_velocity", "angular_velocity")
+        ),
+    }
+    with ROSLoader(
+        corpus / "roboto-ai__robologs-ros-actions/input/tiny.db3", custom_types=types, error_policy="raise"
+    ) as loader:
+        assert sum(1 for _ in loader) == loader.msg_count() == 2352
