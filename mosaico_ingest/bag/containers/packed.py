@@ -18,13 +18,13 @@ _MAGIC = np.frombuffer(ZSTD_MAGIC, "<u4")[0]
 def inflate_messages(slab: Slab, holes: list[Hole]) -> Slab:
     """Return CDR messages as they were before compression; no CDR message begins as a zstd frame does.
 
-    Messages that are not compressed stay as they are; damaged ones are noted as lost.
+    Whether any is, the first and the last tell; others that are not stay as they are, damaged ones are noted as lost.
     """
+    if not (_is_packed(slab, 0) or _is_packed(slab, -1)):
+        return slab
     long_enough = slab.lengths >= len(ZSTD_MAGIC)
     heads = stretches(slab.data, slab.starts[long_enough], len(ZSTD_MAGIC)).view("<u4").reshape(-1)
     packed = np.flatnonzero(long_enough)[heads == _MAGIC]
-    if not len(packed):
-        return slab
     is_packed = np.zeros(len(slab), np.bool_)
     is_packed[packed] = True
     kept: list[int] = []
@@ -42,3 +42,8 @@ def inflate_messages(slab: Slab, holes: list[Hole]) -> Slab:
     lengths = np.array([len(payload) for payload in payloads], np.int64)
     data = np.frombuffer(b"".join(payloads), np.uint8)
     return Slab(slab.key, rows.log_times, data, np.cumsum(lengths) - lengths, lengths, rows.offsets)
+
+
+def _is_packed(slab: Slab, row: int) -> bool:
+    start = int(slab.starts[row])
+    return slab.data[start : start + min(int(slab.lengths[row]), len(ZSTD_MAGIC))].tobytes() == ZSTD_MAGIC

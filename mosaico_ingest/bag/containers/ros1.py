@@ -73,19 +73,17 @@ class Ros1Part:
         self._source.close()
 
     def _load(self, piece: Piece, want: Want) -> Loaded:
-        raw = self._source.read(piece.offset, piece.stop - piece.offset)
         loaded = Loaded([], [])
-        if not piece.is_chunk:
-            _scan(raw, piece, want, loaded)
-            return loaded
         try:
-            data, after = _chunk(raw, piece, loaded)
+            raw = self._source.read(piece.offset, piece.stop - piece.offset)
+            data, after = _chunk(raw, piece, loaded) if piece.is_chunk else (raw, len(raw))
         except BagError as err:
             for key in piece.counts.keys() & want.keys:
                 reason = f"broken chunk: {err.what}"
                 loaded.holes.append(Hole(piece.offset, reason, key=key, count=piece.counts[key]))
             return loaded
-        if piece.is_cut or not _by_index(data, raw[after:], piece, want, loaded):
+        is_indexed = piece.is_chunk and not piece.is_cut
+        if not is_indexed or not _by_index(data, raw[after:], piece, want, loaded):
             _scan(data, piece, want, loaded)
         return loaded
 
