@@ -16,7 +16,8 @@ __all__ = ["render_findings", "texts_of"]
 
 _STYLES = {Severity.ERROR: "bold red", Severity.WARNING: "bold yellow", Severity.INFO: "bold cyan"}
 _SECRET = re.compile(
-    r"((?:api_?key|password|token|secret)[\"']?\s*[:=]\s*[\"']?)([^\s\"'$,}][^\s\"',}]*)", re.IGNORECASE
+    r"((?:api_?key|password|token|secret)[\"']?\s*[:=]\s*[\"']?|(?=msco_))([^\s\"'$,}][^\s\"',}]*)",
+    re.IGNORECASE,
 )
 _UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 _WIDTH = 160

@@ -54,14 +54,14 @@ class Rule:
 
     def examples(self, heading: str) -> list[str]:
         r"""Return the blocks of the page under `Bad:` or `Good:`; a `\t` in them is a tab."""
-        blocks: list[str] = []
-        block: list[str] | None = None
-        for line in (self.page or "").strip("\n").replace("\\t", "\t").splitlines():
+        blocks: list[list[str]] = []
+        inside = False
+        for line in (self.page or "").replace("\\t", "\t").splitlines():
             if line == f"{heading}:":
-                block = []
-            elif block is not None and (not line or line.startswith("    ")):
-                block.append(line)
-            elif block is not None:
-                blocks.append(dedent("\n".join(block)).strip("\n") + "\n")
-                block = None
-        return blocks if block is None else [*blocks, dedent("\n".join(block)).strip("\n") + "\n"]
+                blocks.append([])
+                inside = True
+            elif inside and (not line or line.startswith("    ")):
+                blocks[-1].append(line)
+            else:
+                inside = False
+        return [dedent("\n".join(block)).strip("\n") + "\n" for block in blocks]

@@ -48,7 +48,13 @@ class _Problem:
 
     @property
     def span(self) -> Span:
+        """The value's place."""
         return self.source.span(self.path)
+
+    @property
+    def secret(self) -> bool:
+        """Whether the value must not be shown."""
+        return _node_at(self.schema, self.path).get("writeOnly", False)
 
     def finding(
         self, rule: str, message: str, remedy: str | None, span: Span | None = None, fix: Edit | None = None
@@ -193,6 +199,8 @@ def _wrong_type(problem: _Problem, expected: str) -> Finding:
     if value is None:
         span = problem.source.key_span(problem.path)
         return problem.finding("empty-value", f"{name} is empty", "give it a value, or remove the key", span)
+    if problem.secret:
+        return problem.finding("wrong-type", f"{name} must be {expected}", "quote it")
     message = f"{name} must be {expected}, not {_kind(value)}"
     written = _written(problem)
     remedy = fix = None

@@ -43,11 +43,14 @@ def _or_variable(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str,
 
 
 def tidy(node: dict[str, Any]) -> dict[str, Any]:
-    """Leave out the titles, which repeat the keys, and the null that stands for a key left out."""
+    """Leave out titles, which repeat the keys, nulls for keys left out, and the defaults of whole sections."""
     branches = [branch for branch in node.get("anyOf", ()) if branch != {"type": "null"}]
     if len(branches) == 1:
         node = {**{key: value for key, value in node.items() if key != "anyOf"}, **branches[0]}
-    kept = {key: value for key, value in node.items() if key != "title" and (key, value) != ("default", None)}
+    noise = {"title", "default"} if "$ref" in node and isinstance(node.get("default"), dict) else {"title"}
+    kept = {
+        key: value for key, value in node.items() if key not in noise and (key, value) != ("default", None)
+    }
     return {key: _tidy_member(key, value) for key, value in kept.items()}
 
 

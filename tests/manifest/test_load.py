@@ -173,6 +173,15 @@ def test_a_message_never_shows_what_a_variable_holds() -> None:
     assert all("s3cret" not in str(finding) for finding in findings)
 
 
+def test_a_key_of_the_wrong_type_is_not_shown() -> None:
+    _, findings = check_manifest(
+        load_source("bag: {path: x}\ntarget: {host: h, api_key: 123456}\n", file="j"), env={}
+    )
+    assert [str(finding) for finding in findings] == [
+        "j:2:28: error[wrong-type] target.api_key must be text — quote it"
+    ]
+
+
 def test_a_key_is_not_shown_by_the_model() -> None:
     text = "bag: {path: x}\ntarget: {host: h, api_key: s3cret}\n"
     manifest, _ = check_manifest(load_source(text, file="j"), env={})

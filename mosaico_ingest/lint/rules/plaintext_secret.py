@@ -6,6 +6,10 @@ Bad:
     bag: {path: data/run.mcap}
     target: {host: localhost, api_key: not_a_real_key}
 
+Bad:
+    bag: {path: data/run.mcap}
+    target: {host: localhost, api_key: "${MOSAICO_API_KEY:-not_a_real_key}"}
+
 Good:
     bag: {path: data/run.mcap}
     target: {host: localhost, api_key: "${MOSAICO_API_KEY:-}"}
@@ -23,15 +27,18 @@ from mosaico_ingest.lint.rule import Problem, Rule
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem if the key is no variable, and for every API key that stands elsewhere."""
+    """Yield a problem if the key is no variable or has a default, and for every API key that stands elsewhere."""
     remedy = "write ${MOSAICO_API_KEY} and set it in the environment"
     for path in values_below(job.source.value, ()):
         value = job.source.at(path)
-        is_key = path == ("target", "api_key") and isinstance(value, str) and "${" not in value
-        if is_key or (isinstance(value, str) and _KEY.search(value)):
+        if not isinstance(value, str):
+            continue
+        is_key = path == ("target", "api_key") and ("${" not in value or _DEFAULT.search(value))
+        if is_key or _KEY.search(value):
             yield Problem("an API key can be read here", job.source.span(path), remedy)
 
 
+_DEFAULT = re.compile(r"\$\{\w+:-[^}]")
 _KEY = re.compile(r"msco_[a-z0-9]{32}_[0-9a-f]{8}")
 
 
