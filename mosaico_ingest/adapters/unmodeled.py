@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -15,6 +15,8 @@ from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 __all__ = ["UnmodeledSpec"]
 
 _ENVELOPE_COLUMN = "timestamp_ns"
+_ONE_MEMBER = pa.struct([("structure_needs_at_least_one_member", pa.uint8())])
+"""What a nested message without fields becomes, as ROS 2 itself spells it: Parquet has no struct without fields."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,14 +32,14 @@ class UnmodeledSpec:
         """Take the ROS shape for the ontology's columns; two types of one short name differ by fingerprint."""
         tag = definition.root.rsplit("/", 1)[-1]
         names = _free_of_the_envelope(shape)
-        struct = pa.struct([field.with_name(names[field.name]) for field in shape])
+        struct = pa.struct([pa.field(names[field.name], _storable(field.type)) for field in shape])
         renamed = {new: old for old, new in names.items() if new != old}
         return UnmodeledAdapter(OntologyType(tag, struct, self.serialization_format), renamed)
 
 
 @dataclass(frozen=True, slots=True)
 class UnmodeledAdapter:
-    """Hands the rows on without copying; at most a field gets another name."""
+    """Hands the rows on without copying; at most fields get another name, or a member where they have none."""
 
     ontology: OntologyType
     renamed: dict[str, str]
@@ -45,8 +47,11 @@ class UnmodeledAdapter:
 
     def adapt(self, rows: pa.StructArray, envelope: Envelope) -> Adapted:  # noqa: ARG002 - the seam's signature
         """Return the same columns."""
-        if self.renamed:
-            rows = pa.StructArray.from_arrays(rows.flatten(), fields=list(self.ontology.struct))
+        columns = list(self.ontology.struct)
+        if any(field.type != column.type for field, column in zip(rows.type, columns, strict=True)):
+            rows = _with_members(rows, self.ontology.struct)
+        elif self.renamed:
+            rows = pa.StructArray.from_arrays(rows.flatten(), fields=columns)
         return Adapted(rows, np.arange(len(rows), dtype=np.int64), ())
 
     def topic_metadata(self, first_row: pa.StructScalar | None) -> dict[str, Any]:  # noqa: ARG002 - as above
@@ -63,3 +68,22 @@ def _free_of_the_envelope(shape: pa.StructType) -> dict[str, str]:
             free += "_"
         names[_ENVELOPE_COLUMN] = free
     return names
+
+
+def _storable(kind: Any) -> pa.DataType:  # noqa: ANN401 - the stubs hide what a nested type is made of
+    """Return the type with a member in every struct that has none."""
+    if pa.types.is_struct(kind):
+        members = [field.with_type(_storable(field.type)) for field in kind]
+        return pa.struct(members) if members else _ONE_MEMBER
+    if pa.types.is_fixed_size_list(kind):
+        return pa.list_(kind.value_field.with_type(_storable(kind.value_type)), kind.list_size)
+    if pa.types.is_list(kind):
+        return pa.list_(kind.value_field.with_type(_storable(kind.value_type)))
+    return kind
+
+
+def _with_members(rows: Any, struct: pa.StructType) -> pa.StructArray:  # noqa: ANN401 - as above
+    """Rebuild rows with the members they lack, null; through Python, since hardly a type has such fields."""
+    names = [field.name for field in struct]
+    renamed = [dict(zip(names, row.values(), strict=True)) for row in rows.to_pylist()]
+    return cast("pa.StructArray", pa.array(renamed, type=struct))

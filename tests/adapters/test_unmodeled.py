@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from mosaico_ingest.adapters.adapter import Adapted
 from mosaico_ingest.adapters.metadata import ros_metadata
@@ -54,6 +55,25 @@ def test_a_field_called_like_the_envelopes_column_gets_an_underscore(adapt: Call
 def test_a_message_without_fields_still_counts(adapt: Callable[..., Adapted]) -> None:
     adapted = adapt(UnmodeledSpec(), _defined(""), [{}, {}])
     assert len(adapted.rows) == len(adapted.index) == 2
+
+
+def test_a_nested_message_without_fields_gets_the_member_ros_2_gives_it(
+    adapt: Callable[..., Adapted],
+) -> None:
+    nothing = "=" * 80 + "\nMSG: pkg/Nothing\nuint8 A=1\n"
+    definition = _defined(f"Nothing one\nNothing[2] two\nNothing[] many\nint64 timestamp_ns\n{nothing}")
+    messages: list[dict[str, Any]] = [
+        {"one": {}, "two": [{}, {}], "many": [{}, {}, {}], "timestamp_ns": 4},
+        {"one": {}, "two": [{}, {}], "many": [], "timestamp_ns": 5},
+    ]
+    rows = adapt(UnmodeledSpec(), definition, messages).rows
+    member = {"structure_needs_at_least_one_member": None}
+    assert rows.to_pylist() == [
+        {"one": member, "two": [member] * 2, "many": [member] * 3, "timestamp_ns_": 4},
+        {"one": member, "two": [member] * 2, "many": [], "timestamp_ns_": 5},
+    ]
+    table = pa.Table.from_batches([pa.RecordBatch.from_struct_array(rows)])
+    pq.write_table(table, pa.BufferOutputStream())
 
 
 def test_the_spec_is_picklable_and_carries_the_layout() -> None:
