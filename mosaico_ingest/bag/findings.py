@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 
-from mosaico_ingest.bag.batch import Channel, Encoding
+from mosaico_ingest.bag.batch import Channel, Encoding, Loss
 from mosaico_ingest.bag.containers.part import Part
 from mosaico_ingest.bag.metadata import Metadata, TopicHint
 from mosaico_ingest.diagnostics import Finding, Severity
@@ -14,18 +14,22 @@ __all__ = ["compare"]
 
 
 def compare(
-    parts: Sequence[Part], channels: Sequence[Channel], metadata: Metadata | None
+    parts: Sequence[Part], channels: Sequence[Channel], losses: Sequence[Loss], metadata: Metadata | None
 ) -> tuple[Finding, ...]:
     """Return what a reader of this recording should know, most of it harmless."""
-    return (*_parts(parts), *_channels(channels), *(_metadata(channels, metadata) if metadata else ()))
+    hints = _metadata(channels, metadata) if metadata else ()
+    return (*_parts(parts), *_losses(losses), *_channels(channels), *hints)
 
 
 def _parts(parts: Sequence[Part]) -> Iterator[Finding]:
     for part in parts:
         for note in part.notes:
             yield Finding("container-note", Severity.INFO, f"{part.path}: {note}")
-        for hole in part.holes:
-            yield Finding("damaged", Severity.WARNING, f"{part.path}: at {hole.offset}: {hole.reason}")
+
+
+def _losses(losses: Sequence[Loss]) -> Iterator[Finding]:
+    for loss in losses:
+        yield Finding("damaged", Severity.WARNING, f"{loss.file}: at {loss.offset}: {loss.reason}")
 
 
 def _channels(channels: Sequence[Channel]) -> Iterator[Finding]:
@@ -51,8 +55,9 @@ def _metadata(channels: Sequence[Channel], metadata: Metadata) -> Iterator[Findi
     for hint in metadata.topics:
         for difference in _differences(hint, stored.pop(hint.topic, [])):
             yield _differs(metadata, f"{hint.topic}: {difference}")
-    for topic in stored:
-        yield _differs(metadata, f"{topic} is not in the metadata")
+    for topic, found in stored.items():
+        if any(channel.count != 0 for channel in found):
+            yield _differs(metadata, f"{topic} is not in the metadata")
 
 
 def _differences(hint: TopicHint, channels: Sequence[Channel]) -> Iterator[str]:

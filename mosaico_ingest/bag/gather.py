@@ -96,8 +96,8 @@ class Gather:
     def _batches(self, channel: Channel, slab: Slab) -> Iterator[RawBatch]:
         """Cut into batches of the allowed size, as equal as can be."""
         payload_bytes = int(slab.lengths.sum())
-        parts = min(len(slab), max(-(-len(slab) // self._rows), -(-payload_bytes // BATCH_BYTES)), 1 << 16)
-        edges = np.linspace(0, len(slab), max(parts, 1) + 1).astype(np.int64).tolist()
+        parts = min(len(slab), max(-(-len(slab) // self._rows), -(-payload_bytes // BATCH_BYTES)))
+        edges = np.linspace(0, len(slab), parts + 1).astype(np.int64).tolist()
         for begin, end in pairwise(edges):
             rows = slab.rows(slice(begin, end))
             yield RawBatch(channel, rows.log_times, rows.data, rows.starts, rows.lengths, rows.offsets)

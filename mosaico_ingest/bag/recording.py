@@ -37,16 +37,34 @@ def open_recording(paths: Path | Sequence[Path], *, resolve: Resolver) -> Record
         BagError: A path does not exist, is empty, is no recording, or is damaged beyond reading.
     """
     found = discover([paths] if isinstance(paths, Path) else list(paths))
-    with ExitStack() as stack:
-        parts = [open_part(file, stack) for file in found.files]
-        kinds = sorted({part.container for part in parts})
-        if len(kinds) > 1:
-            raise BagError(
-                f"the parts of one recording are of different formats: {', '.join(kinds)}",
-                where=str(found.files[0].parent),
-                hint="name the files of one format",
-            )
-        return Recording(parts, found, resolve, stack.pop_all())
+    stack = ExitStack()
+    try:
+        parts, losses = _open_parts(found.files, stack)
+        return Recording(parts, losses, found, resolve, stack)
+    except BaseException:
+        stack.close()
+        raise
+
+
+def _open_parts(files: Sequence[Path], stack: ExitStack) -> tuple[list[Part], list[Loss]]:
+    """Open every file; one of several that cannot be opened is a loss, as a recorder that crashed leaves such."""
+    parts: list[Part] = []
+    failed: list[BagError] = []
+    for file in files:
+        try:
+            parts.append(open_part(file, stack))
+        except BagError as err:  # noqa: PERF203 - each file may fail for itself
+            failed.append(err)
+    if not parts:
+        raise failed[0]
+    kinds = sorted({part.container for part in parts})
+    if len(kinds) > 1:
+        raise BagError(
+            f"the parts of one recording are of different formats: {', '.join(kinds)}",
+            where=str(files[0].parent),
+            hint="name the files of one format",
+        )
+    return parts, [Loss(err.where or "", 0, f"this part cannot be opened: {err.what}") for err in failed]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,12 +81,19 @@ class _Step:
 class Recording:
     """What is in a recording, and its messages in batches; a context manager, usable at once."""
 
-    def __init__(self, parts: Sequence[Part], found: Found, resolver: Resolver, stack: ExitStack) -> None:
+    def __init__(
+        self,
+        parts: Sequence[Part],
+        losses: Sequence[Loss],
+        found: Found,
+        resolver: Resolver,
+        stack: ExitStack,
+    ) -> None:
         self._parts = parts
         self._stack = stack
         self._table = ChannelTable(parts, resolver)
         self._running: weakref.WeakSet[Generator[RawBatch, None, None]] = weakref.WeakSet()
-        self._losses: dict[Loss, None] = {}
+        self._losses: dict[Loss, None] = dict.fromkeys(losses)
         self.files: tuple[Path, ...] = found.files
         self.container: str = parts[0].container
         """`mcap`, `sqlite3` or `ros1`."""
@@ -79,9 +104,11 @@ class Recording:
         """The last message's time, inclusive."""
         counts = [part.message_count for part in parts]
         self.message_count: int | None = None if None in counts else sum(count or 0 for count in counts)
-        self.findings: tuple[Finding, ...] = (*found.findings, *compare(parts, self.channels, found.metadata))
         for number, part in enumerate(parts):
             self._note(number, part.holes)
+        oddities = compare(parts, self.channels, self.losses, found.metadata)
+        self.findings: tuple[Finding, ...] = (*found.findings, *oddities)
+        """What to know before reading; what reading itself finds broken is in `losses`."""
 
     def __enter__(self) -> Recording:  # noqa: PYI034 - never subclassed, and `Self` is not in 3.10
         """Return the recording."""

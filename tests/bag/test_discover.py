@@ -171,3 +171,15 @@ def test_metadata_that_list_nothing_that_is_there_fall_back_on_what_is(split: Pa
         file.unlink()
     with pytest.raises(BagError, match=r"none of the files it lists is there: gone\.mcap"):
         discover([split])
+
+
+def test_a_part_that_cannot_be_opened_is_a_loss_and_a_finding(split: Path, recordings: Any) -> None:
+    (split / "part_10.mcap").write_bytes(b"")
+    with open_recording(split, resolve=recordings.blind) as recording:
+        assert len(recordings.received(recording)) == 60
+        assert "damaged" in [finding.rule for finding in recording.findings]
+        assert [loss.reason for loss in recording.losses] == ["this part cannot be opened: the file is empty"]
+    for file in split.glob("*.mcap"):
+        file.write_bytes(b"")
+    with pytest.raises(BagError, match="the file is empty"):
+        open_recording(split, resolve=recordings.blind)
