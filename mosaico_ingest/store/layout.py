@@ -16,7 +16,7 @@ import re
 import secrets
 import shutil
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,18 +76,13 @@ class Layout:
         for folder, _, files in os.walk(self.segments):
             yield from (Path(folder, name) for name in files)
 
-    def publish(self, staged: Path, target: Path) -> None:
-        """Move a finished file to its place, so that it is there after a power cut."""
-        missing = [folder for folder in target.parents if not folder.exists()]
-        for attempt in range(_ATTEMPTS):
-            target.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                staged.rename(target)
-                break
-            except FileNotFoundError:  # a deletion next door may remove the empty folder just made
-                if attempt == _ATTEMPTS - 1 or not staged.exists():
-                    raise
-        for folder in (target.parent, *(folder.parent for folder in missing)):
+    def publish(self, moves: Mapping[Path, Path]) -> None:
+        """Move finished files to their places, so that they are there after a power cut."""
+        changed: set[Path] = set()
+        for staged, target in moves.items():
+            changed |= {folder.parent for folder in target.parents if not folder.exists()} | {target.parent}
+            _move(staged, target)
+        for folder in changed:
             fsync(folder)
 
     def remove(self, paths: Iterable[Path]) -> None:
@@ -106,6 +101,18 @@ class Layout:
     def discard(self, session: str) -> None:
         """Remove what a session has staged."""
         shutil.rmtree(self.session(session), ignore_errors=True)
+
+
+def _move(staged: Path, target: Path) -> None:
+    for attempts_left in reversed(range(_ATTEMPTS)):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            staged.rename(target)
+        except FileNotFoundError:  # a deletion next door may remove the empty folder just made
+            if not attempts_left or not staged.exists():
+                raise
+        else:
+            return
 
 
 def fsync(path: Path) -> None:

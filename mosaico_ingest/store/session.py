@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
@@ -20,7 +19,7 @@ from mosaico_ingest.store.catalog import Catalog
 from mosaico_ingest.store.faults import explained
 from mosaico_ingest.store.layout import Layout, new_session_id
 from mosaico_ingest.store.lease import Lease, is_live
-from mosaico_ingest.store.segment import Segment, time_span
+from mosaico_ingest.store.segment import time_span
 from mosaico_ingest.store.topic import Staging, StoreTopic
 
 __all__ = ["StoreSession"]
@@ -84,14 +83,20 @@ class StoreSession:
         """Finish every topic, move the segments to their places, and enter them in the catalog at once."""
         with ThreadPoolExecutor(thread_name_prefix="segment") as pool:
             list(pool.map(StoreTopic.close, self._staging.topics.values()))
-        published: list[Path] = []
+        topics = tuple(self._placed(topic) for topic in self._staging.topics.values())
+        moves = {
+            segment.path: self._layout.root / path
+            for topic in topics
+            for path, segment in topic.segments.items()
+        }
+        new = entries.NewSession(self.id, self._metadata, self.created_ns, topics, tuple(self._notes))
         try:
-            topics = tuple(self._publish(topic, published) for topic in self._staging.topics.values())
-            new = entries.NewSession(self.id, self._metadata, self.created_ns, topics, tuple(self._notes))
+            with explained(self._layout.segments):
+                self._layout.publish(moves)
             with self._catalog.write() as db:
                 replaced = entries.commit(db, self._claim, new)
         except BaseException:
-            self._layout.remove(published)
+            self._layout.remove(moves.values())
             raise
         self._leave()
         self._layout.remove(self._layout.root / path for path in replaced)
@@ -108,15 +113,9 @@ class StoreSession:
         finally:
             self._leave()
 
-    def _publish(self, topic: StoreTopic, published: list[Path]) -> entries.NewTopic:
+    def _placed(self, topic: StoreTopic) -> entries.NewTopic:
         folder = self._layout.topic(self._claim.sequence, topic.name)
-        segments: dict[str, Segment] = {}
-        for segment in topic.segments:
-            target = folder / segment.path.name
-            with explained(target):
-                self._layout.publish(segment.path, target)
-            published.append(target)
-            segments[self._layout.relative(target)] = segment
+        segments = {self._layout.relative(folder / segment.path.name): segment for segment in topic.segments}
         return entries.NewTopic(
             topic.name, topic.ontology, topic.schema, topic.metadata, topic.created_ns, segments
         )

@@ -10,6 +10,7 @@ import pyarrow.flight as fl
 from mosaico_ingest import wire
 from mosaico_ingest.store.model import SequenceInfo, SessionInfo, TopicInfo
 from mosaico_ingest.store.scan import Window, count, scan
+from mosaico_ingest.store.server.before_0_7 import Extent, OlderTopicInfo, sequence_schema, topic_schema
 from mosaico_ingest.store.server.refusals import Refusal, checked
 from mosaico_ingest.store.server.uploads import Uploads
 from mosaico_ingest.store.store import Store
@@ -49,12 +50,14 @@ class Flights:
         if topic is not None:
             info = self._store.topic(name, topic)
             ended = {each.id: each for each in self._store.sequence(name).sessions}
-            return fl.FlightInfo(info.schema, descriptor, [_endpoint(info, ended, question)], -1, -1)
+            endpoint = _endpoint(info, ended, question)
+            return fl.FlightInfo(topic_schema(info), descriptor, [endpoint], -1, -1)
         sequence = self._store.sequence(name)
         ended = {each.id: each for each in sequence.sessions}
         endpoints = [_endpoint(each, ended, question) for each in sequence.topics]
         metadata = JSON.encode(self._described(sequence))
-        return fl.FlightInfo(pa.schema([]), descriptor, endpoints, -1, -1, app_metadata=metadata)
+        schema = sequence_schema(sequence)
+        return fl.FlightInfo(schema, descriptor, endpoints, -1, -1, app_metadata=metadata)
 
     def schema(self, descriptor: fl.FlightDescriptor) -> pa.Schema:
         """Return the columns of a topic."""
@@ -64,7 +67,8 @@ class Flights:
         """Return a topic's columns and its rows in time order, in messages of a moderate size."""
         question = JSON.decode(bodies.GetInfo, ticket.ticket)
         topic = self._topic(question)
-        return topic.schema, _messages(scan(topic.segments, topic.schema, _window(question)))
+        rows = scan(topic.segments, topic.schema, _window(question))
+        return topic_schema(topic), _messages(rows)
 
     def _topic(self, question: bodies.GetInfo) -> TopicInfo:
         sequence, topic = split_locator(question.resource_locator)
@@ -120,7 +124,8 @@ def _endpoint(
     window = _window(question)
     ticket = question.model_copy(update={"resource_locator": _locator(topic)})
     session = ended.get(topic.session)
-    described = bodies.TopicInfo(
+    interval = _interval(topic.start_ns, topic.end_ns)
+    described = OlderTopicInfo(
         resource_locator=_locator(topic),
         ontology_tag=topic.ontology.tag,
         serialization_format=topic.ontology.serialization_format,
@@ -129,11 +134,12 @@ def _endpoint(
         completed_at_ns=session.completed_ns if session else None,
         locked=True,
         data_info=bodies.DataInfo(
-            interval=_interval(topic.start_ns, topic.end_ns),
+            interval=interval,
             total_row_count=topic.rows,
             total_bytes=topic.stored_bytes,
             total_chunks_count=len(topic.segments),
         ),
+        info=Extent(chunks_number=len(topic.segments), total_bytes=topic.stored_bytes, timestamp=interval),
         time_window_info=None if window == Window() else _inside(topic, window),
     )
     return fl.FlightEndpoint(JSON.encode(ticket), [], None, JSON.encode(described))
