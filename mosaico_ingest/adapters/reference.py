@@ -23,7 +23,7 @@ from mosaico_ingest.adapters.python_adapter import PythonAdapterSpec, is_adapter
 from mosaico_ingest.adapters.unmodeled import UnmodeledSpec
 from mosaico_ingest.errors import AdapterError
 
-__all__ = ["adapter_spec", "load_adapter_reference"]
+__all__ = ["KnownAdapters", "adapter_spec", "load_adapter_reference"]
 
 _MAPPING_SUFFIXES = frozenset({".yaml", ".yml"})
 
@@ -79,12 +79,13 @@ def load_adapter_reference(ref: str, base_dir: Path) -> AdapterSpec:
 
 
 @dataclass(frozen=True, slots=True)
-class _Known:
+class KnownAdapters:
     """Finds the adapters a mapping may use: the built-in ones, and those of the files beside it."""
 
     folder: Path
 
     def __call__(self, name: str) -> AdapterSpec | None:
+        """Return the adapter of that name, None where there is none."""
         if name in BY_NAME:
             return BY_NAME[name]
         said = re.compile(rf"^adapter:\s*['\"]?{re.escape(name)}['\"]?\s*(#|$)", re.MULTILINE)
@@ -94,7 +95,7 @@ class _Known:
 
 
 def _load_mapping(path: Path) -> AdapterSpec:
-    return load_adapter(path, adapters=_Known(path.parent))
+    return load_adapter(path, adapters=KnownAdapters(path.parent))
 
 
 def _attribute(module: ModuleType, qualname: str, ref: str) -> object:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import cache
 
-from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.adapters.mapping.load import MappingSpec, load_adapter
+from mosaico_ingest.adapters.reference import KnownAdapters
 from mosaico_ingest.bag.definition import Definition, Embedded
 from mosaico_ingest.bag.shape import ros_shape
 from mosaico_ingest.bag.types import TypeResolver
@@ -23,7 +23,7 @@ _DISTROS = ((2, Stores.LATEST), (1, Stores.ROS1_NOETIC))
 def adapter_findings(document: Document) -> Iterator[Finding]:
     """Yield what is wrong with an adapter file, once for each place."""
     try:
-        spec = load_adapter(document.text, file=document.file, adapters=BY_NAME.get)
+        spec = load_adapter(document.text, file=document.file, adapters=KnownAdapters(document.folder))
     except AdapterError as error:
         start = Span(document.file, 1, 1, 1, 1)
         yield from error.findings or [Finding("mapping", Severity.ERROR, error.what, start, error.hint)]

@@ -199,6 +199,21 @@ def test_a_byte_order_mark_does_not_shift_a_fix(project: Path) -> None:
     assert (project / "job.yaml").read_text() == 'bag: {path: "5"}\n'
 
 
+def test_an_adapter_may_use_one_in_a_file_beside_it(project: Path) -> None:
+    text = """\
+version: 1
+adapter: StampedPackAdapter
+ros_type: sensor_msgs/msg/Temperature
+ontology: Temperature
+fields:
+  value: temperature
+  header: {use: %s, of: header}
+"""
+    assert rules(judged(project, text % "HeaderAdapter", "adapters/other.yaml")) == []
+    assert rules(judged(project, text % "NoAdapter", "adapters/other.yaml")) == ["unknown-adapter"]
+    assert rules(judged(project, text % "PackAdapter", "adapters/other.yaml")) == ["misfit"]
+
+
 def test_without_fix_nothing_is_written(project: Path) -> None:
     judged(project, BROKEN)
     assert (project / "job.yaml").read_text() == BROKEN
