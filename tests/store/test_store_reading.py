@@ -24,7 +24,7 @@ Rows = Callable[..., pa.RecordBatch]
 TIMES = st.lists(st.lists(st.integers(0, 60), max_size=8), max_size=6)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     sessions=st.lists(TIMES, min_size=1, max_size=3),
     window=st.tuples(st.none() | st.integers(-5, 65), st.none() | st.integers(-5, 65)),
