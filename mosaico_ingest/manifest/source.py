@@ -183,7 +183,7 @@ class _Reader:
         else:
             return False
         inside = self._text[opening + 1 : closing]
-        return opening >= 0 and inside.isprintable() and inside != "" and self._blank(opening, closing)
+        return 0 <= opening < closing and inside.isprintable() and inside != "" and self._blank(opening, closing)
 
     def _syntax(self, error: yaml.MarkedYAMLError) -> list[Finding]:
         if any(finding.rule == "yaml-tab" for finding in self._findings):

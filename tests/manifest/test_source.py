@@ -67,6 +67,7 @@ def test_a_place_inside_a_text_is_exact_where_the_text_is_written_as_it_is() -> 
         ("a: 'x\nb: 1\n", [("yaml-syntax", "1:4")], None),
         ("a: [1, 2\nb: 3\n", [("yaml-syntax", "1:4")], None),
         ("a:\n  - b\n c: 1\n", [("yaml-syntax", "3:2")], None),
+        ("{${00", [("yaml-syntax", "1:1")], None),
         ("a: \0\n", [("yaml-character", "1:4")], None),
         ("a: {<<: 5}\n", [("yaml-merge", "1:9")], {"a": {}}),
         ("x: " + "[" * (MAX_DEPTH + 5), [("yaml-depth", f"1:{MAX_DEPTH + 4}")], None),
@@ -120,6 +121,7 @@ def test_an_empty_document_is_null() -> None:
     assert read("# nothing\n").findings == ()
 
 
+@settings(max_examples=300)
 @given(st.text(alphabet=st.sampled_from("ab:-[]{}!*&#|>'\"%@`,?\t\n 01.~$_<é"), max_size=60))
 def test_any_text_gives_a_source_whose_places_lie_in_the_text(text: str) -> None:
     source = read(text)
