@@ -5,14 +5,17 @@ Knows nothing of bytes. `from mosaico_ingest.adapters import IMUAdapter` gives a
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-_BASE = ("ROSAdapterBase", "register_default_adapter")
+if TYPE_CHECKING:
+    from mosaico_ingest.adapters.base import ROSAdapterBase, register_default_adapter
+
+__all__ = ["ROSAdapterBase", "register_default_adapter"]
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401 - a class or a function
     """Import what `name` needs, and nothing before."""
-    if name in _BASE:
+    if name in __all__:
         from mosaico_ingest.adapters import base  # noqa: PLC0415 - on demand
 
         return getattr(base, name)
@@ -29,4 +32,4 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401 - a class or a function
 def __dir__() -> list[str]:
     from mosaico_ingest.adapters.builtin import BY_NAME  # noqa: PLC0415 - on demand
 
-    return sorted({*globals(), *_BASE, *BY_NAME})
+    return sorted({*globals(), *__all__, *BY_NAME})

@@ -1,4 +1,4 @@
-"""This file is the functions over point clouds: the values of one field, for all points of all messages at once."""
+"""This file is the fields of point clouds, of all points of all messages at once."""
 
 from __future__ import annotations
 

@@ -1,0 +1,49 @@
+"""docs/adapters.md says what the catalog says, and its examples work."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+from mosaico_ingest.adapters import base
+from mosaico_ingest.adapters.builtin import BY_NAME
+from mosaico_ingest.adapters.catalog_page import with_catalog
+from mosaico_ingest.adapters.reference import load_adapter_reference
+from mosaico_ingest.bag.message import ROSMessage
+from mosaico_ingest.bridge import ROSBridge
+from mosaico_ingest.manifest.model import AdaptersSection
+
+PAGE = (Path(__file__).parents[2] / "docs" / "adapters.md").read_text("utf-8")
+
+
+@pytest.fixture(autouse=True)
+def _nothing_stays_registered() -> Iterator[None]:
+    before = dict(base._registered)
+    yield
+    base._registered.clear()
+    base._registered.update(before)
+
+
+def _block(language: str) -> str:
+    (block,) = re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
+    return block
+
+
+def test_the_table_is_the_catalogs() -> None:
+    assert with_catalog(PAGE) == PAGE
+    assert all(f"| `{name}` |" in PAGE for name in BY_NAME)
+
+
+def test_the_python_example_works(tmp_path: Path) -> None:
+    (tmp_path / "wheel.py").write_text(_block("python"))
+    assert load_adapter_reference("wheel.py:WheelAdapter", tmp_path).ros_types == ("my_pkg/msg/WheelTicks",)
+    message = ROSMessage(1, "/wheel", "my_pkg/WheelTicks", {"left": 3, "right": 4})
+    assert ROSBridge.from_ros_message(message).data.model_dump() == {"left": 3, "right": 4}
+
+
+def test_the_manifest_example_has_the_manifests_keys() -> None:
+    AdaptersSection.model_validate(yaml.safe_load(_block("yaml"))["adapters"])
