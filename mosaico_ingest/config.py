@@ -8,6 +8,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, TypeVar, get_args
 
+from mosaico_ingest.diagnostics import Span
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.patterns import first_match
 from mosaico_ingest.policies import (
@@ -154,6 +155,12 @@ class ROSInjectionConfig:
     """How many recordings are ingested at the same time, where there are several."""
     where: str | None = field(default=None, compare=False)
     """The manifest this came from, for messages."""
+    places: Mapping[tuple[str | int | float | bool | None, ...], Span] = field(
+        default_factory=dict[tuple[str | int | float | bool | None, ...], Span], compare=False, repr=False
+    )
+    """Where the manifest says what: of a key its place, of a list's item the item's, by their path."""
+    plan_digest: str | None = None
+    """The `digest` of the only plan that may be run; None: whatever the recording calls for."""
 
     def __post_init__(self) -> None:
         """Bring every value into its one form and check it."""

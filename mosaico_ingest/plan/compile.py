@@ -78,6 +78,7 @@ def _fields(loaded: LoadedManifest) -> dict[str, Any]:
         "memory_bytes": None if manifest.run.memory is None else parse_size(manifest.run.memory),
         "jobs": manifest.run.jobs,
         "where": str(loaded.path),
+        "places": {**loaded.source.spans, **loaded.source.key_spans},
         **_topic_settings(loaded),
         **_target(loaded),
     }

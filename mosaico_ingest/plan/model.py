@@ -10,7 +10,7 @@ from typing import Any
 from mosaico_ingest.adapters.adapter import AdapterSpec
 from mosaico_ingest.bag.definition import Resolver
 from mosaico_ingest.config import ServerTarget, StoreTarget
-from mosaico_ingest.diagnostics import Finding
+from mosaico_ingest.diagnostics import Finding, Span
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.policies import (
     IfExists,
@@ -54,6 +54,8 @@ class LeftOut:
     msgtype: str
     count: int | None
     why: str
+    span: Span | None = None
+    """Where the manifest says so."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from difflib import get_close_matches
 
 from mosaico_ingest.bag.recording import Recording
 from mosaico_ingest.bag.types import TypeResolver
 from mosaico_ingest.bridge import ROSBridge
-from mosaico_ingest.config import ROSInjectionConfig, TimeBound, TimeRange
-from mosaico_ingest.diagnostics import Finding, Severity
-from mosaico_ingest.errors import BagError, NothingMatched
+from mosaico_ingest.config import DEFAULT_TOPIC, ROSInjectionConfig, TimeBound, TimeRange
+from mosaico_ingest.diagnostics import Finding, Severity, Span
+from mosaico_ingest.errors import AdapterError, BagError, NothingMatched
 from mosaico_ingest.patterns import Selection, first_match, select
 from mosaico_ingest.plan.model import DEFAULT_MEMORY_BYTES, LeftOut, Plan, TopicPlan
 from mosaico_ingest.plan.topics import decide, merge
@@ -25,19 +25,27 @@ def resolve(
 
     Raises:
         NothingMatched: No topic is left, or the recording has no message.
-        AdapterError: An override does not fit its topic, or a type without adapter is not wanted.
+        AdapterError: An adapter does not fit its topic, or a type without adapter is not wanted; `findings` has
+            every mistake of every topic.
     """
     topics = tuple(dict.fromkeys(channel.topic for channel in recording.channels))
     selection = select(config.topics or (), topics)
     findings = [*recording.findings, *resolver.findings, *_findings(config, selection, topics)]
     taken: list[TopicPlan] = []
     left: list[LeftOut] = []
+    misfits: list[tuple[str, AdapterError]] = []
     for channel in recording.channels:
-        outcome = decide(config, channel, selection, bridge, recording.files[0].name)
+        try:
+            outcome = decide(config, channel, selection, bridge, recording.files[0].name)
+        except AdapterError as error:
+            misfits.append((channel.topic, error))
+            continue
         if isinstance(outcome, LeftOut):
             left.append(outcome)
         elif (finding := merge(taken, outcome)) is not None:
             findings.append(finding)
+    if misfits:
+        raise _misfit(config, misfits)
     if not taken:
         raise _nothing(config, recording, left)
     read_from_ns, read_until_ns = _window(config.time_range, recording)
@@ -80,25 +88,46 @@ def _window(wanted: TimeRange, recording: Recording) -> tuple[int | None, int | 
     return instant(wanted.start), instant(wanted.end)
 
 
+def _misfit(config: ROSInjectionConfig, misfits: list[tuple[str, AdapterError]]) -> AdapterError:
+    """Return one error for all topics whose adapters do not fit."""
+    findings: dict[Finding, None] = {}
+    for topic, error in misfits:
+        glob = first_match(config.adapter_override, topic)
+        place = config.places.get(("adapters", "override", glob))
+        said = f"{error.where}: {error.what}" if error.where else error.what
+        own = Finding("misfit", Severity.ERROR, said, place, error.hint)
+        findings.update(dict.fromkeys(error.findings or (own,)))
+    first = misfits[0][1]
+    more = f" (and {len(misfits) - 1} more topics)" if len(misfits) > 1 else ""
+    return AdapterError(f"{first.what}{more}", where=first.where, hint=first.hint, findings=tuple(findings))
+
+
 def _findings(config: ROSInjectionConfig, selection: Selection, topics: tuple[str, ...]) -> Iterator[Finding]:
     """Yield what the configuration names that the recording does not have."""
     patterns = config.topics or ()
     for position in selection.unused:
-        yield _no_match("topics", patterns[position], topics)
-    settings = {**config.topic_metadata, **config.images, **config.rename, **config.every}
-    for key, globs in (("adapters.override", config.adapter_override), ("topic_settings", settings)):
+        yield _no_match("topics", patterns[position], topics, config.places.get(("topics", position)))
+    settings = dict.fromkeys((*config.topic_metadata, *config.images, *config.rename, *config.every))
+    policies = config.topics_on_error if isinstance(config.topics_on_error, Mapping) else {}
+    keyed: tuple[tuple[tuple[str, ...], Iterable[str]], ...] = (
+        (("topic_settings",), settings),
+        (("adapters", "override"), config.adapter_override),
+        (("on_error", "topic"), (glob for glob in policies if glob != DEFAULT_TOPIC)),
+    )
+    for section, globs in keyed:
         for glob in globs:
             if not any(first_match((glob,), topic) for topic in topics):
-                yield _no_match(key, glob, topics)
+                yield _no_match(".".join(section), glob, topics, config.places.get((*section, glob)))
 
 
-def _no_match(key: str, glob: str, topics: tuple[str, ...]) -> Finding:
+def _no_match(key: str, glob: str, topics: tuple[str, ...], place: Span | None) -> Finding:
     near = get_close_matches(glob.lstrip("!"), topics, n=1, cutoff=0.5)
     return Finding(
         "matches-nothing",
         Severity.WARNING,
         f"{key}: {glob!r} matches none of {len(topics)} topics",
-        help=f"the nearest is {near[0]}" if near else None,
+        place,
+        f"the nearest is {near[0]}" if near else None,
     )
 
 

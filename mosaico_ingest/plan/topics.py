@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TypeVar
 
@@ -11,7 +11,7 @@ from mosaico_ingest.bag.batch import Channel, Encoding
 from mosaico_ingest.bag.shape import ros_shape
 from mosaico_ingest.bridge import ROSBridge
 from mosaico_ingest.config import ROSInjectionConfig
-from mosaico_ingest.diagnostics import Finding, Severity
+from mosaico_ingest.diagnostics import Finding, Severity, Span
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.patterns import Selection, first_match
 from mosaico_ingest.plan.model import LeftOut, TopicPlan
@@ -31,7 +31,7 @@ def decide(
         AdapterError: An override does not fit, or the type has no adapter and the job says to fail then.
     """
     if channel.topic not in selection.selected:
-        return _left_out(channel, _why_not_selected(config.topics or (), selection, channel.topic))
+        return _not_selected(config, channel, selection)
     if channel.encoding is Encoding.OTHER:
         encoding = channel.attributes.get("encoding", "unknown")
         return _left_out(channel, channel.problem or f"not a ROS encoding: {encoding}")
@@ -45,7 +45,10 @@ def decide(
                 where=channel.topic,
                 hint="name one in adapters.override, or set adapters.unmodeled to keep or skip",
             )
-        return _left_out(channel, f"no adapter takes {channel.msgtype}, and adapters.unmodeled is skip")
+        place = config.places.get(("adapters", "unmodeled"))
+        return _left_out(
+            channel, f"no adapter takes {channel.msgtype}, and adapters.unmodeled is skip", place
+        )
     bound = found.spec.bind(channel.definition, ros_shape(channel.definition))
     metadata = {
         **_setting(config.topic_metadata, channel.topic, {}),
@@ -101,12 +104,13 @@ def _free_name(plan: TopicPlan, used: set[str]) -> str:
     return next(name for name in candidates if name not in used)
 
 
-def _left_out(channel: Channel, why: str) -> LeftOut:
-    return LeftOut(channel.topic, channel.msgtype, channel.count, why)
+def _left_out(channel: Channel, why: str, place: Span | None = None) -> LeftOut:
+    return LeftOut(channel.topic, channel.msgtype, channel.count, why, place)
 
 
-def _why_not_selected(patterns: Sequence[str], selection: Selection, topic: str) -> str:
-    position = selection.decided_by[topic]
+def _not_selected(config: ROSInjectionConfig, channel: Channel, selection: Selection) -> LeftOut:
+    position = selection.decided_by[channel.topic]
     if position is None:
-        return "no pattern of `topics` matches it"
-    return f"left out by {patterns[position]!r} in `topics`"
+        return _left_out(channel, "no pattern of `topics` matches it", config.places.get(("topics",)))
+    why = f"left out by {(config.topics or ())[position]!r} in `topics`"
+    return _left_out(channel, why, config.places.get(("topics", position)))

@@ -102,7 +102,8 @@ run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
         "dry_run",
         "registry",
         "store",
-    }  # if_exists, a command, Python's, the host
+        "plan_digest",
+    }  # if_exists, a command, Python's, the host, a plan
 
 
 def test_the_smallest_manifest_is_a_job(folder: Path) -> None:
