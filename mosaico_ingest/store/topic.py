@@ -5,10 +5,13 @@ from __future__ import annotations
 import itertools
 import threading
 import time
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pyarrow as pa
 
+from mosaico_ingest.errors import SinkError
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.sink import check_batch, topic_schema
 from mosaico_ingest.store.columns import check_columns
@@ -57,6 +60,7 @@ class StoreTopic:
         self._staging = staging
         self._batches: list[pa.RecordBatch] = []
         self._rows = 0
+        self._broken = False
         self._writer: SegmentWriter | None = None
         self._lock = threading.Lock()
 
@@ -66,6 +70,7 @@ class StoreTopic:
         if not batch.num_rows:
             return
         with self._lock:
+            self._refuse_if_broken()
             self._batches.append(batch)
             self._rows += batch.num_rows
             self.buffered_bytes += batch.nbytes
@@ -77,12 +82,12 @@ class StoreTopic:
 
     def flush(self) -> None:
         """Write what is in memory as one row group."""
-        with self._lock, explained(self._staging.folder):
+        with self._writing():
             self._flush()
 
     def close(self) -> None:
         """Write what is in memory and finish the last segment."""
-        with self._lock, explained(self._staging.folder):
+        with self._writing():
             self._flush()
             self._finish_segment()
 
@@ -93,6 +98,19 @@ class StoreTopic:
             if self._writer is not None:
                 self._writer.abandon()
                 self._writer = None
+
+    @contextmanager
+    def _writing(self) -> Generator[None, None, None]:
+        """Hold the lock; what fails inside leaves a file nobody may finish, so the topic cannot be committed."""
+        with self._lock, explained(self._staging.folder):
+            self._refuse_if_broken()
+            self._broken = True
+            yield
+            self._broken = False
+
+    def _refuse_if_broken(self) -> None:
+        if self._broken:
+            raise SinkError("an earlier write of the topic failed", where=self.name)
 
     def _flush(self) -> None:
         batches, self._batches = self._batches, []

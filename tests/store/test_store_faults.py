@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import sqlite3
@@ -22,6 +23,7 @@ from mosaico_ingest.store import Store, StoreSink
 from mosaico_ingest.store.catalog import FORMAT
 from mosaico_ingest.store.faults import explained
 from mosaico_ingest.store.lease import Lease, is_live
+from mosaico_ingest.store.segment import SegmentWriter
 
 Rows = Callable[..., pa.RecordBatch]
 
@@ -146,6 +148,25 @@ def test_a_full_disk_fails_the_session_and_leaves_nothing(
     with StoreSink(store).open("s", {}) as session:
         session.topic("/t", sample, {}).write(rows([1]))
     assert store.sequence("s").rows == 1
+
+
+def test_a_topic_that_failed_once_cannot_be_committed(
+    sink: StoreSink, store: Store, rows: Rows, sample: OntologyType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    with pytest.raises(SinkError, match="earlier write of the topic failed"), sink.open("s", {}) as session:
+        topic = session.topic("/t", sample, {})
+        topic.write(rows([1]))
+        with monkeypatch.context() as patched:
+            patched.setattr(SegmentWriter, "append", fail)
+            with pytest.raises(SinkError, match="Input/output error"):
+                topic.flush()
+        with pytest.raises(SinkError, match="earlier write of the topic failed"):
+            topic.write(rows([2]))
+    assert store.sequences() == ()
+    assert list(store.path.rglob("*.parquet")) == []
 
 
 FULL = """
