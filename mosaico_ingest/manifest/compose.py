@@ -25,7 +25,7 @@ _INDICATORS = {
 }
 _NOWHERE = yaml.Mark("", 0, 0, 0, None, 0)
 """What an event without a mark gets; PyYAML's own always have one."""
-_QUOTABLE = re.compile(r"[^\s\"\\:#]+")
+_QUOTABLE = re.compile(r"[^\s\"\\:#]*[^\s\"\\:#\],]")
 """Texts that quotes can be put around without a second look."""
 
 MAX_DEPTH = 40
