@@ -264,8 +264,10 @@ class ROSInjectionConfig:
     def _check_topics(self) -> None:
         for topic, metadata in self.topic_metadata.items():
             check_metadata(metadata, where=f"{self.where or 'topic_metadata'}: topic {topic}")
-        for name in self.rename.values():
+        for topic, name in self.rename.items():
             check_topic_name(name)
+            if any(character in topic for character in "*?["):
+                raise self._error(f"rename[{topic!r}] is for every topic of a glob", "name one topic")
         for topic, step in self.every.items():
             if step < 1:
                 raise self._error(f"every[{topic!r}] is {step}", "it must be at least 1")

@@ -113,6 +113,7 @@ def test_the_key_is_not_shown() -> None:
         ({"metadata": {"a.b": 1}}, "metadata key 'a.b'"),
         ({"topic_metadata": {"/a": {"x/y": 1}}}, "metadata key 'x/y'"),
         ({"rename": {"/a": "/b c"}}, "topic name '/b c'"),
+        ({"rename": {"/a/*": "/b"}}, "rename\\['/a/\\*'\\] is for every topic of a glob"),
     ],
 )
 def test_what_cannot_be_is_refused_with_the_value(fields: dict[str, Any], message: str) -> None:
