@@ -86,11 +86,13 @@ def _overlapping(segments: Iterable[SegmentInfo]) -> Iterator[list[SegmentInfo]]
 
 def _read(segment: SegmentInfo, schema: pa.Schema, window: Window) -> Iterator[pa.RecordBatch]:
     with explained(segment.path), pq.ParquetFile(segment.path) as file:
-        groups = [i for i in range(file.num_row_groups) if window.overlaps(*time_span(file.metadata, i))]
-        for batch in file.iter_batches(_BATCH_ROWS, row_groups=groups, columns=schema.names):
-            inside = window.cut(batch)
-            if inside.num_rows:
-                yield pa.RecordBatch.from_arrays(inside.columns, schema=schema)
+        for group in range(file.num_row_groups):
+            if not window.overlaps(*time_span(file.metadata, group)):
+                continue
+            for batch in file.iter_batches(_BATCH_ROWS, row_groups=[group], columns=schema.names):
+                inside = window.cut(batch)
+                if inside.num_rows:
+                    yield pa.RecordBatch.from_arrays(inside.columns, schema=schema)
 
 
 def _merge(streams: Sequence[Iterator[pa.RecordBatch]], schema: pa.Schema) -> Iterator[pa.RecordBatch]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -81,7 +82,7 @@ class StoreSession:
 
     def commit(self) -> None:
         """Finish every topic, move the segments to their places, and enter them in the catalog at once."""
-        with ThreadPoolExecutor(thread_name_prefix="segment") as pool:
+        with ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="segment") as pool:
             list(pool.map(StoreTopic.close, self._staging.topics.values()))
         topics = tuple(self._placed(topic) for topic in self._staging.topics.values())
         moves = {
