@@ -48,8 +48,7 @@ class Gather:
     def add(self, channel: int, slab: Slab, floor_ns: int) -> Iterator[RawBatch]:
         """Take `compact` messages; none that come later, these included, is older than `floor_ns`."""
         waiting = self._waiting.setdefault(channel, _Waiting())
-        payload_bytes = int(slab.lengths.sum())
-        if waiting.slabs and self._is_full(waiting, len(slab), payload_bytes):
+        if waiting.slabs and self._is_full(waiting, len(slab), slab.payload_bytes):
             yield from self._flush(channel, floor_ns)
         self._waiting[channel].add(slab)
 
@@ -81,10 +80,12 @@ class Gather:
 
     def _flush(self, channel: int, floor_ns: int) -> Iterator[RawBatch]:
         """Give the messages up to `floor_ns`, keep the others."""
-        slabs = [in_time(slab) for slab in self._waiting[channel].slabs]
+        slabs = self._waiting[channel].slabs
         waiting = self._waiting[channel] = _Waiting()
+        if slabs and not any(_is_view(slab) for slab in slabs):
+            slabs = [_joined(slabs)]
         ready: list[Slab] = []
-        for slab in slabs:
+        for slab in map(in_time, slabs):
             count = int(np.searchsorted(slab.log_times, floor_ns, side="right"))
             if count:
                 ready.append(slab.rows(slice(0, count)))
@@ -95,8 +96,7 @@ class Gather:
 
     def _batches(self, channel: Channel, slab: Slab) -> Iterator[RawBatch]:
         """Cut into batches of the allowed size, as equal as can be."""
-        payload_bytes = int(slab.lengths.sum())
-        parts = min(len(slab), max(-(-len(slab) // self._rows), -(-payload_bytes // BATCH_BYTES)))
+        parts = min(len(slab), max(-(-len(slab) // self._rows), -(-slab.payload_bytes // BATCH_BYTES)))
         edges = np.linspace(0, len(slab), parts + 1).astype(np.int64).tolist()
         for begin, end in pairwise(edges):
             rows = slab.rows(slice(begin, end))
@@ -110,7 +110,7 @@ def compact(slab: Slab) -> Slab:
 
 def _is_view(slab: Slab) -> bool:
     """Return whether the slab's buffer is that of the block it came in."""
-    return int(slab.lengths.sum()) > _BIG_BYTES * len(slab)
+    return slab.payload_bytes > _BIG_BYTES * len(slab)
 
 
 def _ordered(slabs: Sequence[Slab]) -> list[Slab]:

@@ -35,7 +35,7 @@ from mosaico_ingest.bag.containers.part import (
     Want,
     orphans,
 )
-from mosaico_ingest.bag.containers.slab import Bytes, by_key, keep, stretches
+from mosaico_ingest.bag.containers.slab import Bytes, by_key, keep_each, stretches
 from mosaico_ingest.bag.containers.source import FileSource
 from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.errors import BagError
@@ -118,11 +118,12 @@ class McapPart:
         starts = _message_starts(data, piece, loaded)
         records = np.frombuffer(data, np.uint8)
         heads = _heads(records, starts)
-        for key, rows in by_key(heads["channel"]):
-            if key in want.keys:
-                keep(_slab(key, records, heads[rows], starts[rows], piece), want, loaded)
-            elif self._index.counts is None:
-                loaded.holes.extend(orphans({key: len(rows)}, self._index.channels))
+        found = list(by_key(heads["channel"]))
+        wanted = [(key, rows) for key, rows in found if key in want.keys]
+        keep_each(_slab(records, heads, starts, piece), wanted, want, loaded)
+        if self._index.counts is None:
+            unwanted = {key: len(rows) for key, rows in found if key not in want.keys}
+            loaded.holes.extend(orphans(unwanted, self._index.channels))
 
 
 def _stream(key: int, channel: McapChannel, index: McapIndex) -> Stream:
@@ -165,14 +166,18 @@ def _whole_chunk(piece: Piece, raw: bytes, want: Want, reason: str) -> Iterator[
     for key, offset in piece.index_offsets():
         if key in want.keys:
             try:
-                count: int | None = len(_entries(raw, piece, key, offset))
+                count: int | None = len(_entries(raw, piece, key, offset)) // _ENTRY.itemsize
             except BagError:
                 count = None
             yield Hole(piece.offset, reason, key=key, count=count)
 
 
-def _entries(raw: bytes, piece: Piece, key: int, offset: int) -> NDArray[np.void]:
-    """Return the times and offsets of one message index record."""
+def _entries(raw: bytes, piece: Piece, key: int, offset: int) -> bytes:
+    """Return the entries of one message index record, as they stand there.
+
+    Raises:
+        BagError: It is not there, or is another's.
+    """
     at = offset - piece.offset
     if not 0 <= at <= len(raw) - RECORD.size - 6:
         raise BagError(f"the message index of channel {key} lies at {offset}, outside its chunk's stretch")
@@ -180,43 +185,43 @@ def _entries(raw: bytes, piece: Piece, key: int, offset: int) -> NDArray[np.void
     begin = at + RECORD.size + 6
     if op != Op.MESSAGE_INDEX or channel != key or size % _ENTRY.itemsize or begin + size > len(raw):
         raise BagError(f"no message index of channel {key} at {offset}")
-    return np.frombuffer(raw, _ENTRY, size // _ENTRY.itemsize, begin)
+    return raw[begin : begin + size]
 
 
 def _by_index(data: bytes | memoryview, raw: bytes, piece: Piece, want: Want, loaded: Loaded) -> bool:
     """Add the wanted messages that the chunk's message indexes name; return whether they could be trusted."""
+    wanted = [(key, offset) for key, offset in piece.index_offsets() if key in want.keys]
+    if not wanted:
+        return True
     try:
-        slabs = _indexed(np.frombuffer(data, np.uint8), raw, piece, want)
+        indexes = [_entries(raw, piece, key, offset) for key, offset in wanted]
+        counts = [len(index) // _ENTRY.itemsize for index in indexes]
+        keys = np.repeat(np.array([key for key, _ in wanted], np.uint16), counts)
+        entries = np.frombuffer(b"".join(indexes), _ENTRY)
+        whole = _indexed(np.frombuffer(data, np.uint8), entries, keys, piece)
     except BagError as err:
         loaded.holes.append(Hole(piece.offset, f"{err.what}; the chunk was read record by record", count=0))
         return False
-    for slab in slabs:
-        keep(slab, want, loaded)
+    edges = np.cumsum([0, *counts]).tolist()
+    spans = [slice(begin, end) for begin, end in pairwise(edges)]
+    keep_each(whole, [(key, span) for (key, _), span in zip(wanted, spans, strict=True)], want, loaded)
     return True
 
 
-def _indexed(records: Bytes, raw: bytes, piece: Piece, want: Want) -> list[Slab]:
-    """Return the messages of the wanted channels, all checked at once against the records.
+def _indexed(records: Bytes, entries: NDArray[np.void], keys: NDArray[np.uint16], piece: Piece) -> Slab:
+    """Return the messages of all these index entries, checked at once against the records.
 
     Raises:
-        BagError: An index does not agree with the records.
+        BagError: An entry does not agree with its record.
     """
-    wanted = [(key, offset) for key, offset in piece.index_offsets() if key in want.keys]
-    if not wanted:
-        return []
-    indexes = [_entries(raw, piece, key, offset) for key, offset in wanted]
-    entries = np.concatenate(indexes)
     if len(entries) and int(entries["offset"].max()) > len(records) - _HEAD.itemsize:
         raise BagError("a message index points outside its chunk")
     starts = entries["offset"].astype(np.int64)
     heads = _heads(records, starts)
-    keys = np.repeat(np.array([key for key, _ in wanted], np.uint16), [len(index) for index in indexes])
     fits = (heads["op"] == Op.MESSAGE) & (heads["channel"] == keys) & (heads["time"] == entries["time"])
     if not bool((fits & _within(heads, starts, len(records))).all()):
         raise BagError("a message index does not point at its messages")
-    edges = np.cumsum([0, *(len(index) for index in indexes)]).tolist()
-    rows = [slice(begin, end) for begin, end in pairwise(edges)]
-    return [_slab(key, records, heads[r], starts[r], piece) for (key, _), r in zip(wanted, rows, strict=True)]
+    return _slab(records, heads, starts, piece)
 
 
 def _message_starts(data: bytes | memoryview, piece: Piece, loaded: Loaded) -> NDArray[np.int64]:
@@ -251,8 +256,8 @@ def _within(heads: NDArray[np.void], starts: NDArray[np.int64], size: int) -> ND
     return (length >= _FIXED_BYTES) & (length <= room)
 
 
-def _slab(key: int, records: Bytes, heads: NDArray[np.void], starts: NDArray[np.int64], piece: Piece) -> Slab:
-    """Return messages whose records have been checked; each is told by its chunk, or by its own place outside chunks."""
+def _slab(records: Bytes, heads: NDArray[np.void], starts: NDArray[np.int64], piece: Piece) -> Slab:
+    """Return messages, of any channel, whose records have been checked; chunks tell where they lie, or they do."""
     offsets = np.full(len(starts), piece.offset, np.int64) if piece.is_chunk else starts + piece.offset
     lengths = heads["length"].astype(np.int64) - _FIXED_BYTES
-    return Slab(key, np.ascontiguousarray(heads["time"]), records, starts + _HEAD.itemsize, lengths, offsets)
+    return Slab(-1, np.ascontiguousarray(heads["time"]), records, starts + _HEAD.itemsize, lengths, offsets)

@@ -39,7 +39,7 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class Slab:
-    """n messages of one stream inside one buffer; every start and length has been checked against it."""
+    """n messages inside one buffer, of one stream; every start and length has been checked against the buffer."""
 
     key: int
     log_times: NDArray[np.int64]
@@ -47,15 +47,20 @@ class Slab:
     starts: NDArray[np.int64]
     lengths: NDArray[np.int64]
     offsets: NDArray[np.int64]
+    payload_bytes: int = field(init=False)
+    """The sum of the lengths, which is asked for often."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "payload_bytes", int(self.lengths.sum()))
 
     def __len__(self) -> int:
         """Return the number of messages."""
         return len(self.log_times)
 
-    def rows(self, choice: NDArray[np.int64] | NDArray[np.bool_] | slice) -> Slab:
-        """Return some of the messages, over the same buffer."""
+    def rows(self, choice: NDArray[np.int64] | NDArray[np.bool_] | slice, *, key: int | None = None) -> Slab:
+        """Return some of the messages, over the same buffer; `key` names their stream where this slab has several."""
         return Slab(
-            self.key,
+            self.key if key is None else key,
             self.log_times[choice],
             self.data,
             self.starts[choice],

@@ -24,7 +24,7 @@ from mosaico_ingest.bag.containers.ros1_records import (
     time_of,
     times_of,
 )
-from mosaico_ingest.bag.containers.slab import Bytes, by_key, keep, stretches
+from mosaico_ingest.bag.containers.slab import Bytes, by_key, keep, keep_each, stretches
 from mosaico_ingest.bag.containers.source import FileSource
 from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.errors import BagError
@@ -248,7 +248,5 @@ def _scan(data: bytes | memoryview, piece: Piece, want: Want, loaded: Loaded) ->
     keys, times, begins, ends, ats = columns.T
     offsets = np.full(len(ats), piece.offset, np.int64) if piece.is_chunk else ats + piece.offset
     records = np.frombuffer(data, np.uint8)
-    for key, rows in by_key(keys):
-        if key in want.keys:
-            slab = Slab(key, times[rows], records, begins[rows], (ends - begins)[rows], offsets[rows])
-            keep(slab, want, loaded)
+    wanted = [(key, rows) for key, rows in by_key(keys) if key in want.keys]
+    keep_each(Slab(-1, times, records, begins, ends - begins, offsets), wanted, want, loaded)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mosaico_ingest.bag.containers.part import LATEST_NS, Hole, Loaded, Slab, Want
 
-__all__ = ["Bytes", "by_key", "in_time", "keep", "pack", "stretches"]
+__all__ = ["Bytes", "by_key", "in_time", "keep", "keep_each", "pack", "stretches"]
 
 _FEW_ROWS = 8
 """With fewer rows to a length on average, one index for every byte is cheaper than one step for every length."""
@@ -42,24 +42,37 @@ def keep(slab: Slab, want: Want, loaded: Loaded) -> None:
         loaded.slabs.append(slab)
 
 
+def keep_each(whole: Slab, streams: Iterable[tuple[int, Longs | slice]], want: Want, loaded: Loaded) -> None:
+    """Add the messages within the wanted time, stream by stream: its key, and its rows of the whole."""
+    if _is_inside(whole, want):
+        slabs = [whole.rows(rows, key=key) for key, rows in streams]
+        loaded.slabs.extend(slab for slab in slabs if len(slab))
+        return
+    for key, rows in streams:
+        keep(whole.rows(rows, key=key), want, loaded)
+
+
+def _is_inside(slab: Slab, want: Want) -> bool:
+    if not len(slab):
+        return True
+    first, last = int(slab.log_times.min()), int(slab.log_times.max())
+    return max(want.start_ns, 0) <= first and last < want.end_ns
+
+
 def _wanted(slab: Slab, want: Want, holes: list[Hole]) -> Slab:
     """Return the messages within the wanted time; those after 2262 are noted as lost."""
-    times = slab.log_times
-    if not len(times):
+    if _is_inside(slab, want):
         return slab
-    first, last = int(times.min()), int(times.max())
-    if first < 0:  # unsigned in the file
-        broken = times < 0
+    times = slab.log_times
+    broken = times < 0  # unsigned in the file
+    if bool(broken.any()):
         offset = int(slab.offsets[int(broken.argmax())])
         reason = f"recorded at {int(times.view(np.uint64).max())} ns, which is after the year 2262"
         holes.append(Hole(offset, reason, key=slab.key, count=int(broken.sum())))
-        return _wanted(slab.rows(~broken), want, holes)
-    if first >= want.start_ns and last < want.end_ns:
-        return slab
-    keep = times >= want.start_ns
+    keep_rows = ~broken & (times >= want.start_ns)
     if want.end_ns <= LATEST_NS:
-        keep &= times < want.end_ns
-    return slab.rows(keep)
+        keep_rows &= times < want.end_ns
+    return slab.rows(keep_rows)
 
 
 def in_time(slab: Slab) -> Slab:

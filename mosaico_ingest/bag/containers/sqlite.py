@@ -252,8 +252,6 @@ def _load(page: list[Row]) -> Loaded:
     starts = np.cumsum(lengths) - lengths
     all_times, all_ids = np.array(times, np.int64), np.array(ids, np.int64)
     keys = np.array(topics, np.int64)
-    slabs = [
-        Slab(key, all_times[rows], data, starts[rows], lengths[rows], all_ids[rows])
-        for key, rows in by_key(keys)
-    ]
+    whole = Slab(-1, all_times, data, starts, lengths, all_ids)
+    slabs = [whole.rows(rows, key=key) for key, rows in by_key(keys)]
     return Loaded(slabs, holes)
