@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import runpy
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ import pyarrow as pa
 import pytest
 
 from mosaico_ingest.adapters.adapter import Adapted, Envelope
+from mosaico_ingest.adapters.python_adapter import PythonAdapterSpec, ontology_of
 from mosaico_ingest.adapters.reference import load_adapter_reference
 from mosaico_ingest.bag.shape import ros_shape
 from mosaico_ingest.bag.types import TypeResolver
@@ -17,7 +20,7 @@ from mosaico_ingest.bridge import ROSBridge
 from mosaico_ingest.policies import Stores
 
 pytestmark = pytest.mark.interop
-pytest.importorskip("mosaicolabs.bridges.ros", reason="the official SDK is not installed")
+sdk = pytest.importorskip("mosaicolabs.bridges.ros", reason="the official SDK is not installed")
 
 WRITTEN_FOR_THE_SDK = """
 from mosaicolabs import Message
@@ -44,6 +47,11 @@ class LateAdapter(SpeedAdapter):
         stamp = msg.header.stamp
         return Message(timestamp_ns=stamp.seconds * 10**9 + stamp.nanoseconds, data=message.data)
 """
+
+
+@pytest.fixture(scope="module")
+def fuzz() -> Any:
+    return runpy.run_path(str(Path(__file__).parents[1] / "adapters" / "fuzz.py"))["message"]
 
 
 @pytest.fixture(scope="module")
@@ -84,3 +92,32 @@ def test_a_built_in_adapter_of_the_sdk_can_be_named(folder: Path) -> None:
     definition = TypeResolver(Stores.LATEST).resolve("sensor_msgs/msg/Imu", None, ros_version=2)
     bound: Any = found.spec.bind(definition, ros_shape(definition))
     assert (bound.ontology.tag, bound.ontology.fingerprint) == ("IMU", "2d6a4121b0")
+
+
+@pytest.mark.parametrize("msgtype", sorted(sdk.ROSBridge.get_default_adapters()))
+def test_every_adapter_of_the_sdk_runs_on_our_rows(msgtype: str, fuzz: Any) -> None:
+    adapter = sdk.ROSBridge.get_default_adapters()[msgtype]
+    types = {"nmea_msgs/msg/Sentence": "std_msgs/Header header\nstring sentence\n"}
+    definition = TypeResolver(Stores.LATEST, types=types).resolve(msgtype, None, ros_version=2)
+    random = Random(msgtype)  # noqa: S311 - messages, not secrets
+    messages = [_small(fuzz(definition, random)) for _ in range(30)]
+    shape = ros_shape(definition)
+    envelope = Envelope("/t", msgtype, np.arange(len(messages), dtype=np.int64))
+    adapted = PythonAdapterSpec(adapter).bind(definition, shape).adapt(pa.array(messages, shape), envelope)
+    assert adapted.index.tolist() == [row for row, message in enumerate(messages) if _taken(adapter, message)]
+
+
+def _small(message: dict[str, Any]) -> dict[str, Any]:
+    """Keep pictures of random sizes from being packed."""
+    return {**message, "height": 1, "step": 0} if "encoding" in message else message
+
+
+def _taken(adapter: Any, message: dict[str, Any]) -> bool:
+    """Whether the SDK stores the message as its own loader hands it over: bytes as lists of numbers."""
+    listed = {name: list(value) if isinstance(value, bytes) else value for name, value in message.items()}
+    try:
+        row = adapter.from_dict(listed).model_dump()
+        pa.array([row], ontology_of(adapter.__mosaico_ontology_type__).struct)
+    except Exception:  # noqa: BLE001 - whatever it raises is how it rejects a message
+        return False
+    return True
