@@ -150,6 +150,21 @@ def test_damaged_database_pages_are_stepped_over(tmp_path: Path, recordings: Any
     assert read <= {(message.topic, message.payload) for message in messages}
 
 
+@pytest.mark.parametrize("share", [0.5, 0.9, 0.99])
+def test_a_database_that_is_cut_off_gives_the_rows_that_are_left(
+    tmp_path: Path, recordings: Any, share: float
+) -> None:
+    messages = recordings.sent(600)
+    path = next(recordings.rosbag2(tmp_path / "l", messages, storage="sqlite3").glob("*.db3"))
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
+    with open_recording(path, resolve=recordings.blind) as recording:
+        found = recordings.received(recording)
+        assert set(found) < set(messages)
+        assert len(found) > (share - 0.1) * len(messages)
+        assert any("rows are missing" in loss.reason for loss in recording.losses)
+
+
 def test_changes_still_in_the_log_are_read_and_nothing_is_written(tmp_path: Path, recordings: Any) -> None:
     messages = recordings.sent(40)
     folder = recordings.rosbag2(tmp_path / "f", messages, storage="sqlite3")

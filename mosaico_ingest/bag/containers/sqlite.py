@@ -183,10 +183,19 @@ def _text(value: object) -> str:
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
+def _tables(connection: sqlite3.Connection) -> set[str]:
+    """Return the names of the tables, also of a file that was cut off."""
+    query = "SELECT name FROM sqlite_master WHERE type = 'table'"
+    try:
+        return {str(name) for (name,) in connection.execute(query)}
+    except sqlite3.DatabaseError:
+        # With this SQLite opens files shorter than their header says; nothing is ever written here.
+        connection.execute("PRAGMA writable_schema = ON")
+        return {str(name) for (name,) in connection.execute(query)}
+
+
 def _columns(connection: sqlite3.Connection) -> _Columns:
-    tables = {
-        str(name) for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
-    }
+    tables = _tables(connection)
     if not {"topics", "messages"} <= tables:
         raise BagError(
             f"a SQLite file without the tables of a recording; it has {', '.join(sorted(tables)) or 'none'}"
