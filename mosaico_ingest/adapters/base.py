@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Generic, TypeVar
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
 
 from mosaico_ingest.bag.message import ROSMessage
 from mosaico_ingest.bag.names import normalize_msgtype
@@ -26,20 +27,21 @@ class ROSAdapterBase(Generic[T]):
     the ontology's columns come back, a null row is a rejected one.
     """
 
-    ros_msgtype: ClassVar[str | tuple[str, ...]]
+    ros_msgtype: str | tuple[str, ...]
     """The message types it takes, as `sensor_msgs/msg/Imu`."""
-    __mosaico_ontology_type__: ClassVar[type[Any]]
+    __mosaico_ontology_type__: type[Any]
     """The class `from_dict` returns an object of."""
 
     @classmethod
-    def from_dict(cls, ros_data: dict[str, Any], **kwargs: Any) -> T:  # noqa: ANN401 - whatever translate was given
+    def from_dict(cls, ros_data: dict[str, Any]) -> T:
         """Return the object for one message, a dict of its fields; any exception rejects the message."""
         raise NotImplementedError(f"{cls.__name__} defines neither from_dict nor from_batch")
 
     @classmethod
     def translate(cls, ros_msg: ROSMessage, **kwargs: Any) -> Message:  # noqa: ANN401 - passed on to from_dict
         """Return the object with its time; to be overridden where the topic or the time of a message matter."""
-        return Message(timestamp_ns=ros_msg.bag_timestamp_ns, data=cls.from_dict(ros_msg.data, **kwargs))
+        convert: Callable[..., T] = cls.from_dict  # one that is overridden may take more
+        return Message(timestamp_ns=ros_msg.bag_timestamp_ns, data=convert(ros_msg.data, **kwargs))
 
     @classmethod
     def schema_metadata(

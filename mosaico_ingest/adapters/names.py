@@ -22,7 +22,7 @@ class CatalogAdapter(ROSAdapterBase[Serializable]):
     __adapter_spec__: ClassVar[Builtin]
 
     @classmethod
-    def from_dict(cls, ros_data: dict[str, Any], **kwargs: Any) -> Serializable:  # noqa: ANN401, ARG003 - the base's
+    def from_dict(cls, ros_data: dict[str, Any]) -> Serializable:
         """Return the ontology's object for the fields of one message.
 
         Raises:

@@ -221,8 +221,8 @@ def test_a_dict_that_does_not_fit_says_why() -> None:
 def test_a_class_can_be_extended() -> None:
     class Louder(adapters.StringStdAdapter):
         @classmethod
-        def from_dict(cls, ros_data: dict[str, Any], **kwargs: Any) -> Any:
-            return super().from_dict({"data": ros_data["data"].upper()}, **kwargs)
+        def from_dict(cls, ros_data: dict[str, Any]) -> Any:
+            return super().from_dict({"data": ros_data["data"].upper()})
 
     assert Louder.translate(ROSMessage(1, "/s", "std_msgs/msg/String", {"data": "hi"})).data.data == "HI"
 
