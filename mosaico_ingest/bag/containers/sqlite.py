@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
 import tempfile
@@ -160,19 +161,31 @@ class SqlitePart:
 
 
 def _open(path: Path, stack: ExitStack, notes: list[str]) -> sqlite3.Connection:
-    """Open read-only; a file with changes still to be replayed is copied first, as replaying writes."""
+    """Open read-only; a copy, where changes must be replayed first, or where the last page is not whole."""
     pending = [beside for suffix in ("-wal", "-journal") if _has_bytes(beside := Path(f"{path}{suffix}"))]
-    if pending:
+    whole_bytes = _whole_pages(path)
+    if pending or whole_bytes < path.stat().st_size:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mosaico-")))
         for file in (path, *pending):
             shutil.copyfile(file, folder / file.name)
         path = folder / path.name
+        os.truncate(path, whole_bytes)
+    if pending:
         notes.append(f"{pending[0].name} holds changes; they were replayed on a copy")
     uri = f"{path.absolute().as_uri()}?{'mode=rw' if pending else 'mode=ro&immutable=1'}"
     connection = sqlite3.connect(uri, uri=True, check_same_thread=False)
     stack.callback(connection.close)
     connection.text_factory = _text
     return connection
+
+
+def _whole_pages(path: Path) -> int:
+    """Return the size without the page that is cut off: SQLite would take the missing bytes for zeros."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        page_bytes = int.from_bytes(file.read(18)[16:], "big")
+    page_bytes = 1 << 16 if page_bytes == 1 else page_bytes
+    return size - size % page_bytes if page_bytes else size
 
 
 def _has_bytes(path: Path) -> bool:
