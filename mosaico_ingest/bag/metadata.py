@@ -52,16 +52,16 @@ def read_metadata(path: Path) -> Metadata:
         info = content["rosbag2_bagfile_information"]
         return Metadata(
             path,
-            tuple(str(name) for name in info.get("relative_file_paths") or ()),
+            tuple(_text(name) for name in info.get("relative_file_paths") or ()),
             int(info.get("message_count") or 0),
             tuple(_topic(entry) for entry in info.get("topics_with_message_count") or ()),
-            str(info.get("ros_distro") or ""),
+            _text(info.get("ros_distro")),
         )
     except OSError as err:
         raise BagError(f"cannot be read: {err.strerror}", where=str(path)) from err
     except yaml.YAMLError as err:
         raise BagError(f"no YAML: {' '.join(str(err).split())}", where=str(path)) from err
-    except (KeyError, TypeError, ValueError, AttributeError) as err:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as err:
         raise BagError(f"not of the shape of rosbag2's metadata: {err}", where=str(path)) from err
 
 
@@ -69,9 +69,16 @@ def _topic(entry: dict[str, Any]) -> TopicHint:
     about = entry.get("topic_metadata") or entry["topic_and_type"]
     qos = about.get("offered_qos_profiles")
     return TopicHint(
-        str(about["name"]),
-        str(about["type"]),
+        _text(about["name"]),
+        _text(about["type"]),
         int(entry.get("message_count") or 0),
-        str(about.get("serialization_format") or ""),
+        _text(about.get("serialization_format")),
         qos if isinstance(qos, str) else "",
     )
+
+
+def _text(value: object) -> str:
+    """Return a scalar as text; a list would be spelled out with all that its aliases stand for."""
+    if value is None or isinstance(value, (str, int, float)):
+        return "" if value is None else str(value)
+    raise ValueError(f"a text expected, a {type(value).__name__} found")

@@ -14,6 +14,14 @@ from mosaico_ingest.bag.discover import discover
 from mosaico_ingest.bag.recording import open_recording
 from mosaico_ingest.errors import BagError
 
+BOMB = "\n".join(
+    [
+        "a: &a0 [x]",
+        *(f"b{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 30)),
+        "rosbag2_bagfile_information: {relative_file_paths: [*a29]}",
+    ]
+)
+
 
 @pytest.fixture
 def split(tmp_path: Path, recordings: Any) -> Path:
@@ -92,7 +100,9 @@ def test_the_storage_decides_and_metadata_that_differ_are_findings(split: Path, 
     assert sum("messages in the metadata" in message for message in messages) == 3
 
 
-@pytest.mark.parametrize("content", ["{", "[]", "rosbag2_bagfile_information: 3", "a: &a [*a]"])
+@pytest.mark.parametrize(
+    "content", ["{", "[]", "rosbag2_bagfile_information: 3", "a: &a [*a]", "[" * 9000, BOMB]
+)
 def test_metadata_that_cannot_be_read_are_a_finding(split: Path, recordings: Any, content: str) -> None:
     (split / "metadata.yaml").write_text(content)
     with open_recording(split, resolve=recordings.blind) as recording:
