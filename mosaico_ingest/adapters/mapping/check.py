@@ -22,7 +22,7 @@ from mosaico_ingest.adapters.mapping.expression import (
     Place,
 )
 from mosaico_ingest.adapters.mapping.functions import lookup
-from mosaico_ingest.adapters.mapping.functions.registry import check, nearest
+from mosaico_ingest.adapters.mapping.functions.registry import Take, check, nearest
 from mosaico_ingest.adapters.mapping.kinds import (
     Kind,
     Unfit,
@@ -273,7 +273,7 @@ class Checker:
         """Take the first argument whose fields exist; where none does, the last says what is there."""
         for argument in node.arguments[:-1]:
             mistakes: list[str] = []
-            quiet = Checker(self._scope, lambda rule, *_: mistakes.append(rule), self._text)  # noqa: B023 - used at once
+            quiet = Checker(self._scope, _noting(mistakes), self._text)
             typed = quiet.infer(argument)
             if typed is not None or set(mistakes) != {_UNKNOWN}:
                 return typed or self.infer(argument)
@@ -288,8 +288,9 @@ class Checker:
             return None  # an unknown function was reported when the file was read
         arguments = tuple(_folded(a, function.take(i).takes) for i, a in enumerate(arguments))
         for position, argument in enumerate(arguments):
-            if function.take(position).literal and not isinstance(argument, Const):
-                self._fail(f"{node.name} takes a text in quotes here", node.arguments[position].at)
+            problem = _literal_problem(function.take(position), argument)
+            if problem is not None:
+                self._fail(f"{node.name} {problem}", node.arguments[position].at)
                 return None
         try:
             kind = check(function, [argument.kind.element for argument in arguments])
@@ -301,6 +302,25 @@ class Checker:
             return constant(None, self._source(node))
         kind = replace(kind, axes=_deepest(arguments))
         return Apply(node.name, function, arguments, kind, self._source(node))
+
+
+def _noting(rules: list[str]) -> Report:
+    """Return a report that only keeps the rules that were broken."""
+
+    def note(rule: str, message: str, place: Place, hint: str | None) -> None:  # noqa: ARG001 - a report's arguments
+        rules.append(rule)
+
+    return note
+
+
+def _literal_problem(take: Take, argument: Typed) -> str | None:
+    """Return what is wrong with an argument that has to be written out."""
+    if not take.literal:
+        return None
+    if not isinstance(argument, Const) or not isinstance(argument.value, str):
+        return f"takes {take.words} here"
+    problem = take.problem(argument.value) if take.problem else None
+    return f"cannot take this: {problem}" if problem else None
 
 
 def _folded(value: Typed, takes: Callable[[Kind], bool]) -> Typed:

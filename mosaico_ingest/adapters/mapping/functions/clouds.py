@@ -9,14 +9,19 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mosaico_ingest.adapters.mapping.arrow import Array, DataType, arrays
+from mosaico_ingest.adapters.mapping.arrow import Array, DataType, arrays, pt
 from mosaico_ingest.adapters.mapping.columns import field_of, nulls, open_list, var_list
 from mosaico_ingest.adapters.mapping.functions.registry import TEXT_LITERAL, Refuse, function, struct_with
 
 __all__: list[str] = []
 
 _NUMBERS = ("height", "width", "is_bigendian", "point_step", "row_step")
-_CLOUD = struct_with("a sensor_msgs/PointCloud2", (*_NUMBERS, "fields", "data"))
+_FIELDS: dict[str, Any] = {
+    **dict.fromkeys(_NUMBERS, pt.is_primitive),
+    "fields": pt.is_list,
+    "data": pt.is_binary,
+}
+_CLOUD = struct_with("a sensor_msgs/PointCloud2", _FIELDS)
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _PACKED_BYTES = 4
 

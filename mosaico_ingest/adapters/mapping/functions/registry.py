@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any, Protocol, TypeAlias
@@ -54,6 +54,8 @@ class Take:
     prepare: Callable[[Any], Any] | None = None
     literal: bool = False
     """The argument is written out in the expression, and handed over as a Python value."""
+    problem: Callable[[str], str | None] | None = None
+    """What is wrong with a text that is written out."""
 
     def takes(self, kind: Kind) -> bool:
         """Return whether an argument of a kind is accepted; null always is."""
@@ -202,12 +204,17 @@ ANY = Take("a value", lambda _: True)
 TEXT_LITERAL = Take("a text in quotes", lambda kind: pt.is_string(kind.type), literal=True)
 
 
-def struct_with(words: str, *choices: tuple[str, ...]) -> Take:
-    """Return a parameter for messages that have all the fields of one of the choices."""
+def struct_with(words: str, *choices: Mapping[str, Callable[[DataType], bool]]) -> Take:
+    """Return a parameter for messages that have all the fields of one of the choices, of the right types."""
+
+    def has(type_: DataType, name: str, fits: Callable[[DataType], bool]) -> bool:
+        position = type_.get_field_index(name)
+        return position >= 0 and fits(type_.field(position).type)
 
     def accepts(kind: Kind) -> bool:
-        names = {field.name for field in kind.type} if pt.is_struct(kind.type) else set[str]()
-        return any(names.issuperset(choice) for choice in choices)
+        return pt.is_struct(kind.type) and any(
+            all(has(kind.type, name, fits) for name, fits in choice.items()) for choice in choices
+        )
 
     return Take(words, accepts)
 

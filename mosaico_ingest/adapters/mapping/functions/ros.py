@@ -19,7 +19,7 @@ from mosaico_ingest.adapters.mapping.columns import (
 from mosaico_ingest.adapters.mapping.functions.lists import NUMBERS
 from mosaico_ingest.adapters.mapping.functions.operators import computed
 from mosaico_ingest.adapters.mapping.functions.registry import FLOAT, TEXT, Refuse, function, struct_with
-from mosaico_ingest.adapters.mapping.functions.time import STAMP_TYPE, as_stamp
+from mosaico_ingest.adapters.mapping.functions.time import STAMP, STAMP_TYPE, as_stamp
 from mosaico_ingest.adapters.mapping.kinds import Kind
 
 __all__ = ["HEADER", "HEADER_TYPE", "as_header"]
@@ -27,7 +27,13 @@ __all__ = ["HEADER", "HEADER_TYPE", "as_header"]
 HEADER_TYPE: DataType = arrays.struct(
     [("timestamp", STAMP_TYPE), ("frame_id", arrays.string()), ("sample_counter", arrays.uint64())]
 )
-HEADER = struct_with("a std_msgs/Header", ("stamp", "frame_id"))
+
+
+def _is_stamp(type_: DataType) -> bool:
+    return STAMP.accepts(Kind(type_))
+
+
+HEADER = struct_with("a std_msgs/Header", {"stamp": _is_stamp, "frame_id": pt.is_string})
 _CODECS = {name: name for name in ("png", "jpeg", "jpg", "tiff", "h264", "hevc", "raw")} | {"h265": "hevc"}
 
 

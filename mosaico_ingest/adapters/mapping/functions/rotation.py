@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 from mosaico_ingest.adapters.mapping.arrow import Array, DataType, arrays, pc
 from mosaico_ingest.adapters.mapping.columns import field_of
 from mosaico_ingest.adapters.mapping.functions.registry import FLOAT, function, struct_with
+from mosaico_ingest.adapters.mapping.kinds import is_number
 
 __all__ = ["QUATERNION_TYPE"]
 
 _AXES = ("x", "y", "z", "w")
 QUATERNION_TYPE: DataType = arrays.struct([(axis, arrays.float64()) for axis in _AXES])
-_QUATERNION = struct_with("a quaternion {x, y, z, w}", _AXES)
+_QUATERNION = struct_with("a quaternion {x, y, z, w}", dict.fromkeys(_AXES, is_number))
 
 
 def _halves(*angles: Array) -> tuple[NDArray[np.bool_], list[NDArray[np.float64]]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 
@@ -51,8 +52,15 @@ def strip(s: Array) -> Array:
     return pc.utf8_trim_whitespace(s)
 
 
-@function(TEXT, TEXT_LITERAL, TEXT_LITERAL, gives=arrays.string())
-def replace(s: Array, old: str, new: str) -> Array:
+def _empty_problem(text: str) -> str | None:
+    return None if text else "the text to look for is empty"
+
+
+_SOUGHT = replace(TEXT_LITERAL, words="a text in quotes, not empty,", problem=_empty_problem)
+
+
+@function(TEXT, _SOUGHT, TEXT_LITERAL, gives=arrays.string())
+def replace_(s: Array, old: str, new: str) -> Array:
     """Every occurrence replaced."""
     return pc.replace_substring(s, pattern=old, replacement=new)
 
@@ -75,17 +83,33 @@ def contains(s: Array, part: str) -> Array:
     return pc.match_substring(s, pattern=part)
 
 
-@function(TEXT, TEXT_LITERAL, gives=arrays.list_(arrays.string()))
+@function(TEXT, _SOUGHT, gives=arrays.list_(arrays.string()))
 def split(s: Array, separator: str) -> Array:
     """The parts between separators, a list of text."""
     return pc.split_pattern(s, pattern=separator)
 
 
-@function(TEXT, TEXT_LITERAL, gives=arrays.string())
+def _grouped(pattern: str) -> str:
+    """Return a pattern with its first group named, all of it where it has none: Arrow gives named groups only."""
+    named, found = re.subn(r"(?<!\\)\((?!\?)", "(?P<part>", pattern, count=1)
+    return named if found else f"(?P<part>{pattern})"
+
+
+def _pattern_problem(pattern: str) -> str | None:
+    try:
+        pc.extract_regex(arrays.array([], arrays.string()), pattern=_grouped(pattern))
+    except arrays.ArrowInvalid:
+        return f"{pattern!r} is not a regular expression of RE2"
+    return None
+
+
+_PATTERN = replace(TEXT_LITERAL, words="a pattern in quotes", problem=_pattern_problem)
+
+
+@function(TEXT, _PATTERN, gives=arrays.string())
 def extract(s: Array, pattern: str) -> Array:
-    """What the pattern's first group matches; null where it does not match."""
-    named = re.sub(r"(?<!\\)\((?!\?)", "(?P<part>", pattern, count=1)
-    return pc.struct_field(pc.extract_regex(s, pattern=named), [0])
+    """What the pattern's first group matches, or all of it without one; null where it does not match."""
+    return pc.struct_field(pc.extract_regex(s, pattern=_grouped(pattern)), [0])
 
 
 @function(_SPELLED, gives=arrays.string())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mosaico_ingest.adapters.mapping.arrow import Array, DataType, arrays, pc
+from mosaico_ingest.adapters.mapping.arrow import Array, DataType, arrays, pc, pt
 from mosaico_ingest.adapters.mapping.columns import field_of, nulls, true_where
 from mosaico_ingest.adapters.mapping.functions.operators import numbers, whole
 from mosaico_ingest.adapters.mapping.functions.registry import (
@@ -26,7 +26,11 @@ STAMP_TYPE: DataType = arrays.struct(
     ]
 )
 """The ontology's time: what `Time` and `Duration` are, and a header's `timestamp`."""
-STAMP = struct_with("a time or duration", ("sec", "nanosec"), ("seconds", "nanoseconds"))
+STAMP = struct_with(
+    "a time or duration",
+    {"sec": pt.is_integer, "nanosec": pt.is_integer},
+    {"seconds": pt.is_integer, "nanoseconds": pt.is_integer},
+)
 _INT32 = (-(2**31), 2**31 - 1)
 
 

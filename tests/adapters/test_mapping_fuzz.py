@@ -1,0 +1,195 @@
+"""Random programs and damaged files: what comes out is a column, a finding, or a rejected row; never anything else."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+import mosaico_ingest
+from mosaico_ingest.adapters.adapter import Envelope
+from mosaico_ingest.adapters.mapping.check import Checker, Scope
+from mosaico_ingest.adapters.mapping.evaluate import Evaluation, RowsRefused
+from mosaico_ingest.adapters.mapping.expression import ExpressionError, parse
+from mosaico_ingest.adapters.mapping.fit import convert, demand
+from mosaico_ingest.adapters.mapping.functions import functions
+from mosaico_ingest.adapters.mapping.kinds import Kind, Unfit
+from mosaico_ingest.adapters.mapping.load import load_adapter
+from mosaico_ingest.adapters.mapping.typed import Typed
+from mosaico_ingest.errors import AdapterError
+
+STAMP = pa.struct([("sec", pa.int32()), ("nanosec", pa.uint32())])
+HEADER = pa.struct([("stamp", STAMP), ("frame_id", pa.string())])
+INNER = pa.struct([("v", pa.int16()), ("t", pa.string()), ("n", pa.list_(pa.float32())), ("h", HEADER)])
+MESSAGE = pa.struct(
+    [
+        ("b", pa.bool_()),
+        ("i", pa.int8()),
+        ("u", pa.uint8()),
+        ("k", pa.int64()),
+        ("w", pa.uint64()),
+        ("f", pa.float32()),
+        ("d", pa.float64()),
+        ("s", pa.string()),
+        ("x", pa.list_(pa.int32())),
+        ("y", pa.list_(pa.float64(), 3)),
+        ("m", pa.list_(INNER)),
+        ("p", INNER),
+        ("o", pa.binary()),
+        ("q", pa.list_(pa.uint8(), 4)),
+        ("h", HEADER),
+    ]
+)
+TARGETS: list[Any] = [
+    *(pa.int8(), pa.uint64(), pa.float32(), pa.float64(), pa.string(), pa.binary(), pa.bool_()),
+    *(pa.list_(t) for t in (pa.float64(), pa.int64(), pa.string(), pa.list_(pa.float32()))),
+    pa.list_(pa.float64(), 3),
+]
+LEAVES = [
+    *(field.name for field in MESSAGE),
+    *(
+        "self",
+        "x[]",
+        "y[]",
+        "m[]",
+        "m[].v",
+        "m[].n",
+        "m[].n[]",
+        "m[].t",
+        "m[].h.stamp",
+        "p.v",
+        "p.n[]",
+        "h.stamp",
+    ),
+    *("x[0]", "m[-1].n[0]", "null", "true", "1", "-1", "0.5", "'a'", "1e300", "[1, 2]", "[]", "[i, 2.5]"),
+]
+OPERATORS = ["+", "-", "*", "/", "//", "%", "**", "==", "!=", "<", "<=", ">", ">=", "and", "or"]
+CALLED = [f for f in functions() if f.name.isidentifier() and f.name not in {"and", "or", "not"}]
+TYPES = ["bool", "int8", "uint64", "float32", "int64", "float64"]
+
+
+class Writer:
+    """Writes programs and messages."""
+
+    def __init__(self, seed: int) -> None:
+        self.random = random.Random(seed)  # noqa: S311 - no secret
+
+    def program(self, depth: int) -> str:
+        pick, inner = self.random, lambda: self.program(depth - 1)
+        if depth == 0 or pick.random() < 0.2:
+            return pick.choice(LEAVES)
+        form = pick.randrange(10)
+        if form < 3:
+            return f"({inner()} {pick.choice(OPERATORS)} {inner()})"
+        if form == 3:
+            return f"({inner()} if {inner()} else {inner()})"
+        if form == 4:
+            return f"[{inner()}, {inner()}][{pick.choice(['', '0', '-1'])}]"
+        if form == 5:
+            return f"cast({inner()}, '{pick.choice(TYPES)}')"
+        called = pick.choice(CALLED)
+        taken = [called.take(k) for k in range(len(called.takes) + called.variadic)]
+        texts = (pick.choice(["'a'", "''", "'(a)'", "'('"]) if take.literal else inner() for take in taken)
+        return f"{called.name}({', '.join(texts)})"
+
+    def value(self, type_: Any) -> Any:  # noqa: PLR0911 - a return for each type
+        pick = self.random
+        if pick.random() < 0.08:
+            return None
+        if pa.types.is_struct(type_):
+            return {field.name: self.value(field.type) for field in type_}
+        if pa.types.is_fixed_size_list(type_) or pa.types.is_list(type_):
+            fixed = pa.types.is_fixed_size_list(type_)
+            return [
+                self.value(type_.value_type) for _ in range(type_.list_size if fixed else pick.randrange(3))
+            ]
+        if pa.types.is_floating(type_):
+            return pick.choice([0.0, 1.5, -2.0, float("nan"), float("inf"), 1e30])
+        if pa.types.is_integer(type_):
+            low, high = np.iinfo(str(type_)).min, np.iinfo(str(type_)).max
+            return pick.choice([0, 1, 2, low, high])
+        if pa.types.is_boolean(type_):
+            return pick.random() < 0.5
+        return pick.choice(["", "a", "12", "ż"]) if pa.types.is_string(type_) else pick.choice([b"", b"ab"])
+
+
+def run(typed: Typed, rows: Any) -> None:
+    """Evaluate and convert to whatever it surely fits; every round leaves out the rows that were refused."""
+    while True:
+        evaluation = Evaluation(rows, Envelope("", "", np.zeros(len(rows), np.int64)))
+        try:
+            result = evaluation.of(typed).closed(len(rows))
+            result.validate(full=True)
+            assert len(result) == len(rows)
+            for target in TARGETS:
+                check_fit(typed, result, target, evaluation)
+        except RowsRefused as refused:
+            good = np.ones(len(rows), bool)
+            good[list(refused.refusals)] = False
+            remaining = rows.filter(pa.array(good))
+        else:
+            return
+        assert len(remaining) < len(rows)
+        rows = remaining
+
+
+def check_fit(typed: Typed, result: Any, target: Any, evaluation: Evaluation) -> None:
+    try:
+        demand(typed.kind, target)
+    except Unfit:
+        return
+    fitted = convert(result, target, evaluation.refuser((), "it"))
+    fitted.validate(full=True)
+    assert (fitted.type, len(fitted)) == (target, len(result))
+
+
+def attempts(seed: int, count: int) -> int:
+    """Return how many of the programs had a meaning."""
+    writer = Writer(seed)
+    rows: Any = pa.array([writer.value(MESSAGE) or {} for _ in range(12)], MESSAGE)
+    meant = 0
+    for _ in range(count):
+        text = writer.program(3)
+        try:
+            typed = Checker(Scope(Kind(MESSAGE), {}), lambda *_: None, text).infer(parse(text))
+        except ExpressionError:
+            continue
+        if typed is not None:
+            meant += 1
+            run(typed, rows)
+    return meant
+
+
+def test_random_programs_give_columns_findings_or_rejected_rows() -> None:
+    assert attempts(seed=1, count=1500) > 100
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2, 8))
+def test_many_random_programs_give_columns_findings_or_rejected_rows(seed: int) -> None:
+    assert attempts(seed, count=15_000) > 1000
+
+
+def test_damaged_files_are_adapters_or_errors() -> None:
+    folder = Path(mosaico_ingest.__file__).parent / "adapters" / "catalog"
+    texts = [path.read_text("utf-8") for path in sorted(folder.glob("*.yaml"))]
+    pick = random.Random(7)  # noqa: S311 - no secret
+    errors: list[AdapterError] = []
+    for _ in range(400):
+        text = pick.choice(texts)
+        for _ in range(pick.randrange(1, 4)):
+            at, length = pick.randrange(len(text)), pick.randrange(12)
+            other = pick.choice(texts)
+            start = pick.randrange(len(other))
+            text = text[:at] + other[start : start + pick.randrange(12)] + text[at + length :]
+        try:
+            load_adapter(text, file="damaged.yaml")
+        except AdapterError as error:
+            errors.append(error)
+    assert len(errors) > 100
+    assert all(error.findings for error in errors)
+    assert all(finding.span is not None for error in errors for finding in error.findings)
