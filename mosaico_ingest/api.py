@@ -4,24 +4,39 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mosaico_ingest.bridge import ROSBridge
 from mosaico_ingest.config import ROSInjectionConfig
-from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.diagnostics import Finding, Severity
+from mosaico_ingest.errors import IngestError, ManifestError
 from mosaico_ingest.executors.inspection import inspect
 from mosaico_ingest.executors.local import run_all
+from mosaico_ingest.executors.preview import decide, plan_document
 from mosaico_ingest.executors.worker import execute, make_plan
 from mosaico_ingest.manifest.load import load_manifest
 from mosaico_ingest.plan.compile import compile_manifest
+from mosaico_ingest.plan.document import PlanDocument, read_plan
+from mosaico_ingest.plan.drift import Difference, differences
 from mosaico_ingest.plan.model import Plan
 from mosaico_ingest.report.events import Observer, ignore_events
 from mosaico_ingest.report.inspection import Inspection
 from mosaico_ingest.report.model import Report, RunReport
 from mosaico_ingest.version import __version__
 
-__all__ = ["RosbagInjector", "compile_job", "inspect_recording", "quick_config", "run"]
+__all__ = [
+    "RosbagInjector",
+    "compare_jobs",
+    "compile_job",
+    "compile_plan",
+    "inspect_recording",
+    "plan_differences",
+    "plan_job",
+    "quick_config",
+    "run",
+]
 
 
 class RosbagInjector:
@@ -68,6 +83,60 @@ def compile_job(manifest: Path) -> tuple[ROSInjectionConfig, ...]:
     configs = compile_manifest(load_manifest(manifest))
     ROSBridge.for_config(configs[0])  # the jobs of one manifest share their adapters
     return configs
+
+
+def plan_job(manifest: Path, *, folder: Path | None = None, connect: bool = False) -> PlanDocument:
+    """Return what a manifest would do, tried on the first messages of each topic; writes nothing.
+
+    The document names the manifest as seen from `folder` (the current one). A server is asked only with `connect`.
+
+    Raises:
+        IngestError: The job cannot be done; the message says why.
+    """
+    return plan_document(compile_job(manifest), job=manifest, folder=folder or Path(), connect=connect)
+
+
+def plan_differences(path: Path, document: PlanDocument) -> tuple[Difference, ...]:
+    """Return how a plan file's decisions differ from those of a document.
+
+    Raises:
+        ManifestError: The file is no plan.
+    """
+    known = [recording.decisions for recording in read_plan(path).recordings]
+    return differences(known, [recording.decisions for recording in document.recordings])
+
+
+def compare_jobs(before: Path, after: Path) -> tuple[Difference, ...]:
+    """Return what changes in the plan from one manifest to the other.
+
+    Raises:
+        IngestError: One of them cannot be done; the message says why.
+    """
+    both = ([decide(config, folder=Path()) for config in compile_job(job)] for job in (before, after))
+    return differences(*both)
+
+
+def compile_plan(path: Path) -> tuple[ROSInjectionConfig, ...]:
+    """Return the configurations of a plan file; each runs as planned, or not at all.
+
+    Raises:
+        ManifestError: The file is no plan, or its manifest has mistakes.
+        IngestError: The manifest or a recording no longer fits the plan; `findings` say how.
+    """
+    planned = read_plan(path).recordings
+    configs = compile_job(path.parent / read_plan(path).job)
+    found = [decide(config, folder=config.base_dir) for config in configs]
+    drift = differences([recording.decisions for recording in planned], found)
+    if drift:
+        raise IngestError(
+            f"{len(drift)} decisions are no longer those of the plan; the first: {drift[0]}",
+            where=str(path),
+            hint="make a new plan with `ingest plan --out`",
+            findings=tuple(Finding("plan-drift", Severity.ERROR, str(one)) for one in drift),
+        )
+    return tuple(
+        replace(config, plan_digest=decided.digest) for config, decided in zip(configs, found, strict=True)
+    )
 
 
 def run(configs: Sequence[ROSInjectionConfig], *, observe: Observer = ignore_events) -> RunReport:

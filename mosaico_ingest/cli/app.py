@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from mosaico_ingest.cli import bag, inspect, lint, run, schema, store
+from mosaico_ingest.cli import bag, diff, inspect, lint, plan, run, schema, store
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.version import __version__
 
@@ -22,6 +22,8 @@ COMMANDS: tuple[tuple[str, Callable[..., Any]], ...] = (
     ("bag", bag.bag),
     ("inspect", inspect.inspect),
     ("schema", schema.schema),
+    ("plan", plan.plan),
+    ("diff", diff.diff),
     ("lint", lint.lint),
     ("schema", schema.schema),
 )

@@ -12,8 +12,14 @@ __all__ = ["run"]
 
 def run(
     manifests: Annotated[
-        list[Path], typer.Argument(metavar="JOB.yaml...", help="Job manifests, run in order.")
-    ],
+        list[Path] | None, typer.Argument(metavar="JOB.yaml...", help="Job manifests, run in order.")
+    ] = None,
+    plan: Annotated[
+        Path | None,
+        typer.Option(
+            "--plan", help="Run exactly this plan, or nothing where it no longer fits.", metavar="FILE"
+        ),
+    ] = None,
     report: Annotated[
         Path | None, typer.Option("--report", help="Write the report of this call as JSON.", metavar="FILE")
     ] = None,
@@ -26,5 +32,9 @@ def run(
     from mosaico_ingest import api
     from mosaico_ingest.cli.session import run_configs
 
-    configs = [config for manifest in manifests for config in api.compile_job(manifest)]
+    if bool(manifests) == (plan is not None):
+        raise typer.BadParameter("name manifests, or a plan with --plan", param_hint="JOB.yaml")
+    configs = [config for manifest in manifests or () for config in api.compile_job(manifest)]
+    if plan is not None:
+        configs += api.compile_plan(plan)
     run_configs(configs, report=report, quiet=quiet, log=log)

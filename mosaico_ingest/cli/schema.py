@@ -18,6 +18,7 @@ class Document(str, Enum):
 
     JOB = "job"
     ADAPTER = "adapter"
+    PLAN = "plan"
     REPORT = "report"
 
 
@@ -53,11 +54,13 @@ def schema(
 def _text(document: Document) -> str:
     from mosaico_ingest.adapters.mapping.schema import adapter_schema
     from mosaico_ingest.manifest.schema import job_schema
+    from mosaico_ingest.plan.document import plan_schema
     from mosaico_ingest.report.model import report_schema
 
     makers: dict[Document, Callable[[], dict[str, Any]]] = {
         Document.JOB: job_schema,
         Document.ADAPTER: adapter_schema,
+        Document.PLAN: plan_schema,
         Document.REPORT: report_schema,
     }
     return json.dumps(makers[document](), indent=2, ensure_ascii=False) + "\n"

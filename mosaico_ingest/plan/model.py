@@ -44,6 +44,8 @@ class TopicPlan:
     on_error: TopicLevelErrorPolicy
     every: int = 1
     """Keep the first of each `every` messages."""
+    definitions: tuple[str, ...] = ()
+    """Where each of its definitions was found, and the digest of its text, as `bag 1f0c9a22b7e4d8a3`."""
 
 
 @dataclass(frozen=True, slots=True)

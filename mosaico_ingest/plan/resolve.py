@@ -12,6 +12,7 @@ from mosaico_ingest.config import DEFAULT_TOPIC, ROSInjectionConfig, TimeBound, 
 from mosaico_ingest.diagnostics import Finding, Severity, Span
 from mosaico_ingest.errors import AdapterError, BagError, NothingMatched
 from mosaico_ingest.patterns import Selection, first_match, select
+from mosaico_ingest.plan.describe import check_digest
 from mosaico_ingest.plan.model import DEFAULT_MEMORY_BYTES, LeftOut, Plan, TopicPlan
 from mosaico_ingest.plan.topics import decide, merge
 
@@ -27,6 +28,7 @@ def resolve(
         NothingMatched: No topic is left, or the recording has no message.
         AdapterError: An adapter does not fit its topic, or a type without adapter is not wanted; `findings` has
             every mistake of every topic.
+        IngestError: The configuration is for one plan only, and this is another.
     """
     topics = tuple(dict.fromkeys(channel.topic for channel in recording.channels))
     selection = select(config.topics or (), topics)
@@ -49,7 +51,7 @@ def resolve(
     if not taken:
         raise _nothing(config, recording, left)
     read_from_ns, read_until_ns = _window(config.time_range, recording)
-    return Plan(
+    plan = Plan(
         files=recording.files,
         container=recording.container,
         source_bytes=recording.size_bytes,
@@ -69,6 +71,8 @@ def resolve(
         read_until_ns=read_until_ns,
         memory_bytes=config.memory_bytes or DEFAULT_MEMORY_BYTES,
     )
+    check_digest(plan, config)
+    return plan
 
 
 def _window(wanted: TimeRange, recording: Recording) -> tuple[int | None, int | None]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import TypeVar
 
 from mosaico_ingest.adapters.metadata import ros_metadata
 from mosaico_ingest.bag.batch import Channel, Encoding
+from mosaico_ingest.bag.definition import Definition
 from mosaico_ingest.bag.shape import ros_shape
 from mosaico_ingest.bridge import ROSBridge
 from mosaico_ingest.config import ROSInjectionConfig
@@ -66,7 +68,12 @@ def decide(
         metadata=metadata,
         on_error=config.topic_policy(channel.topic),
         every=_setting(config.every, channel.topic, 1),
+        definitions=(_definition(channel.definition),),
     )
+
+
+def _definition(definition: Definition) -> str:
+    return f"{definition.source.value} {hashlib.sha256(definition.text.encode()).hexdigest()[:16]}"
 
 
 def merge(taken: list[TopicPlan], more: TopicPlan) -> Finding | None:
@@ -76,7 +83,12 @@ def merge(taken: list[TopicPlan], more: TopicPlan) -> Finding | None:
         same = plan.target == more.target and plan.msgtype == more.msgtype and plan.ontology == more.ontology
         if same and plan.topic == more.topic:
             count = None if plan.count is None or more.count is None else plan.count + more.count
-            taken[position] = replace(plan, channels=(*plan.channels, *more.channels), count=count)
+            taken[position] = replace(
+                plan,
+                channels=(*plan.channels, *more.channels),
+                count=count,
+                definitions=tuple(dict.fromkeys((*plan.definitions, *more.definitions))),
+            )
             return None
     if not same_topic:
         taken.append(more)

@@ -1,0 +1,83 @@
+"""This file makes a recording's plan to look at: decided as for a run, tried on a few messages, nothing written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from os.path import relpath
+from pathlib import Path
+
+from mosaico_ingest.bag.recording import Recording
+from mosaico_ingest.bridge import ROSBridge
+from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.diagnostics import Finding, Severity
+from mosaico_ingest.executors.trial import try_messages
+from mosaico_ingest.executors.worker import open_for
+from mosaico_ingest.plan.describe import decisions, notes
+from mosaico_ingest.plan.destination import ask_destination, space_finding
+from mosaico_ingest.plan.document import Decisions, PlanDocument, RecordingPlan
+from mosaico_ingest.plan.model import Plan
+from mosaico_ingest.plan.resolve import resolve
+from mosaico_ingest.version import __version__
+
+__all__ = ["decide", "plan_document", "preview"]
+
+
+def plan_document(
+    configs: Sequence[ROSInjectionConfig], *, job: Path, folder: Path, connect: bool
+) -> PlanDocument:
+    """Return what a manifest's configurations would do, as a document for `folder`.
+
+    Raises:
+        IngestError: One of them cannot be done; the message says why.
+    """
+    return PlanDocument(
+        tool=f"mosaico-ingest {__version__}",
+        job=Path(relpath(job, folder)).as_posix(),
+        recordings=tuple(preview(config, connect=connect) for config in configs),
+    )
+
+
+def preview(config: ROSInjectionConfig, *, connect: bool) -> RecordingPlan:
+    """Open the recording, decide everything, try a few messages, ask the destination (a server only with `connect`).
+
+    Raises:
+        IngestError: The job cannot be done; the message says why.
+    """
+    bridge = ROSBridge.for_config(config)
+    with open_for(config) as (recording, resolver):
+        plan = resolve(config, recording, bridge=bridge, resolver=resolver)
+        samples = try_messages(plan, recording)
+        losses = tuple(_losses(recording))
+    decided = decisions(plan, folder=config.base_dir)
+    state = ask_destination(plan, samples, connect=connect)
+    space = space_finding(state)
+    return RecordingPlan(
+        digest=decided.digest,
+        decisions=decided,
+        destination=state,
+        samples=samples,
+        notes=notes((*plan.findings, *losses, *_left_out(plan), *((space,) if space else ()))),
+    )
+
+
+def decide(config: ROSInjectionConfig, *, folder: Path) -> Decisions:
+    """Open the recording and decide everything; paths are seen from `folder`.
+
+    Raises:
+        IngestError: The job cannot be done; the message says why.
+    """
+    bridge = ROSBridge.for_config(config)
+    with open_for(config) as (recording, resolver):
+        return decisions(resolve(config, recording, bridge=bridge, resolver=resolver), folder=folder)
+
+
+def _losses(recording: Recording) -> Iterator[Finding]:
+    for loss in recording.losses:
+        where = f"{Path(loss.file).name} at {loss.offset}" if loss.file else "the recording"
+        yield Finding("unreadable", Severity.WARNING, f"{where}: {loss.reason}")
+
+
+def _left_out(plan: Plan) -> Iterator[Finding]:
+    """Yield a note for each topic that is not read, with the line of the manifest that says so."""
+    for topic in plan.left_out:
+        yield Finding("left-out", Severity.INFO, f"{topic.topic}: {topic.why}", topic.span)
