@@ -28,7 +28,7 @@ from mosaico_ingest.bag.containers.part import (
     orphans,
 )
 from mosaico_ingest.bag.containers.slab import by_key
-from mosaico_ingest.bag.containers.sqlite_salvage import Row, Salvage
+from mosaico_ingest.bag.containers.sqlite_salvage import BROKEN, Row, Salvage
 from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.errors import BagError
 
@@ -84,7 +84,7 @@ class SqlitePart:
             self.message_count: int | None = None if self._counts is None else sum(self._counts.values())
             self.holes.extend(orphans(self._counts, {stream.key for stream in self.streams}))
             self.start_ns, self.end_ns = self._read_bounds()
-        except (sqlite3.Error, OSError, TypeError, ValueError) as err:
+        except (*BROKEN, OSError, TypeError, ValueError) as err:
             self._stack.close()
             raise BagError(f"the SQLite file cannot be read: {err}", where=str(self.path)) from err
         except BaseException:
@@ -104,7 +104,7 @@ class SqlitePart:
             for page in _pages(self._connection.execute(query, bounds)):
                 done = done.after(page)
                 yield Block(int(page[0][2]), partial(_load, page))
-        except sqlite3.DatabaseError as err:
+        except BROKEN as err:
             yield from self._salvaged(want, done, str(err))
 
     def _salvaged(self, want: Want, done: _Done, reason: str) -> Iterator[Block]:
@@ -139,7 +139,7 @@ class SqlitePart:
     def _read_counts(self) -> dict[int, int] | None:
         try:
             return dict(self._connection.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
-        except sqlite3.DatabaseError as err:
+        except BROKEN as err:
             self.notes.append(f"the messages cannot be counted: {err}")
             return None
 
@@ -155,7 +155,7 @@ class SqlitePart:
     def _read_bounds(self) -> tuple[int | None, int | None]:
         try:
             return self._connection.execute("SELECT min(timestamp), max(timestamp) FROM messages").fetchone()
-        except sqlite3.DatabaseError as err:
+        except BROKEN as err:
             self.notes.append(f"the first and last time stamps cannot be read: {err}")
             return None, None
 
@@ -201,7 +201,7 @@ def _tables(connection: sqlite3.Connection) -> set[str]:
     query = "SELECT name FROM sqlite_master WHERE type = 'table'"
     try:
         return {str(name) for (name,) in connection.execute(query)}
-    except sqlite3.DatabaseError:
+    except BROKEN:
         # With this SQLite opens files shorter than their header says; nothing is ever written here.
         connection.execute("PRAGMA writable_schema = ON")
         return {str(name) for (name,) in connection.execute(query)}
@@ -250,7 +250,7 @@ def _pages(rows: Iterator[Row]) -> Iterator[list[Row]]:
             if size >= _PAGE_BYTES or len(page) >= _PAGE_ROWS:
                 yield page
                 page, size = [], 0
-    except sqlite3.DatabaseError:
+    except BROKEN:
         if page:
             yield page
         raise

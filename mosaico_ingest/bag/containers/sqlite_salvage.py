@@ -9,7 +9,10 @@ from typing import Any
 
 from mosaico_ingest.bag.containers.part import Hole
 
-__all__ = ["Row", "Salvage"]
+__all__ = ["BROKEN", "Row", "Salvage"]
+
+BROKEN = (sqlite3.Error, UnicodeDecodeError)
+"""How damage shows; the second, where SQLite's message quotes a name that is damaged."""
 
 Row = tuple[int, int, int, Any]
 """Row id, topic id, time stamp, payload; what SQLite keeps in the last column need not be bytes."""
@@ -32,7 +35,7 @@ class Salvage:
                 for row in self._from(at):
                     at = row[0] + 1
                     yield row
-            except sqlite3.DatabaseError as err:
+            except BROKEN as err:
                 at = self._next_readable(max(begin, at))
                 upto = "the end" if at is None else f"row {at}"
                 self.holes.append(Hole(max(begin, at or 0), f"{err}: rows are missing before {upto}"))
@@ -62,6 +65,6 @@ class Salvage:
     def _is_readable(self, rowid: int) -> bool:
         try:
             list(self._from(rowid, 1))
-        except sqlite3.DatabaseError:
+        except BROKEN:
             return False
         return True
