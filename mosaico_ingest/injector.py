@@ -77,7 +77,7 @@ def _pump(plan: Plan, recording: Recording, streams: tuple[Stream, ...], observe
             tuple(by_channel),
             start_ns=plan.read_from_ns,
             end_ns=plan.read_until_ns,
-            memory_bytes=plan.memory_bytes // 2,
+            memory_bytes=plan.memory_bytes // 4,
         )
         for batch in batches:
             by_channel[batch.channel.id].feed(batch, buffer)

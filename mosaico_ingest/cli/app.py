@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from mosaico_ingest.cli import bag, diff, inspect, lint, plan, run, schema, store
+from mosaico_ingest.cli import bag, diff, inspect, keys, lint, plan, run, schema, serve, store
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.version import __version__
 
@@ -21,15 +21,15 @@ COMMANDS: tuple[tuple[str, Callable[..., Any]], ...] = (
     ("run", run.run),
     ("bag", bag.bag),
     ("inspect", inspect.inspect),
-    ("schema", schema.schema),
     ("plan", plan.plan),
     ("diff", diff.diff),
     ("lint", lint.lint),
+    ("serve", serve.serve),
     ("schema", schema.schema),
 )
 """In the order `--help` lists them."""
 
-GROUPS: tuple[tuple[str, typer.Typer], ...] = (("store", store.app),)
+GROUPS: tuple[tuple[str, typer.Typer], ...] = (("store", store.app), ("keys", keys.app))
 
 app = typer.Typer(
     name="ingest",

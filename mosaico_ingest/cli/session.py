@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import logging
-import signal
 from collections.abc import Sequence
 from pathlib import Path
-from types import FrameType
 
 import typer
 
 from mosaico_ingest import api
 from mosaico_ingest.cli.errors import print_error
 from mosaico_ingest.cli.progress import display
+from mosaico_ingest.cli.signals import interrupt_on_terminate
 from mosaico_ingest.cli.tables import print_report
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.errors import ManifestError
@@ -27,7 +26,7 @@ def run_configs(
 ) -> None:
     """Run each configuration in turn; exit with the report's code unless it is 0."""
     _set_up_logging(log or configs[0].log_level)
-    signal.signal(signal.SIGTERM, _as_interrupt)
+    interrupt_on_terminate()
     failures: list[RunFinished] = []
 
     def tell(event: Event) -> None:
@@ -51,10 +50,6 @@ def run_configs(
 
 def _report_path(config: ROSInjectionConfig) -> Path | None:
     return None if config.report_path is None else Path(config.report_path)
-
-
-def _as_interrupt(_signal: int, _frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
 
 
 def _set_up_logging(level: str) -> None:

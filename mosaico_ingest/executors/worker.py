@@ -58,13 +58,13 @@ def make_plan(config: ROSInjectionConfig) -> Plan:
         return resolve(config, recording, bridge=bridge, resolver=resolver)
 
 
-def sink_for(target: StoreTarget | ServerTarget) -> Sink:
-    """Turn a target into the object that writes there."""
+def sink_for(target: StoreTarget | ServerTarget, *, buffer_bytes: int) -> Sink:
+    """Turn a target into the object that writes there and holds at most about `buffer_bytes` in memory."""
     if isinstance(target, StoreTarget):
-        return StoreSink(Store.open(target.path))
+        return StoreSink(Store.open(target.path), buffer_bytes)
     from mosaico_ingest.platform.sink import PlatformSink  # noqa: PLC0415 - Flight is slow to import and rarely needed
 
-    return PlatformSink(target)
+    return PlatformSink(target, buffer_bytes)
 
 
 def execute(plan: Plan, observe: Observer, *, sink: Sink | None = None) -> tuple[Report, IngestError | None]:
@@ -84,7 +84,7 @@ def execute(plan: Plan, observe: Observer, *, sink: Sink | None = None) -> tuple
         tell(Noted(finding))
     try:
         with open_recording(plan.files, resolve=plan.resolver) as recording:
-            inject(plan, recording, sink or sink_for(plan.target), tell)
+            inject(plan, recording, sink or sink_for(plan.target, buffer_bytes=plan.memory_bytes // 4), tell)
     except IngestError as error:
         failure = error
     tell(_failed(failure) if failure else _done(collector))
