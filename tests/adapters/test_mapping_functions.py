@@ -12,7 +12,7 @@ import pytest
 
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.mapping.check import Checker, Scope
-from mosaico_ingest.adapters.mapping.evaluate import Evaluation
+from mosaico_ingest.adapters.mapping.evaluate import Evaluation, RowsRefused
 from mosaico_ingest.adapters.mapping.expression import parse
 from mosaico_ingest.adapters.mapping.functions import SUBJECTS, functions, operators
 from mosaico_ingest.adapters.mapping.functions.ros import HEADER_TYPE
@@ -96,6 +96,8 @@ CASES = [
     ("len(x)", pa.list_(I4), [[], [1, 2], None], [0, 2, None]),
     ("len(x)", pa.list_(I4, 2), [[1, 2]], [2]),
     ("sum(x)", pa.list_(I4), [[], [1, 2], [None], None], [0, 3, None, None]),
+    ("sum(x)", pa.list_(pa.uint64()), [[2**63 - 2, 1]], [2**63 - 1]),
+    ("sum(x)", pa.list_(pa.int64()), [[2**63 - 1, -1]], [2**63 - 2]),
     ("sum(x)", pa.list_(pa.float32()), [[], [0.5, 1.5]], [0.0, 2.0]),
     ("sum(x[] * 2)", pa.list_(I4), [[], [1, 2]], [0, 6]),
     ("mean(x)", pa.list_(I4), [[], [1, 2]], [None, 1.5]),
@@ -200,6 +202,12 @@ def test_header_and_time_are_those_of_the_ontology() -> None:
 def test_the_reference_in_the_documentation_is_current() -> None:
     path = Path(__file__).parents[2] / "docs" / "mapping.md"
     assert with_reference(path.read_text("utf-8")) == path.read_text("utf-8")
+
+
+def test_a_sum_of_more_than_64_bits_rejects_the_row() -> None:
+    for type_ in (pa.int64(), pa.uint64()):
+        with pytest.raises(RowsRefused):
+            column("sum(x)", [[2**63 - 1, 1]], pa.list_(type_))
 
 
 def test_every_function_is_documented_and_has_a_case() -> None:

@@ -11,7 +11,7 @@ from mosaico_ingest.adapters.mapping.arrow import Array, arrays, pc, pt
 from mosaico_ingest.adapters.mapping.columns import Axis, open_list
 from mosaico_ingest.adapters.mapping.functions.operators import computed, whole
 from mosaico_ingest.adapters.mapping.functions.registry import Refuse, Take, function, list_of
-from mosaico_ingest.adapters.mapping.kinds import Kind, int_bounds, is_number, kind_of
+from mosaico_ingest.adapters.mapping.kinds import INT64, Kind, int_bounds, is_number, kind_of
 
 __all__ = ["BOOLEANS", "NUMBERS"]
 
@@ -70,8 +70,15 @@ def _absent(elements: Array, axis: Axis) -> NDArray[np.bool_]:
 
 
 def _plain(elements: Array) -> NDArray[Any]:
-    dtype = np.int64 if pt.is_integer(elements.type) else np.float64
-    return np.asarray(pc.fill_null(elements, 0)).astype(dtype)
+    """Return the elements in 64 bits, 0 for null."""
+    wide = (
+        np.float64
+        if not pt.is_integer(elements.type)
+        else np.uint64
+        if pt.is_uint64(elements.type)
+        else np.int64
+    )
+    return np.asarray(pc.fill_null(elements, 0)).astype(wide)
 
 
 @function(NUMBERS, gives=_total, name="sum")
@@ -80,10 +87,14 @@ def sum_(refuse: Refuse, x: Array) -> Array:
     elements, axis = open_list(x)
     values = _plain(elements)
     total = _fold(values, axis, np.add, 0)
-    if values.dtype == np.int64:
+    if values.dtype != np.float64:
         near = np.abs(_fold(values.astype(np.float64), axis, np.add, 0)) > _NEAR_OVERFLOW
+        for row in np.flatnonzero(near):
+            exact = sum(values[axis.offsets[row] : axis.offsets[row + 1]].tolist())
+            near[row] = not INT64[0] <= exact <= INT64[1]
         if near.any():
-            refuse(near, "overflow", lambda _: "the sum comes near 64 bits")
+            refuse(near, "overflow", lambda _: "the sum has more than 64 bits")
+        total = total.astype(np.int64)
     return arrays.array(total, mask=_absent(elements, axis))
 
 

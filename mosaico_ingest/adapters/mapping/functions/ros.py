@@ -19,7 +19,7 @@ from mosaico_ingest.adapters.mapping.columns import (
 from mosaico_ingest.adapters.mapping.functions.lists import NUMBERS
 from mosaico_ingest.adapters.mapping.functions.operators import computed
 from mosaico_ingest.adapters.mapping.functions.registry import FLOAT, TEXT, Refuse, function, struct_with
-from mosaico_ingest.adapters.mapping.functions.time import STAMP, STAMP_TYPE, as_stamp
+from mosaico_ingest.adapters.mapping.functions.time import STAMP, STAMP_TYPE, as_stamp, stamp_parts
 from mosaico_ingest.adapters.mapping.kinds import Kind
 
 __all__ = ["HEADER", "HEADER_TYPE", "as_header"]
@@ -56,8 +56,7 @@ def _is_silent(stamp: Array, frame: Array) -> Mask:
     unnamed = true_where(pc.equal(pc.binary_length(frame), 0), null=True)
     if not unnamed.any():
         return unnamed
-    parts = (field_of(stamp, name) for name in ("sec", "nanosec"))
-    zero = [true_where(pc.equal(part, 0), null=True) for part in parts]
+    zero = [true_where(pc.equal(part, 0), null=True) for part in stamp_parts(stamp)]
     return unnamed & zero[0] & zero[1]
 
 

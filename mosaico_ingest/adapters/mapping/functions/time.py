@@ -16,7 +16,7 @@ from mosaico_ingest.adapters.mapping.functions.registry import (
 )
 from mosaico_ingest.adapters.mapping.kinds import Kind
 
-__all__ = ["STAMP", "STAMP_TYPE", "as_stamp"]
+__all__ = ["STAMP", "STAMP_TYPE", "as_stamp", "stamp_parts"]
 
 SECOND_NS = 1_000_000_000
 STAMP_TYPE: DataType = arrays.struct(
@@ -34,14 +34,15 @@ STAMP = struct_with(
 _INT32 = (-(2**31), 2**31 - 1)
 
 
-def _parts(t: Array) -> tuple[Array, Array]:
+def stamp_parts(t: Array) -> tuple[Array, Array]:
+    """Return the seconds and the nanoseconds, in ROS's or the ontology's spelling."""
     names = ("sec", "nanosec") if t.type.get_field_index("sec") >= 0 else ("seconds", "nanoseconds")
     return field_of(t, names[0]), field_of(t, names[1])
 
 
 def as_stamp(refuse: Refuse, t: Array) -> Array:
     """Return `{sec, nanosec}` as the ontology's time; the fields are shared where their types agree."""
-    sec, nanosec = _parts(t)
+    sec, nanosec = stamp_parts(t)
     over = true_where(pc.greater_equal(nanosec, SECOND_NS))
     if over.any():
         refuse(over, "nanosec", lambda i: f"nanosec is {nanosec[i]}; it must be below 1e9")
@@ -61,7 +62,7 @@ def ros_time(refuse: Refuse, t: Array) -> Array:
 @function(STAMP, gives=arrays.float64())
 def seconds(t: Array) -> Array:
     """A time or duration in s."""
-    sec, nanosec = _parts(t)
+    sec, nanosec = stamp_parts(t)
     fraction = pc.multiply(pc.cast(nanosec, arrays.float64()), 1e-9)
     return pc.add(pc.cast(sec, arrays.float64()), fraction)
 
@@ -73,7 +74,7 @@ def _whole(_: Kind) -> Kind:
 @function(STAMP, gives=_whole)
 def nanoseconds(t: Array) -> Array:
     """A time or duration in ns."""
-    sec, nanosec = (pc.cast(part, arrays.int64()) for part in _parts(t))
+    sec, nanosec = (pc.cast(part, arrays.int64()) for part in stamp_parts(t))
     return pc.add(pc.multiply(sec, SECOND_NS), nanosec)
 
 

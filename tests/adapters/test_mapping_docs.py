@@ -1,0 +1,60 @@
+"""The documentation of the mapping language: its examples work."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from mosaico_ingest.adapters.mapping.load import load_adapter
+from mosaico_ingest.adapters.mapping.trial import run_tests
+from mosaico_ingest.bag.shape import ros_shape
+from mosaico_ingest.bag.types import TypeResolver
+
+TEXT = (Path(__file__).parents[2] / "docs" / "mapping.md").read_text("utf-8")
+BLOCKS = re.findall(r"```yaml\n(.*?)```", TEXT, re.DOTALL)
+
+BATTERY_PACK = """\
+std_msgs/Header header
+uint32 voltage_mv
+int32 current_ma
+uint8 soc
+acme_msgs/Cell[] cells
+uint8 status
+string serial
+"""
+TYPES: dict[str, Path | str] = {
+    "acme_msgs/msg/BatteryPack": BATTERY_PACK,
+    "acme_msgs/msg/Cell": "uint16 voltage_mv\n",
+}
+
+
+def block(start: str) -> str:
+    [found] = [block for block in BLOCKS if block.startswith(start)]
+    return found
+
+
+def test_the_first_example_passes_its_own_tests() -> None:
+    outcomes = run_tests(load_adapter(block("version: 1"), file="docs"), TypeResolver(types=TYPES))
+    assert [(outcome.name, outcome.problems) for outcome in outcomes] == [("nominal", ())]
+
+
+def test_the_example_of_variants_binds_to_all_of_them() -> None:
+    spec = load_adapter(f"version: 1\nadapter: A\nontology: Pose\n{block('variants:')}", file="docs")
+    for name in spec.ros_types:
+        definition = TypeResolver().resolve(name, None, ros_version=2)
+        assert spec.check(definition, ros_shape(definition)) == ()
+
+
+def test_the_example_of_a_type_of_one_s_own_is_one() -> None:
+    text = f"version: 1\nadapter: A\nros_type: a/msg/B\nfields: {{left: 1}}\n{block('ontology:')}"
+    spec = load_adapter(text, file="docs")
+    assert (spec.ontology.tag, len(spec.ontology.struct)) == ("WheelTicks", 6)
+
+
+@pytest.mark.parametrize(
+    "key", ["value", "map", "else", "use", "of", "fields", "with", "when", "variants", "definition"]
+)
+def test_every_key_is_on_the_page(key: str) -> None:
+    assert f"`{key}`" in TEXT or f"{key}:" in TEXT
