@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from mosaico_ingest.bag.recording import Recording
-from mosaico_ingest.diagnostics import Stage
+from mosaico_ingest.diagnostics import Finding, Severity, Stage
 from mosaico_ingest.errors import Interrupted, NothingMatched, VerificationError
 from mosaico_ingest.plan.model import Plan
 from mosaico_ingest.policies import SessionLevelErrorPolicy
-from mosaico_ingest.report.events import Observer, Rejected, TopicClosed, TopicProgress, Unreadable
+from mosaico_ingest.report.events import Noted, Observer, Rejected, TopicClosed, TopicProgress, Unreadable
 from mosaico_ingest.sink import Session, Sink, StoredTopic
 from mosaico_ingest.stream import Stream
 from mosaico_ingest.write_buffer import WriteBuffer
@@ -81,9 +81,21 @@ def _pump(plan: Plan, recording: Recording, streams: tuple[Stream, ...], observe
         )
         for batch in batches:
             by_channel[batch.channel.id].feed(batch, buffer)
+    for stream in streams:
+        if stream.padded:
+            observe(Noted(_padded(stream)))
     for loss in recording.losses:
         stream = by_channel.get(loss.channel) if loss.channel is not None else None
         observe(Unreadable(stream.plan.target if stream else None, loss.count, loss.offset, loss.reason))
+
+
+def _padded(stream: Stream) -> Finding:
+    return Finding(
+        "padded-messages",
+        Severity.WARNING,
+        f"{stream.plan.topic}: {stream.padded} messages end in 4 to 7 zero bytes that {stream.plan.msgtype} does not explain",
+        help="they were read; check that the definition is the one they were written with",
+    )
 
 
 def _check_not_empty(plan: Plan, streams: tuple[Stream, ...]) -> None:

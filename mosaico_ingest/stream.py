@@ -62,6 +62,8 @@ class Stream:
     """Messages read so far."""
     rows: int = 0
     """Rows handed to the destination so far."""
+    padded: int = 0
+    """Messages that ended in zero bytes their definition does not explain."""
     start_ns: int | None = None
     end_ns: int | None = None
     status: TopicStatus = TopicStatus.EMPTY
@@ -113,6 +115,7 @@ class Stream:
         keep = positions[taken]
         sampled = batch if taken.all() else _take(batch, keep)
         decoded = self._decoders[batch.channel.id].decode(sampled)
+        self.padded += decoded.padded
         lost = [_Lost(Stage.DECODE, replace(f, row=int(keep[f.row]))) for f in decoded.failures]
         index = keep[decoded.index]
         envelope = Envelope(self.plan.topic, self.plan.msgtype, batch.log_times[index])

@@ -150,6 +150,7 @@ def test_case(case: Path, container: str, tmp_path: Path) -> None:
     assert exit_code == expected["exit_code"], error
     if report is None:
         return
+    assert expected.get("finding", "") in "\n".join(report.findings)
     store = Store.open(tmp_path / "store")
     topics = {topic.target: topic for topic in report.topics}
     for name, wanted in expected.get("topics", {}).items():
