@@ -86,7 +86,10 @@ def _pump(plan: Plan, recording: Recording, streams: tuple[Stream, ...], observe
             observe(Noted(_padded(stream)))
     for loss in recording.losses:
         stream = by_channel.get(loss.channel) if loss.channel is not None else None
-        observe(Unreadable(stream.plan.target if stream else None, loss.count, loss.offset, loss.reason))
+        if loss.count == 0:
+            observe(Noted(Finding("detour", Severity.INFO, f"{loss.file} at {loss.offset}: {loss.reason}")))
+        else:
+            observe(Unreadable(stream.plan.target if stream else None, loss.count, loss.offset, loss.reason))
 
 
 def _padded(stream: Stream) -> Finding:

@@ -15,6 +15,9 @@ from mosaico_ingest.report.model import Report, RunReport, TopicReport
 
 __all__ = ["open_console", "print_inspection", "print_json", "print_report"]
 
+COLUMNS = ("read", "written", "rejected", "rate", "payload", "stored")
+ROOMY = 100
+"""Columns of a terminal that has room for all of them."""
 WIDE = 240
 """Columns of output that goes to a file or a pipe, where nothing needs to be folded."""
 
@@ -88,14 +91,16 @@ def _print_recording(report: Report, console: Console) -> None:
         if report.status is RunStatus.SKIPPED:
             console.print(f"{report.sequence}: skipped, the sequence is there already", highlight=False)
         return
+    columns = COLUMNS if console.width >= ROOMY else tuple(c for c in COLUMNS if c not in {"rate", "payload"})
     table = Table(box=None, pad_edge=False, header_style="dim")
-    table.add_column("topic", overflow="fold")
-    table.add_column("ontology", style="cyan")
-    for column in ("read", "written", "rejected", "rate", "payload", "stored"):
-        table.add_column(column, justify="right")
+    table.add_column("topic", overflow="ellipsis", no_wrap=True)
+    table.add_column("ontology", style="cyan", no_wrap=True)
+    for column in columns:
+        table.add_column(column, justify="right", no_wrap=True)
     for topic in report.topics:
         if topic.status is not TopicStatus.LEFT_OUT:
-            table.add_row(*_cells(topic))
+            cells = _cells(topic)
+            table.add_row(topic.target, topic.ontology, *(cells[column] for column in columns))
     console.print(table)
     _print_left_out(report, console)
     for topic in report.topics:
@@ -105,19 +110,15 @@ def _print_recording(report: Report, console: Console) -> None:
     _print_totals(report, console)
 
 
-def _cells(topic: TopicReport) -> tuple[str | Text, ...]:
-    rate = "" if topic.rate_hz is None else f"{topic.rate_hz:.1f} Hz"
-    rejected = Text(count_text(topic.rejected), style="red" if topic.rejected else "dim")
-    return (
-        topic.target,
-        topic.ontology,
-        count_text(topic.read),
-        count_text(topic.written),
-        rejected,
-        rate,
-        bytes_text(topic.payload_bytes),
-        bytes_text(topic.stored_bytes),
-    )
+def _cells(topic: TopicReport) -> dict[str, str | Text]:
+    return {
+        "read": count_text(topic.read),
+        "written": count_text(topic.written),
+        "rejected": Text(count_text(topic.rejected), style="red" if topic.rejected else "dim"),
+        "rate": "" if topic.rate_hz is None else f"{topic.rate_hz:.1f} Hz",
+        "payload": bytes_text(topic.payload_bytes),
+        "stored": bytes_text(topic.stored_bytes),
+    }
 
 
 def _print_left_out(report: Report, console: Console) -> None:
