@@ -10,9 +10,40 @@ from mosaico_ingest.adapters.mapping.functions import (
     text,
     time,
 )
-from mosaico_ingest.adapters.mapping.functions.registry import Function, function, functions, lookup
+from mosaico_ingest.adapters.mapping.functions.registry import (
+    ANY,
+    BINARY,
+    BOOLEAN,
+    FLOAT,
+    INTEGER,
+    LIST,
+    NUMBER,
+    STRUCT,
+    TEXT,
+    TEXT_LITERAL,
+    Function,
+    function,
+    functions,
+    lookup,
+)
 
-__all__ = ["SUBJECTS", "Function", "function", "functions", "lookup"]
+__all__ = [
+    "ANY",
+    "BINARY",
+    "BOOLEAN",
+    "FLOAT",
+    "INTEGER",
+    "LIST",
+    "NUMBER",
+    "STRUCT",
+    "SUBJECTS",
+    "TEXT",
+    "TEXT_LITERAL",
+    "Function",
+    "function",
+    "functions",
+    "lookup",
+]
 
 SUBJECTS = (operators, numeric, lists, text, time, rotation, ros, clouds)
 """Where the functions come from, in the order of the documentation."""

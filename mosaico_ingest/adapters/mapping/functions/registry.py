@@ -13,6 +13,7 @@ import numpy as np
 from mosaico_ingest.adapters.mapping.arrow import Array, DataType, arrays, pc, pt
 from mosaico_ingest.adapters.mapping.columns import Mask
 from mosaico_ingest.adapters.mapping.kinds import Kind, Unfit, is_list, is_number, kind_of, spell
+from mosaico_ingest.errors import AdapterError
 
 __all__ = [
     "ANY",
@@ -126,6 +127,9 @@ def function(
     """Add a function to the language; its docstring's first line is its documentation.
 
     The decorated function gets one array for each argument, all of one length, and returns an array. A first parameter called `refuse` rejects rows, see `Refuse`.
+
+    Raises:
+        AdapterError: Another module has a function of that name.
     """
 
     def add(apply: Callable[..., Any]) -> Callable[..., Any]:
@@ -133,6 +137,10 @@ def function(
         parameters = tuple(name for name, p in known.items() if p.kind is not p.VAR_POSITIONAL)
         refuses = parameters[:1] == ("refuse",)
         spelled = name or apply.__name__.rstrip("_")
+        taken = _FUNCTIONS.get(spelled)
+        if taken is not None and taken.apply.__module__ != apply.__module__:
+            hint = f"{taken.apply.__module__} has it; give yours another name"
+            raise AdapterError(f"there is already a function {spelled!r}", where=apply.__module__, hint=hint)
         _FUNCTIONS[spelled] = Function(
             name=spelled,
             takes=takes,
