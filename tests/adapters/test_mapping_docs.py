@@ -50,7 +50,7 @@ def test_the_example_of_variants_binds_to_all_of_them() -> None:
 def test_the_example_of_a_type_of_one_s_own_is_one() -> None:
     text = f"version: 1\nadapter: A\nros_type: a/msg/B\nfields: {{left: 1}}\n{block('ontology:')}"
     spec = load_adapter(text, file="docs")
-    assert (spec.ontology.tag, len(spec.ontology.struct)) == ("WheelTicks", 6)
+    assert (spec.ontology.tag, len(spec.ontology.struct)) == ("WheelTicks", 7)
 
 
 @pytest.mark.parametrize(

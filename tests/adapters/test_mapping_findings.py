@@ -165,6 +165,8 @@ def test_a_mistake_in_a_field_is_one_finding_at_its_place(
         ("  volts: voltage_mv * 0.001\n", "  count: status\n", "missing-target", "fields"),
         ("  volts: voltage_mv * 0.001\n", "  volts: null\n", "missing-target", "volts"),
         ("count: int32", "count: int33", "mapping", "count"),
+        ("tag: Pack", "tag: IMU", "mapping", "tag"),
+        ("count: int32", "count: {type: int32, fields: {a: int8}}", "mapping", "count"),
         ("count: int32", "timestamp_ns: int32", "mapping", "timestamp_ns"),
         ("    count: int32\n", "    count: {unit: m}\n", "mapping", "count"),
         ("fields:\n  volts", "schema_metadata: {rate: soc +}\nfields:\n  volts", "expression", "+"),

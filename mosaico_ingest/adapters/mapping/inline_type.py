@@ -11,6 +11,7 @@ from mosaico_ingest.adapters.mapping.arrow import DataType, arrays
 from mosaico_ingest.adapters.mapping.model import FieldType, InlineType, TypedField
 from mosaico_ingest.manifest.source import Path
 from mosaico_ingest.ontology.registry import UnknownTag, ontology_type
+from mosaico_ingest.ontology.tags import MODULES
 from mosaico_ingest.ontology.types import OntologyType
 
 __all__ = ["make_type"]
@@ -28,6 +29,7 @@ _PLAIN: dict[str, DataType] = {
 }
 _LIST = re.compile(r"list\[\s*(?P<element>.+?)\s*(,\s*(?P<size>\d+)\s*)?\]")
 _ENVELOPE = "timestamp_ns"
+_LIST_OF_STRUCTS = "list"
 
 Report = Callable[[Path, str, "str | None"], None]
 """Takes a mistake: the path of the value, what, what to do."""
@@ -38,6 +40,11 @@ def make_type(inline: InlineType, report: Report) -> OntologyType:
     path: Path = ("ontology", "fields")
     if _ENVELOPE in inline.fields:
         report((*path, _ENVELOPE), f"{_ENVELOPE} is the envelope's column", "give the field another name")
+    if inline.tag in MODULES:
+        hint = f"write ontology: {inline.tag}, or give yours another tag"
+        report(
+            ("ontology", "tag"), f"the tag {inline.tag!r} is a built-in's, which has its own columns", hint
+        )
     return OntologyType(inline.tag, pa.struct(_fields(inline.fields, path, report)), inline.format)
 
 
@@ -48,14 +55,15 @@ def _fields(fields: Mapping[str, FieldType], path: Path, report: Report) -> list
 
 def _field(name: str, field: FieldType, path: Path, report: Report) -> DataType | None:
     typed = TypedField(type=field) if isinstance(field, str) else field
-    if (typed.type is None) == (typed.fields is None):
-        report(path, f"the field {name!r} needs either type or fields", "as {type: float64}")
+    if typed.fields is not None and typed.type in {None, _LIST_OF_STRUCTS}:
+        struct = pa.struct(_fields(typed.fields, (*path, "fields"), report))
+        type_: DataType = struct if typed.type is None else arrays.list_(struct)
+    elif typed.type is None or typed.fields is not None:
+        hint = "as {type: float64}, {fields: {…}}, or {type: list, fields: {…}}"
+        report(path, f"the field {name!r} needs either type or fields", hint)
         return None
-    where = path if isinstance(field, str) else (*path, "type")
-    if typed.fields is not None:
-        type_: DataType = pa.struct(_fields(typed.fields, (*path, "fields"), report))
     else:
-        type_ = _type(typed.type or "", where, report)
+        type_ = _type(typed.type, path if isinstance(field, str) else (*path, "type"), report)
     return None if type_ is None else pa.field(name, type_, nullable=typed.nullable)
 
 

@@ -90,7 +90,7 @@ class TypedField(_Strict):
     type: str | None = None
     """As `float32`, `list[float64]`, `list[float64, 9]`, or an ontology tag."""
     fields: Mapping[str, FieldType] | None = None
-    """Instead of `type`: the fields of a nested struct."""
+    """The fields of a nested struct; with `type: list`, of each struct in a list."""
     nullable: bool = True
     """Whether a row may have no value."""
     unit: str | None = None
