@@ -74,7 +74,7 @@ class Compiler:
         self._require(inner, {*model.fields, *wrap})
         if slot.scope is None or fields is None or replaced is None or (said is not None and of is None):
             return None
-        source = ByFields(of.typed if of else None, _complete(fields, slot.type))
+        source = ByFields(of.typed if of else None, _complete(fields, slot))
         return Filled(slot.title, "", slot.type, nullable=False, source=source, replaced=replaced)
 
     def _of(self, slot: Slot, said: Value) -> Written | None:
@@ -102,7 +102,7 @@ class Compiler:
             self._desk.report(path, f"{owner.title} has no field {name!r}", help_, rule="unknown-target")
             return None
         field = owner.type.field(position)
-        full = f"{owner.name}.{name}" if owner.name else name
+        full = owner.inside(name)
         return self._field(field, value, Slot(full, field.type, path, owner.scope, full))
 
     def _require(self, owner: Slot, given: AbstractSet[str]) -> None:
@@ -195,7 +195,7 @@ class Compiler:
         self._require(inner, {*values, *skip})
         if fields is None or inner.scope is None:
             return None
-        return ByFields(typed, _complete(fields, element))
+        return ByFields(typed, _complete(fields, inner))
 
     def _by_adapter(self, use: str, slot: Slot, text: str) -> Source | None:
         desk = self._desk
@@ -246,10 +246,11 @@ def _form_problem(form: Form) -> tuple[str, str] | None:
     return None
 
 
-def _complete(fields: tuple[Filled, ...], struct: DataType) -> tuple[Filled, ...]:
+def _complete(fields: tuple[Filled, ...], owner: Slot) -> tuple[Filled, ...]:
     """Return a field for each of the struct, in its order; what is not mentioned is null or replaced later."""
     known = {field.name: field for field in fields}
-    return tuple(
-        known.get(field.name) or Filled(field.name, field.name, field.type, nullable=True, source=Absent())
-        for field in struct
-    )
+    return tuple(known.get(field.name) or _absent(field, owner) for field in owner.type)
+
+
+def _absent(field: DataType, owner: Slot) -> Filled:
+    return Filled(owner.inside(field.name), field.name, field.type, nullable=True, source=Absent())

@@ -45,6 +45,10 @@ class Slot:
         """Return the slot with the place of a key inside its value."""
         return replace(self, path=(*self.path, *keys))
 
+    def inside(self, name: str) -> str:
+        """Return what a field of this column is called."""
+        return f"{self.name}.{name}" if self.name else name
+
 
 class Desk:
     """The file being read, and what was found wrong with it so far."""
