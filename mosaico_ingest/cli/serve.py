@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -10,6 +12,7 @@ import typer
 __all__ = ["serve"]
 
 LOOPBACK = {"127.0.0.1", "::1", "[::1]", "localhost"}
+GRACE_S = 0.5
 
 
 def serve(
@@ -41,12 +44,16 @@ def serve(
     tls = Tls(tls_cert, tls_key) if tls_cert is not None and tls_key is not None else None
     keys = Keyring(api_keys) if api_keys is not None else None
     interrupt_on_terminate()
-    with start(store, host, port, keys=keys, tls=tls) as server:
+    server = start(store, host, port, keys=keys, tls=tls)
+    try:
         typer.echo(f"serving {store} at {server.location}")
         if keys is None:
             reach = "who can reach this machine" if host not in LOOPBACK else "on this machine"
             typer.echo(f"warning: without --api-keys everybody {reach} may read, write and delete", err=True)
-        try:
-            server.wait()
-        except KeyboardInterrupt:
-            typer.echo("stopping")
+        server.wait()
+    except KeyboardInterrupt:
+        typer.echo("stopping")
+    if not server.shutdown(grace_s=GRACE_S):
+        typer.echo("a client's call was still open; what it had not finalized is discarded", err=True)
+        sys.stdout.flush()
+        os._exit(0)  # the thread of that call would keep the process for as long as the client likes

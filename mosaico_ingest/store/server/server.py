@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -18,6 +19,7 @@ __all__ = ["PORT", "Server", "Tls", "serve"]
 
 PORT = 6726
 """Where clients look unless told otherwise."""
+_GRACE_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +35,7 @@ class Server:
 
     def __init__(self, service: Service, store: Store, host: str, *, scheme: str) -> None:
         self._service = service
+        self._stopped = threading.Event()
         self.store_path = store.path
         self.host = host
         self.port = service.port
@@ -40,13 +43,21 @@ class Server:
         """What a Flight client connects to."""
 
     def wait(self) -> None:
-        """Block until the server is shut down."""
-        self._service.wait()
+        """Block until the server is shut down; unlike Flight's own way to wait, signals are heard."""
+        self._stopped.wait()
 
-    def shutdown(self) -> None:
-        """Stop taking calls, wait for those under way, and discard what was never finalized."""
-        self._service.shutdown()
+    def shutdown(self, *, grace_s: float = _GRACE_S) -> bool:
+        """Stop taking calls, wait for those under way, and discard what was never finalized.
+
+        Returns whether all calls ended in time. Flight cannot end the call of a client that says nothing, nor
+        can a process that has one end normally.
+        """
+        stopping = threading.Thread(target=self._service.shutdown, name="mosaico-ingest-stop", daemon=True)
+        stopping.start()
+        stopping.join(grace_s)
         self._service.drop_uploads()
+        self._stopped.set()
+        return not stopping.is_alive()
 
     def __enter__(self) -> Server:  # noqa: PYI034 - Self comes with Python 3.11, and nobody derives from this
         return self
