@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,8 @@ from mosaico_ingest.executors.inspection import inspect
 from mosaico_ingest.executors.local import run_all
 from mosaico_ingest.executors.preview import decide, plan_document
 from mosaico_ingest.executors.worker import execute, make_plan
-from mosaico_ingest.manifest.load import load_manifest
-from mosaico_ingest.plan.compile import compile_manifest
+from mosaico_ingest.manifest.load import load_manifests
+from mosaico_ingest.plan.compile import compile_manifests
 from mosaico_ingest.plan.document import PlanDocument, read_plan
 from mosaico_ingest.plan.drift import Difference, differences
 from mosaico_ingest.plan.model import Plan
@@ -80,8 +81,9 @@ def compile_job(manifest: Path) -> tuple[ROSInjectionConfig, ...]:
         NothingMatched: There is no such recording.
         AdapterError: An adapter it names is not there or has a mistake.
     """
-    configs = compile_manifest(load_manifest(manifest))
-    ROSBridge.for_config(configs[0])  # the jobs of one manifest share their adapters
+    configs = compile_manifests(load_manifests(manifest))
+    for _, alike in groupby(configs, key=lambda config: (config.adapters, config.adapter_override)):
+        ROSBridge.for_config(next(alike))
     return configs
 
 

@@ -7,11 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from mosaico_ingest.diagnostics import Finding, Severity
+from mosaico_ingest.manifest.matrix import combinations, variables
 from mosaico_ingest.manifest.source import Path, Source, Value
 
 __all__ = ["Filled", "fill_in"]
 
 _REFERENCE = re.compile(r"\$(?:(\$)|\{([^{}]*)\}|(?=\{))")
+_WITHOUT = {("extends",), ("defaults",), ("matrix",)}
+"""Sections in which there are no variables."""
 _INSIDE = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)(?::([-?])(.*))?", re.DOTALL)
 
 
@@ -27,24 +30,48 @@ class Filled:
     """Where it could not be filled in; the text stands there as written."""
 
 
-def fill_in(source: Source, env: Mapping[str, str] | None) -> Filled:
-    """Fill in the variables of every text; without `env` only those with a default, and none is missed."""
+def fill_in(source: Source, env: Mapping[str, str] | None, cell: Mapping[str, str] | None = None) -> Filled:
+    """Fill in the variables of every text; without `env` only those with a default, and none is missed.
+
+    The values of `cell` come first (without it, those of the first job of the document's matrix), then those of the
+    environment, then the document's own `defaults`.
+    """
+    known = _Variables(
+        combinations(source.value)[0] if cell is None else cell, env, variables(source.at(("defaults",)))
+    )
     filled = Filled(None)
-    filled.value = _value(source.value, (), source, env, filled)
+    filled.value = _value(source.value, (), source, known, filled)
     return filled
 
 
-def _value(value: Value, path: Path, source: Source, env: Mapping[str, str] | None, out: Filled) -> Value:
+@dataclass(frozen=True, slots=True)
+class _Variables:
+    """What variables stand for; the first that knows one says."""
+
+    cell: Mapping[str, str]
+    env: Mapping[str, str] | None
+    """None: not looked at, and nothing is missed."""
+    defaults: Mapping[str, str]
+
+    def get(self, name: str) -> str | None:
+        if name in self.cell:
+            return self.cell[name]
+        return (self.env or {}).get(name) or self.defaults.get(name)
+
+
+def _value(value: Value, path: Path, source: Source, known: _Variables, out: Filled) -> Value:
+    if path in _WITHOUT:
+        return value
     if isinstance(value, dict):
-        return {key: _value(inner, (*path, key), source, env, out) for key, inner in value.items()}
+        return {key: _value(inner, (*path, key), source, known, out) for key, inner in value.items()}
     if isinstance(value, list):
-        return [_value(inner, (*path, index), source, env, out) for index, inner in enumerate(value)]
+        return [_value(inner, (*path, index), source, known, out) for index, inner in enumerate(value)]
     if isinstance(value, str) and "$" in value:
-        return _text(value, path, source, env, out)
+        return _text(value, path, source, known, out)
     return value
 
 
-def _text(text: str, path: Path, source: Source, env: Mapping[str, str] | None, out: Filled) -> str:
+def _text(text: str, path: Path, source: Source, known: _Variables, out: Filled) -> str:
     def replace(match: re.Match[str]) -> str:
         if match[1]:
             return "$"
@@ -59,12 +86,13 @@ def _text(text: str, path: Path, source: Source, env: Mapping[str, str] | None, 
             )
             return match[0]
         name, operator, rest = inside.groups()
-        if env is not None and env.get(name):
-            return env[name]
+        value = known.get(name)
+        if value is not None:
+            return value
         if operator == "-":
             return rest
         out.unknown.add(path)
-        if env is not None:
+        if known.env is not None:
             why = f": {rest}" if operator == "?" and rest else ""
             report("unset-variable", f"{name} is not set{why}", f"set {name} in the environment", match)
         return match[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,8 @@ from pydantic import ValidationError
 from mosaico_ingest.diagnostics import Finding, Severity, Span
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.manifest.environment import Filled, fill_in
+from mosaico_ingest.manifest.extends import extended
+from mosaico_ingest.manifest.matrix import combinations
 from mosaico_ingest.manifest.model import Manifest
 from mosaico_ingest.manifest.problems import explain
 from mosaico_ingest.manifest.scalars import resolve_plain
@@ -22,7 +24,14 @@ from mosaico_ingest.manifest.schema import job_schema
 from mosaico_ingest.manifest.source import Path as Place
 from mosaico_ingest.manifest.source import Source, Value, load_source, member
 
-__all__ = ["LoadedManifest", "check_manifest", "load_manifest", "read_text"]
+__all__ = [
+    "LoadedManifest",
+    "check_manifest",
+    "load_manifest",
+    "load_manifests",
+    "read_manifest",
+    "read_text",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +41,8 @@ class LoadedManifest:
     manifest: Manifest
     source: Source
     path: Path
+    cell: Mapping[str, str] = field(default_factory=dict[str, str])
+    """The values of its matrix that make it this job and no other."""
 
     def where(self, *place: str | int) -> str:
         """Return `file:line:column` of the value at a path, for the errors of later stages."""
@@ -43,26 +54,51 @@ class LoadedManifest:
 
 
 def load_manifest(path: Path | str, *, env: Mapping[str, str] | None = os.environ) -> LoadedManifest:
-    """Load a job manifest; `env=None` judges it without looking at the environment.
+    """Load a job manifest, of a matrix the first job; see `load_manifests`."""
+    return load_manifests(path, env=env)[0]
+
+
+def load_manifests(
+    path: Path | str, *, env: Mapping[str, str] | None = os.environ
+) -> tuple[LoadedManifest, ...]:
+    """Load every job of a manifest with what it extends; `env=None` judges it without looking at the environment.
 
     Raises:
         ManifestError: The file cannot become a job; `findings` has one entry for each mistake.
     """
     file = Path(path)
-    source = load_source(read_text(file), file=str(path))
-    manifest, findings = check_manifest(source, env=env)
-    if manifest is None:
-        raise _refusal(findings, str(path))
-    return LoadedManifest(manifest, source, file)
+    source = read_manifest(file)
+    jobs: list[LoadedManifest] = []
+    findings: dict[Finding, None] = {}
+    for cell in combinations(source.value):
+        manifest, mistakes = check_manifest(source, env=env, cell=cell)
+        findings.update(dict.fromkeys(mistakes))
+        if manifest is not None:
+            jobs.append(LoadedManifest(manifest, source, file, cell))
+    if findings or not jobs:
+        raise _refusal(tuple(findings), str(path))
+    return tuple(jobs)
+
+
+def read_manifest(path: Path) -> Source:
+    """Read a manifest's text and that of what it extends, joined; what is wrong with them is in the findings.
+
+    Raises:
+        ManifestError: The file cannot be read.
+    """
+    return extended(load_source(read_text(path), file=str(path)), folder=path.parent)
 
 
 def check_manifest(
-    source: Source, *, env: Mapping[str, str] | None
+    source: Source, *, env: Mapping[str, str] | None, cell: Mapping[str, str] | None = None
 ) -> tuple[Manifest | None, tuple[Finding, ...]]:
-    """Return the model, None if there are mistakes, and the findings in the order of the text."""
+    """Return the model, None if there are mistakes, and the findings in the order of the text.
+
+    `cell` has the values of one combination of its matrix; without it they are those of the first.
+    """
     if not isinstance(source.value, dict):
         return None, source.findings or (_not_a_job(source),)
-    filled = fill_in(source, env)
+    filled = fill_in(source, env, cell)
     findings = [*source.findings, *filled.findings]
     filled.value = _with_text_keys(filled.value, (), source, findings)
     manifest, mistakes = _validate(source, filled)

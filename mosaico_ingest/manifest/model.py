@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import prod
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -14,10 +15,12 @@ from pydantic import (
     SecretStr,
     StringConstraints,
     Tag,
+    WithJsonSchema,
     model_validator,
 )
 from pydantic_core import PydanticCustomError
 
+from mosaico_ingest.manifest.matrix import MAX_JOBS
 from mosaico_ingest.manifest.units import parse_instant, parse_offset, parse_size
 from mosaico_ingest.policies import (
     IfExists,
@@ -63,7 +66,35 @@ def _shape(value: Any) -> str:  # noqa: ANN401 - whatever YAML holds
     return "several" if isinstance(value, list | tuple | dict) else "one"
 
 
+def _check_cell(value: Any) -> str | int:  # noqa: ANN401 - whatever YAML holds
+    if isinstance(value, bool) or not isinstance(value, str | int):
+        raise ValueError("a variable's value is a text or a whole number")  # noqa: TRY004 - pydantic's way to refuse
+    return value
+
+
+def _check_matrix(value: Any) -> Any:  # noqa: ANN401 - one of two shapes
+    if isinstance(value, dict) and prod(map(len, value.values())) > MAX_JOBS:
+        raise ValueError(f"more than {MAX_JOBS} combinations")
+    return value
+
+
+def _axes_or_cells(value: Any) -> str:  # noqa: ANN401 - whatever YAML holds
+    return "cells" if isinstance(value, list | tuple) else "axes"
+
+
 Text = Annotated[str, StringConstraints(min_length=1)]
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
+Cell = Annotated[
+    Any,
+    AfterValidator(_check_cell),
+    WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "integer"}]}),
+]
+Matrix = Annotated[
+    Annotated[dict[Name, Annotated[tuple[Cell, ...], Field(min_length=1)]], Tag("axes")]
+    | Annotated[tuple[dict[Name, Cell], ...], Field(min_length=1, max_length=MAX_JOBS), Tag("cells")],
+    Discriminator(_axes_or_cells),
+    AfterValidator(_check_matrix),
+]
 TimeText = Annotated[
     Text,
     AfterValidator(_check_time),
@@ -228,6 +259,15 @@ class Manifest(_Section):
 
     version: Annotated[int, Field(ge=1, le=VERSION)] = VERSION
     """The version of this language."""
+    extends: Paths | None = Field(default=None, examples=["base.yaml", ["fleet.yaml", "night.yaml"]])
+    """Manifests, or parts of them, that say what this one does not; mappings are joined, later files count more."""
+    defaults: dict[Name, Cell] = Field(default={}, examples=[{"VEHICLE": "demo-01"}])
+    """What `${NAME}` stands for where neither the matrix nor the environment says."""
+    matrix: Matrix | None = Field(
+        default=None,
+        examples=[{"vehicle": ["a", "b"], "day": ["monday", "tuesday"]}, [{"vehicle": "a", "day": "monday"}]],
+    )
+    """One job for each combination, `${NAME}` standing for its value; or the combinations, one by one."""
     bag: BagSection
     """The recording, and what it takes to read it."""
     sequence: SequenceSection = SequenceSection()

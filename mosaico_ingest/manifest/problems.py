@@ -237,7 +237,7 @@ def _written(problem: _Problem) -> str:
     span = problem.span
     if span.line != span.end_line:
         return ""
-    return problem.source.line(span.line)[span.column - 1 : span.end_column - 1]
+    return problem.source.line(span)[span.column - 1 : span.end_column - 1]
 
 
 def _kind(value: Value) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, cast
 
+from mosaico_ingest.manifest.extends import KEY as EXTENDS
 from mosaico_ingest.manifest.model import Manifest
 
 __all__ = ["DIALECT", "job_schema", "tidy"]
@@ -23,6 +24,8 @@ def job_schema() -> dict[str, Any]:
         if not model["properties"]:
             del model["properties"]
     definitions["Variable"] = _VARIABLE
+    required = schema.pop("required")
+    schema["anyOf"] = [{"required": required}, {"required": [EXTENDS]}]  # what is extended may say the rest
     return {"$schema": DIALECT, "title": "mosaico-ingest job", **schema, "$defs": definitions}
 
 

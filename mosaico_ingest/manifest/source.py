@@ -60,6 +60,8 @@ class Source:
     findings: tuple[Finding, ...] = ()
     spans: dict[Path, Span] = field(default_factory=dict[Path, Span])
     key_spans: dict[Path, Span] = field(default_factory=dict[Path, Span])
+    others: dict[str, str] = field(default_factory=dict[str, str])
+    """The texts of the other files that places are in, by their names."""
 
     def span(self, path: Path) -> Span:
         """Return the place of the value at `path`, or of the nearest thing around it that is written."""
@@ -75,18 +77,19 @@ class Source:
     def inner_span(self, path: Path, start: int, end: int) -> Span:
         """Return the place of the characters `start:end` of the string at `path`, or of all of it if it is folded."""
         whole = self.span(path)
-        line = self.line(whole.line)
+        line = self.line(whole)
         written = line[whole.column - 1 : whole.end_column - 1] if whole.line == whole.end_line else ""
         value = written[1:-1] if written[:1] in {'"', "'"} else written
         if not value or self.at(path) != value:
             return whole
         first = whole.column + (len(written) - len(value)) // 2
-        return Span(self.file, whole.line, first + start, whole.line, first + end)
+        return Span(whole.file, whole.line, first + start, whole.line, first + end)
 
-    def line(self, number: int) -> str:
-        """Return a line of the text, 1-based, without its end; empty beyond the last."""
-        lines = self.text.splitlines()
-        return lines[number - 1] if 0 < number <= len(lines) else ""
+    def line(self, span: Span) -> str:
+        """Return the line in which a place begins, without its end; empty beyond the last."""
+        text = self.text if span.file == self.file else self.others.get(span.file, "")
+        lines = text.splitlines()
+        return lines[span.line - 1] if 0 < span.line <= len(lines) else ""
 
     def at(self, path: Path) -> Value:
         """Return the value at `path`, None where there is none."""
@@ -183,7 +186,9 @@ class _Reader:
         else:
             return False
         inside = self._text[opening + 1 : closing]
-        return 0 <= opening < closing and inside.isprintable() and inside != "" and self._blank(opening, closing)
+        return (
+            0 <= opening < closing and inside.isprintable() and inside != "" and self._blank(opening, closing)
+        )
 
     def _syntax(self, error: yaml.MarkedYAMLError) -> list[Finding]:
         if any(finding.rule == "yaml-tab" for finding in self._findings):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,7 +15,14 @@ from mosaico_ingest.manifest.units import parse_instant, parse_offset, parse_siz
 from mosaico_ingest.plan.recordings import Recording, find_recordings, sequence_name
 from mosaico_ingest.policies import TopicLevelErrorPolicy
 
-__all__ = ["compile_manifest"]
+__all__ = ["compile_manifest", "compile_manifests"]
+
+
+def compile_manifests(jobs: Sequence[LoadedManifest]) -> tuple[ROSInjectionConfig, ...]:
+    """Return the configurations of every job of a manifest; see `compile_manifest`."""
+    configs = tuple(config for job in jobs for config in compile_manifest(job))
+    _refuse_duplicates(jobs[0], [config.sequence_name for config in configs])
+    return configs
 
 
 def compile_manifest(loaded: LoadedManifest) -> tuple[ROSInjectionConfig, ...]:
@@ -51,7 +59,7 @@ def _refuse_duplicates(loaded: LoadedManifest, names: list[str]) -> None:
         raise ManifestError(
             f"{count} recordings would be named {name!r}",
             where=loaded.where("sequence", "name"),
-            hint="put {stem}, {parent} or {index} into sequence.name",
+            hint="put {stem}, {parent} or {index}, or a variable of the matrix, into sequence.name",
         )
 
 

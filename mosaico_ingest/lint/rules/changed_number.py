@@ -31,7 +31,7 @@ def check(job: Job) -> Iterator[Problem]:
     for place in metadata_places(job):
         for path in values_below(job.source.at(place), place):
             value, span = job.source.at(path), job.source.span(path)
-            written = job.source.line(span.line)[span.column - 1 : span.end_column - 1]
+            written = job.source.line(span)[span.column - 1 : span.end_column - 1]
             if isinstance(value, float) and math.isfinite(value) and _loses(written, value):
                 remedy = f'for a text write "{written}"'
                 yield Problem(
