@@ -10,6 +10,8 @@ from mosaico_ingest.adapters.mapping.trial import run_tests
 from mosaico_ingest.bag.shape import ros_shape
 from mosaico_ingest.bag.types import TypeResolver
 from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.ontology.registry import ontology_type
+from mosaico_ingest.ontology.tags import MODULES
 
 ODD = """\
 uint64 timestamp_ns
@@ -47,6 +49,26 @@ def test_a_draft_is_an_adapter_that_passes_its_own_test(msgtype: str) -> None:
     spec = load_adapter(text, file="draft.yaml", adapters=None)
     assert spec.check(definition, shape) == (), text
     assert [outcome.problems for outcome in run_tests(spec, resolver)] == [()], text
+
+
+@pytest.mark.parametrize("tag", sorted(set(MODULES) - {"Unmodeled", "Floating16"}))
+@pytest.mark.parametrize("msgtype", ["sensor_msgs/msg/Imu", "sensor_msgs/msg/Image", "nav_msgs/msg/Odometry"])
+def test_a_draft_for_an_ontology_type_is_an_adapter(msgtype: str, tag: str) -> None:
+    resolver = TypeResolver()
+    definition = resolver.resolve(msgtype, None, ros_version=2)
+    shape = ros_shape(definition)
+    text = draft_adapter(definition, shape, name="DraftAdapter", ontology=ontology_type(tag))
+    spec = load_adapter(text, file="draft.yaml")
+    assert spec.check(definition, shape) == (), text
+    assert [outcome.problems for outcome in run_tests(spec, resolver)] == [()], text
+
+
+def test_a_draft_takes_the_fields_that_have_the_column_s_names() -> None:
+    definition = TypeResolver().resolve("sensor_msgs/msg/BatteryState", None, ros_version=2)
+    text = draft_adapter(definition, ros_shape(definition), ontology=ontology_type("BatteryState"))
+    assert "  voltage: voltage\n" in text
+    assert "  present: present\n" in text
+    assert "# not used" not in text
 
 
 def test_a_type_without_fields_cannot_be_drafted() -> None:
