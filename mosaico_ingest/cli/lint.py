@@ -66,11 +66,12 @@ def lint(
 def _print_text(report: LintReport, *, quiet: bool) -> None:
     from rich.console import Console
 
-    from mosaico_ingest.cli.render import render_findings
+    from mosaico_ingest.cli.render import render_findings, texts_of
 
     console = Console(soft_wrap=True, highlight=False)
     if report.findings:
-        console.print(render_findings(report.findings, {judged.file: judged.text for judged in report.files}))
+        texts = {**texts_of(report.findings), **{judged.file: judged.text for judged in report.files}}
+        console.print(render_findings(report.findings, texts))
     if not quiet:
         Console(stderr=True, soft_wrap=True, highlight=False).print(_summary(report), style="bold")
 

@@ -14,7 +14,7 @@ from mosaico_ingest.lint.suppress import MARKER
 
 __all__ = ["Document", "Kind", "documents_in", "kind_of"]
 
-_JOB = re.compile(r"^(bag|\"bag\"|'bag') *:|^ *\{ *\"?bag\"? *:", re.MULTILINE)
+_JOB = re.compile(r"^(bag|\"bag\"|'bag'|extends) *:|^ *\{ *\"?(bag|extends)\"? *:", re.MULTILINE)
 _ADAPTER = re.compile(r"^(adapter|ros_type|variants) *:", re.MULTILINE)
 _NAMED = re.compile(r"^adapter *:", re.MULTILINE)
 _FENCE = re.compile(r"^(?P<indent> *)(?P<fence>```+|~~~+) *(?P<language>\w*)[^\n]*$")

@@ -17,6 +17,8 @@ from mosaico_ingest.lint.message import MessageFile, read_message
 from mosaico_ingest.lint.rules import RULES
 from mosaico_ingest.lint.settings import NAMES, Settings, settings_for
 from mosaico_ingest.lint.suppress import apply_ignores, ignores_in
+from mosaico_ingest.manifest.extends import KEY as EXTENDS
+from mosaico_ingest.manifest.extends import bases_of, extended
 from mosaico_ingest.manifest.load import read_text
 from mosaico_ingest.manifest.source import load_source
 
@@ -25,6 +27,8 @@ __all__ = ["STDIN", "Judged", "LintReport", "lint_document", "lint_paths"]
 STDIN = "-"
 _SUFFIXES = (".yaml", ".yml", ".msg", ".md", ".markdown")
 _MAX_ROUNDS = 10
+_OF_WHOLE = frozenset({"missing-key", "unset-variable"})
+"""Rules about what only a whole job must have."""
 _EXIT_CODES = {Severity.INFO: 10, Severity.WARNING: 11, Severity.ERROR: 12}
 
 
@@ -37,6 +41,8 @@ class Judged:
     findings: tuple[Finding, ...]
     fixed: int = 0
     """How many changes were made."""
+    bases: frozenset[str] = frozenset()
+    """The files it extends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,17 +91,44 @@ def lint_paths(
             found = _judge_file(Path(given), named=True, env=env, fix=fix)
             if found is not None:
                 judged[given] = found
-    return LintReport(tuple(judged[file] for file in sorted(judged)))
+    return LintReport(tuple(_without_repeats(judged)))
+
+
+def _without_repeats(judged: Mapping[str, Judged]) -> Iterator[Judged]:
+    """Yield the files, each finding at one of them only; a file that others extend need not be a job alone."""
+    bases = {base for one in judged.values() for base in one.bases}
+    said: set[tuple[str, Span | None]] = set()
+    settled: dict[str, Judged] = {}
+    for file in sorted(judged, key=lambda file: (file not in bases, file)):
+        found = judged[file].findings
+        kept = [
+            finding
+            for finding in found
+            if (finding.rule, finding.span) not in said and not (file in bases and finding.rule in _OF_WHOLE)
+        ]
+        said.update((finding.rule, finding.span) for finding in kept)
+        settled[file] = replace(judged[file], findings=tuple(kept))
+    yield from (settled[file] for file in sorted(settled))
 
 
 def lint_document(document: Document, *, env: Mapping[str, str] | None, settings: Settings) -> list[Finding]:
     """Return what is wrong with one document, after comments and settings, in the order of the text."""
-    found = list(_raw_findings(document, env))
-    kept = apply_ignores(found, ignores_in(document.text, file=document.file), NAMES)
+    kept = list(_heeded(document, list(_raw_findings(document, env))))
     adjusted = [known for finding in kept if (known := settings.apply(finding)) is not None]
     return sorted(
         adjusted, key=lambda finding: (finding.span or Span(document.file, 0, 0, 0, 0), finding.rule)
     )
+
+
+def _heeded(document: Document, found: list[Finding]) -> Iterator[Finding]:
+    """Apply the comments of each file to what is found in it; what lies in another file is not mended from here."""
+    own = [finding for finding in found if finding.span is None or finding.span.file == document.file]
+    yield from apply_ignores(own, ignores_in(document.text, file=document.file), NAMES)
+    for file in {finding.span.file for finding in found if finding.span} - {document.file}:
+        theirs = [finding for finding in found if finding.span and finding.span.file == file]
+        ignores = ignores_in(read_text(Path(file)), file=file)
+        kept = (finding for finding in apply_ignores(theirs, ignores, NAMES) if finding in theirs)
+        yield from (replace(finding, fix=None) for finding in kept)
 
 
 def _raw_findings(document: Document, env: Mapping[str, str] | None) -> Iterator[Finding]:
@@ -107,6 +140,9 @@ def _raw_findings(document: Document, env: Mapping[str, str] | None) -> Iterator
         yield from adapter_findings(document)
         return
     source = load_source(document.text, file=document.file)
+    if document.example and source.at((EXTENDS,)) is not None:
+        return  # without what it extends there is no telling what is missing
+    source = extended(source, folder=document.folder)
     job, findings = read_job(source, folder=document.folder, env=env, file=document.path)
     yield from findings
     if job is not None:
@@ -161,7 +197,7 @@ def _judge(
             for document in documents
             for finding in lint_document(document, env=env, settings=settings)
         ]
-        judged = replace(judged, findings=tuple(findings))
+        judged = replace(judged, findings=tuple(findings), bases=_bases(judged.text, file, folder))
         mended, made = apply_fixes(judged.text, findings) if fix else (judged.text, 0)
         if not made:
             break
@@ -169,3 +205,9 @@ def _judge(
     if judged.fixed and path is not None:
         path.write_bytes(judged.text.encode())
     return judged
+
+
+def _bases(text: str, file: str, folder: Path) -> frozenset[str]:
+    if EXTENDS not in text or not file.lower().endswith((".yaml", ".yml")):
+        return frozenset()
+    return frozenset(str(path) for path, _ in bases_of(load_source(text, file=file), folder=folder))

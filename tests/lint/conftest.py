@@ -23,6 +23,7 @@ def project(tmp_path: Path) -> Path:
         (tmp_path / folder).mkdir()
     (tmp_path / "msgs" / "BatteryPack.msg").write_text("float64 voltage\n")
     (tmp_path / "msgs" / "Cell.msg").write_text("float64 voltage\n")
+    (tmp_path / "base.yaml").write_text("on_error: {topic: ignore}\n")
     (tmp_path / "metadata.json").write_text("{}")
     (tmp_path / "adapters" / "pack.yaml").write_text(ADAPTER)
     (tmp_path / "adapters" / "wheel.py").write_text("class WheelAdapter(Base):\n    pass\n")
