@@ -11,7 +11,6 @@ import pyarrow as pa
 import pytest
 
 from mosaico_ingest.adapters.adapter import Adapted, Adapter, AdapterSpec, Envelope
-from mosaico_ingest.adapters.mapping.explain import explain
 from mosaico_ingest.adapters.mapping.load import MappingAdapter, MappingSpec, load_adapter
 from mosaico_ingest.adapters.mapping.trial import message_row, run_tests
 from mosaico_ingest.bag.definition import Definition, Embedded
@@ -343,22 +342,6 @@ def test_metadata_is_read_from_the_first_row() -> None:
     first = rows_of({"volts": 2.0, "cells": [{"voltage_mv": 7}]})[0]
     assert adapter.topic_metadata(first) == {"rate": 4.0, "kind": "pack", "channels": 3, "cells": [7]}
     assert adapter.topic_metadata(None) == {}
-
-
-def test_an_adapter_explains_where_every_column_comes_from() -> None:
-    fields = """\
-a: {value: status, map: {0: 5, CHARGING: null}, else: keep}
-p: {of: pose.position, fields: {x: y}, with: {y: volts}, when: volts > 0}
-q: {use: PoseAdapter, of: pose}
-c: cells[].voltage_mv * 0.5"""
-    adapter = bound(spec_of("a: uint8\np: Point2d\nq: Pose\nc: list[float32]\nn: {type: string}", fields))
-    origins = {origin.column: origin.source for origin in explain(adapter)}
-    assert origins["a"] == "status: 0 → 5, 1 → null, else status"
-    assert origins["p"] == "fields of pose.position when volts > 0"
-    assert (origins["p.x"], origins["p.y"], origins["p.header"]) == ("y", "volts", "null")
-    assert origins["q"] == "PoseAdapter of pose"
-    assert origins["c"] == "cells[].voltage_mv * 0.5"
-    assert origins["n"] == "null"
 
 
 def test_a_field_named_like_a_keyword_is_reached_through_self() -> None:

@@ -33,7 +33,7 @@ from mosaico_ingest.adapters.mapping.kinds import (
     within,
 )
 
-__all__ = ["convert", "demand", "peel", "refuse_nulls", "special", "to_number"]
+__all__ = ["convert", "demand", "peel", "refuse_nulls", "to_number"]
 
 
 def peel(target: DataType, axes: tuple[int | None, ...]) -> DataType:
@@ -112,7 +112,7 @@ def _remedy(source: DataType, target: DataType) -> str | None:
 
 
 def _demand_fields(kind: Kind, target: DataType) -> None:
-    if special(kind.type, target) is not None:
+    if _special(kind.type, target) is not None:
         return
     there = {field.name for field in target}
     extra = [field.name for field in kind.type if field.name not in there]
@@ -129,7 +129,7 @@ def _demand_fields(kind: Kind, target: DataType) -> None:
             raise Unfit(f"{spell(kind)} has no {field.name}, which {spell(target)} requires")
 
 
-def special(source: DataType, target: DataType) -> Callable[[Refuse, Array], Array] | None:
+def _special(source: DataType, target: DataType) -> Callable[[Refuse, Array], Array] | None:
     """Return the conversion of a header or time stamp."""
     names = {field.name for field in source}
     if target == HEADER_TYPE and names >= {"stamp", "frame_id"}:
@@ -198,7 +198,7 @@ def _of_elements(axis: Axis, refuse: Refuse) -> Refuse:
 
 
 def _convert_struct(array: Array, target: DataType, refuse: Refuse) -> Array:
-    conversion = special(array.type, target)
+    conversion = _special(array.type, target)
     if conversion is not None:
         return conversion(refuse, array)
     absent = nulls(array)
