@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import ssl
 import time
 from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from ipaddress import ip_address
 from typing import Any, TypeVar, cast
 
 import pyarrow as pa
@@ -30,6 +32,8 @@ _CHANNEL: list[tuple[str, Any]] = [
     ("grpc.initial_reconnect_backoff_ms", 100),
     ("grpc.max_reconnect_backoff_ms", 1000),
 ]
+_HOST = re.compile(r"[A-Za-z0-9._-]+|[0-9A-Fa-f:.]+%\w+")
+"""A name, or an IPv6 address with its interface."""
 _UNKNOWN = frozenset({Condition.UNIMPLEMENTED, Condition.INVALID, Condition.NOT_FOUND})
 
 _Question = TypeVar("_Question", bound=Body)
@@ -198,9 +202,9 @@ class PlatformClient:
 
 @contextmanager
 def connect(
-    target: ServerTarget, *, codec: Codec = JSON, answer_s: float = _ANSWER_S
+    target: ServerTarget, *, codec: Codec = JSON, answer_s: float = _ANSWER_S, handshake: bool = True
 ) -> Generator[PlatformClient, None, None]:
-    """Connect to a server, shake hands, and let go of it at the end.
+    """Connect to a server, shake hands unless it is known already, and let go of it at the end.
 
     Raises:
         SinkError: There is no server, or it does not let us in; says which.
@@ -211,7 +215,8 @@ def connect(
     flight = fl.FlightClient(str(address), tls_root_certs=address.roots, generic_options=_CHANNEL)
     with flight:
         client = PlatformClient(flight, address, codec, answer_s)
-        client.handshake()
+        if handshake:
+            client.handshake()
         yield client
 
 
@@ -221,7 +226,20 @@ def _address(target: ServerTarget) -> Address:
         raise SinkError(
             "the API key has characters no key has", hint="check for blanks and line breaks around it"
         )
+    _check_host(target.host)
     return Address(target.host, target.port, target.tls or target.tls_cert is not None, _roots(target), key)
+
+
+def _check_host(host: str) -> None:
+    """Raise SinkError for what cannot be a host, such as a URL or a host with its port."""
+    with suppress(ValueError):
+        ip_address(host)
+        return
+    if not host or not _HOST.fullmatch(host):
+        raise SinkError(
+            f"host {host!r} is neither a name nor an address",
+            hint="give target.host without scheme and port, and target.port by itself",
+        )
 
 
 def _roots(target: ServerTarget) -> str | None:
@@ -231,14 +249,12 @@ def _roots(target: ServerTarget) -> str | None:
         roots = target.tls_cert.read_text("ascii", errors="ignore")  # bundles carry comments in any script
         ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_verify_locations(cadata=roots)
     except (ssl.SSLError, ValueError):
-        what = "it holds no certificate"
+        what, hint = "it holds no certificate", "PEM is wanted"
     except OSError as error:
-        what = error.strerror or str(error)
+        what, hint = error.strerror or str(error), "check target.tls_cert"
     else:
         return roots
-    raise SinkError(
-        f"the certificate file cannot be used: {what}", where=str(target.tls_cert), hint="PEM is wanted"
-    )
+    raise SinkError(f"the certificate file cannot be used: {what}", where=str(target.tls_cert), hint=hint)
 
 
 def _uploaded(held: bodies.DataInfo) -> Uploaded:

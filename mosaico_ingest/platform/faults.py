@@ -17,6 +17,8 @@ __all__ = ["Address", "Refused", "add_hint", "check_tls", "reraise"]
 _PATIENCE_S = 3.0
 _WRONG_NAME = frozenset({62, 64})
 """OpenSSL's verification results for a certificate of another host name or IP address."""
+_NO_HTTP2 = "Failed parsing HTTP/2"
+"""What gRPC says of a server that speaks another protocol, a web server for example."""
 _KEY_HINT = "set target.api_key or MOSAICO_API_KEY"
 
 
@@ -87,20 +89,22 @@ def _explained(error: Exception, address: Address, *, doing: str, needs: Permiss
             f"no answer to {doing} in time", where=where, hint="the server is slow or stuck"
         )
     if condition in {Condition.UNAUTHENTICATED, Condition.PERMISSION}:
-        what, hint = _about_key(address.key, condition, doing, needs)
-        return Refused(f"{what} ({text})", where=where, hint=hint, condition=condition)
+        what, hint = _about_key(address.key, condition, text, doing=doing, needs=needs)
+        return Refused(what, where=where, hint=hint, condition=condition)
     return Refused(f"{doing} is refused: {text}", where=where, condition=condition)
 
 
-def _about_key(key: str | None, condition: Condition, doing: str, needs: Permission) -> tuple[str, str]:
+def _about_key(
+    key: str | None, condition: Condition, text: str, *, doing: str, needs: Permission
+) -> tuple[str, str]:
     if not key:
         return "the server wants an API key", _KEY_HINT
     problem = key_problem(key)
     if problem:
         return f"the API key is refused: {problem}", _KEY_HINT
     if condition is Condition.PERMISSION:
-        return f"the API key may not do {doing}", f"it needs a key with the permission {needs.value}"
-    return "the API key is refused", "it may be unknown, expired or revoked; ask for a new one"
+        return f"the API key may not do {doing} ({text})", f"use a key with the permission {needs.value}"
+    return f"the API key is refused ({text})", "ask for a new one"
 
 
 def _diagnosed(address: Address, text: str) -> SinkError:
@@ -118,6 +122,9 @@ def _diagnosed(address: Address, text: str) -> SinkError:
         return SinkUnavailable(why, where=where, hint="check target.host and the network")
     with connection:
         found = _tls_fault(connection, address) if address.tls else _plain_fault(connection, address)
+    if found is None and _NO_HTTP2 in text:
+        hint = "check target.host and target.port"
+        return SinkError("what answers there is no Mosaico server", where=where, hint=hint)
     return found or SinkUnavailable(f"the server does not answer: {text}", where=where, hint="try again")
 
 

@@ -99,7 +99,7 @@ class PlatformSession:
 
     def stored(self) -> tuple[StoredTopic, ...]:
         """Return what the server says over a new connection; see `Session.stored`."""
-        with connect(self._target) as client:
+        with connect(self._target, handshake=False) as client:
             held = client.uploaded(self._sequence) if self._uploads else {}
             return tuple(self._stored(client, held, name, path) for name, path in self._given.items())
 

@@ -113,7 +113,7 @@ def traffic(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Traffic,
 
 
 def test_both_make_the_same_calls_with_the_same_keys(traffic: tuple[Traffic, Traffic]) -> None:
-    """The handshake aside: ours makes one before it plans, and one before it writes; older SDKs call it `version`."""
+    """The handshake aside, which older SDKs make by `version`."""
     ours, theirs = ([call for call in said.actions if call[0] not in {"info", "version"}] for said in traffic)
     assert Counter(ours) == Counter(theirs)
     for calls in (ours, theirs):

@@ -5,8 +5,10 @@ from __future__ import annotations
 import shutil
 import socket
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import pytest
@@ -14,7 +16,7 @@ from mosaicod import Mosaicod, running
 
 from mosaico_ingest.config import ServerTarget
 from mosaico_ingest.errors import SinkError, SinkUnavailable
-from mosaico_ingest.platform.client import connect
+from mosaico_ingest.platform.client import _check_host, connect
 
 
 @pytest.fixture(scope="session")
@@ -59,6 +61,29 @@ def test_a_host_nobody_knows() -> None:
         "grpc://no-such-host.invalid:6726: no host is called 'no-such-host.invalid' — check target.host"
     )
     assert not found.retryable
+
+
+@pytest.mark.parametrize("host", ["", "grpc://127.0.0.1:6726", "127.0.0.1:6726", "a b", "[::1]"])
+def test_a_host_that_cannot_be_one(host: str) -> None:
+    assert "is neither a name nor an address — give target.host without scheme and port" in str(
+        refusal(host, 6726)
+    )
+
+
+@pytest.mark.parametrize("host", ["::1", "fe80::1%lo", "127.0.0.1", "robot_7.local"])
+def test_a_host_that_can_be_one(host: str) -> None:
+    _check_host(host)
+
+
+def test_a_web_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mosaico_ingest.platform.client._DELAYS_S", (0.01,))
+    with HTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as web:
+        thread = threading.Thread(target=web.serve_forever, kwargs={"poll_interval": 0.05})
+        thread.start()
+        found = refusal("127.0.0.1", web.server_port)
+        web.shutdown()
+        thread.join()
+    assert "what answers there is no Mosaico server — check target.host and target.port" in str(found)
 
 
 def test_a_port_nobody_listens_on(monkeypatch: pytest.MonkeyPatch) -> None:

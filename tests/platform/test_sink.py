@@ -346,11 +346,11 @@ class TestKeys:
         ("key", "reason"),
         [
             (None, "the server wants an API key"),
-            (make_key("other"), "the API key is refused .* — it may be unknown, expired or revoked"),
+            (make_key("other"), r"the API key is refused \(.*\) — ask for a new one"),
             (make_key("w")[:-1] + "?", "the API key is refused: it is not msco_"),
             (
                 make_key("r"),
-                "the API key may not do sequence_create .* — it needs a key with the permission write",
+                "the API key may not do sequence_create .* — use a key with the permission write",
             ),
         ],
     )
