@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 from mosaico_ingest.bag.recording import Recording
 from mosaico_ingest.diagnostics import Finding, Severity, Stage
 from mosaico_ingest.errors import Interrupted, NothingMatched, VerificationError
@@ -23,12 +25,14 @@ def inject(plan: Plan, recording: Recording, sink: Sink, observe: Observer) -> N
         VerificationError: The destination does not hold what was written.
     """
     failure: BaseException | None = None
+    missing: list[str] = []
     streams: tuple[Stream, ...] = ()
     try:
         with sink.open(plan.sequence, plan.metadata, if_exists=plan.if_exists) as session:
             streams = _open_streams(plan, recording, session, observe)
             try:
                 _pump(plan, recording, streams, observe)
+                missing = _missing(plan, recording, streams, observe)
                 _check_not_empty(plan, streams)
             except BaseException as error:
                 # Every way to end early, Ctrl-C too, is the session policy's to judge.
@@ -41,12 +45,12 @@ def inject(plan: Plan, recording: Recording, sink: Sink, observe: Observer) -> N
             _take_back(stream, stream.rows, f"the session was discarded: {error}", observe)
             observe(TopicClosed(stream.plan.target, stream.status, 0, error=stream.error))
         raise
-    wrong = _close(session.stored(), streams, observe, forgive=failure)
+    wrong = missing + _close(session.stored(), streams, observe, forgive=failure)
     if failure is not None:
         raise failure
     if wrong:
         raise VerificationError(
-            "; ".join(wrong), hint="the destination lost rows; ingest the recording again"
+            "; ".join(wrong), hint="what is stored is incomplete; replace it, and report this as a mistake"
         )
 
 
@@ -99,6 +103,30 @@ def _padded(stream: Stream) -> Finding:
         f"{stream.plan.topic}: {stream.padded} messages end in 4 to 7 zero bytes that {stream.plan.msgtype} does not explain",
         help="they were read; check that the definition is the one they were written with",
     )
+
+
+def _missing(plan: Plan, recording: Recording, streams: tuple[Stream, ...], observe: Observer) -> list[str]:
+    """Hold what was read against what the index promises; return what is nowhere to be found."""
+    if plan.read_from_ns is not None or plan.read_until_ns is not None:
+        return []
+    known = Counter[int]()
+    for loss in recording.losses:
+        known.update({} if loss.channel is None else {loss.channel: loss.count or 0})
+    elsewhere = any(loss.channel is None or loss.count is None for loss in recording.losses)
+    wrong: list[str] = []
+    for stream in streams:
+        target, promised = stream.plan.target, stream.plan.count
+        found = stream.seen + sum(known[channel] for channel in stream.plan.channels)
+        if promised is None or promised == found:
+            continue
+        says = f"{target}: the index promises {promised} messages, {stream.seen} were read"
+        if promised < found:
+            observe(Noted(Finding("more-than-promised", Severity.WARNING, says)))
+        elif elsewhere:
+            observe(Unreadable(target, promised - found, None, "they lie in what could not be read"))
+        else:
+            wrong.append(f"{says} and nothing says where the others are")
+    return wrong
 
 
 def _check_not_empty(plan: Plan, streams: tuple[Stream, ...]) -> None:

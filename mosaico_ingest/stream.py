@@ -93,6 +93,7 @@ class Stream:
             IngestError: A policy says that the run ends here.
         """
         if self.status in {TopicStatus.FINALIZED, TopicStatus.FAILED}:
+            self.seen += len(batch)
             self._count(batch, len(batch))
             self._reject_rest(batch, 0)
             return

@@ -28,6 +28,7 @@ __all__ = ["Collector"]
 
 @dataclass(slots=True)
 class _Sum:
+    unreadable: int = 0
     read: int = 0
     written: int = 0
     filtered: int = 0
@@ -87,6 +88,8 @@ class Collector:
             case RunStarted():
                 self._start = event
             case Unreadable():
+                if event.target is not None:
+                    self._sums[event.target].unreadable += event.count or 0
                 self._losses.append(
                     Loss(topic=event.target, count=event.count, offset=event.offset, reason=event.reason)
                 )
@@ -136,6 +139,7 @@ class Collector:
             why=expected.why,
             status=_status(expected, total),
             promised=expected.count,
+            unreadable=total.unreadable,
             read=total.read,
             written=total.written,
             filtered=total.filtered,

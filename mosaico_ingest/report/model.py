@@ -48,7 +48,10 @@ class Loss(_Part):
 
 
 class TopicReport(_Part):
-    """One topic: read = written + filtered + downsampled + rejected, always."""
+    """One topic: read = written + filtered + downsampled + rejected, always.
+
+    Of a recording that was read to its end, promised = read + unreadable.
+    """
 
     topic: str
     """Its name in the recording."""
@@ -63,6 +66,8 @@ class TopicReport(_Part):
     status: TopicStatus
     promised: int | None
     """How many messages the recording's index promises."""
+    unreadable: int = 0
+    """How many of them could not be read, as far as that can be told; `losses` says where."""
     read: int = 0
     written: int = 0
     filtered: int = 0
