@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, computed_field
 
 from mosaico_ingest.diagnostics import Stage
 from mosaico_ingest.report.events import RunStatus, TopicStatus
@@ -14,7 +14,8 @@ __all__ = ["Loss", "Rejection", "Report", "RunReport", "TopicReport", "Totals", 
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    # What is computed is written for other readers, and left out again when a report is read back.
+    model_config = ConfigDict(extra="ignore", frozen=True, use_attribute_docstrings=True)
 
 
 class Rejection(_Part):
@@ -84,12 +85,13 @@ class TopicReport(_Part):
     """Size of the rows in the destination, as far as it says."""
     error: str | None = None
 
+    @computed_field
     @property
     def rate_hz(self) -> float | None:
-        """Messages written a second over the topic's own span."""
+        """Rows a second over the topic's own span."""
         if self.start_ns is None or self.end_ns is None or self.end_ns <= self.start_ns:
             return None
-        return (self.written - 1) / ((self.end_ns - self.start_ns) / 1e9)
+        return round((self.written - 1) / ((self.end_ns - self.start_ns) / 1e9), 6)
 
 
 class Totals(_Part):
@@ -124,9 +126,10 @@ class Report(_Part):
     findings: tuple[str, ...] = ()
     """What there was to say about the recording."""
 
+    @computed_field
     @property
     def totals(self) -> Totals:
-        """The sums over all topics that were taken."""
+        """Sums over all topics that were taken."""
         taken = [topic for topic in self.topics if topic.status is not TopicStatus.LEFT_OUT]
         return Totals(
             read=sum(t.read for t in taken),
@@ -138,6 +141,12 @@ class Report(_Part):
             stored_bytes=sum(t.stored_bytes for t in taken),
         )
 
+    @computed_field
+    @property
+    def compression(self) -> float | None:
+        """Stored bytes for each byte of the recording's files: below 1 it became smaller."""
+        return round(self.totals.stored_bytes / self.source_bytes, 6) if self.source_bytes else None
+
 
 class RunReport(_Part):
     """What one call of the tool did: a report for each recording; `version` changes when the form does."""
@@ -147,6 +156,7 @@ class RunReport(_Part):
     """Name and version of the program that wrote this."""
     recordings: tuple[Report, ...]
 
+    @computed_field
     @property
     def exit_code(self) -> int:
         """The code of the first recording that failed, else 4 where messages were rejected, else 0."""
