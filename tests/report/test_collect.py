@@ -1,0 +1,124 @@
+"""The report is the sum of the events, adds up, and survives being written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mosaico_ingest.diagnostics import Finding, Severity, Stage
+from mosaico_ingest.errors import SinkError
+from mosaico_ingest.report.collect import Collector
+from mosaico_ingest.report.events import (
+    Expected,
+    Noted,
+    Rejected,
+    RunFinished,
+    RunStarted,
+    RunStatus,
+    TopicClosed,
+    TopicProgress,
+    TopicStatus,
+    Unreadable,
+)
+from mosaico_ingest.report.model import Report, RunReport
+from mosaico_ingest.report.write import write_report
+
+IMU = Expected("/imu", "/sensors/imu", "sensor_msgs/msg/Imu", "IMUAdapter", "IMU", "built-in", 10)
+LEFT = Expected("/debug", "/debug", "std_msgs/msg/String", "", "", "left out", None, left_out=True)
+
+
+def started() -> Collector:
+    collector = Collector()
+    collector(RunStarted("drive", "./mosaico", ("drive.mcap",), 1000, (IMU, LEFT)))
+    return collector
+
+
+def rejected(rule: str, count: int) -> Rejected:
+    return Rejected(IMU.target, Stage.ADAPT, rule, count, f"{rule} at first", 7, 70)
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9), st.sampled_from(["nan", "range"])), max_size=20)
+)
+def test_every_increment_is_in_the_sum(steps: list[tuple[int, int, str]]) -> None:
+    collector = started()
+    for written, lost, rule in steps:
+        collector(TopicProgress(IMU.target, read=written + lost, written=written, payload_bytes=written))
+        if lost:
+            collector(rejected(rule, lost))
+    topic = collector.report().topics[0]
+    assert topic.written == sum(written for written, _, _ in steps)
+    assert topic.rejected == sum(lost for _, lost, _ in steps) == collector.rejected
+    assert topic.read == topic.written + topic.rejected
+    assert len(topic.rejections) <= 2
+
+
+def test_a_reason_is_that_of_the_first_message() -> None:
+    collector = started()
+    collector(rejected("nan", 2))
+    collector(Rejected(IMU.target, Stage.ADAPT, "nan", 3, "another text", 9, 90))
+    rejection = collector.report().topics[0].rejections[0]
+    assert (rejection.count, rejection.reason, rejection.first_offset) == (5, "nan at first", 70)
+
+
+def test_a_topic_left_out_is_in_the_report_but_not_in_the_totals() -> None:
+    report = started().report()
+    assert [topic.status for topic in report.topics] == [TopicStatus.EMPTY, TopicStatus.LEFT_OUT]
+    assert report.totals.read == 0
+
+
+def test_rates_and_compression_are_computed() -> None:
+    collector = started()
+    collector(TopicProgress(IMU.target, read=11, written=11, start_ns=0, end_ns=1_000_000_000))
+    collector(TopicClosed(IMU.target, TopicStatus.WRITTEN, stored_bytes=250))
+    report = collector.report()
+    assert report.topics[0].rate_hz == 10.0
+    assert report.compression == 0.25
+
+
+def test_what_was_taken_back_leaves_no_time_span() -> None:
+    collector = started()
+    collector(TopicProgress(IMU.target, read=1, written=1, start_ns=5, end_ns=5))
+    collector(TopicProgress(IMU.target, written=-1))
+    topic = collector.report().topics[0]
+    assert (topic.written, topic.start_ns, topic.end_ns) == (0, None, None)
+
+
+def test_findings_and_losses_are_kept() -> None:
+    collector = started()
+    collector(Noted(Finding("two-types", Severity.WARNING, "two types")))
+    collector(Unreadable(None, 3, 100, "a broken chunk"))
+    report = collector.report()
+    assert "two types" in report.findings[0]
+    assert report.losses[0].count == 3
+    assert collector.unreadable
+
+
+def recording(status: RunStatus, code: int) -> Report:
+    collector = started()
+    collector(RunFinished(status, code))
+    return collector.report()
+
+
+@pytest.mark.parametrize(
+    ("codes", "expected"), [([], 0), ([0, 0], 0), ([0, 4], 4), ([4, 1, 3], 1), ([0, 5], 5), ([3, 130], 3)]
+)
+def test_the_exit_code_is_that_of_the_first_failure(codes: list[int], expected: int) -> None:
+    reports = tuple(recording(RunStatus.COMPLETED, code) for code in codes)
+    assert RunReport(tool="t", recordings=reports).exit_code == expected
+
+
+def test_a_written_report_reads_back_the_same(tmp_path: Path) -> None:
+    report = RunReport(tool="t", recordings=(recording(RunStatus.COMPLETED, 0),))
+    write_report(report, tmp_path / "deep" / "report.json")
+    assert RunReport.model_validate_json((tmp_path / "deep" / "report.json").read_text()) == report
+    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["report.json"]
+
+
+def test_a_report_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(SinkError, match="report"):
+        write_report(RunReport(tool="t", recordings=()), tmp_path / "file" / "report.json")
