@@ -98,6 +98,10 @@ class Layout:
             folder.rmdir()
             folder = folder.parent
 
+    def staged_files(self, session: str) -> list[Path]:
+        """Return the segments a session has begun and not published."""
+        return [path for path in self.session(session).rglob("*.parquet") if path.is_file()]
+
     def discard(self, session: str) -> None:
         """Remove what a session has staged."""
         shutil.rmtree(self.session(session), ignore_errors=True)

@@ -164,11 +164,13 @@ class Store:
             with self.catalog.write() as db:
                 known = removal.forget(db, live)
             orphans = [file for file in files if self._is_orphan(file, known, live)]
-            stored_bytes = sum(file.stat().st_size for file in orphans)
+            dead = sorted(set(sessions) - live)
+            staged = [file for session in dead for file in self.layout.staged_files(session)]
+            stored_bytes = sum(file.stat().st_size for file in (*orphans, *staged))
             self.layout.remove(orphans)
-            for session in set(sessions) - live:
+            for session in dead:
                 self.layout.discard(session)
-        return Collected(len(set(sessions) - live), len(orphans), stored_bytes)
+        return Collected(len(dead), len(orphans) + len(staged), stored_bytes)
 
     def _in_use(self, session: str, grace_s: float) -> bool:
         folder = self.layout.session(session)
