@@ -50,6 +50,7 @@ class SegmentWriter:
             use_compliant_nested_type=False,  # a list item's name is part of the type readers look for
             sorting_columns=[pq.SortingColumn(0)],
             write_batch_size=4096,
+            write_page_checksum=True,
             **writer_options(self._leaves, first_rows),
         )
 

@@ -1,0 +1,51 @@
+"""This file reads what is stored back, every page against its checksum, and holds it against the catalog."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from mosaico_ingest.store.model import SegmentInfo, SequenceInfo, TopicInfo
+from mosaico_ingest.store.segment import time_span
+
+__all__ = ["Checked", "verify"]
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """One segment that was read to its end, and what is wrong with it."""
+
+    topic: str
+    segment: SegmentInfo
+    problem: str | None
+
+
+def verify(info: SequenceInfo) -> Iterator[Checked]:
+    """Read every segment of a sequence; a damaged page, a missing file and rows the catalog does not know are problems."""
+    for topic in info.topics:
+        for segment in topic.segments:
+            yield Checked(topic.name, segment, _problem(topic, segment))
+
+
+def _problem(topic: TopicInfo, segment: SegmentInfo) -> str | None:
+    try:
+        with pq.ParquetFile(segment.path, page_checksum_verification=True) as file:
+            found = (segment.path.stat().st_size, *_rows_and_span(file))
+            same_columns = file.schema_arrow.equals(topic.schema)
+    except (OSError, pa.ArrowException) as error:
+        return str(error).partition("\n")[0]
+    wanted = (segment.stored_bytes, segment.rows, segment.start_ns, segment.end_ns)
+    if found != wanted:
+        form = "{} bytes, {} rows in [{}, {}]"
+        return f"the catalog says {form.format(*wanted)}, the file has {form.format(*found)}"
+    return None if same_columns else "its columns are not those of its topic"
+
+
+def _rows_and_span(file: pq.ParquetFile) -> tuple[int, int, int]:
+    """Return how many rows the file really gives, and the span its row groups state."""
+    rows = sum(batch.num_rows for batch in file.iter_batches(batch_size=1 << 12))
+    spans = [time_span(file.metadata, group) for group in range(file.num_row_groups)]
+    return rows, min(low for low, _ in spans), max(high for _, high in spans)
