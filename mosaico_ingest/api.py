@@ -13,16 +13,18 @@ from mosaico_ingest.bridge import ROSBridge
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.diagnostics import Finding, Severity
 from mosaico_ingest.errors import IngestError, ManifestError
+from mosaico_ingest.executors.executor import Executor
 from mosaico_ingest.executors.inspection import inspect
-from mosaico_ingest.executors.local import run_all
+from mosaico_ingest.executors.local import Inline
 from mosaico_ingest.executors.preview import decide, plan_document
+from mosaico_ingest.executors.processes import Processes
 from mosaico_ingest.executors.worker import execute, make_plan
 from mosaico_ingest.manifest.load import load_manifests
 from mosaico_ingest.plan.compile import compile_manifests
 from mosaico_ingest.plan.document import PlanDocument, read_plan
 from mosaico_ingest.plan.drift import Difference, differences
 from mosaico_ingest.plan.model import Plan
-from mosaico_ingest.report.events import Observer, ignore_events
+from mosaico_ingest.report.events import BatchObserver, Observer, ignore_batch, ignore_events
 from mosaico_ingest.report.inspection import Inspection
 from mosaico_ingest.report.model import Report, RunReport
 from mosaico_ingest.version import __version__
@@ -141,9 +143,16 @@ def compile_plan(path: Path) -> tuple[ROSInjectionConfig, ...]:
     )
 
 
-def run(configs: Sequence[ROSInjectionConfig], *, observe: Observer = ignore_events) -> RunReport:
-    """Run every configuration; a failure is in the report, not raised."""
-    return RunReport(tool=f"mosaico-ingest {__version__}", recordings=tuple(run_all(configs, observe)))
+def run(
+    configs: Sequence[ROSInjectionConfig],
+    *,
+    executor: Executor | None = None,
+    observe: BatchObserver = ignore_batch,
+) -> RunReport:
+    """Run every configuration, without an `executor` in as many processes as they say; failures are in the report."""
+    jobs = configs[0].jobs if configs else 1
+    chosen = executor or (Processes(jobs) if jobs > 1 else Inline())
+    return RunReport(tool=f"mosaico-ingest {__version__}", recordings=tuple(chosen.map(configs, observe)))
 
 
 def inspect_recording(path: Path, *, ros_distro: str | None = None) -> Inspection:

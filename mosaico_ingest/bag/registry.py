@@ -67,6 +67,17 @@ class ROSTypeRegistry:
         return {**cls._scopes.get(None, {}), **(cls._scopes.get(scope, {}) if scope else {})}
 
     @classmethod
+    def snapshot(cls) -> dict[Stores | None, dict[str, Registered]]:
+        """Return everything announced so far, to be restored in another process."""
+        return {scope: dict(entries) for scope, entries in cls._scopes.items()}
+
+    @classmethod
+    def restore(cls, snapshot: Mapping[Stores | None, Mapping[str, Registered]]) -> None:
+        """Announce what a snapshot holds, and nothing else."""
+        cls._scopes.clear()
+        cls._scopes.update({scope: dict(entries) for scope, entries in snapshot.items()})
+
+    @classmethod
     def reset(cls) -> None:
         """Forget every announced type."""
         cls._scopes.clear()

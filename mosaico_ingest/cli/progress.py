@@ -14,8 +14,10 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from mosaico_ingest.cli.batch_progress import BatchBoard, BatchLines, print_nothing
 from mosaico_ingest.cli.units import bytes_text, count_text
 from mosaico_ingest.report.events import (
+    BatchObserver,
     Event,
     Expected,
     Noted,
@@ -25,7 +27,7 @@ from mosaico_ingest.report.events import (
     RunStarted,
     TopicProgress,
     Unreadable,
-    ignore_events,
+    ignore_batch,
 )
 
 __all__ = ["display"]
@@ -36,19 +38,29 @@ MAX_ROWS = 30
 
 
 @contextmanager
-def display(*, quiet: bool) -> Generator[Observer]:
-    """Yield the observer that draws, on standard error."""
+def display(recordings: int, *, quiet: bool) -> Generator[BatchObserver]:
+    """Yield the observer that draws one recording or a batch of them, on standard error."""
     if quiet:
-        yield ignore_events
+        yield ignore_batch
         return
     console = Console(file=sys.stderr)
-    if console.is_terminal:
-        board = _Board()
-        with Live(get_renderable=board.render, console=console, refresh_per_second=8, transient=True) as live:
-            board.say = live.console.print
-            yield board
-    else:
-        yield _Lines(console)
+    if not console.is_terminal:
+        lines = BatchLines(console, recordings) if recordings > 1 else _Lines(console)
+        yield lines if isinstance(lines, BatchLines) else _alone(lines)
+        return
+    board = BatchBoard(recordings) if recordings > 1 else _Board()
+    with Live(get_renderable=board.render, console=console, refresh_per_second=8, transient=True) as live:
+        board.say = live.console.print
+        yield board if isinstance(board, BatchBoard) else _alone(board)
+
+
+def _alone(observe: Observer) -> BatchObserver:
+    """Return the observer of a batch of one."""
+
+    def tell(_position: int, event: Event) -> None:
+        observe(event)
+
+    return tell
 
 
 @dataclass(slots=True)
@@ -183,10 +195,6 @@ class _Board:
         if len(counts) > MAX_ROWS:
             table.add_row(f"… and {len(counts) - MAX_ROWS} more", "", "", "", "")
         return table
-
-
-def print_nothing(*_: object) -> None:
-    """Stand in until the live display runs."""
 
 
 def _begins(start: RunStarted) -> str:

@@ -14,10 +14,17 @@ def run(
     manifests: Annotated[
         list[Path] | None, typer.Argument(metavar="JOB.yaml...", help="Job manifests, run in order.")
     ] = None,
+    *,
     plan: Annotated[
         Path | None,
         typer.Option(
             "--plan", help="Run exactly this plan, or nothing where it no longer fits.", metavar="FILE"
+        ),
+    ] = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            "--jobs", "-j", min=1, max=1024, help="Recordings ingested at a time; overrides run.jobs."
         ),
     ] = None,
     report: Annotated[
@@ -37,4 +44,4 @@ def run(
     configs = [config for manifest in manifests or () for config in api.compile_job(manifest)]
     if plan is not None:
         configs += api.compile_plan(plan)
-    run_configs(configs, report=report, quiet=quiet, log=log)
+    run_configs(configs, report=report, quiet=quiet, log=log, jobs=jobs)

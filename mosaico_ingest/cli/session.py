@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import typer
@@ -15,6 +16,9 @@ from mosaico_ingest.cli.signals import interrupt_on_terminate
 from mosaico_ingest.cli.tables import print_report
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.executors.executor import Executor
+from mosaico_ingest.executors.local import Inline
+from mosaico_ingest.executors.processes import Processes
 from mosaico_ingest.report.events import Event, RunFinished
 from mosaico_ingest.report.write import write_report
 
@@ -22,20 +26,26 @@ __all__ = ["run_configs"]
 
 
 def run_configs(
-    configs: Sequence[ROSInjectionConfig], *, report: Path | None, quiet: bool, log: str | None
+    configs: Sequence[ROSInjectionConfig],
+    *,
+    report: Path | None,
+    quiet: bool,
+    log: str | None,
+    jobs: int | None = None,
 ) -> None:
-    """Run each configuration in turn; exit with the report's code unless it is 0."""
-    _set_up_logging(log or configs[0].log_level)
+    """Run the configurations, several at a time where asked for; exit with the report's code unless it is 0."""
+    level = log or configs[0].log_level
+    _set_up_logging(level)
     interrupt_on_terminate()
     failures: list[RunFinished] = []
 
-    def tell(event: Event) -> None:
+    def tell(position: int, event: Event) -> None:
         if isinstance(event, RunFinished) and event.error is not None:
             failures.append(event)
-        observe(event)
+        observe(position, event)
 
-    with display(quiet=quiet) as observe:
-        result = api.run(configs, observe=tell)
+    with display(len(configs), quiet=quiet) as observe:
+        result = api.run(configs, executor=_executor(configs, jobs, level), observe=tell)
     for target in {
         path for path in (report, *(_report_path(config) for config in configs)) if path is not None
     }:
@@ -46,6 +56,11 @@ def run_configs(
         print_error(failure.error or "", failure.findings)
     if result.exit_code:
         raise typer.Exit(result.exit_code)
+
+
+def _executor(configs: Sequence[ROSInjectionConfig], jobs: int | None, level: str) -> Executor:
+    wanted = min(jobs or configs[0].jobs, len(configs))
+    return Processes(wanted, prepare=partial(_set_up_logging, level)) if wanted > 1 else Inline()
 
 
 def _report_path(config: ROSInjectionConfig) -> Path | None:

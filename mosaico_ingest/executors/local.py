@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.executors.worker import run_config
-from mosaico_ingest.report.events import Observer
+from mosaico_ingest.report.events import BatchObserver, RunStatus
 from mosaico_ingest.report.model import Report
 
-__all__ = ["run_all"]
+__all__ = ["Inline"]
 
 
-def run_all(configs: Iterable[ROSInjectionConfig], observe: Observer) -> Iterator[Report]:
-    """Yield a report for each configuration; one that fails does not stop the next, an interrupt does."""
-    for config in configs:
-        report = run_config(config, observe)
-        yield report
-        if report.exit_code == INTERRUPTED:
-            return
+class Inline:
+    """The executor that needs nothing."""
 
-
-INTERRUPTED = 130
+    def map(self, configs: Sequence[ROSInjectionConfig], observe: BatchObserver) -> Iterator[Report]:
+        """Yield a report for each configuration; see `Executor.map`."""
+        for position, config in enumerate(configs):
+            report = run_config(config, partial(observe, position))
+            yield report
+            if report.status is RunStatus.INTERRUPTED:
+                return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Generator
 from contextlib import contextmanager
 from os.path import normpath
@@ -31,7 +32,9 @@ from mosaico_ingest.sink import Sink
 from mosaico_ingest.store.sink import StoreSink
 from mosaico_ingest.store.store import Store
 
-__all__ = ["execute", "make_plan", "open_for", "run_config", "sink_for"]
+__all__ = ["execute", "failed_report", "make_plan", "open_for", "run_config", "sink_for"]
+
+_log = logging.getLogger(__name__)
 
 EXIT_REJECTED = 4
 """Everything that could be ingested was, but some messages could not."""
@@ -92,18 +95,37 @@ def execute(plan: Plan, observe: Observer, *, sink: Sink | None = None) -> tuple
 
 
 def run_config(config: ROSInjectionConfig, observe: Observer) -> Report:
-    """Plan and run one configuration; every outcome is a report."""
+    """Plan and run one configuration; every outcome is a report, a mistake of ours and an interrupt too."""
     try:
-        plan = make_plan(config)
+        report, _ = execute(make_plan(config), observe)
     except IngestError as error:
-        collector = Collector()
-        collector(_unplanned(config))
-        failed = _failed(error)
-        collector(failed)
-        observe(failed)
-        return collector.report()
-    report, _ = execute(plan, observe)
+        return failed_report(config, error, observe)
+    except KeyboardInterrupt:
+        stopped = Interrupted("stopped before the recording was opened", where=str(config.paths[0]))
+        return failed_report(config, stopped, observe)
+    except Exception as error:  # noqa: BLE001 - the border: whatever one recording brings up, the next is still run
+        _log.debug("unexpected", exc_info=True)
+        return failed_report(config, _unexpected(config, error), observe)
     return report
+
+
+def failed_report(config: ROSInjectionConfig, error: IngestError, observe: Observer) -> Report:
+    """Return the report of a recording of which nothing was done."""
+    collector = Collector()
+    collector(_unplanned(config))
+    failed = _failed(error)
+    collector(failed)
+    observe(failed)
+    return collector.report()
+
+
+def _unexpected(config: ROSInjectionConfig, error: Exception) -> IngestError:
+    said = str(error).strip().partition("\n")[0]
+    return IngestError(
+        f"unexpected {type(error).__name__}: {said}" if said else f"unexpected {type(error).__name__}",
+        where=str(config.paths[0]),
+        hint="this is a mistake in the program or in an adapter; `--log debug` shows where",
+    )
 
 
 def _started(plan: Plan) -> RunStarted:

@@ -10,6 +10,7 @@ from typing import TypeAlias
 from mosaico_ingest.diagnostics import Finding, Stage
 
 __all__ = [
+    "BatchObserver",
     "Event",
     "Expected",
     "Noted",
@@ -22,6 +23,7 @@ __all__ = [
     "TopicProgress",
     "TopicStatus",
     "Unreadable",
+    "ignore_batch",
     "ignore_events",
 ]
 
@@ -146,7 +148,13 @@ class RunFinished:
 
 Event: TypeAlias = RunStarted | TopicProgress | Rejected | Unreadable | Noted | TopicClosed | RunFinished
 Observer: TypeAlias = Callable[[Event], None]
+BatchObserver: TypeAlias = Callable[[int, Event], None]
+"""Told which configuration of a batch an event is about, by its position, and the event."""
 
 
 def ignore_events(_event: Event) -> None:
     """Do nothing: the observer of whoever does not want one."""
+
+
+def ignore_batch(_position: int, _event: Event) -> None:
+    """Do nothing: the observer of a batch nobody watches."""

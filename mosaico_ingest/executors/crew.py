@@ -1,0 +1,108 @@
+"""This file is what a worker process does: recordings come in through a pipe, events and reports go out."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from types import FrameType
+from typing import Any
+
+import pyarrow as pa
+
+from mosaico_ingest.adapters.base import register_default_adapter, registered_adapters
+from mosaico_ingest.bag.registry import Registered, ROSTypeRegistry
+from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.errors import IngestError, Interrupted
+from mosaico_ingest.executors.worker import failed_report, run_config
+from mosaico_ingest.policies import Stores
+from mosaico_ingest.report.events import Event
+
+__all__ = ["Announced", "do_nothing", "work"]
+
+
+@dataclass(frozen=True, slots=True)
+class Announced:
+    """The types and adapters a program has registered, which a new process does not know of."""
+
+    types: Mapping[Stores | None, Mapping[str, Registered]]
+    adapters: tuple[type[Any], ...]
+
+    @classmethod
+    def here(cls) -> Announced:
+        """Return those of this process."""
+        return cls(ROSTypeRegistry.snapshot(), tuple(dict.fromkeys(registered_adapters().values())))
+
+    def announce(self) -> None:
+        """Register them in this process."""
+        ROSTypeRegistry.restore(self.types)
+        for adapter in self.adapters:
+            register_default_adapter(adapter)
+
+
+def do_nothing() -> None:
+    """Prepare nothing."""
+
+
+def work(pipe: Connection, announced: Announced, prepare: Callable[[], None], jobs: int) -> None:
+    """Ingest what comes through the pipe until its other end is closed."""
+    os.setsid()  # Ctrl-C reaches the parent only, which passes it on once
+    stop = _Stop()
+    signal.signal(signal.SIGINT, stop)
+    signal.signal(signal.SIGTERM, stop)
+    pa.set_cpu_count(max(1, (os.cpu_count() or 1) // jobs))
+    prepare()
+    announced.announce()
+    try:
+        while not stop.asked:
+            _ingest(pipe, pipe.recv_bytes(), stop)
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        return
+
+
+def _ingest(pipe: Connection, letter: bytes, stop: _Stop) -> None:
+    def tell(event: Event) -> None:
+        stop.hold()  # an interrupt in the middle of a message would leave half of it in the pipe
+        pipe.send(event)
+        stop.heed()
+
+    try:
+        config: ROSInjectionConfig = pickle.loads(letter)  # noqa: S301 - from our own parent
+    except Exception as error:  # noqa: BLE001 - the border: a class's own code runs here
+        pipe.send(IngestError(f"the job cannot be read in another process: {type(error).__name__}: {error}"))
+        return
+    try:
+        stop.heed()
+        report = run_config(config, tell)
+    except KeyboardInterrupt:
+        report = failed_report(config, Interrupted("stopped before it was begun"), tell)
+    stop.hold()
+    pipe.send(report)
+
+
+class _Stop:
+    """A signal handler that interrupts once, and not while it is held off."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._held = True
+        self._raised = False
+
+    def __call__(self, _signal: int, _frame: FrameType | None) -> None:
+        self.asked = True
+        if not self._held:
+            self.heed()
+
+    def hold(self) -> None:
+        """Put an interrupt off."""
+        self._held = True
+
+    def heed(self) -> None:
+        """Let interrupts through again, one that was put off at once."""
+        self._held = False
+        if self.asked and not self._raised:
+            self._raised = True
+            raise KeyboardInterrupt

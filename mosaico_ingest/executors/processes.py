@@ -1,0 +1,232 @@
+"""This file runs configurations in several processes, each of which does one recording after the other."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from multiprocessing.reduction import ForkingPickler
+
+from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.errors import IngestError, Interrupted
+from mosaico_ingest.executors.crew import Announced, do_nothing, work
+from mosaico_ingest.executors.worker import failed_report
+from mosaico_ingest.plan.model import DEFAULT_MEMORY_BYTES
+from mosaico_ingest.report.events import BatchObserver
+from mosaico_ingest.report.model import Report
+
+__all__ = ["Processes"]
+
+ATTEMPTS = 2
+"""How often a recording is begun whose process died under it."""
+_LEAVE_S = 10.0
+_LOOK_S = 0.2
+"""How long a request to stop may go unnoticed."""
+_LEAST_BYTES = 32 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Processes:
+    """The executor for one machine: at most `jobs` recordings at a time, each in a process of its own.
+
+    A process that dies takes only its recording with it, which is begun anew up to `attempts` times. The jobs' memory
+    is shared out. `prepare` is called in every process first, where logging is to be set up.
+    """
+
+    jobs: int
+    attempts: int = ATTEMPTS
+    prepare: Callable[[], None] = do_nothing
+
+    def map(self, configs: Sequence[ROSInjectionConfig], observe: BatchObserver) -> Iterator[Report]:
+        """Yield the report of each configuration; see `Executor.map`."""
+        jobs = max(1, min(self.jobs, len(configs)))
+        shared = [replace(config, memory_bytes=_share(config.memory_bytes, jobs)) for config in configs]
+        crew = _Crew(shared, observe, jobs, self.attempts, partial(_start, self.prepare, jobs))
+        with _counted_interrupts() as interrupts:
+            try:
+                yield from crew.reports(interrupts)
+            finally:
+                crew.leave()
+
+
+@dataclass(slots=True)
+class _Hand:
+    """A process, our end of the pipe to it, and the recording it has in work."""
+
+    process: SpawnProcess
+    pipe: Connection
+    task: int | None = None
+
+
+@dataclass(slots=True)
+class _Crew:
+    configs: Sequence[ROSInjectionConfig]
+    observe: BatchObserver
+    jobs: int
+    attempts: int
+    hire: Callable[[], _Hand]
+    waiting: deque[int] = field(default_factory=deque[int])
+    hands: list[_Hand] = field(default_factory=list[_Hand])
+    begun: dict[int, int] = field(default_factory=dict[int, int])
+    done: dict[int, Report] = field(default_factory=dict[int, Report])
+    interrupted: int = 0
+
+    def reports(self, interrupts: list[int]) -> Iterator[Report]:
+        """Yield reports in order, as soon as those before them are there too."""
+        self.waiting.extend(range(len(self.configs)))
+        position = 0
+        while self.waiting or any(hand.task is not None for hand in self.hands):
+            self._assign()
+            self._listen()
+            if len(interrupts) > self.interrupted:
+                self._interrupt()
+            while position in self.done:
+                yield self.done.pop(position)
+                position += 1
+        for left in sorted(self.done):
+            yield self.done[left]
+
+    def leave(self) -> None:
+        """End every process: the idle by closing their pipes, one still at work by interrupting it."""
+        for hand in self.hands:
+            if hand.task is not None:
+                _signal(hand, signal.SIGINT)
+            hand.pipe.close()
+        for hand in self.hands:
+            hand.process.join(_LEAVE_S)
+            if hand.process.is_alive():
+                hand.process.kill()
+                hand.process.join()
+
+    def _assign(self) -> None:
+        while self.waiting:
+            hand = next((hand for hand in self.hands if hand.task is None), None)
+            if hand is None:
+                if len(self.hands) == self.jobs:
+                    return
+                hand = self.hire()
+                self.hands.append(hand)
+            self._give(hand, self.waiting.popleft())
+
+    def _give(self, hand: _Hand, task: int) -> None:
+        try:
+            letter = ForkingPickler.dumps(self.configs[task])
+        except Exception as error:  # noqa: BLE001 - pickle raises what the object's class raises
+            self._fail(task, _unsendable(error))
+            return
+        hand.task = task
+        self.begun[task] = self.begun.get(task, 0) + 1
+        with suppress(BrokenPipeError):  # a process that is gone is noticed where we listen
+            hand.pipe.send_bytes(letter)
+
+    def _listen(self) -> None:
+        at_work = [hand.pipe for hand in self.hands if hand.task is not None]
+        ready = set(wait(at_work, _LOOK_S)) if at_work else set[object]()
+        for hand in self.hands[:]:
+            if hand.task is not None and hand.pipe in ready:
+                self._hear(hand, hand.task)
+
+    def _hear(self, hand: _Hand, task: int) -> None:
+        try:
+            said = hand.pipe.recv()
+        except (EOFError, OSError):
+            self._bury(hand, task)
+            return
+        if isinstance(said, Report):
+            self.done[task], hand.task = said, None
+        elif isinstance(said, IngestError):
+            hand.task = None
+            self._fail(task, said)
+        else:
+            self.observe(task, said)
+
+    def _bury(self, hand: _Hand, task: int) -> None:
+        """Account for a process that died: its recording is begun anew, or has failed."""
+        hand.process.join()
+        hand.pipe.close()
+        self.hands.remove(hand)
+        if self.interrupted:
+            self._fail(task, Interrupted("stopped before the end of the recording"))
+        elif self.begun[task] < self.attempts:
+            self.waiting.appendleft(task)
+        else:
+            self._fail(task, _died(hand.process.exitcode, self.attempts))
+
+    def _fail(self, task: int, error: IngestError) -> None:
+        self.done[task] = failed_report(self.configs[task], error, partial(self.observe, task))
+
+    def _interrupt(self) -> None:
+        """Begin nothing more and let what is in work end as its policy says; asked twice, end it at once."""
+        self.waiting.clear()
+        for hand in self.hands:
+            if hand.task is not None:
+                _signal(hand, signal.SIGKILL if self.interrupted else signal.SIGINT)
+        self.interrupted += 1
+
+
+@contextmanager
+def _counted_interrupts() -> Generator[list[int]]:
+    """Collect requests to stop instead of raising: an exception in the middle of a message would cost the pipe."""
+    asked = list[int]()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked
+        return
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda number, _: asked.append(number)) for number in numbers]
+    try:
+        yield asked
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+def _start(prepare: Callable[[], None], jobs: int) -> _Hand:
+    spawning = multiprocessing.get_context("spawn")  # threads run here, so forking would be a gamble
+    ours, theirs = spawning.Pipe()
+    try:
+        process = spawning.Process(
+            target=work, args=(theirs, Announced.here(), prepare, jobs), name="ingest-worker", daemon=True
+        )
+        process.start()
+    except Exception as error:
+        ours.close()
+        raise _unsendable(error) from error
+    finally:
+        theirs.close()
+    return _Hand(process, ours)
+
+
+def _share(memory_bytes: int | None, jobs: int) -> int:
+    return max((memory_bytes or DEFAULT_MEMORY_BYTES) // jobs, _LEAST_BYTES)
+
+
+def _signal(hand: _Hand, number: signal.Signals) -> None:
+    if hand.process.pid is not None and hand.process.is_alive():
+        os.kill(hand.process.pid, number)
+
+
+def _unsendable(error: Exception) -> IngestError:
+    return IngestError(
+        f"the job cannot be sent to another process: {error}",
+        hint="define its adapters at the top level of a module, or run with one job",
+    )
+
+
+def _died(exit_code: int | None, attempts: int) -> IngestError:
+    if exit_code is not None and exit_code < 0:
+        how = f"was killed by {signal.Signals(-exit_code).name}"
+    else:
+        how = f"ended with exit code {exit_code}"
+    memory = exit_code == -signal.SIGKILL
+    return IngestError(
+        f"the process that ingested it {how}, {attempts} times in all",
+        hint="memory may have run out: give fewer jobs or less run.memory" if memory else None,
+    )
