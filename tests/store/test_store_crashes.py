@@ -108,9 +108,10 @@ def test_garbage_collection_spares_the_living(
     orphan = store.paths("drive", "/t")[0].with_name("01ABC-0000.parquet")
     orphan.write_bytes(b"left by a crash")
     (store.layout.staging / "01ABD").mkdir()
+    (store.layout.staging / "01ABD" / "0.parquet").write_bytes(b"begun")
     assert store.collect_garbage().sessions == 0
     collected = store.collect_garbage(grace_s=0)
-    assert (collected.sessions, collected.files, collected.stored_bytes) == (1, 0, 0)
+    assert (collected.sessions, collected.files, collected.stored_bytes) == (1, 1, 5)
     assert store.scan("drive", "/t").read_all().num_rows == 2
     assert not orphan.exists()
 
