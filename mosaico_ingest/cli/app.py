@@ -11,7 +11,21 @@ from typing import Annotated, Any
 
 import typer
 
-from mosaico_ingest.cli import bag, diff, inspect, keys, lint, plan, run, schema, serve, store, verify
+from mosaico_ingest.cli import (
+    bag,
+    diff,
+    expand,
+    init,
+    inspect,
+    keys,
+    lint,
+    plan,
+    run,
+    schema,
+    serve,
+    store,
+    verify,
+)
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.version import __version__
 
@@ -23,6 +37,8 @@ COMMANDS: tuple[tuple[str, Callable[..., Any]], ...] = (
     ("inspect", inspect.inspect),
     ("plan", plan.plan),
     ("diff", diff.diff),
+    ("init", init.init),
+    ("expand", expand.expand),
     ("verify", verify.verify),
     ("lint", lint.lint),
     ("serve", serve.serve),

@@ -10,7 +10,7 @@ from mosaico_ingest.diagnostics import Finding, Severity
 from mosaico_ingest.manifest.matrix import combinations, variables
 from mosaico_ingest.manifest.source import Path, Source, Value
 
-__all__ = ["Filled", "fill_in"]
+__all__ = ["Filled", "fill_in", "fill_in_cell"]
 
 _REFERENCE = re.compile(r"\$(?:(\$)|\{([^{}]*)\}|(?=\{))")
 _WITHOUT = {("extends",), ("defaults",), ("matrix",)}
@@ -39,6 +39,15 @@ def fill_in(source: Source, env: Mapping[str, str] | None, cell: Mapping[str, st
     known = _Variables(
         combinations(source.value)[0] if cell is None else cell, env, variables(source.at(("defaults",)))
     )
+    return _filled(source, known)
+
+
+def fill_in_cell(source: Source, cell: Mapping[str, str]) -> Filled:
+    """Fill in the variables of a matrix and leave every other one as it is written."""
+    return _filled(source, _Variables(cell, None, {}, alone=True))
+
+
+def _filled(source: Source, known: _Variables) -> Filled:
     filled = Filled(None)
     filled.value = _value(source.value, (), source, known, filled)
     return filled
@@ -52,6 +61,8 @@ class _Variables:
     env: Mapping[str, str] | None
     """None: not looked at, and nothing is missed."""
     defaults: Mapping[str, str]
+    alone: bool = False
+    """Whether nothing but the cell counts, and all else stays to be filled in later."""
 
     def get(self, name: str) -> str | None:
         if name in self.cell:
@@ -74,7 +85,9 @@ def _value(value: Value, path: Path, source: Source, known: _Variables, out: Fil
 def _text(text: str, path: Path, source: Source, known: _Variables, out: Filled) -> str:
     def replace(match: re.Match[str]) -> str:
         if match[1]:
-            return "$"
+            return "$$" if known.alone else "$"
+        if known.alone and (match[2] or "").partition(":")[0] not in known.cell:
+            return match[0]
         out.changed.add(path)
         inside = _INSIDE.fullmatch(match[2] or "")
         if inside is None:
@@ -88,7 +101,7 @@ def _text(text: str, path: Path, source: Source, known: _Variables, out: Filled)
         name, operator, rest = inside.groups()
         value = known.get(name)
         if value is not None:
-            return value
+            return value.replace("$", "$$") if known.alone else value
         if operator == "-":
             return rest
         out.unknown.add(path)

@@ -136,7 +136,7 @@ def _moved_value(value: Value, path: Path, way: str) -> Value:
     if isinstance(value, list):
         return [_moved_value(inner, (*path, i), way) for i, inner in enumerate(value)]
     if isinstance(value, str) and _is_path(value, path) and _is_relative(value):
-        return File(way, value).as_posix()
+        return File(normpath(File(way, value))).as_posix()
     return value
 
 

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from mosaico_ingest.diagnostics import Finding, Severity, Span
 from mosaico_ingest.errors import ManifestError
-from mosaico_ingest.manifest.environment import Filled, fill_in
+from mosaico_ingest.manifest.environment import Filled, fill_in, fill_in_cell
 from mosaico_ingest.manifest.extends import extended
 from mosaico_ingest.manifest.matrix import combinations
 from mosaico_ingest.manifest.model import Manifest
@@ -31,6 +31,8 @@ __all__ = [
     "load_manifests",
     "read_manifest",
     "read_text",
+    "refusal",
+    "stand_alone",
 ]
 
 
@@ -76,7 +78,7 @@ def load_manifests(
         if manifest is not None:
             jobs.append(LoadedManifest(manifest, source, file, cell))
     if findings or not jobs:
-        raise _refusal(tuple(findings), str(path))
+        raise refusal(tuple(findings), str(path))
     return tuple(jobs)
 
 
@@ -103,9 +105,27 @@ def check_manifest(
     filled.value = _with_text_keys(filled.value, (), source, findings)
     manifest, mistakes = _validate(source, filled)
     known = {finding.span for finding in findings}
+    if any(finding.rule == "missing-base" for finding in findings):
+        mistakes = [finding for finding in mistakes if finding.rule != "missing-key"]
     findings += [finding for finding in mistakes if finding.span not in known]  # one word for one place
     ordered = tuple(sorted(findings, key=lambda finding: finding.span or Span("", 0, 0, 0, 0)))
     return (None if ordered else manifest), ordered
+
+
+def stand_alone(source: Source, cell: Mapping[str, str]) -> Value:
+    """Return one job of a manifest as a document of its own: nothing to extend, no matrix, its variables filled in.
+
+    Those of the environment stay, and with them the defaults they may need.
+    """
+    filled = fill_in_cell(source, cell)
+    _validate(source, filled)  # finds the texts that have to be numbers
+    if not isinstance(filled.value, dict):
+        return filled.value
+    defaults = filled.value.get("defaults")
+    left = {key: value for key, value in filled.value.items() if key not in {"extends", "defaults", "matrix"}}
+    if isinstance(defaults, dict) and (unfilled := {k: v for k, v in defaults.items() if k not in cell}):
+        return {"defaults": unfilled, **left}
+    return left
 
 
 def read_text(path: Path) -> str:
@@ -121,14 +141,15 @@ def read_text(path: Path) -> str:
         finding = Finding(
             "not-utf8", Severity.ERROR, message, Span(str(path), 1, 1, 1, 1), "save it as UTF-8"
         )
-        raise _refusal((finding,), str(path)) from err
+        raise refusal((finding,), str(path)) from err
     except OSError as err:
         message = f"cannot be read: {(err.strerror or str(err)).lower()}"
         finding = Finding("unreadable-file", Severity.ERROR, message, Span(str(path), 1, 1, 1, 1))
-        raise _refusal((finding,), str(path)) from err
+        raise refusal((finding,), str(path)) from err
 
 
-def _refusal(findings: tuple[Finding, ...], where: str) -> ManifestError:
+def refusal(findings: tuple[Finding, ...], where: str) -> ManifestError:
+    """Return the error that says why a manifest cannot become a job."""
     if not findings:
         return ManifestError(
             "there is no job without its variables", where=where, hint="set them in the environment"

@@ -1,0 +1,40 @@
+"""This file is `ingest init`: the draft of a manifest from a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+__all__ = ["init"]
+
+
+def init(
+    path: Annotated[Path, typer.Argument(metavar="BAG", help="A recording: a file or a rosbag2 directory.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Write it here [default: print it].", metavar="JOB.yaml"),
+    ] = None,
+    ros_distro: Annotated[
+        str | None, typer.Option("--ros-distro", help="As ros2_humble; for recordings without definitions.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+) -> None:
+    """Draft a manifest: every topic with its type, count and adapter, and what one may want to change."""
+    from mosaico_ingest import api
+    from mosaico_ingest.plan.draft import draft_manifest
+
+    if out is not None and out.exists() and not force:
+        raise typer.BadParameter(f"{out} is there already; --force replaces it", param_hint="--out")
+    found = api.inspect_recording(path, ros_distro=ros_distro)
+    folder = out.parent if out is not None else Path()
+    text = draft_manifest(found, path, folder=folder, ros_distro=ros_distro)
+    if out is None:
+        typer.echo(text, nl=False)
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    out.write_text(text, encoding="utf-8")
+    typer.echo(
+        f"{out}: {sum(topic.problem is None for topic in found.topics)} topics; run it with `ingest {out}`"
+    )
