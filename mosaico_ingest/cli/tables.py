@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from mosaico_ingest.cli.console import Terminal
 from mosaico_ingest.cli.units import bytes_text, count_text, seconds_text, time_text
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.inspection import Inspection
@@ -18,13 +19,14 @@ __all__ = ["open_console", "print_inspection", "print_json", "print_report"]
 COLUMNS = ("read", "written", "rejected", "rate", "payload", "stored")
 ROOMY = 100
 """Columns of a terminal that has room for all of them."""
-WIDE = 240
-"""Columns of output that goes to a file or a pipe, where nothing needs to be folded."""
+MANY = 3
+"""More recordings than that get a line each instead of a table each."""
+STATUS_STYLE = {RunStatus.COMPLETED: "green", RunStatus.REJECTED: "yellow", RunStatus.SKIPPED: "dim"}
 
 
 def open_console() -> Console:
     """Return standard output as wide as it is, or wide enough where it is no terminal."""
-    return Console() if sys.stdout.isatty() else Console(width=WIDE)
+    return Terminal()
 
 
 def print_json(text: str) -> None:
@@ -82,8 +84,36 @@ def print_inspection(found: Inspection, *, as_json: bool) -> None:
 def print_report(report: RunReport) -> None:
     """Print what was done."""
     console = open_console()
+    if len(report.recordings) > MANY:
+        _print_batch(report, console)
+        return
     for recording in report.recordings:
         _print_recording(recording, console)
+
+
+def _print_batch(report: RunReport, console: Console) -> None:
+    """Print a line for each recording, and the sums."""
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    table.add_column("sequence", overflow="fold")
+    table.add_column("status", no_wrap=True)
+    for column in ("topics", "read", "written", "rejected", "stored", "time"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for one in report.recordings:
+        totals, taken = one.totals, sum(t.status is not TopicStatus.LEFT_OUT for t in one.topics)
+        counts = (taken, totals.read, totals.written, totals.rejected)
+        style = STATUS_STYLE.get(one.status, "red")
+        table.add_row(
+            one.sequence,
+            Text(one.status.value, style=style),
+            *map(count_text, counts),
+            bytes_text(totals.stored_bytes),
+            seconds_text(one.duration_s),
+        )
+    console.print(table)
+    bad = sum(one.exit_code not in {0, 4} for one in report.recordings)
+    written = count_text(sum(one.totals.written for one in report.recordings))
+    line = f"{len(report.recordings)} recordings, {bad} failed, {written} messages written"
+    console.print(Text(line, style="red" if bad else "green"), soft_wrap=True)
 
 
 def _print_recording(report: Report, console: Console) -> None:
@@ -152,7 +182,7 @@ def _print_totals(report: Report, console: Console) -> None:
         parts.append(_sizes(report))
     rate = totals.read / report.duration_s if report.duration_s else 0
     parts.append(f"{seconds_text(report.duration_s)}, {count_text(round(rate))} msg/s")
-    style = {RunStatus.COMPLETED: "green", RunStatus.REJECTED: "yellow"}.get(report.status, "red")
+    style = STATUS_STYLE.get(report.status, "red")
     console.print(
         Text(f"{report.sequence} in {report.destination}: {', '.join(parts)}", style=style), soft_wrap=True
     )

@@ -1,0 +1,202 @@
+"""One behaviour for every executor: reports in order, a failure costs its recording, whoever registered what."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mosaico_ingest.adapters.base import ROSAdapterBase
+from mosaico_ingest.bag.registry import ROSTypeRegistry
+from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.executors.executor import Executor
+from mosaico_ingest.executors.local import Inline
+from mosaico_ingest.executors.processes import Processes
+from mosaico_ingest.ontology import IMU
+from mosaico_ingest.report.events import (
+    Event,
+    RunFinished,
+    RunStarted,
+    RunStatus,
+    TopicProgress,
+    ignore_batch,
+)
+from mosaico_ingest.report.model import Report
+from mosaico_ingest.store import Store
+
+DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
+
+
+class Killer(ROSAdapterBase[IMU]):
+    """An adapter whose process dies of it; only the first time where the job's folder remembers."""
+
+    ros_msgtype = "sensor_msgs/msg/Imu"
+    __mosaico_ontology_type__ = IMU
+
+    @classmethod
+    def from_dict(cls, ros_data: dict[str, Any]) -> IMU:
+        os.kill(os.getpid(), signal.SIGKILL)
+        raise NotImplementedError(ros_data)
+
+
+class KillerOnce(Killer):
+    """The same, until a file says that it has happened."""
+
+    @classmethod
+    def from_dict(cls, ros_data: dict[str, Any]) -> IMU:  # noqa: ARG003 - the base class's signature
+        happened = Path(os.environ["KILLED_ONCE"])
+        if not happened.exists():
+            happened.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return IMU(acceleration=None, angular_velocity=None)
+
+
+class Refusing(ROSAdapterBase[IMU]):
+    """An adapter that no message fits."""
+
+    ros_msgtype = "sensor_msgs/msg/Imu"
+    __mosaico_ontology_type__ = IMU
+
+    @classmethod
+    def from_dict(cls, ros_data: dict[str, Any]) -> IMU:
+        raise ValueError(sorted(ros_data)[0])
+
+
+class Slow(Refusing):
+    """One that gives time to interrupt it."""
+
+    @classmethod
+    def from_dict(cls, ros_data: dict[str, Any]) -> IMU:
+        time.sleep(0.02)
+        return super().from_dict(ros_data)
+
+
+def configs(folder: Path, names: str, **more: Any) -> list[ROSInjectionConfig]:
+    options: dict[str, Any] = {"store": folder / "store", "topics": ["/imu"], **more}
+    return [ROSInjectionConfig(DRIVE, name, **options) for name in names]
+
+
+@pytest.fixture(params=["inline", "processes"])
+def executor(request: pytest.FixtureRequest) -> Executor:
+    return Inline() if request.param == "inline" else Processes(2)
+
+
+def test_reports_come_in_order_and_the_sequences_are_there(executor: Executor, tmp_path: Path) -> None:
+    reports = list(executor.map(configs(tmp_path, "abcde"), ignore_batch))
+    assert [report.sequence for report in reports] == list("abcde")
+    assert {report.status for report in reports} == {RunStatus.COMPLETED}
+    assert {report.totals.written for report in reports} == {1000}
+    assert Store.open(tmp_path / "store").names() == tuple("abcde")
+
+
+def test_a_recording_that_fails_does_not_stop_the_others(executor: Executor, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(b"no recording")
+    jobs = configs(tmp_path, "abc")
+    jobs[1] = ROSInjectionConfig(broken, "b", store=tmp_path / "store")
+    reports = list(executor.map(jobs, ignore_batch))
+    assert [report.exit_code for report in reports] == [0, 1, 0]
+    assert "broken.mcap" in (reports[1].error or "")
+    assert Store.open(tmp_path / "store").names() == ("a", "c")
+
+
+def test_events_tell_of_which_recording_they_are(executor: Executor, tmp_path: Path) -> None:
+    told: list[tuple[int, Event]] = []
+    list(executor.map(configs(tmp_path, "abc"), lambda position, event: told.append((position, event))))
+    for position, name in enumerate("abc"):
+        events = [event for at, event in told if at == position]
+        assert isinstance(events[0], RunStarted)
+        assert events[0].sequence == name
+        assert isinstance(events[-1], RunFinished)
+        assert sum(event.written for event in events if isinstance(event, TopicProgress)) == 1000
+
+
+def test_an_adapter_class_reaches_the_worker(executor: Executor, tmp_path: Path) -> None:
+    jobs = configs(tmp_path, "ab", adapter_override={"/imu": Refusing}, topics_on_error="raise")
+    reports = list(executor.map(jobs, ignore_batch))
+    assert [report.exit_code for report in reports] == [1, 1]
+
+
+def test_registered_types_reach_the_worker(executor: Executor, tmp_path: Path) -> None:
+    bare = tmp_path / "drive.mcap"
+    shutil.copy(DRIVE, bare)
+    before = ROSTypeRegistry.snapshot()
+    ROSTypeRegistry.register("acme_msgs/msg/OnlyHere", "uint8 x")
+    try:
+        reports = list(executor.map(configs(tmp_path, "ab"), ignore_batch))
+    finally:
+        ROSTypeRegistry.restore(before)
+    assert [report.exit_code for report in reports] == [0, 0]
+
+
+def test_no_configuration_is_no_report(executor: Executor) -> None:
+    assert list(executor.map([], ignore_batch)) == []
+
+
+def test_a_process_that_dies_costs_its_recording_only(tmp_path: Path) -> None:
+    jobs = configs(tmp_path, "abc")
+    jobs[1] = configs(tmp_path, "b", adapter_override={"/imu": Killer})[0]
+    reports = list(Processes(2).map(jobs, ignore_batch))
+    assert [report.exit_code for report in reports] == [0, 1, 0]
+    assert "SIGKILL, 2 times in all" in (reports[1].error or "")
+    assert "fewer jobs" in (reports[1].error or "")
+    assert Store.open(tmp_path / "store").names() == ("a", "c")
+
+
+def test_a_recording_is_begun_anew_where_its_process_died(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("KILLED_ONCE", str(tmp_path / "killed"))
+    jobs = configs(tmp_path, "ab", adapter_override={"/imu": KillerOnce}, topics_on_error="ignore")
+    reports = list(Processes(2).map(jobs, ignore_batch))
+    assert (tmp_path / "killed").exists()
+    assert all("SIGKILL" not in (report.error or "") for report in reports)
+    assert [report.totals.read for report in reports] == [1000, 1000]
+
+
+def test_what_cannot_be_sent_fails_with_a_remedy(tmp_path: Path) -> None:
+    class Local(Refusing):
+        pass
+
+    jobs = [*configs(tmp_path, "a", adapter_override={"/imu": Local}), *configs(tmp_path, "b")]
+    reports = list(Processes(2).map(jobs, ignore_batch))
+    assert [report.exit_code for report in reports] == [1, 0]
+    assert "top level of a module" in (reports[0].error or "")
+
+
+def test_an_interrupt_ends_every_process_as_its_policy_says(tmp_path: Path) -> None:
+    jobs = configs(tmp_path, "abcdef", adapter_override={"/imu": Slow}, topics_on_error="ignore")
+    before = signal.getsignal(signal.SIGINT)
+    begun: set[int] = set()
+
+    def interrupt_once_both_run(position: int, event: Event) -> None:
+        if isinstance(event, RunStarted):
+            begun.add(position)
+            if len(begun) == 2:
+                threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+
+    reports: list[Report] = list(Processes(2).map(jobs, interrupt_once_both_run))
+    assert [(report.sequence, report.status) for report in reports] == [
+        ("a", RunStatus.INTERRUPTED),
+        ("b", RunStatus.INTERRUPTED),
+    ]
+    assert {report.exit_code for report in reports} == {130}
+    assert Store.open(tmp_path / "store").names() == ()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_memory_is_shared_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int | None] = []
+    jobs = configs(tmp_path, "abcd", memory_bytes=400 << 20)
+    monkeypatch.setattr(
+        "mosaico_ingest.executors.processes._Crew.reports",
+        lambda self, _: iter(seen.extend(config.memory_bytes for config in self.configs) or ()),
+    )
+    assert list(Processes(4).map(jobs, ignore_batch)) == []
+    assert seen == [100 << 20] * 4
