@@ -2,10 +2,32 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from enum import Enum
 
-__all__ = ["Edit", "Finding", "RowFailure", "Severity", "Span", "Stage"]
+__all__ = ["Edit", "Finding", "RowFailure", "Severity", "Span", "Stage", "encodable", "one_line"]
+
+_ESCAPED_BYTES = 0xDC00
+"""Where Python puts the bytes of a file name that it cannot decode."""
+_SURROGATES = re.compile("[\ud800-\udfff]")
+_UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+"""Control characters, line ends and what turns the direction of writing, which deceive a reader's terminal."""
+
+
+def encodable(text: str) -> str:
+    r"""Return the text with the bytes of a file name that are no UTF-8 spelled as `\xff`."""
+    return _SURROGATES.sub(_spelled, text)
+
+
+def one_line(text: str) -> str:
+    r"""Return the text with everything that does not print spelled as an escape, as `\x1b` or `\n`."""
+    return _UNPRINTABLE.sub(_spelled, text)
+
+
+def _spelled(match: re.Match[str]) -> str:
+    byte = ord(match[0]) - _ESCAPED_BYTES
+    return f"\\x{byte:02x}" if byte in range(0x80, 0x100) else match[0].encode("unicode_escape").decode()
 
 
 class Severity(str, Enum):
@@ -58,7 +80,7 @@ class Finding:
         """Return the finding in one line, without the source excerpt."""
         place = f"{self.span}: " if self.span else ""
         text = f"{place}{self.severity.value}[{self.rule}] {self.message}"
-        return f"{text} — {self.help}" if self.help else text
+        return one_line(f"{text} — {self.help}" if self.help else text)
 
 
 class Stage(str, Enum):

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from mosaico_ingest.diagnostics import Finding
+from mosaico_ingest.diagnostics import Finding, one_line
 
 __all__ = [
     "AdapterError",
@@ -58,7 +58,7 @@ class IngestError(Exception):
     def __str__(self) -> str:
         """Return `where: what — hint` with the parts that are known."""
         text = f"{self.where}: {self.what}" if self.where else self.what
-        return f"{text} — {self.hint}" if self.hint else text
+        return one_line(f"{text} — {self.hint}" if self.hint else text)
 
     def __reduce__(self) -> tuple[object, ...]:
         """Keep the fields when the error crosses a process border."""

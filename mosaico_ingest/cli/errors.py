@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rich.console import Console
 from rich.text import Text
 
+from mosaico_ingest.cli.console import Terminal
 from mosaico_ingest.cli.render import render_findings, texts_of
 from mosaico_ingest.diagnostics import Finding
 
@@ -15,7 +15,7 @@ __all__ = ["print_error"]
 
 def print_error(error: str, findings: Sequence[Finding]) -> None:
     """Print to standard error."""
-    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    console = Terminal(stderr=True, soft_wrap=True)
     if findings:
         console.print(render_findings(findings, texts_of(findings)))
     else:

@@ -64,16 +64,15 @@ def lint(
 
 
 def _print_text(report: LintReport, *, quiet: bool) -> None:
-    from rich.console import Console
-
+    from mosaico_ingest.cli.console import Terminal
     from mosaico_ingest.cli.render import render_findings, texts_of
 
-    console = Console(soft_wrap=True, highlight=False)
+    console = Terminal(soft_wrap=True)
     if report.findings:
         texts = {**texts_of(report.findings), **{judged.file: judged.text for judged in report.files}}
         console.print(render_findings(report.findings, texts))
     if not quiet:
-        Console(stderr=True, soft_wrap=True, highlight=False).print(_summary(report), style="bold")
+        Terminal(stderr=True, soft_wrap=True).print(_summary(report), style="bold")
 
 
 def _summary(report: LintReport) -> str:

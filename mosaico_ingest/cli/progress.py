@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from mosaico_ingest.cli.batch_progress import BatchBoard, BatchLines, print_nothing
+from mosaico_ingest.cli.console import Terminal
 from mosaico_ingest.cli.units import bytes_text, count_text
 from mosaico_ingest.report.events import (
     BatchObserver,
@@ -43,7 +43,7 @@ def display(recordings: int, *, quiet: bool) -> Generator[BatchObserver]:
     if quiet:
         yield ignore_batch
         return
-    console = Console(file=sys.stderr)
+    console = Terminal(stderr=True)
     if not console.is_terminal:
         lines = BatchLines(console, recordings) if recordings > 1 else _Lines(console)
         yield lines if isinstance(lines, BatchLines) else _alone(lines)

@@ -51,7 +51,7 @@ def print_sequence(info: SequenceInfo, *, as_json: bool) -> None:
     console = open_console()
     console.print(Text(info.name, style="bold"))
     for key, value in info.metadata.items():
-        console.print(f"  {key}: {value}", highlight=False, markup=False)
+        console.print(f"  {key}: {value}")
     table = _table("topic", ontology=False, rows=True, size=True, start=False, duration=True)
     for topic in info.topics:
         size = bytes_text(topic.stored_bytes)
@@ -80,19 +80,19 @@ def print_topic(info: TopicInfo, reader: pa.RecordBatchReader, *, rows: int, as_
     console = open_console()
     console.print(Text(f"{info.sequence}{info.name}", style="bold"))
     facts = f"{info.ontology.tag}, {count_text(info.rows)} rows, {bytes_text(info.stored_bytes)}"
-    console.print(f"{facts}, {time_text(info.start_ns)} .. {time_text(info.end_ns)} UTC", highlight=False)
+    console.print(f"{facts}, {time_text(info.start_ns)} .. {time_text(info.end_ns)} UTC")
     for segment in info.segments:
         console.print(Text(f"  {segment.path}"), soft_wrap=True)
-    console.print("[dim]schema[/dim]")
+    console.print("schema", style="dim")
     for field in info.schema:
         console.print(
             Text(f"  {field.name}: {field.type}{'' if field.nullable else ' not null'}"), soft_wrap=True
         )
-    console.print("[dim]metadata[/dim]")
+    console.print("metadata", style="dim")
     for key, value in info.metadata.items():
         console.print(Text(f"  {key}: {_short(value)}"), soft_wrap=True)
     if first:
-        console.print("[dim]first rows[/dim]")
+        console.print("first rows", style="dim")
     for row in first:
         console.print(Text(f"  {_short(row)}"), soft_wrap=True)
 

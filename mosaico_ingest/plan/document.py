@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
+from pydantic import Field, JsonValue, ValidationError
 
 from mosaico_ingest.diagnostics import Severity, Stage
 from mosaico_ingest.errors import ManifestError, SinkError
@@ -17,6 +17,7 @@ from mosaico_ingest.policies import (
     SessionLevelErrorPolicy,
     TopicLevelErrorPolicy,
 )
+from mosaico_ingest.report.part import Part
 
 __all__ = [
     "Decisions",
@@ -35,11 +36,7 @@ __all__ = [
 ]
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
-
-
-class FilePart(_Part):
+class FilePart(Part):
     """One file of the recording."""
 
     path: str
@@ -47,7 +44,7 @@ class FilePart(_Part):
     size_bytes: int
 
 
-class PlannedTopic(_Part):
+class PlannedTopic(Part):
     """A topic that will be read, and what it becomes."""
 
     topic: str
@@ -75,7 +72,7 @@ class PlannedTopic(_Part):
     metadata: dict[str, JsonValue]
 
 
-class UnreadTopic(_Part):
+class UnreadTopic(Part):
     """A topic that will not be read."""
 
     topic: str
@@ -84,7 +81,7 @@ class UnreadTopic(_Part):
     why: str
 
 
-class Decisions(_Part):
+class Decisions(Part):
     """Everything that a run follows, and that `--check` compares."""
 
     sequence: str
@@ -114,7 +111,7 @@ class Decisions(_Part):
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
 
 
-class Note(_Part):
+class Note(Part):
     """Something to know, with the place of its cause."""
 
     severity: Severity
@@ -125,7 +122,7 @@ class Note(_Part):
     help: str | None
 
 
-class SampleRejection(_Part):
+class SampleRejection(Part):
     """Messages of the sample that would be rejected for the same reason."""
 
     stage: Stage
@@ -134,7 +131,7 @@ class SampleRejection(_Part):
     reason: str
 
 
-class Sample(_Part):
+class Sample(Part):
     """What became of a topic's first messages, decoded and adapted on trial."""
 
     target: str
@@ -145,7 +142,7 @@ class Sample(_Part):
     rejections: tuple[SampleRejection, ...]
 
 
-class DestinationState(_Part):
+class DestinationState(Part):
     """What the destination said; null where it was not asked."""
 
     kind: Literal["store", "server"]
@@ -160,7 +157,7 @@ class DestinationState(_Part):
     """What the rows take uncompressed, judged by the sample; what is stored is mostly less."""
 
 
-class RecordingPlan(_Part):
+class RecordingPlan(Part):
     """One recording: what was decided, and what was seen."""
 
     digest: str
@@ -176,7 +173,7 @@ class RecordingPlan(_Part):
         return sum(sample.rejected for sample in self.samples)
 
 
-class PlanDocument(_Part):
+class PlanDocument(Part):
     """What one manifest would do; `version` changes when the form does."""
 
     version: Literal[1] = 1

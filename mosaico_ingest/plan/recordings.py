@@ -102,7 +102,14 @@ def _glob(path: Path) -> Iterable[Path]:
 def _is_recording(path: Path) -> bool:
     if path.is_file():
         return _RECORDING.search(path.name) is not None
-    return (path / "metadata.yaml").is_file() or _any_recording(path.iterdir())
+    return path.is_dir() and ((path / "metadata.yaml").is_file() or _any_recording(_listed(path)))
+
+
+def _listed(folder: Path) -> list[Path]:
+    try:
+        return list(folder.iterdir())
+    except OSError:  # what a pattern meets on its way need not be ours to read
+        return []
 
 
 def _any_recording(paths: Iterable[Path]) -> bool:
@@ -114,7 +121,7 @@ def _nearby(path: Path) -> str:
     folder = path.parent
     while not folder.is_dir() and folder != folder.parent:
         path, folder = folder, folder.parent
-    names = sorted(entry.name for entry in folder.iterdir())
+    names = sorted(entry.name for entry in _listed(folder))
     close = get_close_matches(path.name, names, n=1, cutoff=0.5)
     if close:
         return f"{folder} has {close[0]!r}"

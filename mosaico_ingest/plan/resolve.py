@@ -9,7 +9,7 @@ from mosaico_ingest.bag.recording import Recording
 from mosaico_ingest.bag.types import TypeResolver
 from mosaico_ingest.bridge import ROSBridge
 from mosaico_ingest.config import DEFAULT_TOPIC, ROSInjectionConfig, TimeBound, TimeRange
-from mosaico_ingest.diagnostics import Finding, Severity, Span
+from mosaico_ingest.diagnostics import Finding, Severity, Span, encodable
 from mosaico_ingest.errors import AdapterError, BagError, NothingMatched
 from mosaico_ingest.patterns import Selection, first_match, select
 from mosaico_ingest.plan.describe import check_digest
@@ -38,7 +38,7 @@ def resolve(
     misfits: list[tuple[str, AdapterError]] = []
     for channel in recording.channels:
         try:
-            outcome = decide(config, channel, selection, bridge, recording.files[0].name)
+            outcome = decide(config, channel, selection, bridge, encodable(recording.files[0].name))
         except AdapterError as error:
             misfits.append((channel.topic, error))
             continue

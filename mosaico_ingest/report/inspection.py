@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict
+from mosaico_ingest.report.part import Part
 
 __all__ = ["InspectedTopic", "Inspection"]
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
-
-
-class InspectedTopic(_Part):
+class InspectedTopic(Part):
     """One topic of the recording and what it would become."""
 
     topic: str
@@ -31,7 +27,7 @@ class InspectedTopic(_Part):
     """Why it cannot be ingested."""
 
 
-class Inspection(_Part):
+class Inspection(Part):
     """A recording as its index describes it."""
 
     files: tuple[str, ...]

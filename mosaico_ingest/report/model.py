@@ -5,17 +5,18 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, computed_field
+from pydantic import ConfigDict, Field, computed_field
 
 from mosaico_ingest.diagnostics import Stage
 from mosaico_ingest.report.events import RunStatus, TopicStatus
+from mosaico_ingest.report.part import Part
 
 __all__ = ["Loss", "Rejection", "Report", "RunReport", "TopicReport", "Totals", "report_schema"]
 
 
-class _Part(BaseModel):
+class _Part(Part):
     # What is computed is written for other readers, and left out again when a report is read back.
-    model_config = ConfigDict(extra="ignore", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="ignore")
 
 
 class Rejection(_Part):

@@ -15,7 +15,8 @@ from mosaico_ingest.errors import BagError
 __all__ = ["ZSTD_MAGIC", "inflate", "inflate_file", "inflate_message", "inflate_some"]
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-_STEP_BYTES = 1 << 16
+_STEP_BYTES = 1 << 12
+"""What is inflated at once: zstd makes at most 128 MiB of it, so that a bomb is noticed on the way."""
 _LZ4_RATIO = 255
 """What lz4 can reach at best."""
 _ZSTD_RATIO = 64

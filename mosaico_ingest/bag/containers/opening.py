@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from stat import S_ISREG
 
 from mosaico_ingest.bag.containers import mcap, ros1, sqlite
 from mosaico_ingest.bag.containers.compression import ZSTD_MAGIC, inflate_file
@@ -55,6 +56,8 @@ def open_part(path: Path, stack: ExitStack) -> Part:
 
 def _head(path: Path) -> bytes:
     try:
+        if not S_ISREG(path.stat().st_mode):  # to open a pipe waits for its writer
+            raise BagError("a pipe, a socket or a device, not a file", where=str(path))
         with path.open("rb") as file:
             return file.read(_LOOK_BYTES)
     except OSError as err:

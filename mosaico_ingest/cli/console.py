@@ -1,0 +1,38 @@
+"""This file is the terminal as the commands see it: what recordings and manifests say cannot control it."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterable
+
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
+
+__all__ = ["Terminal"]
+
+_CONTROLLING = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+_WIDE = 240
+"""Columns of output that goes to a file or a pipe, where nothing needs to be folded."""
+
+
+class Terminal(Console):
+    """Prints text as it is: no markup, no emoji names, and a visible sign in place of each control character."""
+
+    def __init__(self, *, stderr: bool = False, soft_wrap: bool = False) -> None:
+        width = None if (sys.stderr if stderr else sys.stdout).isatty() else _WIDE
+        super().__init__(
+            stderr=stderr, soft_wrap=soft_wrap, width=width, markup=False, emoji=False, highlight=False
+        )
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """Render as every console does, then take the controls out of the text."""
+        for segment in super().render(renderable, options):
+            yield (
+                segment if segment.control else Segment(_CONTROLLING.sub(_sign, segment.text), segment.style)
+            )
+
+
+def _sign(match: re.Match[str]) -> str:
+    code = ord(match[0])
+    return chr(0x2400 + code) if code < 0x20 else "\ufffd"  # noqa: PLR2004 - Unicode has a picture of each C0 control
