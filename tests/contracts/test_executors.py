@@ -65,7 +65,7 @@ class Refusing(ROSAdapterBase[IMU]):
 
     @classmethod
     def from_dict(cls, ros_data: dict[str, Any]) -> IMU:
-        raise ValueError(sorted(ros_data)[0])
+        raise ValueError(min(ros_data))
 
 
 class Slow(Refusing):
