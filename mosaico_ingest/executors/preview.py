@@ -11,7 +11,7 @@ from mosaico_ingest.bridge import ROSBridge
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.diagnostics import Finding, Severity
 from mosaico_ingest.executors.trial import try_messages
-from mosaico_ingest.executors.worker import open_for
+from mosaico_ingest.executors.worker import foresee, open_for
 from mosaico_ingest.plan.describe import decisions, notes
 from mosaico_ingest.plan.destination import ask_destination, space_finding
 from mosaico_ingest.plan.document import Decisions, PlanDocument, RecordingPlan
@@ -50,13 +50,14 @@ def preview(config: ROSInjectionConfig, *, connect: bool) -> RecordingPlan:
         losses = tuple(_losses(recording))
     decided = decisions(plan, folder=config.base_dir)
     state = ask_destination(plan, samples, connect=connect)
-    space = space_finding(state)
+    foreseen = foresee(plan) if connect and state.exists else None
+    found = (finding for finding in (space_finding(state), foreseen) if finding is not None)
     return RecordingPlan(
         digest=decided.digest,
         decisions=decided,
         destination=state,
         samples=samples,
-        notes=notes((*plan.findings, *losses, *_left_out(plan), *((space,) if space else ()))),
+        notes=notes((*plan.findings, *losses, *_left_out(plan), *found)),
     )
 
 

@@ -13,10 +13,12 @@ from mosaico_ingest.bag.registry import ROSTypeRegistry
 from mosaico_ingest.bag.types import TypeResolver
 from mosaico_ingest.bridge import ROSBridge
 from mosaico_ingest.config import ROSInjectionConfig, ServerTarget, StoreTarget
+from mosaico_ingest.diagnostics import Finding
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.injector import inject
 from mosaico_ingest.plan.model import Plan
 from mosaico_ingest.plan.resolve import resolve
+from mosaico_ingest.policies import SessionLevelErrorPolicy
 from mosaico_ingest.report.collect import Collector
 from mosaico_ingest.report.events import (
     Event,
@@ -32,7 +34,7 @@ from mosaico_ingest.sink import Sink
 from mosaico_ingest.store.sink import StoreSink
 from mosaico_ingest.store.store import Store
 
-__all__ = ["execute", "failed_report", "make_plan", "open_for", "run_config", "sink_for"]
+__all__ = ["execute", "failed_report", "foresee", "make_plan", "open_for", "run_config", "sink_for"]
 
 _log = logging.getLogger(__name__)
 
@@ -70,6 +72,15 @@ def sink_for(target: StoreTarget | ServerTarget, *, buffer_bytes: int) -> Sink:
     return PlatformSink(target, buffer_bytes)
 
 
+def foresee(plan: Plan) -> Finding | None:
+    """Return what a server's key would not let the session policy do; the server is asked."""
+    if not isinstance(plan.target, ServerTarget) or plan.on_error is not SessionLevelErrorPolicy.Delete:
+        return None
+    from mosaico_ingest.platform.foresight import delete_finding  # noqa: PLC0415 - as in sink_for
+
+    return delete_finding(plan.target, plan.sequence)
+
+
 def execute(plan: Plan, observe: Observer, *, sink: Sink | None = None) -> tuple[Report, IngestError | None]:
     """Run a plan; return what happened, and the error that ended it, if one did.
 
@@ -86,6 +97,9 @@ def execute(plan: Plan, observe: Observer, *, sink: Sink | None = None) -> tuple
     for finding in plan.findings:
         tell(Noted(finding))
     try:
+        foreseen = None if sink else foresee(plan)
+        if foreseen is not None:
+            tell(Noted(foreseen))
         with open_recording(plan.files, resolve=plan.resolver) as recording:
             inject(plan, recording, sink or sink_for(plan.target, buffer_bytes=plan.memory_bytes // 4), tell)
     except IngestError as error:

@@ -19,6 +19,7 @@ from mosaico_ingest.ontology import Integer64
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.platform.client import connect
 from mosaico_ingest.platform.faults import Address
+from mosaico_ingest.platform.foresight import delete_finding
 from mosaico_ingest.platform.sink import PlatformSink
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.sink import topic_schema
@@ -387,6 +388,22 @@ class TestKeys:
         ):
             pytest.fail("opened")
         assert key not in str(caught.value)
+
+    @pytest.mark.parametrize(
+        ("permission", "warned"), [("write", True), ("delete", False), ("manage", False)]
+    )
+    def test_a_key_that_may_not_delete_is_known_beforehand(
+        self, server: Mosaicod, permission: str, warned: bool
+    ) -> None:
+        server.keys[make_key("k")] = permission
+        found = delete_finding(target(server, api_key=make_key("k")), "seq")
+        assert (found is not None) is warned
+        assert server.calls == ["info", "session_delete"]
+
+    def test_a_key_nobody_knows_is_no_warning_but_an_error(self, server: Mosaicod) -> None:
+        server.keys[make_key("k")] = "write"
+        with pytest.raises(SinkError, match="the API key is refused"):
+            delete_finding(target(server, api_key=make_key("other")), "seq")
 
     def test_a_session_that_may_not_be_deleted_is_told(self, server: Mosaicod) -> None:
         server.keys[make_key("w")] = "write"
