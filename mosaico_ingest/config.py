@@ -27,7 +27,9 @@ __all__ = [
     "DEFAULT_TOPIC",
     "AdapterReference",
     "ImageFormat",
+    "Limit",
     "LogLevel",
+    "QuarantineSettings",
     "ROSInjectionConfig",
     "ServerTarget",
     "StoreTarget",
@@ -68,6 +70,25 @@ class TimeRange:
 
     start: TimeBound | None = None
     end: TimeBound | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """At most so many messages, or at most this share of them, from 0 to 1; one of the two is None."""
+
+    count: int | None = None
+    share: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class QuarantineSettings:
+    """Where rejected messages are kept and how many: of one topic, and of all together (None: all of them)."""
+
+    path: Path = Path("quarantine")
+    max: Limit | None = None
+    max_run: Limit | None = None
+    systematic: int = 100
+    """So many failures from the very start of a topic end it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +180,8 @@ class ROSInjectionConfig:
         default_factory=dict[tuple[str | int | float | bool | None, ...], Span], compare=False, repr=False
     )
     """Where the manifest says what: of a key its place, of a list's item the item's, by their path."""
+    quarantine: QuarantineSettings | None = None
+    """Where rejected messages are kept; None: they are only counted."""
     plan_digest: str | None = None
     """The `digest` of the only plan that may be run; None: whatever the recording calls for."""
 

@@ -8,7 +8,8 @@ from mosaico_ingest.bag.recording import Recording
 from mosaico_ingest.diagnostics import Finding, Severity, Stage
 from mosaico_ingest.errors import Interrupted, NothingMatched, VerificationError
 from mosaico_ingest.plan.model import Plan
-from mosaico_ingest.policies import SessionLevelErrorPolicy
+from mosaico_ingest.policies import IfExists, SessionLevelErrorPolicy
+from mosaico_ingest.quarantine.quarantine import Quarantine
 from mosaico_ingest.report.events import Noted, Observer, Rejected, TopicClosed, TopicProgress, Unreadable
 from mosaico_ingest.sink import Session, Sink, StoredTopic
 from mosaico_ingest.stream import Stream
@@ -26,10 +27,11 @@ def inject(plan: Plan, recording: Recording, sink: Sink, observe: Observer) -> N
     """
     failure: BaseException | None = None
     missing: list[str] = []
+    aside = _quarantine(plan)
     streams: tuple[Stream, ...] = ()
     try:
         with sink.open(plan.sequence, plan.metadata, if_exists=plan.if_exists) as session:
-            streams = _open_streams(plan, recording, session, observe)
+            streams = _open_streams(plan, recording, session, observe, aside)
             try:
                 _pump(plan, recording, streams, observe)
                 missing = _missing(plan, recording, streams, observe)
@@ -44,7 +46,13 @@ def inject(plan: Plan, recording: Recording, sink: Sink, observe: Observer) -> N
         for stream in streams:
             _take_back(stream, stream.rows, f"the session was discarded: {error}", observe)
             observe(TopicClosed(stream.plan.target, stream.status, 0, error=stream.error))
+        if aside is not None:
+            aside.discard()
         raise
+    if aside is not None:
+        aside.close(replaced=plan.if_exists is IfExists.REPLACE)
+        if aside.kept:
+            observe(Noted(_kept(aside)))
     wrong = missing + _close(session.stored(), streams, observe, forgive=failure)
     if failure is not None:
         raise failure
@@ -54,6 +62,23 @@ def inject(plan: Plan, recording: Recording, sink: Sink, observe: Observer) -> N
         )
 
 
+def _quarantine(plan: Plan) -> Quarantine | None:
+    if plan.quarantine is None:
+        return None
+    counts = [topic.count for topic in plan.topics]
+    promised = None if None in counts else sum(count or 0 for count in counts)
+    return Quarantine(plan.quarantine, plan.sequence, promised)
+
+
+def _kept(aside: Quarantine) -> Finding:
+    return Finding(
+        "quarantined",
+        Severity.WARNING,
+        f"{aside.kept} messages lie in {aside.messages_path}",
+        help=f"mend the manifest, then `ingest replay {aside.messages_path.parent} --manifest JOB.yaml`",
+    )
+
+
 def _named(error: BaseException) -> BaseException:
     if isinstance(error, KeyboardInterrupt):
         return Interrupted("stopped before the end of the recording", hint="run the job again for all of it")
@@ -61,12 +86,12 @@ def _named(error: BaseException) -> BaseException:
 
 
 def _open_streams(
-    plan: Plan, recording: Recording, session: Session, observe: Observer
+    plan: Plan, recording: Recording, session: Session, observe: Observer, aside: Quarantine | None
 ) -> tuple[Stream, ...]:
     channels = {channel.id: channel for channel in recording.channels}
     streams: list[Stream] = []
     for topic in plan.topics:
-        stream = Stream(topic, plan.on_message_error, session, observe)
+        stream = Stream(topic, plan.on_message_error, session, observe, quarantine=aside)
         for channel_id in topic.channels:
             stream.bind(channels[channel_id])
         streams.append(stream)

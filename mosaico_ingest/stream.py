@@ -20,6 +20,7 @@ from mosaico_ingest.errors import AdapterError, BagError, DecodeError, IngestErr
 from mosaico_ingest.ontology.required import fill_required
 from mosaico_ingest.plan.model import TopicPlan
 from mosaico_ingest.policies import LoaderErrorPolicy, TopicLevelErrorPolicy
+from mosaico_ingest.quarantine.quarantine import Quarantine
 from mosaico_ingest.report.events import Observer, Rejected, TopicProgress, TopicStatus
 from mosaico_ingest.sink import ENVELOPE, Session, TopicWriter
 from mosaico_ingest.write_buffer import WriteBuffer
@@ -68,6 +69,10 @@ class Stream:
     end_ns: int | None = None
     status: TopicStatus = TopicStatus.EMPTY
     error: str | None = None
+    quarantine: Quarantine | None = None
+    """Takes rejected messages; the policies come into play where it does not."""
+    _leading: int = 0
+    """How many messages failed before the first good one."""
     _decoders: dict[int, Decoder] = field(default_factory=dict[int, Decoder])
     _adapters: dict[int, Adapter] = field(default_factory=dict[int, Adapter])
     _writer: TopicWriter | None = None
@@ -98,10 +103,10 @@ class Stream:
             self._reject_rest(batch, 0)
             return
         done = self._translate(batch)
-        fatal = next((lost for lost in done.lost if self._ends_topic(lost)), None)
+        fatal, aside = self._judge(batch, done)
         end = len(batch) if fatal is None else fatal.failure.row + 1
         self._count(batch, end, downsampled=int((done.skipped < end).sum()))
-        self._reject(batch, (lost for lost in done.lost if lost.failure.row < end))
+        self._reject(batch, (lost for lost in done.lost if lost.failure.row < end), aside)
         kept = int(np.searchsorted(done.index, end))
         if kept:
             rows = _record_batch(done.log_times[:kept], done.rows[:kept])
@@ -133,10 +138,44 @@ class Stream:
         lost.sort(key=lambda one: one.failure.row)
         return _Translated(adapted.rows, times, index[adapted.index], tuple(lost), positions[~taken])
 
+    def _judge(self, batch: RawBatch, done: _Translated) -> tuple[_Lost | None, set[int]]:
+        """Put lost messages aside in their order; return the one that ends the topic, and the rows put aside."""
+        aside: set[int] = set()
+        first_good = int(done.index[0]) if len(done.index) else len(batch)
+        for lost in done.lost:
+            row = lost.failure.row
+            self._leading += self.rows == 0 and row < first_good
+            if self._set_aside(batch, lost):
+                aside.add(row)
+            elif self._ends_topic(lost):
+                return lost, aside
+            if self.quarantine is not None and self._leading == self.quarantine.systematic:
+                reason = f"none of the first {self._leading} messages could be used: {lost.failure.reason}"
+                return replace(lost, failure=replace(lost.failure, reason=reason)), aside
+        return None, aside
+
+    def _set_aside(self, batch: RawBatch, lost: _Lost) -> bool:
+        return self.quarantine is not None and self.quarantine.take(
+            batch,
+            lost.failure,
+            stage=lost.stage,
+            target=self.plan.target,
+            promised=self.plan.count,
+            read=self.seen,
+        )
+
     def _ends_topic(self, lost: _Lost) -> bool:
+        if self.quarantine is not None:
+            return self._ends_run(lost.stage) or self.plan.on_error is TopicLevelErrorPolicy.Finalize
         if lost.stage is Stage.DECODE:
             return self.on_message_error is LoaderErrorPolicy.RAISE
         return self.plan.on_error is not TopicLevelErrorPolicy.Ignore
+
+    def _ends_run(self, stage: Stage) -> bool:
+        """Say whether a message that ends its topic ends the run with it."""
+        if stage is Stage.DECODE and self.on_message_error is LoaderErrorPolicy.RAISE:
+            return True
+        return self.plan.on_error is TopicLevelErrorPolicy.Raise
 
     def _end(self, fatal: _Lost, batch: RawBatch, end: int) -> None:
         """Apply the policy a lost message has triggered."""
@@ -145,7 +184,7 @@ class Stream:
         error = kind(fatal.failure.reason, where=f"{self.plan.topic} at offset {offset}")
         self.error = str(error)
         self.session.note_error(self.error, topic=self.plan.target)
-        if fatal.stage is Stage.DECODE or self.plan.on_error is TopicLevelErrorPolicy.Raise:
+        if self._ends_run(fatal.stage):
             raise error
         self.status = TopicStatus.FINALIZED
         self._count_rest(batch, end)
@@ -218,7 +257,7 @@ class Stream:
             )
         )
 
-    def _reject(self, batch: RawBatch, lost: Iterable[_Lost]) -> None:
+    def _reject(self, batch: RawBatch, lost: Iterable[_Lost], aside: set[int]) -> None:
         """Say what was lost, once for each rule, with the first message as the example."""
         groups: dict[tuple[Stage, str], list[RowFailure]] = {}
         for one in lost:
@@ -234,6 +273,7 @@ class Stream:
                     first.reason,
                     int(batch.log_times[first.row]),
                     int(batch.offsets[first.row]),
+                    sum(failure.row in aside for failure in failures),
                 )
             )
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Discriminator,
     Field,
@@ -21,7 +22,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from mosaico_ingest.manifest.matrix import MAX_JOBS
-from mosaico_ingest.manifest.units import parse_instant, parse_offset, parse_size
+from mosaico_ingest.manifest.units import parse_instant, parse_limit, parse_offset, parse_size
 from mosaico_ingest.policies import (
     IfExists,
     LoaderErrorPolicy,
@@ -39,6 +40,7 @@ __all__ = [
     "CustomMessages",
     "Manifest",
     "OnErrorSection",
+    "QuarantineSection",
     "RunSection",
     "SequenceSection",
     "TargetSection",
@@ -59,6 +61,15 @@ def _check_time(text: str) -> str:
 
 def _check_size(text: str) -> str:
     parse_size(text)
+    return text
+
+
+def _limit_text(value: object) -> object:
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+def _check_limit(text: str) -> str:
+    parse_limit(text)
     return text
 
 
@@ -102,6 +113,14 @@ TimeText = Annotated[
 ]
 SizeText = Annotated[
     Text, AfterValidator(_check_size), Field(json_schema_extra={"pattern": r"^[0-9.]+ ?[kKMGT]?i?B$"})
+]
+LimitText = Annotated[
+    Text,
+    BeforeValidator(_limit_text),
+    AfterValidator(_check_limit),
+    Field(
+        json_schema_extra={"type": ["string", "integer"], "minimum": 0, "pattern": r"^[0-9]+$|^[0-9.]+ ?%$"}
+    ),
 ]
 Paths = Annotated[
     Annotated[Text, Tag("one")] | Annotated[tuple[Text, ...], Field(min_length=1), Tag("several")],
@@ -211,6 +230,21 @@ class OnErrorSection(_Section):
     """For a message whose bytes do not fit its type: ignore (count it), log_warn (and say so), raise (end the run)."""
 
 
+class QuarantineSection(_Section):
+    """Where rejected messages are kept for `ingest replay`; while there is room, `on_error` does not come into play."""
+
+    path: Text = Field(default="quarantine", examples=["quarantine"])
+    """The folder for their bytes (MCAP) and what was wrong with them (JSONL)."""
+    max: LimitText | None = Field(default=None, examples=[100, "0.1%"])
+    """How many messages of one topic are kept, as a number or a share of the topic's; the next one is `on_error.topic`'s
+    affair. Without it, all of them."""
+    max_run: LimitText | None = Field(default=None, examples=[1000, "0.01%"])
+    """How many of all topics together."""
+    systematic: Annotated[int, Field(ge=1)] = 100
+    """So many failures from the very start of a topic, without a good message, end it: that is no bad message but a wrong
+    definition or mapping."""
+
+
 class TargetSection(_Section):
     """Where sequences go: a store of files, or a Mosaico server; without both, the store `./mosaico`."""
 
@@ -280,6 +314,8 @@ class Manifest(_Section):
     """How messages become ontology records where the built-in adapters are not wanted."""
     on_error: OnErrorSection = OnErrorSection()
     """What an error costs."""
+    quarantine: QuarantineSection | None = None
+    """Where rejected messages are kept; without this section they are only counted."""
     target: TargetSection = TargetSection()
     """Where sequences go."""
     run: RunSection = RunSection()

@@ -6,7 +6,7 @@ import re
 from datetime import datetime, timezone
 from typing import Final
 
-__all__ = ["parse_instant", "parse_offset", "parse_size"]
+__all__ = ["parse_instant", "parse_limit", "parse_offset", "parse_size"]
 
 _SIZE = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?([kKMGT]?i?B)")
 _BYTES: Final = {
@@ -28,6 +28,7 @@ _NANOSECONDS: Final = {
 _INSTANT = re.compile(
     r"(\d{4}-\d\d-\d\d)(?:[Tt ](\d\d:\d\d(?::\d\d)?)(?:\.(\d{1,9}))?)? ?(Z|z|[+-]\d\d:\d\d)?"
 )
+_LIMIT = re.compile(r"([0-9]+)|([0-9]+(?:\.[0-9]+)?) ?%")
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 
 
@@ -56,6 +57,18 @@ def parse_offset(text: str) -> int:
     unit = _NANOSECONDS[match[3]]
     magnitude = int(whole) * unit + (int(fraction) * unit // 10 ** len(fraction) if fraction else 0)
     return -magnitude if match[1] == "-" else magnitude
+
+
+def parse_limit(text: str) -> tuple[int | None, float | None]:
+    """Return the number that `100` stands for, or the share of `0.1%`; one of the two is None.
+
+    Raises:
+        ValueError: The text is neither.
+    """
+    match = _LIMIT.fullmatch(text)
+    if match is None:
+        raise ValueError(f"{text!r} is no limit; write a number of messages, as 100, or a share, as 0.1%")
+    return (int(match[1]), None) if match[1] else (None, float(match[2]) / 100)
 
 
 def parse_instant(text: str) -> int:

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from mosaico_ingest.config import ROSInjectionConfig, TimeBound, TimeRange
+from mosaico_ingest.config import Limit, QuarantineSettings, ROSInjectionConfig, TimeBound, TimeRange
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.manifest.load import LoadedManifest
-from mosaico_ingest.manifest.units import parse_instant, parse_offset, parse_size
+from mosaico_ingest.manifest.units import parse_instant, parse_limit, parse_offset, parse_size
 from mosaico_ingest.plan.recordings import Recording, find_recordings, sequence_name
 from mosaico_ingest.policies import TopicLevelErrorPolicy
 
@@ -81,6 +81,7 @@ def _fields(loaded: LoadedManifest) -> dict[str, Any]:
         "on_error": manifest.on_error.session,
         "topics_on_error": _topic_policies(loaded),
         "messages_on_error": manifest.on_error.message,
+        "quarantine": _quarantine(loaded),
         "log_level": manifest.run.log_level,
         "report_path": _path(loaded, manifest.run.report),
         "memory_bytes": None if manifest.run.memory is None else parse_size(manifest.run.memory),
@@ -126,6 +127,19 @@ def _topic_settings(loaded: LoadedManifest) -> dict[str, Any]:
 def _topic_policies(loaded: LoadedManifest) -> TopicLevelErrorPolicy | dict[str, TopicLevelErrorPolicy]:
     policies = loaded.manifest.on_error.topic
     return policies if isinstance(policies, TopicLevelErrorPolicy) else dict(policies)
+
+
+def _quarantine(loaded: LoadedManifest) -> QuarantineSettings | None:
+    section = loaded.manifest.quarantine
+    if section is None:
+        return None
+    return QuarantineSettings(
+        loaded.resolve(section.path), _limit(section.max), _limit(section.max_run), section.systematic
+    )
+
+
+def _limit(text: str | None) -> Limit | None:
+    return None if text is None else Limit(*parse_limit(text))
 
 
 def _time_range(loaded: LoadedManifest) -> TimeRange:

@@ -9,7 +9,7 @@ from typing import Any
 
 from mosaico_ingest.adapters.adapter import AdapterSpec
 from mosaico_ingest.bag.definition import Resolver
-from mosaico_ingest.config import ServerTarget, StoreTarget
+from mosaico_ingest.config import QuarantineSettings, ServerTarget, StoreTarget
 from mosaico_ingest.diagnostics import Finding, Span
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.policies import (
@@ -84,5 +84,7 @@ class Plan:
     """Messages recorded before are not read."""
     read_until_ns: int | None = None
     """Messages recorded at this instant or later are not read."""
+    quarantine: QuarantineSettings | None = None
+    """Where rejected messages are kept."""
     memory_bytes: int = DEFAULT_MEMORY_BYTES
     """How much memory batches may take, from reading to writing."""

@@ -69,6 +69,7 @@ def resolve(
         end_ns=recording.end_ns,
         read_from_ns=read_from_ns,
         read_until_ns=read_until_ns,
+        quarantine=config.quarantine,
         memory_bytes=config.memory_bytes or DEFAULT_MEMORY_BYTES,
     )
     check_digest(plan, config)

@@ -29,6 +29,7 @@ __all__ = ["Collector"]
 @dataclass(slots=True)
 class _Sum:
     unreadable: int = 0
+    quarantined: int = 0
     read: int = 0
     written: int = 0
     filtered: int = 0
@@ -51,6 +52,7 @@ class _Sum:
             self.end_ns = more.end_ns if self.end_ns is None else max(self.end_ns, more.end_ns)
 
     def reject(self, event: Rejected) -> None:
+        self.quarantined += event.quarantined
         key = (event.stage, event.rule)
         known = self.rejections.get(key)
         if known is None:
@@ -145,6 +147,7 @@ class Collector:
             filtered=total.filtered,
             downsampled=total.downsampled,
             rejected=sum(rejection.count for rejection in rejections),
+            quarantined=total.quarantined,
             rejections=rejections,
             start_ns=total.start_ns if total.written else None,
             end_ns=total.end_ns if total.written else None,

@@ -105,6 +105,8 @@ class Rejected:
     reason: str
     first_log_time_ns: int
     first_offset: int
+    quarantined: int = 0
+    """How many of them lie in the quarantine."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -75,6 +75,8 @@ class TopicReport(_Part):
     filtered: int = 0
     downsampled: int = 0
     rejected: int = 0
+    quarantined: int = 0
+    """How many of the rejected are kept in the quarantine."""
     rejections: tuple[Rejection, ...] = ()
     start_ns: int | None = None
     """The first time stamp written, ns since the epoch."""
