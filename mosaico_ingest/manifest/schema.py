@@ -36,7 +36,7 @@ def _properties(model: dict[str, Any]) -> dict[str, Any]:
 def _or_variable(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:
     """Allow `${VAR}` where the value is a number or one of a few words; in a text it is allowed anyway."""
     target = definitions[node["$ref"].rsplit("/", 1)[-1]] if "$ref" in node else node
-    if "enum" not in target and target.get("type") not in {"integer", "boolean"}:
+    if "enum" not in target and target.get("type") not in ("integer", "boolean"):
         return node
     about = {key: value for key, value in node.items() if key in {"default", "description", "examples"}}
     return {
