@@ -194,7 +194,8 @@ def _close(
                 f"found {'{} rows in [{}, {}]'.format(*_held(found))}"
             )
         stored_bytes = found.stored_bytes if found else 0
-        observe(TopicClosed(stream.plan.target, stream.status, stored_bytes, error=stream.error))
+        timeline = stream.timeline.report()
+        observe(TopicClosed(stream.plan.target, stream.status, stored_bytes, stream.error, timeline))
     return wrong
 
 

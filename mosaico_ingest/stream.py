@@ -22,6 +22,7 @@ from mosaico_ingest.plan.model import TopicPlan
 from mosaico_ingest.policies import LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.quarantine.quarantine import Quarantine
 from mosaico_ingest.report.events import Observer, Rejected, TopicProgress, TopicStatus
+from mosaico_ingest.report.timeline import Timeline
 from mosaico_ingest.sink import ENVELOPE, Session, TopicWriter
 from mosaico_ingest.write_buffer import WriteBuffer
 
@@ -73,6 +74,7 @@ class Stream:
     """Takes rejected messages; the policies come into play where it does not."""
     _leading: int = 0
     """How many messages failed before the first good one."""
+    timeline: Timeline = field(default_factory=Timeline)
     _decoders: dict[int, Decoder] = field(default_factory=dict[int, Decoder])
     _adapters: dict[int, Adapter] = field(default_factory=dict[int, Adapter])
     _writer: TopicWriter | None = None
@@ -221,6 +223,7 @@ class Stream:
         buffer.put(self._writer, rows)
         times = rows.column(0).to_numpy()
         first, last = int(times.min()), int(times.max())
+        self.timeline.add(times)
         self.rows += rows.num_rows
         self.start_ns = first if self.start_ns is None else min(self.start_ns, first)
         self.end_ns = last if self.end_ns is None else max(self.end_ns, last)

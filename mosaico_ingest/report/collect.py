@@ -154,6 +154,7 @@ class Collector:
             payload_bytes=total.payload_bytes,
             stored_bytes=(total.closed.stored_bytes or 0) if total.closed else 0,
             error=total.closed.error if total.closed else None,
+            timeline=total.closed.timeline if total.closed and total.written else None,
         )
 
 

@@ -8,6 +8,7 @@ from enum import Enum
 from typing import TypeAlias
 
 from mosaico_ingest.diagnostics import Finding, Stage
+from mosaico_ingest.report.timeline import TimelineReport
 
 __all__ = [
     "BatchObserver",
@@ -135,6 +136,7 @@ class TopicClosed:
     status: TopicStatus
     stored_bytes: int | None = None
     error: str | None = None
+    timeline: TimelineReport | None = None
 
 
 @dataclass(frozen=True, slots=True)

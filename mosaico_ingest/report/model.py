@@ -10,6 +10,7 @@ from pydantic import ConfigDict, Field, computed_field
 from mosaico_ingest.diagnostics import Stage
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.part import Part
+from mosaico_ingest.report.timeline import TimelineReport
 
 __all__ = ["Loss", "Rejection", "Report", "RunReport", "TopicReport", "Totals", "report_schema"]
 
@@ -87,6 +88,8 @@ class TopicReport(_Part):
     stored_bytes: int = 0
     """Size of the rows in the destination, as far as it says."""
     error: str | None = None
+    timeline: TimelineReport | None = None
+    """How the rows that were written spread over time."""
 
     @computed_field
     @property
