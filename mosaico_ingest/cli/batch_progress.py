@@ -10,7 +10,6 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from mosaico_ingest.cli.units import bytes_text, count_text, seconds_text
 from mosaico_ingest.report.events import (
     Event,
     Noted,
@@ -21,6 +20,7 @@ from mosaico_ingest.report.events import (
     TopicProgress,
     Unreadable,
 )
+from mosaico_ingest.report.units import bytes_text, count_text, seconds_text
 
 __all__ = ["BatchBoard", "BatchLines", "print_nothing"]
 

@@ -11,7 +11,6 @@ from rich.table import Table
 from rich.text import Text
 
 from mosaico_ingest.cli.tables import open_console
-from mosaico_ingest.cli.units import bytes_text, count_text, seconds_text, time_text
 from mosaico_ingest.diagnostics import Severity
 from mosaico_ingest.plan.document import (
     Decisions,
@@ -22,6 +21,7 @@ from mosaico_ingest.plan.document import (
     Sample,
 )
 from mosaico_ingest.plan.drift import Difference
+from mosaico_ingest.report.units import bytes_text, count_text, seconds_text, time_text
 
 __all__ = ["print_differences", "print_plan"]
 

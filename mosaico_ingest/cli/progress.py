@@ -15,7 +15,6 @@ from rich.text import Text
 
 from mosaico_ingest.cli.batch_progress import BatchBoard, BatchLines, print_nothing
 from mosaico_ingest.cli.console import Terminal
-from mosaico_ingest.cli.units import bytes_text, count_text
 from mosaico_ingest.report.events import (
     BatchObserver,
     Event,
@@ -29,6 +28,7 @@ from mosaico_ingest.report.events import (
     Unreadable,
     ignore_batch,
 )
+from mosaico_ingest.report.units import bytes_text, count_text
 
 __all__ = ["display"]
 

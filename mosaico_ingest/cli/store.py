@@ -52,7 +52,7 @@ def show(
 @app.command()
 def gc(store: Folder = DEFAULT) -> None:
     """Remove what interrupted runs have left behind; what is committed and what is being written stays."""
-    from mosaico_ingest.cli.units import bytes_text
+    from mosaico_ingest.report.units import bytes_text
     from mosaico_ingest.store import Store
 
     removed = Store.open(store, create=False).collect_garbage()
@@ -68,7 +68,7 @@ def remove(
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
 ) -> None:
     """Remove a sequence."""
-    from mosaico_ingest.cli.units import bytes_text, count_text
+    from mosaico_ingest.report.units import bytes_text, count_text
     from mosaico_ingest.store import Store
 
     opened = Store.open(store, create=False)

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from mosaico_ingest.cli.tables import open_console, print_json
-from mosaico_ingest.cli.units import bytes_text, count_text, seconds_text, time_text
+from mosaico_ingest.report.units import bytes_text, count_text, seconds_text, time_text
 from mosaico_ingest.store import SequenceInfo, TopicInfo
 
 __all__ = ["print_sequence", "print_sequences", "print_topic"]

@@ -9,10 +9,10 @@ from rich.table import Table
 from rich.text import Text
 
 from mosaico_ingest.cli.console import Terminal
-from mosaico_ingest.cli.units import bytes_text, count_text, seconds_text, time_text
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.inspection import Inspection
 from mosaico_ingest.report.model import Report, RunReport, TopicReport
+from mosaico_ingest.report.units import bytes_text, count_text, seconds_text, time_text
 
 __all__ = ["open_console", "print_inspection", "print_json", "print_report"]
 

@@ -23,8 +23,8 @@ def verify(
     import json
 
     from mosaico_ingest.cli.tables import print_json
-    from mosaico_ingest.cli.units import bytes_text, count_text
     from mosaico_ingest.errors import VerificationError
+    from mosaico_ingest.report.units import bytes_text, count_text
     from mosaico_ingest.store import Store
     from mosaico_ingest.store.verify import verify as verify_sequence
 
