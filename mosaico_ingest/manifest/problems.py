@@ -73,7 +73,13 @@ def explain(error: ValidationError, *, source: Source, schema: dict[str, Any]) -
         (problem.path, _describe(problem))
         for problem in problems
         if problem.error["type"] != "missing" or (*problem.path, problem.error["loc"][-1]) not in meant
+        if problem.error["type"] != "too_short" or not _any_below(problem.path, problems)
     ]
+
+
+def _any_below(path: Path, problems: Iterable[_Problem]) -> bool:
+    """Say whether something inside a value is wrong: a list is then short only of what was refused."""
+    return any(problem.path[: len(path)] == path and problem.path != path for problem in problems)
 
 
 def place_of(location: Path, value: Value) -> Path:

@@ -82,4 +82,7 @@ def _flow(value: Value) -> str:
 def _number(value: float) -> str:
     if value != value:  # noqa: PLR0124 - not a number
         return ".nan"
-    return {float("inf"): ".inf", float("-inf"): "-.inf"}.get(value, repr(value))
+    mantissa, exponent, power = repr(value).partition("e")
+    if exponent and "." not in mantissa:
+        mantissa += ".0"  # without it, it is a text to some readers
+    return {float("inf"): ".inf", float("-inf"): "-.inf"}.get(value, f"{mantissa}{exponent}{power}")
