@@ -12,9 +12,10 @@ import pyarrow as pa
 
 from mosaico_ingest.adapters.adapter import Adapted, Adapter, AdapterSpec, Envelope
 from mosaico_ingest.bag.definition import Definition
+from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.ontology.types import OntologyType
 
-__all__ = ["PngImageSpec", "greyscale_png"]
+__all__ = ["PngImageSpec", "greyscale_pixels", "greyscale_png", "without_png"]
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _GREYSCALE_8_BIT = bytes((8, 0, 0, 0, 0))
@@ -29,6 +30,45 @@ def greyscale_png(data: bytes | memoryview, *, width: int, height: int) -> bytes
     header = struct.pack(">II", width, height) + _GREYSCALE_8_BIT
     chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(scanlines.data, _FASTEST)), (b"IEND", b""))
     return _SIGNATURE + b"".join(_chunk(kind, body) for kind, body in chunks)
+
+
+def greyscale_pixels(png: bytes) -> bytes:
+    """Return the bytes that `greyscale_png` encoded.
+
+    Raises:
+        AdapterError: It is another kind of PNG.
+    """
+    at, packed = len(_SIGNATURE), b""
+    width = height = 0
+    try:
+        while at < len(png):
+            (size,) = struct.unpack_from(">I", png, at)
+            kind, body = png[at + 4 : at + 8], png[at + 8 : at + 8 + size]
+            at += size + 12
+            if kind == b"IHDR":
+                width, height = struct.unpack(">II", body[:8])
+            packed += body if kind == b"IDAT" else b""
+        scanlines = np.frombuffer(zlib.decompress(packed), np.uint8).reshape(height, width + 1)
+    except (struct.error, zlib.error, ValueError) as error:
+        raise AdapterError(f"this is no PNG of ours: {error}") from error
+    if scanlines[:, 0].any():
+        raise AdapterError("this is no PNG of ours: its lines are filtered")
+    return scanlines[:, 1:].tobytes()
+
+
+def without_png(rows: pa.StructArray) -> pa.StructArray:
+    """Return images with their raw buffers, where they were packed."""
+    columns = {field.name: rows.field(field.name) for field in rows.type}
+    formats = columns["format"].to_pylist()
+    if "png" not in formats:
+        return rows
+    data: list[bytes | memoryview] = [
+        greyscale_pixels(raw.as_py()) if formats[row] == "png" else memoryview(raw.as_buffer())
+        for row, raw in enumerate(columns["data"])
+    ]
+    columns["data"] = pa.array(data, rows.type.field("data").type)
+    columns["format"] = pa.array(["raw" if one == "png" else one for one in formats], pa.string())
+    return pa.StructArray.from_arrays(list(columns.values()), fields=list(rows.type))
 
 
 def _chunk(kind: bytes, body: bytes) -> bytes:

@@ -1,0 +1,135 @@
+"""This file takes stored rows back to the messages they were made of, and tries whether that went well."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import pyarrow as pa
+
+from mosaico_ingest.adapters.adapter import Adapter, Envelope
+from mosaico_ingest.adapters.image import without_png
+from mosaico_ingest.adapters.inverse.compare import differences
+from mosaico_ingest.adapters.inverse.parts import Parts, Place
+from mosaico_ingest.adapters.inverse.undo import Undo
+from mosaico_ingest.adapters.mapping.arrow import Array, DataType, arrays, pt
+from mosaico_ingest.adapters.mapping.columns import (
+    field_of,
+    fixed_list,
+    nulls,
+    open_list,
+    struct_of,
+    var_list,
+)
+from mosaico_ingest.adapters.mapping.kinds import is_list
+from mosaico_ingest.adapters.mapping.load import MappingAdapter
+from mosaico_ingest.adapters.mapping.typed import FieldOf, Typed, Whole
+from mosaico_ingest.adapters.unmodeled import UnmodeledAdapter
+from mosaico_ingest.errors import AdapterError
+
+__all__ = ["Inverse", "Restored", "invert"]
+
+_IMAGE = "Image"
+"""The one type whose rows `topic_settings` may have packed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Restored:
+    """A batch of messages, and how far they are what was stored."""
+
+    rows: pa.StructArray
+    """In the ROS shape, without nulls."""
+    unknown: tuple[str, ...] = ()
+    """Fields of the message that are not in the rows; they are zero, empty or false."""
+    kept_out: Mapping[str, str] | None = None
+    """Columns that no field could be computed from, and what they were computed as."""
+    changed: Mapping[str, int] | None = None
+    """Columns that would come out otherwise if the messages were ingested again, and in how many rows."""
+
+
+class Inverse(Protocol):
+    """Takes rows of one topic back."""
+
+    def restore(self, rows: pa.StructArray, envelope: Envelope) -> Restored:
+        """Return one message a row."""
+        ...
+
+
+def invert(adapter: Adapter, shape: pa.StructType, metadata: Mapping[str, Any]) -> Inverse:
+    """Return the way back through a bound adapter; `metadata` is the topic's.
+
+    Raises:
+        AdapterError: The adapter is a class, of which nobody knows what it does.
+    """
+    if isinstance(adapter, UnmodeledAdapter):
+        return _Kept(shape)
+    if isinstance(adapter, MappingAdapter):
+        return _Mapped(adapter, shape, _said(adapter.metadata, metadata))
+    raise AdapterError("an adapter written in Python has no way back")
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """Of messages that kept their shape: exact."""
+
+    shape: pa.StructType
+
+    def restore(self, rows: pa.StructArray, envelope: Envelope) -> Restored:  # noqa: ARG002 - the seam's signature
+        columns = [
+            _in_shape(values, field.type) for values, field in zip(rows.flatten(), self.shape, strict=True)
+        ]
+        return Restored(struct_of(columns, self.shape, None, len(rows)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Mapped:
+    """Of messages that went through a mapping."""
+
+    adapter: MappingAdapter
+    shape: pa.StructType
+    said: Mapping[Place, str]
+
+    def restore(self, rows: pa.StructArray, envelope: Envelope) -> Restored:
+        if self.adapter.ontology.tag == _IMAGE:
+            rows = without_png(rows)
+        parts = Parts(self.shape, len(rows))
+        undo = Undo(parts, self.said)
+        undo.record(self.adapter.record, rows)
+        messages = parts.build()
+        changed = self._changed(rows, messages, replace(envelope, msgtype=self.adapter.msgtype))
+        return Restored(messages, tuple(parts.unknown), undo.kept_out, changed)
+
+    def _changed(self, rows: Array, messages: Array, envelope: Envelope) -> Mapping[str, int]:
+        again = self.adapter.adapt(messages, envelope)
+        given = rows if len(again.index) == len(rows) else rows.take(arrays.array(again.index))
+        changed = {name: int(wrong.sum()) for name, wrong in differences(given, again.rows).items()}
+        return changed | ({"(refused)": len(again.failures)} if again.failures else {})
+
+
+def _said(values: Mapping[str, Typed], metadata: Mapping[str, Any]) -> Mapping[Place, str]:
+    """Return what the metadata keeps of fields of the first message."""
+    found: dict[Place, str] = {}
+    for key, typed in values.items():
+        if isinstance(typed, FieldOf) and isinstance(typed.of, Whole) and isinstance(metadata.get(key), str):
+            found[(typed.name,)] = metadata[key]
+    return found
+
+
+def _in_shape(values: Array, kind: DataType) -> Array:
+    """Return values in the message's own type: empty messages lose the member that storage gave them."""
+    if values.type == kind and not values.null_count:
+        return values
+    if pt.is_struct(kind):
+        there = [field.name for field in values.type]
+        children = [_in_shape(field_of(values, f.name), f.type) for f in kind if f.name in there]
+        return struct_of(children, kind, None, len(values))
+    if is_list(kind):
+        elements, axis = open_list(values)
+        elements = _in_shape(elements, kind.value_type)
+        if pt.is_fixed_size_list(kind):
+            return fixed_list(elements, kind.list_size, None, len(values), kind)
+        return var_list(elements, axis.offsets, None, kind)
+    if nulls(values) is not None:
+        raise AdapterError(f"null where a {kind} is needed; the topic was not written by an ingestion")
+    return values.cast(kind)

@@ -1,0 +1,179 @@
+"""This file puts messages together from the values of single fields; what nobody knows is zero, empty or false."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from mosaico_ingest.adapters.mapping.arrow import Array, DataType, arrays, pc, pt
+from mosaico_ingest.adapters.mapping.columns import (
+    Axis,
+    Mask,
+    field_of,
+    fixed_list,
+    nulls,
+    open_list,
+    struct_of,
+    var_list,
+)
+from mosaico_ingest.adapters.mapping.kinds import is_list
+
+__all__ = ["EACH", "Parts", "Place"]
+
+Place: TypeAlias = "tuple[str, ...]"
+"""The names that lead to a field; `[]` stands for each element of a list."""
+EACH = "[]"
+_ONTOLOGY_NAMES = {
+    "stamp": "timestamp",
+    "seq": "sample_counter",
+    "sec": "seconds",
+    "nanosec": "nanoseconds",
+}
+"""What the ontology calls the fields of a header and of a time."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Mark:
+    """A value that only says why another was left out; it never takes the place of one that is known."""
+
+    index: int | None
+    """Which element of the list; None: the value itself."""
+    where: Mask
+    value: Any
+
+
+class Parts:
+    """The fields of a batch of messages, as they become known; what was put first stays."""
+
+    def __init__(self, shape: DataType, rows: int) -> None:
+        self._shape = shape
+        self._rows = rows
+        self._values: dict[Place, Array] = {}
+        self._axes: dict[Place, Axis] = {}
+        self._marks: dict[Place, list[_Mark]] = defaultdict(list)
+        self.unknown: list[str] = []
+        """The fields that `build` had to make up, as `header.seq`."""
+
+    def put(self, place: Place, values: Array, axes: tuple[Axis, ...] = ()) -> None:
+        """Say what a field is: one value a row, or one an element of the lists around it."""
+        kind = self.type_at(place)
+        if pt.is_struct(kind):
+            self._put_fields(place, kind, values, axes)
+        elif is_list(kind) and pt.is_struct(kind.value_type):
+            elements, axis = open_list(values)
+            self.put((*place, EACH), elements, (*axes, axis))
+        else:
+            lists = [at for at, name in enumerate(place) if name == EACH]
+            for at, axis in zip(lists, axes, strict=True):
+                self._axes.setdefault(place[:at], axis)
+            self._values.setdefault(place, values)
+
+    def mark(self, place: Place, index: int | None, where: Mask, value: Any) -> None:  # noqa: ANN401 - a field's value
+        """Say what a field, or an element of it, must have been in some rows, unless more is known of it."""
+        self._marks[place].append(_Mark(index, where, value))
+
+    def type_at(self, place: Place) -> DataType:
+        """Return the type of a field of the message."""
+        kind = self._shape
+        for name in place:
+            kind = kind.value_type if name == EACH else kind.field(name).type
+        return kind
+
+    def build(self) -> Array:
+        """Return the messages."""
+        self.unknown.clear()
+        return self._struct(self._shape, (), self._rows)
+
+    def _put_fields(self, place: Place, kind: DataType, values: Array, axes: tuple[Axis, ...]) -> None:
+        there = {field.name for field in values.type}
+        for field in kind:
+            own = field.name if field.name in there else _ONTOLOGY_NAMES.get(field.name)
+            if own in there:
+                self.put((*place, field.name), field_of(values, str(own)), axes)
+
+    def _struct(self, kind: DataType, place: Place, rows: int) -> Array:
+        children = [self._field(field.type, (*place, field.name), rows) for field in kind]
+        return struct_of(children, kind, None, rows)
+
+    def _field(self, kind: DataType, place: Place, rows: int) -> Array:
+        if pt.is_struct(kind):
+            return self._struct(kind, place, rows)
+        if place in self._axes:
+            axis = self._axes[place]
+            elements = self._field(kind.value_type, (*place, EACH), int(axis.offsets[-1]))
+            plain = var_list(elements, axis.offsets, None, arrays.list_(kind.value_field))
+            return _of_size(plain, kind) if pt.is_fixed_size_list(kind) else plain
+        values = self._values.get(place)
+        if values is None and place not in self._marks:
+            self.unknown.append(".".join(place).replace(f".{EACH}", EACH))
+        array = zeros(kind, rows) if values is None else filled(values, kind)
+        absent = np.ones(rows, bool) if values is None else nulls(values)
+        return array if absent is None else self._marked(array, place, absent)
+
+    def _marked(self, array: Array, place: Place, absent: Mask) -> Array:
+        for mark in self._marks.get(place, ()):
+            rows = np.flatnonzero(mark.where & absent)
+            if not len(rows):
+                continue
+            if mark.index is None:
+                array = _with(array, rows, mark.value)
+                continue
+            elements, axis = open_list(array)
+            rows = rows[axis.lengths[rows] > mark.index]
+            changed = _with(elements, axis.offsets[:-1][rows] + mark.index, mark.value)
+            array = axis.close(changed, array.type)
+        return array
+
+
+def zeros(kind: DataType, rows: int) -> Array:
+    """Return an array of zeros, empty texts and lists."""
+    if pt.is_struct(kind):
+        return struct_of([zeros(field.type, rows) for field in kind], kind, None, rows)
+    if pt.is_fixed_size_list(kind):
+        return fixed_list(zeros(kind.value_type, rows * kind.list_size), kind.list_size, None, rows, kind)
+    if pt.is_list(kind):
+        return var_list(zeros(kind.value_type, 0), np.zeros(rows + 1, np.int64), None, kind)
+    return arrays.repeat(_zero(kind), rows)
+
+
+def filled(values: Array, kind: DataType) -> Array:
+    """Return values in a field's type, the field's zero where there is none."""
+    if pt.is_null(values.type):
+        return zeros(kind, len(values))
+    if is_list(kind):
+        elements, axis = open_list(values)
+        plain = var_list(
+            filled(elements, kind.value_type), axis.offsets, None, arrays.list_(kind.value_field)
+        )
+        return _of_size(plain, kind) if pt.is_fixed_size_list(kind) else plain
+    if values.type != kind:
+        if pt.is_integer(kind) and pt.is_floating(values.type):
+            values = pc.round(values)
+        values = pc.cast(values, kind, safe=False)
+    return pc.fill_null(values, _zero(kind)) if values.null_count else values
+
+
+def _zero(kind: DataType) -> Any:  # noqa: ANN401 - an Arrow scalar
+    plain = "" if pt.is_string(kind) else b"" if pt.is_binary(kind) else False if pt.is_boolean(kind) else 0
+    return arrays.scalar(plain, kind)
+
+
+def _of_size(array: Array, kind: DataType) -> Array:
+    """Return lists as lists of a fixed length: those of another length become zeros."""
+    elements, axis = open_list(array)
+    size, good = kind.list_size, axis.lengths == kind.list_size
+    if not good.all():
+        positions = (axis.offsets[:-1, None] + np.arange(size)).ravel()
+        absent = np.repeat(~good, size)
+        taken = elements.take(arrays.array(np.where(absent, 0, positions), mask=absent))
+        elements = filled(taken, kind.value_type) if not pt.is_struct(kind.value_type) else taken
+    return fixed_list(elements, size, None, len(array), kind)
+
+
+def _with(array: Array, positions: Any, value: Any) -> Array:  # noqa: ANN401 - numpy's, and a field's value
+    values = np.array(array)
+    values[positions] = value
+    return arrays.array(values, array.type)

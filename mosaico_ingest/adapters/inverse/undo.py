@@ -1,0 +1,278 @@
+"""This file walks a compiled mapping backwards: for every column it says which fields of the message it came from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mosaico_ingest.adapters.inverse.clouds import CLOUD_FUNCTIONS, CloudField, make_clouds
+from mosaico_ingest.adapters.inverse.parts import EACH, Parts, Place
+from mosaico_ingest.adapters.inverse.solve import ONE_ARGUMENT, with_constant
+from mosaico_ingest.adapters.mapping.arrow import Array, arrays, pc, pt
+from mosaico_ingest.adapters.mapping.build import Absent, ByAdapter, ByFields, Computed, Filled, Looked
+from mosaico_ingest.adapters.mapping.columns import Axis, Mask, field_of, nulls, open_list, true_where
+from mosaico_ingest.adapters.mapping.load import MappingAdapter
+from mosaico_ingest.adapters.mapping.typed import (
+    Apply,
+    Cast,
+    ChoiceOf,
+    Const,
+    EachOf,
+    FieldOf,
+    ItemOf,
+    ListValue,
+    Typed,
+    Whole,
+)
+
+__all__ = ["Undo"]
+
+_STAMP_PARTS = {"seconds": "sec", "nanoseconds": "nanosec"}
+_MOVES = frozenset({"ros_time", "ros_header"})
+_OPERANDS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class _Scope:
+    """Where names are looked up, and the lists that were opened on the way there."""
+
+    place: Place = ()
+    axes: tuple[Axis, ...] = ()
+
+
+class Undo:
+    """Puts the columns of a batch back into the fields of its messages."""
+
+    def __init__(self, parts: Parts, said: Mapping[Place, str]) -> None:
+        """`said` is what the topic's metadata keeps of the first message."""
+        self._parts = parts
+        self._said = said
+        self._clouds: list[CloudField] = []
+        self._target = ""
+        self.kept_out: dict[str, str] = {}
+        """Columns that could not be undone, and what they are computed as."""
+
+    def record(self, record: Filled, rows: Array) -> None:
+        """Take a whole record back."""
+        self._column(record, rows, _Scope())
+        if self._clouds:
+            self._parts.put((), make_clouds(self._clouds, len(rows)))
+
+    def _column(self, field: Filled, values: Array, scope: _Scope) -> None:
+        self._target = field.path
+        absent = nulls(values)
+        if field.when is not None and absent is not None:
+            self._fails(field.when, absent, scope)
+        for replaced in field.replaced:
+            self._column(replaced, field_of(values, replaced.name), scope)
+        self._target = field.path
+        match field.source:
+            case Absent():
+                pass
+            case Computed(typed=typed):
+                self._expression(typed, values, scope)
+            case Looked():
+                self._looked(field.source, values, scope)
+            case ByAdapter():
+                self._adapter(field.source, values, scope)
+            case ByFields(of=of, fields=fields):
+                self._fields(of, fields, values, scope)
+
+    def _fields(self, of: Typed | None, fields: tuple[Filled, ...], values: Array, scope: _Scope) -> None:
+        inside = (values, scope) if of is None else self._inside(of, values, scope)
+        if inside is not None:
+            for one in fields:
+                self._column(one, field_of(inside[0], one.name), inside[1])
+
+    def _adapter(self, source: ByAdapter, values: Array, scope: _Scope) -> None:
+        inside = self._inside(source.of, values, scope)
+        if inside is None:
+            return
+        if isinstance(source.adapter, MappingAdapter):
+            self._column(source.adapter.record, *inside)
+        else:
+            self._give_up(f"{source.name} of {source.of.text}")
+
+    def _inside(self, of: Typed, values: Array, scope: _Scope) -> tuple[Array, _Scope] | None:
+        place = _place(of, scope)
+        if place is None:
+            self._give_up(of.text)
+            return None
+        values, axes = _opened(of, values)
+        return values, _Scope(place, (*scope.axes, *axes))
+
+    def _looked(self, source: Looked, values: Array, scope: _Scope) -> None:
+        values, axes = _opened(source.typed, values)
+        index = pc.index_in(values, value_set=pc.cast(source.values, values.type))
+        found = source.keys.take(index)
+        if source.otherwise == source.typed and found.type != values.type:
+            found = pc.cast(found, values.type)
+        if source.otherwise == source.typed:
+            found = pc.coalesce(found, values)
+        self._assign(source.typed, found, _Scope(scope.place, (*scope.axes, *axes)))
+
+    def _expression(self, typed: Typed, values: Array, scope: _Scope) -> None:
+        values, axes = _opened(typed, values)
+        self._assign(typed, values, _Scope(scope.place, (*scope.axes, *axes)))
+
+    def _assign(self, typed: Typed, values: Array, scope: _Scope) -> None:
+        """Say what an expression's fields were, given what it came to, one value an element of all open lists."""
+        place = _place(typed, scope)
+        if place is not None:
+            if place.count(EACH) != len(scope.axes):
+                self._give_up(typed.text)
+            else:
+                self._parts.put(place, values, scope.axes)
+            return
+        match typed:
+            case Const():
+                pass
+            case Cast(of=of):
+                self._assign(of, values, scope)
+            case ListValue(items=items):
+                for position, item in enumerate(items):
+                    self._assign(item, _element(values, position), scope)
+            case ChoiceOf():
+                self._choice(typed, values, scope)
+            case Apply():
+                self._apply(typed, values, scope)
+            case _:
+                self._give_up(typed.text)
+
+    def _apply(self, typed: Apply, values: Array, scope: _Scope) -> None:
+        first = typed.arguments[0]
+        if typed.name in CLOUD_FUNCTIONS and not scope.axes and isinstance(typed.arguments[1], Const):
+            self._clouds.append(CloudField(str(typed.arguments[1].value), typed.name, values))
+        elif typed.name in ONE_ARGUMENT:
+            self._assign(first, ONE_ARGUMENT[typed.name](values), scope)
+        elif typed.name == "compressed_format":
+            self._assign(first, self._as_said(first, values, scope, typed.function.apply), scope)
+        elif typed.name == "null_if" and isinstance(typed.arguments[1], Const):
+            value = arrays.scalar(typed.arguments[1].value).cast(values.type)
+            self._assign(first, pc.fill_null(values, value), scope)
+        elif typed.name in {"min", "max", "clip"}:
+            self._assign(self._namesake(typed), values, scope)
+        else:
+            self._operator(typed, values, scope)
+
+    def _operator(self, typed: Apply, values: Array, scope: _Scope) -> None:
+        """Undo `x + 1` and `1 + x`; one side is a literal."""
+        if len(typed.arguments) != _OPERANDS:
+            self._give_up(typed.text)
+            return
+        left, right = typed.arguments
+        if isinstance(right, Const):
+            solved, unknown = with_constant(typed.name, values, right.value, first=False), left
+        elif isinstance(left, Const):
+            solved, unknown = with_constant(typed.name, values, left.value, first=True), right
+        else:
+            solved, unknown = None, left
+        if solved is None:
+            self._give_up(typed.text)
+        else:
+            self._assign(unknown, solved, scope)
+
+    def _namesake(self, typed: Apply) -> Typed:
+        """Return the argument that is called like the column; the first where none is."""
+        name = self._target.rpartition(".")[2]
+        named = (one for one in typed.arguments if isinstance(one, FieldOf) and one.name == name)
+        return next(named, typed.arguments[0])
+
+    def _as_said(
+        self, typed: Typed, values: Array, scope: _Scope, function: Callable[[Array], Array]
+    ) -> Array:
+        """Take the text of the topic's metadata in the rows it explains."""
+        said = self._said.get(_place(typed, scope) or ())
+        if said is None:
+            return values
+        gives = function(arrays.array([said]))[0]
+        return pc.if_else(pc.equal(values, gives), arrays.scalar(said), values)
+
+    def _choice(self, typed: ChoiceOf, values: Array, scope: _Scope) -> None:
+        if isinstance(typed.then, Const):
+            missing = typed.then.value
+            nan = isinstance(missing, float) and math.isnan(missing)
+            if nan:
+                self._holds(typed.condition, true_where(pc.is_nan(values)), scope)
+            elif missing is not None:
+                self._give_up(typed.text)
+            self._assign(typed.otherwise, values, scope)
+        elif isinstance(typed.otherwise, Const):
+            self._assign(typed.then, values, scope)
+        else:
+            self._give_up(typed.text)
+
+    def _holds(self, condition: Typed, where: Mask, scope: _Scope) -> None:
+        """Make a condition true in some rows, where one can see how."""
+        match condition:
+            case Apply(name="==", arguments=(value, Const(value=constant))):
+                self._mark(value, where, constant, scope)
+            case Apply(name="not", arguments=(other,)):
+                self._fails(other, where, scope)
+            case _:
+                pass
+
+    def _fails(self, condition: Typed, where: Mask, scope: _Scope) -> None:
+        """Make a condition false in some rows, where one can see how; zero does it for many."""
+        match condition:
+            case Apply(name="!=", arguments=(value, Const(value=constant))):
+                self._mark(value, where, constant, scope)
+            case Apply(name=">=", arguments=(value, Const(value=int(constant)))) if constant <= 0:
+                self._mark(value, where, constant - 1, scope)
+            case Apply(name="or", arguments=both):
+                for one in both:
+                    self._fails(one, where, scope)
+            case _:
+                pass
+
+    def _mark(self, typed: Typed, where: Mask, value: Any, scope: _Scope) -> None:  # noqa: ANN401 - a literal
+        index = typed.index if isinstance(typed, ItemOf) else None
+        place = _place(typed.of if isinstance(typed, ItemOf) else typed, scope)
+        if place is not None and place.count(EACH) == len(scope.axes) and (index is None or index >= 0):
+            self._parts.mark(place, index, where, value)
+
+    def _give_up(self, text: str) -> None:
+        self.kept_out.setdefault(self._target, text)
+
+
+def _place(typed: Typed, scope: _Scope) -> Place | None:
+    """Return the field an expression names; None where it computes something."""
+    match typed:
+        case Whole():
+            return scope.place
+        case FieldOf(of=Apply(name="ros_time", arguments=(of,)), name=name):
+            inner = _place(of, scope)
+            return None if inner is None else (*inner, _STAMP_PARTS[name])
+        case FieldOf(of=of, name=name):
+            inner = _place(of, scope)
+            return None if inner is None else (*inner, name)
+        case EachOf(of=of):
+            inner = _place(of, scope)
+            return None if inner is None else (*inner, EACH)
+        case Apply(name=name, arguments=(of,)) if name in _MOVES:
+            return _place(of, scope)
+        case _:
+            return None
+
+
+def _opened(typed: Typed, values: Array) -> tuple[Array, tuple[Axis, ...]]:
+    """Open the lists of a column that the expression made."""
+    axes: list[Axis] = []
+    for _ in typed.kind.axes:
+        values, axis = open_list(values)
+        axes.append(axis)
+    return values, tuple(axes)
+
+
+def _element(lists: Array, position: int) -> Array:
+    """Return one element of every list, null where there is none."""
+    elements, axis = open_list(lists)
+    there = axis.lengths > position
+    at = np.where(there, axis.offsets[:-1] + position, 0)
+    if pt.is_null(elements.type) or not len(elements):
+        return arrays.nulls(len(lists), elements.type)
+    return elements.take(arrays.array(at, mask=~there))

@@ -1,0 +1,188 @@
+"""This file writes MCAP: zstd chunks with indexes, statistics and checksums, as version 0 of the specification has it."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import zstandard
+
+from mosaico_ingest.bag.containers.mcap_records import MAGIC, RECORD, Op
+from mosaico_ingest.bag.definition import Definition
+from mosaico_ingest.bag.names import short_msgtype
+from mosaico_ingest.errors import BagError
+from mosaico_ingest.version import __version__
+
+__all__ = ["McapWriter"]
+
+_CHUNK_BYTES = 4 << 20
+_SUMMARY_OFFSET = 0x0E
+_MESSAGE = struct.Struct("<HIQQ")
+_MAX_CHANNELS = 65535
+
+
+@dataclass(slots=True)
+class _Chunk:
+    """What is gathered for one chunk."""
+
+    data: bytearray = field(default_factory=bytearray)
+    index: dict[int, bytearray] = field(default_factory=dict[int, bytearray])
+    """By channel: time and offset of each message."""
+    start_ns: int = 0
+    end_ns: int = 0
+
+
+class McapWriter:
+    """Writes one MCAP file; satisfies `RecordingWriter`."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("wb")
+        self._schemas: dict[tuple[str, int, str], int] = {}
+        self._records: list[bytes] = []
+        """Schemas and channels; they stand before the first chunk that may need them, and in the summary."""
+        self._versions: list[int] = []
+        self._counts: dict[int, int] = {}
+        self._pending: list[bytes] = []
+        self._chunk = _Chunk()
+        self._chunk_indexes: list[bytes] = []
+        self._start_ns: int | None = None
+        self._end_ns = 0
+        self._file.write(MAGIC)
+        self._began = False
+
+    def channel(self, topic: str, definition: Definition) -> int:
+        """Open a channel; two definitions of one type are two schemas."""
+        if len(self._versions) == _MAX_CHANNELS:
+            raise BagError(f"MCAP has room for {_MAX_CHANNELS} channels", where=topic)
+        number, version = len(self._versions) + 1, definition.ros_version
+        self._versions.append(version)
+        encoding = "ros1" if version == 1 else "cdr"
+        content = struct.pack("<HH", number, self._schema(definition))
+        self._add(Op.CHANNEL, content + _text(topic) + _text(encoding) + _texts({}))
+        self._counts[number] = 0
+        return number
+
+    def write(self, channel: int, log_ns: int, payload: bytes) -> None:
+        """Append a message; it was published when it was recorded, as far as is known."""
+        self._begin()
+        chunk = self._chunk
+        if not chunk.data:
+            chunk.start_ns = chunk.end_ns = log_ns
+        chunk.start_ns, chunk.end_ns = min(chunk.start_ns, log_ns), max(chunk.end_ns, log_ns)
+        chunk.index.setdefault(channel, bytearray()).extend(struct.pack("<QQ", log_ns, len(chunk.data)))
+        chunk.data += RECORD.pack(Op.MESSAGE, _MESSAGE.size + len(payload))
+        chunk.data += _MESSAGE.pack(channel, self._counts[channel] & 0xFFFFFFFF, log_ns, log_ns)
+        chunk.data += payload
+        self._counts[channel] += 1
+        self._start_ns = log_ns if self._start_ns is None else min(self._start_ns, log_ns)
+        self._end_ns = max(self._end_ns, log_ns)
+        if len(chunk.data) >= _CHUNK_BYTES:
+            self._flush()
+
+    def finish(self) -> None:
+        """Write the last chunk and the summary."""
+        self._begin()
+        self._flush()
+        self._put(Op.DATA_END, struct.pack("<I", 0))
+        start = self._file.tell()
+        groups = [
+            (Op.SCHEMA, [record for record in self._records if record[0] == Op.SCHEMA]),
+            (Op.CHANNEL, [record for record in self._records if record[0] == Op.CHANNEL]),
+            (Op.STATISTICS, [_record(Op.STATISTICS, self._statistics())]),
+            (Op.CHUNK_INDEX, self._chunk_indexes),
+        ]
+        summary, offsets = b"", b""
+        for op, records in groups:
+            group = b"".join(records)
+            if group:
+                place = struct.pack("<BQQ", op, start + len(summary), len(group))
+                offsets += _record(_SUMMARY_OFFSET, place)
+                summary += group
+        footer = RECORD.pack(Op.FOOTER, 20) + struct.pack("<QQ", start, start + len(summary))
+        checked = summary + offsets + footer
+        self._file.write(checked + struct.pack("<I", zlib.crc32(checked)) + MAGIC)
+        self._file.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is."""
+        self._file.close()
+
+    def _begin(self) -> None:
+        """Write the header, once it is known which versions of ROS there are, and what was opened since."""
+        if not self._began:
+            versions = set(self._versions)
+            profile = f"ros{versions.pop()}" if len(versions) == 1 else ""
+            self._put(Op.HEADER, _text(profile) + _text(f"mosaico-ingest {__version__}"))
+            self._began = True
+        for record in self._pending:
+            self._file.write(record)
+        self._pending.clear()
+
+    def _schema(self, definition: Definition) -> int:
+        version = definition.ros_version
+        key = (definition.root, version, definition.text)
+        if key not in self._schemas:
+            number = self._schemas[key] = len(self._schemas) + 1
+            name = short_msgtype(definition.root) if version == 1 else definition.root
+            data = definition.text.encode()
+            content = struct.pack("<H", number) + _text(name) + _text(f"ros{version}msg")
+            self._add(Op.SCHEMA, content + struct.pack("<I", len(data)) + data)
+        return self._schemas[key]
+
+    def _add(self, op: int, content: bytes) -> None:
+        record = _record(op, content)
+        self._records.append(record)
+        self._pending.append(record)
+
+    def _put(self, op: int, content: bytes) -> int:
+        """Write a record and return where it begins."""
+        at = self._file.tell()
+        self._file.write(_record(op, content))
+        return at
+
+    def _flush(self) -> None:
+        chunk, self._chunk = self._chunk, _Chunk()
+        if not chunk.data:
+            return
+        data = bytes(chunk.data)
+        packed = zstandard.compress(data, 3)
+        span = struct.pack("<QQ", chunk.start_ns, chunk.end_ns)
+        head = span + struct.pack("<QI", len(data), zlib.crc32(data)) + _text("zstd")
+        at = self._put(Op.CHUNK, head + struct.pack("<Q", len(packed)) + packed)
+        length = self._file.tell() - at
+        places = b""
+        for channel, entries in chunk.index.items():
+            where = self._put(Op.MESSAGE_INDEX, struct.pack("<HI", channel, len(entries)) + entries)
+            places += struct.pack("<HQ", channel, where)
+        content = span + struct.pack("<QQ", at, length) + struct.pack("<I", len(places)) + places
+        content += struct.pack("<Q", self._file.tell() - at - length) + _text("zstd")
+        content += struct.pack("<QQ", len(packed), len(data))
+        self._chunk_indexes.append(_record(Op.CHUNK_INDEX, content))
+
+    def _statistics(self) -> bytes:
+        counts = b"".join(struct.pack("<HQ", channel, count) for channel, count in self._counts.items())
+        return (
+            struct.pack("<QHI", sum(self._counts.values()), len(self._schemas), len(self._versions))
+            + struct.pack("<II", 0, 0)
+            + struct.pack("<I", len(self._chunk_indexes))
+            + struct.pack("<QQ", self._start_ns or 0, self._end_ns)
+            + struct.pack("<I", len(counts))
+            + counts
+        )
+
+
+def _record(op: int, content: bytes | bytearray) -> bytes:
+    return RECORD.pack(op, len(content)) + content
+
+
+def _text(text: str) -> bytes:
+    data = text.encode()
+    return struct.pack("<I", len(data)) + data
+
+
+def _texts(texts: Mapping[str, str]) -> bytes:
+    data = b"".join(_text(part) for item in texts.items() for part in item)
+    return struct.pack("<I", len(data)) + data
