@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from mosaico_ingest.executors.executor import Executor
 from mosaico_ingest.executors.local import Inline
 from mosaico_ingest.executors.processes import Processes
 from mosaico_ingest.report.events import Event, RunFinished
+from mosaico_ingest.report.model import RunReport
 from mosaico_ingest.report.write import write_report
 
 __all__ = ["run_configs"]
@@ -32,6 +33,7 @@ def run_configs(
     quiet: bool,
     log: str | None,
     jobs: int | None = None,
+    finished: Callable[[RunReport], None] = lambda _result: None,
 ) -> None:
     """Run the configurations, several at a time where asked for; exit with the report's code unless it is 0."""
     level = log or configs[0].log_level
@@ -46,6 +48,7 @@ def run_configs(
 
     with display(len(configs), quiet=quiet) as observe:
         result = api.run(configs, executor=_executor(configs, jobs, level), observe=tell)
+    finished(result)
     for target in {
         path for path in (report, *(_report_path(config) for config in configs)) if path is not None
     }:

@@ -18,7 +18,7 @@ from mosaico_ingest.diagnostics import RowFailure, Stage
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.quarantine.mcap_file import McapFile
 
-__all__ = ["INDEX", "MESSAGES", "Quarantine"]
+__all__ = ["INDEX", "MESSAGES", "Quarantine", "retire"]
 
 MESSAGES = ".mcap"
 INDEX = ".jsonl"
@@ -118,7 +118,7 @@ class Quarantine:
         for path in self.messages_path.parent.glob(f"*{INDEX}"):
             messages = path.with_suffix(MESSAGES)
             if messages != self.messages_path and messages.is_file() and _sequence_of(path) == self._sequence:
-                messages.rename(messages.with_suffix(f"{MESSAGES}.superseded"))
+                retire(messages, "superseded")
 
     @contextmanager
     def _explained(self) -> Generator[None, None, None]:
@@ -127,6 +127,12 @@ class Quarantine:
         except OSError as error:
             where = str(self.messages_path.parent)
             raise SinkError(f"cannot write the quarantine: {error.strerror}", where=where) from error
+
+
+def retire(messages: Path, why: str) -> None:
+    """Rename messages and their index, so that no replay takes them."""
+    for path in (messages, messages.with_suffix(INDEX)):
+        path.rename(path.with_name(f"{path.name}.{why}"))
 
 
 def _allows(limit: Limit | None, kept: int, promised: int | None, read: int) -> bool:
