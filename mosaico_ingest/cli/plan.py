@@ -39,7 +39,7 @@ def plan(
         print_plan(document, folder=manifest.parent)
     if check is not None:
         drift = api.plan_differences(check, document)
-        if drift and not as_json:
+        if not as_json:
             print_differences(drift)
         code = 1 if drift else 0
     else:

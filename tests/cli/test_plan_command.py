@@ -1,0 +1,259 @@
+"""`ingest plan` as a user runs it: what would happen, what has changed, and running exactly that."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from jsonschema import Draft202012Validator
+
+from mosaico_ingest.cli.app import main
+from mosaico_ingest.plan.document import PlanDocument
+from mosaico_ingest.store import Store
+
+ROOT = Path(__file__).resolve().parents[2]
+JOB = "configs/quickstart.yaml"
+
+
+@pytest.fixture(autouse=True)
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    shutil.copytree(ROOT / "configs", tmp_path / "configs")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def ingest(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
+    def call(*arguments: str) -> tuple[int, str]:
+        with pytest.raises(SystemExit) as leave:
+            main(list(arguments))
+        said = capsys.readouterr()
+        assert "Traceback" not in said.err
+        return int(leave.value.code or 0), said.out + said.err
+
+    return call
+
+
+def edit(file: str, old: str, new: str) -> None:
+    text = Path(file).read_text()
+    assert old in text
+    Path(file).write_text(text.replace(old, new))
+
+
+Ingest = Callable[..., tuple[int, str]]
+
+
+def test_a_plan_says_what_becomes_of_each_topic_and_why_and_writes_nothing(ingest: Ingest) -> None:
+    code, said = ingest("plan", JOB)
+    assert code == 0
+    assert "quickstart_drive → mosaico" in said
+    assert "configs/quickstart/drive.mcap: mcap by its first bytes" in said
+    battery = next(line for line in said.splitlines() if line.startswith("/battery"))
+    assert "BatteryPackAdapter" in battery
+    assert "10 fit" in battery
+    assert "configs/quickstart.yaml:15:15: info[left-out] /camera/image_raw: left out by" in said
+    assert "will be made" in said
+    assert not Path("mosaico").exists()
+
+
+def test_what_the_manifest_names_and_the_recording_lacks_is_pointed_at(ingest: Ingest) -> None:
+    edit(JOB, '["*", "!/camera/image_raw"]', '["*", /imuu]')
+    edit(JOB, '"/camera/*": ignore', '"/kamera/*": ignore')
+    with Path(JOB).open("a") as file:
+        file.write("topic_settings: {/gps/fixx: {every: 2}}\n")
+    code, said = ingest("plan", JOB)
+    assert code == 0
+    assert "quickstart.yaml:15:15: warning[matches-nothing] topics: '/imuu' matches none of 10 topics" in said
+    assert "the nearest is /imu" in said
+    assert "on_error.topic: '/kamera/*' matches none" in said
+    assert "topic_settings: '/gps/fixx' matches none of 10 topics — the nearest is /gps/fix" in said
+
+
+def test_every_adapter_that_does_not_fit_is_told_at_once(ingest: Ingest) -> None:
+    edit("configs/quickstart/adapters/battery_pack.yaml", "voltage: voltage_mv", "voltage: gone")
+    edit(JOB, "adapters:\n", "adapters:\n  override: {/imu: GPSAdapter}\n")
+    code, said = ingest("plan", JOB)
+    assert code == 1
+    assert "battery_pack.yaml:10:12: error[unknown-field] no field 'gone'" in said
+    assert "quickstart.yaml:18:14: error[misfit]" in said
+    assert "GPSAdapter" in said
+
+
+def test_what_would_be_rejected_shows_in_the_sample(ingest: Ingest) -> None:
+    edit("configs/quickstart/adapters/battery_pack.yaml", "map: {0: 3, 1: 1, 2: 2}", "map: {0: 3}")
+    code, said = ingest("plan", JOB)
+    assert code == 4
+    assert "10 of 10 rejected" in said
+    assert "/battery: 10 of 10 would be rejected [" in said
+    assert not Path("mosaico").exists()
+
+
+def test_the_document_fits_its_schema_and_reads_back(ingest: Ingest) -> None:
+    code, said = ingest("plan", JOB, "--json")
+    assert code == 0
+    schema = json.loads((ROOT / "schemas" / "plan.schema.json").read_text())
+    Draft202012Validator(schema).validate(json.loads(said))
+    document = PlanDocument.model_validate_json(said)
+    assert document.job == JOB
+    (recording,) = document.recordings
+    assert recording.digest == recording.decisions.digest
+    assert [topic.topic for topic in recording.decisions.left_out] == ["/camera/image_raw"]
+    assert sum(topic.count or 0 for topic in recording.decisions.topics) == 2110
+    assert {sample.target: sample.rejected for sample in recording.samples if sample.rejected} == {}
+    assert all(sample.row_bytes for sample in recording.samples)
+    assert "_ros_" not in said
+
+
+def test_a_plan_is_the_same_wherever_it_is_made_from(
+    ingest: Ingest, project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    edit(JOB, "target: {store: ../mosaico}", "target: {store: store}")
+    ingest("plan", JOB, "--out", "plans/plan.json")
+    monkeypatch.chdir(project / "configs")
+    assert ingest("plan", "quickstart.yaml", "--check", "../plans/plan.json") == (
+        0,
+        "the plans are the same\n",
+    )
+
+
+def test_check_tells_what_has_changed(ingest: Ingest) -> None:
+    ingest("plan", JOB, "--out", "plan.json")
+    edit(JOB, '"!/camera/image_raw"', '"!/camera/image_raw", "!/odom"')
+    edit(JOB, "demo-01", "demo-02")
+    edit(JOB, '"/camera/*": ignore', '"/camera/*": finalize')
+    code, said = ingest("plan", JOB, "--check", "plan.json")
+    assert code == 1
+    lines = said.splitlines()
+    assert "quickstart_drive: metadata vehicle: demo-01 → demo-02" in lines
+    assert "quickstart_drive: - topic /odom: nav_msgs/msg/Odometry by OdometryAdapter to MotionState" in lines
+    assert "quickstart_drive: + left out /odom: left out by '!/odom' in `topics`" in lines
+    assert "quickstart_drive: topic /camera/camera_info on_error: ignore → finalize" in lines
+    assert len(lines) == 5
+
+
+def test_a_changed_adapter_is_a_drift_and_a_comment_in_it_is_none(ingest: Ingest) -> None:
+    adapter = "configs/quickstart/adapters/battery_pack.yaml"
+    ingest("plan", JOB, "--out", "plan.json")
+    Path(adapter).write_text("# a remark\n" + Path(adapter).read_text())
+    assert ingest("plan", JOB, "--check", "plan.json")[0] == 0
+    edit(adapter, "location: header.frame_id", "location: '\"roof\"'")
+    code, said = ingest("plan", JOB, "--check", "plan.json")
+    assert code == 1
+    assert "topic /battery adapter_digest" in said
+
+
+def test_a_plan_that_fits_is_run_and_one_that_does_not_is_not(ingest: Ingest) -> None:
+    ingest("plan", JOB, "--out", "plans/plan.json")
+    assert ingest("run", "--plan", "plans/plan.json", "-q")[0] == 0
+    assert Store.open("mosaico").names() == ("quickstart_drive",)
+    shutil.rmtree("mosaico")
+    edit(JOB, '"!/camera/image_raw"', '"!/odom"')
+    code, said = ingest("run", "--plan", "plans/plan.json", "-q")
+    assert code == 1
+    assert "- topic /odom" in said
+    assert "plan-drift" in said
+    assert not Path("mosaico").exists()
+
+
+def test_a_name_that_is_taken_is_said_before_the_run(ingest: Ingest) -> None:
+    ingest("run", JOB, "-q")
+    code, said = ingest("plan", JOB)
+    assert code == 1
+    assert "store mosaico refuses: there is a sequence 'quickstart_drive'" in said
+    edit(JOB, "sequence:\n", "sequence:\n  if_exists: replace\n")
+    code, said = ingest("plan", JOB)
+    assert code == 0
+    assert "has quickstart_drive, replace it" in said
+
+
+def test_rows_that_cannot_join_a_topic_are_said_before_the_run(ingest: Ingest) -> None:
+    ingest("run", JOB, "-q")
+    edit(JOB, "sequence:\n", "sequence:\n  if_exists: append\n")
+    assert ingest("plan", JOB)[0] == 0
+    with Path(JOB).open("a") as file:
+        file.write("topic_settings: {/imu: {rename: /imu2}, /gps/fix: {rename: /imu}}\n")
+    code, said = ingest("plan", JOB)
+    assert code == 1
+    assert "the topic holds IMU" in said
+
+
+@pytest.mark.slow
+def test_a_server_is_asked_only_when_told_to(ingest: Ingest) -> None:
+    edit(JOB, "target: {store: ../mosaico}", "target: {host: 127.0.0.1, port: 1}")
+    code, said = ingest("plan", JOB)
+    assert code == 0
+    assert "server 127.0.0.1:1 was not asked; --connect does" in said
+    code, said = ingest("plan", JOB, "--connect")
+    assert code == 1
+    assert "server 127.0.0.1:1 refuses: " in said
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("{}", "tool: Field required"), ("no json", "this is no plan"), (None, "cannot be read")],
+)
+def test_what_is_no_plan_is_said_so(ingest: Ingest, text: str | None, message: str) -> None:
+    if text is not None:
+        Path("p.json").write_text(text)
+    code, said = ingest("run", "--plan", "p.json")
+    assert code == 2
+    assert message in said
+    assert "ingest plan job.yaml --out" in said
+
+
+def test_run_wants_manifests_or_a_plan(ingest: Ingest) -> None:
+    assert ingest("run")[0] == 2
+    assert ingest("run", JOB, "--plan", "p.json")[0] == 2
+
+
+def test_diff_tells_what_another_manifest_would_do(ingest: Ingest) -> None:
+    shutil.copy(JOB, "configs/other.yaml")
+    assert ingest("diff", JOB, "configs/other.yaml") == (0, "the plans are the same\n")
+    edit("configs/other.yaml", "name: quickstart_{stem}", "name: other_{stem}")
+    edit("configs/other.yaml", "target: {store: ../mosaico}", "target: {host: h}")
+    edit("configs/other.yaml", "load: [quickstart/adapters/battery_pack.yaml]", "unmodeled: skip")
+    code, said = ingest("diff", JOB, "configs/other.yaml")
+    assert code == 1
+    lines = said.splitlines()
+    assert "quickstart_drive: sequence: quickstart_drive → other_drive" in lines
+    assert "quickstart_drive: destination: mosaico → h:6726" in lines
+    assert any(line.startswith("quickstart_drive: - topic /battery: ") for line in lines)
+    assert any(line.startswith("quickstart_drive: + left out /battery: ") for line in lines)
+    code, said = ingest("diff", JOB, "configs/other.yaml", "--json")
+    assert code == 1
+    assert {"sequence", "what", "before", "after"} == set(json.loads(said)[0])
+
+
+def test_a_job_of_a_matrix_is_planned_for_each_combination(ingest: Ingest) -> None:
+    Path("night.yaml").write_text(
+        "extends: configs/quickstart.yaml\nmatrix: {n: [1, 2]}\nsequence: {name: 'run_${n}'}\n"
+    )
+    code, said = ingest("plan", "night.yaml", "--json")
+    assert code == 0
+    plans = PlanDocument.model_validate_json(said).recordings
+    assert [plan.decisions.sequence for plan in plans] == ["run_1", "run_2"]
+    code, said = ingest("expand", "night.yaml")
+    assert code == 0
+    assert "name: run_2\n" in said
+    assert "configs/quickstart.yaml:5" in said
+    assert [job["sequence"]["name"] for job in json.loads(ingest("expand", "night.yaml", "--json")[1])] == [
+        "run_1",
+        "run_2",
+    ]
+
+
+def test_a_drafted_manifest_lints_clean_and_runs(ingest: Ingest) -> None:
+    code, said = ingest("init", "configs/quickstart/drive.mcap", "--out", "job.yaml")
+    assert code == 0
+    assert "job.yaml: 10 topics" in said
+    assert ingest("lint", "job.yaml")[0] == 0
+    assert ingest("job.yaml", "-q")[0] == 0
+    assert len(Store.open("mosaico").sequence("drive").topics) == 10
+    text = Path("job.yaml").read_text()
+    assert "# 1000 x sensor_msgs/msg/Imu at 100.0 Hz, IMU by IMUAdapter" in text
+    assert ingest("init", "configs/quickstart/drive.mcap", "--out", "job.yaml")[0] == 2
+    assert ingest("init", "configs/quickstart/drive.mcap", "--out", "job.yaml", "--force")[0] == 0
+    assert ingest("init", "configs/quickstart/drive.mcap")[1].count("\n") > 30
