@@ -83,7 +83,8 @@ def _kind(node: dict[str, Any], schema: dict[str, Any]) -> str:
     if isinstance(node.get("additionalProperties"), dict):
         inner = _kind(node["additionalProperties"], schema)
         return f"name → {inner}"
-    return _WORDS.get(node.get("type", ""), "anything")
+    kinds = node.get("type", "")
+    return " or ".join(_WORDS.get(kind, "anything") for kind in ([kinds] if isinstance(kinds, str) else kinds))
 
 
 _WORDS = {"string": "text", "integer": "number", "boolean": "true or false", "object": "mapping"}
