@@ -84,7 +84,9 @@ def _kind(node: dict[str, Any], schema: dict[str, Any]) -> str:
         inner = _kind(node["additionalProperties"], schema)
         return f"name → {inner}"
     kinds = node.get("type", "")
-    return " or ".join(_WORDS.get(kind, "anything") for kind in ([kinds] if isinstance(kinds, str) else kinds))
+    return " or ".join(
+        _WORDS.get(kind, "anything") for kind in ([kinds] if isinstance(kinds, str) else kinds)
+    )
 
 
 _WORDS = {"string": "text", "integer": "number", "boolean": "true or false", "object": "mapping"}
