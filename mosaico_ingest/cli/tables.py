@@ -117,9 +117,9 @@ def _print_batch(report: RunReport, console: Console) -> None:
 
 
 def _print_recording(report: Report, console: Console) -> None:
-    if not report.topics:
-        if report.status is RunStatus.SKIPPED:
-            console.print(f"{report.sequence}: skipped, the sequence is there already", highlight=False)
+    if report.status is RunStatus.SKIPPED:
+        console.print(f"{report.sequence}: skipped, the same content is there already", highlight=False)
+    if report.status is RunStatus.SKIPPED or not report.topics:
         return
     columns = COLUMNS if console.width >= ROOMY else tuple(c for c in COLUMNS if c not in {"rate", "payload"})
     table = Table(box=None, pad_edge=False, header_style="dim")

@@ -15,6 +15,7 @@ from mosaico_ingest.bridge import ROSBridge
 from mosaico_ingest.config import ROSInjectionConfig, ServerTarget, StoreTarget
 from mosaico_ingest.diagnostics import Finding
 from mosaico_ingest.errors import IngestError, Interrupted
+from mosaico_ingest.executors.ledger import enter
 from mosaico_ingest.injector import inject
 from mosaico_ingest.plan.model import Plan
 from mosaico_ingest.plan.resolve import resolve
@@ -100,8 +101,13 @@ def execute(plan: Plan, observe: Observer, *, sink: Sink | None = None) -> tuple
         foreseen = None if sink else foresee(plan)
         if foreseen is not None:
             tell(Noted(foreseen))
+        entered = plan if sink else enter(plan)
+        if entered is None:
+            tell(RunFinished(RunStatus.SKIPPED, 0))
+            return collector.report(), None
         with open_recording(plan.files, resolve=plan.resolver) as recording:
-            inject(plan, recording, sink or sink_for(plan.target, buffer_bytes=plan.memory_bytes // 4), tell)
+            destination = sink or sink_for(plan.target, buffer_bytes=plan.memory_bytes // 4)
+            inject(entered, recording, destination, tell)
     except IngestError as error:
         failure = error
     tell(_failed(failure) if failure else _done(collector))

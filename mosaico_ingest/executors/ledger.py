@@ -1,0 +1,190 @@
+"""This file knows what a sequence was made from: the ledger every run leaves in its metadata, and what it means for the next."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from mosaico_ingest.config import ServerTarget, StoreTarget
+from mosaico_ingest.errors import BagError, SequenceExists
+from mosaico_ingest.plan.describe import decisions
+from mosaico_ingest.plan.model import Plan
+from mosaico_ingest.policies import IfExists
+from mosaico_ingest.store.layout import Layout
+from mosaico_ingest.store.store import Store
+from mosaico_ingest.version import __version__
+from mosaico_ingest.wire import actions, bodies
+
+__all__ = [
+    "LEDGER_KEY",
+    "Held",
+    "Ledger",
+    "Source",
+    "content_digest",
+    "enter",
+    "held",
+    "ledger_of",
+    "what_to_do",
+]
+
+LEDGER_KEY = "mosaico_ingest"
+"""The key of a sequence's metadata, and of each of its sessions, that the ledger is kept under."""
+_PIECE_BYTES = 1 << 20
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+
+class Source(_Part):
+    """One file of the recording: what it is called, and what is in it."""
+
+    name: str
+    size_bytes: int
+    content: str
+
+
+class Ledger(_Part):
+    """What a session was made from."""
+
+    tool: str
+    job: str
+    """Digest of every decision about what is stored: topics, adapters, definitions, columns, metadata, time."""
+    sources: tuple[Source, ...]
+
+    def same_content(self, other: Ledger) -> bool:
+        """Say whether both are about the same bytes, whatever the files are called."""
+        return [s.content for s in self.sources] == [s.content for s in other.sources]
+
+
+class Held(_Part):
+    """What a destination has under a sequence's name."""
+
+    ledgers: tuple[Ledger, ...]
+    complete: bool
+    """False where an error that ended a run is attached to it."""
+
+
+def enter(plan: Plan) -> Plan | None:
+    """Return the plan with its ledger among its metadata; None where the same content is there and is to be skipped.
+
+    Raises:
+        SequenceExists: The plan skips the same content, and other content is there.
+    """
+    ledger = ledger_of(plan)
+    if_exists: IfExists | None = plan.if_exists
+    if if_exists is IfExists.SKIP:
+        if_exists = what_to_do(ledger, held(plan.target, plan.sequence), plan.sequence)
+    if if_exists is None:
+        return None
+    return replace(
+        plan, if_exists=if_exists, metadata={**plan.metadata, LEDGER_KEY: ledger.model_dump(mode="json")}
+    )
+
+
+def ledger_of(plan: Plan) -> Ledger:
+    """Read the recording's files and return what this run is going to note."""
+    sources = tuple(
+        Source(name=path.name, size_bytes=path.stat().st_size, content=content_digest(path))
+        for path in plan.files
+    )
+    return Ledger(tool=__version__, job=_job_digest(plan), sources=sources)
+
+
+def content_digest(path: Path) -> str:
+    """Return a name for the bytes of a file: SHA-256 over its length and the CRC-32 of every MiB.
+
+    It tells apart what changes by itself or by a new recording, fast; it is no defence against forgery.
+
+    Raises:
+        BagError: The file cannot be read.
+    """
+    digest = hashlib.sha256()
+    size = 0
+    piece = bytearray(_PIECE_BYTES)
+    try:
+        with path.open("rb", buffering=0) as file:
+            while got := file.readinto(piece):
+                size += got
+                digest.update(zlib.crc32(memoryview(piece)[:got]).to_bytes(4, "little"))
+    except OSError as error:
+        raise BagError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    digest.update(size.to_bytes(8, "little"))
+    return digest.hexdigest()[:32]
+
+
+def held(target: StoreTarget | ServerTarget, sequence: str) -> Held | None:
+    """Return what the destination has of a sequence, None where it has none."""
+    if isinstance(target, ServerTarget):
+        return _held_by_server(target, sequence)
+    if not Layout(target.path).catalog.is_file():
+        return None
+    store = Store.open(target.path, create=False)
+    if sequence not in store.names():
+        return None
+    info = store.sequence(sequence)
+    complete = all(note.topic is not None for note in info.notes)
+    return Held(ledgers=_ledgers(session.metadata for session in info.sessions), complete=complete)
+
+
+def what_to_do(ledger: Ledger, found: Held | None, sequence: str) -> IfExists | None:
+    """Return how to open a sequence that is to be skipped where it is the same; None: it is, so do nothing.
+
+    Raises:
+        SequenceExists: What is there was made from something else.
+    """
+    if found is None:
+        return IfExists.FAIL
+    same = [known for known in found.ledgers if known.same_content(ledger)]
+    if not same:
+        names = ", ".join(source.name for known in found.ledgers for source in known.sources)
+        made = f"it was made from other content ({names})" if names else "nothing says what it was made from"
+        raise SequenceExists(f"the sequence exists, and {made}", where=sequence, hint=_HINT)
+    if not found.complete:
+        return IfExists.REPLACE
+    if all(known.job != ledger.job for known in same):
+        raise SequenceExists(
+            "the sequence exists, and was made from this recording by another job", where=sequence, hint=_HINT
+        )
+    return None
+
+
+_HINT = "set sequence.if_exists to replace or append, or choose another name"
+
+
+def _held_by_server(target: ServerTarget, sequence: str) -> Held | None:
+    from mosaico_ingest.platform.client import connect  # noqa: PLC0415 - Flight is slow to import and rarely needed
+
+    with connect(target) as client:
+        info = client.find(sequence)
+        if info is None:
+            return None
+        notes = client.act(actions.SEQUENCE_NOTIFICATION_LIST, bodies.Located(locator=sequence)).notifications
+    complete = not notes and all(session.locked for session in info.sessions)
+    return Held(ledgers=_ledgers([info.user_metadata]), complete=complete)
+
+
+def _ledgers(metadata: Iterable[Mapping[str, Any]]) -> tuple[Ledger, ...]:
+    found: list[Ledger] = []
+    for one in metadata:
+        if LEDGER_KEY in one:
+            try:
+                found.append(Ledger.model_validate(one[LEDGER_KEY]))
+            except ValidationError:
+                continue  # written by somebody else, or by a version to come: it says nothing we know
+    return tuple(found)
+
+
+def _job_digest(plan: Plan) -> str:
+    """Digest the decisions without where the recording lies, where it goes and what happens when the name is taken."""
+    decided = decisions(plan, folder=Path())
+    noted = decided.model_dump(mode="json", exclude={"files", "destination", "if_exists"})
+    noted["metadata"] = dict(plan.metadata)
+    return hashlib.sha256(json.dumps(noted, sort_keys=True).encode()).hexdigest()[:32]

@@ -1,0 +1,121 @@
+"""The same job again does nothing; other content under the same name is refused; half of it is completed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from mosaico_ingest import api
+from mosaico_ingest.executors.ledger import LEDGER_KEY, content_digest
+from mosaico_ingest.report.events import Event, RunStatus, TopicProgress
+from mosaico_ingest.store import Store
+
+from .conftest import CUT, RunJob, WriteBag, number
+
+WriteJob = Callable[..., Path]
+SKIP = {"name": "drive", "if_exists": "skip"}
+
+
+def test_the_same_job_again_does_nothing(
+    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [number(1)]})
+    job = write_job(sequence=SKIP)
+    assert run_job(job).status is RunStatus.COMPLETED
+    before = Store.open(tmp_path / "store").sequence("drive")
+    again = run_job(job)
+    assert (again.status, again.exit_code, again.error) == (RunStatus.SKIPPED, 0, None)
+    assert again.totals.written == 0
+    assert Store.open(tmp_path / "store").sequence("drive") == before
+
+
+def test_a_job_that_did_not_say_skip_is_recognised_too(
+    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
+) -> None:
+    bag = write_bag({"/speed": [number(1)]})
+    assert run_job(write_job()).status is RunStatus.COMPLETED
+    bag.rename(tmp_path / "moved.db3")
+    job = write_job(
+        sequence=SKIP,
+        bag={"path": "moved.db3", "custom_msgs": [{"package": "own_msgs", "path": "definitions"}]},
+    )
+    assert run_job(job).status is RunStatus.SKIPPED
+
+
+def test_other_content_under_the_same_name_is_refused(
+    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [number(1)]})
+    job = write_job(sequence=SKIP)
+    run_job(job)
+    (tmp_path / "drive.db3").unlink()
+    write_bag({"/speed": [number(2)]})
+    report = run_job(job)
+    assert (report.status, report.exit_code) == (RunStatus.FAILED, 1)
+    assert report.error is not None
+    assert "made from other content (drive.db3)" in report.error
+    assert "replace or append" in report.error
+    assert Store.open(tmp_path / "store").scan("drive", "/speed").read_all()["data"].to_pylist() == [1]
+    assert run_job(write_job(sequence={**SKIP, "if_exists": "replace"})).status is RunStatus.COMPLETED
+    assert Store.open(tmp_path / "store").scan("drive", "/speed").read_all()["data"].to_pylist() == [2]
+
+
+def test_another_job_for_the_same_recording_is_refused(
+    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob
+) -> None:
+    write_bag({"/speed": [number(1), number(2)]})
+    run_job(write_job(sequence=SKIP))
+    report = run_job(write_job(sequence=SKIP, topic_settings={"/speed": {"every": 2}}))
+    assert report.status is RunStatus.FAILED
+    assert "by another job" in str(report.error)
+
+
+def test_a_sequence_nobody_noted_anything_about_is_not_taken_for_the_same(
+    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [number(1)]})
+    Store.open(tmp_path / "store").create_sequence("drive", {LEDGER_KEY: "no ledger"})
+    assert "nothing says" in str(run_job(write_job(sequence=SKIP)).error)
+
+
+def test_what_an_interrupt_left_is_completed_by_the_next_run(
+    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [number(value) for value in range(70_000)]})
+    job = write_job(sequence=SKIP)
+
+    def stop(_position: int, event: Event) -> None:
+        if isinstance(event, TopicProgress) and event.written:
+            raise KeyboardInterrupt
+
+    (stopped,) = api.run(api.compile_job(job), observe=stop).recordings
+    assert stopped.status is RunStatus.INTERRUPTED
+    store = Store.open(tmp_path / "store")
+    assert 0 < store.sequence("drive").rows < 70_000
+    assert run_job(job).status is RunStatus.COMPLETED
+    assert store.sequence("drive").rows == 70_000
+    assert run_job(job).status is RunStatus.SKIPPED
+
+
+def test_messages_that_were_rejected_do_not_make_a_sequence_incomplete(
+    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob
+) -> None:
+    write_bag({"/speed": [number(1), CUT]})
+    job = write_job(sequence=SKIP)
+    assert run_job(job).status is RunStatus.REJECTED
+    assert run_job(job).status is RunStatus.SKIPPED
+
+
+@pytest.mark.parametrize("at", [0, 1 << 20, (3 << 20) - 1])
+def test_every_byte_of_a_file_counts(at: int, tmp_path: Path) -> None:
+    data = bytearray(3 << 20)
+    path = tmp_path / "recording"
+    path.write_bytes(data)
+    before = content_digest(path)
+    data[at] = 1
+    path.write_bytes(data)
+    assert content_digest(path) != before
+    path.write_bytes(data + b"\0")
+    assert content_digest(path) != before
