@@ -12,15 +12,18 @@ from typing import Annotated, Any
 import typer
 
 from mosaico_ingest.cli import (
+    adapters,
     bag,
     diff,
     expand,
+    export,
     init,
     inspect,
     keys,
     lint,
     plan,
     replay,
+    report,
     run,
     schema,
     serve,
@@ -42,13 +45,19 @@ COMMANDS: tuple[tuple[str, Callable[..., Any]], ...] = (
     ("expand", expand.expand),
     ("verify", verify.verify),
     ("replay", replay.replay),
+    ("export", export.export),
     ("lint", lint.lint),
     ("serve", serve.serve),
+    ("report", report.report),
     ("schema", schema.schema),
 )
 """In the order `--help` lists them."""
 
-GROUPS: tuple[tuple[str, typer.Typer], ...] = (("store", store.app), ("keys", keys.app))
+GROUPS: tuple[tuple[str, typer.Typer], ...] = (
+    ("adapters", adapters.app),
+    ("store", store.app),
+    ("keys", keys.app),
+)
 
 app = typer.Typer(
     name="ingest",

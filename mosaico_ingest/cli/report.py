@@ -1,0 +1,39 @@
+"""This file is `ingest report`: a run's report as a page for people."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+__all__ = ["report"]
+
+
+def report(
+    path: Annotated[
+        Path, typer.Argument(metavar="RUN.json", help="What `ingest run --report RUN.json` wrote.")
+    ],
+    *,
+    html: Annotated[
+        Path | None, typer.Option("--html", metavar="FILE", help="Write one page that needs nothing else.")
+    ] = None,
+    markdown: Annotated[
+        Path | None, typer.Option("--markdown", metavar="FILE", help="Write a summary for a CI job's page.")
+    ] = None,
+) -> None:
+    """Show a report: as tables here, as a page, as Markdown."""
+    from mosaico_ingest.cli.tables import print_report
+    from mosaico_ingest.report.markdown import markdown_summary
+    from mosaico_ingest.report.page import html_page
+    from mosaico_ingest.report.write import read_report, write_whole
+
+    found = read_report(path)
+    if html is not None:
+        write_whole(html, html_page(found))
+        typer.echo(f"wrote {html}", err=True)
+    if markdown is not None:
+        write_whole(markdown, markdown_summary(found))
+        typer.echo(f"wrote {markdown}", err=True)
+    if html is None and markdown is None:
+        print_report(found)

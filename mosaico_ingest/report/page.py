@@ -1,0 +1,243 @@
+"""This file writes a report as one page that needs nothing else: no server, no network, no script to be complete."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from importlib.resources import files
+from itertools import islice
+
+from mosaico_ingest.report.events import RunStatus, TopicStatus
+from mosaico_ingest.report.markup import Markup, element, join
+from mosaico_ingest.report.model import Report, RunReport, TopicReport
+from mosaico_ingest.report.sparkline import sparkline
+from mosaico_ingest.report.units import bytes_text, count_text, seconds_text, time_text
+
+__all__ = ["STATUS_WORDS", "html_page"]
+
+STATUS_WORDS = {
+    RunStatus.COMPLETED: "completed",
+    RunStatus.REJECTED: "completed, some messages rejected",
+    RunStatus.SKIPPED: "skipped, it is there already",
+    RunStatus.FAILED: "failed",
+    RunStatus.INTERRUPTED: "interrupted",
+}
+_BAD = {RunStatus.FAILED, RunStatus.INTERRUPTED}
+_OPEN = 3
+"""That many recordings are shown open."""
+
+
+def html_page(report: RunReport) -> str:
+    """Return the whole page."""
+    title = f"Ingestion report: {_headline(report)}"
+    head = element(
+        "head",
+        element("meta", charset="utf-8"),
+        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        element("title", title),
+        element("style", _asset("page.css")),
+    )
+    body = element(
+        "body",
+        element("a", "Skip to the recordings", class_="skip", href="#recordings"),
+        element("header", element("h1", "Ingestion report"), _subtitle(report)),
+        element("main", _sums(report), *_look_at(report), _recordings(report)),
+        element("script", _asset("page.js")) if report.recordings else None,
+    )
+    return f"<!doctype html>\n{element('html', head, body, lang='en')}\n"
+
+
+def _asset(name: str) -> Markup:
+    return Markup((files("mosaico_ingest.report") / name).read_text(encoding="utf-8"))
+
+
+def _headline(report: RunReport) -> str:
+    if not report.recordings:
+        return "nothing was ingested"
+    bad = sum(one.status in _BAD for one in report.recordings)
+    return f"{count_text(len(report.recordings))} recordings, {count_text(bad) if bad else 'none'} failed"
+
+
+def _subtitle(report: RunReport) -> Markup:
+    began = min((one.started_at for one in report.recordings), default=None)
+    when = f", begun {began:%Y-%m-%d %H:%M:%S} UTC" if began else ""
+    return element("p", f"{_headline(report)} ({report.tool}{when})", class_="dim")
+
+
+def _sums(report: RunReport) -> Markup:
+    totals = [one.totals for one in report.recordings]
+    source = sum(one.source_bytes for one in report.recordings)
+    stored = sum(one.stored_bytes for one in totals)
+    topics = [topic for one in report.recordings for topic in one.topics]
+    sums = {
+        "Recordings": count_text(len(report.recordings)),
+        "Messages read": count_text(sum(one.read for one in totals)),
+        "Written": count_text(sum(one.written for one in totals)),
+        "Rejected": count_text(sum(one.rejected for one in totals)),
+        "Unreadable": count_text(sum(topic.unreadable for topic in topics)),
+        "Recordings' size": bytes_text(source),
+        "Stored size": f"{bytes_text(stored)}{f', {stored / source:.0%}' if source else ''}",
+        "Working time": seconds_text(sum(one.duration_s for one in report.recordings)),
+    }
+    return element(
+        "dl", *(element("div", element("dt", k), element("dd", v)) for k, v in sums.items()), class_="sums"
+    )
+
+
+def _look_at(report: RunReport) -> Iterator[Markup]:
+    """Yield what somebody has to look at: recordings that failed, messages that were rejected, by reason."""
+    failed = [(at, one) for at, one in enumerate(report.recordings) if one.status in _BAD]
+    if failed:
+        items = (element("li", _link(at, one), f": {one.error or one.status.value}") for at, one in failed)
+        yield join(element("h2", "Failed recordings"), element("ul", *items))
+    rows = list(_rejections(report))
+    if rows:
+        head = ("Stage", "Rule", "Messages", "Recordings", "The first reason")
+        yield join(
+            element("h2", "Rejected messages by reason"), _table("Of all recordings", head, rows, {2, 3})
+        )
+
+
+def _rejections(report: RunReport) -> Iterator[tuple[str, ...]]:
+    groups: dict[tuple[str, str], list[tuple[int, int, str]]] = defaultdict(list)
+    for at, one in enumerate(report.recordings):
+        for topic in one.topics:
+            for rejection in topic.rejections:
+                said = f"{one.sequence}{topic.target}: {rejection.reason}"
+                groups[rejection.stage.value, rejection.rule].append((at, rejection.count, said))
+    for (stage, rule), found in sorted(groups.items(), key=lambda group: -sum(one[1] for one in group[1])):
+        recordings = {at for at, _, _ in found}
+        link = element("a", count_text(len(recordings)), href=f"#r{min(recordings)}")
+        yield stage, rule, count_text(sum(count for _, count, _ in found)), link, found[0][2]
+
+
+def _recordings(report: RunReport) -> Markup:
+    if not report.recordings:
+        return element("p", "No recording was ingested.", id="recordings")
+    words = element("label", "Filter ", element("input", type="search", id="words", autocomplete="off"))
+    problems = element("label", element("input", type="checkbox", id="problems"), " only those with problems")
+    shown = element("span", id="shown", role="status", class_="dim")
+    opened = {at for at, _ in zip(range(len(report.recordings)), range(_OPEN), strict=False)}
+    opened |= set(islice((at for at, one in enumerate(report.recordings) if one.status in _BAD), _OPEN))
+    return join(
+        element("h2", "Recordings", id="recordings"),
+        element("div", words, problems, shown, class_="filter", hidden=True),
+        *(_recording(at, one, is_open=at in opened) for at, one in enumerate(report.recordings)),
+    )
+
+
+def _recording(at: int, one: Report, *, is_open: bool) -> Markup:
+    totals = one.totals
+    summary = element(
+        "summary",
+        element("span", one.sequence, class_="name"),
+        element("span", STATUS_WORDS[one.status], class_=f"state {one.status.value}"),
+        element("span", f"{count_text(totals.written)} of {count_text(totals.read)} messages"),
+        element("span", f"{count_text(totals.rejected)} rejected", class_="warn")
+        if totals.rejected
+        else None,
+        element("span", seconds_text(one.duration_s), class_="dim"),
+    )
+    problem = one.status is not RunStatus.COMPLETED and one.status is not RunStatus.SKIPPED
+    return element(
+        "details",
+        summary,
+        element("div", *_inside(one), class_="inside"),
+        class_="recording",
+        id=f"r{at}",
+        open=is_open,
+        data_words=" ".join((one.sequence, *one.files, *(topic.target for topic in one.topics))),
+        data_problem="yes" if problem else None,
+    )
+
+
+def _inside(one: Report) -> Iterator[Markup]:
+    if one.error:
+        yield element("p", one.error, class_="error")
+    rate = one.totals.read / one.duration_s if one.duration_s else 0
+    stored = f", {one.compression:.0%} of it stored" if one.compression is not None else ""
+    where = f"{', '.join(one.files)} ({bytes_text(one.source_bytes)}{stored}) to {one.destination}"
+    yield element("p", f"{where}; {count_text(round(rate))} messages a second", class_="dim")
+    taken = [topic for topic in one.topics if topic.status is not TopicStatus.LEFT_OUT]
+    if taken:
+        yield _topics(taken)
+    yield from _lists(one)
+
+
+def _topics(taken: list[TopicReport]) -> Markup:
+    times = [time for topic in taken for time in (topic.start_ns, topic.end_ns) if time is not None]
+    span = (min(times), max(times)) if times else (0, 0)
+    during = f"from {time_text(span[0])} to {time_text(span[1])} UTC" if times else "no rows"
+    head = ("Topic", "Ontology", "Read", "Written", "Rejected", "Rate", "Stored", "Rows over time (gaps red)")
+    rows = [_topic(topic, span) for topic in sorted(taken, key=lambda topic: topic.target)]
+    return _table(f"{len(taken)} topics, {during}", head, rows, {2, 3, 4, 5, 6})
+
+
+def _topic(topic: TopicReport, span: tuple[int, int]) -> tuple[str, ...]:
+    rejected = count_text(topic.rejected)
+    return (
+        topic.target,
+        topic.ontology,
+        count_text(topic.read),
+        count_text(topic.written),
+        element("strong", rejected, class_="warn") if topic.rejected else rejected,
+        f"{topic.rate_hz:.1f} Hz" if topic.rate_hz is not None else "",
+        bytes_text(topic.stored_bytes),
+        sparkline(topic, span) or "",
+    )
+
+
+def _lists(one: Report) -> Iterator[Markup]:
+    """Yield what there is to say about a recording beside its numbers."""
+    rejected = [
+        f"{topic.target}: {count_text(r.count)} at {r.stage.value} [{r.rule}]: {r.reason} "
+        f"(the first recorded {time_text(r.first_log_time_ns)}, offset {r.first_offset})"
+        for topic in one.topics
+        for r in topic.rejections
+    ]
+    lost = [
+        f"{loss.topic or 'the recording'}: {'?' if loss.count is None else count_text(loss.count)} messages"
+        f"{'' if loss.offset is None else f' at offset {loss.offset}'}: {loss.reason}"
+        for loss in one.losses
+    ]
+    kept = [
+        f"{topic.target}: {count_text(topic.quarantined)} messages"
+        for topic in one.topics
+        if topic.quarantined
+    ]
+    left = [f"{topic.topic}: {topic.why}" for topic in one.topics if topic.status is TopicStatus.LEFT_OUT]
+    for title, lines in {
+        "Rejected": rejected,
+        "In the quarantine": kept,
+        "Unreadable": lost,
+        "Left out": left,
+        "Notes": one.findings,
+    }.items():
+        if lines:
+            yield join(element("h3", title), element("ul", *(element("li", line) for line in lines)))
+
+
+def _link(at: int, one: Report) -> Markup:
+    return element("a", one.sequence, href=f"#r{at}")
+
+
+def _table(caption: str, head: tuple[str, ...], rows: Iterable[tuple[str, ...]], numbers: set[int]) -> Markup:
+    def kind(column: int) -> str | None:
+        return "n" if column in numbers else None
+
+    titles = (element("th", name, scope="col", class_=kind(at)) for at, name in enumerate(head))
+    lines = (
+        element(
+            "tr",
+            element("th", row[0], scope="row"),
+            *(element("td", cell, class_=kind(at)) for at, cell in enumerate(row[1:], 1)),
+        )
+        for row in rows
+    )
+    table = element(
+        "table",
+        element("caption", caption),
+        element("thead", element("tr", *titles)),
+        element("tbody", *lines),
+    )
+    return element("div", table, class_="table", tabindex="0", role="region", aria_label=caption)

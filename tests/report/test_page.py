@@ -1,0 +1,201 @@
+"""The page holds what the report holds, whatever texts it has; Chromium lays it out where it is present."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from datetime import datetime, timezone
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from mosaico_ingest.cli.app import app
+from mosaico_ingest.diagnostics import Stage
+from mosaico_ingest.report.events import RunStatus, TopicStatus
+from mosaico_ingest.report.markdown import markdown_summary
+from mosaico_ingest.report.model import Loss, Rejection, Report, RunReport, TopicReport
+from mosaico_ingest.report.page import html_page
+from mosaico_ingest.report.sparkline import gaps
+from mosaico_ingest.report.timeline import TimelineReport
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+VOID = {"meta", "input", "path"}
+NASTY = "<script>alert('|x|')</script> & \"quoted\""
+T0 = 1_700_000_000 * 10**9
+
+
+def topic(name: str, *, rejected: int = 0, counts: tuple[int, ...] = (50,) * 20) -> TopicReport:
+    rejections = (
+        Rejection(
+            stage=Stage.ADAPT, rule="nan", count=rejected, reason=NASTY, first_log_time_ns=T0, first_offset=7
+        ),
+    )
+    return TopicReport(
+        topic=name,
+        target=name,
+        msgtype="sensor_msgs/msg/Imu",
+        adapter="IMUAdapter",
+        ontology="IMU",
+        why="built-in",
+        status=TopicStatus.WRITTEN,
+        promised=sum(counts) + rejected,
+        read=sum(counts) + rejected,
+        written=sum(counts),
+        rejected=rejected,
+        rejections=rejections if rejected else (),
+        start_ns=T0,
+        end_ns=T0 + len(counts) * 10**9,
+        payload_bytes=10**6,
+        stored_bytes=10**5,
+        timeline=TimelineReport(start_ns=T0, step_ns=10**9, counts=counts),
+    )
+
+
+def recording(number: int, status: RunStatus = RunStatus.COMPLETED, topics: int = 2) -> Report:
+    failed = status is RunStatus.FAILED
+    gap = (50,) * 6 + (0,) * 6 + (20,) * 8
+    made = [topic(f"/sensor_{at}", counts=gap if at == 1 else (50,) * 20) for at in range(topics - 1)]
+    made.append(topic("/imu", rejected=3 if status is RunStatus.REJECTED else 0))
+    return Report(
+        sequence=f"drive_{number:03}",
+        destination="mosaico",
+        files=(f"drives/{NASTY if failed else number}.mcap",),
+        status=status,
+        exit_code={RunStatus.FAILED: 1, RunStatus.REJECTED: 4}.get(status, 0),
+        error=f"drive.mcap: {NASTY}" if failed else None,
+        started_at=datetime(2026, 3, 1, tzinfo=timezone.utc),
+        duration_s=1.5,
+        source_bytes=5 * 10**6,
+        topics=() if failed else tuple(made),
+        losses=(Loss(topic=None, count=4, offset=99, reason="bad checksum"),) if failed else (),
+        findings=("a note",),
+    )
+
+
+def run(*recordings: Report) -> RunReport:
+    return RunReport(tool="mosaico-ingest 0", recordings=recordings)
+
+
+def mixed(number: int) -> Report:
+    status = {7: RunStatus.FAILED, 5: RunStatus.REJECTED, 3: RunStatus.SKIPPED}.get(
+        number % 40, RunStatus.COMPLETED
+    )
+    return recording(number, status, topics=6)
+
+
+RUNS = {
+    "empty": run(),
+    "small": run(recording(1), recording(2)),
+    "large": run(*map(mixed, range(500))),
+    "failing": run(recording(1, RunStatus.FAILED), recording(2, RunStatus.REJECTED), recording(3)),
+}
+
+
+class Outline(HTMLParser):
+    """Checks that elements close in order, and keeps ids, links and text."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.links: list[str] = []
+        self.loads: list[str] = []
+        self.words: list[str] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        self.ids += [value for key, value in attrs if key == "id" and value]
+        self.links += [value for key, value in attrs if key == "href" and value]
+        self.loads += [str(given[key]) for key in ("src", "srcset", "data") if key in given]
+        if tag not in VOID or tag == "path":
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_the_page_is_well_formed_and_needs_nothing_else(name: str) -> None:
+    outline = Outline(html_page(RUNS[name]))
+    assert outline.open == []
+    assert outline.loads == []
+    assert len(outline.ids) == len(set(outline.ids))
+    assert {link for link in outline.links if not link.startswith("#")} == set()
+    assert {link[1:] for link in outline.links} <= set(outline.ids)
+
+
+def test_every_recording_topic_rejection_and_loss_is_on_the_page() -> None:
+    text = " ".join(Outline(html_page(RUNS["failing"])).words)
+    for wanted in ("drive_001", "drive_003", "/sensor_0", "nan", "bad checksum", "a note", NASTY):
+        assert wanted in text
+
+
+def test_texts_cannot_become_markup() -> None:
+    assert "<script>alert" not in html_page(RUNS["failing"])
+
+
+def test_500_recordings_stay_a_page_a_browser_opens_at_once() -> None:
+    assert len(html_page(RUNS["large"])) < 6_000_000
+
+
+def test_a_drop_out_is_a_gap_and_a_slow_topic_is_not_full_of_them() -> None:
+    drop_out = TimelineReport(start_ns=0, step_ns=10**9, counts=(50,) * 6 + (0,) * 6 + (50,) * 8)
+    slow = TimelineReport(start_ns=0, step_ns=10**9, counts=((1, 0, 0) * 30 + (1,)))
+    assert [(gap.start_ns, gap.end_ns) for gap in gaps(drop_out)] == [(6 * 10**9, 12 * 10**9)]
+    assert gaps(slow) == ()
+
+
+def test_the_summary_lists_problems_first_and_no_text_breaks_its_table() -> None:
+    lines = markdown_summary(RUNS["failing"]).splitlines()
+    assert lines[0] == "## Ingestion: 3 recordings, 1 failed, 2,760 messages written"
+    assert lines[4].startswith("| drive\\_001") or lines[4].startswith("| drive_001")
+    assert any("\\<script\\>" in line for line in lines)
+    assert len(markdown_summary(RUNS["large"]).splitlines()) < 250
+
+
+def test_the_command_writes_the_page_and_the_summary(tmp_path: Path) -> None:
+    source = tmp_path / "run.json"
+    source.write_text(RUNS["small"].model_dump_json())
+    page, summary = tmp_path / "out.html", tmp_path / "out.md"
+    done = CliRunner().invoke(app, ["report", str(source), "--html", str(page), "--markdown", str(summary)])
+    assert done.exit_code == 0, done.output
+    assert page.read_text() == html_page(RUNS["small"])
+    assert summary.read_text() == markdown_summary(RUNS["small"])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("name", RUNS)
+def test_chromium_lays_the_page_out(name: str, scheme: str, tmp_path: Path) -> None:
+    page, picture = tmp_path / f"{name}.html", tmp_path / f"{name}-{scheme}.png"
+    page.write_text(html_page(RUNS[name]))
+    dark = ["--blink-settings=preferredColorScheme=0"] if scheme == "dark" else []
+    dump = chromium(page, tmp_path, "--dump-dom", *dark)
+    assert ("recordings</span>" in dump) == bool(RUNS[name].recordings)  # the script has counted them
+    chromium(page, tmp_path, f"--screenshot={picture}", "--window-size=1200,1600", *dark)
+    assert picture.stat().st_size > 5_000
+
+
+def chromium(page: Path, profile: Path, *arguments: str) -> str:
+    options = (
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--hide-scrollbars",
+        f"--user-data-dir={profile}/p",
+    )
+    done = subprocess.run(  # noqa: S603 - a browser, on a page of ours
+        [str(CHROMIUM), *options, *arguments, page.as_uri()],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    return done.stdout
