@@ -25,7 +25,7 @@ from mosaico_ingest.ontology.message import Message
 from mosaico_ingest.ontology.types import SerializationFormat
 from mosaico_ingest.patterns import first_match
 
-__all__ = ["ENTRY_POINTS", "ROSBridge", "Reason", "Resolution"]
+__all__ = ["ENTRY_POINTS", "ROSBridge", "Reason", "Resolution", "installed_adapters"]
 
 ENTRY_POINTS = "mosaico_ingest.adapters"
 """The group under which an installed package names its adapters: a class, a spec, or a list of them."""
@@ -69,7 +69,8 @@ class ROSBridge:
         folder = base_dir or Path()
         own = [(str(reference), adapter_spec(reference, folder)) for reference in loaded]
         self._loaded = _by_type((f"loaded from {origin}", spec) for origin, spec in own)
-        names = {spec.name: spec for _, spec in own}
+        self._installed = _by_type(installed_adapters())
+        names = {spec.name: spec for _, spec in (*installed_adapters(), *own)}
         self._overrides = {
             pattern: names.get(reference) or adapter_spec(reference, folder)
             if isinstance(reference, str)
@@ -113,7 +114,7 @@ class ROSBridge:
         sources: tuple[tuple[Reason, Mapping[str, tuple[str, AdapterSpec]]], ...] = (
             ("loaded", self._loaded),
             ("registered", _registered()),
-            ("entry point", _installed()),
+            ("entry point", self._installed),
         )
         for reason, by_type in sources:
             if msgtype in by_type:
@@ -176,8 +177,12 @@ def _registered() -> dict[str, tuple[str, AdapterSpec]]:
 
 
 @cache
-def _installed() -> dict[str, tuple[str, AdapterSpec]]:
-    """Load what installed packages offer, once; a broken one is an error that names it."""
+def installed_adapters() -> tuple[tuple[str, AdapterSpec], ...]:
+    """Return what installed packages offer, with where it comes from.
+
+    Raises:
+        AdapterError: One of them cannot be imported or is no adapter; names the package.
+    """
     found: list[tuple[str, AdapterSpec]] = []
     for entry in entry_points(group=ENTRY_POINTS):
         package = entry.dist.name if entry.dist else "an installed package"
@@ -191,4 +196,4 @@ def _installed() -> dict[str, tuple[str, AdapterSpec]]:
                 hint=f"repair or remove {package}",
             ) from error
         found += [(f"entry point {entry.name} of {package}", spec) for spec in specs]
-    return _by_type(found)
+    return tuple(found)

@@ -1,0 +1,133 @@
+"""This file says in words what an adapter does: for every column where its values come from, and what it leaves out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from mosaico_ingest.adapters.adapter import AdapterSpec
+from mosaico_ingest.adapters.definitions import mapping_of
+from mosaico_ingest.adapters.mapping.arrow import DataType, pt
+from mosaico_ingest.adapters.mapping.kinds import is_list, spell
+from mosaico_ingest.adapters.mapping.load import MappingSpec
+from mosaico_ingest.adapters.mapping.model import Form, Scalar, Value
+from mosaico_ingest.adapters.python_adapter import PythonAdapterSpec, ontology_of
+from mosaico_ingest.bag.names import normalize_msgtype
+from mosaico_ingest.ontology.types import OntologyType
+
+__all__ = ["ColumnOrigin", "Description", "describe"]
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnOrigin:
+    """One column of the records, or a field of one, and where its values come from."""
+
+    name: str
+    """As `orientation.covariance`; `poses[].header` is a field of a list's elements."""
+    type: str
+    required: bool
+    origin: str | None
+    """An expression, or what stands for one; None: it is null."""
+
+
+@dataclass(frozen=True, slots=True)
+class Description:
+    """An adapter in words."""
+
+    name: str
+    summary: str
+    default: bool
+    """Whether it is used for its types without being asked for."""
+    ontology: str
+    serialization_format: str
+    takes: Mapping[str, str]
+    """Message type → where the payload sits in it; empty where it is the message itself."""
+    columns: tuple[ColumnOrigin, ...]
+
+
+def describe(spec: AdapterSpec, msgtype: str | None = None) -> Description:
+    """Describe an adapter as it treats one of its types, or the first.
+
+    Raises:
+        AdapterError: Its ontology class is no such class.
+    """
+    mapping = mapping_of(spec)
+    if mapping is not None:
+        return _of_mapping(mapping, msgtype)
+    if isinstance(spec, PythonAdapterSpec):
+        return _of_class(spec)
+    summary = "Keeps a message in its ROS shape, under the last part of its type's name"
+    return Description(spec.name, summary, spec.default, "", "default", dict.fromkeys(spec.ros_types, ""), ())
+
+
+def _of_mapping(spec: MappingSpec, msgtype: str | None) -> Description:
+    variants = {normalize_msgtype(name): wrap for name, wrap in (spec.model.variants or {}).items()}
+    wrap = variants.get(msgtype or spec.ros_types[0], {})
+    values = {**spec.model.fields, **{name: value for name, value in wrap.items() if name != "of"}}
+    return Description(
+        spec.name,
+        spec.model.description or "",
+        spec.default,
+        spec.ontology.tag,
+        spec.ontology.serialization_format.value,
+        {name: _text(variants.get(name, {}).get("of", "")) for name in spec.ros_types},
+        tuple(_columns(spec.ontology.struct, values, "")),
+    )
+
+
+def _of_class(spec: PythonAdapterSpec) -> Description:
+    cls: Any = spec.adapter
+    ontology: OntologyType = ontology_of(cls.__mosaico_ontology_type__)
+    method = "from_batch" if hasattr(cls, "from_batch") else "from_dict"
+    origin = f"{cls.__module__}.{cls.__qualname__}.{method}"
+    doc = (cls.__doc__ or "").strip().partition("\n")[0]
+    columns = [
+        ColumnOrigin(field.name, spell(field.type), not field.nullable, origin) for field in ontology.struct
+    ]
+    takes = dict.fromkeys(spec.ros_types, "")
+    layout = ontology.serialization_format.value
+    return Description(spec.name, doc, spec.default, ontology.tag, layout, takes, tuple(columns))
+
+
+def _columns(struct: DataType, values: Mapping[str, Value], prefix: str) -> Iterator[ColumnOrigin]:
+    """Yield the fields of a struct in its order, those that are mappings of their own with their fields."""
+    for field in struct:
+        name = f"{prefix}{field.name}"
+        value = values.get(field.name)
+        origin = _origin(value) if isinstance(value, Form) else None if value is None else _text(value)
+        yield ColumnOrigin(name, spell(field.type), not field.nullable, origin)
+        if not isinstance(value, Form):
+            continue
+        element, inner = field.type, f"{name}."
+        while is_list(element):
+            element, inner = element.value_type, f"{inner[:-1]}[]."
+        if not pt.is_struct(element):
+            continue
+        if value.fields is not None:
+            yield from _columns(element, {**value.fields, **(value.replaced or {})}, inner)
+        elif value.replaced:
+            named = [child for child in element if child.name in value.replaced]
+            yield from _columns(named, value.replaced, inner)
+
+
+def _origin(form: Form) -> str:
+    """Return a form in one line."""
+    if form.use is not None:
+        text = f"{form.use} of {form.of}"
+    elif form.fields is not None:
+        text = f"fields of {form.of}" if form.of else "field by field"
+    else:
+        text = _text(form.value)
+    if form.map is not None:
+        pairs = ", ".join(f"{_text(key)} → {_text(value)}" for key, value in form.map.items())
+        text = f"{text}: {pairs}, else {_text(form.otherwise)}"
+    return f"{text}, where {form.when}" if form.when else text
+
+
+def _text(value: Value) -> str:
+    """Return a plain value as the file spells it."""
+    if isinstance(value, Form):
+        return _origin(value)
+    words: dict[Scalar, str] = {None: "null", True: "true", False: "false"}
+    return words[value] if value is None or isinstance(value, bool) else str(value)
