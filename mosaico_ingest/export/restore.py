@@ -12,6 +12,7 @@ import pyarrow as pa
 from mosaico_ingest.adapters.adapter import Adapter, AdapterSpec, Envelope
 from mosaico_ingest.adapters.builtin import BUILTIN
 from mosaico_ingest.adapters.inverse import Inverse, Restored, invert
+from mosaico_ingest.adapters.mapping.columns import struct_of
 from mosaico_ingest.adapters.unmodeled import UnmodeledSpec
 from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.definition import Definition
@@ -56,11 +57,11 @@ class Restorer:
             for start in range(0, batch.num_rows, _ROWS):
                 part = batch.slice(start, _ROWS)
                 times: Any = part.column(0).to_numpy()
-                rows = pa.StructArray.from_arrays(part.columns[1:], fields=list(self.info.ontology.struct))
+                rows = struct_of(part.columns[1:], self.info.ontology.struct, None, part.num_rows)
                 envelope = Envelope(self.info.name, self.definition.root, times)
                 restored = self.inverse.restore(rows, envelope)
                 self._count(restored)
-                values = cast("Any", restored.rows).to_pylist()  # the stubs do not know a struct's
+                values: Any = cast("Any", restored.rows).to_pylist()  # the stubs do not know a struct's
                 yield from zip(times.tolist(), map(serializer.from_dict, values), strict=True)
 
     def account(self) -> TopicExport:

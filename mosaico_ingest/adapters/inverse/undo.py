@@ -52,6 +52,7 @@ class Undo:
         self._parts = parts
         self._said = said
         self._clouds: list[CloudField] = []
+        self._held: dict[tuple[Place, int | None, Any], Mask] = {}
         self._target = ""
         self.kept_out: dict[str, str] = {}
         """Columns that could not be undone, and what they are computed as."""
@@ -59,6 +60,8 @@ class Undo:
     def record(self, record: Filled, rows: Array) -> None:
         """Take a whole record back."""
         self._column(record, rows, _Scope())
+        for (place, index, value), where in self._held.items():
+            self._parts.mark(place, index, where, value)
         if self._clouds:
             self._parts.put((), make_clouds(self._clouds, len(rows)))
 
@@ -207,12 +210,13 @@ class Undo:
             self._give_up(typed.text)
 
     def _holds(self, condition: Typed, where: Mask, scope: _Scope) -> None:
-        """Make a condition true in some rows, where one can see how."""
+        """Make `a == 1` true in some rows, unless other columns that depend on it show that it was not."""
         match condition:
             case Apply(name="==", arguments=(value, Const(value=constant))):
-                self._mark(value, where, constant, scope)
-            case Apply(name="not", arguments=(other,)):
-                self._fails(other, where, scope)
+                named = _marked_place(value, scope)
+                if named is not None:
+                    key = (*named, constant)
+                    self._held[key] = where & self._held.get(key, where)
             case _:
                 pass
 
@@ -230,10 +234,9 @@ class Undo:
                 pass
 
     def _mark(self, typed: Typed, where: Mask, value: Any, scope: _Scope) -> None:  # noqa: ANN401 - a literal
-        index = typed.index if isinstance(typed, ItemOf) else None
-        place = _place(typed.of if isinstance(typed, ItemOf) else typed, scope)
-        if place is not None and place.count(EACH) == len(scope.axes) and (index is None or index >= 0):
-            self._parts.mark(place, index, where, value)
+        named = _marked_place(typed, scope)
+        if named is not None:
+            self._parts.mark(*named, where, value)
 
     def _give_up(self, text: str) -> None:
         self.kept_out.setdefault(self._target, text)
@@ -257,6 +260,15 @@ def _place(typed: Typed, scope: _Scope) -> Place | None:
             return _place(of, scope)
         case _:
             return None
+
+
+def _marked_place(typed: Typed, scope: _Scope) -> tuple[Place, int | None] | None:
+    """Return the field that stands for a value, and which element of it; None where it computes something."""
+    index = typed.index if isinstance(typed, ItemOf) else None
+    place = _place(typed.of if isinstance(typed, ItemOf) else typed, scope)
+    if place is None or place.count(EACH) != len(scope.axes) or (index is not None and index < 0):
+        return None
+    return place, index
 
 
 def _opened(typed: Typed, values: Array) -> tuple[Array, tuple[Axis, ...]]:

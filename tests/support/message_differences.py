@@ -1,0 +1,50 @@
+"""How the messages of two recordings differ, field by field."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from mosaico_ingest.bag.loader import ROSLoader
+
+
+def messages_of(path: Path, **options: Any) -> dict[str, list[tuple[int, dict[str, Any]]]]:
+    """Return time and content of each topic's messages; those that cannot be read are left out."""
+    found: dict[str, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
+    with ROSLoader(path, error_policy="ignore", **options) as loader:
+        for message in loader:
+            found[message.topic].append((message.bag_timestamp_ns, message.data))
+    return dict(found)
+
+
+def differing(left: Any, right: Any, at: str = "") -> Iterator[str]:
+    """Yield the fields in which two messages differ, as `header.stamp`, `poses[].position`."""
+    if isinstance(left, dict) and isinstance(right, dict):
+        for name in left.keys() | right.keys():
+            yield from differing(left.get(name), right.get(name), f"{at}.{name}" if at else name)
+    elif isinstance(left, (list, tuple)) and isinstance(right, (list, tuple)):
+        if len(left) != len(right):
+            yield at
+        for one, other in zip(left, right, strict=False):
+            yield from differing(one, other, at if not isinstance(one, dict) else f"{at}[]")
+    elif isinstance(left, float) and isinstance(right, float) and math.isnan(left) and math.isnan(right):
+        return
+    elif left != right:
+        yield at
+
+
+def differences(source: Path, written: Path, **options: Any) -> dict[str, set[str]]:
+    """Return by topic the fields that differ in any message; `(count)` or `(time)` where the messages do."""
+    before, after = messages_of(source, **options), messages_of(written)
+    found: dict[str, set[str]] = {}
+    for topic, messages in before.items():
+        others = after.get(topic, [])
+        wrong = set() if len(messages) == len(others) else {"(count)"}
+        for (time, one), (other_time, other) in zip(messages, others, strict=False):
+            wrong |= set(differing(one, other)) | ({"(time)"} if time != other_time else set())
+        if wrong:
+            found[topic] = wrong
+    return found
