@@ -1,0 +1,101 @@
+"""A plan tries the first messages of each topic in memory: what would be lost shows, however rare the topic."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Ros2Writer
+from rosbags.typesys import Stores, get_typestore
+
+from mosaico_ingest.config import ROSInjectionConfig, TimeBound, TimeRange
+from mosaico_ingest.executors import trial
+from mosaico_ingest.executors.preview import preview
+from mosaico_ingest.plan.document import RecordingPlan, Sample
+
+FLOAT = b"\0\1\0\0" + bytes(8)
+START_NS = 1_700_000_000 * 10**9
+
+
+def recording(folder: Path, payloads: dict[str, list[bytes]]) -> Path:
+    """Write `std_msgs/msg/Float64` payloads as they stand, one a second on each topic."""
+    store = get_typestore(Stores.LATEST)
+    with Ros2Writer(folder / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, items in payloads.items():
+            connection = writer.add_connection(topic, "std_msgs/msg/Float64", typestore=store)
+            for second, payload in enumerate(items):
+                writer.write(connection, START_NS + second * 10**9, payload)
+    return folder / "bag"
+
+
+def planned(path: Path, **options: object) -> RecordingPlan:
+    config = ROSInjectionConfig(path, "s", store=path.parent / "store", **options)  # type: ignore[arg-type] # a test's own
+    return preview(config, connect=False)
+
+
+def sample(plan: RecordingPlan, topic: str) -> Sample:
+    return next(one for one in plan.samples if one.target == topic)
+
+
+def test_only_the_first_messages_are_tried(tmp_path: Path) -> None:
+    plan = planned(recording(tmp_path, {"/a": [FLOAT] * 500}))
+    assert trial.MESSAGES <= sample(plan, "/a").read <= 2 * trial.MESSAGES
+    assert sample(plan, "/a").rejected == 0
+    assert plan.rejected == 0
+
+
+def test_bytes_that_do_not_fit_are_counted_with_the_reason(tmp_path: Path) -> None:
+    plan = planned(recording(tmp_path, {"/a": [FLOAT, FLOAT[:-3], FLOAT], "/b": [FLOAT]}))
+    tried = sample(plan, "/a")
+    assert (tried.read, tried.rejected, tried.rejections[0].count) == (3, 1, 1)
+    assert tried.rejections[0].stage == "decode"
+    assert sample(plan, "/b").rejected == 0
+    assert plan.rejected == 1
+
+
+def test_a_topic_that_comes_late_is_tried_too(tmp_path: Path) -> None:
+    late = [FLOAT] * 400
+    path = recording(tmp_path, {"/a": late, "/late": []})
+    assert sample(planned(path), "/late").read == 0
+    (tmp_path / "more").mkdir()
+    store = get_typestore(Stores.LATEST)
+    with Ros2Writer(tmp_path / "more" / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        often = writer.add_connection("/often", "std_msgs/msg/Float64", typestore=store)
+        rare = writer.add_connection("/rare", "std_msgs/msg/Float64", typestore=store)
+        for second in range(2000):
+            writer.write(often, START_NS + second * 10**9, FLOAT)
+        writer.write(rare, START_NS + 2000 * 10**9, FLOAT)
+    assert sample(planned(tmp_path / "more" / "bag"), "/rare").read == 1
+
+
+def test_only_the_part_of_the_recording_that_is_read_is_tried(tmp_path: Path) -> None:
+    path = recording(tmp_path, {"/a": [FLOAT[:-1]] * 5 + [FLOAT] * 5})
+    window = TimeRange(TimeBound(5 * 10**9, relative=True))
+    assert sample(planned(path, time_range=window), "/a").rejected == 0
+
+
+def test_an_error_policy_is_for_the_run_not_for_the_trial(tmp_path: Path) -> None:
+    path = recording(tmp_path, {"/a": [FLOAT[:-1]] * 3})
+    plan = planned(path, messages_on_error="raise", on_error="delete")
+    assert sample(plan, "/a").rejected == 3
+    assert plan.decisions.on_message_error == "raise"
+
+
+def test_room_is_judged_by_the_rows_that_will_be_read(tmp_path: Path) -> None:
+    path = recording(tmp_path, {"/a": [FLOAT] * 100})
+    whole = planned(path).destination.estimated_bytes
+    assert whole is not None
+    assert whole >= 100 * 16
+    assert planned(path, every={"/a": 10}).destination.estimated_bytes == whole // 10
+    half = TimeRange(TimeBound(int(49.5e9), relative=True))
+    assert planned(path, time_range=half).destination.estimated_bytes == whole // 2
+
+
+def test_the_digest_names_the_decisions_and_nothing_else(tmp_path: Path) -> None:
+    path = recording(tmp_path, {"/a": [FLOAT] * 3})
+    plan = planned(path)
+    assert planned(path).digest == plan.digest
+    assert planned(path, memory_bytes=1 << 28).digest == plan.digest
+    assert planned(path, if_exists="replace").digest != plan.digest
+    assert json.loads(plan.model_dump_json())["digest"] == plan.digest
