@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import operator
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fnmatch import translate
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, cast
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -37,6 +38,8 @@ class Test(Protocol):
         ...
 
 
+_HUGE = 2**1023
+"""Whole numbers up to here are some float."""
 _COMPARISONS: Mapping[str, Callable[[Any, Any], Any]] = {
     "$eq": operator.eq,
     "$neq": operator.ne,
@@ -159,7 +162,18 @@ def tests_of(conditions: object, *, of: str) -> list[Test]:
     """Return the tests in `{operator: value, …}`, or refuse what is no such thing."""
     if not isinstance(conditions, Mapping):
         raise Refusal(Condition.INVALID, f"{of}: {conditions!r} is not {{operator: value}}")
-    return [test for name, operand in conditions.items() for test in _tests(str(name), operand, of)]
+    return [
+        test for name, operand in conditions.items() for test in _tests(str(name), _storable(operand), of)
+    ]
+
+
+def _storable(operand: object) -> object:
+    """Return an operand whose numbers Arrow can hold: whole ones beyond 64 bits as the nearest float."""
+    if isinstance(operand, list):
+        return [_storable(each) for each in cast("list[object]", operand)]  # JSON has no other lists
+    if isinstance(operand, int) and not -(2**63) <= operand < 2**63:
+        return float(operand) if abs(operand) < _HUGE else math.copysign(math.inf, operand)
+    return operand
 
 
 def _tests(name: str, operand: object, of: str) -> list[Test]:
