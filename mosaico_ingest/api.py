@@ -27,6 +27,7 @@ from mosaico_ingest.plan.model import Plan
 from mosaico_ingest.report.events import BatchObserver, Observer, ignore_batch, ignore_events
 from mosaico_ingest.report.inspection import Inspection
 from mosaico_ingest.report.model import Report, RunReport
+from mosaico_ingest.textfile import read_whole
 from mosaico_ingest.version import __version__
 
 __all__ = [
@@ -196,7 +197,7 @@ def _metadata(given: str | None) -> dict[str, Any]:
     if not given.lstrip().startswith("{"):
         where = given
         try:
-            text = Path(given).read_text(encoding="utf-8")
+            text = read_whole(Path(given)).decode()
         except OSError as error:
             raise ManifestError(
                 f"is neither a JSON object nor a file that can be read ({error.strerror})",
@@ -204,7 +205,7 @@ def _metadata(given: str | None) -> dict[str, Any]:
             ) from error
     try:
         value = json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ManifestError(f"is not JSON: {error}", where=where) from error
     if not isinstance(value, dict):
         raise ManifestError(

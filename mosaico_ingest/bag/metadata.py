@@ -9,6 +9,7 @@ from typing import Any
 import yaml
 
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.textfile import read_whole
 
 __all__ = ["FILE_NAME", "Metadata", "TopicHint", "read_metadata"]
 
@@ -48,7 +49,7 @@ def read_metadata(path: Path) -> Metadata:
     try:
         if path.stat().st_size > _LIMIT_BYTES:
             raise BagError(f"larger than {_LIMIT_BYTES} bytes", where=str(path))
-        content = yaml.load(path.read_bytes(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))  # noqa: S506 - both are safe loaders, one is fast
+        content = yaml.load(read_whole(path), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))  # noqa: S506 - both are safe loaders, one is fast
         info = content["rosbag2_bagfile_information"]
         return Metadata(
             path,

@@ -13,6 +13,7 @@ from mosaico_ingest.bag.names import normalize_msgtype
 from mosaico_ingest.bag.schemas import read_types
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.policies import Stores
+from mosaico_ingest.textfile import read_whole
 
 __all__ = ["ROSTypeRegistry", "Registered", "directory_types", "register_source", "store_of"]
 
@@ -125,7 +126,7 @@ def _is_text(source: Path | str) -> bool:
 
 def _read(path: Path) -> tuple[str, str]:
     try:
-        return path.read_text(encoding="utf-8-sig"), str(path)
+        return read_whole(path).decode("utf-8-sig"), str(path)
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
         raise BagError(f"cannot read the definition: {reason}", where=str(path)) from error

@@ -12,6 +12,7 @@ from pathlib import Path
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.manifest.source import Path as Place
 from mosaico_ingest.manifest.source import load_source
+from mosaico_ingest.textfile import read_whole
 
 __all__ = [
     "PythonReference",
@@ -60,7 +61,7 @@ def loaded_names(job: Job) -> set[str] | None:
 
 def _adapter_name(file: Path) -> str | None:
     try:
-        name = load_source(file.read_text("utf-8"), file=str(file)).at(("adapter",))
+        name = load_source(read_whole(file).decode(), file=str(file)).at(("adapter",))
     except (OSError, UnicodeDecodeError):
         return None
     return name if isinstance(name, str) else None
@@ -100,7 +101,7 @@ def read_classes(file: Path) -> dict[str, bool]:
         OSError: It cannot be read.
     """
     names: dict[str, bool] = {}
-    for node in ast.parse(file.read_bytes(), str(file)).body:
+    for node in ast.parse(read_whole(file), str(file)).body:
         if isinstance(node, ast.ClassDef):
             methods = {item.name for item in node.body if isinstance(item, ast.FunctionDef)}
             names[node.name] = bool(node.bases) or "from_dict" in methods or "bind" in methods

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from itertools import count
 from os.path import normpath, relpath
 from pathlib import Path as File
 
 from mosaico_ingest.diagnostics import Finding, Severity, Span
 from mosaico_ingest.manifest.scalars import Scalar
 from mosaico_ingest.manifest.source import Path, Source, Value, load_source
+from mosaico_ingest.textfile import read_whole
 
-__all__ = ["KEY", "bases_of", "extended"]
+__all__ = ["KEY", "MAX_FILES", "bases_of", "extended"]
 
 KEY = "extends"
+MAX_FILES = 100
+"""How many files one document may extend, each counted as often as it is named."""
 _PATHS: tuple[Path, ...] = (
     ("bag", "path"),
     ("bag", "path", None),
@@ -35,7 +39,7 @@ def extended(source: Source, *, folder: File) -> Source:
     empty value takes a key away. Paths of another file are rewritten to start in `folder`, the document's own.
     What is wrong with the other files is among the findings.
     """
-    return _extended(source, folder, ())
+    return _extended(source, folder, (), count(1))
 
 
 def bases_of(source: Source, *, folder: File) -> Iterator[tuple[File, Span]]:
@@ -47,11 +51,11 @@ def bases_of(source: Source, *, folder: File) -> Iterator[tuple[File, Span]]:
             yield File(normpath(folder / File(name).expanduser())), source.span(place)
 
 
-def _extended(source: Source, folder: File, chain: tuple[File, ...]) -> Source:
+def _extended(source: Source, folder: File, chain: tuple[File, ...], read: Iterator[int]) -> Source:
     if not isinstance(source.value, dict):
         return source
     for path, span in reversed(list(bases_of(source, folder=folder))):
-        base = _base(path, span, chain)
+        base = _base(path, span, chain, read)
         if isinstance(base, Finding):
             source = replace(source, findings=(*source.findings, base))
         else:
@@ -59,21 +63,23 @@ def _extended(source: Source, folder: File, chain: tuple[File, ...]) -> Source:
     return source
 
 
-def _base(path: File, span: Span, chain: tuple[File, ...]) -> Source | Finding:
+def _base(path: File, span: Span, chain: tuple[File, ...], read: Iterator[int]) -> Source | Finding:
     """Read a file to extend, with all it extends itself; a finding at `span` where that cannot be done."""
     here = path.resolve()
     if here in chain:
         names = " → ".join(file.name for file in (*chain[chain.index(here) :], here))
         return _finding(f"files extend one another: {names}", span, "take one of them out")
+    if next(read) > MAX_FILES:
+        return _finding(f"{path} is one of more than {MAX_FILES} files", span, "extend fewer files")
     try:
-        text = path.read_bytes().decode()
+        text = read_whole(path).decode()
     except (OSError, UnicodeDecodeError) as error:
         why = (error.strerror or str(error)).lower() if isinstance(error, OSError) else "it is not UTF-8"
         return _finding(f"{path} cannot be extended: {why}", span, "name a manifest, or a part of one")
     source = load_source(text, file=str(path))
     if not isinstance(source.value, dict) and not source.findings:
         return _finding(f"{path} cannot be extended: it holds no mapping", span, "name a part of a manifest")
-    return _extended(source, path.parent, (*chain, here))
+    return _extended(source, path.parent, (*chain, here), read)
 
 
 def _finding(message: str, span: Span, remedy: str) -> Finding:

@@ -23,6 +23,7 @@ from mosaico_ingest.manifest.scalars import resolve_plain
 from mosaico_ingest.manifest.schema import job_schema
 from mosaico_ingest.manifest.source import Path as Place
 from mosaico_ingest.manifest.source import Source, Value, load_source, member
+from mosaico_ingest.textfile import read_whole
 
 __all__ = [
     "LoadedManifest",
@@ -135,7 +136,7 @@ def read_text(path: Path) -> str:
         ManifestError: It is not there, not readable, or not UTF-8.
     """
     try:
-        return path.read_bytes().decode()
+        return read_whole(path).decode()
     except UnicodeDecodeError as err:
         message = f"not UTF-8 text: byte {err.start} is 0x{err.object[err.start]:02x}"
         finding = Finding(

@@ -10,6 +10,7 @@ __all__ = ["PLACEHOLDERS", "Placeholder", "placeholders_in"]
 
 PLACEHOLDERS = ("stem", "name", "parent", "date", "index")
 
+_WIDTH = re.compile(r"0?[0-9]")
 _BRACED = re.compile(r"\{([^{}]*)\}")
 
 
@@ -26,7 +27,7 @@ class Placeholder:
     def known(self) -> bool:
         """Whether something can stand for it; only `index` has a width."""
         return self.name in PLACEHOLDERS and (
-            not self.width or (self.name == "index" and self.width.isdigit())
+            not self.width or (self.name == "index" and _WIDTH.fullmatch(self.width) is not None)
         )
 
 

@@ -21,6 +21,8 @@ _OLD_BOOLEANS = {"yes": "true", "on": "true", "no": "false", "off": "false"}
 _INTEGER = re.compile(r"[-+]?[0-9]+")
 _HEXADECIMAL = re.compile(r"0x[0-9a-fA-F]+")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+_WHOLE = re.compile(r"[-+]?(0x[0-9a-fA-F]+|0?o?[0-9]+)")
+_LONGEST_NUMBER = 1000
 _OCTAL = re.compile(r"[-+]?0o?[0-7]+")
 _OTHER_NUMBER = re.compile(
     r"[-+]?(0b[01_]+|0x[0-9a-fA-F]*_[0-9a-fA-F_]*|[0-9][0-9_]*_[0-9_]*(\.[0-9_]*)?|[0-9]+(:[0-5]?[0-9])+(\.[0-9]*)?)"
@@ -46,6 +48,9 @@ def resolve_plain(text: str) -> tuple[Scalar, Trap | None]:
         return text, Trap("yaml-boolean", message, f'write {meant}, or "{text}" for the text')
     if text[:1] not in "+-.0123456789":
         return text, None
+    if len(text) > _LONGEST_NUMBER and _WHOLE.fullmatch(text):
+        message = f"a number of {len(text)} characters"
+        return text, Trap("yaml-number", message, f"quote it, or write at most {_LONGEST_NUMBER}")
     return _number(text)
 
 

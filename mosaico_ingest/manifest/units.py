@@ -8,7 +8,7 @@ from typing import Final
 
 __all__ = ["parse_instant", "parse_limit", "parse_offset", "parse_size"]
 
-_SIZE = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?([kKMGT]?i?B)")
+_SIZE = re.compile(r"([0-9]{1,18}(?:\.[0-9]{1,18})?) ?([kKMGT]?i?B)")
 _BYTES: Final = {
     "B": 1,
     **{f"{letter}B": 1000**power for power, letter in enumerate(("k", "M", "G", "T"), 1)},
@@ -16,7 +16,7 @@ _BYTES: Final = {
     "KB": 1000,
     "kiB": 1024,
 }
-_OFFSET = re.compile(r"([+-])([0-9]+(?:\.[0-9]+)?) ?(ns|us|ms|s|min|h)")
+_OFFSET = re.compile(r"([+-])([0-9]{1,18}(?:\.[0-9]{1,18})?) ?(ns|us|ms|s|min|h)")
 _NANOSECONDS: Final = {
     "ns": 1,
     "us": 1_000,
@@ -28,7 +28,7 @@ _NANOSECONDS: Final = {
 _INSTANT = re.compile(
     r"(\d{4}-\d\d-\d\d)(?:[Tt ](\d\d:\d\d(?::\d\d)?)(?:\.(\d{1,9}))?)? ?(Z|z|[+-]\d\d:\d\d)?"
 )
-_LIMIT = re.compile(r"([0-9]+)|([0-9]+(?:\.[0-9]+)?) ?%")
+_LIMIT = re.compile(r"([0-9]{1,18})|([0-9]{1,18}(?:\.[0-9]{1,18})?) ?%")
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 
 

@@ -14,6 +14,7 @@ from mosaico_ingest.manifest.load import LoadedManifest
 from mosaico_ingest.manifest.units import parse_instant, parse_limit, parse_offset, parse_size
 from mosaico_ingest.plan.recordings import Recording, find_recordings, sequence_name
 from mosaico_ingest.policies import TopicLevelErrorPolicy
+from mosaico_ingest.textfile import read_whole
 
 __all__ = ["compile_manifest", "compile_manifests"]
 
@@ -183,12 +184,12 @@ def _metadata(loaded: LoadedManifest) -> dict[str, Any]:
 def _metadata_file(loaded: LoadedManifest, path: Path) -> dict[str, Any]:
     where = loaded.where("sequence", "metadata_file")
     try:
-        metadata = json.loads(path.read_bytes())
+        metadata = json.loads(read_whole(path))
     except OSError as err:
         raise ManifestError(
             f"{path} cannot be read: {(err.strerror or str(err)).lower()}", where=where
         ) from err
-    except ValueError as err:
+    except (ValueError, RecursionError) as err:
         raise ManifestError(f"{path} is not JSON: {err}", where=where) from err
     if not isinstance(metadata, dict):
         raise ManifestError(f"{path} holds no JSON object", where=where, hint='write {"key": "value"}')

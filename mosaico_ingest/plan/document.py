@@ -18,6 +18,7 @@ from mosaico_ingest.policies import (
     TopicLevelErrorPolicy,
 )
 from mosaico_ingest.report.part import Part
+from mosaico_ingest.textfile import read_whole
 
 __all__ = [
     "Decisions",
@@ -205,7 +206,7 @@ def read_plan(path: Path) -> PlanDocument:
     """
     hint = "make one with `ingest plan job.yaml --out plan.json`"
     try:
-        return PlanDocument.model_validate_json(path.read_bytes())
+        return PlanDocument.model_validate_json(read_whole(path))
     except OSError as error:
         raise ManifestError(f"cannot be read: {error.strerror}", where=str(path), hint=hint) from error
     except ValidationError as error:

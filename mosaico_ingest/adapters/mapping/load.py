@@ -30,6 +30,7 @@ from mosaico_ingest.manifest.problems import explain
 from mosaico_ingest.manifest.source import Source, load_source
 from mosaico_ingest.ontology.registry import UnknownTag, ontology_type
 from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.textfile import read_whole
 
 __all__ = ["MappingAdapter", "MappingSpec", "load_adapter"]
 
@@ -161,7 +162,7 @@ def load_adapter(
     if isinstance(path_or_text, Path):
         file = file or str(path_or_text)
         try:
-            path_or_text = path_or_text.read_text("utf-8")
+            path_or_text = read_whole(path_or_text).decode()
         except (OSError, UnicodeDecodeError) as error:
             raise AdapterError(f"the adapter file cannot be read: {error}", where=file) from error
     source = load_source(path_or_text, file=file or "<adapter>")
