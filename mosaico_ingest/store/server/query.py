@@ -10,7 +10,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from functools import reduce
 from operator import and_
-from typing import Any
+from typing import Any, cast
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -57,7 +57,9 @@ def _about(asked: Mapping[str, Any], fields: Sequence[str], kind: str) -> Tests:
     tests: list[tuple[str, Test]] = []
     for field, conditions in asked.items():
         if field == "user_metadata":
-            for path, inner in dict(conditions).items():
+            if not isinstance(conditions, Mapping):
+                raise Refusal(Condition.INVALID, f"user_metadata: {conditions!r} is not {{path: conditions}}")
+            for path, inner in cast("Mapping[str, Any]", conditions).items():  # JSON's keys are text
                 tests += [(f"user_metadata.{path}", test) for test in tests_of(inner, of=path)]
         elif field in fields:
             tests += [(field, test) for test in tests_of(conditions, of=field)]
