@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mosaico_ingest.config import ROSInjectionConfig, ServerTarget, StoreTarget, TimeBound, TimeRange
+from mosaico_ingest.config import Limit, QuarantineSettings, ROSInjectionConfig, ServerTarget, StoreTarget, TimeBound, TimeRange
 from mosaico_ingest.errors import IngestError, ManifestError, NothingMatched
 from mosaico_ingest.manifest.load import load_manifest
 from mosaico_ingest.plan.compile import compile_manifest
@@ -59,6 +59,7 @@ adapters:
   unmodeled: skip
   serialization_formats: {p/msg/Scan: ragged}
 on_error: {session: delete, topic: {default: finalize, /gps: ignore}, message: raise}
+quarantine: {path: q, max: 0.1%, max_run: 100, systematic: 7}
 target: {host: h, port: 1, api_key: "${KEY}", tls_cert: ca.pem, tls: true}
 run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
 """,
@@ -89,6 +90,7 @@ run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
         on_error=SessionLevelErrorPolicy.Delete,
         topics_on_error={"default": TopicLevelErrorPolicy.Finalize, "/gps": TopicLevelErrorPolicy.Ignore},
         messages_on_error=LoaderErrorPolicy.RAISE,
+        quarantine=QuarantineSettings(folder / "q", Limit(share=0.001), Limit(100), 7),
         log_level="DEBUG",
         report_path=folder / "r.json",
         memory_bytes=2**20,
