@@ -9,8 +9,10 @@ import pytest
 from hypothesis import settings
 
 # Machines are noisy: how long an example takes says nothing about the code.
-settings.register_profile("unhurried", deadline=None)
-settings.load_profile("unhurried")
+# CI tries the same examples each time, so that it judges the change; everybody else explores.
+settings.register_profile("ci", deadline=None, derandomize=True)
+settings.register_profile("explore", deadline=None)
+settings.load_profile("ci" if "CI" in os.environ else "explore")
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("MOSAICO_SHARED", ROOT.parent / "shared"))
