@@ -60,24 +60,35 @@ def guess_columns(struct: DataType, definition: Definition, shape: pa.StructType
 
 def _column(field: DataType, known: Sequence[_Candidate]) -> Guess:
     type_ = spell(field.type)
-    for candidate in _by_likeness(field.name, known):
-        value = _fitting(candidate, field.type)
-        if value is not None:
-            return Guess(field.name, value, f"{type_}, {'may be null' if field.nullable else 'required'}")
+    for some in _by_likeness(field, known):
+        values = [value for one in some if (value := _fitting(one, field.type)) is not None]
+        if len(values) == 1:
+            return Guess(field.name, values[0], f"{type_}, {'may be null' if field.nullable else 'required'}")
+    perhaps = ", ".join(
+        one.text for one in known if len(one.path) == 1 and _resembles(field.name, one.path[0])
+    )
+    note = f"{type_}, perhaps {perhaps}" if perhaps else type_
     if field.nullable:
-        return Guess(field.name, None, type_)
+        return Guess(field.name, None, note)
     if pt.is_struct(field.type):
         inner = tuple(_column(child, ()) for child in field.type)
         return Guess(field.name, None, "required: no field is called so", inner)
-    return Guess(field.name, _nothing(field.type), f"{type_}, required: no field is called so")
+    return Guess(field.name, _nothing(field.type), f"{note}, required: no field is called so")
 
 
-def _by_likeness(name: str, known: Sequence[_Candidate]) -> Iterator[_Candidate]:
-    """Yield the fields with a column's name, then those that have it in theirs; the shallow before the deep."""
-    plain = _plain(name)
-    yield from (one for one in known if _plain(one.path[-1]) == plain)
-    if len(plain) >= _TELLING:
-        yield from (one for one in known if plain in _plain(one.path[-1]) and one.msgtype is not None)
+def _by_likeness(field: DataType, known: Sequence[_Candidate]) -> Iterator[list[_Candidate]]:
+    """Yield fields that may be meant, the likeliest first; of several at once none is taken."""
+    named = [one for one in known if _plain(one.path[-1]) == _plain(field.name)]
+    yield [one for one in named if len(one.path) == 1]
+    yield named
+    if pt.is_struct(field.type):
+        yield [one for one in known if one.msgtype is not None and _resembles(field.name, one.path[-1])]
+        if not field.nullable:
+            yield [one for one in known if one.msgtype is not None and len(one.path) == 1]
+
+
+def _resembles(column: str, name: str) -> bool:
+    return len(column) >= _TELLING and _plain(column) in _plain(name)
 
 
 def _candidates(

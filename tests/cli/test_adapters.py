@@ -1,0 +1,202 @@
+"""`ingest adapters`: what is there, what it does, whether it does it, and a draft of what is not there yet."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from mosaico_ingest.adapters.builtin import BUILTIN, BY_NAME
+from mosaico_ingest.adapters.definitions import KnownTypes
+from mosaico_ingest.cli.app import main
+from mosaico_ingest.executors.catalog import explain_adapter
+
+Ingest = Callable[..., tuple[int, str, str]]
+ROOT = Path(__file__).resolve().parents[2]
+JOB = ROOT / "configs" / "quickstart.yaml"
+BAG = ROOT / "configs" / "quickstart" / "drive.mcap"
+PACK = ROOT / "configs" / "quickstart" / "adapters" / "battery_pack.yaml"
+MESSAGES = ROOT / "configs" / "quickstart" / "acme_msgs"
+
+
+@pytest.fixture
+def ingest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Ingest:
+    """Run `ingest adapters …` in an empty folder; return exit code, output and errors."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as leave:
+            main(["adapters", *map(str, arguments)])
+        out, err = capsys.readouterr()
+        assert "Traceback" not in err
+        return int(leave.value.code or 0), out, err
+
+    return run
+
+
+def test_every_built_in_adapter_is_listed(ingest: Ingest) -> None:
+    code, out, _ = ingest("list", "--json")
+    assert code == 0
+    assert [one["name"] for one in json.loads(out)] == [builtin.name for builtin in BUILTIN]
+    assert "by override" in ingest("list")[1]
+
+
+@pytest.mark.parametrize("glob", ["sensor_msgs/msg/Imu", "sensor_msgs/Im*", "Imu"])
+def test_the_list_can_be_of_one_type(ingest: Ingest, glob: str) -> None:
+    names = [one["name"] for one in json.loads(ingest("list", "--type", glob, "--json")[1])]
+    assert "IMUAdapter" in names
+    assert "PoseAdapter" not in names
+
+
+def test_show_prints_the_file_as_it_is(ingest: Ingest) -> None:
+    assert ingest("show", "IMUAdapter")[1] == BY_NAME["IMUAdapter"].path.read_text()
+    assert ingest("show", PACK)[1] == PACK.read_text()
+
+
+def test_an_adapter_that_is_not_there_names_the_nearest(ingest: Ingest) -> None:
+    code, _, err = ingest("show", "ImuAdaptr")
+    assert code == 1
+    assert "did you mean" in err
+
+
+def test_every_built_in_adapter_is_explained_column_by_column() -> None:
+    types = KnownTypes()
+    for builtin in BUILTIN:
+        found = explain_adapter(builtin.name, types).description
+        struct = builtin.mapping.ontology.struct
+        origins = {column.name: column.origin for column in found.columns}
+        assert found.ontology == builtin.tag
+        assert {field.name for field in struct} <= origins.keys()
+        assert all(origins[field.name] is not None for field in struct if not field.nullable)
+
+
+def test_a_type_is_explained_by_the_adapter_it_gets(ingest: Ingest) -> None:
+    found = json.loads(ingest("explain", "sensor_msgs/PointCloud2", "--json")[1])
+    assert found["description"]["name"] == "PointCloudAdapter"
+    assert found["why"] == "built-in for sensor_msgs/msg/PointCloud2"
+    assert "LidarAdapter" in found["others"]
+    assert "Unmodeled" in ingest("explain", "std_msgs/msg/ColorRGBA")[1]
+
+
+def test_what_a_variant_adds_is_explained_for_its_type(ingest: Ingest) -> None:
+    found = json.loads(ingest("explain", "geometry_msgs/msg/PoseStamped", "--json")[1])
+    origins = {column["name"]: column["origin"] for column in found["description"]["columns"]}
+    assert origins["header"] == "header"
+    assert origins["covariance"] is None
+    assert found["description"]["takes"]["geometry_msgs/msg/PoseWithCovarianceStamped"] == "pose.pose"
+
+
+def test_fields_of_the_message_that_are_left_out_are_named(ingest: Ingest) -> None:
+    _, out, _ = ingest("explain", PACK, "--msg-dir", MESSAGES)
+    assert "current_ma" in out
+    assert "left out" not in out
+    text = PACK.read_text().replace("  current: -current_ma / 1000\n", "").replace("current: -0.5, ", "")
+    Path("less.yaml").write_text(text)
+    assert "left out of the message: current_ma" in ingest("explain", "less.yaml", "--msg-dir", MESSAGES)[1]
+
+
+def test_every_topic_of_a_job_says_which_adapter_and_why(ingest: Ingest) -> None:
+    topics = {one["topic"]: one for one in json.loads(ingest("explain", "--job", JOB, "--json")[1])}
+    assert topics["/battery"]["adapter"] == "BatteryPackAdapter"
+    assert topics["/battery"]["why"] == "loaded from quickstart/adapters/battery_pack.yaml"
+    assert topics["/camera/image_raw"]["adapter"] == ""
+    assert "`topics`" in topics["/camera/image_raw"]["why"]
+
+
+def test_every_topic_of_a_recording_says_which_adapter_and_why(ingest: Ingest) -> None:
+    code, out, _ = ingest("explain", "--bag", BAG)
+    assert code == 0
+    assert "built-in for sensor_msgs/msg/Imu" in out
+    assert "no adapter takes acme_msgs/msg/BatteryPack" in out
+
+
+def test_all_built_in_tests_pass(ingest: Ingest) -> None:
+    code, out, _ = ingest("test", "--all")
+    assert code == 0
+    assert f"{len(BUILTIN)} adapters" in out
+
+
+def test_a_test_that_fails_says_where_and_what_came_out(ingest: Ingest) -> None:
+    Path("pack.yaml").write_text(PACK.read_text().replace("voltage: 12.0", "voltage: 13.0"))
+    code, out, _ = ingest("test", "pack.yaml", "--msg-dir", MESSAGES)
+    assert code == 1
+    assert "pack.yaml:23: discharging" in out
+    assert "voltage: expected 13.0, got 12.0" in out
+    assert "0 of 1 tests passed" in out
+
+
+def test_an_adapter_that_does_not_fit_its_type_is_shown_with_its_source(ingest: Ingest) -> None:
+    Path("pack.yaml").write_text(PACK.read_text().replace("soc / 100", "charge_left / 100"))
+    code, out, _ = ingest("test", "pack.yaml", "--msg-dir", f"acme_msgs={MESSAGES}")
+    assert code == 1
+    assert "pack.yaml:12:15" in out
+    assert "charge_left" in out
+
+
+def test_a_test_can_be_a_recorded_message(ingest: Ingest, tmp_path: Path) -> None:
+    text = PACK.read_text()
+    test = f"tests:\n  - name: recorded\n    given: {{bag: {BAG}, topic: /battery, index: 2}}\n    expect: {{serial_number: PK-0042}}\n"
+    (tmp_path / "pack.yaml").write_text(text[: text.index("tests:")] + test)
+    assert ingest("test", "pack.yaml", "--msg-dir", MESSAGES)[0] == 0
+    (tmp_path / "pack.yaml").write_text(
+        (tmp_path / "pack.yaml").read_text().replace("index: 2", "index: 99999")
+    )
+    code, out, _ = ingest("test", "pack.yaml", "--msg-dir", MESSAGES)
+    assert code == 1
+    assert "there is none at index 99999" in out
+
+
+@pytest.mark.parametrize("ontology", [(), ("--ontology", "BatteryState")])
+def test_a_draft_of_a_recorded_message_passes_its_test_and_the_linter(
+    ingest: Ingest, capsys: pytest.CaptureFixture[str], ontology: tuple[str, ...]
+) -> None:
+    draft = (
+        "init",
+        "acme_msgs/BatteryPack",
+        "--bag",
+        BAG,
+        "--record",
+        "/battery",
+        *ontology,
+        "-o",
+        "draft.yaml",
+    )
+    assert ingest(*draft)[0] == 0
+    assert "PK-0042" in Path("draft.yaml").read_text()
+    assert ingest("test", "draft.yaml")[0] == 0
+    with pytest.raises(SystemExit) as leave:
+        main(["lint", "draft.yaml"])
+    assert not leave.value.code, capsys.readouterr().out
+    assert ingest(*draft)[0] == 2  # it is there already
+
+
+@pytest.mark.parametrize("topic", ["/imu", "/lidar/points", "/odom", "/camera/image_raw/compressed"])
+def test_a_draft_made_of_a_large_message_names_it_by_its_place(ingest: Ingest, topic: str) -> None:
+    topics = json.loads(ingest("explain", "--bag", BAG, "--json")[1])
+    chosen = next(one for one in topics if one["topic"] == topic)
+    code, out, _ = ingest(
+        "init", chosen["msgtype"], "--bag", BAG, "--record", topic, "--ontology", chosen["ontology"]
+    )
+    assert code == 0
+    Path("draft.yaml").write_text(out)
+    assert ingest("test", "draft.yaml")[0] == 0
+
+
+def test_a_draft_of_an_unknown_type_says_where_it_was_looked_for(ingest: Ingest) -> None:
+    code, _, err = ingest("init", "nosuch_msgs/Type")
+    assert code == 1
+    assert "searched" in err
+    code, _, err = ingest("init", "acme_msgs/BatteryPack", "--bag", BAG, "--record", "/imu")
+    assert code == 1
+    assert "it carries sensor_msgs/msg/Imu" in err
+
+
+@pytest.mark.parametrize(
+    "arguments", [("explain",), ("test",), ("test", "IMUAdapter", "--all"), ("init", "a/B", "--record", "/x")]
+)
+def test_a_command_that_does_not_know_what_is_meant_says_so(
+    ingest: Ingest, arguments: tuple[str, ...]
+) -> None:
+    assert ingest(*arguments)[0] == 2
