@@ -8,7 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from mosaico_ingest.config import Limit, QuarantineSettings, ROSInjectionConfig, ServerTarget, StoreTarget, TimeBound, TimeRange
+from mosaico_ingest.config import (
+    Limit,
+    QuarantineSettings,
+    ROSInjectionConfig,
+    ServerTarget,
+    StoreTarget,
+    TimeBound,
+    TimeRange,
+)
 from mosaico_ingest.errors import IngestError, ManifestError, NothingMatched
 from mosaico_ingest.manifest.load import load_manifest
 from mosaico_ingest.plan.compile import compile_manifest

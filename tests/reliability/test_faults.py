@@ -1,0 +1,231 @@
+"""Jobs that are killed, stopped, starved of space or deprived of their files: the old state or the new, and an answer."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from mosaico_ingest import api
+from mosaico_ingest.report.events import Event, RunStatus, TopicProgress
+from mosaico_ingest.store import Store
+
+from .conftest import RunJob, WriteBag, number
+
+WriteJob = Callable[..., Path]
+REPLACE = {"name": "drive", "if_exists": "replace"}
+
+
+def start(job: Path) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "mosaico_ingest.cli.app", "run", "-q", str(job)]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)  # noqa: S603 - this interpreter, our own command
+
+
+def speeds(store: Store) -> list[float]:
+    return store.scan("drive", "/speed").read_all()["data"].to_pylist()
+
+
+def kill_and_look(write_bag: WriteBag, job: Path, store: Path, rounds: int) -> int:
+    """Replace the sequence again and again, killing each run; return how many got through in time."""
+    moments = random.Random()  # noqa: S311 - any moment will do
+    survivor = 0.0
+    through = 0
+    for source in range(1, rounds + 1):
+        (job.parent / "drive.db3").unlink(missing_ok=True)
+        write_bag({"/speed": [number(source)] * 3000})
+        process = start(job)
+        try:
+            process.wait(0.3 + moments.random() * 0.9)
+        except subprocess.TimeoutExpired:
+            process.kill()
+        process.communicate()
+        if not (store / "catalog.sqlite").exists() or "drive" not in Store.open(store).names():
+            assert not survivor, "the old state is gone"
+            continue
+        found = speeds(Store.open(store))
+        assert found == [found[0]] * 3000
+        assert found[0] in {survivor, source}
+        through += found[0] == source
+        survivor = found[0]
+    return through
+
+
+def test_a_killed_job_leaves_the_old_or_the_new_and_the_next_completes_it(
+    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
+) -> None:
+    job = write_job(sequence=REPLACE)
+    kill_and_look(write_bag, job, tmp_path / "store", 2)
+    assert run_job(job).status is RunStatus.COMPLETED
+    store = Store.open(tmp_path / "store")
+    store.collect_garbage(grace_s=0)
+    assert set(store.layout.segment_files()) == set(store.paths("drive", "/speed"))
+
+
+@pytest.mark.slow
+def test_a_killed_job_leaves_the_old_or_the_new_200_times(
+    write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
+) -> None:
+    through = kill_and_look(write_bag, write_job(sequence=REPLACE), tmp_path / "store", 200)
+    assert 0 < through < 200, "the moments were not where they matter"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number_of_signal", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_stops_a_job_within_a_second_or_two(
+    number_of_signal: signal.Signals, write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [number(1)] * 200_000})
+    process = start(write_job(on_error={"session": "delete"}, topic_settings={"/speed": {"every": 1}}))
+    while process.poll() is None and not list((tmp_path / "store").glob("staging/*")):
+        time.sleep(0.005)
+    process.send_signal(number_of_signal)
+    _, said = process.communicate(timeout=10)
+    if process.returncode == 0:
+        pytest.skip("the machine was faster than the signal")
+    assert process.returncode == 130
+    assert said.startswith("error: ")
+    assert Store.open(tmp_path / "store").names() == ()
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 1 MiB, where this user may mount one."""
+    folder = tmp_path / "small"
+    folder.mkdir()
+    mount, umount = shutil.which("mount"), shutil.which("umount")
+    if mount is None or umount is None:
+        pytest.skip("there is no mount command")
+    made = subprocess.run(  # noqa: S603 - a system command with our own arguments
+        [mount, "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)],
+        capture_output=True,
+        check=False,
+        text=True,
+    )
+    if made.returncode:
+        pytest.skip(f"no file system may be mounted here: {made.stderr.strip()}")
+    yield folder
+    subprocess.run([umount, str(folder)], check=True)  # noqa: S603 - as above
+
+
+def test_a_full_disk_is_said_and_leaves_the_old_sequence(
+    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, small_disk: Path
+) -> None:
+    job = write_job(sequence=REPLACE, target={"store": str(small_disk / "store")})
+    write_bag({"/speed": [number(1)]})
+    assert run_job(job).status is RunStatus.COMPLETED
+    (job.parent / "drive.db3").unlink()
+    noise = random.Random(1)  # noqa: S311 - numbers that do not compress
+    write_bag({"/speed": [number(noise.random()) for _ in range(150_000)]})
+    report = run_job(job)
+    assert (report.status, report.exit_code) == (RunStatus.FAILED, 1)
+    assert "No space left" in str(report.error)
+    store = Store.open(small_disk / "store")
+    assert speeds(store) == [1.0]
+    assert store.layout.open_sessions() == []
+
+
+def test_a_store_that_cannot_be_written_is_said(
+    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, small_disk: Path
+) -> None:
+    write_bag({"/speed": [number(1)]})
+    job = write_job(sequence=REPLACE, target={"store": str(small_disk / "store")})
+    run_job(job)
+    remount = [str(shutil.which("mount")), "-o", "remount,ro", str(small_disk)]
+    subprocess.run(remount, check=True)  # noqa: S603 - as above
+    report = run_job(job)
+    assert report.exit_code == 1
+    assert str(small_disk / "store") in str(report.error)
+    assert speeds(Store.open(small_disk / "store", create=False)) == [1.0]
+
+
+@pytest.mark.parametrize("in_the_way", ["store", "store/catalog.sqlite"])
+def test_something_else_where_the_store_should_be_is_said(
+    in_the_way: str, write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [number(1)]})
+    (tmp_path / in_the_way).parent.mkdir(exist_ok=True)
+    (tmp_path / in_the_way).write_text("something else")
+    report = run_job(write_job())
+    assert report.exit_code == 1
+    assert str(tmp_path / "store") in str(report.error)
+    assert (tmp_path / in_the_way).read_text() == "something else"
+
+
+def interrupted_by(job: Path, act: Callable[[], object]) -> tuple[RunStatus, int, str]:
+    """Run a job and do something to its files once the first rows are written."""
+    done: list[bool] = []
+
+    def tell(_position: int, event: Event) -> None:
+        if isinstance(event, TopicProgress) and event.written and not done:
+            done.append(True)
+            act()
+
+    (report,) = api.run(api.compile_job(job), observe=tell).recordings
+    assert done
+    return report.status, report.exit_code, str(report.error)
+
+
+def test_a_store_that_is_deleted_under_way_is_said(
+    write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [number(1)] * 70_000})
+    status, code, said = interrupted_by(write_job(), lambda: shutil.rmtree(tmp_path / "store"))
+    assert (status, code) == (RunStatus.FAILED, 1)
+    assert "store" in said
+
+
+def test_a_recording_that_is_cut_off_while_it_is_read_loses_nothing_in_silence(
+    write_bag: WriteBag, write_job: WriteJob
+) -> None:
+    bag = write_bag({"/speed": [number(1)] * 150_000})
+    status, code, said = interrupted_by(write_job(), lambda: os.truncate(bag, bag.stat().st_size // 2))
+    assert status is not RunStatus.COMPLETED, said
+    assert code in {1, 4, 5}
+
+
+def test_two_jobs_write_two_sequences_of_one_store_at_once(
+    write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [number(1)] * 20_000})
+    jobs = [write_job(file=f"{name}.yaml", sequence={"name": name}) for name in ("one", "two")]
+    running = [start(job) for job in jobs]
+    assert [(process.communicate()[1], process.returncode) for process in running] == [("", 0)] * 2
+    store = Store.open(tmp_path / "store")
+    assert [info.rows for info in store.sequences()] == [20_000] * 2
+
+
+def test_one_of_two_jobs_gets_the_name(write_bag: WriteBag, write_job: WriteJob, tmp_path: Path) -> None:
+    write_bag({"/speed": [number(1)] * 20_000})
+    job = write_job()
+    running = [start(job), start(job)]
+    ended = sorted((process.communicate()[1], process.returncode) for process in running)
+    assert [code for _, code in ended] == [0, 1]
+    assert "exists" in ended[1][0] or "another run is writing" in ended[1][0]
+    assert len(speeds(Store.open(tmp_path / "store"))) == 20_000
+
+
+def test_stamps_that_repeat_or_go_back_keep_every_message(
+    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
+) -> None:
+    import sqlite3  # noqa: PLC0415 - for this one
+
+    bag = write_bag({"/speed": [number(value) for value in range(100)]})
+    db = sqlite3.connect(bag)
+    db.execute("UPDATE messages SET timestamp = timestamp - 500000000 WHERE rowid % 3 = 0")
+    db.execute("UPDATE messages SET timestamp = 1700000000000000000 WHERE rowid % 7 = 0")
+    db.commit()
+    db.close()
+    report = run_job(write_job())
+    assert (report.status, report.totals.written) == (RunStatus.COMPLETED, 100)
+    table = Store.open(tmp_path / "store").scan("drive", "/speed").read_all()
+    times = table["timestamp_ns"].to_pylist()
+    assert times == sorted(times)
+    assert sorted(table["data"].to_pylist()) == list(range(100))
