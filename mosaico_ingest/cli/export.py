@@ -17,7 +17,7 @@ NOT_ALL = 4
 
 
 def export(
-    sequence: Annotated[str, typer.Argument(help="The sequence to write.")],
+    sequence: Annotated[str, typer.Argument(metavar="SEQUENCE", help="The sequence to write.")],
     *,
     to: Annotated[
         Path,

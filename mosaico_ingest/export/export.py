@@ -60,6 +60,10 @@ def export_sequence(
         streams = [_stream(store, channel, restorer, start_ns, end_ns) for channel, restorer in restorers]
         for log_ns, channel, payload in heapq.merge(*streams, key=lambda message: message[0]):
             writer.write(channel, log_ns, payload)
+        if not any(restorer.messages for _, restorer in restorers):
+            raise NothingMatched(
+                "there is no message to write", where=sequence, hint="look at --start and --end"
+            )
     accounts = [*(restorer.account() for _, restorer in restorers), *left]
     accounts.sort(key=lambda one: one.topic)
     return ExportReport(sequence=sequence, path=str(path), bytes=path.stat().st_size, topics=tuple(accounts))
