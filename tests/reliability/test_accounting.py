@@ -1,0 +1,115 @@
+"""Every message that an index promises was read, or is known to be unreadable; what is stored is what was written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from mosaico_ingest import api
+from mosaico_ingest.bag.batch import Loss
+from mosaico_ingest.cli.app import main
+from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.errors import VerificationError
+from mosaico_ingest.executors.worker import execute, make_plan
+from mosaico_ingest.injector import _missing
+from mosaico_ingest.report.events import Event, Noted, RunStatus, Unreadable
+from mosaico_ingest.sink import MemorySink, StoredTopic
+from mosaico_ingest.store import Store
+
+from .conftest import RunJob, WriteBag, number
+
+WriteJob = Callable[..., Path]
+DRIVE = Path(__file__).parents[2] / "configs" / "quickstart" / "drive.mcap"
+
+
+def missing(
+    promised: int | None, seen: int, losses: list[Loss], **plan: Any
+) -> tuple[list[str], list[Event]]:
+    events: list[Event] = []
+    topic = SimpleNamespace(target="/t", count=promised, channels=(7,))
+    recording: Any = SimpleNamespace(losses=losses)
+    wanted: Any = SimpleNamespace(**{"read_from_ns": None, "read_until_ns": None, **plan})
+    streams: Any = (SimpleNamespace(plan=topic, seen=seen),)
+    return _missing(wanted, recording, streams, events.append), events
+
+
+def test_messages_nobody_can_account_for_are_a_difference() -> None:
+    wrong, events = missing(10, 8, [Loss("f", 0, "bad", 7, 1)])
+    assert wrong == ["/t: the index promises 10 messages, 8 were read and nothing says where the others are"]
+    assert not events
+
+
+def test_messages_in_a_stretch_nobody_can_read_are_accounted_for() -> None:
+    wrong, events = missing(10, 8, [Loss("f", 0, "bad", None, None)])
+    assert not wrong
+    assert events == [Unreadable("/t", 2, None, "they lie in what could not be read")]
+    assert missing(10, 8, [Loss("f", 0, "bad", 7, 2)]) == ([], [])
+
+
+def test_more_than_promised_is_no_loss() -> None:
+    wrong, (event,) = missing(10, 12, [])
+    assert not wrong
+    assert isinstance(event, Noted)
+    assert event.finding.rule == "more-than-promised"
+
+
+def test_part_of_a_recording_owes_nothing() -> None:
+    assert missing(10, 1, [], read_from_ns=5) == ([], [])
+    assert missing(None, 1, []) == ([], [])
+
+
+def test_the_sums_of_a_damaged_recording_hold(tmp_path: Path) -> None:
+    data = bytearray(DRIVE.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 60_000] = bytes(60_000)
+    bag = tmp_path / "drive.mcap"
+    bag.write_bytes(data)
+    (report,) = api.run([ROSInjectionConfig(bag, "drive", store=tmp_path / "store")]).recordings
+    assert (report.status, report.exit_code) == (RunStatus.REJECTED, 4)
+    assert report.losses
+    taken = [topic for topic in report.topics if topic.promised is not None]
+    assert sum(topic.unreadable for topic in taken) > 0
+    for topic in taken:
+        assert topic.promised == topic.read + topic.unreadable
+        assert topic.read == topic.written + topic.filtered + topic.downsampled + topic.rejected
+
+
+def test_a_destination_that_loses_rows_fails_the_run(
+    write_bag: WriteBag, write_job: WriteJob, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_bag({"/speed": [number(1), number(2)]})
+    (config,) = api.compile_job(write_job())
+    monkeypatch.setattr(
+        "mosaico_ingest.sink._MemorySession.stored", lambda _self: (StoredTopic("/speed", 1, 0, 0, 8),)
+    )
+    report, failure = execute(make_plan(config), lambda _event: None, sink=MemorySink())
+    assert isinstance(failure, VerificationError)
+    assert report.exit_code == 5
+    assert "wrote 2 rows" in str(report.error)
+    assert "found 1 rows" in str(report.error)
+
+
+@pytest.mark.parametrize("damage", ["flip", "cut", "remove"])
+def test_verify_finds_what_changed_on_the_disk(
+    damage: str, write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [number(value) for value in range(500)]})
+    run_job(write_job())
+    store = Store.open(tmp_path / "store")
+    arguments = ["verify", "drive", "--store", str(store.path), "--json"]
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 0
+    (segment,) = store.paths("drive", "/speed")
+    data = bytearray(segment.read_bytes())
+    data[100] ^= 0xFF
+    segment.unlink()
+    if damage != "remove":
+        segment.write_bytes(data if damage == "flip" else data[:-20])
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 5
