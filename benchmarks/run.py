@@ -1,0 +1,236 @@
+"""Measures whole runs, from the recording to the committed store, against the floor and the official injector.
+
+    ./dev bench                               all workloads, three runs each
+    ./dev bench --quick                       short recordings, one run each
+    ./dev bench --peer ~/sdk/bin/python       also the official injector (a venv with mosaicolabs), into a server
+                                              that throws everything away
+    ./dev bench --recording drive.mcap        a recording of one's own
+
+The floor reads and inflates every chunk, then writes ready-made tables of the same rows with the same settings.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+
+from measure import Sample, run, typical
+from workloads import BY_NAME, SHORT, WORKLOADS, Workload
+
+HERE = Path(__file__).parent
+MOST_PEAK_MB = 512
+MOST_HELP_S = 0.4
+INGEST = (sys.executable, "-m", "mosaico_ingest")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A recording, the one the official injector is timed on, and what is demanded."""
+
+    name: str
+    recording: Path
+    for_peer: Path
+    least_peer: float = 0.0
+    most_floor: float = 0.0
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a case took; the official injector's figure is messages a second, as it may have a shorter recording."""
+
+    case: Case
+    messages: int
+    ours: Sample
+    floor_s: float
+    stored_bytes: int
+    peer_per_s: float | None
+
+    @property
+    def per_s(self) -> float:
+        return self.messages / self.ours.wall_s
+
+    def record(self) -> dict[str, object]:
+        return {
+            "workload": self.case.name,
+            "messages": self.messages,
+            "source_bytes": self.case.recording.stat().st_size,
+            "stored_bytes": self.stored_bytes,
+            "wall_s": self.ours.wall_s,
+            "cpu_s": self.ours.cpu_s,
+            "peak_bytes": self.ours.peak_bytes,
+            "messages_per_s": self.per_s,
+            "floor_s": self.floor_s,
+            "times_floor": self.ours.wall_s / self.floor_s,
+            "peer_messages_per_s": self.peer_per_s,
+            "times_peer": self.per_s / self.peer_per_s if self.peer_per_s else None,
+        }
+
+
+def measured(case: Case, runs: int, peer: Path | None) -> Result:
+    with tempfile.TemporaryDirectory(dir=HERE / "data") as folder:
+        store, report = Path(folder) / "store", Path(folder) / "report.json"
+        samples: list[Sample] = []
+        for _ in range(runs):
+            shutil.rmtree(store, ignore_errors=True)
+            samples.append(
+                run(
+                    [
+                        *INGEST,
+                        "bag",
+                        case.recording,
+                        "--name",
+                        "run",
+                        "--store",
+                        store,
+                        "--report",
+                        report,
+                        "-q",
+                    ]
+                )
+            )
+        floors = [floor_seconds(case.recording, store) for _ in range(runs)]
+        stored_bytes = sum(file.stat().st_size for file in store.rglob("*.parquet"))
+        messages = sum(
+            topic["written"] for topic in json.loads(report.read_text())["recordings"][0]["topics"]
+        )
+    peer_per_s = peer_speed(case.for_peer, runs, peer) if peer else None
+    return Result(case, messages, typical(samples), sorted(floors)[runs // 2], stored_bytes, peer_per_s)
+
+
+def floor_seconds(recording: Path, store: Path) -> float:
+    """Return the time of a whole process without that of loading what it writes."""
+    sample = run([sys.executable, HERE / "floor.py", recording, store])
+    return sample.wall_s - json.loads(sample.output)["load_s"]
+
+
+def peer_speed(recording: Path, runs: int, python: Path) -> float:
+    """Return the official injector's messages a second."""
+    samples: list[Sample] = []
+    rows = 0
+    for _ in range(runs):
+        with discarding() as (port, counted):
+            program = python.parent / "mosaicolabs.ros_injector"
+            command = [program, recording, "--name", "run", "--host", "127.0.0.1", "--port", port]
+            samples.append(run([*command, "--log", "ERROR"]))
+        rows = counted[0]
+    return rows / typical(samples).wall_s
+
+
+@contextmanager
+def discarding() -> Iterator[tuple[str, list[int]]]:
+    """Run the server that throws rows away; afterwards the list holds how many there were."""
+    server = subprocess.Popen(
+        [sys.executable, HERE / "discard_server.py"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert server.stdout is not None
+    counted: list[int] = []
+    try:
+        yield server.stdout.readline().strip(), counted
+        rows, _ = server.communicate()
+        counted.append(int(rows))
+    finally:
+        server.kill()
+        server.wait()
+
+
+def cases(arguments: argparse.Namespace) -> list[Case]:
+    """Return what to measure; recordings that are not there are made."""
+    if arguments.recording:
+        return [Case(path.name, path, path) for path in arguments.recording]
+    chosen = [*SHORT, *WORKLOADS[3:]] if arguments.quick else list(WORKLOADS)
+    wanted = [workload for workload in chosen if not arguments.only or workload.name in arguments.only]
+    return [_case(workload, arguments.data) for workload in wanted]
+
+
+def _case(workload: Workload, folder: Path) -> Case:
+    path = workload.path(folder)
+    short = BY_NAME[workload.peer].path(folder) if workload.peer else path
+    return Case(workload.name, path, short, workload.least_peer, workload.most_floor)
+
+
+def print_result(result: Result) -> None:
+    case, ours = result.case, result.ours
+    floor, size = ours.wall_s / result.floor_s, case.recording.stat().st_size
+    peer = result.per_s / result.peer_per_s if result.peer_per_s else 0.0
+    missed = [
+        *(["floor"] if case.most_floor and floor > case.most_floor else []),
+        *(["peer"] if peer and peer < case.least_peer else []),
+        *(["memory"] if ours.peak_bytes >> 20 > MOST_PEAK_MB else []),
+    ]
+    print(
+        f"| {case.name} | {result.messages:,} | {size / 1e6:.0f} MB | {ours.wall_s:.2f} s | {ours.cpu_s:.2f} s "
+        f"| {result.per_s:,.0f}/s | {size / 1e6 / ours.wall_s:.0f} MB/s | {ours.peak_bytes >> 20} MiB "
+        f"| {size / result.stored_bytes:.2f} | {floor:.2f}x | {f'{peer:.0f}x' if peer else '-'} |"
+        + (f" missed: {', '.join(missed)}" if missed else ""),
+        flush=True,
+    )
+
+
+HEAD = """| workload | messages | recording | time | CPU | messages | bytes | peak | smaller by | time of the floor | speed of the peer |
+|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|"""
+
+
+def start_up(folder: Path, runs: int) -> dict[str, float]:
+    """Return seconds of what should not depend on how long a recording is."""
+    long, short = BY_NAME["telemetry"].path(folder), BY_NAME["telemetry-30s"].path(folder)
+    commands = {
+        "ingest --help": ["--help"],
+        "ingest inspect, 30 s": ["inspect", short],
+        "ingest inspect, 300 s": ["inspect", long],
+    }
+    return {
+        name: typical([run([*INGEST, *rest]) for _ in range(runs)]).wall_s for name, rest in commands.items()
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--quick", action="store_true", help="short recordings, one run each")
+    parser.add_argument("--runs", type=int, default=0, help="runs of each (3)")
+    parser.add_argument("--only", action="append", help="a workload's name; repeatable")
+    parser.add_argument(
+        "--recording", type=Path, action="append", help="a recording of one's own; repeatable"
+    )
+    parser.add_argument("--peer", type=Path, metavar="PYTHON", help="the Python of a venv with mosaicolabs")
+    parser.add_argument("--data", type=Path, default=HERE / "data", help="where the recordings are kept")
+    parser.add_argument("--json", type=Path, default=HERE / "data" / "results.json", help="where figures go")
+    arguments = parser.parse_args()
+    runs = arguments.runs or (1 if arguments.quick else 3)
+    (HERE / "data").mkdir(exist_ok=True)
+    run([*INGEST, "--help"])  # so that no run compiles the sources
+    print(HEAD)
+    results: list[Result] = []
+    for case in cases(arguments):
+        results.append(measured(case, runs, arguments.peer))
+        print_result(results[-1])
+    figures: dict[str, object] = {
+        "date": datetime.now(timezone.utc).isoformat(timespec="minutes"),
+        "machine": {
+            "system": platform.platform(),
+            "cpus": os.cpu_count(),
+            "python": platform.python_version(),
+        },
+        "runs": runs,
+        "workloads": [result.record() for result in results],
+    }
+    if not arguments.recording and not arguments.only:
+        figures["start_up_s"] = seconds = start_up(arguments.data, runs)
+        print(*(f"{name}: {took:.2f} s" for name, took in seconds.items()), sep="\n")
+    arguments.json.write_text(json.dumps(figures, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
