@@ -18,6 +18,7 @@ from mosaico_ingest.executors.inspection import inspect
 from mosaico_ingest.executors.local import Inline
 from mosaico_ingest.executors.preview import decide, plan_document
 from mosaico_ingest.executors.processes import Processes
+from mosaico_ingest.executors.status import RecordingStatus, standings
 from mosaico_ingest.executors.worker import execute, make_plan
 from mosaico_ingest.manifest.load import load_manifests
 from mosaico_ingest.plan.compile import compile_manifests
@@ -36,6 +37,7 @@ __all__ = [
     "compile_job",
     "compile_plan",
     "inspect_recording",
+    "job_status",
     "plan_differences",
     "plan_job",
     "quick_config",
@@ -154,6 +156,15 @@ def run(
     jobs = configs[0].jobs if configs else 1
     chosen = executor or (Processes(jobs) if jobs > 1 else Inline())
     return RunReport(tool=f"mosaico-ingest {__version__}", recordings=tuple(chosen.map(configs, observe)))
+
+
+def job_status(manifest: Path) -> tuple[RecordingStatus, ...]:
+    """Return which recordings of a job are done, new, changed or failed; writes nothing.
+
+    Raises:
+        IngestError: The manifest cannot become a job.
+    """
+    return tuple(standings(compile_job(manifest)))
 
 
 def inspect_recording(path: Path, *, ros_distro: str | None = None) -> Inspection:

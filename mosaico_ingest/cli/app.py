@@ -27,6 +27,7 @@ from mosaico_ingest.cli import (
     run,
     schema,
     serve,
+    status,
     store,
     verify,
 )
@@ -48,6 +49,7 @@ COMMANDS: tuple[tuple[str, Callable[..., Any]], ...] = (
     ("export", export.export),
     ("lint", lint.lint),
     ("serve", serve.serve),
+    ("status", status.status),
     ("report", report.report),
     ("schema", schema.schema),
 )

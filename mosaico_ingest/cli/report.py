@@ -11,8 +11,11 @@ __all__ = ["report"]
 
 
 def report(
-    path: Annotated[
-        Path, typer.Argument(metavar="RUN.json", help="What `ingest run --report RUN.json` wrote.")
+    paths: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUN.json...", help="What `ingest run --report RUN.json` wrote; several add up."
+        ),
     ],
     *,
     html: Annotated[
@@ -28,7 +31,10 @@ def report(
     from mosaico_ingest.report.page import html_page
     from mosaico_ingest.report.write import read_report, write_whole
 
-    found = read_report(path)
+    parts = [read_report(path) for path in paths]
+    found = parts[0].model_copy(
+        update={"recordings": tuple(one for part in parts for one in part.recordings)}
+    )
     if html is not None:
         write_whole(html, html_page(found))
         typer.echo(f"wrote {html}", err=True)

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from mosaico_ingest.cli.log_format import LogFormat
+
 __all__ = ["run"]
 
 
@@ -27,21 +29,51 @@ def run(
             "--jobs", "-j", min=1, max=1024, help="Recordings ingested at a time; overrides run.jobs."
         ),
     ] = None,
+    shard: Annotated[
+        str | None,
+        typer.Option("--shard", metavar="I/N", help="Only this share of the recordings, as 1/8 .. 8/8."),
+    ] = None,
     report: Annotated[
         Path | None, typer.Option("--report", help="Write the report of this call as JSON.", metavar="FILE")
+    ] = None,
+    metrics: Annotated[
+        Path | None,
+        typer.Option("--metrics", help="Write the sums for Prometheus' textfile collector.", metavar="FILE"),
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
     log: Annotated[
         str | None, typer.Option("--log", help="Log level; overrides run.log_level.", metavar="LEVEL")
     ] = None,
+    log_format: Annotated[
+        LogFormat, typer.Option("--log-format", help="What is said while it runs: for people, or JSON lines.")
+    ] = LogFormat.TEXT,
 ) -> None:
     """Ingest what the manifests name."""
     from mosaico_ingest import api
     from mosaico_ingest.cli.session import run_configs
+    from mosaico_ingest.cli.shard import take_shard
+    from mosaico_ingest.report.metrics import prometheus_text
+    from mosaico_ingest.report.model import RunReport
+    from mosaico_ingest.report.write import write_whole
 
     if bool(manifests) == (plan is not None):
         raise typer.BadParameter("name manifests, or a plan with --plan", param_hint="JOB.yaml")
     configs = [config for manifest in manifests or () for config in api.compile_job(manifest)]
     if plan is not None:
         configs += api.compile_plan(plan)
-    run_configs(configs, report=report, quiet=quiet, log=log, jobs=jobs)
+    if shard is not None:
+        configs = take_shard(configs, shard)
+
+    def finish(result: RunReport) -> None:
+        if metrics is not None:
+            write_whole(metrics, prometheus_text(result))
+
+    run_configs(
+        configs,
+        report=report,
+        quiet=quiet,
+        log=log,
+        jobs=jobs,
+        log_format=log_format,
+        finished=finish,
+    )

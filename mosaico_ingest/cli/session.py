@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -11,11 +11,12 @@ import typer
 
 from mosaico_ingest import api
 from mosaico_ingest.cli.errors import print_error
+from mosaico_ingest.cli.log_format import LogFormat
+from mosaico_ingest.cli.logs import JsonLines, set_up_logging
 from mosaico_ingest.cli.progress import display
 from mosaico_ingest.cli.signals import interrupt_on_terminate
 from mosaico_ingest.cli.tables import print_report
 from mosaico_ingest.config import ROSInjectionConfig
-from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.executors.executor import Executor
 from mosaico_ingest.executors.local import Inline
 from mosaico_ingest.executors.processes import Processes
@@ -33,11 +34,13 @@ def run_configs(
     quiet: bool,
     log: str | None,
     jobs: int | None = None,
+    log_format: LogFormat = LogFormat.TEXT,
     finished: Callable[[RunReport], None] = lambda _result: None,
 ) -> None:
     """Run the configurations, several at a time where asked for; exit with the report's code unless it is 0."""
-    level = log or configs[0].log_level
-    _set_up_logging(level)
+    level = log or (configs[0].log_level if configs else "INFO")
+    prepare = partial(set_up_logging, level, log_format)
+    prepare()
     interrupt_on_terminate()
     failures: list[RunFinished] = []
 
@@ -46,34 +49,29 @@ def run_configs(
             failures.append(event)
         observe(position, event)
 
-    with display(len(configs), quiet=quiet) as observe:
-        result = api.run(configs, executor=_executor(configs, jobs, level), observe=tell)
+    as_json = log_format is LogFormat.JSON
+    shown = nullcontext(JsonLines()) if as_json else display(len(configs), quiet=quiet)
+    with shown as observe:
+        result = api.run(configs, executor=_executor(configs, jobs, prepare), observe=tell)
     finished(result)
     for target in {
         path for path in (report, *(_report_path(config) for config in configs)) if path is not None
     }:
         write_report(result, target)
-    if not quiet:
+    if not quiet and not as_json:
         print_report(result)
-    for failure in failures:
+    for failure in () if as_json else failures:
         print_error(failure.error or "", failure.findings)
     if result.exit_code:
         raise typer.Exit(result.exit_code)
 
 
-def _executor(configs: Sequence[ROSInjectionConfig], jobs: int | None, level: str) -> Executor:
-    wanted = min(jobs or configs[0].jobs, len(configs))
-    return Processes(wanted, prepare=partial(_set_up_logging, level)) if wanted > 1 else Inline()
+def _executor(
+    configs: Sequence[ROSInjectionConfig], jobs: int | None, prepare: Callable[[], None]
+) -> Executor:
+    wanted = min(jobs or configs[0].jobs, len(configs)) if configs else 1
+    return Processes(wanted, prepare=prepare) if wanted > 1 else Inline()
 
 
 def _report_path(config: ROSInjectionConfig) -> Path | None:
     return None if config.report_path is None else Path(config.report_path)
-
-
-def _set_up_logging(level: str) -> None:
-    numeric = getattr(logging, level.upper(), None)
-    if not isinstance(numeric, int):
-        raise ManifestError(
-            f"log level {level!r} is unknown", hint="use DEBUG, INFO, WARNING, ERROR or CRITICAL"
-        )
-    logging.basicConfig(level=numeric, format="%(levelname)s %(name)s: %(message)s", force=True)

@@ -1,0 +1,45 @@
+"""This file writes a run's sums for Prometheus: the text its node exporter's textfile collector reads."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+
+from mosaico_ingest.report.events import RunStatus
+from mosaico_ingest.report.model import RunReport
+
+__all__ = ["prometheus_text"]
+
+_PREFIX = "mosaico_ingest"
+
+
+def prometheus_text(report: RunReport) -> str:
+    """Return the sums of the last run as gauges; nothing is labelled by sequence, so they stay few."""
+    return "\n".join(_lines(report)) + "\n"
+
+
+def _lines(report: RunReport) -> Iterator[str]:
+    states = Counter(one.status for one in report.recordings)
+    yield from _gauge("recordings", "Recordings of the last run by how they ended.")
+    for state in RunStatus:
+        yield f'{_PREFIX}_recordings{{status="{state.value}"}} {states[state]}'
+    totals = [one.totals for one in report.recordings]
+    yield from _gauge("messages", "Messages of the last run by what became of them.")
+    for fate in ("read", "written", "filtered", "downsampled", "rejected"):
+        yield f'{_PREFIX}_messages{{fate="{fate}"}} {sum(getattr(one, fate) for one in totals)}'
+    ended = max((one.started_at.timestamp() + one.duration_s for one in report.recordings), default=0)
+    single: tuple[tuple[str, str, float], ...] = (
+        ("source_bytes", "Size of the recordings.", sum(one.source_bytes for one in report.recordings)),
+        ("stored_bytes", "Size of what is stored.", sum(one.stored_bytes for one in totals)),
+        ("working_seconds", "Time spent on recordings.", sum(one.duration_s for one in report.recordings)),
+        ("last_end_timestamp_seconds", "When the last recording ended, since the epoch.", ended),
+        ("exit_code", "The exit code of the run.", report.exit_code),
+    )
+    for name, what, value in single:
+        yield from _gauge(name, what)
+        yield f"{_PREFIX}_{name} {value:.15g}"
+
+
+def _gauge(name: str, what: str) -> Iterator[str]:
+    yield f"# HELP {_PREFIX}_{name} {what}"
+    yield f"# TYPE {_PREFIX}_{name} gauge"
