@@ -12,7 +12,8 @@ from hypothesis import settings
 # CI tries the same examples each time, so that it judges the change; everybody else explores.
 settings.register_profile("ci", deadline=None, derandomize=True)
 settings.register_profile("explore", deadline=None)
-settings.load_profile("ci" if "CI" in os.environ else "explore")
+settings.register_profile("long", deadline=None, max_examples=100_000)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci" if "CI" in os.environ else "explore"))
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("MOSAICO_SHARED", ROOT.parent / "shared"))
