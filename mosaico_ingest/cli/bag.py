@@ -49,6 +49,7 @@ def bag(
     """Ingest one recording, without a manifest."""
     from mosaico_ingest import api
     from mosaico_ingest.cli.session import run_configs
+    from mosaico_ingest.cli.without_pandas import forgo_pandas
 
     config = api.quick_config(
         path,
@@ -62,4 +63,5 @@ def bag(
         tls_cert_path=tls_cert,
         store=store,
     )
+    forgo_pandas([config])
     run_configs([config], report=report, quiet=quiet, log=log)

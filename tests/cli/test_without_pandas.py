@@ -1,0 +1,37 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+DRIVE = Path(__file__).parents[2] / "configs" / "quickstart" / "drive.mcap"
+PROGRAM = """
+import sys
+from mosaico_ingest.cli.app import main
+try:
+    main(sys.argv[1:])
+except SystemExit as end:
+    assert not end.code, end.code
+print("pandas" in sys.modules)
+import pandas, pyarrow
+print(len(pyarrow.array([1]).to_pandas()))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["bag", "inspect"])
+def test_no_command_on_a_recording_imports_pandas_and_whoever_asks_still_gets_it(
+    command: str, tmp_path: Path
+) -> None:
+    pytest.importorskip("pandas")
+    more = ["--name", "drive", "--store", str(tmp_path), "-q"] if command == "bag" else []
+    run = subprocess.run(  # noqa: S603 - our own program
+        [sys.executable, "-c", PROGRAM, command, str(DRIVE), *more],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.split()[-2:] == ["False", "1"]
