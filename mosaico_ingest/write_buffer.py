@@ -13,13 +13,15 @@ from mosaico_ingest.sink import TopicWriter
 
 __all__ = ["WriteBuffer"]
 
+_INTERRUPTED_S = 20.0
+
 
 class WriteBuffer:
     """Writes batches in order on one thread of its own; `put` waits while too many bytes are queued.
 
     The first error of a writer stops the thread; it is raised by the next `put` or when the buffer is left.
     Leaving normally waits until everything is written; leaving by an exception too, so that rows accepted
-    before an error are not lost.
+    before an error are not lost. Leaving by Ctrl-C waits only for so long: the destination may be stuck.
     """
 
     def __init__(self, *, max_bytes: int) -> None:
@@ -41,7 +43,9 @@ class WriteBuffer:
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        self._thread.join()
+        self._thread.join(_INTERRUPTED_S if kind is KeyboardInterrupt else None)
+        with self._changed:
+            self._queue.clear()
         if kind is None and self._error is not None:
             raise self._error
 
@@ -49,7 +53,7 @@ class WriteBuffer:
         """Queue a batch, waiting for room; a batch larger than the whole buffer is let in alone."""
         size = batch.nbytes
         with self._changed:
-            while self._error is None and self._queue and self._queued_bytes + size > self._max_bytes:
+            while self._error is None and self._queued_bytes and self._queued_bytes + size > self._max_bytes:
                 self._changed.wait()
             if self._error is not None:
                 raise self._error
@@ -64,7 +68,7 @@ class WriteBuffer:
                     self._changed.wait()
                 if not self._queue:
                     return
-                writer, batch, size = self._queue[0]
+                writer, batch, size = self._queue.popleft()
             try:
                 writer.write(batch)
             except BaseException as error:  # noqa: BLE001 - a thread's border: raised again by put or on leaving
@@ -74,6 +78,5 @@ class WriteBuffer:
                     self._changed.notify_all()
                 return
             with self._changed:
-                self._queue.popleft()
                 self._queued_bytes -= size
                 self._changed.notify_all()

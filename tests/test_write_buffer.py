@@ -77,3 +77,16 @@ def test_put_waits_while_the_buffer_is_full() -> None:
             buffer.put(writer, batch(value))
             assert value - len(writer.seen) <= 3
     assert len(writer.seen) == 6
+
+
+def test_an_interrupt_waits_for_a_stuck_writer_only_so_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mosaico_ingest.write_buffer._INTERRUPTED_S", 0.1)
+    writer = Writer(delay_s=0.5)
+    begin = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), WriteBuffer(max_bytes=1000) as buffer:
+        for value in range(3):
+            buffer.put(writer, batch(value))
+        raise KeyboardInterrupt
+    assert time.monotonic() - begin < 0.45
+    buffer._thread.join()
+    assert writer.seen == [0]

@@ -17,7 +17,8 @@ import pyarrow.flight as fl
 
 from mosaico_ingest.config import ServerTarget
 from mosaico_ingest.errors import SinkError, SinkUnavailable
-from mosaico_ingest.platform.faults import Address, Refused, check_tls, reraise
+from mosaico_ingest.platform.faults import Address, Refused, check_tls, late, reraise
+from mosaico_ingest.platform.patience import OutOfPatience, within
 from mosaico_ingest.wire import bodies
 from mosaico_ingest.wire.actions import API_KEY_HEADER, INFO, VERSION, Action, Permission
 from mosaico_ingest.wire.bodies import Body
@@ -27,6 +28,9 @@ from mosaico_ingest.wire.conditions import Condition, condition_of
 __all__ = ["PlatformClient", "Uploaded", "connect"]
 
 _ANSWER_S = 120.0
+_MARGIN_S = 5.0
+"""By then gRPC's own limit has spoken, where a call has one."""
+_CLOSE_S = 1.0
 _DELAYS_S = (0.2, 0.6, 1.8)
 _CHANNEL: list[tuple[str, Any]] = [
     ("grpc.initial_reconnect_backoff_ms", 100),
@@ -62,6 +66,7 @@ class PlatformClient:
         """The most the server takes in one message."""
         self._flight = flight
         self._codec = codec
+        self._answer_s = answer_s
         key = [(API_KEY_HEADER.encode(), address.key.encode())] if address.key else []
         headers = cast("list[tuple[str, str]]", key)  # what the stubs want; Flight wants bytes
         self._upload = fl.FlightCallOptions(headers=headers)
@@ -120,7 +125,13 @@ class PlatformClient:
     def counted(self, locator: str) -> Uploaded:
         """Return what the server holds of a topic by reading it, for servers that do not say."""
         ticket = self._info(locator).endpoints[0].ticket
-        return self._call(lambda: self._read(ticket), "do_get", Permission.READ, repeatable=True)
+        reader = self._call(
+            lambda: self._flight.do_get(ticket, self._upload).to_reader(),
+            "do_get",
+            Permission.READ,
+            repeatable=True,
+        )
+        return self._counted(reader)
 
     def put(self, put: bodies.Put, schema: pa.Schema) -> fl.FlightStreamWriter:
         """Begin an upload."""
@@ -158,10 +169,10 @@ class PlatformClient:
         except Malformed:
             return None
 
-    def _read(self, ticket: fl.Ticket) -> Uploaded:
+    def _counted(self, reader: pa.RecordBatchReader) -> Uploaded:
         rows = size = 0
         bounds: list[int] = []
-        for batch in self._flight.do_get(ticket, self._upload).to_reader():
+        while (batch := self._once(lambda: next(reader, None), "do_get", Permission.READ)) is not None:
             span = pc.min_max(batch.column("timestamp_ns"))
             rows += batch.num_rows
             size += batch.nbytes
@@ -188,14 +199,16 @@ class PlatformClient:
             try:
                 return self._once(call, doing, needs)
             except SinkUnavailable as error:
-                if condition_of(error.__cause__ or error) is Condition.TIMED_OUT:
+                if _was_slow(error):
                     raise
             time.sleep(delay_s)
         return self._once(call, doing, needs)
 
     def _once(self, call: Callable[[], _Result], doing: str, needs: Permission) -> _Result:
         try:
-            return call()
+            return within(self._answer_s + _MARGIN_S, call)
+        except OutOfPatience as error:
+            raise late(self.address, doing) from error
         except pa.ArrowException as error:
             reraise(error, self.address, doing=doing, needs=needs)
 
@@ -213,11 +226,20 @@ def connect(
     if address.tls:
         check_tls(address)
     flight = fl.FlightClient(str(address), tls_root_certs=address.roots, generic_options=_CHANNEL)
-    with flight:
+    try:
         client = PlatformClient(flight, address, codec, answer_s)
         if handshake:
             client.handshake()
         yield client
+    finally:
+        with suppress(OutOfPatience):
+            within(_CLOSE_S, flight.close)  # it waits for calls under way, which may be stuck
+
+
+def _was_slow(error: SinkUnavailable) -> bool:
+    """Say whether the server was there and did not answer in time: asking again would only load it more."""
+    cause = error.__cause__
+    return isinstance(cause, OutOfPatience) or condition_of(cause or error) is Condition.TIMED_OUT
 
 
 def _address(target: ServerTarget) -> Address:

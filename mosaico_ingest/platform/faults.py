@@ -12,7 +12,7 @@ from mosaico_ingest.wire.actions import Permission
 from mosaico_ingest.wire.conditions import Condition, condition_of, text_of
 from mosaico_ingest.wire.keys import key_problem
 
-__all__ = ["Address", "Refused", "add_hint", "check_tls", "reraise"]
+__all__ = ["Address", "Refused", "add_hint", "check_tls", "late", "reraise"]
 
 _PATIENCE_S = 3.0
 _WRONG_NAME = frozenset({62, 64})
@@ -65,6 +65,12 @@ def check_tls(address: Address) -> None:
         raise fault
 
 
+def late(address: Address, doing: str) -> SinkUnavailable:
+    """Return the error of a call that has not ended in time."""
+    hint = "the server is slow or stuck"
+    return SinkUnavailable(f"no answer to {doing} in time", where=str(address), hint=hint)
+
+
 def reraise(error: Exception, address: Address, *, doing: str, needs: Permission) -> NoReturn:
     """Raise what Flight complained about as an error of ours.
 
@@ -85,9 +91,7 @@ def _explained(error: Exception, address: Address, *, doing: str, needs: Permiss
     if condition is Condition.UNAVAILABLE:
         return _diagnosed(address, text)
     if condition is Condition.TIMED_OUT:
-        return SinkUnavailable(
-            f"no answer to {doing} in time", where=where, hint="the server is slow or stuck"
-        )
+        return late(address, doing)
     if condition in {Condition.UNAUTHENTICATED, Condition.PERMISSION}:
         what, hint = _about_key(address.key, condition, text, doing=doing, needs=needs)
         return Refused(what, where=where, hint=hint, condition=condition)

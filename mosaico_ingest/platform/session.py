@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from mosaico_ingest import wire
@@ -13,6 +12,7 @@ from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.platform.client import PlatformClient, Uploaded, connect
 from mosaico_ingest.platform.faults import Refused, add_hint
+from mosaico_ingest.platform.patience import begun
 from mosaico_ingest.platform.upload import Memory, Upload
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.sink import StoredTopic
@@ -106,8 +106,8 @@ class PlatformSession:
     def commit(self) -> None:
         """Wait until the server has every topic, then make them visible at once."""
         self._drop_broken()
-        with ThreadPoolExecutor(thread_name_prefix="upload") as pool:
-            list(pool.map(Upload.close, self._uploads.values()))
+        for closing in [begun(upload.close) for upload in self._uploads.values()]:
+            closing.result()
         for path, message in self._notes:
             self._send_note(path, message)
         session = self._session
@@ -121,8 +121,8 @@ class PlatformSession:
 
     def discard(self) -> str | None:
         """Leave no trace; return what had to stay behind or is lost, None where nothing is."""
-        for upload in self._uploads.values():
-            upload.abandon()
+        for ending in [begun(upload.abandon) for upload in self._uploads.values()]:
+            ending.result()
         remarks = [self._remove()]
         if self._replaced:
             remarks.append(_OLD_IS_GONE)

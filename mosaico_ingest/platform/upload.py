@@ -10,12 +10,18 @@ import pyarrow.flight as fl
 
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.platform.faults import Address, reraise
+from mosaico_ingest.platform.faults import Address, late, reraise
+from mosaico_ingest.platform.patience import OutOfPatience, within
 from mosaico_ingest.platform.sizes import framing_bytes, row_spans
 from mosaico_ingest.sink import check_batch, topic_schema
 from mosaico_ingest.wire.actions import Permission
 
 __all__ = ["Memory", "Upload"]
+
+_UPLOAD_S = 600.0
+"""How long the server may take for one message: ten minutes are 75 kB/s for the largest."""
+_LOCK_S = 2.0
+"""At the end nobody writes any more; who still holds the lock then is stuck in a call."""
 
 
 class Memory:
@@ -47,6 +53,8 @@ class Upload:
         self.name = name
         self.waiting_bytes = 0
         self.broken: SinkError | None = None
+        self._stuck = False
+        self._doing = f"the upload of {name}"
         self._schema = topic_schema(ontology)
         self._rows_bytes = message_bytes - framing_bytes(self._schema)
         self._message_bytes = message_bytes
@@ -77,20 +85,27 @@ class Upload:
 
     def close(self) -> None:
         """Send what is waiting and wait for the server's word that it has everything."""
-        with self._lock:
+        if not self._lock.acquire(timeout=_LOCK_S):
+            raise self._late()
+        try:
             self._flush()
             self._guarded(self._stream.done_writing)
             self._guarded(self._stream.close)
+        finally:
+            self._lock.release()
 
     def abandon(self) -> None:
-        """End the stream, whatever becomes of it."""
-        with self._lock:
+        """End the stream, whatever becomes of it; one that is stuck ends with the process."""
+        if self._stuck or not self._lock.acquire(timeout=_LOCK_S):
+            return
+        try:
             self._waiting.clear()
             self.waiting_bytes = 0
-            try:
-                self._stream.close()
-            except pa.ArrowException as error:
-                self.broken = self.broken or SinkError(type(error).__name__, where=self.name)
+            within(_LOCK_S, self._stream.close)
+        except (pa.ArrowException, OutOfPatience) as error:
+            self.broken = self.broken or SinkError(type(error).__name__, where=self.name)
+        finally:
+            self._lock.release()
 
     def _flush(self) -> None:
         if self.broken is not None:
@@ -101,13 +116,20 @@ class Upload:
 
     def _guarded(self, call: Callable[[], object]) -> None:
         try:
-            call()
+            within(_UPLOAD_S, call)
+        except OutOfPatience as error:
+            self._stuck = True
+            self.broken = self._late()
+            raise self.broken from error
         except pa.ArrowException as error:
             try:
-                reraise(error, self._address, doing=f"the upload of {self.name}", needs=Permission.WRITE)
+                reraise(error, self._address, doing=self._doing, needs=Permission.WRITE)
             except SinkError as failure:
                 self.broken = failure
                 raise
+
+    def _late(self) -> SinkError:
+        return late(self._address, self._doing)
 
     def _refuse_large(self, batch: pa.RecordBatch, spans: list[tuple[int, int, int]]) -> None:
         for row, _, size in spans:

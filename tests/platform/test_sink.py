@@ -1,7 +1,10 @@
 from __future__ import annotations
 
 import logging
+import os
 import pickle
+import signal
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -393,7 +396,7 @@ class TestKeys:
         ("permission", "warned"), [("write", True), ("delete", False), ("manage", False)]
     )
     def test_a_key_that_may_not_delete_is_known_beforehand(
-        self, server: Mosaicod, permission: str, warned: bool
+        self, server: Mosaicod, permission: str, *, warned: bool
     ) -> None:
         server.keys[make_key("k")] = permission
         found = delete_finding(target(server, api_key=make_key("k")), "seq")
@@ -460,3 +463,33 @@ def test_nothing_is_logged(server: Mosaicod, caplog: pytest.LogCaptureFixture, t
         write(server, 1)
     assert not caplog.records
     assert not list(tmp_path.iterdir())
+
+
+def test_a_server_that_never_takes_an_upload_ends_it(
+    server: Mosaicod, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is stuck costs its limit once, and the rest is cleared away."""
+    monkeypatch.setattr("mosaico_ingest.platform.upload._UPLOAD_S", 0.3)
+    monkeypatch.setattr("mosaico_ingest.platform.upload._LOCK_S", 0.2)
+    going_on = threading.Event()
+    server.faults.before_batch = lambda _topic, _number: going_on.wait(20) and None
+    begin = time.monotonic()
+    with (
+        pytest.raises(SinkUnavailable, match="no answer to the upload of /n in time"),
+        PlatformSink(target(server)).open("seq", META) as session,
+    ):
+        for topic in ("/n", "/m"):
+            session.topic(topic, NUMBER, {}).write(numbers(1))
+    assert time.monotonic() - begin < 4
+    assert not server.sequences
+    going_on.set()
+
+
+def test_an_interrupt_is_heard_while_the_server_does_not_answer() -> None:
+    begin = time.monotonic()
+    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        silent_target = ServerTarget("127.0.0.1", silent.getsockname()[1])
+        with pytest.raises(KeyboardInterrupt), connect(silent_target):
+            pytest.fail("connected")
+    assert time.monotonic() - begin < 2.5
