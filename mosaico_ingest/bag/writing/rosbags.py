@@ -36,7 +36,11 @@ class SqliteWriter:
         if self._texts.setdefault(definition.root, definition.text) != definition.text:
             what = f"there is another definition of {definition.root}, and .db3 holds one"
             raise BagError(what, where=topic, hint="write .mcap")
-        rihs01 = _types(definition, topic).hash_rihs01(definition.root)
+        try:
+            rihs01 = _types(definition, topic).hash_rihs01(definition.root)
+        except KeyError as error:  # how rosbags says that it does not know wstring
+            what = f"{definition.root} needs {error}, which cannot be described in .db3"
+            raise BagError(what, where=topic, hint="write .mcap") from error
         opened = self._bag.add_connection(topic, definition.root, msgdef=definition.text, rihs01=rihs01)
         self._connections.append(opened)
         return len(self._connections) - 1

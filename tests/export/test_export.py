@@ -1,0 +1,262 @@
+"""Recordings that are ingested and written back are what they were."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from made_recordings import define, record
+from message_differences import differences, messages_of
+from rosbags.highlevel import AnyReader
+
+from mosaico_ingest.api import run
+from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.errors import BagError, IngestError, NothingMatched
+from mosaico_ingest.export import export_sequence
+from mosaico_ingest.policies import LoaderErrorPolicy, TopicLevelErrorPolicy
+from mosaico_ingest.store import Store
+
+DRIVE = Path(__file__).parents[2] / "configs" / "quickstart" / "drive.mcap"
+ODD = """
+int64 timestamp_ns
+acme_msgs/Nothing nothing
+acme_msgs/Part[] parts
+acme_msgs/Part[2] pair
+uint8[3] octets
+uint8[] blob
+wstring wide
+string[<=2] names
+bool[] flags
+================================================================================
+MSG: acme_msgs/Nothing
+================================================================================
+MSG: acme_msgs/Part
+float32[2] values
+acme_msgs/Nothing nothing
+"""
+PART = {"values": [1.5, float("nan")], "nothing": {}}
+ODD_VALUES: dict[str, Any] = {
+    "timestamp_ns": -5,
+    "nothing": {},
+    "parts": [PART, PART],
+    "pair": [PART, PART],
+    "octets": [1, 2, 3],
+    "blob": b"\x00\xff",
+    "wide": "ä𝄞",
+    "names": ["", "b"],
+    "flags": [True, False],
+}
+
+Ingest = Callable[..., Store]
+
+
+@pytest.fixture
+def ingested(tmp_path: Path) -> Ingest:
+    """Ingest a recording as the sequence `s`."""
+
+    def ingest(recording: Path, **options: Any) -> Store:
+        folder = tmp_path / "store"
+        config = ROSInjectionConfig(file_path=recording, sequence_name="s", store=folder, **options)
+        report = run([config]).recordings[0]
+        assert report.error is None
+        return Store.open(folder)
+
+    return ingest
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".db3"])
+def test_messages_of_ros_2_come_back_field_by_field(ingested: Ingest, tmp_path: Path, suffix: str) -> None:
+    out = tmp_path / f"out{suffix}"
+    report = export_sequence(ingested(DRIVE), "s", out)
+    assert report.faithful
+    assert report.messages == 2130
+    assert report.bytes == out.stat().st_size
+    assert differences(DRIVE, out) == {}
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+def ros_1_messages() -> list[tuple[str, Any, int, dict[str, Any]]]:
+    header = "uint32 seq\ntime stamp\nstring frame_id\n"
+    line = "=" * 80
+    stamped = define(
+        "geometry_msgs/msg/PointStamped",
+        f"Header header\nPoint point\n{line}\nMSG: std_msgs/Header\n{header}"
+        f"{line}\nMSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z\n",
+        version=1,
+    )
+    lone = define("acme_msgs/msg/Lone", "int16 a\n", version=1)
+    values = {
+        "header": {"seq": 7, "stamp": {"sec": 5, "nanosec": 6}, "frame_id": "f"},
+        "point": {"x": 1.0, "y": 2.0, "z": 3.0},
+    }
+    return [("/p", stamped, 10, values), ("/a", lone, 11, {"a": 4}), ("/p", stamped, 12, values)]
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".bag"])
+def test_messages_of_ros_1_come_back_field_by_field(ingested: Ingest, tmp_path: Path, suffix: str) -> None:
+    source = record(tmp_path / "in.bag", ros_1_messages())
+    out = tmp_path / f"out{suffix}"
+    assert export_sequence(ingested(source), "s", out).faithful
+    assert differences(source, out) == {}
+    with AnyReader([source]) as one:
+        digests = {(c.topic, c.msgtype, c.digest) for c in one.connections}
+    if suffix == ".bag":
+        with AnyReader([out]) as other:
+            assert {(c.topic, c.msgtype, c.digest) for c in other.connections} == digests
+
+
+def test_a_ros_1_topic_in_a_container_of_ros_2_is_left_out_and_named(
+    ingested: Ingest, tmp_path: Path
+) -> None:
+    source = record(tmp_path / "in.bag", ros_1_messages())
+    report = export_sequence(ingested(source), "s", tmp_path / "out.db3")
+    left = {topic.topic: topic.left_out for topic in report.topics if topic.left_out}
+    assert set(left) == {"/p"}
+    assert "ROS 1" in left["/p"]
+    assert not report.faithful
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".db3"])
+def test_types_without_an_adapter_are_exact_whatever_they_hold(
+    ingested: Ingest, tmp_path: Path, suffix: str
+) -> None:
+    text = ODD if suffix == ".mcap" else ODD.replace("wstring", "string")
+    odd = define("acme_msgs/msg/Odd", text)
+    empty = define("std_msgs/msg/Empty", "")
+    source = record(
+        tmp_path / "in.mcap", [("/odd", odd, 1, ODD_VALUES), ("/e", empty, 2, {}), ("/e", empty, 2, {})]
+    )
+    out = tmp_path / f"out{suffix}"
+    assert export_sequence(ingested(source), "s", out).faithful
+    assert differences(source, out) == {}
+
+
+def test_a_type_that_a_container_cannot_describe_is_left_out(ingested: Ingest, tmp_path: Path) -> None:
+    odd, plain = define("acme_msgs/msg/Odd", ODD), define("std_msgs/msg/String", "string data\n")
+    messages = [("/odd", odd, 1, ODD_VALUES), ("/s", plain, 2, {"data": "x"})]
+    report = export_sequence(ingested(record(tmp_path / "in.mcap", messages)), "s", tmp_path / "out.db3")
+    assert {topic.topic for topic in report.topics if "wstring" in topic.left_out} == {"/odd"}
+
+
+def test_pictures_packed_as_png_come_back_as_pixels(ingested: Ingest, tmp_path: Path) -> None:
+    store = ingested(DRIVE, images={"/camera/image_raw": "png"})
+    out = tmp_path / "out.mcap"
+    assert export_sequence(store, "s", out, topics=["/camera/image_raw"]).faithful
+    assert set(differences(DRIVE, out).pop("/imu")) == {"(count)"}
+    assert "/camera/image_raw" not in differences(DRIVE, out)
+
+
+def test_a_span_of_time_is_half_open_and_topics_are_patterns(ingested: Ingest, tmp_path: Path) -> None:
+    store, out = ingested(DRIVE), tmp_path / "out.mcap"
+    times = [time for time, _ in messages_of(DRIVE)["/imu"]]
+    export_sequence(store, "s", out, topics=["/*", "!/c*"], start_ns=times[10], end_ns=times[20])
+    written = messages_of(out)
+    assert [time for time, _ in written["/imu"]] == times[10:20]
+    assert not [topic for topic in written if topic.startswith("/c")]
+
+
+def test_what_cannot_be_written_leaves_no_file(ingested: Ingest, tmp_path: Path) -> None:
+    store = ingested(DRIVE)
+    for out, error, options in (
+        ("a.mcap", NothingMatched, {"topics": ["/none"]}),
+        ("a.mcap", NothingMatched, {"start_ns": 2**62}),
+        ("a.bag", NothingMatched, {}),
+        ("a.txt", BagError, {}),
+        ("no/a.mcap", BagError, {}),
+    ):
+        with pytest.raises(error):
+            export_sequence(store, "s", tmp_path / out, **options)
+    assert [path.name for path in tmp_path.iterdir()] == ["store"]
+
+
+def test_a_file_is_replaced_only_if_that_is_said(ingested: Ingest, tmp_path: Path) -> None:
+    store, out = ingested(DRIVE), tmp_path / "out.mcap"
+    out.write_bytes(b"mine")
+    with pytest.raises(BagError, match="there already"):
+        export_sequence(store, "s", out, topics=["/imu"])
+    assert out.read_bytes() == b"mine"
+    export_sequence(store, "s", out, topics=["/imu"], replace=True)
+    assert len(messages_of(out)["/imu"]) == 1000
+
+
+def test_an_adapter_of_ones_own_is_undone_where_it_is_named(ingested: Ingest, tmp_path: Path) -> None:
+    own = DRIVE.parent / "adapters" / "battery_pack.yaml"
+    store, out = ingested(DRIVE, adapters=(str(own),)), tmp_path / "out.mcap"
+    with pytest.raises(NothingMatched, match="--adapter"):
+        export_sequence(store, "s", out, topics=["/battery"])
+    assert export_sequence(store, "s", out, topics=["/battery"], adapters=[str(own)]).faithful
+    assert "/battery" not in differences(DRIVE, out)
+
+
+def test_columns_that_cannot_be_undone_are_named(ingested: Ingest, tmp_path: Path) -> None:
+    adapter = tmp_path / "sum.yaml"
+    adapter.write_text(
+        "version: 1\nadapter: SumAdapter\nros_type: acme_msgs/msg/Two\n"
+        "ontology: {tag: Sum, fields: {sum: float64, a: float64}}\nfields: {sum: a + b, a: a}\n"
+    )
+    two = define("acme_msgs/msg/Two", "float64 a\nfloat64 b\n")
+    source = record(tmp_path / "in.mcap", [("/t", two, 1, {"a": 1.0, "b": 2.0})])
+    store = ingested(source, adapters=(str(adapter),))
+    (topic,) = export_sequence(store, "s", tmp_path / "out.mcap", adapters=[str(adapter)]).topics
+    assert topic.not_undone == {"sum": "a + b"}
+    assert topic.unknown == ("b",)
+    assert topic.changed == {"sum": 1}
+    assert not topic.faithful
+
+
+def test_a_topic_that_does_not_say_what_it_was_is_left_out(ingested: Ingest, tmp_path: Path) -> None:
+    store = ingested(DRIVE)
+    with store.catalog.write() as db:
+        db.execute("UPDATE topics SET metadata = '{}' WHERE name = '/imu'")
+    report = export_sequence(store, "s", tmp_path / "out.mcap", topics=["/imu", "/joint_states"])
+    assert "does not say" in report.topics[0].left_out
+    assert report.topics[1].messages == 500
+
+
+LISTED = {
+    "NavSatFix": {"position_covariance", "position_covariance_type", "status.status", "status.service"},
+    "Range": {"min_range", "max_range"},
+    "Temperature": {"temperature", "variance"},
+    "CameraInfo": {"binning_x", "binning_y"},
+    "CompressedImage": {"format"},
+}
+"""What may differ in real recordings, beside `header.seq` and covariances; the documentation has all of it."""
+
+
+@pytest.mark.slow
+def test_real_recordings_come_back_but_for_what_is_listed(corpus: Path, tmp_path: Path) -> None:
+    with (corpus / "INDEX.tsv").open(encoding="utf-8", newline="") as file:
+        paths = [corpus / entry["path"] for entry in csv.DictReader(file, delimiter="\t")]
+    compared = 0
+    for number, path in enumerate(paths):
+        files = [path] if path.is_file() else [one for one in path.rglob("*") if one.is_file()]
+        if sum(file.stat().st_size for file in files) < 2_000_000:
+            compared += round_trip(path, tmp_path / str(number))
+    assert compared > 150
+
+
+def round_trip(path: Path, folder: Path) -> int:
+    """Check one recording; return how many topics were compared."""
+    folder.mkdir()
+    options = {
+        "topics_on_error": TopicLevelErrorPolicy.Ignore,
+        "messages_on_error": LoaderErrorPolicy.IGNORE,
+    }
+    done = run([ROSInjectionConfig(file_path=path, sequence_name="s", store=folder / "s", **options)])
+    rejected = {topic.target for topic in done.recordings[0].topics if topic.rejected}
+    try:
+        report = export_sequence(Store.open(folder / "s", create=False), "s", folder / "out.mcap")
+        found = differences(path, folder / "out.mcap")
+    except IngestError:
+        assert done.recordings[0].totals.written == 0 or done.recordings[0].error
+        return 0
+    for topic in report.topics:
+        assert not topic.left_out
+        assert not topic.changed
+        wrong = found.get(topic.topic, set()) - LISTED.get(topic.msgtype.rpartition("/")[2], set())
+        wrong = {field for field in wrong if not field.endswith(("header.seq", "covariance"))}
+        assert not wrong or topic.topic in rejected, f"{path}: {topic.topic}: {wrong}"
+    return len(report.topics)

@@ -1,0 +1,34 @@
+"""Recordings made of definitions and values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from mosaico_ingest.bag.batch import Encoding
+from mosaico_ingest.bag.definition import Definition, Embedded
+from mosaico_ingest.bag.serialize import Serializer
+from mosaico_ingest.bag.types import TypeResolver
+from mosaico_ingest.bag.writing import open_writer
+from mosaico_ingest.policies import Stores
+
+Message = tuple[str, Definition, int, dict[str, Any]]
+
+
+def define(msgtype: str, text: str, *, version: int = 2) -> Definition:
+    embedded = Embedded(f"ros{version}msg", text)
+    return TypeResolver(Stores.EMPTY).resolve(msgtype, embedded, ros_version=version)
+
+
+def record(path: Path, messages: Iterable[Message]) -> Path:
+    """Write messages: topic, definition, log time in ns, values."""
+    with open_writer(path) as writer:
+        channels: dict[tuple[str, str], int] = {}
+        for topic, definition, log_ns, values in messages:
+            key = (topic, definition.text)
+            if key not in channels:
+                channels[key] = writer.channel(topic, definition)
+            encoding = Encoding.ROS1 if definition.ros_version == 1 else Encoding.CDR
+            writer.write(channels[key], log_ns, Serializer(definition, encoding).from_dict(values))
+    return path
