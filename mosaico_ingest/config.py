@@ -14,6 +14,7 @@ from mosaico_ingest.patterns import first_match
 from mosaico_ingest.policies import (
     IfExists,
     LoaderErrorPolicy,
+    OnSchemaChange,
     SessionLevelErrorPolicy,
     Stores,
     TopicLevelErrorPolicy,
@@ -182,6 +183,10 @@ class ROSInjectionConfig:
     """Where the manifest says what: of a key its place, of a list's item the item's, by their path."""
     quarantine: QuarantineSettings | None = None
     """Where rejected messages are kept; None: they are only counted."""
+    family: str | None = None
+    """What sequences with the same topics have in common; None: the sequence is alone."""
+    on_schema_change: OnSchemaChange | None = None
+    """What to do when a topic's definition is not what it was in the family; None: nobody looks."""
     plan_digest: str | None = None
     """The `digest` of the only plan that may be run; None: whatever the recording calls for."""
 

@@ -7,6 +7,7 @@ from enum import Enum
 __all__ = [
     "IfExists",
     "LoaderErrorPolicy",
+    "OnSchemaChange",
     "SessionLevelErrorPolicy",
     "Stores",
     "TopicLevelErrorPolicy",
@@ -52,6 +53,16 @@ class IfExists(str, Enum):
     SKIP = "skip"
     APPEND = "append"
     REPLACE = "replace"
+
+
+class OnSchemaChange(str, Enum):
+    """What to do when a topic's message definition is not what it was in its family of sequences."""
+
+    FAIL = "fail"
+    EVOLVE = "evolve"
+    """Say so and store the topic with its new columns."""
+    NEW_TOPIC = "new_topic"
+    """Store it under a name of its own."""
 
 
 class Unmodeled(str, Enum):

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from mosaico_ingest.config import ServerTarget, StoreTarget
 from mosaico_ingest.errors import BagError, SequenceExists
 from mosaico_ingest.plan.describe import decisions
-from mosaico_ingest.plan.model import Plan
+from mosaico_ingest.plan.model import LEDGER_KEY, Plan
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.store.layout import Layout
 from mosaico_ingest.store.store import Store
@@ -34,8 +34,6 @@ __all__ = [
     "what_to_do",
 ]
 
-LEDGER_KEY = "mosaico_ingest"
-"""The key of a sequence's metadata, and of each of its sessions, that the ledger is kept under."""
 _PIECE_BYTES = 1 << 20
 
 
@@ -58,6 +56,8 @@ class Ledger(_Part):
     job: str
     """Digest of every decision about what is stored: topics, adapters, definitions, columns, metadata, time."""
     sources: tuple[Source, ...]
+    family: str | None = None
+    """What it shares its definitions with."""
 
     def same_content(self, other: Ledger) -> bool:
         """Say whether both are about the same bytes, whatever the files are called."""
@@ -95,7 +95,7 @@ def ledger_of(plan: Plan) -> Ledger:
         Source(name=path.name, size_bytes=path.stat().st_size, content=content_digest(path))
         for path in plan.files
     )
-    return Ledger(tool=__version__, job=_job_digest(plan), sources=sources)
+    return Ledger(tool=__version__, job=_job_digest(plan), sources=sources, family=plan.family)
 
 
 def content_digest(path: Path) -> str:

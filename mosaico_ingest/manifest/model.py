@@ -26,6 +26,7 @@ from mosaico_ingest.manifest.units import parse_instant, parse_limit, parse_offs
 from mosaico_ingest.policies import (
     IfExists,
     LoaderErrorPolicy,
+    OnSchemaChange,
     SessionLevelErrorPolicy,
     Stores,
     TopicLevelErrorPolicy,
@@ -176,6 +177,9 @@ class SequenceSection(_Section):
     name: Text = Field(default="{stem}", examples=["Test_Run_01", "{parent}_{stem}"])
     """The sequence's name; filled in for each recording: {stem} and {name}, the file's name without and with its suffix,
     {parent}, its folder's, {date}, the day it was last changed, {index}, its position from 1, {index:03} padded."""
+    family: Text | None = Field(default=None, examples=["delivery robots"])
+    """What this sequence shares its topics' definitions with, for `on_schema_change`; `name` as it is written here,
+    without this."""
     metadata: dict[Text, JsonValue] = Field(
         default={}, examples=[{"driver_version": "v2.1", "weather": "sunny"}]
     )
@@ -314,6 +318,9 @@ class Manifest(_Section):
     """How messages become ontology records where the built-in adapters are not wanted."""
     on_error: OnErrorSection = OnErrorSection()
     """What an error costs."""
+    on_schema_change: OnSchemaChange | None = None
+    """When a topic's message definition is not what it was in earlier sequences of the family: fail, evolve (say so, and
+    store the new columns), new_topic (store it under a name of its own). Nobody looks without this."""
     quarantine: QuarantineSection | None = None
     """Where rejected messages are kept; without this section they are only counted."""
     target: TargetSection = TargetSection()

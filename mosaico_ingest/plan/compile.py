@@ -82,6 +82,8 @@ def _fields(loaded: LoadedManifest) -> dict[str, Any]:
         "on_error": manifest.on_error.session,
         "topics_on_error": _topic_policies(loaded),
         "messages_on_error": manifest.on_error.message,
+        "family": manifest.sequence.family or manifest.sequence.name,
+        "on_schema_change": manifest.on_schema_change,
         "quarantine": _quarantine(loaded),
         "log_level": manifest.run.log_level,
         "report_path": _path(loaded, manifest.run.report),

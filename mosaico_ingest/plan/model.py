@@ -19,8 +19,10 @@ from mosaico_ingest.policies import (
     TopicLevelErrorPolicy,
 )
 
-__all__ = ["DEFAULT_MEMORY_BYTES", "LeftOut", "Plan", "TopicPlan"]
+__all__ = ["DEFAULT_MEMORY_BYTES", "LEDGER_KEY", "LeftOut", "Plan", "TopicPlan"]
 
+LEDGER_KEY = "mosaico_ingest"
+"""The key of a sequence's metadata, and of each of its sessions, that says what it was made from."""
 DEFAULT_MEMORY_BYTES = 256 * 1024 * 1024
 
 
@@ -86,5 +88,7 @@ class Plan:
     """Messages recorded at this instant or later are not read."""
     quarantine: QuarantineSettings | None = None
     """Where rejected messages are kept."""
+    family: str | None = None
+    """What the sequences of the same job, for other recordings, have in common."""
     memory_bytes: int = DEFAULT_MEMORY_BYTES
     """How much memory batches may take, from reading to writing."""

@@ -14,6 +14,7 @@ from mosaico_ingest.errors import AdapterError, BagError, NothingMatched
 from mosaico_ingest.patterns import Selection, first_match, select
 from mosaico_ingest.plan.describe import check_digest
 from mosaico_ingest.plan.model import DEFAULT_MEMORY_BYTES, LeftOut, Plan, TopicPlan
+from mosaico_ingest.plan.schema_change import follow_schema_changes
 from mosaico_ingest.plan.topics import decide, merge
 
 __all__ = ["resolve"]
@@ -70,8 +71,11 @@ def resolve(
         read_from_ns=read_from_ns,
         read_until_ns=read_until_ns,
         quarantine=config.quarantine,
+        family=config.family or config.sequence_name,
         memory_bytes=config.memory_bytes or DEFAULT_MEMORY_BYTES,
     )
+    if config.on_schema_change is not None:
+        plan = follow_schema_changes(plan, config.on_schema_change)
     check_digest(plan, config)
     return plan
 

@@ -23,6 +23,7 @@ from mosaico_ingest.plan.compile import compile_manifest
 from mosaico_ingest.policies import (
     IfExists,
     LoaderErrorPolicy,
+    OnSchemaChange,
     SessionLevelErrorPolicy,
     Stores,
     TopicLevelErrorPolicy,
@@ -58,7 +59,7 @@ bag:
   ros_distro: ros2_humble
   custom_msgs: [{package: p, path: msgs, store: ros1_noetic}]
   time: {start: +10s, end: 2026-03-01T12:00:00Z}
-sequence: {name: "x_{stem}", metadata: {weather: sunny}, metadata_file: metadata.json, if_exists: append}
+sequence: {name: "x_{stem}", family: f, metadata: {weather: sunny}, metadata_file: metadata.json, if_exists: append}
 topics: [/cam*]
 topic_settings: {/imu: {rename: /sensors/imu, metadata: {mount: roof}}, "/camera/*": {every: 3, image: png}}
 adapters:
@@ -67,6 +68,7 @@ adapters:
   unmodeled: skip
   serialization_formats: {p/msg/Scan: ragged}
 on_error: {session: delete, topic: {default: finalize, /gps: ignore}, message: raise}
+on_schema_change: new_topic
 quarantine: {path: q, max: 0.1%, max_run: 100, systematic: 7}
 target: {host: h, port: 1, api_key: "${KEY}", tls_cert: ca.pem, tls: true}
 run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
@@ -98,6 +100,8 @@ run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
         on_error=SessionLevelErrorPolicy.Delete,
         topics_on_error={"default": TopicLevelErrorPolicy.Finalize, "/gps": TopicLevelErrorPolicy.Ignore},
         messages_on_error=LoaderErrorPolicy.RAISE,
+        family="f",
+        on_schema_change=OnSchemaChange.NEW_TOPIC,
         quarantine=QuarantineSettings(folder / "q", Limit(share=0.001), Limit(100), 7),
         log_level="DEBUG",
         report_path=folder / "r.json",
@@ -119,7 +123,7 @@ run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
 def test_the_smallest_manifest_is_a_job(folder: Path) -> None:
     (config,) = compiled(folder, "bag: {path: data/run_a.bag}")
     assert config == ROSInjectionConfig(
-        file_path=folder / "data/run_a.bag", sequence_name="run_a", base_dir=folder
+        file_path=folder / "data/run_a.bag", sequence_name="run_a", base_dir=folder, family="{stem}"
     )
     assert config.target == StoreTarget(Path("mosaico"))
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from mosaico_ingest import api
-from mosaico_ingest.executors.ledger import LEDGER_KEY, content_digest
+from mosaico_ingest.executors.ledger import content_digest
+from mosaico_ingest.plan.model import LEDGER_KEY
 from mosaico_ingest.report.events import Event, RunStatus, TopicProgress
 from mosaico_ingest.store import Store
 
