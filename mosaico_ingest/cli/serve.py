@@ -28,6 +28,10 @@ def serve(
     ] = None,
     tls_cert: Annotated[Path | None, typer.Option("--tls-cert", help="The certificate to show, PEM.")] = None,
     tls_key: Annotated[Path | None, typer.Option("--tls-key", help="Its private key, PEM.")] = None,
+    idle_minutes: Annotated[
+        float,
+        typer.Option("--idle-minutes", min=0.01, help="A session is discarded after so long without a word."),
+    ] = 60,
 ) -> None:
     """Let clients of the platform list, read, query and write the store; until it is interrupted."""
     from mosaico_ingest.cli.signals import interrupt_on_terminate
@@ -44,7 +48,7 @@ def serve(
     tls = Tls(tls_cert, tls_key) if tls_cert is not None and tls_key is not None else None
     keys = Keyring(api_keys) if api_keys is not None else None
     interrupt_on_terminate()
-    server = start(store, host, port, keys=keys, tls=tls)
+    server = start(store, host, port, keys=keys, tls=tls, idle_s=idle_minutes * 60)
     try:
         typer.echo(f"serving {store} at {server.location}")
         if keys is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
@@ -257,6 +258,21 @@ def test_what_was_not_finalized_goes_with_the_server(tmp_path: Path, rows: Rows)
     store = Store.open(tmp_path / "served")
     assert store.sequence("drive").topics == ()
     assert list(store.path.rglob("*.parquet")) == []
+
+
+def test_a_session_nobody_speaks_of_any_more_is_discarded(tmp_path: Path, rows: Rows) -> None:
+    with serve(tmp_path / "store", port=0, idle_s=0.4) as server, Client(server) as client:
+        client.call("sequence_create", locator="drive", user_metadata={})
+        session = client.call("session_create", locator="drive")
+        for number in range(4):  # longer than the limit, but never silent for so long
+            uuid = client.create_topic(session["uuid"], f"drive/{number}")
+            client.put(f"drive/{number}", uuid, rows([1]))
+            time.sleep(0.15)
+        time.sleep(1)
+        assert client.info("drive")[0]["sessions"] == []
+        with refused(Condition.NOT_FOUND, "no open session"):
+            client.call("session_finalize", session_uuid=session["uuid"])
+        assert list((tmp_path / "store").rglob("*.parquet")) == []
 
 
 def test_a_port_that_is_taken_is_said_so(server: Server, tmp_path: Path) -> None:

@@ -15,11 +15,14 @@ from mosaico_ingest.store.server.keyring import Keyring
 from mosaico_ingest.store.server.service import Service
 from mosaico_ingest.store.store import Store
 
-__all__ = ["PORT", "Server", "Tls", "serve"]
+__all__ = ["IDLE_S", "PORT", "Server", "Tls", "serve"]
 
 PORT = 6726
 """Where clients look unless told otherwise."""
+IDLE_S = 3600.0
+"""How long a session may stay open without a word from its client."""
 _GRACE_S = 10.0
+_TIDY_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +36,7 @@ class Tls:
 class Server:
     """A running server; leaving it as a context shuts it down."""
 
-    def __init__(self, service: Service, store: Store, host: str, *, scheme: str) -> None:
+    def __init__(self, service: Service, store: Store, host: str, *, scheme: str, idle_s: float) -> None:
         self._service = service
         self._stopped = threading.Event()
         self.store_path = store.path
@@ -41,6 +44,7 @@ class Server:
         self.port = service.port
         self.location = f"{scheme}://{host}:{self.port}"
         """What a Flight client connects to."""
+        threading.Thread(target=self._tidy, args=(idle_s,), name="mosaico-ingest-tidy", daemon=True).start()
 
     def wait(self) -> None:
         """Block until the server is shut down; unlike Flight's own way to wait, signals are heard."""
@@ -59,6 +63,10 @@ class Server:
         self._stopped.set()
         return not stopping.is_alive()
 
+    def _tidy(self, idle_s: float) -> None:
+        while not self._stopped.wait(min(idle_s / 4, _TIDY_S)):
+            self._service.drop_idle(idle_s)
+
     def __enter__(self) -> Server:  # noqa: PYI034 - Self comes with Python 3.11, and nobody derives from this
         return self
 
@@ -75,10 +83,11 @@ def serve(
     *,
     keys: Keyring | None = None,
     tls: Tls | None = None,
+    idle_s: float = IDLE_S,
 ) -> Server:
     """Serve the store in the folder, which is made where there is none; port 0 takes a free one.
 
-    Without `keys` every caller may do everything.
+    Without `keys` every caller may do everything. A session whose client says nothing for `idle_s` is discarded.
 
     Raises:
         SinkError: The store cannot be opened, the certificate cannot be read, or the port is taken.
@@ -91,7 +100,7 @@ def serve(
     except (OSError, pa.ArrowException) as err:
         text = str(err).splitlines()[0]
         raise SinkError(f"cannot listen: {text}", where=f"{host}:{port}", hint="is the port taken?") from err
-    return Server(service, store, host, scheme=scheme)
+    return Server(service, store, host, scheme=scheme, idle_s=idle_s)
 
 
 def _read(path: Path) -> bytes:

@@ -39,6 +39,10 @@ class Service(fl.FlightServerBase):
         middleware = {MIDDLEWARE: KeyCheck(keyring)}
         super().__init__(location, tls_certificates=certificates, middleware=middleware)  # pyright: ignore[reportArgumentType] - PEM is bytes
 
+    def drop_idle(self, idle_s: float) -> None:
+        """Discard sessions whose clients have said nothing for so long."""
+        self._uploads.discard_idle(idle_s)
+
     def drop_uploads(self) -> None:
         """Discard what was never finalized."""
         self._uploads.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
@@ -50,6 +51,8 @@ class OpenSession:
     session: StoreSession
     topics: dict[str, _Topic] = field(default_factory=dict[str, _Topic])
     """By the UUID each upload names."""
+    heard_s: float = field(default_factory=time.monotonic)
+    """When its client last said something, on the monotonic clock."""
 
     @property
     def locator(self) -> str:
@@ -111,9 +114,10 @@ class Uploads:
         """Take the one upload of a topic."""
         ontology_columns = _payload(schema)
         with self._lock:
-            topic, writer = self._begin(put, ontology_columns)
+            opened, topic, writer = self._begin(put, ontology_columns)
         try:
             for batch in batches:
+                self._hear(opened)
                 columns = [batch.column(name) for name in writer.schema.names]
                 writer.write(pa.RecordBatch.from_arrays(columns, schema=writer.schema))
             writer.close()
@@ -169,12 +173,18 @@ class Uploads:
             topic.name == name for each in self.of_sequence(sequence) for topic in each.topics.values()
         )
 
+    def discard_idle(self, idle_s: float) -> bool:
+        """Drop the open sessions whose clients have said nothing for so long; return whether there are any."""
+        before = time.monotonic() - idle_s
+        with self._lock:
+            return self._drop([each for each in self._sessions.values() if each.heard_s < before])
+
     def close(self) -> None:
         """Drop every open session."""
         with self._lock:
             self._drop(tuple(self._sessions.values()))
 
-    def _begin(self, put: bodies.Put, payload: pa.StructType) -> tuple[_Topic, StoreTopic]:
+    def _begin(self, put: bodies.Put, payload: pa.StructType) -> tuple[OpenSession, _Topic, StoreTopic]:
         owners = [each for each in self._sessions.values() if put.topic_uuid in each.topics]
         if not owners:
             raise NotInStore(f"there is no topic with the UUID {put.topic_uuid}")
@@ -187,13 +197,19 @@ class Uploads:
         with checked():
             writer = owners[0].session.topic(topic.name, ontology, topic.question.user_metadata)
         topic.state = _State.UPLOADING
-        return topic, writer
+        return owners[0], topic, writer
+
+    def _hear(self, opened: OpenSession) -> None:
+        opened.heard_s = time.monotonic()
+        if opened.uuid not in self._sessions:
+            raise Refusal(Condition.PRECONDITION, "the session has ended")
 
     def _session(self, uuid: str) -> OpenSession:
         if uuid in self._finalized:
             raise Refusal(Condition.PRECONDITION, "the session is finalized already")
         if uuid not in self._sessions:
             raise NotInStore(f"there is no open session {uuid}")
+        self._sessions[uuid].heard_s = time.monotonic()
         return self._sessions[uuid]
 
     def _drop(self, sessions: Iterable[OpenSession]) -> bool:
