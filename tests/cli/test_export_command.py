@@ -1,0 +1,91 @@
+"""`ingest export`, as a user runs it."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from mosaico_ingest.cli.app import main
+
+DRIVE = Path(__file__).parents[2] / "configs" / "quickstart" / "drive.mcap"
+
+
+@dataclass(frozen=True)
+class Done:
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def ingest(folder: Path, *arguments: str) -> Done:
+    """Run the command in a folder, in this process."""
+    out, err = io.StringIO(), io.StringIO()
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as left:
+            main(arguments)
+    finally:
+        os.chdir(before)
+    return Done(int(left.value.code or 0), out.getvalue(), err.getvalue())
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a store that holds the sequence `drive`."""
+    folder = tmp_path_factory.mktemp("export")
+    done = ingest(folder, "bag", str(DRIVE), "--name", "drive", "--quiet")
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_the_account_names_every_topic_and_the_file(folder: Path) -> None:
+    done = ingest(folder, "export", "drive", "--to", "a.mcap")
+    assert done.returncode == 0, done.stderr
+    assert "FrameTransformAdapter" in done.stdout
+    assert "a.mcap: 2,130 messages" in done.stdout
+
+
+def test_the_account_is_json_for_programs(folder: Path) -> None:
+    done = ingest(
+        folder, "export", "drive", "--to", "b.mcap", "-t", "/imu", "--start", "+2s", "--end", "-3s", "--json"
+    )
+    account = json.loads(done.stdout)
+    assert [topic["topic"] for topic in account["topics"]] == ["/imu"]
+    assert account["topics"][0]["messages"] == 499
+
+
+def test_what_is_left_out_is_said_and_is_exit_code_4(folder: Path) -> None:
+    job = DRIVE.parents[1] / "quickstart.yaml"
+    (folder / "quickstart").symlink_to(DRIVE.parent)
+    (folder / "job.yaml").write_text(job.read_text().replace("../mosaico", "mosaico"))
+    assert ingest(folder, "run", "job.yaml", "--quiet").returncode == 0
+    done = ingest(folder, "export", "quickstart_drive", "--to", "c.mcap")
+    assert done.returncode == 4
+    assert "/battery: left out: no adapter known makes BatteryState" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (("drive", "--to", "x.txt"), 1, "write .mcap, .db3 or .bag"),
+        (("drive", "--to", "x.bag"), 3, "is of ROS 2"),
+        (("drive", "--to", "x.mcap", "-t", "/none"), 3, "no topic matches"),
+        (("nobody", "--to", "x.mcap"), 1, "no sequence 'nobody'"),
+        (("drive", "--to", "x.mcap", "--start", "soon"), 2, "neither an instant"),
+        (("drive", "--to", "x.mcap", "--adapter", "Nonsense"), 1, "no adapter is called"),
+    ],
+)
+def test_mistakes_are_told_in_a_line_and_leave_no_file(
+    folder: Path, arguments: tuple[str, ...], code: int, says: str
+) -> None:
+    done = ingest(folder, "export", *arguments)
+    assert done.returncode == code
+    assert says in done.stderr
+    assert not list(folder.glob("x.*"))
