@@ -1,0 +1,110 @@
+"""This file is what is fuzzed: each target takes any bytes, and nothing but a refusal of ours may come out.
+
+`python fuzz/targets.py TARGET [CORPUS] [-max_total_time=SECONDS]` fuzzes one of them with atheris, by coverage.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Callable
+from contextlib import nullcontext, suppress
+from pathlib import Path
+
+import numpy as np
+
+try:
+    import atheris
+except ImportError:  # only the long run needs it
+    atheris = None
+
+with atheris.instrument_imports(include=["mosaico_ingest"]) if atheris else nullcontext():
+    from mosaico_ingest.adapters.mapping.load import load_adapter
+    from mosaico_ingest.bag.batch import Channel, Encoding, RawBatch
+    from mosaico_ingest.bag.definition import Embedded
+    from mosaico_ingest.bag.metadata import read_metadata
+    from mosaico_ingest.bag.recording import open_recording
+    from mosaico_ingest.bag.types import TypeResolver
+    from mosaico_ingest.decode.choose import decoder_for
+    from mosaico_ingest.errors import IngestError
+    from mosaico_ingest.manifest.load import check_manifest
+    from mosaico_ingest.manifest.source import load_source
+    from mosaico_ingest.wire.actions import ACTIONS
+    from mosaico_ingest.wire.codec import JSON, Malformed
+
+__all__ = ["TARGETS"]
+
+_RESOLVER = TypeResolver("ros2_humble")
+
+
+def recording(data: bytes) -> None:
+    """A file of any container: what can be read is read to the end."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "recording")
+        path.write_bytes(data)
+        with suppress(IngestError), open_recording(path, resolve=_RESOLVER) as opened:
+            for batch in opened.batches():
+                if batch.channel.definition is not None and batch.channel.encoding is not Encoding.OTHER:
+                    with suppress(IngestError):
+                        decoder_for(batch.channel).decode(batch)
+
+
+def definition(data: bytes) -> None:
+    """The text of a type as a recording carries it, then messages of that type: the first byte says of which kind."""
+    encoding = ("ros1msg", "ros2msg", "ros2idl")[data[0] % 3] if data else "ros2msg"
+    text, _, payload = data[1:].partition(b"\0\0\0\0")
+    embedded = Embedded(encoding, text.decode("utf-8", "replace"))
+    ros1 = encoding == "ros1msg"
+    with suppress(IngestError):
+        found = _RESOLVER.resolve("pkg/msg/Fuzzed", embedded, ros_version=1 if ros1 else 2)
+        channel = Channel(0, "/fuzzed", found.root, Encoding.ROS1 if ros1 else Encoding.CDR, 1, found)
+        one = np.array([0], np.int64)
+        buffer = np.frombuffer(payload, np.uint8)
+        decoded = decoder_for(channel).decode(RawBatch(channel, one, buffer, one, one + len(payload), one))
+        decoded.rows.validate(full=True)
+
+
+def manifest(data: bytes) -> None:
+    """The text of a job."""
+    check_manifest(load_source(data.decode("utf-8", "replace"), file="job.yaml"), env={})
+
+
+def adapter(data: bytes) -> None:
+    """The text of an adapter, its expressions among it."""
+    with suppress(IngestError):
+        load_adapter(data.decode("utf-8", "replace"))
+
+
+def metadata(data: bytes) -> None:
+    """The `metadata.yaml` beside a recording."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "metadata.yaml")
+        path.write_bytes(data)
+        with suppress(IngestError):
+            read_metadata(path)
+
+
+def wire(data: bytes) -> None:
+    """The body of each action, its answer."""
+    for action in ACTIONS.values():
+        with suppress(Malformed):
+            JSON.decode(action.question, data)
+        with suppress(Malformed):
+            JSON.decode_answer(action, data)
+
+
+TARGETS: dict[str, Callable[[bytes], None]] = {
+    target.__name__: target for target in (recording, definition, manifest, adapter, metadata, wire)
+}
+
+
+def main() -> None:
+    """Fuzz the target that the command line names."""
+    if atheris is None or len(sys.argv) < 2 or sys.argv[1] not in TARGETS:  # noqa: PLR2004 - a name must be given
+        sys.exit(f"usage: python fuzz/targets.py {{{','.join(TARGETS)}}} [CORPUS] [-max_total_time=SECONDS]")
+    atheris.Setup([sys.argv[0], *sys.argv[2:]], TARGETS[sys.argv[1]])
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()
