@@ -12,6 +12,7 @@ from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.diagnostics import Finding, Severity
 from mosaico_ingest.executors.trial import try_messages
 from mosaico_ingest.executors.worker import foresee, open_for
+from mosaico_ingest.patterns import first_match
 from mosaico_ingest.plan.describe import decisions, notes
 from mosaico_ingest.plan.destination import ask_destination, space_finding
 from mosaico_ingest.plan.document import Decisions, PlanDocument, RecordingPlan
@@ -57,7 +58,7 @@ def preview(config: ROSInjectionConfig, *, connect: bool) -> RecordingPlan:
         decisions=decided,
         destination=state,
         samples=samples,
-        notes=notes((*plan.findings, *losses, *_left_out(plan), *found)),
+        notes=notes((*plan.findings, *losses, *_chosen(config, plan), *_left_out(plan), *found)),
     )
 
 
@@ -76,6 +77,17 @@ def _losses(recording: Recording) -> Iterator[Finding]:
     for loss in recording.losses:
         where = f"{Path(loss.file).name} at {loss.offset}" if loss.file else "the recording"
         yield Finding("unreadable", Severity.WARNING, f"{where}: {loss.reason}")
+
+
+def _chosen(config: ROSInjectionConfig, plan: Plan) -> Iterator[Finding]:
+    """Yield a note for each topic whose adapter the manifest names, with the line that does."""
+    for topic in plan.topics:
+        glob = first_match(config.adapter_override, topic.topic)
+        if glob is not None:
+            place = config.places.get(("adapters", "override", glob))
+            yield Finding(
+                "override", Severity.INFO, f"{topic.topic}: {topic.adapter.name} by {glob!r}", place
+            )
 
 
 def _left_out(plan: Plan) -> Iterator[Finding]:

@@ -25,6 +25,7 @@ _PATHS: tuple[Path, ...] = (
     ("sequence", "metadata_file"),
     ("target", "store"),
     ("target", "tls_cert"),
+    ("quarantine", "path"),
     ("run", "report"),
 )
 """Where a manifest has paths; None stands for every key and position."""

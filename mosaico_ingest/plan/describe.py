@@ -11,10 +11,10 @@ from mosaico_ingest.adapters.adapter import AdapterSpec
 from mosaico_ingest.adapters.image import PngImageSpec
 from mosaico_ingest.adapters.mapping.load import MappingSpec
 from mosaico_ingest.adapters.metadata import ROS_METADATA_KEY
-from mosaico_ingest.config import ROSInjectionConfig, StoreTarget
+from mosaico_ingest.config import Limit, QuarantineSettings, ROSInjectionConfig, StoreTarget
 from mosaico_ingest.diagnostics import Finding
 from mosaico_ingest.errors import IngestError
-from mosaico_ingest.plan.document import Decisions, FilePart, Note, PlannedTopic, UnreadTopic
+from mosaico_ingest.plan.document import Decisions, FilePart, Kept, Note, PlannedTopic, UnreadTopic
 from mosaico_ingest.plan.model import LeftOut, Plan, TopicPlan
 
 __all__ = ["check_digest", "decisions", "notes"]
@@ -40,6 +40,7 @@ def decisions(plan: Plan, *, folder: Path) -> Decisions:
         if_exists=plan.if_exists,
         on_error=plan.on_error,
         on_message_error=plan.on_message_error,
+        quarantine=None if plan.quarantine is None else _kept(plan.quarantine, folder),
         topics=tuple(map(_planned, plan.topics)),
         left_out=tuple(map(_unread, plan.left_out)),
     )
@@ -71,6 +72,18 @@ def notes(findings: Iterable[Finding]) -> tuple[Note, ...]:
             help=finding.help,
         )
         for finding in findings
+    )
+
+
+def _kept(settings: QuarantineSettings, folder: Path) -> Kept:
+    def bound(limit: Limit | None) -> int | float | None:
+        return None if limit is None else limit.count if limit.share is None else limit.share
+
+    return Kept(
+        path=_seen_from(folder, settings.path),
+        max=bound(settings.max),
+        max_run=bound(settings.max_run),
+        systematic=settings.systematic,
     )
 
 

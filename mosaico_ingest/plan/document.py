@@ -24,6 +24,7 @@ __all__ = [
     "Decisions",
     "DestinationState",
     "FilePart",
+    "Kept",
     "Note",
     "PlanDocument",
     "PlannedTopic",
@@ -82,6 +83,19 @@ class UnreadTopic(Part):
     why: str
 
 
+class Kept(Part):
+    """Where rejected messages are kept, and how many; limits are a number of messages or, below 1, a share of them."""
+
+    path: str
+    """Seen from the manifest's folder."""
+    max: int | float | None
+    """Of one topic."""
+    max_run: int | float | None
+    """Of all topics together."""
+    systematic: int
+    """So many failures from the very start of a topic end it."""
+
+
 class Decisions(Part):
     """Everything that a run follows, and that `--check` compares."""
 
@@ -103,6 +117,7 @@ class Decisions(Part):
     if_exists: IfExists
     on_error: SessionLevelErrorPolicy
     on_message_error: LoaderErrorPolicy
+    quarantine: Kept | None = None
     topics: tuple[PlannedTopic, ...]
     left_out: tuple[UnreadTopic, ...]
 

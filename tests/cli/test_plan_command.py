@@ -72,6 +72,21 @@ def test_what_the_manifest_names_and_the_recording_lacks_is_pointed_at(ingest: I
     assert "topic_settings: '/gps/fixx' matches none of 10 topics — the nearest is /gps/fix" in said
 
 
+def test_an_adapter_that_is_named_is_told_with_the_line_that_does(ingest: Ingest) -> None:
+    edit(JOB, "adapters:\n", 'adapters:\n  override: {"/od*": OdometryAdapter}\n')
+    with Path(JOB).open("a") as file:
+        file.write("quarantine: {max: 1%}\n")
+    code, said = ingest("plan", JOB, "--json")
+    assert code == 0
+    (recording,) = PlanDocument.model_validate_json(said).recordings
+    (note,) = (note for note in recording.notes if note.rule == "override")
+    assert note.message == "/odom: OdometryAdapter by '/od*'"
+    assert note.place == "configs/quickstart.yaml:18:14"
+    kept = recording.decisions.quarantine
+    assert kept is not None
+    assert (kept.path, kept.max) == ("quarantine", 0.01)
+
+
 def test_every_adapter_that_does_not_fit_is_told_at_once(ingest: Ingest) -> None:
     edit("configs/quickstart/adapters/battery_pack.yaml", "voltage: voltage_mv", "voltage: gone")
     edit(JOB, "adapters:\n", "adapters:\n  override: {/imu: GPSAdapter}\n")
