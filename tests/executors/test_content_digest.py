@@ -1,0 +1,37 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mosaico_ingest.executors.ledger import content_digest
+
+MIB = 1 << 20
+
+
+def sparse(path: Path, size: int, *marks: int) -> Path:
+    with path.open("wb") as file:
+        file.truncate(size)
+        for mark in marks:
+            file.seek(mark)
+            file.write(b"x")
+    return path
+
+
+@pytest.mark.parametrize("size", [0, 1, MIB - 1, MIB, 3 * MIB + 5])
+def test_a_copy_has_the_same_digest_and_a_longer_file_another(tmp_path: Path, size: int) -> None:
+    one, other = sparse(tmp_path / "a", size), sparse(tmp_path / "b", size)
+    assert content_digest(one) == content_digest(other)
+    assert content_digest(one) != content_digest(sparse(tmp_path / "c", size + 1))
+
+
+@pytest.mark.parametrize("mark", [0, MIB - 1, MIB, 2 * MIB, 3 * MIB + 4])
+def test_any_byte_of_a_short_file_counts(tmp_path: Path, mark: int) -> None:
+    size = 3 * MIB + 5
+    assert content_digest(sparse(tmp_path / "a", size)) != content_digest(sparse(tmp_path / "b", size, mark))
+
+
+@pytest.mark.parametrize("mark", [0, 300 * MIB - 1])
+def test_the_first_and_the_last_byte_of_a_long_file_count(tmp_path: Path, mark: int) -> None:
+    size = 300 * MIB
+    assert content_digest(sparse(tmp_path / "a", size)) != content_digest(sparse(tmp_path / "b", size, mark))
