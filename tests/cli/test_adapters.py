@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from mosaico_ingest.adapters.builtin import BUILTIN, BY_NAME
 from mosaico_ingest.adapters.definitions import KnownTypes
+from mosaico_ingest.bridge import installed_adapters
 from mosaico_ingest.cli.app import main
 from mosaico_ingest.executors.catalog import explain_adapter
 
@@ -18,6 +20,25 @@ ROOT = Path(__file__).resolve().parents[2]
 JOB = ROOT / "configs" / "quickstart.yaml"
 BAG = ROOT / "configs" / "quickstart" / "drive.mcap"
 PACK = ROOT / "configs" / "quickstart" / "adapters" / "battery_pack.yaml"
+PACKAGE = """
+from mosaico_ingest import ROSAdapterBase, Serializable
+
+
+class FlatImu(Serializable):
+    x: float
+
+
+class FlatImuAdapter(ROSAdapterBase[FlatImu]):
+    ros_msgtype = "sensor_msgs/msg/Imu"
+    __mosaico_ontology_type__ = FlatImu
+
+    @classmethod
+    def from_dict(cls, ros_data):
+        return FlatImu(x=ros_data["linear_acceleration"]["x"])
+
+
+OFFERED = [FlatImuAdapter]
+"""
 MESSAGES = ROOT / "configs" / "quickstart" / "acme_msgs"
 
 
@@ -146,6 +167,46 @@ def test_a_test_can_be_a_recorded_message(ingest: Ingest, tmp_path: Path) -> Non
     code, out, _ = ingest("test", "pack.yaml", "--msg-dir", MESSAGES)
     assert code == 1
     assert "there is none at index 99999" in out
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A package as an installer leaves it, which offers an adapter."""
+    info = tmp_path / "site" / "acme_pkg-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-pkg\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[mosaico_ingest.adapters]\nimu = acme_pkg_for_tests:OFFERED\n")
+    (info.parent / "acme_pkg_for_tests.py").write_text(PACKAGE)
+    monkeypatch.syspath_prepend(info.parent)
+    installed_adapters.cache_clear()
+    yield info
+    sys.modules.pop("acme_pkg_for_tests", None)
+    installed_adapters.cache_clear()
+
+
+@pytest.mark.usefixtures("package")
+def test_the_adapter_of_an_installed_package_is_listed_used_and_may_be_named(
+    ingest: Ingest, capsys: pytest.CaptureFixture[str]
+) -> None:
+    listed = json.loads(ingest("list", "--type", "Imu", "--json")[1])
+    assert listed[0]["name"] == "FlatImuAdapter"
+    assert listed[0]["origin"] == "entry point imu of acme-pkg"
+    assert "entry point imu of acme-pkg" in ingest("explain", "--bag", BAG)[1]
+    assert "acme_pkg_for_tests.FlatImuAdapter.from_dict" in ingest("explain", "FlatImuAdapter")[1]
+    job = f"version: 1\nbag: {{path: {BAG}}}\nsequence: {{name: s}}\ntopics: [/imu]\n"
+    Path("job.yaml").write_text(job + "adapters: {override: {/imu: FlatImuAdapter}}\n")
+    assert "override '/imu'" in ingest("explain", "--job", "job.yaml")[1]
+    with pytest.raises(SystemExit):
+        main(["lint", "job.yaml"])
+    assert "unknown-adapter" not in capsys.readouterr().out
+
+
+def test_a_broken_installed_package_is_named(ingest: Ingest, package: Path) -> None:
+    (package / "entry_points.txt").write_text("[mosaico_ingest.adapters]\nimu = acme_pkg_for_tests:Gone\n")
+    code, _, err = ingest("list")
+    assert code == 1
+    assert "acme-pkg" in err
+    assert "Gone" in err
 
 
 @pytest.mark.parametrize("ontology", [(), ("--ontology", "BatteryState")])
