@@ -100,7 +100,7 @@ def print_tests(results: Sequence[TestResult], *, as_json: bool) -> None:
     for one in results:
         _print_result(one, console)
     tests = [outcome for one in results for outcome in one.outcomes]
-    line = f"{len(results)} adapters, {sum(one.passed for one in tests)} of {len(tests)} tests passed"
+    line = f"{len(results)} adapter{'' if len(results) == 1 else 's'}, {sum(one.passed for one in tests)} of {len(tests)} tests passed"
     misfits = sum(bool(one.findings) for one in results)
     line += f", {misfits} do not fit their types" if misfits else ""
     style = "green" if all(one.passed for one in results) else "bold red"
