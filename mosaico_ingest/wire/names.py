@@ -12,6 +12,7 @@ from mosaico_ingest.errors import SinkError
 __all__ = ["check_metadata", "check_sequence_name", "check_topic_name"]
 
 _FORBIDDEN = re.compile(r"[^\x21-\x7e]|[!\"'*£$%&.:]")
+_MAX_DEPTH = 64
 _KEY = re.compile(r"[A-Za-z0-9 _-]+")
 _NAMES = "ASCII without blanks and without ! \" ' * $ % & . :"
 
@@ -45,6 +46,8 @@ def _refuse(name: str, bad: re.Match[str] | None, *, kind: str, allowed: str) ->
 
 def check_metadata(metadata: Mapping[str, Any], *, where: str) -> str:
     """Return the metadata as JSON, or raise SinkError with the path of the key or value that is refused."""
+    if _is_deeper(metadata, _MAX_DEPTH):
+        raise SinkError(f"metadata is nested deeper than {_MAX_DEPTH} levels", where=where, hint="flatten it")
     for path, key in _keys(metadata, ""):
         if not _KEY.fullmatch(key) or "--" in key:
             raise SinkError(
@@ -52,9 +55,18 @@ def check_metadata(metadata: Mapping[str, Any], *, where: str) -> str:
                 where=where,
             )
     try:
-        return json.dumps(metadata, allow_nan=False)
+        text = json.dumps(metadata, allow_nan=False)
+        json.dumps(metadata, ensure_ascii=False).encode()  # half a surrogate pair is no text to most readers
     except (TypeError, ValueError) as err:
         raise SinkError(f"metadata is not JSON: {err}", where=where) from err
+    return text
+
+
+def _is_deeper(value: object, levels: int) -> bool:
+    if not isinstance(value, Mapping | list | tuple):
+        return False
+    inner = value.values() if isinstance(value, Mapping) else value
+    return levels == 0 or any(_is_deeper(child, levels - 1) for child in inner)
 
 
 def _keys(value: object, path: str) -> list[tuple[str, str]]:

@@ -141,6 +141,8 @@ REFUSED = {
     "depth": "a: " + "[" * 20_000,
     "object": "bag: !!python/object/apply:os.system ['touch sprung']\n",
     "surrogate": 'bag: {path: drive}\nsequence: {metadata: {a: "\\ud800"}}\n',
+    "metadata": "bag: {path: drive}\nsequence: {name: s, metadata_file: deep.json}\n",
+    "half a pair": "bag: {path: drive}\nsequence: {name: s, metadata_file: pair.json}\n",
     "not a number": "bag: {path: drive}\nsequence: {metadata: {a: .nan}}\n",
     "name": "bag: {path: drive}\nsequence: {name: ../../up}\n",
     "topic": "bag: {path: drive}\ntopic_settings: {/ok: {rename: ../../up}}\n",
@@ -154,6 +156,8 @@ def test_a_hostile_job_is_refused(tmp_path: Path, ingest: Ingest, kind: str) -> 
     record(tmp_path / "drive")
     os.mkfifo(tmp_path / "pipe")
     os.mkfifo(tmp_path / "pipe.yaml")
+    (tmp_path / "deep.json").write_text('{"a": ' + '[{"b": ' * 400 + "1" + "}]" * 400 + "}")
+    (tmp_path / "pair.json").write_text('{"a": "\\ud800"}')
     (tmp_path / "msgs").mkdir()
     (tmp_path / "msgs" / "Zero.msg").symlink_to("/dev/zero")
     for number in range(1, 25):
