@@ -52,6 +52,7 @@ def run(
     from mosaico_ingest import api
     from mosaico_ingest.cli.session import run_configs
     from mosaico_ingest.cli.shard import take_shard
+    from mosaico_ingest.cli.without_pandas import forgo_pandas
     from mosaico_ingest.report.metrics import prometheus_text
     from mosaico_ingest.report.model import RunReport
     from mosaico_ingest.report.write import write_whole
@@ -68,6 +69,7 @@ def run(
         if metrics is not None:
             write_whole(metrics, prometheus_text(result))
 
+    forgo_pandas(configs)
     run_configs(
         configs,
         report=report,

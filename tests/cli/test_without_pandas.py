@@ -21,14 +21,22 @@ print(len(pyarrow.array([1]).to_pandas()))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["bag", "inspect"])
+@pytest.mark.parametrize("command", ["run", "bag", "inspect"])
 def test_no_command_on_a_recording_imports_pandas_and_whoever_asks_still_gets_it(
     command: str, tmp_path: Path
 ) -> None:
     pytest.importorskip("pandas")
-    more = ["--name", "drive", "--store", str(tmp_path), "-q"] if command == "bag" else []
+    job = tmp_path / "job.yaml"
+    job.write_text(
+        f"version: 1\nbag: {{path: {DRIVE}}}\nsequence: {{name: drive}}\ntarget: {{store: store}}\n"
+    )
+    arguments = {
+        "run": [str(job), "-q"],
+        "bag": [str(DRIVE), "--name", "drive", "--store", str(tmp_path / "store"), "-q"],
+        "inspect": [str(DRIVE)],
+    }
     run = subprocess.run(  # noqa: S603 - our own program
-        [sys.executable, "-c", PROGRAM, command, str(DRIVE), *more],
+        [sys.executable, "-c", PROGRAM, command, *arguments[command]],
         capture_output=True,
         text=True,
         check=False,
