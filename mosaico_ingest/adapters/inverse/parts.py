@@ -37,12 +37,17 @@ _ONTOLOGY_NAMES = {
 
 @dataclass(frozen=True, slots=True)
 class _Mark:
-    """A value that only says why another was left out; it never takes the place of one that is known."""
+    """An element of a list, or a value that says why another was left out; where the whole is known, that stands."""
 
     index: int | None
     """Which element of the list; None: the value itself."""
     where: Mask
     value: Any
+    """One for all rows, or an array of one a row."""
+
+    def of(self, rows: Any) -> Any:  # noqa: ANN401 - numpy's positions, a field's values
+        """Return the values of some rows."""
+        return self.value[rows] if isinstance(self.value, np.ndarray) else self.value
 
 
 class Parts:
@@ -119,11 +124,11 @@ class Parts:
             if not len(rows):
                 continue
             if mark.index is None:
-                array = _with(array, rows, mark.value)
+                array = _with(array, rows, mark.of(rows))
                 continue
             elements, axis = open_list(array)
             rows = rows[axis.lengths[rows] > mark.index]
-            changed = _with(elements, axis.offsets[:-1][rows] + mark.index, mark.value)
+            changed = _with(elements, axis.offsets[:-1][rows] + mark.index, mark.of(rows))
             array = axis.close(changed, array.type)
         return array
 

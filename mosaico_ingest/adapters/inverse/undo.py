@@ -15,6 +15,7 @@ from mosaico_ingest.adapters.inverse.solve import ONE_ARGUMENT, with_constant
 from mosaico_ingest.adapters.mapping.arrow import Array, arrays, pc, pt
 from mosaico_ingest.adapters.mapping.build import Absent, ByAdapter, ByFields, Computed, Filled, Looked
 from mosaico_ingest.adapters.mapping.columns import Axis, Mask, field_of, nulls, open_list, true_where
+from mosaico_ingest.adapters.mapping.kinds import is_number
 from mosaico_ingest.adapters.mapping.load import MappingAdapter
 from mosaico_ingest.adapters.mapping.typed import (
     Apply,
@@ -139,12 +140,23 @@ class Undo:
             case ListValue(items=items):
                 for position, item in enumerate(items):
                     self._assign(item, _element(values, position), scope)
+            case ItemOf():
+                self._item(typed, values, scope)
             case ChoiceOf():
                 self._choice(typed, values, scope)
             case Apply():
                 self._apply(typed, values, scope)
             case _:
                 self._give_up(typed.text)
+
+    def _item(self, typed: ItemOf, values: Array, scope: _Scope) -> None:
+        """Put one number into its list, which is as long as its type says."""
+        named = _marked_place(typed, scope)
+        if named is None or not is_number(values.type):
+            self._give_up(typed.text)
+        else:
+            present = np.asarray(values.is_valid())
+            self._parts.mark(*named, present, np.asarray(pc.fill_null(values, 0)))
 
     def _apply(self, typed: Apply, values: Array, scope: _Scope) -> None:
         first = typed.arguments[0]

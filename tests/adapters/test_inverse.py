@@ -1,0 +1,159 @@
+"""What a mapping computes is undone, form by form."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from made_recordings import define
+
+from mosaico_ingest.adapters.adapter import Envelope
+from mosaico_ingest.adapters.inverse import Restored, invert
+from mosaico_ingest.adapters.inverse.compare import differences
+from mosaico_ingest.adapters.mapping.load import load_adapter
+from mosaico_ingest.bag.shape import ros_shape
+
+DEFINITION = define(
+    "acme_msgs/msg/T",
+    """
+uint8 IDLE=4
+int32 i
+uint16 u
+float32 f
+float64 d
+bool flag
+string text
+float64[3] three
+float64[] many
+acme_msgs/Cell[] cells
+acme_msgs/Cell cell
+builtin_interfaces/Time when
+================================================================================
+MSG: acme_msgs/Cell
+uint16 mv
+float32 t
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+""",
+)
+CELLS = [{"mv": 4001, "t": 20.5}, {"mv": 3999, "t": -1.25}]
+MESSAGE: dict[str, Any] = {
+    "i": -7,
+    "u": 4,
+    "f": 0.1,
+    "d": 1.5,
+    "flag": True,
+    "text": "a b",
+    "three": [1.0, 2.0, 3.0],
+    "many": [0.5],
+    "cells": CELLS,
+    "cell": CELLS[0],
+    "when": {"sec": 3, "nanosec": 4},
+}
+
+
+def restore(type_: str, value: str, message: dict[str, Any]) -> Restored:
+    """Put one message through a mapping of one column and take it back."""
+    text = (
+        f"version: 1\nadapter: TAdapter\nros_type: acme_msgs/msg/T\n"
+        f"ontology: {{tag: T, fields: {{x: {type_}}}}}\nfields:\n  x: {value}\n"
+    )
+    shape = ros_shape(DEFINITION)
+    adapter = load_adapter(text).bind(DEFINITION, shape)
+    envelope = Envelope("/t", DEFINITION.root, np.zeros(1, np.int64))
+    adapted = adapter.adapt(pa.array([message], shape), envelope)
+    assert not adapted.failures
+    return invert(adapter, shape, {}).restore(adapted.rows, envelope)
+
+
+@pytest.mark.parametrize(
+    ("type_", "value", "field"),
+    [
+        ("int32", "i", "i"),
+        ("float64", "f", "f"),
+        ("float64", "i * 0.001", "i"),
+        ("float64", "0.001 * i", "i"),
+        ("float64", "-i / 1000 + 5", "i"),
+        ("int64", "1000 - i", "i"),
+        ("float64", "u / 100", "u"),
+        ("uint8", "cast(u)", "u"),
+        ("bool", "not flag", "flag"),
+        ("uint8", "{value: u, map: {IDLE: 9, 1: 2}, else: error}", "u"),
+        ("uint16", "{value: u, map: {1: 2}, else: keep}", "u"),
+        ("float64", "nan_to_null(d)", "d"),
+        ("float64", "nan if d == -1 else d", "d"),
+        ("float64", "d if d > 0 else null", "d"),
+        ("float64", "coalesce(d, 0.0)", "d"),
+        ("float64", "null_if(d, 9.0)", "d"),
+        ("float64", "degrees(radians(f))", "f"),
+        ("'list[float64]'", "covariance(three)", "three"),
+        ("'list[float64]'", "'[three[0], three[1], three[2]]'", "three"),
+        ("{fields: {a: float64, b: float64, c: float64}}", "{fields: {a: 'three[0]', b: 'three[1]', c: 'three[2]'}}", "three"),
+        ("'list[float64]'", "empty_to_null(many)", "many"),
+        ("'list[float64, 3]'", "three", "three"),
+        ("'list[float64]'", "'many[] * 2'", "many"),
+        ("{fields: {seconds: int32, nanoseconds: uint32}}", "{fields: {seconds: when.sec, nanoseconds: when.nanosec}}", "when"),
+        ("float64", "seconds(when)", "when"),
+        ("int64", "nanoseconds(when)", "when"),
+        ("{fields: {v: uint16, t: float32}}", "{of: cell, fields: {v: mv, t: t}}", "cell"),
+        ("{type: list, fields: {v: float64, t: float32}}", "{of: 'cells[]', fields: {v: mv * 0.001, t: t}}", "cells"),
+    ],
+)  # fmt: skip
+def test_an_expression_is_undone(type_: str, value: str, field: str) -> None:
+    restored = restore(type_, value, MESSAGE)
+    assert not restored.kept_out
+    got = pa.array([MESSAGE], ros_shape(DEFINITION))
+    assert restored.rows.field(field).to_pylist() == got.field(field).to_pylist()
+    assert not restored.changed
+
+
+@pytest.mark.parametrize("value", ["i + u", "len(many)", "sum(many)", "i % 3", "i if flag else u", "d ** 2"])
+def test_what_has_many_sources_is_named_and_nothing_is_made_up(value: str) -> None:
+    restored = restore("float64", value, MESSAGE)
+    assert restored.kept_out == {"x": value} or restored.changed
+    assert {"text", "many", "cells"} <= set(restored.unknown)
+    assert restored.rows.field("cells").to_pylist() == [[]]
+
+
+def test_columns_of_the_elements_of_one_list_are_put_together() -> None:
+    text = (
+        "version: 1\nadapter: TAdapter\nros_type: acme_msgs/msg/T\n"
+        "ontology: {tag: T, fields: {v: 'list[uint16]', t: 'list[float32]'}}\n"
+        "fields: {v: 'cells[].mv', t: 'cells[].t'}\n"
+    )
+    shape = ros_shape(DEFINITION)
+    adapter = load_adapter(text).bind(DEFINITION, shape)
+    messages = [MESSAGE, MESSAGE | {"cells": []}, MESSAGE]
+    envelope = Envelope("/t", DEFINITION.root, np.zeros(3, np.int64))
+    adapted = adapter.adapt(pa.array(messages, shape), envelope)
+    restored = invert(adapter, shape, {}).restore(adapted.rows, envelope)
+    assert restored.rows.field("cells").to_pylist() == [CELLS, [], CELLS]
+
+
+NUMBER = st.none() | st.floats(width=32)
+VALUES = st.lists(
+    st.fixed_dictionaries({"a": NUMBER, "b": st.none() | st.lists(NUMBER, max_size=2)}),
+    min_size=1,
+    max_size=4,
+)
+TYPE = pa.struct([("a", pa.float32()), ("b", pa.list_(pa.float32()))])
+
+
+@given(VALUES, VALUES)
+def test_rows_differ_where_their_text_does(left: list[Any], right: list[Any]) -> None:
+    size = min(len(left), len(right))
+    left, right = left[:size], right[:size]
+    found = differences(pa.array(left, TYPE), pa.array(right, TYPE))
+    for name in ("a", "b"):
+        wrong = [spell(one[name]) != spell(other[name]) for one, other in zip(left, right, strict=True)]
+        assert found.get(name, np.zeros(size, bool)).tolist() == wrong
+
+
+def spell(value: Any) -> str:
+    return str(value).replace("-0.0", "0.0") if isinstance(value, (float, list)) else str(value)
