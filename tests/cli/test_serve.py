@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Generator
+from datetime import datetime, timezone
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
+from pyarrow import flight
 
 from mosaico_ingest.store import Store
+from mosaico_ingest.store.server import Keyring, Tls, serve
+from mosaico_ingest.wire.actions import Permission
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDING = ROOT / "configs" / "quickstart" / "drive.mcap"
@@ -45,6 +52,25 @@ def served(tmp_path: Path) -> Generator[tuple[Path, str, str]]:
     server.stdout.close()
 
 
+@pytest.fixture(scope="module")
+def places(tmp_path_factory: pytest.TempPathFactory) -> Generator[dict[str, str]]:
+    """The ports of a server without TLS and of one with it, its certificate, and a key that has expired."""
+    openssl = shutil.which("openssl")
+    if openssl is None:
+        pytest.skip("openssl makes the certificate, and is not here")
+    folder = tmp_path_factory.mktemp("places")
+    cert, key = folder / "cert.pem", folder / "key.pem"
+    words = f"req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 2 -subj /CN=localhost -addext subjectAltName=DNS:localhost -keyout {key} -out {cert}"
+    subprocess.run([openssl, *words.split()], check=True, capture_output=True)  # noqa: S603 - our own words
+    ring = Keyring(folder / "keys.json")
+    expired = ring.add(Permission.WRITE, expires=datetime(2020, 1, 1, tzinfo=timezone.utc))
+    with (
+        serve(folder / "plain", port=0, keys=ring) as plain,
+        serve(folder / "tls", port=0, keys=ring, tls=Tls(cert, key)) as secure,
+    ):
+        yield {"port": str(plain.port), "tls": str(secure.port), "cert": str(cert), "expired": expired}
+
+
 def test_a_recording_goes_to_the_server_and_is_in_its_store(served: tuple[Path, str, str]) -> None:
     folder, port, key = served
     arguments = ("bag", str(RECORDING), "--name", "drive", "--host", "127.0.0.1", "--port", port)
@@ -70,6 +96,62 @@ def test_keys_are_listed_without_being_shown(served: tuple[Path, str, str]) -> N
     listed = ingest("keys", "ls", cwd=folder).stdout
     assert "write" in listed
     assert key not in listed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--host", "no-such-host.invalid"), "no host is called 'no-such-host.invalid'"),
+        (("--host", "grpc://127.0.0.1:{port}"), "is neither a name nor an address"),
+        (
+            ("--host", "127.0.0.1", "--port", "{port}", "--tls-cert", "{cert}"),
+            "the server does not speak TLS",
+        ),
+        (("--host", "127.0.0.1", "--port", "{tls}"), "the server speaks TLS only"),
+        (("--host", "127.0.0.1", "--port", "{tls}", "--tls-cert", "{cert}"), "the certificate is not for"),
+        (
+            ("--host", "127.0.0.1", "--port", "{port}", "--api-key", "{expired}"),
+            "the API key expired on 2020",
+        ),
+        (
+            ("--host", "127.0.0.1", "--port", "{port}", "--api-key", "msco_x"),
+            "the API key is refused: it is not",
+        ),
+        (("--host", "127.0.0.1", "--port", "{port}"), "the server wants an API key"),
+    ],
+)
+def test_what_keeps_a_recording_from_its_server_is_one_line(
+    places: dict[str, str], tmp_path: Path, options: tuple[str, ...], said: str
+) -> None:
+    given = [option.format(**places) for option in options]
+    done = ingest("bag", str(RECORDING), "--name", "refused", "--quiet", *given, cwd=tmp_path)
+    assert done.returncode == 1
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert said in line
+    assert "Traceback" not in done.stderr
+    assert places["expired"] not in done.stderr
+
+
+def test_a_server_stops_at_once_with_an_upload_open(served: tuple[Path, str, str]) -> None:
+    """The fixture's end expects the server to leave; this client never ends its call."""
+    _, port, key = served
+    headers = [(b"mosaico-api-key-token", key.encode())]
+    options = flight.FlightCallOptions(headers=headers)
+    client = flight.connect(f"grpc://127.0.0.1:{port}")
+
+    def act(name: str, **body: object) -> dict[str, str]:
+        action = flight.Action(name, json.dumps(body).encode())
+        (answer,) = client.do_action(action, options)
+        return json.loads(answer.body.to_pybytes())["response"]
+
+    act("sequence_create", locator="open", user_metadata={})
+    session = act("session_create", locator="open")["uuid"]
+    kind = {"serialization_format": "default", "ontology_tag": "Sample", "user_metadata": {}}
+    topic = act("topic_create", session_uuid=session, locator="open/t", **kind)["uuid"]
+    command = json.dumps({"resource_locator": "open/t", "topic_uuid": topic}).encode()
+    schema = pa.schema([pa.field("timestamp_ns", pa.int64(), nullable=False)])
+    client.do_put(flight.FlightDescriptor.for_command(command), schema, options)
 
 
 def test_a_certificate_without_its_key_is_refused(tmp_path: Path) -> None:
