@@ -25,6 +25,7 @@ from mosaico_ingest.plan.compile import compile_manifests
 from mosaico_ingest.plan.document import PlanDocument, read_plan
 from mosaico_ingest.plan.drift import Difference, differences
 from mosaico_ingest.plan.model import Plan
+from mosaico_ingest.policies import IfExists
 from mosaico_ingest.report.events import BatchObserver, Observer, ignore_batch, ignore_events
 from mosaico_ingest.report.inspection import Inspection
 from mosaico_ingest.report.model import Report, RunReport
@@ -36,6 +37,7 @@ __all__ = [
     "compare_jobs",
     "compile_job",
     "compile_plan",
+    "compile_recording",
     "inspect_recording",
     "job_status",
     "plan_differences",
@@ -90,6 +92,21 @@ def compile_job(manifest: Path) -> tuple[ROSInjectionConfig, ...]:
     for _, alike in groupby(configs, key=lambda config: (config.adapters, config.adapter_override)):
         ROSBridge.for_config(next(alike))
     return configs
+
+
+def compile_recording(manifest: Path, recording: Path) -> tuple[ROSInjectionConfig, ...]:
+    """Return the configurations of a manifest for one recording instead of those it names.
+
+    What is in the destination already is skipped where the manifest does not say otherwise.
+
+    Raises:
+        IngestError: As `compile_job`.
+    """
+    loaded = (one.for_recording(recording.resolve()) for one in load_manifests(manifest))
+    return tuple(
+        replace(config, if_exists=IfExists.SKIP) if config.if_exists is IfExists.FAIL else config
+        for config in compile_manifests(tuple(loaded))
+    )
 
 
 def plan_job(manifest: Path, *, folder: Path | None = None, connect: bool = False) -> PlanDocument:

@@ -30,6 +30,7 @@ from mosaico_ingest.cli import (
     status,
     store,
     verify,
+    watch,
 )
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.version import __version__
@@ -49,6 +50,7 @@ COMMANDS: tuple[tuple[str, Callable[..., Any]], ...] = (
     ("export", export.export),
     ("lint", lint.lint),
     ("serve", serve.serve),
+    ("watch", watch.watch),
     ("status", status.status),
     ("report", report.report),
     ("schema", schema.schema),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -50,6 +50,11 @@ class LoadedManifest:
     def where(self, *place: str | int) -> str:
         """Return `file:line:column` of the value at a path, for the errors of later stages."""
         return str(self.source.span(place))
+
+    def for_recording(self, path: Path) -> LoadedManifest:
+        """Return the same manifest for another recording."""
+        bag = self.manifest.bag.model_copy(update={"path": str(path)})
+        return replace(self, manifest=self.manifest.model_copy(update={"bag": bag}))
 
     def resolve(self, path: str) -> Path:
         """Return a path of the manifest as seen from here: relative ones start in the manifest's folder."""

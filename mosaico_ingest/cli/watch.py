@@ -1,0 +1,110 @@
+"""This file is `ingest watch`: what arrives in a folder is ingested once it has come to rest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:  # imported for real when the command runs, so that --help starts fast
+    from mosaico_ingest.config import ROSInjectionConfig
+    from mosaico_ingest.executors.arrivals import Arrivals
+    from mosaico_ingest.report.model import Report
+
+__all__ = ["watch"]
+
+
+def watch(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Where recordings arrive.", exists=True, file_okay=False)
+    ],
+    manifest: Annotated[
+        Path, typer.Argument(metavar="JOB.yaml", help="What is done with each; its bag.path is not used.")
+    ],
+    *,
+    rest: Annotated[
+        float, typer.Option("--rest", min=0.0, help="Seconds without a change after which a file is whole.")
+    ] = 10.0,
+    every: Annotated[float, typer.Option("--every", min=0.05, help="Seconds between two looks.")] = 2.0,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Recordings ingested at a time.")] = 1,
+    once: Annotated[
+        bool, typer.Option("--once", help="Ingest what is there and comes to rest, then leave.")
+    ] = False,
+    log: Annotated[str, typer.Option("--log", help="Log level.", metavar="LEVEL")] = "WARNING",
+) -> None:
+    """Ingest what arrives in a folder, until it is interrupted; what is in the destination already is left alone."""
+    import time
+
+    from mosaico_ingest.cli.logs import set_up_logging
+    from mosaico_ingest.cli.signals import interrupt_on_terminate
+    from mosaico_ingest.executors.arrivals import Arrivals
+    from mosaico_ingest.manifest.load import load_manifests
+
+    set_up_logging(log)
+    interrupt_on_terminate()
+    arrivals = Arrivals(folder, rest)
+    load_manifests(manifest)  # a mistake is said now, not with the first recording
+    _say(f"watching {folder}")
+    leave_at = time.monotonic() + rest + every if once else float("inf")
+    try:
+        while True:
+            settled = arrivals.settled(time.monotonic())
+            if settled and not _ingest(manifest, settled, arrivals, jobs):
+                break
+            if not settled and time.monotonic() > leave_at:
+                break
+            time.sleep(every)
+    except KeyboardInterrupt:
+        pass
+    _say("stopped watching")
+
+
+def _ingest(manifest: Path, settled: tuple[Path, ...], arrivals: Arrivals, jobs: int) -> bool:
+    """Ingest recordings and say a line about each; return whether to go on."""
+    from mosaico_ingest.executors.processes import Processes
+    from mosaico_ingest.report.events import RunStatus, ignore_batch
+
+    work = [(path, config) for path in settled for config in _configs(manifest, path, arrivals)]
+    # Even one recording goes to a process of its own: what kills it does not end the watch.
+    reports = Processes(jobs).map([config for _, config in work], ignore_batch)
+    going_on = True
+    for (path, _), report in zip(work, reports, strict=False):
+        going_on = going_on and report.status is not RunStatus.INTERRUPTED
+        failed = report.exit_code not in {0, 4}
+        _say(f"{path}: {_outcome(report)}{_again(arrivals, path) if failed and going_on else ''}")
+    return going_on
+
+
+def _configs(manifest: Path, path: Path, arrivals: Arrivals) -> tuple[ROSInjectionConfig, ...]:
+    from mosaico_ingest import api
+    from mosaico_ingest.errors import IngestError
+
+    try:
+        return api.compile_recording(manifest, path)
+    except IngestError as error:
+        _say(f"{path}: failed: {error}{_again(arrivals, path)}")
+        return ()
+
+
+def _outcome(report: Report) -> str:
+    from mosaico_ingest.report.units import count_text, seconds_text
+
+    done = f"{report.status.value} as {report.sequence}"
+    if report.error is not None:
+        return f"{done}: {report.error}"
+    totals = report.totals
+    rejected = f", {count_text(totals.rejected)} rejected" if totals.rejected else ""
+    return f"{done}, {count_text(totals.written)} messages{rejected}, {seconds_text(report.duration_s)}"
+
+
+def _again(arrivals: Arrivals, path: Path) -> str:
+    import time
+
+    return f"; tried again in {arrivals.again(path, time.monotonic()):.0f} s"
+
+
+def _say(line: str) -> None:
+    from datetime import datetime, timezone
+
+    typer.echo(f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ} {line}")

@@ -1,0 +1,97 @@
+"""A recording is ingested once it has come to rest, and once only, whatever happens to the watcher."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mosaico_ingest.executors.arrivals import Arrivals
+from mosaico_ingest.store import Store
+
+DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
+JOB = 'bag: {path: "nothing/*.mcap"}\ntopics: [/imu]\ntarget: {store: store}\n'
+
+
+def test_a_file_is_given_out_once_when_it_rests_and_again_when_it_changes(tmp_path: Path) -> None:
+    arrivals = Arrivals(tmp_path, rest_s=5)
+    file = tmp_path / "a.mcap"
+    file.write_bytes(b"1")
+    assert arrivals.settled(0) == ()
+    file.write_bytes(b"12")
+    assert arrivals.settled(5) == ()
+    assert arrivals.settled(10) == (file,)
+    assert arrivals.settled(20) == ()
+    file.write_bytes(b"123")
+    assert arrivals.settled(30) == ()
+    assert arrivals.settled(35) == (file,)
+
+
+def test_hidden_empty_and_other_files_are_passed_over(tmp_path: Path) -> None:
+    (tmp_path / ".a.mcap.Xy12").write_bytes(b"1")
+    (tmp_path / "b.mcap").touch()
+    (tmp_path / "notes.txt").write_bytes(b"1")
+    arrivals = Arrivals(tmp_path, rest_s=0)
+    assert arrivals.settled(0) == ()
+    (tmp_path / ".a.mcap.Xy12").rename(tmp_path / "a.mcap")
+    assert arrivals.settled(1) == (tmp_path / "a.mcap",)
+
+
+def test_a_rosbag2_directory_is_one_recording_once_its_metadata_is_there(tmp_path: Path) -> None:
+    folder = tmp_path / "deep" / "drive"
+    folder.mkdir(parents=True)
+    (folder / "drive_0.mcap").write_bytes(b"1")
+    arrivals = Arrivals(tmp_path, rest_s=0)
+    assert arrivals.settled(0) == ()
+    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: {}")
+    assert arrivals.settled(1) == (folder,)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells who has a file open")
+def test_a_file_that_is_open_for_writing_is_not_at_rest(tmp_path: Path) -> None:
+    file = tmp_path / "a.mcap"
+    arrivals = Arrivals(tmp_path, rest_s=0)
+    with file.open("wb") as writing:
+        writing.write(b"1")
+        writing.flush()
+        assert arrivals.settled(0) == ()
+        assert arrivals.settled(9) == ()
+    assert arrivals.settled(10) == (file,)
+
+
+def test_what_failed_is_given_out_again_later_and_later(tmp_path: Path) -> None:
+    file = tmp_path / "a.mcap"
+    file.write_bytes(b"1")
+    arrivals = Arrivals(tmp_path, rest_s=0)
+    assert arrivals.settled(0) == (file,)
+    assert arrivals.again(file, 0) == 60
+    assert arrivals.settled(59) == ()
+    assert arrivals.settled(60) == (file,)
+    assert arrivals.again(file, 60) == 120
+    assert arrivals.settled(179) == ()
+
+
+def watch_once(folder: Path) -> list[str]:
+    command = [sys.executable, "-m", "mosaico_ingest", "watch", "in", "job.yaml", "--once"]
+    pace = ["--rest", "0.2", "--every", "0.1"]
+    done = subprocess.run(  # noqa: S603 - our own command
+        [*command, *pace], cwd=folder, capture_output=True, text=True, check=True, timeout=60
+    )
+    return done.stdout.splitlines()
+
+
+@pytest.mark.slow
+def test_the_command_ingests_what_is_there_and_knows_it_again(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    (tmp_path / "job.yaml").write_text(JOB)
+    shutil.copy(DRIVE, tmp_path / "in" / "a.mcap")
+    assert "in/a.mcap: completed as a, 1,000 messages" in watch_once(tmp_path)[1]
+    (tmp_path / "in" / "c.mcap").write_bytes(b"torn")
+    lines = watch_once(tmp_path)
+    assert "in/a.mcap: skipped as a" in lines[1]
+    assert "in/c.mcap: failed as c" in lines[2]
+    assert "tried again in 60 s" in lines[2]
+    assert Store.open(tmp_path / "store").names() == ("a",)
