@@ -136,6 +136,21 @@ def test_columns_of_the_elements_of_one_list_are_put_together() -> None:
     assert restored.rows.field("cells").to_pylist() == [CELLS, [], CELLS]
 
 
+def test_a_field_that_two_columns_hold_is_taken_from_the_one_that_has_it() -> None:
+    text = (
+        "version: 1\nadapter: TAdapter\nros_type: acme_msgs/msg/T\n"
+        "ontology: {tag: T, fields: {large: float64, all: float64}}\n"
+        "fields: {large: d if d > 2 else null, all: d}\n"
+    )
+    shape = ros_shape(DEFINITION)
+    adapter = load_adapter(text).bind(DEFINITION, shape)
+    envelope = Envelope("/t", DEFINITION.root, np.zeros(2, np.int64))
+    adapted = adapter.adapt(pa.array([MESSAGE, MESSAGE | {"d": 3.5}], shape), envelope)
+    restored = invert(adapter, shape, {}).restore(adapted.rows, envelope)
+    assert restored.rows.field("d").to_pylist() == [1.5, 3.5]
+    assert not restored.changed
+
+
 NUMBER = st.none() | st.floats(width=32)
 VALUES = st.lists(
     st.fixed_dictionaries({"a": NUMBER, "b": st.none() | st.lists(NUMBER, max_size=2)}),

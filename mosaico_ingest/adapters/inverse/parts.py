@@ -51,7 +51,7 @@ class _Mark:
 
 
 class Parts:
-    """The fields of a batch of messages, as they become known; what was put first stays."""
+    """The fields of a batch of messages, as they become known; what was put first stays, where it is not null."""
 
     def __init__(self, shape: DataType, rows: int) -> None:
         self._shape = shape
@@ -74,7 +74,8 @@ class Parts:
             lists = [at for at, name in enumerate(place) if name == EACH]
             for at, axis in zip(lists, axes, strict=True):
                 self._axes.setdefault(place[:at], axis)
-            self._values.setdefault(place, values)
+            known = self._values.get(place)
+            self._values[place] = values if known is None else _either(known, values)
 
     def mark(self, place: Place, index: int | None, where: Mask, value: Any) -> None:  # noqa: ANN401 - a field's value
         """Say what a field, or an element of it, must have been in some rows, unless more is known of it."""
@@ -159,6 +160,13 @@ def filled(values: Array, kind: DataType) -> Array:
             values = pc.round(values)
         values = pc.cast(values, kind, safe=False)
     return pc.fill_null(values, _zero(kind)) if values.null_count else values
+
+
+def _either(known: Array, more: Array) -> Array:
+    """Return what is known, and more where it is null."""
+    if not known.null_count or pt.is_nested(known.type) or len(known) != len(more):
+        return known
+    return pc.coalesce(known, pc.cast(more, known.type, safe=False))
 
 
 def _zero(kind: DataType) -> Any:  # noqa: ANN401 - an Arrow scalar
