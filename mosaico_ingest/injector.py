@@ -43,12 +43,15 @@ def inject(plan: Plan, recording: Recording, sink: Sink, observe: Observer) -> N
                     raise failure from error
                 session.note_error(str(failure))
     except BaseException as error:
+        named = _named(error)
         for stream in streams:
-            _take_back(stream, stream.rows, f"the session was discarded: {error}", observe)
+            _take_back(stream, stream.rows, f"the session was discarded: {named}", observe)
             observe(TopicClosed(stream.plan.target, stream.status, 0, error=stream.error))
         if aside is not None:
             aside.discard()
-        raise
+        if named is error:
+            raise
+        raise named from error
     if aside is not None:
         aside.close(replaced=plan.if_exists is IfExists.REPLACE)
         if aside.kept:
