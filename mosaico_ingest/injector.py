@@ -44,11 +44,7 @@ def inject(plan: Plan, recording: Recording, sink: Sink, observe: Observer) -> N
                 session.note_error(str(failure))
     except BaseException as error:
         named = _named(error)
-        for stream in streams:
-            _take_back(stream, stream.rows, f"the session was discarded: {named}", observe)
-            observe(TopicClosed(stream.plan.target, stream.status, 0, error=stream.error))
-        if aside is not None:
-            aside.discard()
+        _forsake(streams, aside, named, observe)
         if named is error:
             raise
         raise named from error
@@ -63,6 +59,17 @@ def inject(plan: Plan, recording: Recording, sink: Sink, observe: Observer) -> N
         raise VerificationError(
             "; ".join(wrong), hint="what is stored is incomplete; replace it, and report this as a mistake"
         )
+
+
+def _forsake(
+    streams: tuple[Stream, ...], aside: Quarantine | None, error: BaseException, observe: Observer
+) -> None:
+    """Account for a session that leaves nothing behind."""
+    for stream in streams:
+        _take_back(stream, stream.rows, f"the session was discarded: {error}", observe)
+        observe(TopicClosed(stream.plan.target, stream.status, 0, error=stream.error))
+    if aside is not None:
+        aside.discard()
 
 
 def _quarantine(plan: Plan) -> Quarantine | None:
