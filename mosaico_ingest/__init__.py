@@ -23,8 +23,10 @@ if TYPE_CHECKING:
         Stores,
         TopicLevelErrorPolicy,
     )
+    from mosaico_ingest.wire.actions import Permission as APIKeyPermissionEnum
 
 __all__ = [
+    "APIKeyPermissionEnum",
     "IfExists",
     "LoaderErrorPolicy",
     "Message",
@@ -64,6 +66,8 @@ _WHERE = {
 
 
 def __getattr__(name: str) -> object:
+    if name == "APIKeyPermissionEnum":
+        return import_module(f"{__name__}.wire.actions").Permission
     if name not in _WHERE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_WHERE[name]}"), name)

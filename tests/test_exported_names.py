@@ -12,7 +12,14 @@ def test_every_listed_name_is_there() -> None:
     for name in mosaico_ingest.__all__:
         assert getattr(mosaico_ingest, name) is not None
     assert mosaico_ingest.__all__ == sorted(mosaico_ingest.__all__)
-    assert set(mosaico_ingest._WHERE) == set(mosaico_ingest.__all__) - {"__version__"}
+    assert set(mosaico_ingest._WHERE) == set(mosaico_ingest.__all__) - {"APIKeyPermissionEnum", "__version__"}
+
+
+def test_permissions_go_by_the_platforms_spelling() -> None:
+    permission = mosaico_ingest.APIKeyPermissionEnum
+    assert permission.Write is permission("write")
+    assert permission.Delete.includes(permission.Write)
+    assert len(permission) == 4
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:

@@ -48,6 +48,11 @@ class Permission(str, Enum):
     WRITE = "write"
     DELETE = "delete"
     MANAGE = "manage"
+    # The platform's own spelling, as in `APIKeyPermissionEnum.Write`; aliases are no members of their own.
+    Read = READ
+    Write = WRITE
+    Delete = DELETE
+    Manage = MANAGE
 
     def includes(self, needed: Permission) -> bool:
         """Return whether a key with this permission may do what needs `needed`."""
