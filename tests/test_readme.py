@@ -29,7 +29,16 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("readme")
     shutil.copytree(ROOT / "configs", folder / "configs")
     shutil.copy(ROOT / "configs" / "quickstart" / "drive.mcap", folder)
-    done = run(sys.executable, "-m", "mosaico_ingest", "configs/quickstart.yaml", "-q", cwd=folder)
+    done = run(
+        sys.executable,
+        "-m",
+        "mosaico_ingest",
+        "configs/quickstart.yaml",
+        "-q",
+        "--report",
+        "run.json",
+        cwd=folder,
+    )
     assert done.returncode == 0, done.stderr
     return folder
 

@@ -13,6 +13,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mosaico_ingest.config import ServerTarget, StoreTarget
+from mosaico_ingest.diagnostics import encodable
 from mosaico_ingest.errors import BagError, SequenceExists
 from mosaico_ingest.plan.describe import decisions
 from mosaico_ingest.plan.model import LEDGER_KEY, Plan
@@ -93,7 +94,7 @@ def enter(plan: Plan) -> Plan | None:
 def ledger_of(plan: Plan) -> Ledger:
     """Read the recording's files and return what this run is going to note."""
     sources = tuple(
-        Source(name=path.name, size_bytes=path.stat().st_size, content=content_digest(path))
+        Source(name=encodable(path.name), size_bytes=path.stat().st_size, content=content_digest(path))
         for path in plan.files
     )
     return Ledger(tool=__version__, job=_job_digest(plan), sources=sources, family=plan.family)
