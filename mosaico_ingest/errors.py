@@ -9,6 +9,7 @@ IngestError
 ├── SinkError            the destination refused                 exit 1
 │   ├── SequenceExists   … the name is taken
 │   └── SinkUnavailable  … and trying again may help
+├── Unreachable          a URL did not answer, or its content changed under way; again may help  exit 1
 ├── VerificationError    what is stored is not what was read     exit 5
 └── Interrupted          a signal asked to stop                  exit 130
 """
@@ -30,6 +31,7 @@ __all__ = [
     "SequenceExists",
     "SinkError",
     "SinkUnavailable",
+    "Unreachable",
     "VerificationError",
 ]
 
@@ -112,6 +114,12 @@ class SequenceExists(SinkError):  # noqa: N818 - the condition, as `NothingMatch
 
 class SinkUnavailable(SinkError):  # noqa: N818 - the condition, as `NothingMatched`
     """The destination did not answer; trying again may help."""
+
+    retryable = True
+
+
+class Unreachable(IngestError):  # noqa: N818 - the condition, as `NothingMatched`
+    """What lies behind a URL did not answer, or changed while it was read; trying again may help."""
 
     retryable = True
 
