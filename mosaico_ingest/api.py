@@ -21,6 +21,7 @@ from mosaico_ingest.executors.processes import Processes
 from mosaico_ingest.executors.status import RecordingStatus, standings
 from mosaico_ingest.executors.worker import execute, make_plan
 from mosaico_ingest.manifest.load import load_manifests
+from mosaico_ingest.manifest.used import manifest_text
 from mosaico_ingest.plan.compile import compile_manifests
 from mosaico_ingest.plan.document import PlanDocument, read_plan
 from mosaico_ingest.plan.drift import Difference, differences
@@ -28,7 +29,8 @@ from mosaico_ingest.plan.model import Plan
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.report.events import BatchObserver, Observer, ignore_batch, ignore_events
 from mosaico_ingest.report.inspection import Inspection
-from mosaico_ingest.report.model import Report, RunReport
+from mosaico_ingest.report.model import Report, RunReport, UsedManifest
+from mosaico_ingest.report.stopwatch import Stopwatch
 from mosaico_ingest.textfile import read_whole
 from mosaico_ingest.version import __version__
 
@@ -44,6 +46,7 @@ __all__ = [
     "plan_job",
     "quick_config",
     "run",
+    "used_manifest",
 ]
 
 
@@ -71,10 +74,11 @@ class RosbagInjector:
         Raises:
             IngestError: What ended the run; what the session policy keeps is in the destination.
         """
+        watch = Stopwatch()
         plan = self.plan()
         if self._config.dry_run:
             return None
-        report, failure = execute(plan, self._observe)
+        report, failure = execute(plan, self._observe, watch=watch)
         if failure is not None:
             raise failure
         return report
@@ -168,11 +172,28 @@ def run(
     *,
     executor: Executor | None = None,
     observe: BatchObserver = ignore_batch,
+    manifests: Sequence[UsedManifest] = (),
 ) -> RunReport:
-    """Run every configuration, without an `executor` in as many processes as they say; failures are in the report."""
+    """Run every configuration, without an `executor` in as many processes as they say; failures are in the report.
+
+    `manifests` are those the configurations come from, for whoever reads the report.
+    """
     jobs = configs[0].jobs if configs else 1
     chosen = executor or (Processes(jobs) if jobs > 1 else Inline())
-    return RunReport(tool=f"mosaico-ingest {__version__}", recordings=tuple(chosen.map(configs, observe)))
+    return RunReport(
+        tool=f"mosaico-ingest {__version__}",
+        manifests=tuple(manifests),
+        recordings=tuple(chosen.map(configs, observe)),
+    )
+
+
+def used_manifest(path: Path) -> UsedManifest:
+    """Return a manifest for a report: with what it extends, and without secrets.
+
+    Raises:
+        ManifestError: It cannot be read.
+    """
+    return UsedManifest(path=str(path), text=manifest_text(path))
 
 
 def job_status(manifest: Path) -> tuple[RecordingStatus, ...]:

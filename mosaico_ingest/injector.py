@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 
 from mosaico_ingest.bag.recording import Recording
 from mosaico_ingest.diagnostics import Finding, Severity, Stage
@@ -10,7 +11,16 @@ from mosaico_ingest.errors import Interrupted, NothingMatched, VerificationError
 from mosaico_ingest.plan.model import Plan
 from mosaico_ingest.policies import IfExists, SessionLevelErrorPolicy
 from mosaico_ingest.quarantine.quarantine import Quarantine
-from mosaico_ingest.report.events import Noted, Observer, Rejected, TopicClosed, TopicProgress, Unreadable
+from mosaico_ingest.report.events import (
+    Noted,
+    Observer,
+    Quarantined,
+    Rejected,
+    TopicClosed,
+    TopicProgress,
+    Unreadable,
+)
+from mosaico_ingest.report.stopwatch import Step, Stopwatch
 from mosaico_ingest.sink import Session, Sink, StoredTopic
 from mosaico_ingest.stream import Stream
 from mosaico_ingest.write_buffer import WriteBuffer
@@ -18,22 +28,25 @@ from mosaico_ingest.write_buffer import WriteBuffer
 __all__ = ["inject"]
 
 
-def inject(plan: Plan, recording: Recording, sink: Sink, observe: Observer) -> None:
+def inject(
+    plan: Plan, recording: Recording, sink: Sink, observe: Observer, watch: Stopwatch | None = None
+) -> None:
     """Read what the plan names, adapt it, write it, and check what the destination then holds.
 
     Raises:
         IngestError: What ended the run; under the `report` policy the rows accepted before it are kept.
         VerificationError: The destination does not hold what was written.
     """
+    watch = watch or Stopwatch()
     failure: BaseException | None = None
     missing: list[str] = []
     aside = _quarantine(plan)
     streams: tuple[Stream, ...] = ()
     try:
         with sink.open(plan.sequence, plan.metadata, if_exists=plan.if_exists) as session:
-            streams = _open_streams(plan, recording, session, observe, aside)
+            streams = _open_streams(plan, recording, session, observe, aside=aside, watch=watch)
             try:
-                _pump(plan, recording, streams, observe)
+                _pump(plan, recording, streams, observe, watch)
                 missing = _missing(plan, recording, streams, observe)
                 _check_not_empty(plan, streams)
             except BaseException as error:
@@ -52,6 +65,7 @@ def inject(plan: Plan, recording: Recording, sink: Sink, observe: Observer) -> N
         aside.close(replaced=plan.if_exists is IfExists.REPLACE)
         if aside.kept:
             observe(Noted(_kept(aside)))
+            observe(Quarantined(str(aside.messages_path)))
     wrong = missing + _close(session.stored(), streams, observe, forgive=failure)
     if failure is not None:
         raise failure
@@ -96,30 +110,35 @@ def _named(error: BaseException) -> BaseException:
 
 
 def _open_streams(
-    plan: Plan, recording: Recording, session: Session, observe: Observer, aside: Quarantine | None
+    plan: Plan,
+    recording: Recording,
+    session: Session,
+    observe: Observer,
+    *,
+    aside: Quarantine | None,
+    watch: Stopwatch,
 ) -> tuple[Stream, ...]:
     channels = {channel.id: channel for channel in recording.channels}
     streams: list[Stream] = []
     for topic in plan.topics:
-        stream = Stream(topic, plan.on_message_error, session, observe, quarantine=aside)
+        stream = Stream(topic, plan.on_message_error, session, observe, quarantine=aside, watch=watch)
         for channel_id in topic.channels:
             stream.bind(channels[channel_id])
         streams.append(stream)
     return tuple(streams)
 
 
-def _pump(plan: Plan, recording: Recording, streams: tuple[Stream, ...], observe: Observer) -> None:
+def _pump(
+    plan: Plan, recording: Recording, streams: tuple[Stream, ...], observe: Observer, watch: Stopwatch
+) -> None:
     """Move every batch of the recording through its stream, writing on a thread of its own."""
     by_channel = {channel: stream for stream in streams for channel in stream.plan.channels}
-    with WriteBuffer(max_bytes=plan.memory_bytes // 4) as buffer:
-        batches = recording.batches(
-            tuple(by_channel),
-            start_ns=plan.read_from_ns,
-            end_ns=plan.read_until_ns,
-            memory_bytes=plan.memory_bytes // 4,
-        )
-        for batch in batches:
-            by_channel[batch.channel.id].feed(batch, buffer)
+    buffer = WriteBuffer(max_bytes=plan.memory_bytes // 4)
+    try:
+        _feed(plan, recording, by_channel, buffer, watch)
+    finally:
+        watch.lap(Step.WAIT)
+        watch.add(Step.WRITE, buffer.busy_s)
     for stream in streams:
         if stream.padded:
             observe(Noted(_padded(stream)))
@@ -129,6 +148,24 @@ def _pump(plan: Plan, recording: Recording, streams: tuple[Stream, ...], observe
             observe(Noted(Finding("detour", Severity.INFO, f"{loss.file} at {loss.offset}: {loss.reason}")))
         else:
             observe(Unreadable(stream.plan.target if stream else None, loss.count, loss.offset, loss.reason))
+
+
+def _feed(
+    plan: Plan, recording: Recording, streams: Mapping[int, Stream], buffer: WriteBuffer, watch: Stopwatch
+) -> None:
+    with buffer:
+        batches = recording.batches(
+            tuple(streams),
+            start_ns=plan.read_from_ns,
+            end_ns=plan.read_until_ns,
+            memory_bytes=plan.memory_bytes // 4,
+        )
+        watch.lap(Step.PREPARE)
+        for batch in batches:
+            watch.lap(Step.READ)
+            streams[batch.channel.id].feed(batch, buffer)
+            watch.lap(Step.ADAPT)
+        watch.lap(Step.READ)
 
 
 def _padded(stream: Stream) -> Finding:

@@ -22,6 +22,7 @@ from mosaico_ingest.plan.model import TopicPlan
 from mosaico_ingest.policies import LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.quarantine.quarantine import Quarantine
 from mosaico_ingest.report.events import Observer, Rejected, TopicProgress, TopicStatus
+from mosaico_ingest.report.stopwatch import Step, Stopwatch
 from mosaico_ingest.report.timeline import Timeline
 from mosaico_ingest.sink import ENVELOPE, Session, TopicWriter
 from mosaico_ingest.write_buffer import WriteBuffer
@@ -75,6 +76,7 @@ class Stream:
     _leading: int = 0
     """How many messages failed before the first good one."""
     timeline: Timeline = field(default_factory=Timeline)
+    watch: Stopwatch = field(default_factory=Stopwatch)
     _decoders: dict[int, Decoder] = field(default_factory=dict[int, Decoder])
     _adapters: dict[int, Adapter] = field(default_factory=dict[int, Adapter])
     _writer: TopicWriter | None = None
@@ -123,6 +125,7 @@ class Stream:
         keep = positions[taken]
         sampled = batch if taken.all() else _take(batch, keep)
         decoded = self._decoders[batch.channel.id].decode(sampled)
+        self.watch.lap(Step.DECODE)
         self.padded += decoded.padded
         lost = [_Lost(Stage.DECODE, replace(f, row=int(keep[f.row]))) for f in decoded.failures]
         index = keep[decoded.index]
@@ -220,7 +223,9 @@ class Stream:
             except SinkError as error:
                 self._refused(error, rows, batch, index)
                 return
+        self.watch.lap(Step.ADAPT)
         buffer.put(self._writer, rows)
+        self.watch.lap(Step.WAIT)
         times = rows.column(0).to_numpy()
         first, last = int(times.min()), int(times.max())
         self.timeline.add(times)

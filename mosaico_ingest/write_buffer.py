@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from types import TracebackType
 
@@ -31,6 +32,8 @@ class WriteBuffer:
         self._changed = threading.Condition()
         self._closed = False
         self._error: BaseException | None = None
+        self.busy_s = 0.0
+        """How long the thread has been writing, in seconds."""
         self._thread = threading.Thread(target=self._work, name="mosaico-ingest-write", daemon=True)
 
     def __enter__(self) -> Self:
@@ -69,6 +72,7 @@ class WriteBuffer:
                 if not self._queue:
                     return
                 writer, batch, size = self._queue.popleft()
+            began = time.perf_counter()
             try:
                 writer.write(batch)
             except BaseException as error:  # noqa: BLE001 - a thread's border: raised again by put or on leaving
@@ -78,5 +82,6 @@ class WriteBuffer:
                     self._changed.notify_all()
                 return
             with self._changed:
+                self.busy_s += time.perf_counter() - began
                 self._queued_bytes -= size
                 self._changed.notify_all()

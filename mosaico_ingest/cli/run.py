@@ -60,8 +60,10 @@ def run(
     if bool(manifests) == (plan is not None):
         raise typer.BadParameter("name manifests, or a plan with --plan", param_hint="JOB.yaml")
     configs = [config for manifest in manifests or () for config in api.compile_job(manifest)]
+    used = [api.used_manifest(manifest) for manifest in manifests or ()]
     if plan is not None:
         configs += api.compile_plan(plan)
+        used = [api.used_manifest(Path(name)) for name in sorted({c.where for c in configs if c.where})]
     if shard is not None:
         configs = take_shard(configs, shard)
 
@@ -77,5 +79,6 @@ def run(
         log=log,
         jobs=jobs,
         log_format=log_format,
+        manifests=used,
         finished=finish,
     )

@@ -21,7 +21,7 @@ from mosaico_ingest.executors.executor import Executor
 from mosaico_ingest.executors.local import Inline
 from mosaico_ingest.executors.processes import Processes
 from mosaico_ingest.report.events import Event, RunFinished
-from mosaico_ingest.report.model import RunReport
+from mosaico_ingest.report.model import RunReport, UsedManifest
 from mosaico_ingest.report.write import write_report
 
 __all__ = ["run_configs"]
@@ -35,6 +35,7 @@ def run_configs(
     log: str | None,
     jobs: int | None = None,
     log_format: LogFormat = LogFormat.TEXT,
+    manifests: Sequence[UsedManifest] = (),
     finished: Callable[[RunReport], None] = lambda _result: None,
 ) -> None:
     """Run the configurations, several at a time where asked for; exit with the report's code unless it is 0."""
@@ -52,7 +53,9 @@ def run_configs(
     as_json = log_format is LogFormat.JSON
     shown = nullcontext(JsonLines()) if as_json else display(len(configs), quiet=quiet)
     with shown as observe:
-        result = api.run(configs, executor=_executor(configs, jobs, prepare), observe=tell)
+        result = api.run(
+            configs, executor=_executor(configs, jobs, prepare), observe=tell, manifests=manifests
+        )
     finished(result)
     for target in {
         path for path in (report, *(_report_path(config) for config in configs)) if path is not None

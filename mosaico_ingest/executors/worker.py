@@ -29,8 +29,10 @@ from mosaico_ingest.report.events import (
     RunFinished,
     RunStarted,
     RunStatus,
+    Timed,
 )
 from mosaico_ingest.report.model import Report
+from mosaico_ingest.report.stopwatch import Step, Stopwatch
 from mosaico_ingest.sink import Sink
 from mosaico_ingest.store.sink import StoreSink
 from mosaico_ingest.store.store import Store
@@ -82,13 +84,16 @@ def foresee(plan: Plan) -> Finding | None:
     return delete_finding(plan.target, plan.sequence)
 
 
-def execute(plan: Plan, observe: Observer, *, sink: Sink | None = None) -> tuple[Report, IngestError | None]:
+def execute(
+    plan: Plan, observe: Observer, *, sink: Sink | None = None, watch: Stopwatch | None = None
+) -> tuple[Report, IngestError | None]:
     """Run a plan; return what happened, and the error that ended it, if one did.
 
-    `sink` stands in for the plan's target where the caller has its own.
+    `sink` stands in for the plan's target where the caller has its own; `watch` knows when the planning began.
     """
     failure: IngestError | None = None
-    collector = Collector()
+    watch = watch or Stopwatch()
+    collector = Collector(watch)
 
     def tell(event: Event) -> None:
         collector(event)
@@ -107,17 +112,21 @@ def execute(plan: Plan, observe: Observer, *, sink: Sink | None = None) -> tuple
             return collector.report(), None
         with open_recording(plan.files, resolve=plan.resolver) as recording:
             destination = sink or sink_for(plan.target, buffer_bytes=plan.memory_bytes // 4)
-            inject(entered, recording, destination, tell)
+            watch.lap(Step.PREPARE)
+            inject(entered, recording, destination, tell, watch)
     except IngestError as error:
         failure = error
+    watch.lap(Step.COMMIT)
+    tell(Timed(watch.seconds))
     tell(_failed(failure) if failure else _done(collector))
     return collector.report(), failure
 
 
 def run_config(config: ROSInjectionConfig, observe: Observer) -> Report:
     """Plan and run one configuration; every outcome is a report, a mistake of ours and an interrupt too."""
+    watch = Stopwatch()
     try:
-        report, _ = execute(make_plan(config), observe)
+        report, _ = execute(make_plan(config), observe, watch=watch)
     except IngestError as error:
         return failed_report(config, error, observe)
     except KeyboardInterrupt:

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-import time
 from collections import defaultdict
 from dataclasses import dataclass, field
-from datetime import datetime, timezone
 
 from mosaico_ingest.diagnostics import Stage
 from mosaico_ingest.report.events import (
     Event,
     Expected,
     Noted,
+    Quarantined,
     Rejected,
     RunFinished,
     RunStarted,
     RunStatus,
+    Timed,
     TopicClosed,
     TopicProgress,
     TopicStatus,
     Unreadable,
 )
-from mosaico_ingest.report.model import Loss, Rejection, Report, TopicReport
+from mosaico_ingest.report.model import Loss, Rejection, Report, Steps, TopicReport
+from mosaico_ingest.report.stopwatch import Stopwatch
 
 __all__ = ["Collector"]
 
@@ -40,7 +41,15 @@ class _Sum:
     rejections: dict[tuple[Stage, str], Rejection] = field(default_factory=dict[tuple[Stage, str], Rejection])
     closed: TopicClosed | None = None
 
-    def add(self, more: TopicProgress) -> None:
+    def take(self, event: TopicProgress | Rejected | TopicClosed) -> None:
+        if isinstance(event, TopicProgress):
+            self._add(event)
+        elif isinstance(event, Rejected):
+            self._reject(event)
+        else:
+            self.closed = event
+
+    def _add(self, more: TopicProgress) -> None:
         self.read += more.read
         self.written += more.written
         self.filtered += more.filtered
@@ -51,7 +60,7 @@ class _Sum:
         if more.end_ns is not None:
             self.end_ns = more.end_ns if self.end_ns is None else max(self.end_ns, more.end_ns)
 
-    def reject(self, event: Rejected) -> None:
+    def _reject(self, event: Rejected) -> None:
         self.quarantined += event.quarantined
         key = (event.stage, event.rule)
         known = self.rejections.get(key)
@@ -71,22 +80,21 @@ class _Sum:
 class Collector:
     """An observer that ends as a `Report`."""
 
-    def __init__(self) -> None:
-        self._began = time.perf_counter()
-        self._started_at = datetime.now(timezone.utc)
+    def __init__(self, watch: Stopwatch | None = None) -> None:
+        self._watch = watch or Stopwatch()
         self._start = RunStarted(sequence="", destination="", files=(), source_bytes=0, topics=())
         self._sums: dict[str, _Sum] = defaultdict(_Sum)
         self._losses: list[Loss] = []
         self._findings: list[str] = []
+        self._steps = Steps()
+        self._quarantine: str | None = None
         self._finish = RunFinished(status=RunStatus.FAILED, exit_code=1)
 
     def __call__(self, event: Event) -> None:
         """Add one event to the sum."""
         match event:
-            case TopicProgress():
-                self._sums[event.target].add(event)
-            case Rejected():
-                self._sums[event.target].reject(event)
+            case TopicProgress() | Rejected() | TopicClosed():
+                self._sums[event.target].take(event)
             case RunStarted():
                 self._start = event
             case Unreadable():
@@ -97,8 +105,10 @@ class Collector:
                 )
             case Noted():
                 self._findings.append(str(event.finding))
-            case TopicClosed():
-                self._sums[event.target].closed = event
+            case Quarantined():
+                self._quarantine = event.messages
+            case Timed():
+                self._steps = Steps(**{step.value: round(s, 6) for step, s in event.seconds.items()})
             case RunFinished():
                 self._finish = event
 
@@ -121,9 +131,11 @@ class Collector:
             status=self._finish.status,
             exit_code=self._finish.exit_code,
             error=self._finish.error,
-            started_at=self._started_at,
-            duration_s=round(time.perf_counter() - self._began, 6),
+            started_at=self._watch.began_at,
+            duration_s=round(self._watch.elapsed_s, 6),
             source_bytes=self._start.source_bytes,
+            steps=self._steps,
+            quarantine=self._quarantine,
             topics=tuple(self._topic(topic) for topic in self._start.topics),
             losses=tuple(self._losses),
             findings=tuple(self._findings),

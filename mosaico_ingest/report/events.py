@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import TypeAlias
 
 from mosaico_ingest.diagnostics import Finding, Stage
+from mosaico_ingest.report.stopwatch import Step
 from mosaico_ingest.report.timeline import TimelineReport
 
 __all__ = [
@@ -16,10 +17,12 @@ __all__ = [
     "Expected",
     "Noted",
     "Observer",
+    "Quarantined",
     "Rejected",
     "RunFinished",
     "RunStarted",
     "RunStatus",
+    "Timed",
     "TopicClosed",
     "TopicProgress",
     "TopicStatus",
@@ -129,6 +132,14 @@ class Noted:
 
 
 @dataclass(frozen=True, slots=True)
+class Quarantined:
+    """Rejected messages lie in a file, from which they can be replayed."""
+
+    messages: str
+    """Its path."""
+
+
+@dataclass(frozen=True, slots=True)
 class TopicClosed:
     """A stream came to its end."""
 
@@ -137,6 +148,13 @@ class TopicClosed:
     stored_bytes: int | None = None
     error: str | None = None
     timeline: TimelineReport | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Timed:
+    """What the recording's time was spent on, in seconds."""
+
+    seconds: Mapping[Step, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +168,17 @@ class RunFinished:
     """What the error knows of the places it is about."""
 
 
-Event: TypeAlias = RunStarted | TopicProgress | Rejected | Unreadable | Noted | TopicClosed | RunFinished
+Event: TypeAlias = (
+    RunStarted
+    | TopicProgress
+    | Rejected
+    | Unreadable
+    | Noted
+    | Quarantined
+    | TopicClosed
+    | Timed
+    | RunFinished
+)
 Observer: TypeAlias = Callable[[Event], None]
 BatchObserver: TypeAlias = Callable[[int, Event], None]
 """Told which configuration of a batch an event is about, by its position, and the event."""

@@ -12,7 +12,17 @@ from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.part import Part
 from mosaico_ingest.report.timeline import TimelineReport
 
-__all__ = ["Loss", "Rejection", "Report", "RunReport", "TopicReport", "Totals", "report_schema"]
+__all__ = [
+    "Loss",
+    "Rejection",
+    "Report",
+    "RunReport",
+    "Steps",
+    "TopicReport",
+    "Totals",
+    "UsedManifest",
+    "report_schema",
+]
 
 
 class _Part(Part):
@@ -112,6 +122,25 @@ class Totals(_Part):
     stored_bytes: int
 
 
+class Steps(_Part):
+    """What a recording's time was spent on, in seconds; all but `write` add up to its duration."""
+
+    prepare: float = 0
+    """Opening it, planning, asking what the destination has."""
+    read: float = 0
+    """Reading and inflating, as far as the next step had to wait for it."""
+    decode: float = 0
+    """From bytes to columns."""
+    adapt: float = 0
+    """From the message's columns to those of its ontology type."""
+    wait: float = 0
+    """Waiting for the thread that writes."""
+    commit: float = 0
+    """Closing what was written, making it visible, checking it."""
+    write: float = 0
+    """How long that thread was busy, beside all of the above."""
+
+
 class Report(_Part):
     """What became of one recording."""
 
@@ -126,6 +155,9 @@ class Report(_Part):
     duration_s: float
     source_bytes: int
     """Size of the recording's files."""
+    steps: Steps = Steps()
+    quarantine: str | None = None
+    """The file that rejected messages were put into."""
     topics: tuple[TopicReport, ...] = ()
     losses: tuple[Loss, ...] = ()
     """What could not be read at all."""
@@ -154,12 +186,21 @@ class Report(_Part):
         return round(self.totals.stored_bytes / self.source_bytes, 6) if self.source_bytes else None
 
 
+class UsedManifest(_Part):
+    """A manifest of the run, as it was when the run began."""
+
+    path: str
+    text: str
+    """As YAML, with what it extends and without secrets."""
+
+
 class RunReport(_Part):
     """What one call of the tool did: a report for each recording; `version` changes when the form does."""
 
     version: int = Field(default=1, ge=1)
     tool: str
     """Name and version of the program that wrote this."""
+    manifests: tuple[UsedManifest, ...] = ()
     recordings: tuple[Report, ...]
 
     @computed_field

@@ -50,6 +50,8 @@ def test_a_rejected_message_is_kept_with_its_bytes_and_its_reason(
     assert (entry["sequence"], entry["topic"], entry["stage"]) == ("drive", "/speed", "decode")
     assert entry["reason"] == topic.rejections[0].reason
     assert any("ingest replay" in finding for finding in report.findings)
+    assert report.quarantine is not None
+    assert Path(report.quarantine).resolve() in (tmp_path / "quarantine").resolve().iterdir()
 
 
 def test_nothing_is_made_where_nothing_is_rejected(

@@ -1,0 +1,40 @@
+"""The steps of a run account for all of its time, and the report has what a page needs to explain it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from mosaico_ingest.cli.app import app
+from mosaico_ingest.report.stopwatch import Step, Stopwatch
+from mosaico_ingest.report.write import read_report
+
+DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
+
+
+def test_every_moment_belongs_to_one_step() -> None:
+    watch = Stopwatch()
+    for step in (Step.READ, Step.DECODE, Step.READ, Step.COMMIT):
+        watch.lap(step)
+    before = sum(watch.seconds.values())
+    assert before <= watch.elapsed_s
+    watch.add(Step.WRITE, 5.0)
+    assert sum(watch.seconds.values()) == pytest.approx(before + 5.0)
+
+
+def test_the_steps_of_a_recording_add_up_to_its_duration(tmp_path: Path) -> None:
+    (tmp_path / "job.yaml").write_text(
+        f"bag: {{path: {DRIVE}}}\ntopics: [/imu, /odom]\ntarget: {{store: s}}\n"
+    )
+    run = tmp_path / "run.json"
+    done = CliRunner().invoke(app, ["run", str(tmp_path / "job.yaml"), "--report", str(run), "-q"])
+    assert done.exit_code == 0, done.output
+    report = read_report(run)
+    one = report.recordings[0]
+    steps = one.steps.model_dump()
+    assert min(steps.values()) > 0
+    assert sum(steps.values()) - one.steps.write == pytest.approx(one.duration_s, abs=0.01)
+    assert report.manifests[0].path == str(tmp_path / "job.yaml")
+    assert "topics: [/imu, /odom]" in report.manifests[0].text
