@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import errno
-from pathlib import Path
 from stat import S_ISDIR, S_ISREG
+
+from mosaico_ingest.remote.path import AnyPath
 
 __all__ = ["LONGEST", "read_whole"]
 
@@ -12,7 +13,7 @@ LONGEST = 64 * 1024 * 1024
 """Bytes of the longest text that is read."""
 
 
-def read_whole(path: Path) -> bytes:
+def read_whole(path: AnyPath) -> bytes:
     """Return what a file holds.
 
     Raises:

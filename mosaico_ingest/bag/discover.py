@@ -11,6 +11,7 @@ from mosaico_ingest.bag.containers.opening import is_recording
 from mosaico_ingest.bag.metadata import FILE_NAME, Metadata, read_metadata
 from mosaico_ingest.diagnostics import Finding, Severity
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.remote.path import AnyPath
 
 __all__ = ["Found", "discover"]
 
@@ -21,12 +22,12 @@ _SUFFIX = ".zstd"
 class Found:
     """The files of one recording, the metadata that describe all of them, and what is odd about either."""
 
-    files: tuple[Path, ...]
+    files: tuple[AnyPath, ...]
     metadata: Metadata | None
     findings: tuple[Finding, ...]
 
 
-def discover(paths: Sequence[Path]) -> Found:
+def discover(paths: Sequence[AnyPath]) -> Found:
     """Return the files that `paths` stand for, each once.
 
     Raises:
@@ -40,7 +41,7 @@ def discover(paths: Sequence[Path]) -> Found:
     return Found(files, found[0].metadata if len(found) == 1 else None, findings)
 
 
-def _one(path: Path) -> Found:
+def _one(path: AnyPath) -> Found:
     if not path.exists():
         raise BagError(
             "does not exist", where=str(path), hint="check the path; relative ones start at the manifest"
@@ -52,7 +53,7 @@ def _one(path: Path) -> Found:
     return _file(path)
 
 
-def _file(path: Path) -> Found:
+def _file(path: AnyPath) -> Found:
     """A file is itself; the metadata beside it count where they speak of this file alone."""
     beside = path.parent / FILE_NAME
     if not beside.is_file():
@@ -75,7 +76,7 @@ def _file(path: Path) -> Found:
     return Found((path,), None, (part,))
 
 
-def _directory(path: Path) -> Found:
+def _directory(path: AnyPath) -> Found:
     listing = path / FILE_NAME
     findings: tuple[Finding, ...] = ()
     if listing.is_file():
@@ -98,7 +99,7 @@ def _directory(path: Path) -> Found:
 
 def _listed(metadata: Metadata) -> Found:
     folder = metadata.path.parent
-    files: list[Path] = []
+    files: list[AnyPath] = []
     missing: list[str] = []
     for name in metadata.files:
         file = next((file for file in _candidates(folder, name) if file.is_file()), None)
@@ -126,28 +127,28 @@ def _listed(metadata: Metadata) -> Found:
     return Found(tuple(files), metadata, findings)
 
 
-def _recordings(folder: Path) -> list[Path]:
+def _recordings(folder: AnyPath) -> list[AnyPath]:
     return sorted(
         (entry for entry in _entries(folder) if entry.is_file() and is_recording(entry)), key=_natural
     )
 
 
-def _entries(folder: Path) -> list[Path]:
+def _entries(folder: AnyPath) -> list[AnyPath]:
     try:
         return list(folder.iterdir())
     except OSError as err:
         raise BagError(f"cannot be listed: {err.strerror}", where=str(folder)) from err
 
 
-def _candidates(folder: Path, name: str) -> Iterator[Path]:
+def _candidates(folder: AnyPath, name: str) -> Iterator[AnyPath]:
     """Yield where a listed file may be: old versions wrote a directory, or left off the compression's suffix."""
-    for base in (folder / name, folder / Path(name).name):
-        yield base
-        yield Path(f"{base}{_SUFFIX}")
-        yield Path(str(base).removesuffix(_SUFFIX))
+    for part in dict.fromkeys((name, Path(name).name)):
+        yield folder / part
+        yield folder / f"{part}{_SUFFIX}"
+        yield folder / part.removesuffix(_SUFFIX)
 
 
-def _natural(path: Path) -> list[tuple[int, str]]:
+def _natural(path: AnyPath) -> list[tuple[int, str]]:
     """Sort `part_10` behind `part_9`."""
     return [(int(piece), "") if piece.isdigit() else (-1, piece) for piece in re.split(r"(\d+)", path.name)]
 

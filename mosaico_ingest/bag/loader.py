@@ -22,6 +22,7 @@ from mosaico_ingest.diagnostics import Finding
 from mosaico_ingest.errors import BagError, DecodeError, NothingMatched
 from mosaico_ingest.patterns import select
 from mosaico_ingest.policies import LoaderErrorPolicy, Stores
+from mosaico_ingest.remote.path import as_path
 
 __all__ = ["ROSLoader"]
 
@@ -55,7 +56,7 @@ class ROSLoader:
         self._policy = LoaderErrorPolicy(error_policy)
         self._resolver = TypeResolver(ros_distro or typestore_name, custom_msgs, types=custom_types)
         paths = [file_path] if isinstance(file_path, (str, Path)) else list(file_path)
-        self._recording: Recording = open_recording([Path(path) for path in paths], resolve=self._resolver)
+        self._recording: Recording = open_recording([as_path(path) for path in paths], resolve=self._resolver)
         try:
             self._channels = _selected(self._recording, topics)
         except NothingMatched:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import yaml
 
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.remote.path import AnyPath
 from mosaico_ingest.textfile import read_whole
 
 __all__ = ["FILE_NAME", "Metadata", "TopicHint", "read_metadata"]
@@ -33,14 +33,14 @@ class TopicHint:
 class Metadata:
     """The parts of `metadata.yaml` that can be compared with the storage."""
 
-    path: Path
+    path: AnyPath
     files: tuple[str, ...]
     message_count: int
     topics: tuple[TopicHint, ...]
     distro: str
 
 
-def read_metadata(path: Path) -> Metadata:
+def read_metadata(path: AnyPath) -> Metadata:
     """Read a `metadata.yaml` of any version.
 
     Raises:

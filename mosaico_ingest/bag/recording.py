@@ -23,6 +23,7 @@ from mosaico_ingest.bag.merge import Turn, in_turn
 from mosaico_ingest.bag.prefetch import Prefetched
 from mosaico_ingest.diagnostics import Finding
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.remote.path import AnyPath, RemotePath
 
 __all__ = ["Recording", "open_recording"]
 
@@ -30,13 +31,13 @@ ROWS = 1 << 16
 MEMORY_BYTES = 64 << 20
 
 
-def open_recording(paths: Path | Sequence[Path], *, resolve: Resolver) -> Recording:
+def open_recording(paths: AnyPath | Sequence[AnyPath], *, resolve: Resolver) -> Recording:
     """Open a recording: a file, a directory, a `metadata.yaml`, or several of them as one.
 
     Raises:
         BagError: A path does not exist, is empty, is no recording, or is damaged beyond reading.
     """
-    found = discover([paths] if isinstance(paths, Path) else list(paths))
+    found = discover([paths] if isinstance(paths, Path | RemotePath) else list(paths))
     stack = ExitStack()
     try:
         parts, losses = _open_parts(found.files, stack)
@@ -46,7 +47,7 @@ def open_recording(paths: Path | Sequence[Path], *, resolve: Resolver) -> Record
         raise
 
 
-def _open_parts(files: Sequence[Path], stack: ExitStack) -> tuple[list[Part], list[Loss]]:
+def _open_parts(files: Sequence[AnyPath], stack: ExitStack) -> tuple[list[Part], list[Loss]]:
     """Open every file; one of several that cannot be opened is a loss, as a recorder that crashed leaves such."""
     parts: list[Part] = []
     failed: list[BagError] = []
@@ -94,7 +95,7 @@ class Recording:
         self._table = ChannelTable(parts, resolver)
         self._running: weakref.WeakSet[Generator[RawBatch, None, None]] = weakref.WeakSet()
         self._losses: dict[Loss, None] = dict.fromkeys(losses)
-        self.files: tuple[Path, ...] = found.files
+        self.files: tuple[AnyPath, ...] = found.files
         self.container: str = parts[0].container
         """`mcap`, `sqlite3` or `ros1`."""
         self.size_bytes: int = sum(file.stat().st_size for file in found.files)
@@ -180,6 +181,8 @@ class Recording:
         numbers = [number for number, want in enumerate(wants) if want.keys]
         for turn in in_turn(sources):
             yield self._step(numbers[turn.part], turn)
+        for number in numbers:
+            self._parts[number].confirm()
 
     def _step(self, number: int, turn: Turn) -> _Step:
         try:

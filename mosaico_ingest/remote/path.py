@@ -172,6 +172,18 @@ class RemotePath:
         with reaching(str(self)):
             return self.filesystem.open_output_stream(self.place, compression=None)
 
+    def version(self, file: pa.NativeFile | None = None) -> str:
+        """Return what changes when the object does: its size, and its tag or else the time it was written.
+
+        Raises:
+            FileNotFoundError: There is none.
+        """
+        with reaching(str(self)):
+            opened = file or self.open_input()
+            said = {str(name).lower(): bytes(value).decode() for name, value in opened.metadata().items()}
+            tag = next((said[name] for name in ("etag", "generation") if said.get(name)), None)
+            return f"{opened.size()} {tag or self.now().stat().st_mtime_ns}"
+
     def read_bytes(self) -> bytes:
         """Return the whole content."""
         with reaching(str(self)), self.open() as file:

@@ -7,7 +7,6 @@ import zlib
 from collections.abc import Iterator
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +35,7 @@ from mosaico_ingest.bag.containers.part import (
     orphans,
 )
 from mosaico_ingest.bag.containers.slab import Bytes, by_key, keep_each, stretches
-from mosaico_ingest.bag.containers.source import FileSource
+from mosaico_ingest.bag.containers.source import Source
 from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.errors import BagError
 
@@ -63,9 +62,9 @@ class McapPart:
 
     container = "mcap"
 
-    def __init__(self, path: Path, name: Path | None = None) -> None:
-        self.path = name or path
-        self._source = FileSource(path, name)
+    def __init__(self, source: Source) -> None:
+        self.path = source.path
+        self._source = source
         try:
             self._index = read_index(self._source)
         except BaseException:
@@ -79,7 +78,7 @@ class McapPart:
         self.end_ns: int | None = index.end_ns
         self.message_count: int | None = sum(index.counts.values()) if index.counts is not None else None
         self.holes: list[Hole] = [*index.holes, *orphans(index.counts, index.channels)]
-        self.notes: list[str] = []
+        self.notes: list[str] = source.notes
         self._pieces: tuple[list[Piece], list[Hole]] | None = None
 
     def blocks(self, want: Want) -> Iterator[Block]:
@@ -89,9 +88,16 @@ class McapPart:
         pieces, holes = self._pieces
         if holes:
             yield Block(EARLIEST_NS, lambda: Loaded([], list(holes)))
-        for piece in pieces:
-            if want.times(piece.start_ns, piece.end_ns) and piece.has_any(want.keys):
-                yield Block(min(piece.start_ns, LATEST_NS), partial(self._load, piece, want))
+        wanted = [
+            piece for piece in pieces if want.times(piece.start_ns, piece.end_ns) and piece.has_any(want.keys)
+        ]
+        self._source.expect((piece.offset, piece.stop) for piece in wanted)
+        for piece in wanted:
+            yield Block(min(piece.start_ns, LATEST_NS), partial(self._load, piece, want))
+
+    def confirm(self) -> None:
+        """Say that all was read; see `Source.confirm`."""
+        self._source.confirm()
 
     def close(self) -> None:
         """Let go of the file."""

@@ -21,7 +21,7 @@ from mosaico_ingest.bag.containers.mcap_records import (
 )
 from mosaico_ingest.bag.containers.part import LATEST_NS, Hole
 from mosaico_ingest.bag.containers.resume import next_mcap_chunk
-from mosaico_ingest.bag.containers.source import Fields, FileSource, Window
+from mosaico_ingest.bag.containers.source import Fields, Source, Window
 from mosaico_ingest.errors import BagError
 
 __all__ = ["McapIndex", "Piece", "read_index", "read_pieces"]
@@ -73,7 +73,7 @@ class McapIndex:
     """Whether every record was looked at, and not only the summary."""
 
 
-def read_index(source: FileSource) -> McapIndex:
+def read_index(source: Source) -> McapIndex:
     """Return what the summary says, or, where it is missing, incomplete or damaged, what a walk finds."""
     try:
         index = _summary(source)
@@ -86,11 +86,12 @@ def read_index(source: FileSource) -> McapIndex:
     index = McapIndex(data_end=source.size)
     if problem:
         index.holes.append(Hole(source.size, f"{problem}; the file was read record by record", count=0))
+    source.bring_near()
     _Walk(source, index).over(len(MAGIC), source.size)
     return index
 
 
-def read_pieces(source: FileSource, index: McapIndex) -> tuple[list[Piece], list[Hole]]:
+def read_pieces(source: Source, index: McapIndex) -> tuple[list[Piece], list[Hole]]:
     """Return all pieces by time, also those that the summary does not name, and what is broken between its chunks."""
     known = sorted(index.pieces, key=lambda piece: piece.offset)
     found = McapIndex()
@@ -105,7 +106,7 @@ def read_pieces(source: FileSource, index: McapIndex) -> tuple[list[Piece], list
     return sorted(known + found.pieces, key=lambda piece: piece.start_ns), found.holes
 
 
-def _summary(source: FileSource) -> McapIndex | None:
+def _summary(source: Source) -> McapIndex | None:
     tail_at = source.size - _FOOTER_BYTES - len(MAGIC)
     if tail_at < len(MAGIC):
         raise BagError("the file ends without a footer")
@@ -178,7 +179,7 @@ def _statistics(fields: Fields, index: McapIndex) -> int:
 class _Walk:
     """Goes from record to record and writes down what is there."""
 
-    def __init__(self, source: FileSource, index: McapIndex) -> None:
+    def __init__(self, source: Source, index: McapIndex) -> None:
         self._source = source
         self._window = Window(source)
         self._index = index

@@ -1,60 +1,97 @@
-"""This file opens a file of a recording by what it holds, whatever its name."""
+"""This file opens a file of a recording by what it holds, whatever its name and wherever it lies."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from stat import S_ISREG
 
 from mosaico_ingest.bag.containers import mcap, ros1, sqlite
 from mosaico_ingest.bag.containers.compression import ZSTD_MAGIC, inflate_file
 from mosaico_ingest.bag.containers.part import Hole, Part
+from mosaico_ingest.bag.containers.source import FileSource, Source
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.remote.path import AnyPath, RemotePath
 
 __all__ = ["is_recording", "open_part"]
 
-_FORMATS: tuple[tuple[bytes, Callable[[Path, Path], Part]], ...] = (
-    (mcap.MAGIC, mcap.McapPart),
-    (sqlite.MAGIC, sqlite.SqlitePart),
-    (ros1.MAGIC, ros1.Ros1Part),
-)
+_INDEXED: Mapping[bytes, Callable[[Source], Part]] = {mcap.MAGIC: mcap.McapPart, ros1.MAGIC: ros1.Ros1Part}
+"""What is read by position, and so also behind a URL, without reading all of it."""
+_MAGICS = (ZSTD_MAGIC, sqlite.MAGIC, *_INDEXED)
 _LOOK_BYTES = 16
 
 
-def is_recording(path: Path) -> bool:
+def is_recording(path: AnyPath) -> bool:
     """Return whether the file begins as a recording, or as a zstd file that may hold one."""
-    head = _head(path)
-    return head.startswith((ZSTD_MAGIC, *(magic for magic, _ in _FORMATS)))
+    return _head(path).startswith(_MAGICS)
 
 
-def open_part(path: Path, stack: ExitStack) -> Part:
-    """Open a file; `stack` closes it, and removes what a compressed one was inflated to.
+def open_part(path: AnyPath, stack: ExitStack) -> Part:
+    """Open a file; `stack` closes it, and removes what had to be fetched or inflated.
 
     Raises:
         BagError: It is empty, no recording, or damaged beyond reading.
+        Unreachable: It lies behind a URL that does not answer.
     """
+    if isinstance(path, RemotePath):
+        return _open_remote(path, stack)
     head = _head(path)
     if not head.startswith(ZSTD_MAGIC):
         return _open(path, path, head, stack)
-    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mosaico-")))
+    return _inflated(path, path, stack)
+
+
+def _open_remote(path: RemotePath, stack: ExitStack) -> Part:
+    """Open an object in place, or fetch it where it can only be read as a whole."""
+    from mosaico_ingest.bag.containers.remote import RemoteSource, fetch  # noqa: PLC0415 - only jobs with URLs need it
+
+    source = RemoteSource(path)
+    head = source.read_some(0, _LOOK_BYTES)
+    for magic, kind in _INDEXED.items():
+        if head.startswith(magic):
+            return _entered(partial(kind, source), path, stack)
+    source.close()
+    if not head.startswith((ZSTD_MAGIC, sqlite.MAGIC)):
+        raise _no_recording(head, path)
+    folder = _folder(stack)
+    near = fetch(path, folder)
+    if head.startswith(ZSTD_MAGIC):
+        part = _inflated(near, path, stack)
+        near.unlink()
+    else:
+        for beside in (path.parent / f"{path.name}{suffix}" for suffix in ("-wal", "-journal")):
+            if beside.is_file():
+                fetch(beside, folder)
+        part = _open(near, path, head, stack)
+    part.notes.append(f"it can only be read as a whole, so all of its {source.size} bytes were fetched first")
+    return part
+
+
+def _inflated(path: Path, name: AnyPath, stack: ExitStack) -> Part:
+    folder = _folder(stack)
     plain = folder / path.name.removesuffix(".zstd")
     try:
         problem = inflate_file(path, plain)
     except OSError as err:
         raise BagError(
             f"cannot be decompressed to {folder}: {err.strerror}",
-            where=str(path),
+            where=str(name),
             hint="decompress it yourself, or point TMPDIR at a larger disk",
         ) from err
-    part = _open(plain, path, _head(plain), stack)
+    part = _open(plain, name, _head(plain), stack)
     if problem:
         part.holes.append(Hole(plain.stat().st_size, problem))
     return part
 
 
-def _head(path: Path) -> bytes:
+def _folder(stack: ExitStack) -> Path:
+    return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mosaico-")))
+
+
+def _head(path: AnyPath) -> bytes:
     try:
         if not S_ISREG(path.stat().st_mode):  # to open a pipe waits for its writer
             raise BagError("a pipe, a socket or a device, not a file", where=str(path))
@@ -64,18 +101,28 @@ def _head(path: Path) -> bytes:
         raise BagError(f"cannot be opened: {err.strerror}", where=str(path)) from err
 
 
-def _open(path: Path, name: Path, head: bytes, stack: ExitStack) -> Part:
-    for magic, kind in _FORMATS:
+def _open(path: Path, name: AnyPath, head: bytes, stack: ExitStack) -> Part:
+    for magic, kind in _INDEXED.items():
         if head.startswith(magic):
-            try:
-                part = kind(path, name)
-            except BagError as err:
-                raise err if err.where else BagError(err.what, where=str(name), hint=err.hint) from err
-            stack.callback(part.close)
-            return part
+            return _entered(partial(kind, FileSource(path, name)), name, stack)
+    if head.startswith(sqlite.MAGIC):
+        return _entered(partial(sqlite.SqlitePart, path, name), name, stack)
+    raise _no_recording(head, name)
+
+
+def _entered(make: Callable[[], Part], name: AnyPath, stack: ExitStack) -> Part:
+    try:
+        part = make()
+    except BagError as err:
+        raise err if err.where else BagError(err.what, where=str(name), hint=err.hint) from err
+    stack.callback(part.close)
+    return part
+
+
+def _no_recording(head: bytes, name: AnyPath) -> BagError:
     if not head:
-        raise BagError("the file is empty", where=str(name), hint="record again, or remove it from the job")
-    raise BagError(
+        return BagError("the file is empty", where=str(name), hint="record again, or remove it from the job")
+    return BagError(
         f"not a recording; it begins with {head.hex(' ')}",
         where=str(name),
         hint="ROS 1 .bag, rosbag2 .db3 and .mcap are read, each also as .zstd",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.definition import Embedded
+from mosaico_ingest.remote.path import AnyPath
 
 __all__ = ["EARLIEST_NS", "LATEST_NS", "Block", "Hole", "Loaded", "Part", "Slab", "Stream", "Want", "orphans"]
 
@@ -120,7 +120,7 @@ class Want:
 class Part(Protocol):
     """One open file of a recording."""
 
-    path: Path
+    path: AnyPath
     """The file as it was named, not a copy that had to be made."""
     container: str
     streams: tuple[Stream, ...]
@@ -136,6 +136,10 @@ class Part(Protocol):
 
     def blocks(self, want: Want) -> Iterator[Block]:
         """Yield what holds wanted messages, by ascending `start_ns`."""
+        ...
+
+    def confirm(self) -> None:
+        """Say that all was read; raise where the file has changed since it was opened."""
         ...
 
     def close(self) -> None:

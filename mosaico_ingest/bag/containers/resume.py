@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from mosaico_ingest.bag.containers import mcap_records, ros1_records
-from mosaico_ingest.bag.containers.source import FileSource, Window
+from mosaico_ingest.bag.containers.source import Source, Window
 from mosaico_ingest.errors import BagError
 
 __all__ = ["next_mcap_chunk", "next_ros1_chunk"]
@@ -20,7 +20,7 @@ _HEAD_BYTES = 256
 _ROS1_CHUNK = re.compile(rb"\x04\x00\x00\x00op=\x05")
 
 
-def next_mcap_chunk(source: FileSource, at: int, stop: int) -> int | None:
+def next_mcap_chunk(source: Source, at: int, stop: int) -> int | None:
     """Return where the next whole MCAP chunk begins, between `at` and `stop`."""
 
     def is_chunk(place: int) -> bool:
@@ -36,7 +36,7 @@ def next_mcap_chunk(source: FileSource, at: int, stop: int) -> int | None:
     return _search(source, at, stop, _mcap_candidates, is_chunk)
 
 
-def next_ros1_chunk(source: FileSource, at: int, stop: int) -> int | None:
+def next_ros1_chunk(source: Source, at: int, stop: int) -> int | None:
     """Return where the next whole chunk of a ROS 1 bag begins, between `at` and `stop`."""
 
     def is_chunk(place: int) -> bool:
@@ -50,7 +50,7 @@ def next_ros1_chunk(source: FileSource, at: int, stop: int) -> int | None:
 
 
 def _search(
-    source: FileSource,
+    source: Source,
     at: int,
     stop: int,
     candidates: Callable[[bytes], Iterator[int]],

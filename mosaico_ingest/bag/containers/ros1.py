@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +24,7 @@ from mosaico_ingest.bag.containers.ros1_records import (
     times_of,
 )
 from mosaico_ingest.bag.containers.slab import Bytes, by_key, keep, keep_each, stretches
-from mosaico_ingest.bag.containers.source import FileSource
+from mosaico_ingest.bag.containers.source import Source
 from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.errors import BagError
 
@@ -40,9 +39,9 @@ class Ros1Part:
 
     container = "ros1"
 
-    def __init__(self, path: Path, name: Path | None = None) -> None:
-        self.path = name or path
-        self._source = FileSource(path, name)
+    def __init__(self, source: Source) -> None:
+        self.path = source.path
+        self._source = source
         try:
             self._index = read_index(self._source)
         except BaseException:
@@ -59,14 +58,23 @@ class Ros1Part:
         self.end_ns: int | None = max((piece.end_ns for piece in filled), default=None)
         self.message_count: int | None = sum(counts.values())
         self.holes: list[Hole] = [*self._index.holes, *orphans(counts, self._index.connections)]
-        self.notes: list[str] = []
+        self.notes: list[str] = source.notes
 
     def blocks(self, want: Want) -> Iterator[Block]:
         """Yield the chunks that may hold wanted messages."""
         keys = frozenset(want.keys)
-        for piece in self._pieces:
-            if piece.is_cut or (want.times(piece.start_ns, piece.end_ns) and piece.counts.keys() & keys):
-                yield Block(piece.start_ns, partial(self._load, piece, want))
+        wanted = [
+            piece
+            for piece in self._pieces
+            if piece.is_cut or (want.times(piece.start_ns, piece.end_ns) and piece.counts.keys() & keys)
+        ]
+        self._source.expect((piece.offset, piece.stop) for piece in wanted)
+        for piece in wanted:
+            yield Block(piece.start_ns, partial(self._load, piece, want))
+
+    def confirm(self) -> None:
+        """Say that all was read; see `Source.confirm`."""
+        self._source.confirm()
 
     def close(self) -> None:
         """Let go of the file."""

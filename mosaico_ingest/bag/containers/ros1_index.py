@@ -23,7 +23,7 @@ from mosaico_ingest.bag.containers.ros1_records import (
     time_of,
     times_of,
 )
-from mosaico_ingest.bag.containers.source import FileSource, Window
+from mosaico_ingest.bag.containers.source import Source, Window
 from mosaico_ingest.errors import BagError
 
 __all__ = ["MAGIC", "Piece", "Ros1Index", "read_index"]
@@ -57,7 +57,7 @@ class Ros1Index:
     holes: list[Hole] = field(default_factory=list[Hole])
 
 
-def read_index(source: FileSource) -> Ros1Index:
+def read_index(source: Source) -> Ros1Index:
     """Return what the bag's index says, or, where it is missing or damaged, what a walk finds.
 
     Raises:
@@ -83,17 +83,19 @@ def read_index(source: FileSource) -> Ros1Index:
     index_at = number(head.header, b"index_pos", 8)
     problem = None if index_at else "the bag was not closed and has no index"
     if index_at:
+        source.expect([(index_at, source.size)])
         try:
             return _from_index(source, window, head, index_at)
         except BagError as err:
             problem = f"its index is damaged ({err.what})"
     index = Ros1Index()
     index.holes.append(Hole(len(_VERSION), f"{problem}; the file was read record by record", count=0))
+    source.bring_near()
     _Walk(source, index).over(head.end, source.size)
     return index
 
 
-def _from_index(source: FileSource, window: Window, head: Record, index_at: int) -> Ros1Index:
+def _from_index(source: Source, window: Window, head: Record, index_at: int) -> Ros1Index:
     index = Ros1Index()
     places: list[tuple[int, int, int, dict[int, int]]] = []
     at = index_at
@@ -132,7 +134,7 @@ def _chunk_info(record: Record, data: bytes, index_at: int) -> tuple[int, int, i
 class _Walk:
     """Goes from record to record and writes down what is there."""
 
-    def __init__(self, source: FileSource, index: Ros1Index) -> None:
+    def __init__(self, source: Source, index: Ros1Index) -> None:
         self._source = source
         self._window = Window(source)
         self._index = index

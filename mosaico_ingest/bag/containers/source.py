@@ -4,13 +4,59 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Protocol
 
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.remote.path import AnyPath
 
-__all__ = ["Fields", "FileSource", "Window"]
+__all__ = ["Fields", "FileSource", "Source", "Window"]
 
 _WINDOW_BYTES = 1 << 16
+
+
+class Source(Protocol):
+    """What containers read from, by position."""
+
+    @property
+    def path(self) -> AnyPath:
+        """The file as it was named, not a copy that had to be made."""
+        ...
+
+    @property
+    def size(self) -> int:
+        """Its length in bytes."""
+        ...
+
+    @property
+    def notes(self) -> list[str]:
+        """What is worth saying about how it is read."""
+        ...
+
+    def read(self, offset: int, size: int) -> bytes:
+        """Return `size` bytes from `offset` on; BagError where there are fewer."""
+        ...
+
+    def read_some(self, offset: int, size: int) -> bytes:
+        """Return up to `size` bytes from `offset` on, fewer only where the file ends."""
+        ...
+
+    def expect(self, stretches: Iterable[tuple[int, int]]) -> None:
+        """Announce what will be read next, in this order, each as its first byte and the one behind its last."""
+        ...
+
+    def bring_near(self) -> None:
+        """Announce that all of it will be read in small steps."""
+        ...
+
+    def confirm(self) -> None:
+        """Say that all of it was read; raise where it has changed since it was opened."""
+        ...
+
+    def close(self) -> None:
+        """Let go of it; twice does no harm."""
+        ...
 
 
 class FileSource:
@@ -19,8 +65,9 @@ class FileSource:
     Not a memory map: a file that is cut off while it is read must end in an error, not in a signal.
     """
 
-    def __init__(self, path: Path, name: Path | None = None) -> None:
-        self.path = name or path
+    def __init__(self, path: Path, name: AnyPath | None = None) -> None:
+        self.path: AnyPath = name or path
+        self.notes: list[str] = []
         try:
             self._fd = os.open(path, os.O_RDONLY)
             self.size = os.fstat(self._fd).st_size
@@ -59,6 +106,15 @@ class FileSource:
             raise BagError(f"cannot be read at {offset}: {err.strerror}", where=str(self.path)) from err
         return data
 
+    def expect(self, stretches: Iterable[tuple[int, int]]) -> None:
+        """Do nothing: the system reads ahead by itself."""
+
+    def bring_near(self) -> None:
+        """Do nothing: it is here."""
+
+    def confirm(self) -> None:
+        """Do nothing: an open file stays what it is, unless it is written to."""
+
     def close(self) -> None:
         """Close the file; once is enough, twice does no harm."""
         if self._fd >= 0:
@@ -69,7 +125,7 @@ class FileSource:
 class Window:
     """Looks at a file in small steps forward, reading it in large ones."""
 
-    def __init__(self, source: FileSource) -> None:
+    def __init__(self, source: Source) -> None:
         self._source = source
         self._data = b""
         self._at = 0

@@ -31,6 +31,7 @@ from mosaico_ingest.bag.containers.slab import by_key
 from mosaico_ingest.bag.containers.sqlite_salvage import BROKEN, Row, Salvage
 from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.remote.path import AnyPath
 
 __all__ = ["MAGIC", "SqlitePart"]
 
@@ -71,8 +72,8 @@ class SqlitePart:
 
     container = "sqlite3"
 
-    def __init__(self, path: Path, name: Path | None = None) -> None:
-        self.path = name or path
+    def __init__(self, path: Path, name: AnyPath | None = None) -> None:
+        self.path: AnyPath = name or path
         self.holes: list[Hole] = []
         self.notes: list[str] = []
         self._stack = ExitStack()
@@ -117,6 +118,9 @@ class SqlitePart:
             yield Block(done.time_ns, partial(_load, page))
         holes = salvage.holes or [Hole(0, f"{reason}; every row could be read in another way", count=0)]
         yield Block(done.time_ns, lambda: Loaded([], holes))
+
+    def confirm(self) -> None:
+        """Do nothing; see `FileSource.confirm`."""
 
     def close(self) -> None:
         """Let go of the file and of the copy, if there had to be one."""
