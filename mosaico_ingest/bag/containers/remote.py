@@ -1,0 +1,239 @@
+"""This file reads recordings behind URLs: in few large requests, several at a time, ahead of whoever needs them."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from mosaico_ingest.bag.containers.source import FileSource
+from mosaico_ingest.errors import BagError, Unreachable
+from mosaico_ingest.remote.faults import reaching
+from mosaico_ingest.remote.path import RemotePath
+
+__all__ = ["RemoteSource", "fetch"]
+
+_LOOK_BYTES = 256 << 10
+"""What is asked for where less is needed: a request costs more than its first bytes."""
+_LOOKS = 8
+_FIRST_BYTES, _REQUEST_BYTES = 1 << 20, 8 << 20
+"""How much is asked for at once: little at first, as the reader may stop soon, then twice as much each time."""
+_GAP_BYTES = 512 << 10
+"""What lies between two stretches and is fetched with them rather than asked for around."""
+_REQUESTS = 4
+"""How many requests are under way at a time; with their answers they hold at most 32 MiB."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Stretch:
+    start: int
+    data: bytes
+
+    def has(self, start: int, stop: int) -> bool:
+        return self.start <= start and stop <= self.start + len(self.data)
+
+    def cut(self, start: int, stop: int) -> bytes:
+        return self.data[start - self.start : stop - self.start]
+
+
+class RemoteSource:
+    """An object opened for reading by position; it must not change until it has been read.
+
+    Every method that reads raises `Unreachable` where its store does not answer, or where the object is another now.
+    """
+
+    def __init__(self, path: RemotePath) -> None:
+        self.path = path
+        self.notes: list[str] = []
+        self._near: FileSource | None = None
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._ahead: _Ahead | None = None
+        self._looks: deque[_Stretch] = deque(maxlen=_LOOKS)
+        try:
+            self._file = path.open_input()
+            with reaching(str(path)):
+                self.size: int = self._file.size()
+                self._version = path.version(self._file)
+        except FileNotFoundError as err:
+            raise BagError(f"cannot be opened: {err.strerror}", where=str(path)) from err
+
+    def read(self, offset: int, size: int) -> bytes:
+        """Return `size` bytes from `offset` on; see `FileSource.read`."""
+        if offset < 0 or size < 0 or offset + size > self.size:
+            raise BagError(
+                f"{size} bytes expected at {offset}, the file ends at {self.size}", where=str(self.path)
+            )
+        return self.read_some(offset, size)
+
+    def read_some(self, offset: int, size: int) -> bytes:
+        """Return up to `size` bytes from `offset` on, fewer only where the file ends."""
+        if self._near is not None:
+            return self._near.read_some(offset, size)
+        stop = min(offset + size, self.size)
+        if offset >= stop:
+            return b""
+        expected = self._ahead.take(offset, stop) if self._ahead else None
+        return self._look(offset, stop) if expected is None else expected
+
+    def expect(self, stretches: Iterable[tuple[int, int]]) -> None:
+        """Begin to fetch what will be read next, in this order; each stretch is its first byte and the one behind."""
+        self._forget()
+        if self._near is None:
+            self._ahead = _Ahead(self._fetch, _requests(iter(stretches)))
+
+    def bring_near(self) -> None:
+        """Fetch the whole object to a temporary folder, for many small reads; `close` removes it."""
+        if self._near is None:
+            self._folder = tempfile.TemporaryDirectory(prefix="mosaico-")
+            self._near = FileSource(_save(self, Path(self._folder.name)), self.path)
+            self.notes.append(f"it has no index, so all of its {self.size} bytes were fetched first")
+
+    def confirm(self) -> None:
+        """Raise where the object is no longer the one that was opened."""
+        self._forget()
+        self._check_version()
+
+    def _check_version(self) -> None:
+        if self.path.version() != self._version:
+            raise Unreachable(
+                "the recording changed while it was read", where=str(self.path), hint="run again"
+            )
+
+    def close(self) -> None:
+        """Let go of the object and of what was fetched; twice does no harm."""
+        self._forget()
+        self._file.close()
+        if self._near is not None and self._folder is not None:
+            self._near.close()
+            self._folder.cleanup()
+
+    def _forget(self) -> None:
+        if self._ahead is not None:
+            self._ahead.close()
+            self._ahead = None
+
+    def _look(self, start: int, stop: int) -> bytes:
+        """Return a stretch nobody announced, with some of what lies around it."""
+        for known in self._looks:
+            if known.has(start, stop):
+                return known.cut(start, stop)
+        first = max(0, min(start, self.size - _LOOK_BYTES))
+        data = self._fetch(first, max(stop, min(first + _LOOK_BYTES, self.size)))
+        found = _Stretch(first, data)
+        if len(data) <= _LOOK_BYTES:
+            self._looks.append(found)
+        return found.cut(start, stop)
+
+    def _fetch(self, start: int, stop: int) -> bytes:
+        try:
+            with reaching(str(self.path)):
+                data = self._file.read_at(stop - start, start)  # pyright: ignore[reportCallIssue] - the stubs leave the arguments out
+        except Unreachable:
+            raise
+        except Exception:
+            self._check_version()  # a store says of an object that was replaced that there is no such range
+            raise
+        if len(data) != stop - start:
+            self._check_version()
+            raise BagError(
+                f"{stop - start} bytes expected at {start}, {len(data)} sent", where=str(self.path)
+            )
+        return data
+
+
+class _Ahead:
+    """Fetches stretches before they are asked for, in order; no more at a time than the reader has shown to need."""
+
+    def __init__(self, fetch: Callable[[int, int], bytes], wanted: Iterator[tuple[int, int]]) -> None:
+        self._fetch = fetch
+        self._wanted = wanted
+        self._under_way: deque[tuple[int, int, Future[bytes]]] = deque()
+        self._allowed = 1
+        self._pool = ThreadPoolExecutor(_REQUESTS, thread_name_prefix="mosaico-fetch")
+        self._lock = threading.Lock()
+        self._fill()
+
+    def take(self, start: int, stop: int) -> bytes | None:
+        """Return a stretch that was announced, None for any other."""
+        with self._lock:
+            place = next((i for i, (a, b, _) in enumerate(self._under_way) if a <= start and stop <= b), None)
+            if place is None:
+                return None
+            for _ in range(place):
+                self._under_way.popleft()
+            if place:
+                self._allowed = min(self._allowed + 1, _REQUESTS)
+            self._fill()
+            first, _, fetched = self._under_way[0]
+        return fetched.result()[start - first : stop - first]
+
+    def close(self) -> None:
+        """Give up what has not been asked for yet."""
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def _fill(self) -> None:
+        while len(self._under_way) < self._allowed:
+            following = next(self._wanted, None)
+            if following is None:
+                return
+            self._under_way.append((*following, self._pool.submit(self._fetch, *following)))
+
+
+def _requests(stretches: Iterator[tuple[int, int]]) -> Iterator[tuple[int, int]]:
+    """Join neighbours to requests of a good size."""
+    limit = _FIRST_BYTES
+    begun: tuple[int, int] | None = None
+    for start, stop in stretches:
+        if begun and 0 <= start - begun[1] <= _GAP_BYTES and stop - begun[0] <= limit:
+            begun = (begun[0], stop)
+            continue
+        if begun:
+            yield begun
+            limit = min(2 * limit, _REQUEST_BYTES)
+        begun = (start, stop)
+    if begun:
+        yield begun
+
+
+def fetch(path: RemotePath, folder: Path) -> Path:
+    """Copy an object into a folder, checking first that it fits.
+
+    Raises:
+        BagError: There is no such object, or not enough room.
+        Unreachable: Its store does not answer, or it changed meanwhile.
+    """
+    source = RemoteSource(path)
+    try:
+        target = _save(source, folder)
+        source.confirm()
+    finally:
+        source.close()
+    return target
+
+
+def _save(source: RemoteSource, folder: Path) -> Path:
+    free = shutil.disk_usage(folder).free
+    hint = "point TMPDIR at a larger disk"
+    if source.size > free:
+        raise BagError(
+            f"{source.size} bytes are to be fetched to {folder}, and {free} are free",
+            where=str(source.path),
+            hint=hint,
+        )
+    target = folder / source.path.name
+    steps = [(at, min(at + _REQUEST_BYTES, source.size)) for at in range(0, source.size, _REQUEST_BYTES)]
+    source.expect(steps)
+    try:
+        with target.open("wb") as file:
+            for start, stop in steps:
+                file.write(source.read_some(start, stop - start))
+    except OSError as err:
+        raise BagError(
+            f"cannot be fetched to {folder}: {err.strerror}", where=str(source.path), hint=hint
+        ) from err
+    return target
