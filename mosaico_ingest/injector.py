@@ -55,6 +55,8 @@ def inject(
                 if plan.on_error is SessionLevelErrorPolicy.Delete or not any(s.rows for s in streams):
                     raise failure from error
                 session.note_error(str(failure))
+            if aside is not None:
+                aside.close()
     except BaseException as error:
         named = _named(error)
         _forsake(streams, aside, named, observe)
@@ -62,7 +64,8 @@ def inject(
             raise
         raise named from error
     if aside is not None:
-        aside.close(replaced=plan.if_exists is IfExists.REPLACE)
+        if plan.if_exists is IfExists.REPLACE:
+            aside.supersede()
         if aside.kept:
             observe(Noted(_kept(aside)))
             observe(Quarantined(str(aside.messages_path)))
@@ -91,7 +94,7 @@ def _quarantine(plan: Plan) -> Quarantine | None:
         return None
     counts = [topic.count for topic in plan.topics]
     promised = None if None in counts else sum(count or 0 for count in counts)
-    return Quarantine(plan.quarantine, plan.sequence, promised)
+    return Quarantine(plan.quarantine, plan.sequence, promised, name=plan.kept_as)
 
 
 def _kept(aside: Quarantine) -> Finding:

@@ -11,6 +11,10 @@ __all__ = ["replay"]
 
 _DONE = {0, 4}
 """Exit codes of runs that took what could be taken."""
+_SAYS = {
+    "STORED": "its messages are in the sequence already",
+    "FORGOTTEN": "the run that kept it is not part of its sequence; ingest the recording for what it holds",
+}
 
 
 def replay(
@@ -31,17 +35,26 @@ def replay(
     """Add quarantined messages to the sequences they belong to; what fails again stays in the quarantine."""
     from mosaico_ingest import api
     from mosaico_ingest.cli.session import run_configs
-    from mosaico_ingest.executors.replay import replay_config
-    from mosaico_ingest.quarantine.kept import find_kept
+    from mosaico_ingest.errors import NothingMatched
+    from mosaico_ingest.executors.replay import Whereabouts, alone, replays
     from mosaico_ingest.report.model import RunReport
 
-    found = find_kept(folder)
-    configs = api.compile_job(manifest)
-    jobs = [replay_config(kept, configs) for kept in found]
-
     def mark(result: RunReport) -> None:
-        for kept, recording in zip(found, result.recordings, strict=False):
+        for replay, recording in zip(waiting, result.recordings, strict=False):
             if recording.exit_code in _DONE:
-                kept.mark_replayed()
+                replay.kept.mark_replayed()
 
-    run_configs(jobs, report=report, quiet=quiet, log=log, jobs=1, finished=mark)
+    configs = api.compile_job(manifest)
+    with alone(folder):
+        found = replays(folder, configs)
+        for replay in found:
+            if replay.whereabouts is Whereabouts.STORED:
+                replay.kept.mark_replayed()
+            if replay.whereabouts is not Whereabouts.WAITING and not quiet:
+                typer.echo(f"{replay.kept.messages.name}: {_SAYS[replay.whereabouts.name]}", err=True)
+        waiting = [replay for replay in found if replay.whereabouts is Whereabouts.WAITING]
+        if all(replay.whereabouts is Whereabouts.FORGOTTEN for replay in found):
+            raise NothingMatched("there is nothing to replay", where=str(folder), hint=_SAYS["FORGOTTEN"])
+        run_configs(
+            [replay.config for replay in waiting], report=report, quiet=quiet, log=log, jobs=1, finished=mark
+        )

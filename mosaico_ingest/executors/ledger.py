@@ -18,6 +18,7 @@ from mosaico_ingest.errors import BagError, SequenceExists
 from mosaico_ingest.plan.describe import decisions
 from mosaico_ingest.plan.model import LEDGER_KEY, Plan
 from mosaico_ingest.policies import IfExists
+from mosaico_ingest.quarantine.quarantine import kept_name
 from mosaico_ingest.store.layout import Layout
 from mosaico_ingest.store.store import Store
 from mosaico_ingest.version import __version__
@@ -60,6 +61,10 @@ class Ledger(_Part):
     sources: tuple[Source, ...]
     family: str | None = None
     """What it shares its definitions with."""
+    run: str | None = None
+    """Which run made it, where that may begin a recording anew."""
+    quarantine: str | None = None
+    """The name of the file that has its rejected messages, if there are any."""
 
     def same_content(self, other: Ledger) -> bool:
         """Say whether both are about the same bytes, whatever the files are called."""
@@ -86,9 +91,9 @@ def enter(plan: Plan) -> Plan | None:
         if_exists = what_to_do(ledger, held(plan.target, plan.sequence), plan.sequence)
     if if_exists is None:
         return None
-    return replace(
-        plan, if_exists=if_exists, metadata={**plan.metadata, LEDGER_KEY: ledger.model_dump(mode="json")}
-    )
+    kept_as = kept_name(plan.sequence) if plan.quarantine else None
+    noted = ledger.model_copy(update={"quarantine": kept_as}).model_dump(mode="json")
+    return replace(plan, if_exists=if_exists, kept_as=kept_as, metadata={**plan.metadata, LEDGER_KEY: noted})
 
 
 def ledger_of(plan: Plan) -> Ledger:

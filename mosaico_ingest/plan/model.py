@@ -88,6 +88,8 @@ class Plan:
     """Messages recorded at this instant or later are not read."""
     quarantine: QuarantineSettings | None = None
     """Where rejected messages are kept."""
+    kept_as: str | None = None
+    """The name of the file they are kept in, as the ledger of the run has it."""
     family: str | None = None
     """What the sequences of the same job, for other recordings, have in common."""
     memory_bytes: int = DEFAULT_MEMORY_BYTES

@@ -26,10 +26,10 @@ class Kept:
 
 
 def find_kept(folder: Path) -> tuple[Kept, ...]:
-    """Return what waits in a quarantine, the oldest of a sequence first.
+    """Return what lies in a quarantine, the oldest of a sequence first.
 
     Raises:
-        NothingMatched: There is nothing to replay.
+        NothingMatched: It is empty.
         BagError: The index beside the messages is not there or cannot be read.
     """
     found = tuple(_kept(folder))
@@ -45,6 +45,8 @@ def _kept(folder: Path) -> Iterator[Kept]:
         index = messages.with_suffix(INDEX)
         try:
             with index.open(encoding="utf-8") as lines:
-                yield Kept(messages, str(json.loads(lines.readline())["sequence"]))
+                first = lines.readline()
+            if first.endswith("\n"):  # else its run was killed before it had kept a message
+                yield Kept(messages, str(json.loads(first)["sequence"]))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise BagError(f"this is no index of a quarantine: {error}", where=str(index)) from error

@@ -1,4 +1,4 @@
-"""This file writes messages as they are into an MCAP file, readable also where its writer was killed."""
+"""This file writes messages as they are into an MCAP file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _LIBRARY = "mosaico-ingest"
 
 
 class McapFile:
-    """A new MCAP file without chunks: every message is on its way to the disk once `write` returns.
+    """A new MCAP file without chunks.
 
     A definition that came from the recording goes along; another is looked for anew by whoever reads the file.
     """
@@ -36,7 +36,7 @@ class McapFile:
         Raises:
             OSError: It cannot be created, or is there already.
         """
-        self._file: BinaryIO = path.open("xb", buffering=0)
+        self._file: BinaryIO = path.open("xb")
         self._channels: dict[int, bytes] = {}
         self._schemas: dict[int, bytes] = {}
         self._counts: dict[int, int] = {}

@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 from collections import Counter
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TextIO
@@ -18,20 +19,27 @@ from mosaico_ingest.diagnostics import RowFailure, Stage
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.quarantine.mcap_file import McapFile
 
-__all__ = ["INDEX", "MESSAGES", "Quarantine", "retire"]
+__all__ = ["INDEX", "MESSAGES", "Quarantine", "kept_name", "retire"]
 
 MESSAGES = ".mcap"
 INDEX = ".jsonl"
 
 
+def kept_name(sequence: str) -> str:
+    """Return the name of the file a run that begins now keeps its messages in."""
+    stamp = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%S%fZ")
+    return f"{sequence}-{stamp}{MESSAGES}"
+
+
 class Quarantine:
     """The rejected messages of one run; its two files are made with the first of them."""
 
-    def __init__(self, settings: QuarantineSettings, sequence: str, promised: int | None) -> None:
+    def __init__(
+        self, settings: QuarantineSettings, sequence: str, promised: int | None, *, name: str | None = None
+    ) -> None:
         """`promised` is how many messages the index promises for the whole run, None where it does not say."""
-        stamp = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%S%fZ")
         self.systematic = settings.systematic
-        self.messages_path = settings.path / f"{sequence}-{stamp}{MESSAGES}"
+        self.messages_path = settings.path / (name or kept_name(sequence))
         self.kept = 0
         self._settings = settings
         self._sequence = sequence
@@ -70,14 +78,27 @@ class Quarantine:
         self.kept += 1
         return True
 
-    def close(self, *, replaced: bool) -> None:
-        """Finish the files; what earlier runs kept of a sequence that was `replaced` is not to be replayed any more."""
+    def close(self) -> None:
+        """Finish the files and wait until they are on the disk: what is committed next says that they are there."""
         with self._explained():
             if self._files is not None:
                 for file in self._files:
                     file.close()
-            if replaced:
-                self._supersede()
+                for path in (self.messages_path, self.messages_path.with_suffix(INDEX)):
+                    with path.open("rb") as written:
+                        os.fsync(written.fileno())
+
+    def supersede(self) -> None:
+        """Retire what earlier runs kept of the sequence: it was replaced, and is not to be replayed any more."""
+        with self._explained():
+            for path in self.messages_path.parent.glob(f"*{INDEX}"):
+                messages = path.with_suffix(MESSAGES)
+                if (
+                    messages != self.messages_path
+                    and messages.is_file()
+                    and _sequence_of(path) == self._sequence
+                ):
+                    retire(messages, "superseded")
 
     def discard(self) -> None:
         """Remove the files: nothing of the run was kept, so the next one meets these messages again."""
@@ -85,7 +106,8 @@ class Quarantine:
             return
         with self._explained():
             for file in self._files:
-                file.close()
+                with suppress(OSError):  # a full disk refuses the last bytes of what is removed anyway
+                    file.close()
             self.messages_path.unlink(missing_ok=True)
             self.messages_path.with_suffix(INDEX).unlink(missing_ok=True)
 
@@ -113,12 +135,6 @@ class Quarantine:
             "rule": failure.rule,
             "reason": failure.reason,
         }
-
-    def _supersede(self) -> None:
-        for path in self.messages_path.parent.glob(f"*{INDEX}"):
-            messages = path.with_suffix(MESSAGES)
-            if messages != self.messages_path and messages.is_file() and _sequence_of(path) == self._sequence:
-                retire(messages, "superseded")
 
     @contextmanager
     def _explained(self) -> Generator[None, None, None]:

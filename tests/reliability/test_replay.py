@@ -1,0 +1,211 @@
+"""A replay brings each kept message in once, wherever it is stopped, and leaves what still does not fit."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+
+from mosaico_ingest import api
+from mosaico_ingest.cli.app import main
+from mosaico_ingest.executors.replay import Whereabouts, alone, replays
+from mosaico_ingest.quarantine.kept import Kept
+from mosaico_ingest.report.events import RunStatus
+from mosaico_ingest.store import Store
+
+from .conftest import CUT, RunJob, WriteBag, number
+
+WriteJob = Callable[..., Path]
+WRONG = "float64 data\nfloat64 more"
+MOMENTS = {
+    "before the commit": ("mosaico_ingest.store.session.StoreSession", "commit", "before"),
+    "segments moved, not entered": ("mosaico_ingest.store.layout.Layout", "publish", "after"),
+    "committed": ("mosaico_ingest.store.session.StoreSession", "commit", "after"),
+    "committed and checked": ("mosaico_ingest.store.session.StoreSession", "stored", "after"),
+    "before it is marked": ("mosaico_ingest.quarantine.kept.Kept", "mark_replayed", "before"),
+    "messages renamed, their index not": ("pathlib.Path", "rename", "after"),
+    "marked": ("mosaico_ingest.quarantine.kept.Kept", "mark_replayed", "after"),
+}
+_KILLED = """
+import importlib, os, signal, sys
+module, name = sys.argv[1].rsplit(".", 1)
+owner = getattr(importlib.import_module(module), name)
+method, moment = sys.argv[2:4]
+plain = getattr(owner, method)
+def deadly(self, *given, **more):
+    mine = method != "rename" or ".mcap" in str(self)
+    if mine and moment == "before":
+        os.kill(os.getpid(), signal.SIGKILL)
+    done = plain(self, *given, **more)
+    if mine:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return done
+setattr(owner, method, deadly)
+from mosaico_ingest.cli.app import main
+main(sys.argv[4:])
+"""
+
+
+def command(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    return int(ended.value.code or 0)
+
+
+def killed(moment: str, *arguments: object) -> int:
+    """Run the command in a process that is killed at a moment; return its exit code."""
+    ran = subprocess.run(  # noqa: S603 - this interpreter, our own code
+        [sys.executable, "-c", _KILLED, *MOMENTS[moment], *map(str, arguments)],
+        check=False,
+        timeout=60,
+        capture_output=True,
+    )
+    return ran.returncode
+
+
+def values(store: Store, topic: str = "/speed") -> list[float]:
+    found: list[float] = store.scan("drive", topic).read_all()["data"].to_pylist()
+    return sorted(found)
+
+
+def waiting(folder: Path, job: Path) -> int:
+    """Return how many messages a replay would bring in, or try to."""
+    found = replays(folder, api.compile_job(job))
+    files = [one.kept.messages for one in found if one.whereabouts is Whereabouts.WAITING]
+    return sum(len(path.with_suffix(".jsonl").read_text().splitlines()) for path in files)
+
+
+@pytest.fixture
+def spoilt(write_bag: WriteBag, write_job: WriteJob, run_job: RunJob) -> Path:
+    """A sequence of one good message, five in quarantine and one there that will never fit; the mended job."""
+    write_bag({"/speed": [*map(number, range(5)), CUT], "/std/speed": [number(1)]})
+    report = run_job(write_job(definition=WRONG, quarantine={}))
+    assert (report.status, report.totals.written, report.totals.rejected) == (RunStatus.REJECTED, 1, 6)
+    return write_job(quarantine={})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_a_replay_killed_at_any_step_brings_each_message_in_once(
+    moment: str, spoilt: Path, tmp_path: Path
+) -> None:
+    folder, store = tmp_path / "quarantine", Store.open(tmp_path / "store")
+    replay = ("replay", "-q", folder, "-m", spoilt)
+    assert killed(moment, *replay) == -9
+    assert command(*replay) in {0, 3, 4}
+    assert values(store) == list(range(5))
+    assert store.sequence("drive").rows == 6
+    assert waiting(folder, spoilt) == 1
+    assert command(*replay) == 3, "what is left does not fit"
+    assert store.sequence("drive").rows == 6
+    assert waiting(folder, spoilt) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", ["before the commit", "segments moved, not entered", "committed"])
+def test_what_a_killed_run_kept_comes_in_only_where_the_run_did(
+    moment: str, write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
+) -> None:
+    write_bag({"/speed": list(map(number, range(5))), "/std/speed": [number(1)]})
+    folder, store = tmp_path / "quarantine", tmp_path / "store"
+    assert killed(moment, "run", "-q", write_job(definition=WRONG, quarantine={})) == -9
+    if moment != "committed":
+        assert command("run", "-q", write_job(definition=WRONG, quarantine={})) == 4
+    assert command("replay", "-q", folder, "-m", write_job(quarantine={})) == 0
+    assert values(Store.open(store)) == list(range(5))
+
+
+def test_a_replay_stopped_before_it_could_say_so_is_not_done_again(
+    spoilt: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, store = tmp_path / "quarantine", Store.open(tmp_path / "store")
+    with monkeypatch.context() as patched:
+        patched.setattr(Kept, "mark_replayed", str)
+        assert command("replay", "-q", folder, "-m", spoilt) == 4
+    assert len(list(folder.glob("*.mcap"))) == 2, "what was replayed, and what failed again"
+    assert command("replay", folder, "-m", spoilt) == 3
+    assert "in the sequence already" in capsys.readouterr().err
+    assert (values(store), waiting(folder, spoilt)) == (list(range(5)), 1)
+
+
+def test_messages_of_a_run_that_is_not_in_the_store_are_left_alone(
+    spoilt: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, store = tmp_path / "quarantine", Store.open(tmp_path / "store")
+    store.delete_sequence("drive")
+    assert command("replay", folder, "-m", spoilt) == 3
+    assert "not part of its sequence" in capsys.readouterr().err
+    assert "drive" not in store.names()
+    without = yaml.safe_load(spoilt.read_text())
+    del without["quarantine"]
+    again = tmp_path / "again.yaml"
+    again.write_text(yaml.safe_dump(without))
+    assert command("run", "-q", again) == 4
+    assert command("replay", "-q", folder, "-m", spoilt) == 3, "the new sequence has those messages already"
+    assert (values(store), waiting(folder, spoilt)) == (list(range(5)), 0)
+
+
+def test_two_replays_do_not_work_on_one_quarantine(
+    spoilt: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "quarantine"
+    with alone(folder):
+        assert command("replay", "-q", folder, "-m", spoilt) == 1
+    assert "another replay" in capsys.readouterr().err
+    assert command("replay", "-q", folder, "-m", spoilt) == 4
+    assert not list(folder.glob(".replay*"))
+
+
+def test_a_replay_keeps_all_that_fails_again_whatever_the_limits(
+    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [*[CUT] * 9, *map(number, range(5))], "/std/speed": [number(1)]})
+    run_job(write_job(definition=WRONG, quarantine={}))
+    folder = tmp_path / "quarantine"
+    strict = write_job(quarantine={"max": 2, "systematic": 3}, on_error={"topic": "finalize"})
+    assert command("replay", "-q", folder, "-m", strict) == 4
+    assert values(Store.open(tmp_path / "store")) == list(range(5))
+    assert waiting(folder, strict) == 9
+
+
+def test_a_mended_mapping_brings_its_messages_in(
+    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
+) -> None:
+    adapter = tmp_path / "speed.yaml"
+
+    def mapping(data: object) -> None:
+        mapped = {"version": 1, "adapter": "OwnSpeed", "ros_type": "own_msgs/msg/Number"}
+        adapter.write_text(yaml.safe_dump({**mapped, "ontology": "Floating64", "fields": {"data": data}}))
+
+    mapping({"value": "data", "map": {3: 3.0, 4: 4.0, 5: 5.0}, "else": "error"})
+    write_bag({"/speed": [*map(number, range(6)), CUT]})
+    job = write_job(quarantine={}, adapters={"load": ["speed.yaml"]})
+    first = run_job(job)
+    (topic,) = first.topics
+    assert (topic.read, topic.written, topic.rejected, topic.quarantined) == (7, 3, 4, 4)
+    mapping("data")
+    folder, store, said = tmp_path / "quarantine", Store.open(tmp_path / "store"), tmp_path / "replay.json"
+    assert command("replay", "-q", folder, "-m", job, "--report", said) == 4
+    (replayed,) = json.loads(said.read_text())["recordings"][0]["topics"]
+    assert (replayed["read"], replayed["written"], replayed["rejected"]) == (4, 3, 1)
+    assert topic.written + replayed["written"] + replayed["quarantined"] == topic.read
+    assert values(store) == list(range(6))
+    assert waiting(folder, job) == 1
+    assert command("verify", "drive", "--store", store.path) == 0
+
+
+def test_a_mapping_with_other_columns_leaves_everything_as_it_was(
+    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [number(1), CUT], "/std/speed": [number(1)]})
+    run_job(write_job(quarantine={}))
+    folder = tmp_path / "quarantine"
+    other = write_job(definition="uint8 data", quarantine={}, on_error={"topic": "ignore"})
+    assert command("replay", "-q", folder, "-m", other) != 0
+    assert values(Store.open(tmp_path / "store")) == [1]
+    assert waiting(folder, other) == 1
