@@ -90,7 +90,7 @@ class ROSBridge:
         return cls(
             overrides=config.adapter_override,
             loaded=config.adapters,
-            base_dir=config.base_dir,
+            base_dir=config.code_dir or config.base_dir,
             images=config.images,
             formats=config.serialization_formats,
         )

@@ -27,6 +27,7 @@ __all__ = [
     "DEFAULT_STORE",
     "DEFAULT_TOPIC",
     "AdapterReference",
+    "Attempt",
     "ImageFormat",
     "Limit",
     "LogLevel",
@@ -111,6 +112,14 @@ class ServerTarget:
 
 
 @dataclass(frozen=True, slots=True)
+class Attempt:
+    """Which try of which run this is: a later one takes back what an earlier one committed before it died."""
+
+    run: str
+    number: int = 1
+
+
+@dataclass(frozen=True, slots=True)
 class ROSInjectionConfig:
     """A job: which recording becomes which sequence, how, and where it goes.
 
@@ -189,6 +198,10 @@ class ROSInjectionConfig:
     """What to do when a topic's definition is not what it was in the family; None: nobody looks."""
     plan_digest: str | None = None
     """The `digest` of the only plan that may be run; None: whatever the recording calls for."""
+    attempt: Attempt | None = None
+    """Set by who may begin the recording more than once."""
+    code_dir: Path | None = None
+    """Where the relative paths of adapter references start instead of `base_dir`, on a machine they were sent to."""
 
     def __post_init__(self) -> None:
         """Bring every value into its one form and check it."""

@@ -8,7 +8,6 @@ import signal
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from types import FrameType
 from typing import Any
 
 import pyarrow as pa
@@ -17,6 +16,7 @@ from mosaico_ingest.adapters.base import register_default_adapter, registered_ad
 from mosaico_ingest.bag.registry import Registered, ROSTypeRegistry
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.errors import IngestError, Interrupted
+from mosaico_ingest.executors.interrupts import Stop
 from mosaico_ingest.executors.worker import failed_report, run_config
 from mosaico_ingest.policies import Stores
 from mosaico_ingest.report.events import Event
@@ -50,7 +50,7 @@ def do_nothing() -> None:
 def work(pipe: Connection, announced: Announced, prepare: Callable[[], None], jobs: int) -> None:
     """Ingest what comes through the pipe until its other end is closed."""
     os.setsid()  # Ctrl-C reaches the parent only, which passes it on once
-    stop = _Stop()
+    stop = Stop()
     signal.signal(signal.SIGINT, stop)
     signal.signal(signal.SIGTERM, stop)
     pa.set_cpu_count(max(1, (os.cpu_count() or 1) // jobs))
@@ -63,7 +63,7 @@ def work(pipe: Connection, announced: Announced, prepare: Callable[[], None], jo
         return
 
 
-def _ingest(pipe: Connection, letter: bytes, stop: _Stop) -> None:
+def _ingest(pipe: Connection, letter: bytes, stop: Stop) -> None:
     def tell(event: Event) -> None:
         stop.hold()  # an interrupt in the middle of a message would leave half of it in the pipe
         pipe.send(event)
@@ -81,28 +81,3 @@ def _ingest(pipe: Connection, letter: bytes, stop: _Stop) -> None:
         report = failed_report(config, Interrupted("stopped before it was begun"), tell)
     stop.hold()
     pipe.send(report)
-
-
-class _Stop:
-    """A signal handler that interrupts once, and not while it is held off."""
-
-    def __init__(self) -> None:
-        self.asked = False
-        self._held = True
-        self._raised = False
-
-    def __call__(self, _signal: int, _frame: FrameType | None) -> None:
-        self.asked = True
-        if not self._held:
-            self.heed()
-
-    def hold(self) -> None:
-        """Put an interrupt off."""
-        self._held = True
-
-    def heed(self) -> None:
-        """Let interrupts through again, one that was put off at once."""
-        self._held = False
-        if self.asked and not self._raised:
-            self._raised = True
-            raise KeyboardInterrupt

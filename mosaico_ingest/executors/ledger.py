@@ -82,11 +82,15 @@ class Held(_Part):
 def enter(plan: Plan) -> Plan | None:
     """Return the plan with its ledger among its metadata; None where the same content is there and is to be skipped.
 
+    What an earlier attempt of the same run committed before its process died is no obstacle: it is made anew.
+
     Raises:
         SequenceExists: The plan skips the same content, and other content is there.
     """
     ledger = ledger_of(plan)
     if_exists: IfExists | None = plan.if_exists
+    if plan.attempt is not None and plan.attempt.number > 1:
+        if_exists = _take_back(plan, plan.attempt.run)
     if if_exists is IfExists.SKIP:
         if_exists = what_to_do(ledger, held(plan.target, plan.sequence), plan.sequence)
     if if_exists is None:
@@ -102,7 +106,8 @@ def ledger_of(plan: Plan) -> Ledger:
         Source(name=encodable(path.name), size_bytes=path.stat().st_size, content=content_digest(path))
         for path in plan.files
     )
-    return Ledger(tool=__version__, job=_job_digest(plan), sources=sources, family=plan.family)
+    run = plan.attempt.run if plan.attempt else None
+    return Ledger(tool=__version__, job=_job_digest(plan), sources=sources, family=plan.family, run=run)
 
 
 def content_digest(path: Path) -> str:
@@ -171,6 +176,27 @@ def what_to_do(ledger: Ledger, found: Held | None, sequence: str) -> IfExists | 
     return None
 
 
+def _take_back(plan: Plan, run: str) -> IfExists:
+    """Return how to open the sequence so that what this run has committed already is not there twice.
+
+    On a server the ledger is that of the sequence: what was appended to another's is not recognised.
+    """
+    if isinstance(plan.target, ServerTarget):
+        found = _held_by_server(plan.target, plan.sequence)
+        own = found is not None and any(ledger.run == run for ledger in found.ledgers)
+        return IfExists.REPLACE if own else plan.if_exists
+    if not Layout(plan.target.path).catalog.is_file():
+        return plan.if_exists
+    store = Store.open(plan.target.path, create=False)
+    sessions = store.sequence(plan.sequence).sessions if plan.sequence in store.names() else ()
+    own = [s.id for s in sessions if any(ledger.run == run for ledger in _ledgers([s.metadata]))]
+    if own and len(own) == len(sessions):
+        return IfExists.REPLACE
+    for session in own:
+        store.delete_session(plan.sequence, session)
+    return plan.if_exists
+
+
 _HINT = "set sequence.if_exists to replace or append, or choose another name"
 
 
@@ -198,8 +224,9 @@ def _ledgers(metadata: Iterable[Mapping[str, Any]]) -> tuple[Ledger, ...]:
 
 
 def _job_digest(plan: Plan) -> str:
-    """Digest the decisions without where the recording lies, where it goes and what happens when the name is taken."""
+    """Digest the decisions without where things lie, where they go and what happens when the name is taken."""
     decided = decisions(plan, folder=Path())
-    noted = decided.model_dump(mode="json", exclude={"files", "destination", "if_exists"})
+    aside: dict[str, Any] = {"files": True, "destination": True, "if_exists": True, "quarantine": {"path"}}
+    noted = decided.model_dump(mode="json", exclude=aside)
     noted["metadata"] = dict(plan.metadata)
     return hashlib.sha256(json.dumps(noted, sort_keys=True).encode()).hexdigest()[:32]

@@ -5,10 +5,8 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import threading
-from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from multiprocessing.connection import Connection, wait
@@ -17,8 +15,9 @@ from multiprocessing.reduction import ForkingPickler
 
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.errors import IngestError, Interrupted
+from mosaico_ingest.executors.batch import Batch
 from mosaico_ingest.executors.crew import Announced, do_nothing, work
-from mosaico_ingest.executors.worker import failed_report
+from mosaico_ingest.executors.interrupts import counted_interrupts
 from mosaico_ingest.plan.model import DEFAULT_MEMORY_BYTES
 from mosaico_ingest.report.events import BatchObserver
 from mosaico_ingest.report.model import Report
@@ -49,8 +48,8 @@ class Processes:
         """Yield the report of each configuration; see `Executor.map`."""
         jobs = max(1, min(self.jobs, len(configs)))
         shared = [replace(config, memory_bytes=_share(config.memory_bytes, jobs)) for config in configs]
-        crew = _Crew(shared, observe, jobs, self.attempts, partial(_start, self.prepare, jobs))
-        with _counted_interrupts() as interrupts:
+        crew = _Crew(Batch(shared, observe), jobs, self.attempts, partial(_start, self.prepare, jobs))
+        with counted_interrupts() as interrupts:
             try:
                 yield from crew.reports(interrupts)
             finally:
@@ -68,31 +67,22 @@ class _Hand:
 
 @dataclass(slots=True)
 class _Crew:
-    configs: Sequence[ROSInjectionConfig]
-    observe: BatchObserver
+    batch: Batch
     jobs: int
     attempts: int
     hire: Callable[[], _Hand]
-    waiting: deque[int] = field(default_factory=deque[int])
     hands: list[_Hand] = field(default_factory=list[_Hand])
-    begun: dict[int, int] = field(default_factory=dict[int, int])
-    done: dict[int, Report] = field(default_factory=dict[int, Report])
     interrupted: int = 0
 
     def reports(self, interrupts: list[int]) -> Iterator[Report]:
         """Yield reports in order, as soon as those before them are there too."""
-        self.waiting.extend(range(len(self.configs)))
-        position = 0
-        while self.waiting or any(hand.task is not None for hand in self.hands):
+        while self.batch.waiting or any(hand.task is not None for hand in self.hands):
             self._assign()
             self._listen()
             if len(interrupts) > self.interrupted:
                 self._interrupt()
-            while position in self.done:
-                yield self.done.pop(position)
-                position += 1
-        for left in sorted(self.done):
-            yield self.done[left]
+            yield from self.batch.reports()
+        yield from self.batch.rest()
 
     def leave(self) -> None:
         """End every process: the idle by closing their pipes, one still at work by interrupting it."""
@@ -107,23 +97,22 @@ class _Crew:
                 hand.process.join()
 
     def _assign(self) -> None:
-        while self.waiting:
+        while self.batch.waiting:
             hand = next((hand for hand in self.hands if hand.task is None), None)
             if hand is None:
                 if len(self.hands) == self.jobs:
                     return
                 hand = self.hire()
                 self.hands.append(hand)
-            self._give(hand, self.waiting.popleft())
+            self._give(hand, self.batch.waiting.popleft())
 
     def _give(self, hand: _Hand, task: int) -> None:
         try:
-            letter = ForkingPickler.dumps(self.configs[task])
+            letter = ForkingPickler.dumps(replace(self.batch.configs[task], attempt=self.batch.begin(task)))
         except Exception as error:  # noqa: BLE001 - pickle raises what the object's class raises
-            self._fail(task, _unsendable(error))
+            self.batch.fail(task, _unsendable(error))
             return
         hand.task = task
-        self.begun[task] = self.begun.get(task, 0) + 1
         with suppress(BrokenPipeError):  # a process that is gone is noticed where we listen
             hand.pipe.send_bytes(letter)
 
@@ -141,12 +130,13 @@ class _Crew:
             self._bury(hand, task)
             return
         if isinstance(said, Report):
-            self.done[task], hand.task = said, None
+            hand.task = None
+            self.batch.finish(task, said)
         elif isinstance(said, IngestError):
             hand.task = None
-            self._fail(task, said)
+            self.batch.fail(task, said)
         else:
-            self.observe(task, said)
+            self.batch.tell(task, said)
 
     def _bury(self, hand: _Hand, task: int) -> None:
         """Account for a process that died: its recording is begun anew, or has failed."""
@@ -154,38 +144,19 @@ class _Crew:
         hand.pipe.close()
         self.hands.remove(hand)
         if self.interrupted:
-            self._fail(task, Interrupted("stopped before the end of the recording"))
-        elif self.begun[task] < self.attempts:
-            self.waiting.appendleft(task)
+            self.batch.fail(task, Interrupted("stopped before the end of the recording"))
+        elif self.batch.begun[task] < self.attempts:
+            self.batch.again(task)
         else:
-            self._fail(task, _died(hand.process.exitcode, self.attempts))
-
-    def _fail(self, task: int, error: IngestError) -> None:
-        self.done[task] = failed_report(self.configs[task], error, partial(self.observe, task))
+            self.batch.fail(task, _died(hand.process.exitcode, self.attempts))
 
     def _interrupt(self) -> None:
         """Begin nothing more and let what is in work end as its policy says; asked twice, end it at once."""
-        self.waiting.clear()
+        self.batch.waiting.clear()
         for hand in self.hands:
             if hand.task is not None:
                 _signal(hand, signal.SIGKILL if self.interrupted else signal.SIGINT)
         self.interrupted += 1
-
-
-@contextmanager
-def _counted_interrupts() -> Generator[list[int]]:
-    """Collect requests to stop instead of raising: an exception in the middle of a message would cost the pipe."""
-    asked = list[int]()
-    if threading.current_thread() is not threading.main_thread():
-        yield asked
-        return
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda number, _: asked.append(number)) for number in numbers]
-    try:
-        yield asked
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
 
 
 def _start(prepare: Callable[[], None], jobs: int) -> _Hand:

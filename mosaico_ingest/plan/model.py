@@ -9,7 +9,7 @@ from typing import Any
 
 from mosaico_ingest.adapters.adapter import AdapterSpec
 from mosaico_ingest.bag.definition import Resolver
-from mosaico_ingest.config import QuarantineSettings, ServerTarget, StoreTarget
+from mosaico_ingest.config import Attempt, QuarantineSettings, ServerTarget, StoreTarget
 from mosaico_ingest.diagnostics import Finding, Span
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.policies import (
@@ -94,3 +94,5 @@ class Plan:
     """What the sequences of the same job, for other recordings, have in common."""
     memory_bytes: int = DEFAULT_MEMORY_BYTES
     """How much memory batches may take, from reading to writing."""
+    attempt: Attempt | None = None
+    """Which try this is, where there may be several."""

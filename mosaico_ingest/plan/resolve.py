@@ -73,6 +73,7 @@ def resolve(
         quarantine=config.quarantine,
         family=config.family or config.sequence_name,
         memory_bytes=config.memory_bytes or DEFAULT_MEMORY_BYTES,
+        attempt=config.attempt,
     )
     if config.on_schema_change is not None:
         plan = follow_schema_changes(plan, config.on_schema_change)
