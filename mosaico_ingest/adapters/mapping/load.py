@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from contextvars import ContextVar
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -22,7 +22,7 @@ from mosaico_ingest.adapters.mapping.kinds import Kind
 from mosaico_ingest.adapters.mapping.model import InlineType, MappingFile
 from mosaico_ingest.adapters.mapping.schema import adapter_schema
 from mosaico_ingest.adapters.mapping.typed import Typed
-from mosaico_ingest.bag.definition import Definition
+from mosaico_ingest.bag.definition import Definition, MessageType
 from mosaico_ingest.bag.names import normalize_msgtype
 from mosaico_ingest.diagnostics import Finding, RowFailure, Severity
 from mosaico_ingest.errors import AdapterError
@@ -36,6 +36,11 @@ __all__ = ["MappingAdapter", "MappingSpec", "load_adapter"]
 
 _BINDING: ContextVar[tuple[tuple[str, str], ...]] = ContextVar("binding", default=())
 """The adapters being bound and the types they are bound to, to notice one that uses itself."""
+
+
+_MOST_BOUND = 64
+_Known: TypeAlias = tuple[str, int, tuple[MessageType, ...]]
+"""All of a definition that decides how a mapping is compiled."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +93,10 @@ class MappingSpec:
     ontology: OntologyType
     adapters: AdapterLookup | None = None
     """Finds the adapters that `use` names; a module-level function."""
+    _bound: dict[_Known, MappingAdapter] = field(
+        default_factory=dict["_Known", "MappingAdapter"], compare=False, repr=False
+    )
+    """What it has been compiled to: a batch has the same few types in each of its recordings."""
 
     @property
     def name(self) -> str:
@@ -114,10 +123,19 @@ class MappingSpec:
         Raises:
             AdapterError: It does not fit; `findings` has one for each mistake, with its place in the file.
         """
+        known = _known(definition)
+        if known in self._bound:
+            return self._bound[known]
         adapter, findings = self._compile(definition, shape)
         if adapter is None or findings:
             raise _refused(f"{self.name} does not fit {definition.root}", self.source, findings)
+        if len(self._bound) < _MOST_BOUND:
+            self._bound[known] = adapter
         return adapter
+
+    def __reduce__(self) -> tuple[type[MappingSpec], tuple[object, ...]]:
+        """Leave what was compiled behind: it is quickly made anew, and large."""
+        return MappingSpec, (self.model, self.source, self.ontology, self.adapters)
 
     def _compile(
         self, definition: Definition, shape: pa.StructType
@@ -149,6 +167,10 @@ class MappingSpec:
         if record is None:
             return None, tuple(desk.findings)
         return MappingAdapter(self.ontology, record, metadata, definition.root), tuple(desk.findings)
+
+
+def _known(definition: Definition) -> _Known:
+    return definition.root, definition.ros_version, tuple(definition.types.values())
 
 
 def load_adapter(

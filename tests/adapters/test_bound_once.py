@@ -1,0 +1,35 @@
+"""An adapter is compiled once for each definition: a batch has the same few types in each of its recordings."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+
+from mosaico_ingest.adapters.builtin import BY_NAME
+from mosaico_ingest.adapters.mapping.load import load_adapter
+from mosaico_ingest.bag.shape import ros_shape
+from mosaico_ingest.bag.types import TypeResolver
+from mosaico_ingest.policies import Stores
+
+IMU = TypeResolver(Stores.ROS2_HUMBLE).resolve("sensor_msgs/msg/Imu", None, ros_version=2)
+SPEC = BY_NAME["IMUAdapter"].path
+
+
+def test_the_same_definition_is_compiled_once_and_another_anew() -> None:
+    spec, shape = load_adapter(SPEC), ros_shape(IMU)
+    own = IMU.types[IMU.root]
+    other = replace(IMU, types={**IMU.types, IMU.root: replace(own, fields=own.fields[:-1])})
+    first = spec.bind(IMU, shape)
+    assert spec.bind(replace(IMU, text="from another recording"), shape) is first
+    assert spec.bind(IMU, shape) is first
+
+    assert spec.check(other, ros_shape(other))
+
+
+def test_what_was_compiled_stays_behind_when_an_adapter_is_sent_away() -> None:
+    spec = load_adapter(SPEC)
+    fresh = len(pickle.dumps(spec))
+    spec.bind(IMU, ros_shape(IMU))
+    assert len(pickle.dumps(spec)) == fresh
+    again = pickle.loads(pickle.dumps(spec))  # noqa: S301 - our own
+    assert again.bind(IMU, ros_shape(IMU)).ontology == spec.ontology
