@@ -54,8 +54,8 @@ def schema(
 def _text(document: Document) -> str:
     from mosaico_ingest.adapters.mapping.schema import adapter_schema
     from mosaico_ingest.manifest.schema import job_schema
-    from mosaico_ingest.plan.document import plan_schema
-    from mosaico_ingest.report.model import report_schema
+    from mosaico_ingest.plan.schema import plan_schema
+    from mosaico_ingest.report.schema import report_schema
 
     makers: dict[Document, Callable[[], dict[str, Any]]] = {
         Document.JOB: job_schema,

@@ -8,7 +8,7 @@ __all__ = ["ExportReport", "TopicExport"]
 
 
 class _Record(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 class TopicExport(_Record):

@@ -30,7 +30,7 @@ NAMES = {rule.name: rule.name for rule in RULES} | {rule.code: rule.name for rul
 
 
 class _Lint(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     severity: dict[str, Literal["error", "warning", "info", "off"]] = {}
     """How much each rule matters, by code or name."""

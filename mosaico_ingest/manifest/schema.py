@@ -6,6 +6,7 @@ from typing import Any, cast
 
 from mosaico_ingest.manifest.extends import KEY as EXTENDS
 from mosaico_ingest.manifest.model import Manifest
+from mosaico_ingest.model_schema import schema_of
 
 __all__ = ["DIALECT", "job_schema", "tidy"]
 
@@ -15,7 +16,7 @@ _VARIABLE = {"type": "string", "pattern": r"\$\{[^{}]+\}", "description": "A var
 
 def job_schema() -> dict[str, Any]:
     """Return the schema (draft 2020-12) that editors complete and check manifests with."""
-    schema = tidy(Manifest.model_json_schema())
+    schema = tidy(schema_of(Manifest))
     definitions: dict[str, Any] = schema.pop("$defs")
     for model in [schema, *definitions.values()]:
         model["properties"] = {

@@ -16,7 +16,7 @@ _Model = TypeVar("_Model", bound=Serializable)
 class Message(BaseModel):
     """The envelope around a row."""
 
-    model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", defer_build=True)
 
     timestamp_ns: int
     """When it was recorded, ns since the epoch."""

@@ -29,7 +29,7 @@ class Serializable(BaseModel):
     model a struct; `ontology.fields` names the exact types.
     """
 
-    model_config = ConfigDict(extra="forbid", validate_assignment=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", validate_assignment=True, defer_build=True)
 
     __ontology_tag__: ClassVar[str]
     """The name the platform stores; the class's own name where nothing is said."""

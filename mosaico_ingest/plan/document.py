@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import Field, JsonValue, ValidationError
 
@@ -32,7 +32,6 @@ __all__ = [
     "Sample",
     "SampleRejection",
     "UnreadTopic",
-    "plan_schema",
     "read_plan",
     "write_plan",
 ]
@@ -205,12 +204,6 @@ class PlanDocument(Part):
         if any(recording.destination.problem for recording in self.recordings):
             return 1
         return 4 if any(recording.rejected for recording in self.recordings) else 0
-
-
-def plan_schema() -> dict[str, Any]:
-    """Return the JSON Schema (draft 2020-12) of a plan file."""
-    schema = PlanDocument.model_json_schema(mode="serialization")
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
 def read_plan(path: Path) -> PlanDocument:

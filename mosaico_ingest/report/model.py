@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any
 
 from pydantic import ConfigDict, Field, computed_field
 
@@ -21,13 +20,12 @@ __all__ = [
     "TopicReport",
     "Totals",
     "UsedManifest",
-    "report_schema",
 ]
 
 
 class _Part(Part):
     # What is computed is written for other readers, and left out again when a report is read back.
-    model_config = ConfigDict(extra="ignore")
+    model_config = ConfigDict(extra="ignore", defer_build=True)
 
 
 class Rejection(_Part):
@@ -210,9 +208,3 @@ class RunReport(_Part):
         codes = [report.exit_code for report in self.recordings]
         failed = [code for code in codes if code not in {0, 4}]
         return failed[0] if failed else max(codes, default=0)
-
-
-def report_schema() -> dict[str, Any]:
-    """Return the JSON Schema (draft 2020-12) of a report file."""
-    schema = RunReport.model_json_schema(mode="serialization")
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}

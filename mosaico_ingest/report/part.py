@@ -14,7 +14,7 @@ __all__ = ["Part"]
 class Part(BaseModel):
     """A model whose texts can be encoded, whatever the names of files hold."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     @field_validator("*", mode="before")
     @classmethod

@@ -64,7 +64,7 @@ def session_locator(sequence: str, ulid: str) -> str:
 class Body(BaseModel):
     """Anything that travels; what a newer peer adds is passed over."""
 
-    model_config = ConfigDict(frozen=True, extra="ignore")
+    model_config = ConfigDict(frozen=True, extra="ignore", defer_build=True)
 
 
 class Empty(Body):

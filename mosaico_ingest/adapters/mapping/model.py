@@ -39,7 +39,7 @@ _NAME = r"^[A-Za-z_]\w*$"
 
 class _Strict(BaseModel):
     model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True, populate_by_name=False
+        extra="forbid", frozen=True, strict=True, populate_by_name=False, defer_build=True
     )
 
 

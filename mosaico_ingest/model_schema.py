@@ -1,0 +1,54 @@
+"""This file writes a model's JSON Schema, with the strings under its fields as their descriptions.
+
+Pydantic's `use_attribute_docstrings` gives the same, but reads the source of every class whenever it is imported.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from itertools import pairwise
+from typing import Any, Literal
+
+from pydantic import BaseModel
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic_core.core_schema import ModelSchema
+
+__all__ = ["schema_of"]
+
+
+def schema_of(
+    model: type[BaseModel], *, mode: Literal["validation", "serialization"] = "validation"
+) -> dict[str, Any]:
+    """Return the JSON Schema of `model`; fields are named as files name them."""
+    return model.model_json_schema(mode=mode, schema_generator=_WithDocstrings)
+
+
+class _WithDocstrings(GenerateJsonSchema):
+    def model_schema(self, schema: ModelSchema) -> JsonSchemaValue:
+        """Add to the members of one model what stands under its fields."""
+        written, model = super().model_schema(schema), schema["cls"]
+        model.model_rebuild()  # one that names a later class knows its aliases only then
+        members = written.get("properties", {})
+        for owner in reversed(model.__mro__):
+            if not issubclass(owner, BaseModel) or owner is BaseModel:
+                continue
+            for name, text in _docstrings(owner).items():
+                field = model.model_fields.get(name)
+                member = members.get((field and field.alias) or name)
+                if member is not None:
+                    member.setdefault("description", text)
+        return written
+
+
+def _docstrings(owner: type) -> dict[str, str]:
+    """Return the string under each annotated name of a class body."""
+    tree = ast.parse(inspect.cleandoc("\n" + inspect.getsource(owner)))
+    body = tree.body[0].body if isinstance(tree.body[0], ast.ClassDef) else []
+    return {
+        above.target.id: inspect.cleandoc(below.value.value)
+        for above, below in pairwise(body)
+        if isinstance(above, ast.AnnAssign) and isinstance(above.target, ast.Name)
+        if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+        if isinstance(below.value.value, str)
+    }
