@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mosaico_ingest.cli.log_format import LogFormat
 
+if TYPE_CHECKING:
+    from mosaico_ingest.executors.executor import Executor
+
 __all__ = ["run"]
+
+
+class Place(str, Enum):
+    """Where recordings are ingested."""
+
+    LOCAL = "local"
+    RAY = "ray"
 
 
 def run(
@@ -27,6 +38,17 @@ def run(
         int | None,
         typer.Option(
             "--jobs", "-j", min=1, max=1024, help="Recordings ingested at a time; overrides run.jobs."
+        ),
+    ] = None,
+    executor: Annotated[
+        Place, typer.Option("--executor", help="Where recordings are ingested: on this machine, or on Ray.")
+    ] = Place.LOCAL,
+    address: Annotated[
+        str | None,
+        typer.Option(
+            "--address",
+            help="The Ray cluster, as auto or host:6379; without it Ray is started here.",
+            metavar="ADDRESS",
         ),
     ] = None,
     shard: Annotated[
@@ -66,6 +88,8 @@ def run(
         used = [api.used_manifest(Path(name)) for name in sorted({c.where for c in configs if c.where})]
     if shard is not None:
         configs = take_shard(configs, shard)
+    if address is not None and executor is not Place.RAY:
+        raise typer.BadParameter("is for --executor ray", param_hint="--address")
 
     def finish(result: RunReport) -> None:
         if metrics is not None:
@@ -78,7 +102,14 @@ def run(
         quiet=quiet,
         log=log,
         jobs=jobs,
+        executor=_on_ray(address, jobs) if executor is Place.RAY else None,
         log_format=log_format,
         manifests=used,
         finished=finish,
     )
+
+
+def _on_ray(address: str | None, jobs: int | None) -> Executor:
+    from mosaico_ingest.executors.ray import Ray
+
+    return Ray(address, jobs)

@@ -34,6 +34,7 @@ def run_configs(
     quiet: bool,
     log: str | None,
     jobs: int | None = None,
+    executor: Executor | None = None,
     log_format: LogFormat = LogFormat.TEXT,
     manifests: Sequence[UsedManifest] = (),
     finished: Callable[[RunReport], None] = lambda _result: None,
@@ -53,9 +54,8 @@ def run_configs(
     as_json = log_format is LogFormat.JSON
     shown = nullcontext(JsonLines()) if as_json else display(len(configs), quiet=quiet)
     with shown as observe:
-        result = api.run(
-            configs, executor=_executor(configs, jobs, prepare), observe=tell, manifests=manifests
-        )
+        chosen = executor or _executor(configs, jobs, prepare)
+        result = api.run(configs, executor=chosen, observe=tell, manifests=manifests)
     finished(result)
     for target in {
         path for path in (report, *(_report_path(config) for config in configs)) if path is not None

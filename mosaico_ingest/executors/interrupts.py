@@ -36,6 +36,7 @@ class Stop:
         self._raised = False
 
     def __call__(self, _signal: int, _frame: FrameType | None) -> None:
+        """Take note, and interrupt now or when it is no longer held off."""
         self.asked = True
         if not self._held:
             self.heed()

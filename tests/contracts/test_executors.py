@@ -7,6 +7,7 @@ import shutil
 import signal
 import threading
 import time
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.executors.executor import Executor
 from mosaico_ingest.executors.local import Inline
 from mosaico_ingest.executors.processes import Processes
-from mosaico_ingest.ontology import IMU
+from mosaico_ingest.ontology import IMU, Vector3d
 from mosaico_ingest.report.events import (
     Event,
     RunFinished,
@@ -29,8 +30,11 @@ from mosaico_ingest.report.events import (
 )
 from mosaico_ingest.report.model import Report
 from mosaico_ingest.store import Store
+from mosaico_ingest.store.session import StoreSession
 
 DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
+
+_STILL = Vector3d(x=0.0, y=0.0, z=0.0)
 
 
 class Killer(ROSAdapterBase[IMU]):
@@ -50,11 +54,31 @@ class KillerOnce(Killer):
 
     @classmethod
     def from_dict(cls, ros_data: dict[str, Any]) -> IMU:  # noqa: ARG003 - the base class's signature
-        happened = Path(os.environ["KILLED_ONCE"])
+        happened = Path(os.environ["KILLED_ONCE"]) / "once"
         if not happened.exists():
             happened.touch()
             os.kill(os.getpid(), signal.SIGKILL)
-        return IMU(acceleration=None, angular_velocity=None)
+        return IMU(acceleration=_STILL, angular_velocity=_STILL)
+
+
+class KillerAfterCommit(Killer):
+    """One whose process dies once, when the sequence is in the store and nobody has been told."""
+
+    @classmethod
+    def from_dict(cls, ros_data: dict[str, Any]) -> IMU:  # noqa: ARG003 - the base class's signature
+        StoreSession.commit = _commit_and_die_once  # type: ignore[method-assign] - only in the worker's process
+        return IMU(acceleration=_STILL, angular_velocity=_STILL)
+
+
+_COMMIT = StoreSession.commit
+
+
+def _commit_and_die_once(session: StoreSession) -> None:
+    _COMMIT(session)
+    happened = Path(os.environ["KILLED_ONCE"]) / session._claim.sequence
+    if not happened.exists():
+        happened.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
 
 
 class Refusing(ROSAdapterBase[IMU]):
@@ -77,14 +101,52 @@ class Slow(Refusing):
         return super().from_dict(ros_data)
 
 
-def configs(folder: Path, names: str, **more: Any) -> list[ROSInjectionConfig]:
+def configs(folder: Path, names: Iterable[str], **more: Any) -> list[ROSInjectionConfig]:
     options: dict[str, Any] = {"store": folder / "store", "topics": ["/imu"], **more}
     return [ROSInjectionConfig(DRIVE, name, **options) for name in names]
 
 
-@pytest.fixture(params=["inline", "processes"])
-def executor(request: pytest.FixtureRequest) -> Executor:
+@pytest.fixture(scope="module")
+def killed_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The folder killers remember by; a cluster's workers have the environment that it was started with."""
+    with pytest.MonkeyPatch.context() as patch:
+        happened = tmp_path_factory.mktemp("killed")
+        patch.setenv("KILLED_ONCE", str(happened))
+        yield happened
+
+
+@pytest.fixture(scope="module")
+def on_ray(killed_once: Path) -> Iterator[Executor]:  # noqa: ARG001 - to be set before it starts
+    """An executor in a program that is connected to a cluster of two nodes."""
+    from ray_cluster import connected, two_nodes  # noqa: PLC0415 - it imports Ray, where that is installed
+
+    with two_nodes() as cluster, connected(cluster.address):
+        from mosaico_ingest.executors.ray import Ray  # noqa: PLC0415 - as above
+
+        yield Ray()
+
+
+RAY = pytest.param("ray", marks=pytest.mark.slow)
+
+
+def _executor(request: pytest.FixtureRequest) -> Executor:
+    if request.param == "ray":
+        pytest.importorskip("ray", reason="Ray is not installed")
+        return request.getfixturevalue("on_ray")
     return Inline() if request.param == "inline" else Processes(2)
+
+
+@pytest.fixture(params=["inline", "processes", RAY])
+def executor(request: pytest.FixtureRequest) -> Executor:
+    return _executor(request)
+
+
+@pytest.fixture(params=["processes", RAY])
+def elsewhere(request: pytest.FixtureRequest, killed_once: Path) -> Executor:
+    """An executor whose workers may die."""
+    shutil.rmtree(killed_once)
+    killed_once.mkdir()
+    return _executor(request)
 
 
 def test_reports_come_in_order_and_the_sequences_are_there(executor: Executor, tmp_path: Path) -> None:
@@ -139,25 +201,46 @@ def test_no_configuration_is_no_report(executor: Executor) -> None:
     assert list(executor.map([], ignore_batch)) == []
 
 
-def test_a_process_that_dies_costs_its_recording_only(tmp_path: Path) -> None:
+def test_a_worker_that_dies_costs_its_recording_only(elsewhere: Executor, tmp_path: Path) -> None:
     jobs = configs(tmp_path, "abc")
     jobs[1] = configs(tmp_path, "b", adapter_override={"/imu": Killer})[0]
-    reports = list(Processes(2).map(jobs, ignore_batch))
+    reports = list(elsewhere.map(jobs, ignore_batch))
     assert [report.exit_code for report in reports] == [0, 1, 0]
-    assert "SIGKILL, 2 times in all" in (reports[1].error or "")
-    assert "fewer jobs" in (reports[1].error or "")
+    assert "2 times in all" in (reports[1].error or "")
     assert Store.open(tmp_path / "store").names() == ("a", "c")
 
 
-def test_a_recording_is_begun_anew_where_its_process_died(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("KILLED_ONCE", str(tmp_path / "killed"))
-    jobs = configs(tmp_path, "ab", adapter_override={"/imu": KillerOnce}, topics_on_error="ignore")
+def test_a_process_that_was_killed_may_have_wanted_memory(tmp_path: Path) -> None:
+    jobs = [*configs(tmp_path, "a", adapter_override={"/imu": Killer}), *configs(tmp_path, "b")]
     reports = list(Processes(2).map(jobs, ignore_batch))
-    assert (tmp_path / "killed").exists()
-    assert all("SIGKILL" not in (report.error or "") for report in reports)
-    assert [report.totals.read for report in reports] == [1000, 1000]
+    assert "SIGKILL" in (reports[0].error or "")
+    assert "fewer jobs" in (reports[0].error or "")
+
+
+def test_a_recording_is_begun_anew_where_its_worker_died(
+    elsewhere: Executor, killed_once: Path, tmp_path: Path
+) -> None:
+    jobs = configs(tmp_path, "ab", adapter_override={"/imu": KillerOnce})
+    reports = list(elsewhere.map(jobs, ignore_batch))
+    assert [path.name for path in killed_once.iterdir()] == ["once"]
+    assert [(report.status, report.totals.written) for report in reports] == [(RunStatus.COMPLETED, 1000)] * 2
+
+
+@pytest.mark.slow
+def test_what_a_worker_committed_before_it_died_is_no_obstacle_and_not_there_twice(
+    elsewhere: Executor, killed_once: Path, tmp_path: Path
+) -> None:
+    policies = ["append", "fail", "replace", "skip"]
+    list(Inline().map(configs(tmp_path, ["append"]), ignore_batch))
+    jobs = [
+        configs(tmp_path, [policy], adapter_override={"/imu": KillerAfterCommit}, if_exists=policy)[0]
+        for policy in policies
+    ]
+    reports = list(elsewhere.map(jobs, ignore_batch))
+    assert sorted(path.name for path in killed_once.iterdir()) == policies
+    assert [(report.status, report.totals.written) for report in reports] == [(RunStatus.COMPLETED, 1000)] * 4
+    sequences = Store.open(tmp_path / "store").sequences()
+    assert [sequence.rows for sequence in sequences] == [2000, 1000, 1000, 1000]
 
 
 def test_what_cannot_be_sent_fails_with_a_remedy(tmp_path: Path) -> None:
@@ -196,7 +279,7 @@ def test_memory_is_shared_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     jobs = configs(tmp_path, "abcd", memory_bytes=400 << 20)
     monkeypatch.setattr(
         "mosaico_ingest.executors.processes._Crew.reports",
-        lambda self, _: iter(seen.extend(config.memory_bytes for config in self.configs) or ()),
+        lambda self, _: iter(seen.extend(config.memory_bytes for config in self.batch.configs) or ()),
     )
     assert list(Processes(4).map(jobs, ignore_batch)) == []
     assert seen == [100 << 20] * 4

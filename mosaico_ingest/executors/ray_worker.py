@@ -1,0 +1,173 @@
+"""This file is what happens on a node of a Ray cluster: a recording comes in, events go to the desk, a report comes out."""
+
+from __future__ import annotations
+
+import logging
+import pickle
+import signal
+import socket
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import pyarrow as pa
+import ray
+
+from mosaico_ingest.config import ROSInjectionConfig, StoreTarget
+from mosaico_ingest.errors import BagError, IngestError, Interrupted, SinkError
+from mosaico_ingest.executors.crew import Announced
+from mosaico_ingest.executors.interrupts import Stop
+from mosaico_ingest.executors.worker import failed_report, run_config
+from mosaico_ingest.report.events import Event, RunFinished, RunStarted
+from mosaico_ingest.report.model import Report
+
+__all__ = ["Desk", "Letter", "Setting", "ingest"]
+
+Letter: TypeAlias = tuple[int, int, Event | logging.LogRecord]
+"""The recording's position, the number of the attempt, what there is to say."""
+
+_SEND_EVERY_S = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What all tasks of a run have in common."""
+
+    announced: Announced
+    log_level: int
+    beacon: str
+    """The name of the file by which a worker knows that it sees the same store as the driver."""
+
+
+class Desk:
+    """The actor beside the driver that takes letters in until they are fetched; the driver asks, so that it never waits."""
+
+    def __init__(self) -> None:
+        self._letters: list[Letter] = []
+
+    def post(self, letters: list[Letter]) -> None:
+        """Take letters in."""
+        self._letters += letters
+
+    def fetch(self) -> list[Letter]:
+        """Hand out what has come in."""
+        letters, self._letters = self._letters, []
+        return letters
+
+
+def ingest(letter: bytes, position: int, attempt: int, desk: Any, setting: Setting) -> Report | IngestError:  # noqa: ANN401 - Ray's handle of the desk
+    """Ingest one recording; what cannot even be begun is an error."""
+    try:
+        config: ROSInjectionConfig = pickle.loads(letter)  # noqa: S301 - from our own driver
+    except Exception as error:  # noqa: BLE001 - the border: a class's own code runs here
+        return IngestError(f"the job cannot be read on {_node()}: {type(error).__name__}: {error}")
+    pa.set_cpu_count(1)
+    setting.announced.announce()
+    stop = Stop()
+    outbox = _Outbox(desk, position, attempt, stop)
+    before = signal.signal(signal.SIGINT, stop)  # what Ray's cancellation raises
+    try:
+        with _records_sent(outbox, setting.log_level):
+            report = _run(config, outbox, stop, setting.beacon)
+        outbox.flush()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    return report
+
+
+def _run(config: ROSInjectionConfig, outbox: _Outbox, stop: Stop, beacon: str) -> Report:
+    try:
+        stop.heed()
+        blind = _out_of_sight(config, beacon)
+        report = failed_report(config, blind, outbox.tell) if blind else run_config(config, outbox.tell)
+    except KeyboardInterrupt:
+        report = failed_report(config, Interrupted("stopped before it was begun"), outbox.tell)
+    stop.hold()
+    return report
+
+
+def _out_of_sight(config: ROSInjectionConfig, beacon: str) -> IngestError | None:
+    """Return what is wrong where this node does not see the files that the driver sees."""
+    for path in config.paths:
+        if isinstance(path, Path) and not path.exists():
+            return BagError(
+                f"the node {_node()} does not see the recording",
+                where=str(path),
+                hint="put recordings on storage that every node mounts at the same place, or name them by URL",
+            )
+    store = config.target.path if isinstance(config.target, StoreTarget) else None
+    if isinstance(store, Path) and not (store / beacon).exists():
+        return SinkError(
+            f"the node {_node()} does not see this store",
+            where=str(store),
+            hint="put it on storage that every node mounts at the same place, or use a server",
+        )
+    return None
+
+
+def _node() -> str:
+    return socket.gethostname()
+
+
+class _Outbox:
+    """Collects what there is to say and posts it a few times a second."""
+
+    def __init__(self, desk: Any, position: int, attempt: int, stop: Stop) -> None:  # noqa: ANN401 - Ray's handle
+        self._desk = desk
+        self._address = (position, attempt)
+        self._stop = stop
+        self._letters: list[Letter] = []
+        self._posted_at = 0.0
+
+    def tell(self, event: Event) -> None:
+        """Take an event; an interrupt is not let through while it is sent."""
+        self._stop.hold()
+        self.put(event)
+        urgent = isinstance(event, RunStarted | RunFinished)
+        if urgent or time.monotonic() - self._posted_at > _SEND_EVERY_S:
+            self._post()
+        self._stop.heed()
+
+    def put(self, said: Event | logging.LogRecord) -> None:
+        """Take something that goes with the next event."""
+        self._letters.append((*self._address, said))
+
+    def flush(self) -> None:
+        """Post everything and wait until it is there, so that no report comes before its events."""
+        ray.get(self._post())
+
+    def _post(self) -> Any:  # noqa: ANN401 - Ray's reference
+        letters, self._letters = self._letters, []
+        self._posted_at = time.monotonic()
+        return self._desk.post.remote(letters)
+
+
+class _Records(logging.Handler):
+    def __init__(self, outbox: _Outbox) -> None:
+        super().__init__()
+        self._outbox = outbox
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send a record as text: what it was made from may not travel."""
+        record.msg, record.args = record.getMessage(), None
+        if record.exc_info:
+            record.exc_text = logging.Formatter().formatException(record.exc_info)
+            record.exc_info = None
+        self._outbox.put(record)
+
+
+@contextmanager
+def _records_sent(outbox: _Outbox, level: int) -> Generator[None]:
+    """Send what is logged to the driver, which shows it as its own."""
+    root, handler = logging.getLogger(), _Records(outbox)
+    before = root.level
+    root.addHandler(handler)
+    root.setLevel(level)
+    try:
+        yield
+    finally:
+        root.setLevel(before)
+        root.removeHandler(handler)
