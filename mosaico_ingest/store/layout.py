@@ -17,15 +17,21 @@ import secrets
 import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Layout", "fsync", "new_session_id"]
+from mosaico_ingest.remote.path import AnyPath
+from mosaico_ingest.store.faults import explained
+from mosaico_ingest.store.lease import Lease, is_live
+
+__all__ = ["Layout", "encoded", "fsync", "new_session_id"]
 
 _UNSAFE = re.compile(rb"[^A-Za-z0-9_-]")
 _LONGEST = 200
 _ATTEMPTS = 5
+_AT_ONCE = 4
 _CROCKFORD = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
 
 
@@ -61,33 +67,53 @@ class Layout:
     def topic(self, sequence: str, topic: str) -> Path:
         """Return the folder of a topic's segments."""
         parts = (sequence, *topic.strip("/").split("/"))
-        return self.segments.joinpath(*(_encode(part) for part in parts))
+        return self.segments.joinpath(*(encoded(part) for part in parts))
 
-    def relative(self, path: Path) -> str:
+    def staged(self, session: str, sequence: str, topic: str, number: int) -> Path:  # noqa: ARG002 - it is moved later
+        """Return where a session writes a segment before it is published."""
+        return self.session(session) / f"{session}-{number:04}.parquet"
+
+    def relative(self, path: AnyPath) -> str:
         """Return how the catalog spells a segment's path."""
-        return path.relative_to(self.root).as_posix()
+        return Path(str(path)).relative_to(self.root).as_posix()
+
+    def begin(self, session: str) -> Lease:
+        """Make a session's folder, and lock it for as long as its writer lives."""
+        with explained(self.staging):
+            self.session(session).mkdir(parents=True)
+            return Lease(self.lock(session))
+
+    def is_live(self, session: str) -> bool:
+        """Say whether a process holds the session's lock."""
+        return is_live(self.lock(session))
+
+    def in_use(self, session: str, grace_s: float) -> bool:
+        """Say whether the session's lock is held, or its folder so young that it may be about to be."""
+        folder = self.session(session)
+        young = folder.exists() and time.time() - folder.stat().st_mtime < grace_s
+        return young or self.is_live(session)
 
     def open_sessions(self) -> list[str]:
         """Return the sessions that have a staging folder, live or not."""
         return sorted(entry.name for entry in self.staging.iterdir()) if self.staging.is_dir() else []
 
-    def segment_files(self) -> Iterator[Path]:
+    def segment_files(self) -> Iterator[AnyPath]:
         """Yield every file below the folder of segments."""
         for folder, _, files in os.walk(self.segments):
             yield from (Path(folder, name) for name in files)
 
-    def publish(self, moves: Mapping[Path, Path]) -> None:
+    def publish(self, moves: Mapping[AnyPath, AnyPath]) -> None:
         """Move finished files to their places, so that they are there after a power cut."""
         changed: set[Path] = set()
-        for staged, target in moves.items():
+        for staged, target in ((Path(str(one)), Path(str(other))) for one, other in moves.items()):
             changed |= {folder.parent for folder in target.parents if not folder.exists()} | {target.parent}
             _move(staged, target)
-        for folder in changed:
-            fsync(folder)
+        with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="fsync") as pool:
+            list(pool.map(fsync, changed))  # a disk takes several together in the time of one
 
-    def remove(self, paths: Iterable[Path]) -> None:
+    def remove(self, paths: Iterable[AnyPath]) -> None:
         """Remove segment files and the folders that are empty then; garbage collection gets what resists."""
-        for path in paths:
+        for path in (Path(str(one)) for one in paths):
             with suppress(OSError):
                 path.unlink()
             with suppress(OSError):
@@ -98,13 +124,21 @@ class Layout:
             folder.rmdir()
             folder = folder.parent
 
-    def staged_files(self, session: str) -> list[Path]:
+    def staged_files(self, session: str) -> list[AnyPath]:
         """Return the segments a session has begun and not published."""
         return [path for path in self.session(session).rglob("*.parquet") if path.is_file()]
 
     def discard(self, session: str) -> None:
         """Remove what a session has staged."""
         shutil.rmtree(self.session(session), ignore_errors=True)
+
+
+def encoded(part: str) -> str:
+    """Return a part of a name as a part of a path, as the head of this file says."""
+    safe = _UNSAFE.sub(lambda match: b"%%%02X" % match.group()[0], part.encode()).decode()
+    if len(safe) <= _LONGEST:
+        return safe
+    return f"{safe[:_LONGEST]}%{hashlib.sha256(part.encode()).hexdigest()[:16]}"
 
 
 def _move(staged: Path, target: Path) -> None:
@@ -132,10 +166,3 @@ def new_session_id() -> str:
     """Return a ULID: 48 bits of milliseconds, 80 random bits, in 26 characters that sort by time."""
     number = (time.time_ns() // 1_000_000) << 80 | secrets.randbits(80)
     return "".join(_CROCKFORD[number >> shift & 31] for shift in range(125, -1, -5))
-
-
-def _encode(part: str) -> str:
-    safe = _UNSAFE.sub(lambda match: b"%%%02X" % match.group()[0], part.encode()).decode()
-    if len(safe) <= _LONGEST:
-        return safe
-    return f"{safe[:_LONGEST]}%{hashlib.sha256(part.encode()).hexdigest()[:16]}"
