@@ -64,11 +64,7 @@ def inject(
             raise
         raise named from error
     if aside is not None:
-        if plan.if_exists is IfExists.REPLACE:
-            aside.supersede()
-        if aside.kept:
-            observe(Noted(_kept(aside)))
-            observe(Quarantined(str(aside.messages_path)))
+        _put_away(aside, plan.if_exists, observe)
     wrong = missing + _close(session.stored(), streams, observe, forgive=failure)
     if failure is not None:
         raise failure
@@ -76,6 +72,15 @@ def inject(
         raise VerificationError(
             "; ".join(wrong), hint="what is stored is incomplete; replace it, and report this as a mistake"
         )
+
+
+def _put_away(aside: Quarantine, if_exists: IfExists, observe: Observer) -> None:
+    """Say what is kept of a session that is committed; what was kept of one it replaced is no longer needed."""
+    if if_exists is IfExists.REPLACE:
+        aside.supersede()
+    if aside.kept:
+        observe(Noted(_kept(aside)))
+        observe(Quarantined(str(aside.messages_path)))
 
 
 def _forsake(
@@ -243,9 +248,16 @@ def _close(
                 f"{stream.plan.target}: wrote {stream.rows} rows in [{stream.start_ns}, {stream.end_ns}], "
                 f"found {'{} rows in [{}, {}]'.format(*_held(found))}"
             )
-        stored_bytes = found.stored_bytes if found else 0
-        timeline = stream.timeline.report()
-        observe(TopicClosed(stream.plan.target, stream.status, stored_bytes, stream.error, timeline))
+        observe(
+            TopicClosed(
+                stream.plan.target,
+                stream.status,
+                found.stored_bytes if found else 0,
+                stream.error,
+                stream.timeline.report(),
+                found.checksum if found else None,
+            )
+        )
     return wrong
 
 

@@ -44,6 +44,8 @@ class StoredTopic:
     end_ns: int | None
     """The largest time stamp, inclusive."""
     stored_bytes: int
+    checksum: str | None = None
+    """Of the values of its rows, where the destination makes one."""
 
 
 class TopicWriter(Protocol):

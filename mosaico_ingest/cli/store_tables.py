@@ -143,6 +143,7 @@ def _topic_json(info: TopicInfo) -> dict[str, Any]:
         "stored_bytes": info.stored_bytes,
         "start_ns": info.start_ns,
         "end_ns": info.end_ns,
+        "checksum": info.checksum,
         "metadata": dict(info.metadata),
         "files": [str(segment.path) for segment in info.segments],
         "schema": {field.name: str(field.type) for field in info.schema},

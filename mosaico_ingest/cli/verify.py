@@ -19,7 +19,7 @@ def verify(
     ),
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Read stored sequences back, every page against its checksum; exit 5 where something is wrong."""
+    """Read stored sequences back and hold every page and all rows against their checksums; exit 5 where they differ."""
     import json
 
     from mosaico_ingest.cli.tables import print_json

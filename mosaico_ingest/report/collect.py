@@ -165,6 +165,7 @@ class Collector:
             end_ns=total.end_ns if total.written else None,
             payload_bytes=total.payload_bytes,
             stored_bytes=(total.closed.stored_bytes or 0) if total.closed else 0,
+            checksum=total.closed.checksum if total.closed else None,
             error=total.closed.error if total.closed else None,
             timeline=total.closed.timeline if total.closed and total.written else None,
         )

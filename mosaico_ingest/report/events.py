@@ -148,6 +148,7 @@ class TopicClosed:
     stored_bytes: int | None = None
     error: str | None = None
     timeline: TimelineReport | None = None
+    checksum: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

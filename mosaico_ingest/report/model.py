@@ -95,6 +95,8 @@ class TopicReport(_Part):
     """Size of the messages read, as they were serialised."""
     stored_bytes: int = 0
     """Size of the rows in the destination, as far as it says."""
+    checksum: str | None = None
+    """Of the values of the rows (XXH3, 128 bits), where the destination makes one; `ingest verify` makes it anew."""
     error: str | None = None
     timeline: TimelineReport | None = None
     """How the rows that were written spread over time."""

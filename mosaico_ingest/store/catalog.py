@@ -60,7 +60,8 @@ CREATE TABLE segments (
     rows INTEGER NOT NULL,
     bytes INTEGER NOT NULL,
     start_ns INTEGER NOT NULL,
-    end_ns INTEGER NOT NULL
+    end_ns INTEGER NOT NULL,
+    checksum TEXT
 );
 CREATE INDEX segments_of_topic ON segments (topic_id, start_ns);
 CREATE INDEX segments_of_session ON segments (session_id);
@@ -153,6 +154,8 @@ class Catalog:
                     db.execute(f"PRAGMA application_id = {_APPLICATION}")
                     db.execute(f"PRAGMA user_version = {FORMAT}")
                 db.execute("COMMIT")
+            elif create:
+                _complete(db)
             found = self._format(db)
         if found > FORMAT:
             raise SinkError(
@@ -172,6 +175,20 @@ class Catalog:
 
 
 _STAMPS = ("user_version", "application_id")
+
+
+def _complete(db: sqlite3.Connection) -> None:
+    """Add what catalogs of the same format once did without."""
+    if not _has_checksums(db):
+        db.execute("BEGIN IMMEDIATE")
+        if not _has_checksums(db):  # nobody else was faster
+            db.execute("ALTER TABLE segments ADD COLUMN checksum TEXT")
+        db.execute("COMMIT")
+
+
+def _has_checksums(db: sqlite3.Connection) -> bool:
+    columns = db.execute("SELECT name FROM pragma_table_info('segments')").fetchall()
+    return not columns or ("checksum",) in map(tuple, columns)
 
 
 def _use_wal(db: sqlite3.Connection) -> None:

@@ -204,9 +204,18 @@ def _enter_segments(
 ) -> None:
     for path, segment in segments.items():
         cursor = db.execute(
-            "INSERT INTO segments (topic_id, session_id, path, rows, bytes, start_ns, end_ns)"
-            " VALUES (?, ?, ?, ?, ?, ?, ?)",
-            (topic_id, session, path, segment.rows, segment.stored_bytes, segment.start_ns, segment.end_ns),
+            "INSERT INTO segments (topic_id, session_id, path, rows, bytes, start_ns, end_ns, checksum)"
+            " VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+            (
+                topic_id,
+                session,
+                path,
+                segment.rows,
+                segment.stored_bytes,
+                segment.start_ns,
+                segment.end_ns,
+                segment.checksum,
+            ),
         )
         db.executemany(
             "INSERT INTO bounds VALUES (?, ?, ?, ?)",

@@ -10,6 +10,7 @@ from typing import Any
 import pyarrow as pa
 
 from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.store.content import combined
 
 __all__ = ["Collected", "Note", "SegmentInfo", "SequenceInfo", "SessionInfo", "TopicInfo"]
 
@@ -25,6 +26,8 @@ class SegmentInfo:
     start_ns: int
     end_ns: int
     """The largest time stamp, inclusive."""
+    checksum: str | None
+    """Of the values of its rows, see `ContentHash`; None where it was written before there were any."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +65,11 @@ class TopicInfo:
     def end_ns(self) -> int | None:
         """The largest time stamp, inclusive; None without rows."""
         return max((segment.end_ns for segment in self.segments), default=None)
+
+    @property
+    def checksum(self) -> str | None:
+        """Of the values of its rows; None where it is not known of all of them."""
+        return combined(segment.checksum for segment in self.segments)
 
 
 @dataclass(frozen=True, slots=True)

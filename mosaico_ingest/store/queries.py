@@ -96,6 +96,7 @@ def _segments(db: sqlite3.Connection, sequence_id: int, root: Path) -> dict[int,
                 stored_bytes=row["bytes"],
                 start_ns=row["start_ns"],
                 end_ns=row["end_ns"],
+                checksum=row["checksum"] if "checksum" in row.keys() else None,  # noqa: SIM118 - `in` would look among its values
             )
         )
     return found

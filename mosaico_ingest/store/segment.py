@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mosaico_ingest.store.columns import Leaf, leaves, writer_options
+from mosaico_ingest.store.content import ContentHash
 from mosaico_ingest.store.layout import fsync
 
 __all__ = ["Bounds", "Segment", "SegmentWriter", "sorted_rows", "time_span"]
@@ -33,6 +34,8 @@ class Segment:
     stored_bytes: int
     start_ns: int
     end_ns: int
+    checksum: str
+    """Of the values of its rows; see `ContentHash`."""
     bounds: tuple[Bounds, ...]
 
 
@@ -43,6 +46,7 @@ class SegmentWriter:
         self.path = path
         self.end_ns = -(1 << 63)
         self._leaves = leaves(schema)
+        self._content = ContentHash(schema)
         self._file = pa.OSFile(str(path), "wb")
         self._writer = pq.ParquetWriter(
             self._file,
@@ -62,6 +66,7 @@ class SegmentWriter:
     def append(self, rows: pa.Table) -> None:
         """Write one row group; the rows are sorted, and none is earlier than what is there."""
         self._writer.write_table(rows, row_group_size=max(1, rows.num_rows))
+        self._content.add(rows)
         self.end_ns = rows.column(0)[-1].as_py()
 
     def close(self) -> Segment:
@@ -72,7 +77,15 @@ class SegmentWriter:
         footer = pq.read_metadata(self.path)
         bounds = tuple(_bounds(self._leaves, footer))
         _, start_ns, end_ns = bounds[0]
-        return Segment(self.path, footer.num_rows, self.path.stat().st_size, start_ns, end_ns, bounds)
+        return Segment(
+            self.path,
+            footer.num_rows,
+            self.path.stat().st_size,
+            start_ns,
+            end_ns,
+            self._content.hexdigest(),
+            bounds,
+        )
 
     def abandon(self) -> None:
         """Close the file without caring for its content."""

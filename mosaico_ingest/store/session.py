@@ -17,6 +17,7 @@ from mosaico_ingest.policies import IfExists
 from mosaico_ingest.sink import StoredTopic, check_same_type
 from mosaico_ingest.store import entries
 from mosaico_ingest.store.catalog import Catalog
+from mosaico_ingest.store.content import combined
 from mosaico_ingest.store.faults import explained
 from mosaico_ingest.store.layout import Layout, new_session_id
 from mosaico_ingest.store.lease import Lease, is_live
@@ -133,7 +134,10 @@ class StoreSession:
                 rows += footer.num_rows
                 for group in range(footer.num_row_groups):
                     times += time_span(footer, group)
-        return StoredTopic(name, rows, min(times, default=None), max(times, default=None), stored_bytes)
+        checksum = combined(s.checksum for s in sorted(topic.segments, key=lambda s: (s.start_ns, s.path)))
+        return StoredTopic(
+            name, rows, min(times, default=None), max(times, default=None), stored_bytes, checksum
+        )
 
     def _leave(self) -> None:
         self._lease.release()

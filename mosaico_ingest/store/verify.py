@@ -1,4 +1,4 @@
-"""This file reads what is stored back, every page against its checksum, and holds it against the catalog."""
+"""This file reads what is stored back, every page and all rows against their checksums, and holds it against the catalog."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from mosaico_ingest.store.content import ContentHash
 from mosaico_ingest.store.model import SegmentInfo, SequenceInfo, TopicInfo
 from mosaico_ingest.store.segment import time_span
 
@@ -33,19 +34,27 @@ def verify(info: SequenceInfo) -> Iterator[Checked]:
 def _problem(topic: TopicInfo, segment: SegmentInfo) -> str | None:
     try:
         with pq.ParquetFile(segment.path, page_checksum_verification=True) as file:
-            found = (segment.path.stat().st_size, *_rows_and_span(file))
             same_columns = file.schema_arrow.equals(topic.schema)
+            content = ContentHash(file.schema_arrow)
+            found = (segment.path.stat().st_size, *_rows_and_span(file, content))
     except (OSError, pa.ArrowException) as error:
         return str(error).partition("\n")[0]
     wanted = (segment.stored_bytes, segment.rows, segment.start_ns, segment.end_ns)
     if found != wanted:
         form = "{} bytes, {} rows in [{}, {}]"
         return f"the catalog says {form.format(*wanted)}, the file has {form.format(*found)}"
-    return None if same_columns else "its columns are not those of its topic"
+    if not same_columns:
+        return "its columns are not those of its topic"
+    if segment.checksum not in {None, content.hexdigest()}:
+        return f"its rows have the checksum {content.hexdigest()}, those that were written {segment.checksum}"
+    return None
 
 
-def _rows_and_span(file: pq.ParquetFile) -> tuple[int, int, int]:
-    """Return how many rows the file really gives, and the span its row groups state."""
-    rows = sum(batch.num_rows for batch in file.iter_batches(batch_size=1 << 12))
+def _rows_and_span(file: pq.ParquetFile, content: ContentHash) -> tuple[int, int, int]:
+    """Return how many rows the file really gives, after adding them to `content`, and the span its row groups state."""
+    rows = 0
+    for batch in file.iter_batches(batch_size=1 << 12):
+        content.add(batch)
+        rows += batch.num_rows
     spans = [time_span(file.metadata, group) for group in range(file.num_row_groups)]
     return rows, min(low for low, _ in spans), max(high for _, high in spans)

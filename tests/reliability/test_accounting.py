@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import pytest
 
 from mosaico_ingest import api
@@ -113,3 +117,50 @@ def test_verify_finds_what_changed_on_the_disk(
     with pytest.raises(SystemExit) as ended:
         main(arguments)
     assert ended.value.code == 5
+
+
+def test_verify_finds_rows_that_are_not_those_that_were_written(
+    write_bag: WriteBag,
+    write_job: WriteJob,
+    run_job: RunJob,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    write_bag({"/speed": [number(value) for value in range(500)]})
+    (told,) = run_job(write_job()).topics
+    store = Store.open(tmp_path / "store")
+    assert told.checksum == store.topic("drive", "/speed").checksum is not None
+    (segment,) = store.paths("drive", "/speed")
+    rows = pq.read_table(segment)
+    other = rows.set_column(1, rows.schema.field(1), pc.add(rows["data"], 1))
+    pq.write_table(other, segment, use_compliant_nested_type=False)
+    with store.catalog.write() as db:  # a file of the same size, as far as anyone can tell
+        db.execute("UPDATE segments SET bytes = ?", (segment.stat().st_size,))
+    with pytest.raises(SystemExit) as ended:
+        main(["verify", "--store", str(store.path)])
+    assert ended.value.code == 5
+    said = capsys.readouterr().err
+    assert f"drive/speed: {segment}: its rows have the checksum" in said
+    assert f"those that were written {told.checksum}" in said
+
+
+def test_the_same_recording_has_the_same_checksums_in_every_store(tmp_path: Path) -> None:
+    jobs = [ROSInjectionConfig(DRIVE, "drive", store=tmp_path / name) for name in ("one", "other")]
+    one, other = ({t.target: t.checksum for t in report.topics} for report in api.run(jobs).recordings)
+    assert one == other
+    assert len(set(one.values())) == len(one), "each topic has its own"
+
+
+def test_a_catalog_from_before_there_were_checksums_is_read_and_added_to(
+    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [number(1)]})
+    run_job(write_job())
+    with closing(sqlite3.connect(tmp_path / "store" / "catalog.sqlite")) as db:
+        db.execute("ALTER TABLE segments DROP COLUMN checksum")
+    with pytest.raises(SystemExit) as ended:
+        main(["verify", "--store", str(tmp_path / "store")])
+    assert ended.value.code == 0
+    run_job(write_job(sequence={"name": "drive", "if_exists": "append"}))
+    segments = Store.open(tmp_path / "store").topic("drive", "/speed").segments
+    assert [segment.checksum is None for segment in segments] == [True, False]

@@ -1,0 +1,221 @@
+"""This file names the content of rows: one checksum of their values, whatever files, row groups and batches they lie in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, Protocol
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from xxhash import xxh3_128
+
+__all__ = ["ContentHash", "combined"]
+
+
+class ContentHash:
+    """XXH3 (128 bits) over the columns of rows that come one table after the other.
+
+    Of each column count: which values are null, the lengths of lists and texts, and the bytes of what is not null. What
+    lies in memory behind a null, how rows are cut into chunks, and how they are encoded in a file do not.
+    """
+
+    def __init__(self, schema: pa.Schema) -> None:
+        self._columns = [_column(field.type) for field in schema]
+
+    def add(self, rows: pa.Table | pa.RecordBatch) -> None:
+        """Take the rows that come next."""
+        for column, values in zip(self._columns, rows.columns, strict=True):
+            for chunk in values.chunks if isinstance(values, pa.ChunkedArray) else (values,):
+                if len(chunk):
+                    column.add(chunk)
+
+    def hexdigest(self) -> str:
+        """Return the checksum of all rows so far, 32 hexadecimal digits."""
+        return xxh3_128(b"".join(column.digest() for column in self._columns)).hexdigest()
+
+
+def combined(checksums: Iterable[str | None]) -> str | None:
+    """Return one checksum for the rows of several segments, None without any or where one is not known."""
+    all_of_them = list(checksums)
+    known = [one for one in all_of_them if one is not None]
+    if not known or len(known) < len(all_of_them):
+        return None
+    return known[0] if len(known) == 1 else xxh3_128("".join(known).encode()).hexdigest()
+
+
+class _Column(Protocol):
+    def add(self, array: pa.Array[Any]) -> None:
+        """Take one chunk, which is not empty."""
+        ...
+
+    def digest(self) -> bytes: ...
+
+
+def _column(kind: pa.DataType) -> _Column:
+    nested: dict[type[pa.DataType], Callable[[Any], _Column]] = {
+        pa.StructType: _Structs,
+        pa.ListType: _Lists,
+        pa.LargeListType: _Lists,
+        pa.FixedSizeListType: _Lists,
+        pa.MapType: _Maps,
+    }
+    if type(kind) in nested:
+        return nested[type(kind)](kind)
+    if isinstance(kind, pa.DictionaryType):
+        return _Decoded(kind.value_type)
+    if any(is_text(kind) for is_text in _TEXTS):
+        return _Texts()
+    if pa.types.is_string_view(kind) or pa.types.is_binary_view(kind):
+        return _Decoded(pa.large_binary())
+    return _Decoded(pa.uint8()) if pa.types.is_boolean(kind) else _Numbers()
+
+
+_TEXTS = (pa.types.is_string, pa.types.is_large_string, pa.types.is_binary, pa.types.is_large_binary)
+
+
+class _Nulls:
+    """Which values are null, as the lengths of runs: first of values, then of nulls, and so on."""
+
+    def __init__(self) -> None:
+        self._hash = xxh3_128()
+        self._valid = True
+        self._run = 0
+
+    def add(self, array: pa.Array[Any]) -> None:
+        if array.null_count in {0, len(array)}:
+            self._extend(np.array([len(array)]), valid=array.null_count == 0)
+            return
+        valid = array.is_valid().to_numpy(zero_copy_only=False)
+        edges = np.flatnonzero(valid[1:] != valid[:-1]) + 1
+        self._extend(np.diff(edges, prepend=0, append=len(array)), valid=bool(valid[0]))
+
+    def digest(self) -> bytes:
+        ended = self._hash.copy()
+        ended.update(self._run.to_bytes(8, "little"))
+        return ended.digest()
+
+    def _extend(self, runs: NDArray[np.int64], *, valid: bool) -> None:
+        """Append runs, the first of which is of values or not; a run is known once the next one begins."""
+        if valid is self._valid:
+            runs[0] += self._run
+        else:
+            self._hash.update(self._run.to_bytes(8, "little"))
+        self._hash.update(runs[:-1].astype("<i8").tobytes())
+        self._valid = valid if len(runs) % 2 else not valid
+        self._run = int(runs[-1])
+
+
+class _Numbers:
+    """Values of one width."""
+
+    def __init__(self) -> None:
+        self._nulls = _Nulls()
+        self._hash = xxh3_128()
+
+    def add(self, array: pa.Array[Any]) -> None:
+        self._nulls.add(array)
+        values = array.drop_null() if array.null_count else array
+        if len(values):
+            width = values.type.bit_width // 8
+            self._hash.update(_piece(values.buffers()[1], values.offset * width, len(values) * width))
+
+    def digest(self) -> bytes:
+        return self._nulls.digest() + self._hash.digest()
+
+
+class _Texts:
+    """Values of any length."""
+
+    def __init__(self) -> None:
+        self._nulls = _Nulls()
+        self._lengths = xxh3_128()
+        self._hash = xxh3_128()
+
+    def add(self, array: pa.Array[Any]) -> None:
+        self._nulls.add(array)
+        values = array.drop_null() if array.null_count else array
+        if not len(values):
+            return
+        large = pa.types.is_large_string(values.type) or pa.types.is_large_binary(values.type)
+        _, offsets, data = values.buffers()
+        kind = np.dtype(np.int64 if large else np.int32)
+        stretch = _piece(offsets, values.offset * kind.itemsize, (len(values) + 1) * kind.itemsize)
+        ends = np.frombuffer(stretch, kind)
+        self._lengths.update(np.diff(ends).astype("<i8").tobytes())
+        self._hash.update(_piece(data, int(ends[0]), int(ends[-1] - ends[0])))
+
+    def digest(self) -> bytes:
+        return self._nulls.digest() + self._lengths.digest() + self._hash.digest()
+
+
+class _Lists:
+    """Lists of any length, or of one."""
+
+    def __init__(
+        self, kind: pa.ListType[Any] | pa.LargeListType[Any] | pa.FixedSizeListType[Any, Any]
+    ) -> None:
+        self._nulls = _Nulls()
+        self._lengths = xxh3_128()
+        self._items = _column(kind.value_type)
+
+    def add(self, array: pa.Array[Any]) -> None:
+        self._nulls.add(array)
+        lists: Any = array.drop_null() if array.null_count else array
+        if isinstance(lists, pa.ListArray | pa.LargeListArray):
+            self._lengths.update(np.diff(lists.offsets.to_numpy()).astype("<i8").tobytes())
+        items = lists.flatten()
+        if len(items):
+            self._items.add(items)
+
+    def digest(self) -> bytes:
+        return self._nulls.digest() + self._lengths.digest() + self._items.digest()
+
+
+class _Structs:
+    """Fields side by side; those of a null are null."""
+
+    def __init__(self, kind: pa.StructType) -> None:
+        self._nulls = _Nulls()
+        self._fields = [_column(field.type) for field in kind]
+
+    def add(self, array: pa.Array[Any]) -> None:
+        self._nulls.add(array)
+        structs: Any = array
+        for field, values in zip(self._fields, structs.flatten(), strict=True):
+            field.add(values)
+
+    def digest(self) -> bytes:
+        return self._nulls.digest() + b"".join(field.digest() for field in self._fields)
+
+
+class _Maps:
+    """Maps, as lists of their entries."""
+
+    def __init__(self, kind: pa.MapType[Any, Any]) -> None:
+        self._entries = pa.list_(pa.struct([kind.key_field, kind.item_field]))
+        self._lists = _Lists(self._entries)
+
+    def add(self, array: pa.Array[Any]) -> None:
+        self._lists.add(array.cast(self._entries))
+
+    def digest(self) -> bytes:
+        return self._lists.digest()
+
+
+class _Decoded:
+    """Values that count as those of another type."""
+
+    def __init__(self, kind: pa.DataType) -> None:
+        self._kind = kind
+        self._values = _column(kind)
+
+    def add(self, array: pa.Array[Any]) -> None:
+        self._values.add(array.cast(self._kind))
+
+    def digest(self) -> bytes:
+        return self._values.digest()
+
+
+def _piece(buffer: pa.Buffer | None, start: int, size: int) -> memoryview:
+    return memoryview(buffer)[start : start + size] if buffer is not None else memoryview(b"")
