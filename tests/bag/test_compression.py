@@ -5,13 +5,23 @@ from __future__ import annotations
 import bz2
 import os
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import lz4.frame
 import pytest
 import zstandard
+from hypothesis import given
+from hypothesis import strategies as st
 
-from mosaico_ingest.bag.containers.compression import inflate, inflate_file, inflate_message, inflate_some
+from mosaico_ingest.bag.containers.compression import (
+    Packed,
+    inflate,
+    inflate_all,
+    inflate_file,
+    inflate_message,
+    inflate_some,
+)
 from mosaico_ingest.errors import BagError
 
 PACK: dict[str, Callable[[bytes], bytes]] = {
@@ -69,3 +79,38 @@ def test_a_file_of_several_frames_is_one_file(tmp_path: Path) -> None:
     assert inflate_file(packed, plain) == "the zstd file is cut off"
     packed.write_bytes(zstandard.compress(DATA)[:4] + b"\xff" * 5000)
     assert str(inflate_file(packed, plain)).startswith("damaged zstd file")
+
+
+def _packed(name: str, data: bytes, size: int | None = None) -> Packed:
+    return Packed(memoryview(PACK[name](data)), name, len(data) if size is None else size)
+
+
+@given(
+    chunks=st.lists(st.tuples(st.sampled_from(sorted(PACK)), st.binary(max_size=3000)), max_size=6),
+    more=st.integers(0, 3),
+)
+def test_chunks_inflated_together_are_what_each_alone_is(chunks: list[tuple[str, bytes]], more: int) -> None:
+    packed = [_packed(name, data * (1 + more)) for name, data in chunks]
+    buffer, edges, failures = inflate_all(packed)
+    assert not failures
+    found = [buffer[begin:end].tobytes() for begin, end in pairwise(edges.tolist())]
+    assert found == [data * (1 + more) for _, data in chunks]
+
+
+@pytest.mark.parametrize("name", PACK)
+@pytest.mark.parametrize("size", [0, 10, len(DATA) - 1, len(DATA) + 1, 1 << 50, (1 << 64) - 1])
+def test_one_broken_chunk_costs_no_other(name: str, size: int) -> None:
+    buffer, edges, failures = inflate_all(
+        [_packed(name, b"before"), _packed(name, DATA, size), _packed(name, b"after")]
+    )
+    assert list(failures) == [1]
+    assert "announced" in failures[1].what
+    begin, end = edges[2:].tolist()
+    assert buffer[:6].tobytes() + buffer[begin:end].tobytes() == b"beforeafter"
+
+
+@pytest.mark.parametrize("cut", [1, 5, 1000])
+@pytest.mark.parametrize("name", ["zstd", "lz4"])
+def test_a_chunk_cut_off_among_others_is_an_error(name: str, cut: int) -> None:
+    whole = _packed(name, DATA)
+    assert list(inflate_all([whole, Packed(whole.data[:-cut], name, whole.size)])[2]) == [1]

@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 import bz2
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol
 
 import lz4.frame
+import numpy as np
 import zstandard
+from numpy.typing import NDArray
 
 from mosaico_ingest.errors import BagError
 
-__all__ = ["ZSTD_MAGIC", "inflate", "inflate_file", "inflate_message", "inflate_some"]
+__all__ = [
+    "ZSTD_MAGIC",
+    "Packed",
+    "inflate",
+    "inflate_all",
+    "inflate_file",
+    "inflate_message",
+    "inflate_some",
+]
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _STEP_BYTES = 1 << 12
@@ -21,7 +33,12 @@ _LZ4_RATIO = 255
 """What lz4 can reach at best."""
 _ZSTD_RATIO = 64
 """Up to here the announced size is allocated at once; beyond, memory grows with what really comes out."""
+_TOGETHER_BYTES = 64 << 20
+"""Up to here the announced sizes of several chunks are allocated at once."""
 _FAILURES = (zstandard.ZstdError, RuntimeError, OSError, EOFError, ValueError, MemoryError)
+
+
+Bytes = NDArray[np.uint8]
 
 
 class _Stream(Protocol):
@@ -53,6 +70,54 @@ def inflate(data: bytes | memoryview, compression: str, size: int) -> bytes | me
     if len(whole) != size:
         raise BagError(f"{size} bytes announced, {len(whole)} found")
     return whole
+
+
+@dataclass(frozen=True, slots=True)
+class Packed:
+    """A chunk's data as they lie in the file, and what the chunk says of them."""
+
+    data: memoryview
+    compression: str
+    size: int
+
+
+def inflate_all(chunks: Sequence[Packed]) -> tuple[Bytes, NDArray[np.int64], dict[int, BagError]]:
+    """Return one buffer with what is in the chunks, where each begins and the last ends, and which are damaged."""
+    failures: dict[int, BagError] = {}
+    total = sum(chunk.size for chunk in chunks)
+    if len(chunks) != 1 and total <= _TOGETHER_BYTES:
+        buffer = np.empty(total, np.uint8)
+        edges = np.cumsum([0, *(chunk.size for chunk in chunks)], dtype=np.int64)
+        for number, (chunk, (begin, end)) in enumerate(zip(chunks, pairwise(edges.tolist()), strict=True)):
+            try:
+                _inflate_into(buffer[begin:end], chunk)
+            except BagError as err:  # noqa: PERF203 - each chunk may fail for itself
+                failures[number] = err
+        return buffer, edges, failures
+    pieces: list[Bytes] = []
+    for number, chunk in enumerate(chunks):
+        try:
+            pieces.append(np.frombuffer(inflate(chunk.data, chunk.compression, chunk.size), np.uint8))
+        except BagError as err:  # noqa: PERF203 - as above
+            failures[number] = err
+            pieces.append(np.empty(0, np.uint8))
+    edges = np.cumsum([0, *map(len, pieces)], dtype=np.int64)
+    return pieces[0] if len(pieces) == 1 else np.concatenate(pieces), edges, failures
+
+
+def _inflate_into(target: Bytes, chunk: Packed) -> None:
+    """Fill `target` with what is in a chunk, without a copy where the library can do that."""
+    if chunk.compression != "zstd" or not len(target):
+        target[:] = np.frombuffer(inflate(chunk.data, chunk.compression, chunk.size), np.uint8)
+        return
+    try:
+        stream = zstandard.ZstdDecompressor().stream_reader(chunk.data)
+        found = stream.readinto(target.data)
+        more = stream.read(1)
+    except _FAILURES as err:
+        raise BagError(f"damaged zstd data: {err}") from err
+    if found != len(target) or more:
+        raise BagError(f"{len(target)} bytes announced, {'more' if more else found} found")
 
 
 def inflate_some(data: bytes | memoryview, compression: str, size: int) -> bytes:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mosaico_ingest.bag.batch import Encoding
-from mosaico_ingest.bag.containers.compression import inflate, inflate_some
+from mosaico_ingest.bag.containers.compression import Packed, inflate_all, inflate_some
 from mosaico_ingest.bag.containers.mcap_index import McapIndex, Piece, read_index, read_pieces
 from mosaico_ingest.bag.containers.mcap_records import (
     MAGIC,
@@ -32,6 +34,7 @@ from mosaico_ingest.bag.containers.part import (
     Slab,
     Stream,
     Want,
+    in_groups,
     orphans,
 )
 from mosaico_ingest.bag.containers.slab import Bytes, by_key, keep_each, stretches
@@ -55,6 +58,23 @@ _HEAD = np.dtype(
 )
 _FIXED_BYTES = _HEAD.itemsize - RECORD.size
 """How much of a message record's length is not payload."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Chunk:
+    """A piece as it was read, and its data."""
+
+    piece: Piece
+    raw: bytes
+    records: Bytes
+    """What all chunks that were read together hold."""
+    begin: int
+    end: int
+
+    @property
+    def data(self) -> Bytes:
+        """What this one holds."""
+        return self.records[self.begin : self.end]
 
 
 class McapPart:
@@ -92,8 +112,8 @@ class McapPart:
             piece for piece in pieces if want.times(piece.start_ns, piece.end_ns) and piece.has_any(want.keys)
         ]
         self._source.expect((piece.offset, piece.stop) for piece in wanted)
-        for piece in wanted:
-            yield Block(min(piece.start_ns, LATEST_NS), partial(self._load, piece, want))
+        for group in in_groups(wanted, lambda piece: max(piece.size, piece.stop - piece.offset)):
+            yield Block(min(group[0].start_ns, LATEST_NS), partial(self._load, group, want))
 
     def confirm(self) -> None:
         """Say that all was read; see `Source.confirm`."""
@@ -103,30 +123,66 @@ class McapPart:
         """Let go of the file."""
         self._source.close()
 
-    def _load(self, piece: Piece, want: Want) -> Loaded:
-        raw = self._source.read(piece.offset, piece.stop - piece.offset)
+    def _load(self, pieces: Sequence[Piece], want: Want) -> Loaded:
         loaded = Loaded([], [])
-        if not piece.is_chunk:
-            self._scan(raw, piece, want, loaded)
-            return loaded
-        try:
-            head = chunk_head(raw)
-            data = _cut_chunk(raw, head, piece, loaded) if piece.is_cut else _chunk(raw, head)
-        except BagError as err:
-            loaded.holes.extend(_whole_chunk(piece, raw, want, f"broken chunk: {err.what}"))
-            return loaded
-        if not piece.indexes or not _by_index(data, raw, piece, want, loaded):
-            self._scan(data, piece, want, loaded)
+        chunks = self._chunks(pieces, want, loaded)
+        indexed = [chunk for chunk in chunks if chunk.piece.indexes]
+        if indexed:
+            self._by_index(indexed, want, loaded)
+        for chunk in chunks:
+            if not chunk.piece.indexes:
+                self._scan(chunk, want, loaded)
         return loaded
 
-    def _scan(self, data: bytes | memoryview, piece: Piece, want: Want, loaded: Loaded) -> None:
+    def _chunks(self, pieces: Sequence[Piece], want: Want, loaded: Loaded) -> list[_Chunk]:
+        """Read and inflate; what is whole lies in one buffer, what is broken is among the holes."""
+        found: list[_Chunk] = []
+        packed: list[tuple[Piece, bytes, ChunkHead]] = []
+        for piece in pieces:
+            raw = b""
+            try:
+                raw = self._source.read(piece.offset, piece.stop - piece.offset)
+                head = chunk_head(raw) if piece.is_chunk else None
+                if head is None or piece.is_cut:
+                    found.append(_whole(piece, raw if head is None else _cut(raw, head, piece, loaded)))
+                else:
+                    packed.append((piece, raw, head))
+            except BagError as err:
+                loaded.holes.extend(_whole_chunk(piece, raw, want, err))
+        records, edges, failures = inflate_all([_packed(raw, head) for _, raw, head in packed])
+        for place, (piece, raw, head) in enumerate(packed):
+            begin, end = edges[place : place + 2].tolist()
+            chunk = _Chunk(piece, raw, records, begin, end)
+            broken = failures.get(place) or _wrong_checksum(chunk.data, head)
+            if broken:
+                loaded.holes.extend(_whole_chunk(piece, raw, want, broken))
+            else:
+                found.append(chunk)
+        return found
+
+    def _by_index(self, chunks: Sequence[_Chunk], want: Want, loaded: Loaded) -> None:
+        """Add the wanted messages that the message indexes name; a chunk whose index is wrong is scanned."""
+        try:
+            keep_each(*_indexed(chunks, want.keys), want, loaded)
+        except BagError as err:
+            if len(chunks) > 1:
+                for chunk in chunks:
+                    self._by_index([chunk], want, loaded)
+                return
+            reason = f"{err.what}; the chunk was read record by record"
+            loaded.holes.append(Hole(chunks[0].piece.offset, reason, count=0))
+            self._scan(chunks[0], want, loaded)
+
+    def _scan(self, chunk: _Chunk, want: Want, loaded: Loaded) -> None:
         """Add the wanted messages record by record, up to the first that does not fit."""
-        starts = _message_starts(data, piece, loaded)
-        records = np.frombuffer(data, np.uint8)
+        piece = chunk.piece
+        starts = _message_starts(chunk.data.data, piece, loaded)
+        records = chunk.data
         heads = _heads(records, starts)
         found = list(by_key(heads["channel"]))
         wanted = [(key, rows) for key, rows in found if key in want.keys]
-        keep_each(_slab(records, heads, starts, piece), wanted, want, loaded)
+        offsets = np.full(len(starts), piece.offset, np.int64) if piece.is_chunk else starts + piece.offset
+        keep_each(_slab(records, heads, starts, offsets), wanted, want, loaded)
         if self._index.counts is None:
             unwanted = {key: len(rows) for key, rows in found if key not in want.keys}
             loaded.holes.extend(orphans(unwanted, self._index.channels))
@@ -149,24 +205,30 @@ def _stream(key: int, channel: McapChannel, index: McapIndex) -> Stream:
     )
 
 
-def _chunk(raw: bytes, head: ChunkHead) -> bytes | memoryview:
-    if head.end > len(raw):
-        raise BagError(f"{head.end - head.begin} bytes announced, {len(raw) - head.begin} left")
-    data = inflate(memoryview(raw)[head.begin : head.end], head.compression, head.size)
-    if head.crc and zlib.crc32(data) != head.crc:
-        raise BagError(f"its checksum is {zlib.crc32(data):08x}, {head.crc:08x} expected")
-    return data
+def _whole(piece: Piece, data: bytes) -> _Chunk:
+    return _Chunk(piece, data, np.frombuffer(data, np.uint8), 0, len(data))
 
 
-def _cut_chunk(raw: bytes, head: ChunkHead, piece: Piece, loaded: Loaded) -> bytes:
+def _packed(raw: bytes, head: ChunkHead) -> Packed:
+    return Packed(memoryview(raw)[head.begin : head.end], head.compression, head.size)
+
+
+def _wrong_checksum(data: Bytes, head: ChunkHead) -> BagError | None:
+    if not head.crc or (found := zlib.crc32(data.data)) == head.crc:
+        return None
+    return BagError(f"its checksum is {found:08x}, {head.crc:08x} expected")
+
+
+def _cut(raw: bytes, head: ChunkHead, piece: Piece, loaded: Loaded) -> bytes:
     data = inflate_some(memoryview(raw)[head.begin : head.end], head.compression, head.size)
     reason = f"this chunk is cut off; {len(data)} of its {head.size} bytes could be read"
     loaded.holes.append(Hole(piece.offset, reason))
     return data
 
 
-def _whole_chunk(piece: Piece, raw: bytes, want: Want, reason: str) -> Iterator[Hole]:
+def _whole_chunk(piece: Piece, raw: bytes, want: Want, err: BagError) -> Iterator[Hole]:
     """Yield the loss of a chunk, by channel where its index says how many messages each had."""
+    reason = f"broken chunk: {err.what}"
     if not piece.indexes:
         yield Hole(piece.offset, reason)
     for key, offset in piece.index_offsets():
@@ -194,43 +256,55 @@ def _entries(raw: bytes, piece: Piece, key: int, offset: int) -> bytes:
     return raw[begin : begin + size]
 
 
-def _by_index(data: bytes | memoryview, raw: bytes, piece: Piece, want: Want, loaded: Loaded) -> bool:
-    """Add the wanted messages that the chunk's message indexes name; return whether they could be trusted."""
-    wanted = [(key, offset) for key, offset in piece.index_offsets() if key in want.keys]
-    if not wanted:
-        return True
-    try:
-        indexes = [_entries(raw, piece, key, offset) for key, offset in wanted]
-        counts = [len(index) // _ENTRY.itemsize for index in indexes]
-        keys = np.repeat(np.array([key for key, _ in wanted], np.uint16), counts)
-        entries = np.frombuffer(b"".join(indexes), _ENTRY)
-        whole = _indexed(np.frombuffer(data, np.uint8), entries, keys, piece)
-    except BagError as err:
-        loaded.holes.append(Hole(piece.offset, f"{err.what}; the chunk was read record by record", count=0))
-        return False
-    edges = np.cumsum([0, *counts]).tolist()
-    spans = [slice(begin, end) for begin, end in pairwise(edges)]
-    keep_each(whole, [(key, span) for (key, _), span in zip(wanted, spans, strict=True)], want, loaded)
-    return True
+def _indexed(chunks: Sequence[_Chunk], keys: Collection[int]) -> tuple[Slab, list[tuple[int, slice]]]:
+    """Return the wanted messages that the indexes of all these chunks name, and which of them are of which channel.
+
+    Raises:
+        BagError: An index record is not there, or an entry does not agree with its record.
+    """
+    named = [
+        (key, number, _entries(chunk.raw, chunk.piece, key, offset))
+        for number, chunk in enumerate(chunks)
+        for key, offset in chunk.piece.index_offsets()
+        if key in keys
+    ]
+    named.sort(key=itemgetter(0))
+    counts = [len(entries) // _ENTRY.itemsize for _, _, entries in named]
+    entries = np.frombuffer(b"".join(entries for _, _, entries in named), _ENTRY)
+    channels = np.repeat(np.array([key for key, _, _ in named], np.uint16), counts)
+    owners = np.repeat(np.array([number for _, number, _ in named], np.int64), counts)
+    slab = _checked(chunks, entries, channels, owners)
+    edges = np.flatnonzero(np.diff(channels.astype(np.int64), prepend=-1, append=-1)).tolist()
+    return slab, [(int(channels[begin]), slice(begin, end)) for begin, end in pairwise(edges)]
 
 
-def _indexed(records: Bytes, entries: NDArray[np.void], keys: NDArray[np.uint16], piece: Piece) -> Slab:
-    """Return the messages of all these index entries, checked at once against the records.
+def _checked(
+    chunks: Sequence[_Chunk],
+    entries: NDArray[np.void],
+    channels: NDArray[np.uint16],
+    owners: NDArray[np.int64],
+) -> Slab:
+    """Return the messages of all these index entries, checked at once against the records in their chunks.
 
     Raises:
         BagError: An entry does not agree with its record.
     """
-    if len(entries) and int(entries["offset"].max()) > len(records) - _HEAD.itemsize:
+    records = chunks[0].records
+    begins = np.array([chunk.begin for chunk in chunks], np.int64)[owners]
+    ends = np.array([chunk.end for chunk in chunks], np.int64)[owners]
+    room = ends - begins - _HEAD.itemsize
+    if bool((room < 0).any()) or bool((entries["offset"] > room.astype(np.uint64)).any()):
         raise BagError("a message index points outside its chunk")
-    starts = entries["offset"].astype(np.int64)
+    starts = begins + entries["offset"].astype(np.int64)
     heads = _heads(records, starts)
-    fits = (heads["op"] == Op.MESSAGE) & (heads["channel"] == keys) & (heads["time"] == entries["time"])
-    if not bool((fits & _within(heads, starts, len(records))).all()):
+    fits = (heads["op"] == Op.MESSAGE) & (heads["channel"] == channels) & (heads["time"] == entries["time"])
+    if not bool((fits & _within(heads, starts, ends)).all()):
         raise BagError("a message index does not point at its messages")
-    return _slab(records, heads, starts, piece)
+    places = np.array([chunk.piece.offset for chunk in chunks], np.int64)[owners]
+    return _slab(records, heads, starts, places)
 
 
-def _message_starts(data: bytes | memoryview, piece: Piece, loaded: Loaded) -> NDArray[np.int64]:
+def _message_starts(data: memoryview, piece: Piece, loaded: Loaded) -> NDArray[np.int64]:
     """Return where messages begin, up to the first record that does not fit."""
     found: list[int] = []
     at = 0
@@ -256,14 +330,14 @@ def _heads(records: Bytes, starts: NDArray[np.int64]) -> NDArray[np.void]:
     return stretches(records, starts, _HEAD.itemsize).view(_HEAD).reshape(-1)
 
 
-def _within(heads: NDArray[np.void], starts: NDArray[np.int64], size: int) -> NDArray[np.bool_]:
+def _within(heads: NDArray[np.void], starts: NDArray[np.int64], ends: NDArray[np.int64]) -> NDArray[np.bool_]:
     length = heads["length"]
-    room = (size - RECORD.size - starts).astype(np.uint64)
-    return (length >= _FIXED_BYTES) & (length <= room)
+    return (length >= _FIXED_BYTES) & (length <= (ends - RECORD.size - starts).astype(np.uint64))
 
 
-def _slab(records: Bytes, heads: NDArray[np.void], starts: NDArray[np.int64], piece: Piece) -> Slab:
-    """Return messages, of any channel, whose records have been checked; chunks tell where they lie, or they do."""
-    offsets = np.full(len(starts), piece.offset, np.int64) if piece.is_chunk else starts + piece.offset
+def _slab(
+    records: Bytes, heads: NDArray[np.void], starts: NDArray[np.int64], offsets: NDArray[np.int64]
+) -> Slab:
+    """Return messages, of any channel, whose records have been checked."""
     lengths = heads["length"].astype(np.int64) - _FIXED_BYTES
     return Slab(-1, np.ascontiguousarray(heads["time"]), records, starts + _HEAD.itemsize, lengths, offsets)

@@ -43,6 +43,8 @@ class Piece:
     end_ns: int
     indexes: bytes = b""
     """Channel (u16) and file offset (u64) of each message index; empty where there is none."""
+    size: int = 0
+    """Bytes of a chunk's data, as its index announces them; 0 where there is none."""
     is_chunk: bool = True
     is_cut: bool = False
 
@@ -158,7 +160,8 @@ def _indexed_chunk(fields: Fields, data_end: int) -> Piece:
     stop = offset + length + fields.u64()
     if stop > data_end or len(indexes) % 10:
         raise BagError(f"the chunk index at {offset} does not fit the file")
-    return Piece(offset, stop, start_ns, end_ns, indexes)
+    fields.take(fields.u32() + 8)  # how it is compressed, and to how many bytes: the chunk says so too
+    return Piece(offset, stop, start_ns, end_ns, indexes, fields.u64())
 
 
 def _statistics(fields: Fields, index: McapIndex) -> int:
@@ -281,7 +284,7 @@ class _Walk:
         except BagError as err:
             self._index.holes.append(Hole(at, f"a damaged chunk record: {err.what}"))
             return
-        piece = Piece(at, end, head.start_ns, head.end_ns)
+        piece = Piece(at, end, head.start_ns, head.end_ns, size=head.size)
         self._index.pieces.append(piece)
         following = self._window.peek(end, 1)
         if following != bytes([Op.MESSAGE_INDEX]) and head.size:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,25 @@ from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.remote.path import AnyPath
 
-__all__ = ["EARLIEST_NS", "LATEST_NS", "Block", "Hole", "Loaded", "Part", "Slab", "Stream", "Want", "orphans"]
+__all__ = [
+    "EARLIEST_NS",
+    "LATEST_NS",
+    "Block",
+    "Hole",
+    "Loaded",
+    "Part",
+    "Slab",
+    "Stream",
+    "Want",
+    "in_groups",
+    "orphans",
+]
 
 EARLIEST_NS, LATEST_NS = -(2**63), 2**63 - 1
 """The first and last time stamps there are; the last is in the year 2262."""
+BLOCK_BYTES, MOST_PIECES = 8 << 20, 64
+"""Up to how many bytes, and how many chunks, are read at once: what is done once a block is done less often."""
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +117,20 @@ class Block:
 
     start_ns: int
     load: Callable[[], Loaded]
+
+
+def in_groups(pieces: Iterable[T], size: Callable[[T], int], *, most: int = MOST_PIECES) -> Iterator[list[T]]:
+    """Yield neighbours together, as long as they have no more than `BLOCK_BYTES` and are no more than `most`."""
+    group: list[T] = []
+    held_bytes = 0
+    for piece in pieces:
+        held_bytes += size(piece)
+        if group and (held_bytes > BLOCK_BYTES or len(group) == most):
+            yield group
+            group, held_bytes = [], size(piece)
+        group.append(piece)
+    if group:
+        yield group
 
 
 @dataclass(frozen=True, slots=True)

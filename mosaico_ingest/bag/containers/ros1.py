@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mosaico_ingest.bag.batch import Encoding
-from mosaico_ingest.bag.containers.compression import inflate, inflate_some
-from mosaico_ingest.bag.containers.part import Block, Hole, Loaded, Slab, Stream, Want, orphans
+from mosaico_ingest.bag.containers.compression import Packed, inflate_all, inflate_some
+from mosaico_ingest.bag.containers.part import Block, Hole, Loaded, Slab, Stream, Want, in_groups, orphans
 from mosaico_ingest.bag.containers.ros1_index import MAGIC, Piece, Ros1Index, read_index
 from mosaico_ingest.bag.containers.ros1_records import (
+    ChunkHead,
     Op,
     chunk_head,
     index_entries,
@@ -31,7 +32,31 @@ from mosaico_ingest.errors import BagError
 __all__ = ["MAGIC", "Ros1Part"]
 
 _LAYOUTS = 4
-"""How many different layouts of message headers one chunk may have before it is read record by record."""
+"""How many different layouts of message headers a connection may have before chunks are read record by record."""
+_CHUNKS = 16
+"""How many chunks are read at once: only they themselves know to what size they inflate."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Chunk:
+    """A piece as it was read: its data, and the index records behind it."""
+
+    piece: Piece
+    after: bytes
+    records: Bytes
+    """What all chunks that were read together hold."""
+    begin: int
+    end: int
+
+    @property
+    def is_indexed(self) -> bool:
+        """Whether index records say where its messages are."""
+        return self.piece.is_chunk and not self.piece.is_cut
+
+    @property
+    def data(self) -> Bytes:
+        """What this one holds."""
+        return self.records[self.begin : self.end]
 
 
 class Ros1Part:
@@ -69,8 +94,8 @@ class Ros1Part:
             if piece.is_cut or (want.times(piece.start_ns, piece.end_ns) and piece.counts.keys() & keys)
         ]
         self._source.expect((piece.offset, piece.stop) for piece in wanted)
-        for piece in wanted:
-            yield Block(piece.start_ns, partial(self._load, piece, want))
+        for group in in_groups(wanted, lambda piece: piece.stop - piece.offset, most=_CHUNKS):
+            yield Block(group[0].start_ns, partial(self._load, group, want))
 
     def confirm(self) -> None:
         """Say that all was read; see `Source.confirm`."""
@@ -80,20 +105,39 @@ class Ros1Part:
         """Let go of the file."""
         self._source.close()
 
-    def _load(self, piece: Piece, want: Want) -> Loaded:
+    def _load(self, pieces: Sequence[Piece], want: Want) -> Loaded:
         loaded = Loaded([], [])
-        try:
-            raw = self._source.read(piece.offset, piece.stop - piece.offset)
-            data, after = _chunk(raw, piece, loaded) if piece.is_chunk else (raw, len(raw))
-        except BagError as err:
-            for key in piece.counts.keys() & want.keys:
-                reason = f"broken chunk: {err.what}"
-                loaded.holes.append(Hole(piece.offset, reason, key=key, count=piece.counts[key]))
-            return loaded
-        is_indexed = piece.is_chunk and not piece.is_cut
-        if not is_indexed or not _by_index(data, raw[after:], piece, want, loaded):
-            _scan(data, piece, want, loaded)
+        chunks = self._chunks(pieces, want, loaded)
+        indexed = [chunk for chunk in chunks if chunk.is_indexed]
+        if indexed:
+            _by_index(indexed, want, loaded)
+        for chunk in chunks:
+            if not chunk.is_indexed:
+                _scan(chunk, want, loaded)
         return loaded
+
+    def _chunks(self, pieces: Sequence[Piece], want: Want, loaded: Loaded) -> list[_Chunk]:
+        """Read and inflate; what is whole lies in one buffer, what is broken is among the holes."""
+        found: list[_Chunk] = []
+        packed: list[tuple[Piece, bytes, ChunkHead]] = []
+        for piece in pieces:
+            try:
+                raw = self._source.read(piece.offset, piece.stop - piece.offset)
+                head = _head(raw, piece) if piece.is_chunk else None
+                if head is None or piece.is_cut:
+                    found.append(_whole(piece, raw if head is None else _cut(raw, head, piece, loaded)))
+                else:
+                    packed.append((piece, raw, head))
+            except BagError as err:  # noqa: PERF203 - each chunk may fail for itself
+                loaded.holes.extend(_broken(piece, want, err))
+        records, edges, failures = inflate_all([_packed(raw, head) for _, raw, head in packed])
+        for place, (piece, raw, head) in enumerate(packed):
+            if place in failures:
+                loaded.holes.extend(_broken(piece, want, failures[place]))
+            else:
+                begin, end = edges[place : place + 2].tolist()
+                found.append(_Chunk(piece, raw[head.end :], records, begin, end))
+        return found
 
 
 def _streams(index: Ros1Index, counts: dict[int, int]) -> tuple[Stream, ...]:
@@ -113,46 +157,87 @@ def _streams(index: Ros1Index, counts: dict[int, int]) -> tuple[Stream, ...]:
     )
 
 
-def _chunk(raw: bytes, piece: Piece, loaded: Loaded) -> tuple[bytes | memoryview, int]:
-    """Return a chunk's data, and where its index records begin."""
+def _whole(piece: Piece, data: bytes) -> _Chunk:
+    return _Chunk(piece, b"", np.frombuffer(data, np.uint8), 0, len(data))
+
+
+def _head(raw: bytes, piece: Piece) -> ChunkHead:
     head = chunk_head(raw)
-    packed = memoryview(raw)[head.begin : head.end]
-    if piece.is_cut:
-        data = inflate_some(packed, head.compression, head.size)
-        reason = f"this chunk is cut off; {len(data)} of its {head.size} bytes could be read"
-        loaded.holes.append(Hole(piece.offset, reason))
-        return data, len(raw)
-    if head.end > len(raw):
+    if head.end > len(raw) and not piece.is_cut:
         raise BagError(f"{head.end - head.begin} bytes announced, {len(raw) - head.begin} left")
-    return inflate(packed, head.compression, head.size), head.end
+    return head
 
 
-def _by_index(data: bytes | memoryview, after: bytes, piece: Piece, want: Want, loaded: Loaded) -> bool:
-    """Add the wanted messages that the index records behind the chunk name; return whether they could be trusted."""
-    keys = {key for key, count in piece.counts.items() if count and key in want.keys}
-    records = np.frombuffer(data, np.uint8)
+def _packed(raw: bytes, head: ChunkHead) -> Packed:
+    return Packed(memoryview(raw)[head.begin : head.end], head.compression, head.size)
+
+
+def _cut(raw: bytes, head: ChunkHead, piece: Piece, loaded: Loaded) -> bytes:
+    data = inflate_some(memoryview(raw)[head.begin : head.end], head.compression, head.size)
+    reason = f"this chunk is cut off; {len(data)} of its {head.size} bytes could be read"
+    loaded.holes.append(Hole(piece.offset, reason))
+    return data
+
+
+def _broken(piece: Piece, want: Want, err: BagError) -> Iterator[Hole]:
+    for key in piece.counts.keys() & want.keys:
+        yield Hole(piece.offset, f"broken chunk: {err.what}", key=key, count=piece.counts[key])
+
+
+def _by_index(chunks: Sequence[_Chunk], want: Want, loaded: Loaded) -> None:
+    """Add the wanted messages that the index records name; a chunk whose index is wrong is scanned."""
     try:
-        found = _indexes(after, piece, keys)
-        slabs = [_indexed(records, data, key, entries, piece) for key, entries in found.items()]
+        slabs = _indexed(chunks, want.keys)
     except BagError as err:
-        loaded.holes.append(Hole(piece.offset, f"{err.what}; the chunk was read record by record", count=0))
-        return False
+        if len(chunks) > 1:
+            for chunk in chunks:
+                _by_index([chunk], want, loaded)
+            return
+        reason = f"{err.what}; the chunk was read record by record"
+        loaded.holes.append(Hole(chunks[0].piece.offset, reason, count=0))
+        _scan(chunks[0], want, loaded)
+        return
     for slab in slabs:
         keep(slab, want, loaded)
-    return True
 
 
-def _indexes(after: bytes, piece: Piece, keys: set[int]) -> dict[int, NDArray[np.void]]:
+def _indexed(chunks: Sequence[_Chunk], keys: Collection[int]) -> list[Slab]:
+    """Return the wanted messages that the index records behind all these chunks name.
+
+    Raises:
+        BagError: The index does not agree with the records.
+    """
+    records = chunks[0].records
+    begins = np.array([chunk.begin for chunk in chunks], np.int64)
+    ends = np.array([chunk.end for chunk in chunks], np.int64)
+    places = np.array([chunk.piece.offset for chunk in chunks], np.int64)
+    named: dict[int, list[tuple[int, NDArray[np.void]]]] = {}
+    for owner, chunk in enumerate(chunks):
+        for key, entries in _indexes(chunk, keys).items():
+            named.setdefault(key, []).append((owner, entries))
+    slabs: list[Slab] = []
+    for key, found in named.items():
+        owners = np.repeat([owner for owner, _ in found], [len(entries) for _, entries in found])
+        entries = np.concatenate([entries for _, entries in found])
+        at, times = begins[owners] + entries["offset"].astype(np.int64), times_of(entries)
+        starts, lengths = _located(records, key, at, times, ends[owners])
+        slabs.append(Slab(key, times, records, starts, lengths, places[owners]))
+    return slabs
+
+
+def _indexes(chunk: _Chunk, wanted: Collection[int]) -> dict[int, NDArray[np.void]]:
     """Return the entries of the wanted connections.
 
     Raises:
         BagError: Some are missing, or are not as many as promised.
     """
+    counts = chunk.piece.counts
+    keys = {key for key, count in counts.items() if count and key in wanted}
     found: dict[int, NDArray[np.void]] = {}
-    for record in records_in(after) if keys else ():
+    for record in records_in(chunk.after) if keys else ():
         if record.op == Op.INDEX:
-            key, entries = index_entries(record, after)
-            if key in keys and len(entries) == piece.counts[key]:
+            key, entries = index_entries(record, chunk.after)
+            if key in keys and len(entries) == counts[key]:
                 found[key] = entries
             if found.keys() == keys:
                 break
@@ -161,22 +246,24 @@ def _indexes(after: bytes, piece: Piece, keys: set[int]) -> dict[int, NDArray[np
     return found
 
 
-def _indexed(
-    records: Bytes, data: bytes | memoryview, key: int, entries: NDArray[np.void], piece: Piece
-) -> Slab:
-    """Return the messages of one index record; those whose headers are laid out alike are checked together.
+def _located(
+    records: Bytes, key: int, at: NDArray[np.int64], times: NDArray[np.int64], ends: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return where the payloads of messages begin and how long they are; those with like headers go together.
 
     Raises:
         BagError: The index does not agree with the records.
     """
-    at, times = entries["offset"].astype(np.int64), times_of(entries)
     starts, lengths = np.empty_like(at), np.empty_like(at)
     left = np.arange(len(at))
     for _ in range(_LAYOUTS):
         if not len(left):
-            return Slab(key, times, records, starts, lengths, np.full(len(at), piece.offset, np.int64))
-        layout = _layout(data, int(at[left[0]]))
-        alike, starts[left], lengths[left] = _alike(records, layout, key, at[left], times[left])
+            return starts, lengths
+        first = left[0]
+        layout = _layout(records[at[first] : ends[first]])
+        alike, starts[left], lengths[left] = _alike(
+            records, layout, key, at[left], times[left], ends=ends[left]
+        )
         if not alike[0]:
             break
         left = left[~alike]
@@ -184,15 +271,21 @@ def _indexed(
 
 
 def _alike(
-    records: Bytes, layout: _Layout, key: int, at: NDArray[np.int64], times: NDArray[np.int64]
+    records: Bytes,
+    layout: _Layout,
+    key: int,
+    at: NDArray[np.int64],
+    times: NDArray[np.int64],
+    *,
+    ends: NDArray[np.int64],
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
     """Return which messages have this layout and are what the index says, their payloads' starts and lengths.
 
     Raises:
-        BagError: One would lie outside the chunk.
+        BagError: One would lie outside its chunk.
     """
     begin = at + layout.skipped
-    if int(begin.max()) > len(records) - layout.size:
+    if bool((begin > ends - layout.size).any()):
         raise BagError("an index record points outside its chunk")
     heads = stretches(records, begin, layout.size)
     alike = (heads[:, layout.fixed] == heads[0, layout.fixed]).all(axis=1)
@@ -200,7 +293,7 @@ def _alike(
     lengths = _words(heads, layout.size - 4, 1).astype(np.int64).reshape(-1)
     alike &= _words(heads, layout.conn_at, 1).reshape(-1) == key
     alike &= stamps[:, 0] * 1_000_000_000 + stamps[:, 1] == times
-    alike &= begin + layout.size + lengths <= len(records)
+    alike &= begin + layout.size + lengths <= ends
     return alike, begin + layout.size, lengths
 
 
@@ -221,14 +314,14 @@ class _Layout:
     time_at: int
 
 
-def _layout(data: bytes | memoryview, at: int) -> _Layout:
-    """Return the layout of the message at `at`.
+def _layout(data: Bytes) -> _Layout:
+    """Return the layout of the message that `data` begins with, maybe behind connection records.
 
     Raises:
         BagError: None is there.
     """
     skipped = 0
-    for record in records_in(memoryview(data)[at:]):
+    for record in records_in(data.data):
         if record.op == Op.MESSAGE:
             break
         skipped = record.end
@@ -236,7 +329,7 @@ def _layout(data: bytes | memoryview, at: int) -> _Layout:
         raise BagError("an index record points at no message")
     number(record.header, b"conn", 4)
     time_of(record.header, b"time")
-    head = bytes(data[at + record.at : at + record.begin])
+    head = data[record.at : record.begin].tobytes()
     conn_at, time_at = head.find(b"conn=") + 5, head.find(b"time=") + 5
     fixed = np.ones(len(head), np.bool_)
     for begin, size in ((conn_at, 4), (time_at, 8), (len(head) - 4, 4)):
@@ -244,17 +337,17 @@ def _layout(data: bytes | memoryview, at: int) -> _Layout:
     return _Layout(skipped, len(head), fixed, conn_at, time_at)
 
 
-def _scan(data: bytes | memoryview, piece: Piece, want: Want, loaded: Loaded) -> None:
+def _scan(chunk: _Chunk, want: Want, loaded: Loaded) -> None:
     """Add the wanted messages record by record, up to the first that does not fit."""
+    piece, records = chunk.piece, chunk.data
     found: list[tuple[int, int, int, int, int]] = []
     try:
-        for message in messages_in(data):
+        for message in messages_in(records.data):
             found.append((message.connection, message.time_ns, message.begin, message.end, message.at))  # noqa: PERF401 - what came before an error counts
     except BagError as err:
         loaded.holes.append(Hole(piece.offset, f"{err.what}; the rest is not read"))
     columns = np.array(found, np.int64).reshape(-1, 5)
     keys, times, begins, ends, ats = columns.T
     offsets = np.full(len(ats), piece.offset, np.int64) if piece.is_chunk else ats + piece.offset
-    records = np.frombuffer(data, np.uint8)
     wanted = [(key, rows) for key, rows in by_key(keys) if key in want.keys]
     keep_each(Slab(-1, times, records, begins, ends - begins, offsets), wanted, want, loaded)
