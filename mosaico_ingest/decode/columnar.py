@@ -11,7 +11,7 @@ from mosaico_ingest.bag.batch import Encoding, RawBatch
 from mosaico_ingest.bag.definition import Definition
 from mosaico_ingest.decode.columns import build_columns
 from mosaico_ingest.decode.decoder import Decoded
-from mosaico_ingest.decode.gather import array_of
+from mosaico_ingest.decode.gather import array_of, bytes_at
 from mosaico_ingest.decode.layout import PADDING, compile_layout
 from mosaico_ingest.decode.locate import locate
 from mosaico_ingest.decode.places import Frame, Int64s
@@ -73,7 +73,7 @@ class ColumnarDecoder:
         if self._layout.encoding is Encoding.ROS1:
             return [("<", np.arange(len(batch)))] if len(batch) else []
         rows = np.flatnonzero(batch.lengths >= _HEADER)
-        first, second = batch.data[batch.starts[rows]], batch.data[batch.starts[rows] + 1]
+        first, second = (bytes_at(batch.data, batch.starts[rows] + place) for place in range(2))
         groups = [(order, rows[(first == 0) & (second == kind)]) for order, kind in _ORDERS.items()]
         return [(order, members) for order, members in groups if len(members)]
 

@@ -6,10 +6,9 @@ from typing import cast
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from mosaico_ingest.bag.shape import NUMBERS
-from mosaico_ingest.decode.gather import Array, array_of, cells, offsets_of, spans
+from mosaico_ingest.decode.gather import Array, Cells, array_of, bytes_at, cells, offsets_of, spans
 from mosaico_ingest.decode.layout import (
     Block,
     Column,
@@ -52,8 +51,8 @@ class _Instances:
         self.places = places
         self.count = count
         self.owners = owners
-        self.blocks: dict[int, NDArray[np.uint8]] = {}
-        """The bytes of blocks, shape (m, size): gathered once for all columns that lie in one."""
+        self.blocks: dict[int, Cells] = {}
+        """The bytes of blocks, one each: gathered once for all columns that lie in one."""
 
     def messages(self, which: Int64s) -> Int64s:
         """Return the position of the message each of some instances belongs to."""
@@ -94,16 +93,14 @@ class _Builder:
                 return array_of(kind, count, children=arrays)
 
     def _leaf(self, leaf: Leaf, kind: pa.DataType, inst: _Instances) -> Array:
-        block = self._block(inst, leaf.step)
-        counts, strides = zip(*leaf.dims, strict=True) if leaf.dims else ((), ())
         number = np.dtype(f"{self._order}{'u1' if leaf.type == 'bool' else NUMBERS[leaf.type]}")
-        view = np.ndarray((len(block), *counts), number, block, leaf.offset, (block.shape[1], *strides))
+        view = self._block(inst, leaf.step).numbers(number, leaf.offset, leaf.dims)
         if leaf.type == "bool":
             return array_of(kind, view.size, np.packbits(view != 0, bitorder="little"))
         values = np.require(view, number.newbyteorder("="), ["C_CONTIGUOUS", "ALIGNED"])
         return array_of(kind, values.size, values)
 
-    def _block(self, inst: _Instances, number: int) -> NDArray[np.uint8]:
+    def _block(self, inst: _Instances, number: int) -> Cells:
         if number not in inst.blocks:
             step = inst.steps[number]
             size = step.size if isinstance(step, Block) else 0
@@ -131,7 +128,7 @@ class _Builder:
         if of.stride > size or not size:
             return _Instances((of.cell,), (Place(expand(place.at, counts, of.stride)),), total)
         inner = _Instances((of.cell,), (place,), total)
-        inner.blocks[0] = spans(self._data, place.at, counts * size).reshape(total, size)
+        inner.blocks[0] = Cells(spans(self._data, place.at, counts * size), total, size)
         return inner
 
     def _texts(self, words: Words, kind: pa.DataType, inst: _Instances) -> Array:
@@ -148,7 +145,8 @@ class _Builder:
     def _without_nul(self, inst: _Instances, place: Place) -> Int64s:
         """Return the sizes of texts without the NUL that ends them; one of size 0 has none."""
         sizes = np.maximum(place.counts - 1, 0)
-        open_ended = (self._data[np.maximum(place.at + place.counts - 1, 0)] != 0) & (place.counts > 0)
+        last = bytes_at(self._data, np.maximum(place.at + place.counts - 1, 0))
+        open_ended = (last != 0) & (place.counts > 0)
         self._leave(inst, np.flatnonzero(open_ended))
         return sizes
 

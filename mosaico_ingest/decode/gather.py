@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.decode.places import Int64s, expand
 
-__all__ = ["Array", "array_of", "cells", "offsets_of", "spans"]
+__all__ = ["Array", "Cells", "array_of", "bytes_at", "cells", "offsets_of", "spans"]
 
 Array: TypeAlias = "pa.Array[Any]"
 Bytes: TypeAlias = NDArray[np.uint8]
@@ -22,12 +23,44 @@ _FAR = 1 << 28
 """Bytes from the first to the last value from which on taking, which reserves half as many, could be refused."""
 
 
-def cells(data: Bytes, at: Int64s, size: int) -> Bytes:
-    """Return the `size` bytes at each position, shape (len(at), size)."""
+@dataclass(frozen=True, slots=True)
+class Cells:
+    """`count` pieces of one size: the first begins at `begin` in `data`, each other `stride` bytes further."""
+
+    data: Bytes
+    count: int
+    stride: int
+    begin: int = 0
+
+    def numbers(self, kind: np.dtype[Any], offset: int, dims: Sequence[tuple[int, int]] = ()) -> NDArray[Any]:
+        """Return what lies at `offset` in each piece; `dims` are (count, stride) of what is there more than once."""
+        counts, strides = zip(*dims, strict=True) if dims else ((), ())
+        at = self.begin + offset if self.count else 0
+        return np.ndarray((self.count, *counts), kind, self.data.data, at, (self.stride, *strides))
+
+
+def cells(data: Bytes, at: Int64s, size: int) -> Cells:
+    """Return the `size` bytes at each position: where they are equally far from each other, they are not copied."""
     if not len(at) or not size:
-        return np.zeros((len(at), size), np.uint8)
+        return Cells(np.zeros(0, np.uint8), len(at), 0)
+    stride = _stride(at)
+    if stride is not None:
+        return Cells(data, len(at), stride, int(at[0]))
     view = np.ndarray((len(data) - size + 1,), f"V{size}", data.data, 0, (1,))
-    return view[at].view(np.uint8).reshape(len(at), size)
+    return Cells(view[at].view(np.uint8), len(at), size)
+
+
+def bytes_at(data: Bytes, at: Int64s) -> Bytes:
+    """Return the byte at each position."""
+    return cells(data, at, 1).numbers(np.dtype(np.uint8), 0)
+
+
+def _stride(at: Int64s) -> int | None:
+    """Return how far positions are from each other, where all are equally far and ascend."""
+    stride = int(at[-1] - at[0]) // max(len(at) - 1, 1)
+    if stride <= 0 or int(at[0]) + stride * (len(at) - 1) != at[-1]:
+        return stride if len(at) == 1 else None
+    return stride if (at[1:] - at[:-1] == stride).all() else None
 
 
 def spans(data: Bytes, at: Int64s, sizes: Int64s) -> Bytes:
@@ -38,7 +71,8 @@ def spans(data: Bytes, at: Int64s, sizes: Int64s) -> Bytes:
     if (at[1:] == ends[:-1]).all():
         return data[at[0] : ends[-1]]
     if sizes[0] == sizes.max() == sizes.min():
-        return cells(data, at, int(sizes[0])).reshape(-1)
+        size = int(sizes[0])
+        return np.ascontiguousarray(cells(data, at, size).numbers(np.dtype(f"V{size}"), 0)).view(np.uint8)
     total = int(sizes.sum())
     if total > _LARGE * len(at):
         return _copied(data, at, ends, total)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mosaico_ingest.decode import gather
-from mosaico_ingest.decode.gather import cells, spans
+from mosaico_ingest.decode.gather import Cells, bytes_at, cells, spans
 
 DATA = np.random.default_rng(1).integers(0, 256, 60_000).astype(np.uint8)
 
@@ -33,11 +33,30 @@ def test_spans_far_apart_are_found_without_reserving_what_lies_between(pairs: li
     assert found.tobytes() == slow_spans(at, sizes)
 
 
-@given(at=st.lists(st.integers(0, 50_000), max_size=20), size=st.integers(0, 5000))
+def bytes_of(found: Cells, size: int) -> bytes:
+    return found.numbers(np.dtype(np.uint8), 0, [(size, 1)]).tobytes()
+
+
+@given(at=st.lists(st.integers(0, 50_000), max_size=20), size=st.integers(1, 5000))
 def test_cells_are_the_bytes_at_each_position(at: list[int], size: int) -> None:
     found = cells(DATA, np.array(at, np.int64), size)
-    assert found.shape == (len(at), size)
-    assert found.tobytes() == slow_spans(at, [size] * len(at))
+    assert bytes_of(found, size) == slow_spans(at, [size] * len(at))
+
+
+@given(st.integers(0, 9000), st.integers(1, 500), st.integers(1, 90), st.integers(1, 5000))
+def test_cells_equally_far_from_each_other_are_not_copied(
+    begin: int, stride: int, count: int, size: int
+) -> None:
+    at = begin + stride * np.arange(count)
+    found = cells(DATA, at, size)
+    assert np.shares_memory(found.data, DATA)
+    assert bytes_of(found, size) == slow_spans(at.tolist(), [size] * count)
+    assert bytes_at(DATA, at).tobytes() == DATA[at].tobytes()
+    assert spans(DATA, at, np.full(count, size)).tobytes() == bytes_of(found, size)
+
+
+def test_cells_without_a_byte_read_none() -> None:
+    assert cells(DATA, np.zeros(0, np.int64), 8).numbers(np.dtype("<u4"), 4).size == 0
 
 
 def test_spans_that_follow_each_other_are_not_copied() -> None:

@@ -107,7 +107,11 @@ def nulls(array: Array) -> Mask | None:
 
 def true_where(values: Array, *, null: bool = False) -> Mask:
     """Return where a boolean column holds; `null` stands for what is null."""
-    return np.asarray(pc.fill_null(values, null))
+    known = pc.fill_null(values, null) if values.null_count else values
+    trues = known.true_count
+    if trues in {0, len(known)}:
+        return np.full(len(known), trues > 0)
+    return np.asarray(known)
 
 
 def field_of(rows: Array, name: str) -> Array:

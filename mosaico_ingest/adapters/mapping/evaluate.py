@@ -215,8 +215,13 @@ class Evaluation:
         with self.within(Column(pc.invert(condition.values), condition.axes)):
             otherwise = self.of(typed.otherwise)
         columns, axes = self._aligned([condition, then, otherwise], typed.text)
+        chosen = columns[0].values
         branches = one_type(columns[1].values, columns[2].values)
-        return Column(pc.if_else(columns[0].values, *branches), axes)
+        if isinstance(chosen, pa.BooleanArray) and not chosen.null_count:
+            taken = {0: branches[1], len(chosen): branches[0]}.get(chosen.true_count)
+            if isinstance(taken, pa.Array):
+                return Column(taken, axes)
+        return Column(pc.if_else(chosen, *branches), axes)
 
 
 def _scalar(typed: Const) -> Array:

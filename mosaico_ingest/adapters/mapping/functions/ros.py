@@ -8,6 +8,7 @@ import numpy as np
 
 from mosaico_ingest.adapters.mapping.arrow import Array, DataType, arrays, pc, pt
 from mosaico_ingest.adapters.mapping.columns import (
+    Axis,
     Mask,
     field_of,
     fixed_list,
@@ -74,13 +75,7 @@ def _same(kind: Kind) -> Kind:
 def covariance(c: Array) -> Array:
     """The list, or null unless an element is > 0."""
     elements, axis = open_list(c)
-    positive = true_where(pc.greater(elements, 0))
-    if axis.size is not None:
-        known: Mask = np.logical_or.reduce(positive.reshape(len(c), axis.size), axis=1)
-    else:
-        known = np.zeros(len(c), bool)
-        known[axis.parents[positive]] = True
-    absent = ~known
+    absent = ~_any_positive(elements, axis)
     if axis.null is not None:
         absent |= axis.null
     if not absent.any():
@@ -88,6 +83,20 @@ def covariance(c: Array) -> Array:
     if axis.size is not None:
         return fixed_list(elements, axis.size, absent, len(c))
     return var_list(elements, axis.offsets, absent)
+
+
+def _any_positive(elements: Array, axis: Axis) -> Mask:
+    """Return which lists have an element > 0."""
+    rows = len(axis.offsets) - 1
+    known = np.zeros(rows, bool)
+    if axis.size is None or elements.null_count:
+        known[axis.parents[true_where(pc.greater(elements, 0))]] = True
+        return known
+    for column in np.asarray(elements).reshape(rows, axis.size).T:
+        known |= column > 0
+        if known.all():
+            break
+    return known
 
 
 @function(FLOAT, gives=computed)
