@@ -36,7 +36,7 @@ def report(
         update={"recordings": tuple(one for part in parts for one in part.recordings)}
     )
     if html is not None:
-        write_whole(html, html_page(found))
+        write_whole(html, html_page(found, html.parent))
         typer.echo(f"wrote {html}", err=True)
     if markdown is not None:
         write_whole(markdown, markdown_summary(found))

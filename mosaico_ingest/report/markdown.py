@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from mosaico_ingest.report.kept import replay_command
 from mosaico_ingest.report.model import Report, RunReport
+from mosaico_ingest.report.slowness import STEP_WORDS, longest_step, slowest, total_seconds
 from mosaico_ingest.report.units import bytes_text, count_text, seconds_text
 
 __all__ = ["markdown_summary"]
 
+_SLOWEST = 3
 _MOST_ROWS = 100
 """A job page takes a limited size; those with problems come first."""
 
@@ -25,10 +28,31 @@ def markdown_summary(report: RunReport) -> str:
         lines += ["|---|---|---:|---:|---:|---:|---:|", *map(_row, ordered[:_MOST_ROWS])]
     if len(ordered) > _MOST_ROWS:
         lines += ["", f"… and {len(ordered) - _MOST_ROWS} more, all of them in the report."]
+    lines += _time(report)
     problems = list(_problems(ordered))
     if problems:
         lines += ["", "### To look at", "", *problems[:_MOST_ROWS]]
+    commands = {f"    {command}" for one in ordered if (command := replay_command(report, one))}
+    if commands:
+        lines += ["", "Rejected messages were kept; once the manifest is mended:", "", *sorted(commands)]
     return "\n".join(lines) + "\n"
+
+
+def _time(report: RunReport) -> list[str]:
+    """Return where the time went, and which recordings took longest."""
+    sums = total_seconds(report.recordings)
+    if not sums:
+        return []
+    total = sum(sums.values())
+    shares = ", ".join(f"{STEP_WORDS[name]} {spent / total:.0%}" for name, spent in sums.items())
+    lines = ["", f"Time: {shares}."]
+    if len(report.recordings) > 1:
+        longest = (
+            f"{_cell(one.sequence)} {seconds_text(one.duration_s)} ({longest_step(one.steps)})"
+            for _, one in slowest(report.recordings, _SLOWEST)
+        )
+        lines += ["", f"Longest: {'; '.join(longest)}."]
+    return lines
 
 
 def _row(one: Report) -> str:

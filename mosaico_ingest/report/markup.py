@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from html import escape
 
-__all__ = ["Markup", "element", "join"]
+__all__ = ["Markup", "element", "join", "table"]
 
 _VOID = {"input", "meta", "link", "br"}
 
@@ -26,6 +27,30 @@ def element(name: str, /, *children: str | None, **attributes: str | bool | None
 def join(*children: str | None) -> Markup:
     """Return the children one after the other; None is nothing."""
     return Markup("".join(_text(child) for child in children if child is not None))
+
+
+def table(caption: str, head: tuple[str, ...], rows: Iterable[tuple[str, ...]], numbers: set[int]) -> Markup:
+    """Return a table that scrolls by itself; `numbers` are the columns to align on the right."""
+
+    def kind(column: int) -> str | None:
+        return "n" if column in numbers else None
+
+    titles = (element("th", name, scope="col", class_=kind(at)) for at, name in enumerate(head))
+    lines = (
+        element(
+            "tr",
+            element("th", row[0], scope="row"),
+            *(element("td", cell, class_=kind(at)) for at, cell in enumerate(row[1:], 1)),
+        )
+        for row in rows
+    )
+    table = element(
+        "table",
+        element("caption", caption),
+        element("thead", element("tr", *titles)),
+        element("tbody", *lines),
+    )
+    return element("div", table, class_="table", tabindex="0", role="region", aria_label=caption)
 
 
 def _text(child: str) -> str:

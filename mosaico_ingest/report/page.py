@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from importlib.resources import files
 from itertools import islice
+from pathlib import Path
 
 from mosaico_ingest.report.events import RunStatus, TopicStatus
-from mosaico_ingest.report.markup import Markup, element, join
+from mosaico_ingest.report.kept import folder_link, replay_command
+from mosaico_ingest.report.markup import Markup, element, join, table
 from mosaico_ingest.report.model import Report, RunReport, TopicReport
+from mosaico_ingest.report.page_time import steps_line, time_section
 from mosaico_ingest.report.sparkline import sparkline
 from mosaico_ingest.report.units import bytes_text, count_text, seconds_text, time_text
 
@@ -27,8 +30,9 @@ _OPEN = 3
 """That many recordings are shown open."""
 
 
-def html_page(report: RunReport) -> str:
-    """Return the whole page."""
+def html_page(report: RunReport, folder: Path | None = None) -> str:
+    """Return the whole page; links to files start in `folder` (the current one), where the page will lie."""
+    folder = folder or Path()
     title = f"Ingestion report: {_headline(report)}"
     head = element(
         "head",
@@ -41,7 +45,14 @@ def html_page(report: RunReport) -> str:
         "body",
         element("a", "Skip to the recordings", class_="skip", href="#recordings"),
         element("header", element("h1", "Ingestion report"), _subtitle(report)),
-        element("main", _sums(report), *_look_at(report), _recordings(report)),
+        element(
+            "main",
+            _sums(report),
+            *_look_at(report, folder),
+            *time_section(report),
+            _recordings(report, folder),
+            *_manifests(report),
+        ),
         element("script", _asset("page.js")) if report.recordings else None,
     )
     return f"<!doctype html>\n{element('html', head, body, lang='en')}\n"
@@ -84,21 +95,21 @@ def _sums(report: RunReport) -> Markup:
     )
 
 
-def _look_at(report: RunReport) -> Iterator[Markup]:
+def _look_at(report: RunReport, folder: Path) -> Iterator[Markup]:
     """Yield what somebody has to look at: recordings that failed, messages that were rejected, by reason."""
     failed = [(at, one) for at, one in enumerate(report.recordings) if one.status in _BAD]
     if failed:
         items = (element("li", _link(at, one), f": {one.error or one.status.value}") for at, one in failed)
         yield join(element("h2", "Failed recordings"), element("ul", *items))
-    rows = list(_rejections(report))
+    rows = list(_rejections(report, folder))
     if rows:
-        head = ("Stage", "Rule", "Messages", "Recordings", "The first reason")
+        head = ("Stage", "Rule", "Messages", "Recordings", "The first reason", "Kept in")
         yield join(
-            element("h2", "Rejected messages by reason"), _table("Of all recordings", head, rows, {2, 3})
+            element("h2", "Rejected messages by reason"), table("Of all recordings", head, rows, {2, 3})
         )
 
 
-def _rejections(report: RunReport) -> Iterator[tuple[str, ...]]:
+def _rejections(report: RunReport, folder: Path) -> Iterator[tuple[str, ...]]:
     groups: dict[tuple[str, str], list[tuple[int, int, str]]] = defaultdict(list)
     for at, one in enumerate(report.recordings):
         for topic in one.topics:
@@ -108,10 +119,32 @@ def _rejections(report: RunReport) -> Iterator[tuple[str, ...]]:
     for (stage, rule), found in sorted(groups.items(), key=lambda group: -sum(one[1] for one in group[1])):
         recordings = {at for at, _, _ in found}
         link = element("a", count_text(len(recordings)), href=f"#r{min(recordings)}")
-        yield stage, rule, count_text(sum(count for _, count, _ in found)), link, found[0][2]
+        messages = count_text(sum(count for _, count, _ in found))
+        yield stage, rule, messages, link, found[0][2], _kept(report, recordings, folder)
 
 
-def _recordings(report: RunReport) -> Markup:
+def _kept(report: RunReport, recordings: set[int], folder: Path) -> Markup:
+    """Link the folders that hold messages of these recordings; most runs have one."""
+    links = {
+        folder_link(report.recordings[at], folder): Path(kept).parent
+        for at in sorted(recordings)
+        if (kept := report.recordings[at].quarantine)
+    }
+    return join(*(element("a", str(path), href=link) for link, path in links.items()))
+
+
+def _manifests(report: RunReport) -> Iterator[Markup]:
+    """Yield the manifests the run was made from, closed."""
+    if report.manifests:
+        yield element("h2", "Manifest" if len(report.manifests) == 1 else "Manifests")
+    for used in report.manifests:
+        text = element("pre", used.text, tabindex="0", role="region", aria_label=used.path)
+        yield element(
+            "details", element("summary", element("span", used.path, class_="name")), text, class_="manifest"
+        )
+
+
+def _recordings(report: RunReport, folder: Path) -> Markup:
     if not report.recordings:
         return element("p", "No recording was ingested.", id="recordings")
     words = element("label", "Filter ", element("input", type="search", id="words", autocomplete="off"))
@@ -122,11 +155,30 @@ def _recordings(report: RunReport) -> Markup:
     return join(
         element("h2", "Recordings", id="recordings"),
         element("div", words, problems, shown, class_="filter", hidden=True),
-        *(_recording(at, one, is_open=at in opened) for at, one in enumerate(report.recordings)),
+        *(
+            _recording(at, one, _aside(report, one, folder), is_open=at in opened)
+            for at, one in enumerate(report.recordings)
+        ),
     )
 
 
-def _recording(at: int, one: Report, *, is_open: bool) -> Markup:
+def _aside(report: RunReport, one: Report, folder: Path) -> Markup | None:
+    """Say where a recording's rejected messages lie, and how they come in once the reason is mended."""
+    link, command = folder_link(one, folder), replay_command(report, one)
+    if link is None or one.quarantine is None:
+        return None
+    count = count_text(sum(topic.quarantined for topic in one.topics))
+    file = element("a", one.quarantine, href=link)
+    return element(
+        "p",
+        f"{count} rejected messages lie in ",
+        file,
+        "; mend the manifest, then ",
+        element("code", command),
+    )
+
+
+def _recording(at: int, one: Report, aside: Markup | None, *, is_open: bool) -> Markup:
     totals = one.totals
     summary = element(
         "summary",
@@ -142,7 +194,7 @@ def _recording(at: int, one: Report, *, is_open: bool) -> Markup:
     return element(
         "details",
         summary,
-        element("div", *_inside(one), class_="inside"),
+        element("div", *_inside(one, aside), class_="inside"),
         class_="recording",
         id=f"r{at}",
         open=is_open,
@@ -151,13 +203,14 @@ def _recording(at: int, one: Report, *, is_open: bool) -> Markup:
     )
 
 
-def _inside(one: Report) -> Iterator[Markup]:
+def _inside(one: Report, aside: Markup | None) -> Iterator[Markup]:
     if one.error:
         yield element("p", one.error, class_="error")
     rate = one.totals.read / one.duration_s if one.duration_s else 0
     stored = f", {one.compression:.0%} of it stored" if one.compression is not None else ""
     where = f"{', '.join(one.files)} ({bytes_text(one.source_bytes)}{stored}) to {one.destination}"
     yield element("p", f"{where}; {count_text(round(rate))} messages a second", class_="dim")
+    yield from (part for part in (steps_line(one.steps), aside) if part is not None)
     taken = [topic for topic in one.topics if topic.status is not TopicStatus.LEFT_OUT]
     if taken:
         yield _topics(taken)
@@ -170,7 +223,7 @@ def _topics(taken: list[TopicReport]) -> Markup:
     during = f"from {time_text(span[0])} to {time_text(span[1])} UTC" if times else "no rows"
     head = ("Topic", "Ontology", "Read", "Written", "Rejected", "Rate", "Stored", "Rows over time (gaps red)")
     rows = [_topic(topic, span) for topic in sorted(taken, key=lambda topic: topic.target)]
-    return _table(f"{len(taken)} topics, {during}", head, rows, {2, 3, 4, 5, 6})
+    return table(f"{len(taken)} topics, {during}", head, rows, {2, 3, 4, 5, 6})
 
 
 def _topic(topic: TopicReport, span: tuple[int, int]) -> tuple[str, ...]:
@@ -219,25 +272,3 @@ def _lists(one: Report) -> Iterator[Markup]:
 
 def _link(at: int, one: Report) -> Markup:
     return element("a", one.sequence, href=f"#r{at}")
-
-
-def _table(caption: str, head: tuple[str, ...], rows: Iterable[tuple[str, ...]], numbers: set[int]) -> Markup:
-    def kind(column: int) -> str | None:
-        return "n" if column in numbers else None
-
-    titles = (element("th", name, scope="col", class_=kind(at)) for at, name in enumerate(head))
-    lines = (
-        element(
-            "tr",
-            element("th", row[0], scope="row"),
-            *(element("td", cell, class_=kind(at)) for at, cell in enumerate(row[1:], 1)),
-        )
-        for row in rows
-    )
-    table = element(
-        "table",
-        element("caption", caption),
-        element("thead", element("tr", *titles)),
-        element("tbody", *lines),
-    )
-    return element("div", table, class_="table", tabindex="0", role="region", aria_label=caption)

@@ -7,6 +7,7 @@ import subprocess
 from datetime import datetime, timezone
 from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import unquote
 
 import pytest
 from typer.testing import CliRunner
@@ -15,7 +16,15 @@ from mosaico_ingest.cli.app import app
 from mosaico_ingest.diagnostics import Stage
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.markdown import markdown_summary
-from mosaico_ingest.report.model import Loss, Rejection, Report, RunReport, TopicReport
+from mosaico_ingest.report.model import (
+    Loss,
+    Rejection,
+    Report,
+    RunReport,
+    Steps,
+    TopicReport,
+    UsedManifest,
+)
 from mosaico_ingest.report.page import html_page
 from mosaico_ingest.report.sparkline import gaps
 from mosaico_ingest.report.timeline import TimelineReport
@@ -23,6 +32,7 @@ from mosaico_ingest.report.timeline import TimelineReport
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 VOID = {"meta", "input", "path"}
 NASTY = "<script>alert('|x|')</script> & \"quoted\""
+MANIFEST = 'version: 1\nbag:\n  path: drives/*.mcap\ntarget:\n  api_key: "***"\n'
 T0 = 1_700_000_000 * 10**9
 
 
@@ -44,6 +54,7 @@ def topic(name: str, *, rejected: int = 0, counts: tuple[int, ...] = (50,) * 20)
         read=sum(counts) + rejected,
         written=sum(counts),
         rejected=rejected,
+        quarantined=rejected,
         rejections=rejections if rejected else (),
         start_ns=T0,
         end_ns=T0 + len(counts) * 10**9,
@@ -66,8 +77,12 @@ def recording(number: int, status: RunStatus = RunStatus.COMPLETED, topics: int 
         exit_code={RunStatus.FAILED: 1, RunStatus.REJECTED: 4}.get(status, 0),
         error=f"drive.mcap: {NASTY}" if failed else None,
         started_at=datetime(2026, 3, 1, tzinfo=timezone.utc),
-        duration_s=1.5,
+        duration_s=1.5 + number % 7,
         source_bytes=5 * 10**6,
+        steps=Steps()
+        if failed
+        else Steps(prepare=0.1, read=0.6, decode=0.3, adapt=0.2, commit=0.3, write=0.4),
+        quarantine="kept here/drive-1.mcap" if status is RunStatus.REJECTED else None,
         topics=() if failed else tuple(made),
         losses=(Loss(topic=None, count=4, offset=99, reason="bad checksum"),) if failed else (),
         findings=("a note",),
@@ -75,7 +90,8 @@ def recording(number: int, status: RunStatus = RunStatus.COMPLETED, topics: int 
 
 
 def run(*recordings: Report) -> RunReport:
-    return RunReport(tool="mosaico-ingest 0", recordings=recordings)
+    manifests = (UsedManifest(path="jobs/nightly.yaml", text=MANIFEST),) if recordings else ()
+    return RunReport(tool="mosaico-ingest 0", manifests=manifests, recordings=recordings)
 
 
 def mixed(number: int) -> Report:
@@ -126,14 +142,39 @@ def test_the_page_is_well_formed_and_needs_nothing_else(name: str) -> None:
     assert outline.open == []
     assert outline.loads == []
     assert len(outline.ids) == len(set(outline.ids))
-    assert {link for link in outline.links if not link.startswith("#")} == set()
-    assert {link[1:] for link in outline.links} <= set(outline.ids)
+    assert {link for link in outline.links if not link.startswith("#")} <= {"kept%20here/"}
+    assert {link[1:] for link in outline.links if link.startswith("#")} <= set(outline.ids)
 
 
 def test_every_recording_topic_rejection_and_loss_is_on_the_page() -> None:
     text = " ".join(Outline(html_page(RUNS["failing"])).words)
     for wanted in ("drive_001", "drive_003", "/sensor_0", "nan", "bad checksum", "a note", NASTY):
         assert wanted in text
+
+
+def test_the_manifest_the_steps_and_the_way_back_from_the_quarantine_are_on_the_page(tmp_path: Path) -> None:
+    outline = Outline(html_page(RUNS["failing"], tmp_path))
+    text = " ".join(outline.words)
+    assert "api_key: " in text
+    assert "Where the time went" in text
+    assert "The recordings that took longest" in text
+    assert "ingest replay 'kept here' --manifest jobs/nightly.yaml" in text
+    (link,) = {link for link in outline.links if not link.startswith("#")}
+    assert (tmp_path / unquote(link)).resolve() == Path("kept here").resolve()
+
+
+def test_a_report_of_an_earlier_version_has_no_empty_parts() -> None:
+    old = RUNS["small"].model_copy(
+        update={
+            "manifests": (),
+            "recordings": tuple(
+                one.model_copy(update={"steps": Steps()}) for one in RUNS["small"].recordings
+            ),
+        }
+    )
+    text = " ".join(Outline(html_page(old)).words)
+    assert "Where the time went" not in text
+    assert "Manifest" not in text
 
 
 def test_texts_cannot_become_markup() -> None:
@@ -156,6 +197,8 @@ def test_the_summary_lists_problems_first_and_no_text_breaks_its_table() -> None
     assert lines[0] == "## Ingestion: 3 recordings, 1 failed, 4,000 messages written"
     assert lines[4].startswith("| drive_001 | failed")
     assert any("\\<script\\>" in line for line in lines)
+    assert any(line.startswith("Longest: drive_003 4.50 s (reading, 40%); ") for line in lines)
+    assert "    ingest replay 'kept here' --manifest jobs/nightly.yaml" in lines
     assert len(markdown_summary(RUNS["large"]).splitlines()) < 250
 
 
@@ -165,7 +208,7 @@ def test_the_command_writes_the_page_and_the_summary(tmp_path: Path) -> None:
     page, summary = tmp_path / "out.html", tmp_path / "out.md"
     done = CliRunner().invoke(app, ["report", str(source), "--html", str(page), "--markdown", str(summary)])
     assert done.exit_code == 0, done.output
-    assert page.read_text() == html_page(RUNS["small"])
+    assert page.read_text() == html_page(RUNS["small"], tmp_path)
     assert summary.read_text() == markdown_summary(RUNS["small"])
 
 

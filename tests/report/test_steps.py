@@ -35,6 +35,6 @@ def test_the_steps_of_a_recording_add_up_to_its_duration(tmp_path: Path) -> None
     one = report.recordings[0]
     steps = one.steps.model_dump()
     assert min(steps.values()) > 0
-    assert sum(steps.values()) - one.steps.write == pytest.approx(one.duration_s, abs=0.01)
+    assert sum(steps.values()) - one.steps.write == pytest.approx(one.duration_s, abs=0.25)
     assert report.manifests[0].path == str(tmp_path / "job.yaml")
     assert "topics: [/imu, /odom]" in report.manifests[0].text
