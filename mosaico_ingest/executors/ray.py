@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import socket
 import tempfile
 from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
@@ -43,6 +44,7 @@ NODES = 3
 """How many nodes may go under a recording before it has failed: a node that goes is not its doing, mostly."""
 _LOOK_S = 0.1
 _LEAVE_S = 10.0
+_KNOCK_S = 5.0
 _AT_ONCE = 1000
 """How many tasks Ray is given at a time, so that it sees how many nodes there is work for."""
 _WORKER_BYTES = 256 << 20
@@ -226,6 +228,7 @@ def _connected(
             f"{address} is the address of Ray's client server",
             hint="run on a machine of the cluster, with --address auto, or by `ray job submit`",
         )
+    _knock(address)
     with tempfile.TemporaryDirectory(prefix="mosaico-ingest-") as folder:
         sent = configs
         options: dict[str, Any] = {**_HERE, "num_cpus": jobs}
@@ -235,11 +238,29 @@ def _connected(
         try:
             ray.init(address or "local", log_to_driver=False, logging_level=logging.ERROR, **options)
         except (ConnectionError, RuntimeError, ValueError) as error:
-            raise IngestError(f"cannot connect to Ray: {_said(error)}", where=address) from error
+            raise _unreachable(address, error) from error
         try:
             yield sent
         finally:
             ray.shutdown()
+
+
+def _knock(address: str | None) -> None:
+    """Find out whether anybody is at `host:port`: Ray would try for minutes."""
+    host, _, port = (address or "").rpartition(":")
+    if port.isdecimal():
+        try:
+            socket.create_connection((host, int(port)), _KNOCK_S).close()
+        except OSError as error:
+            raise _unreachable(address, error) from error
+
+
+def _unreachable(address: str | None, error: Exception) -> IngestError:
+    return IngestError(
+        f"cannot connect to Ray: {_said(error)}",
+        where=address,
+        hint="see `ray status --address` for the cluster",
+    )
 
 
 @contextmanager

@@ -1,0 +1,169 @@
+"""A cluster of two nodes does what one machine does, with nodes that go, an interrupt, and files it must be sent."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mosaico_ingest.api import compile_job
+from mosaico_ingest.report.events import Event, RunStarted
+from mosaico_ingest.report.model import RunReport
+from mosaico_ingest.store import Store
+
+pytest.importorskip("ray", reason="Ray is not installed")
+
+from ray_cluster import NODE, two_nodes
+
+from mosaico_ingest.executors.ray import Ray
+
+pytestmark = pytest.mark.slow
+
+DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
+ADAPTER = """
+import logging
+import time
+
+from imu_factor import FACTOR
+
+from mosaico_ingest.adapters import ROSAdapterBase
+from mosaico_ingest.ontology import IMU, Vector3d
+
+
+class Slow(ROSAdapterBase[IMU]):
+    ros_msgtype = "sensor_msgs/msg/Imu"
+    __mosaico_ontology_type__ = IMU
+    said = False
+
+    @classmethod
+    def from_dict(cls, ros_data):
+        time.sleep(PAUSE)
+        if not cls.said:
+            logging.getLogger("slow").warning("at work")
+            cls.said = True
+        return IMU(acceleration=Vector3d(x=FACTOR, y=0.0, z=0.0), angular_velocity=Vector3d(x=0.0, y=0.0, z=0.0))
+"""
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    with two_nodes() as both:
+        yield both
+
+
+def make_job(folder: Path, names: str, *, pause_s: float) -> Path:
+    """A job whose adapter is a file beside it, which needs another one."""
+    (folder / "adapters").mkdir(parents=True)
+    for name in names:
+        shutil.copy(DRIVE, folder / f"{name}.mcap")
+    (folder / "adapters" / "imu.py").write_text(ADAPTER.replace("PAUSE", str(pause_s)))
+    (folder / "adapters" / "imu_factor.py").write_text("FACTOR = 2.0\n")
+    manifest = folder / "job.yaml"
+    manifest.write_text(
+        'bag: {path: "*.mcap"}\ntopics: [/imu]\ntarget: {store: store}\n'
+        'adapters: {override: {/imu: "adapters/imu.py:Slow"}}\n'
+    )
+    return manifest
+
+
+def ingest(folder: Path, *arguments: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "mosaico_ingest", "run", "job.yaml", "--report", "run.json", *arguments]
+    return subprocess.Popen(  # noqa: S603 - our own command
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+
+
+def ended(process: subprocess.Popen[str]) -> tuple[int, str]:
+    try:
+        _, said = process.communicate(timeout=120)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+    return process.returncode, said
+
+
+def outcome(folder: Path) -> list[dict[str, Any]]:
+    """What a run's report says, without what time it took."""
+    report = RunReport.model_validate_json((folder / "run.json").read_text())
+    timed = {"started_at", "duration_s", "steps"}
+    return [recording.model_dump(mode="json", exclude=timed) for recording in report.recordings]
+
+
+def test_a_cluster_does_what_one_machine_does(cluster: Any, tmp_path: Path) -> None:
+    here, there = tmp_path / "here", tmp_path / "there"
+    for folder in (here, there):
+        make_job(folder, "abcd", pause_s=0)
+    code, said = ended(ingest(here))
+    assert code == 0, said
+    code, said = ended(
+        ingest(there, "--executor", "ray", "--address", cluster.address, "--log-format", "json")
+    )
+    assert code == 0, said
+    assert outcome(there) == outcome(here)
+    ours, theirs = Store.open(here / "store"), Store.open(there / "store")
+    assert theirs.names() == ours.names() == tuple("abcd")
+    for name in ours.names():
+        assert theirs.scan(name, "/imu").read_all() == ours.scan(name, "/imu").read_all()
+    lines = [json.loads(line) for line in said.splitlines()]
+    assert sorted(line["sequence"] for line in lines if line["event"] == "finished") == list("abcd")
+    assert {line["message"] for line in lines if line["event"] == "log"} == {"at work"}
+    assert not list((there / "store").glob(".run-*"))
+
+
+def test_a_node_that_goes_costs_no_recording(cluster: Any, tmp_path: Path) -> None:
+    jobs = compile_job(make_job(tmp_path, "ab", pause_s=0.005))
+    begun: list[int] = []
+
+    def end_a_node_once_both_are_at_work(position: int, event: Event) -> None:
+        if isinstance(event, RunStarted):
+            begun.append(position)
+            if len(begun) == 2:
+                cluster.remove_node(cluster.worker_nodes.copy().pop(), allow_graceful=False)
+
+    try:
+        reports = list(Ray(cluster.address).map(jobs, end_a_node_once_both_are_at_work))
+    finally:
+        cluster.add_node(**NODE)
+    assert [(report.exit_code, report.totals.written) for report in reports] == [(0, 1000)] * 2
+    assert len(begun) == 3
+    assert [one.rows for one in Store.open(tmp_path / "store").sequences()] == [1000, 1000]
+
+
+def test_an_interrupt_leaves_what_the_policy_says_and_130(cluster: Any, tmp_path: Path) -> None:
+    make_job(tmp_path, "abcd", pause_s=0.05)
+    process = ingest(tmp_path, "--executor", "ray", "--address", cluster.address, "--log-format", "json")
+    assert process.stderr is not None
+    started = 0
+    for line in process.stderr:
+        started += json.loads(line)["event"] == "started"
+        if started == 2:
+            break
+    time.sleep(0.5)
+    os.killpg(process.pid, signal.SIGINT)
+    code, said = ended(process)
+    assert code == 130, said
+    assert {one["status"] for one in outcome(tmp_path)} == {"interrupted"}
+    assert Store.open(tmp_path / "store").names() == ()
+
+
+def test_without_an_address_ray_is_started_here(tmp_path: Path) -> None:
+    make_job(tmp_path, "ab", pause_s=0)
+    code, said = ended(ingest(tmp_path, "--executor", "ray", "--jobs", "2"))
+    assert code == 0, said
+    assert Store.open(tmp_path / "store").names() == ("a", "b")
+
+
+def test_no_cluster_at_an_address_is_said(tmp_path: Path) -> None:
+    make_job(tmp_path, "a", pause_s=0)
+    code, said = ended(ingest(tmp_path, "--executor", "ray", "--address", "127.0.0.1:9"))
+    assert code == 1
+    assert "127.0.0.1:9: cannot connect to Ray" in " ".join(said.split())

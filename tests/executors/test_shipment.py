@@ -1,0 +1,99 @@
+"""What a job needs travels with it: adapters with what lies beside them, definitions, certificates; nothing else."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from mosaico_ingest.api import compile_job
+from mosaico_ingest.cli.app import main
+from mosaico_ingest.executors.shipment import absolute, pack
+from mosaico_ingest.executors.worker import make_plan
+from mosaico_ingest.plan.describe import decisions
+
+QUICKSTART = Path(__file__).resolve().parents[2] / "configs" / "quickstart"
+PYTHON = """
+from factor import FACTOR
+from pressure_units import scale
+
+from mosaico_ingest.adapters import ROSAdapterBase
+from mosaico_ingest.ontology import IMU
+
+
+class Mine(ROSAdapterBase[IMU]):
+    ros_msgtype = "sensor_msgs/msg/Imu"
+    __mosaico_ontology_type__ = IMU
+"""
+JOB = """
+bag:
+  path: ../drives/drive.mcap
+  custom_msgs: [{package: acme_msgs, path: ../acme_msgs}]
+adapters:
+  load: [../adapters/battery_pack.yaml]
+  override: {/imu: "imu.py:Mine"}
+target: {store: ../store}
+"""
+
+
+@pytest.fixture
+def job(tmp_path: Path) -> Path:
+    """A manifest whose adapters lie beside and above it."""
+    for folder in ("adapters", "acme_msgs"):
+        shutil.copytree(QUICKSTART / folder, tmp_path / "here" / folder)
+    jobs = tmp_path / "here" / "jobs"
+    (jobs / "pressure_units").mkdir(parents=True)
+    (jobs / "pressure_units" / "__init__.py").write_text("from .scale import scale\n")
+    (jobs / "pressure_units" / "scale.py").write_text("def scale(): ...\n")
+    (jobs / "factor.py").write_text("FACTOR = 2\n")
+    (jobs / "imu.py").write_text(PYTHON)
+    (jobs / "huge.bin").write_bytes(b"no code")
+    (tmp_path / "here" / "drives").mkdir()
+    shutil.copy(QUICKSTART / "drive.mcap", tmp_path / "here" / "drives")
+    (jobs / "job.yaml").write_text(JOB)
+    return jobs / "job.yaml"
+
+
+def test_the_plan_is_the_same_where_only_the_shipment_and_the_recording_are(
+    job: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(job.parent.parent)
+    given = compile_job(Path("jobs/job.yaml"))
+    planned = decisions(make_plan(given[0]), folder=given[0].base_dir)
+    (tmp_path / "box").mkdir()
+    sent = pack([absolute(config) for config in given], tmp_path / "box")
+    for name in ("jobs", "adapters", "acme_msgs"):
+        shutil.rmtree(tmp_path / "here" / name)
+    for name in [name for name in sys.modules if name.startswith(("mosaico_ingest_adapters_", "factor"))]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.chdir(tmp_path / "box")
+    assert decisions(make_plan(sent[0]), folder=sent[0].base_dir) == planned
+
+
+def test_nothing_but_code_and_definitions_is_sent(job: Path, tmp_path: Path) -> None:
+    (tmp_path / "box").mkdir()
+    pack([absolute(config) for config in compile_job(job)], tmp_path / "box")
+    sent = {path.name for path in (tmp_path / "box").rglob("*") if path.is_file()}
+    assert sent == {
+        ".here",
+        "imu.py",
+        "factor.py",
+        "__init__.py",
+        "scale.py",
+        "job.yaml",
+        *(path.name for path in (QUICKSTART / "acme_msgs").rglob("*.msg")),
+        *(path.name for path in (QUICKSTART / "adapters").iterdir() if path.suffix == ".yaml"),
+    }
+
+
+def test_without_ray_the_command_says_how_to_get_it(
+    job: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    monkeypatch.delitem(sys.modules, "mosaico_ingest.executors.ray", raising=False)
+    with pytest.raises(SystemExit) as left:
+        main(["run", str(job), "--executor", "ray"])
+    assert left.value.code == 1
+    assert "pip install 'mosaico-ingest[ray]'" in " ".join(capsys.readouterr().err.split())
