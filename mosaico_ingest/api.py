@@ -1,4 +1,7 @@
-"""This file is the whole pipeline in a few functions: compile, plan, run, inspect."""
+"""This file is the whole pipeline in a few functions: compile, plan, run, inspect.
+
+Each imports what only it needs: a short run is over before all of them would be loaded.
+"""
 
 from __future__ import annotations
 
@@ -7,32 +10,28 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mosaico_ingest.bridge import ROSBridge
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.diagnostics import Finding, Severity
 from mosaico_ingest.errors import IngestError, ManifestError
-from mosaico_ingest.executors.executor import Executor
-from mosaico_ingest.executors.inspection import inspect
 from mosaico_ingest.executors.local import Inline
-from mosaico_ingest.executors.preview import decide, plan_document
-from mosaico_ingest.executors.processes import Processes
-from mosaico_ingest.executors.status import RecordingStatus, standings
 from mosaico_ingest.executors.worker import execute, make_plan
-from mosaico_ingest.manifest.load import load_manifests
-from mosaico_ingest.manifest.used import manifest_text
-from mosaico_ingest.plan.compile import compile_manifests
-from mosaico_ingest.plan.document import PlanDocument, read_plan
-from mosaico_ingest.plan.drift import Difference, differences
 from mosaico_ingest.plan.model import Plan
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.report.events import BatchObserver, Observer, ignore_batch, ignore_events
-from mosaico_ingest.report.inspection import Inspection
 from mosaico_ingest.report.model import Report, RunReport, UsedManifest
 from mosaico_ingest.report.stopwatch import Stopwatch
 from mosaico_ingest.textfile import read_whole
 from mosaico_ingest.version import __version__
+
+if TYPE_CHECKING:
+    from mosaico_ingest.executors.executor import Executor
+    from mosaico_ingest.executors.status import RecordingStatus
+    from mosaico_ingest.plan.document import PlanDocument
+    from mosaico_ingest.plan.drift import Difference
+    from mosaico_ingest.report.inspection import Inspection
 
 __all__ = [
     "RosbagInjector",
@@ -92,6 +91,9 @@ def compile_job(manifest: Path) -> tuple[ROSInjectionConfig, ...]:
         NothingMatched: There is no such recording.
         AdapterError: An adapter it names is not there or has a mistake.
     """
+    from mosaico_ingest.manifest.load import load_manifests
+    from mosaico_ingest.plan.compile import compile_manifests
+
     configs = compile_manifests(load_manifests(manifest))
     for _, alike in groupby(configs, key=lambda config: (config.adapters, config.adapter_override)):
         ROSBridge.for_config(next(alike))
@@ -106,6 +108,9 @@ def compile_recording(manifest: Path, recording: Path) -> tuple[ROSInjectionConf
     Raises:
         IngestError: As `compile_job`.
     """
+    from mosaico_ingest.manifest.load import load_manifests
+    from mosaico_ingest.plan.compile import compile_manifests
+
     loaded = (one.for_recording(recording.resolve()) for one in load_manifests(manifest))
     return tuple(
         replace(config, if_exists=IfExists.SKIP) if config.if_exists is IfExists.FAIL else config
@@ -121,6 +126,8 @@ def plan_job(manifest: Path, *, folder: Path | None = None, connect: bool = Fals
     Raises:
         IngestError: The job cannot be done; the message says why.
     """
+    from mosaico_ingest.executors.preview import plan_document
+
     return plan_document(compile_job(manifest), job=manifest, folder=folder or Path(), connect=connect)
 
 
@@ -130,6 +137,9 @@ def plan_differences(path: Path, document: PlanDocument) -> tuple[Difference, ..
     Raises:
         ManifestError: The file is no plan.
     """
+    from mosaico_ingest.plan.document import read_plan
+    from mosaico_ingest.plan.drift import differences
+
     known = [recording.decisions for recording in read_plan(path).recordings]
     return differences(known, [recording.decisions for recording in document.recordings])
 
@@ -140,6 +150,9 @@ def compare_jobs(before: Path, after: Path) -> tuple[Difference, ...]:
     Raises:
         IngestError: One of them cannot be done; the message says why.
     """
+    from mosaico_ingest.executors.preview import decide
+    from mosaico_ingest.plan.drift import differences
+
     both = ([decide(config, folder=Path()) for config in compile_job(job)] for job in (before, after))
     return differences(*both)
 
@@ -151,6 +164,10 @@ def compile_plan(path: Path) -> tuple[ROSInjectionConfig, ...]:
         ManifestError: The file is no plan, or its manifest has mistakes.
         IngestError: The manifest or a recording no longer fits the plan; `findings` say how.
     """
+    from mosaico_ingest.executors.preview import decide
+    from mosaico_ingest.plan.document import read_plan
+    from mosaico_ingest.plan.drift import differences
+
     planned = read_plan(path).recordings
     configs = compile_job(path.parent / read_plan(path).job)
     found = [decide(config, folder=config.base_dir) for config in configs]
@@ -179,12 +196,20 @@ def run(
     `manifests` are those the configurations come from, for whoever reads the report.
     """
     jobs = configs[0].jobs if configs else 1
-    chosen = executor or (Processes(jobs) if jobs > 1 else Inline())
+    chosen = executor or _executor(jobs)
     return RunReport(
         tool=f"mosaico-ingest {__version__}",
         manifests=tuple(manifests),
         recordings=tuple(chosen.map(configs, observe)),
     )
+
+
+def _executor(jobs: int) -> Executor:
+    if jobs == 1:
+        return Inline()
+    from mosaico_ingest.executors.processes import Processes
+
+    return Processes(jobs)
 
 
 def used_manifest(path: Path) -> UsedManifest:
@@ -193,6 +218,8 @@ def used_manifest(path: Path) -> UsedManifest:
     Raises:
         ManifestError: It cannot be read.
     """
+    from mosaico_ingest.manifest.used import manifest_text
+
     return UsedManifest(path=str(path), text=manifest_text(path))
 
 
@@ -202,6 +229,8 @@ def job_status(manifest: Path) -> tuple[RecordingStatus, ...]:
     Raises:
         IngestError: The manifest cannot become a job.
     """
+    from mosaico_ingest.executors.status import standings
+
     return tuple(standings(compile_job(manifest)))
 
 
@@ -211,6 +240,8 @@ def inspect_recording(path: Path, *, ros_distro: str | None = None) -> Inspectio
     Raises:
         BagError: It cannot be opened.
     """
+    from mosaico_ingest.executors.inspection import inspect
+
     config = ROSInjectionConfig(file_path=path, sequence_name="inspected", ros_distro=ros_distro)
     return inspect(config)
 

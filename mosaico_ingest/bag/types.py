@@ -172,8 +172,10 @@ class TypeResolver:
 
     def _agreement(self, who: str, distros: tuple[Stores, ...]) -> _Place:
         def find(name: str) -> MessageType | None:
+            if name in BUILTIN:
+                return BUILTIN[name]  # embedded texts never define them; loading the distros takes a while
             known = agreed_type(name, distros)
-            if known and name not in BUILTIN:
+            if known:
                 self._assumed.setdefault(name, who)
             return known
 

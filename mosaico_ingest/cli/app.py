@@ -32,6 +32,7 @@ from mosaico_ingest.cli import (
     verify,
     watch,
 )
+from mosaico_ingest.cli.collector import collect_rarely
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.version import __version__
 
@@ -95,6 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit with the documented code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
+    collect_rarely()
     try:
         app(_with_command([argument for argument in given if argument != "--debug"]), prog_name="ingest")
     except IngestError as error:

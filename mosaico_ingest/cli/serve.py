@@ -34,6 +34,7 @@ def serve(
     ] = 60,
 ) -> None:
     """Let clients of the platform list, read, query and write the store; until it is interrupted."""
+    from mosaico_ingest.cli.collector import collect_as_usual
     from mosaico_ingest.cli.heap import share_heaps
     from mosaico_ingest.cli.signals import interrupt_on_terminate
     from mosaico_ingest.errors import ManifestError
@@ -49,6 +50,7 @@ def serve(
     tls = Tls(tls_cert, tls_key) if tls_cert is not None and tls_key is not None else None
     keys = Keyring(api_keys) if api_keys is not None else None
     interrupt_on_terminate()
+    collect_as_usual()
     share_heaps()
     server = start(store, host, port, keys=keys, tls=tls, idle_s=idle_minutes * 60)
     try:

@@ -10,6 +10,7 @@ from pathlib import Path
 import typer
 
 from mosaico_ingest import api
+from mosaico_ingest.cli.collector import collect_as_usual
 from mosaico_ingest.cli.errors import print_error
 from mosaico_ingest.cli.log_format import LogFormat
 from mosaico_ingest.cli.logs import JsonLines, set_up_logging
@@ -19,7 +20,6 @@ from mosaico_ingest.cli.tables import print_report
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.executors.executor import Executor
 from mosaico_ingest.executors.local import Inline
-from mosaico_ingest.executors.processes import Processes
 from mosaico_ingest.report.events import Event, RunFinished
 from mosaico_ingest.report.model import RunReport, UsedManifest
 from mosaico_ingest.report.write import write_report
@@ -44,6 +44,7 @@ def run_configs(
     prepare = partial(set_up_logging, level, log_format)
     prepare()
     interrupt_on_terminate()
+    collect_as_usual()
     failures: list[RunFinished] = []
 
     def tell(position: int, event: Event) -> None:
@@ -73,7 +74,11 @@ def _executor(
     configs: Sequence[ROSInjectionConfig], jobs: int | None, prepare: Callable[[], None]
 ) -> Executor:
     wanted = min(jobs or configs[0].jobs, len(configs)) if configs else 1
-    return Processes(wanted, prepare=prepare) if wanted > 1 else Inline()
+    if wanted == 1:
+        return Inline()
+    from mosaico_ingest.executors.processes import Processes
+
+    return Processes(wanted, prepare=prepare)
 
 
 def _report_path(config: ROSInjectionConfig) -> Path | None:

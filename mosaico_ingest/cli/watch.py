@@ -36,6 +36,7 @@ def watch(
     """Ingest what arrives in a folder, until it is interrupted; what is in the destination already is left alone."""
     import time
 
+    from mosaico_ingest.cli.collector import collect_as_usual
     from mosaico_ingest.cli.logs import set_up_logging
     from mosaico_ingest.cli.signals import interrupt_on_terminate
     from mosaico_ingest.executors.arrivals import Arrivals
@@ -43,6 +44,7 @@ def watch(
 
     set_up_logging(log)
     interrupt_on_terminate()
+    collect_as_usual()
     arrivals = Arrivals(folder, rest)
     load_manifests(manifest)  # a mistake is said now, not with the first recording
     _say(f"watching {folder}")

@@ -22,7 +22,6 @@ from mosaico_ingest.quarantine.quarantine import kept_name
 from mosaico_ingest.store.layout import Layout
 from mosaico_ingest.store.store import Store
 from mosaico_ingest.version import __version__
-from mosaico_ingest.wire import actions, bodies
 
 __all__ = [
     "LEDGER_KEY",
@@ -202,6 +201,7 @@ _HINT = "set sequence.if_exists to replace or append, or choose another name"
 
 def _held_by_server(target: ServerTarget, sequence: str) -> Held | None:
     from mosaico_ingest.platform.client import connect  # noqa: PLC0415 - Flight is slow to import and rarely needed
+    from mosaico_ingest.wire import actions, bodies  # noqa: PLC0415 - the same
 
     with connect(target) as client:
         info = client.find(sequence)

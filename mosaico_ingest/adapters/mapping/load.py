@@ -20,13 +20,11 @@ from mosaico_ingest.adapters.mapping.evaluate import Evaluation, Refusal, RowsRe
 from mosaico_ingest.adapters.mapping.inline_type import make_type
 from mosaico_ingest.adapters.mapping.kinds import Kind
 from mosaico_ingest.adapters.mapping.model import InlineType, MappingFile
-from mosaico_ingest.adapters.mapping.schema import adapter_schema
 from mosaico_ingest.adapters.mapping.typed import Typed
 from mosaico_ingest.bag.definition import Definition, MessageType
 from mosaico_ingest.bag.names import normalize_msgtype
 from mosaico_ingest.diagnostics import Finding, RowFailure, Severity
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.manifest.problems import explain
 from mosaico_ingest.manifest.source import Source, load_source
 from mosaico_ingest.ontology.registry import UnknownTag, ontology_type
 from mosaico_ingest.ontology.types import OntologyType
@@ -200,6 +198,9 @@ def _read(source: Source, adapters: AdapterLookup | None) -> tuple[MappingSpec |
     try:
         model = MappingFile.model_validate(source.value)
     except ValidationError as error:
+        from mosaico_ingest.adapters.mapping.schema import adapter_schema  # noqa: PLC0415 - brings the manifest's models
+        from mosaico_ingest.manifest.problems import explain  # noqa: PLC0415 - the same
+
         return None, tuple(finding for _, finding in explain(error, source=source, schema=adapter_schema()))
     desk = Desk(source)
     if (model.ros_type is None) == (model.variants is None):
