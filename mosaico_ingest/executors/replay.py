@@ -13,7 +13,8 @@ from pathlib import Path
 from mosaico_ingest.config import QuarantineSettings, ROSInjectionConfig, StoreTarget, TimeRange
 from mosaico_ingest.diagnostics import encodable
 from mosaico_ingest.errors import ManifestError, SinkUnavailable
-from mosaico_ingest.executors.ledger import content_digest, held
+from mosaico_ingest.executors.content import content_digest
+from mosaico_ingest.executors.ledger import held
 from mosaico_ingest.policies import IfExists, SessionLevelErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.quarantine.kept import Kept, find_kept
 from mosaico_ingest.store.lease import Lease

@@ -8,7 +8,7 @@ from enum import Enum
 
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.errors import IngestError, SequenceExists
-from mosaico_ingest.executors.ledger import held, ledger_of, what_to_do
+from mosaico_ingest.executors.ledger import certain, held, ledger_of, what_to_do
 from mosaico_ingest.executors.worker import make_plan
 from mosaico_ingest.policies import IfExists
 
@@ -53,7 +53,7 @@ def _standing(config: ROSInjectionConfig) -> tuple[Standing, str]:
         found = held(plan.target, plan.sequence)
         if found is None:
             return Standing.NEW, ""
-        decided = what_to_do(ledger_of(plan), found, plan.sequence)
+        decided = what_to_do(certain(ledger_of(plan), plan.files, found), found, plan.sequence)
     except SequenceExists as error:
         return Standing.CHANGED, error.what
     except IngestError as error:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from mosaico_ingest.executors.ledger import content_digest
+from mosaico_ingest.executors.content import content_digest, whole_digest
 
 MIB = 1 << 20
 
@@ -35,3 +35,16 @@ def test_any_byte_of_a_short_file_counts(tmp_path: Path, mark: int) -> None:
 def test_the_first_and_the_last_byte_of_a_long_file_count(tmp_path: Path, mark: int) -> None:
     size = 300 * MIB
     assert content_digest(sparse(tmp_path / "a", size)) != content_digest(sparse(tmp_path / "b", size, mark))
+
+
+@pytest.mark.parametrize("mark", [100 * MIB, 131 * MIB + 7, 300 * MIB - 2])
+def test_the_digest_of_a_whole_file_takes_every_byte(tmp_path: Path, mark: int) -> None:
+    size = 300 * MIB
+    one, other = sparse(tmp_path / "a", size), sparse(tmp_path / "b", size, mark)
+    assert whole_digest(one) != whole_digest(other)
+    assert whole_digest(one) == whole_digest(sparse(tmp_path / "c", size))
+
+
+def test_a_short_file_needs_no_second_digest(tmp_path: Path) -> None:
+    assert whole_digest(sparse(tmp_path / "a", 64 * MIB)) is None
+    assert whole_digest(sparse(tmp_path / "b", 64 * MIB + 1)) is not None

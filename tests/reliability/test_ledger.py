@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from mosaico_ingest import api
-from mosaico_ingest.executors.ledger import content_digest
+from mosaico_ingest.executors.content import content_digest
+from mosaico_ingest.executors.status import Standing
 from mosaico_ingest.plan.model import LEDGER_KEY
 from mosaico_ingest.report.events import Event, RunStatus, TopicProgress
 from mosaico_ingest.store import Store
@@ -106,6 +108,52 @@ def test_messages_that_were_rejected_do_not_make_a_sequence_incomplete(
     write_bag({"/speed": [number(1), CUT]})
     job = write_job(sequence=SKIP)
     assert run_job(job).status is RunStatus.REJECTED
+    assert run_job(job).status is RunStatus.SKIPPED
+
+
+def rewritten(bag: Path, value: float, other: float) -> None:
+    """Put one number of a recording in the place of another; what the file system says of it is as before."""
+    was = bag.stat()
+    data = bag.read_bytes()
+    assert data.count(number(value)) == 1
+    bag.write_bytes(data.replace(number(value), number(other)))
+    os.utime(bag, ns=(was.st_atime_ns, was.st_mtime_ns))
+
+
+def test_a_long_file_that_was_changed_between_its_samples_is_noticed(
+    write_bag: WriteBag,
+    write_job: WriteJob,
+    run_job: RunJob,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("mosaico_ingest.executors.content._SAMPLES", 2)
+    monkeypatch.setattr("mosaico_ingest.executors.content._READ_BYTES", 1 << 10)
+    bag = write_bag({"/speed": [number(value) for value in range(1000)]})
+    assert bag.stat().st_size > 32 << 10
+    job = write_job(sequence=SKIP)
+    assert run_job(job).status is RunStatus.COMPLETED
+    bag.touch()
+    assert run_job(job).status is RunStatus.SKIPPED, "a copy is the same, whatever its time"
+    rewritten(bag, 500, 5000)
+    assert "other content" in str(run_job(job).error)
+    (standing,) = api.job_status(job)
+    assert standing.standing is Standing.CHANGED
+    rewritten(bag, 5000, 500)
+    assert run_job(job).status is RunStatus.SKIPPED
+
+
+def test_a_long_file_with_the_time_it_had_is_not_read_again(
+    write_bag: WriteBag,
+    write_job: WriteJob,
+    run_job: RunJob,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("mosaico_ingest.executors.content._SAMPLES", 2)
+    monkeypatch.setattr("mosaico_ingest.executors.content._READ_BYTES", 1 << 10)
+    write_bag({"/speed": [number(value) for value in range(1000)]})
+    job = write_job(sequence=SKIP)
+    assert run_job(job).status is RunStatus.COMPLETED
+    monkeypatch.delattr("mosaico_ingest.executors.ledger.whole_digest")
     assert run_job(job).status is RunStatus.SKIPPED
 
 
