@@ -20,6 +20,7 @@ from mosaico_ingest.executors.local import Inline
 from mosaico_ingest.executors.worker import execute, make_plan
 from mosaico_ingest.plan.model import Plan
 from mosaico_ingest.policies import IfExists
+from mosaico_ingest.remote.path import AnyPath
 from mosaico_ingest.report.events import BatchObserver, Observer, ignore_batch, ignore_events
 from mosaico_ingest.report.model import Report, RunReport, UsedManifest
 from mosaico_ingest.report.stopwatch import Stopwatch
@@ -234,7 +235,7 @@ def job_status(manifest: Path) -> tuple[RecordingStatus, ...]:
     return tuple(standings(compile_job(manifest)))
 
 
-def inspect_recording(path: Path, *, ros_distro: str | None = None) -> Inspection:
+def inspect_recording(path: AnyPath | str, *, ros_distro: str | None = None) -> Inspection:
     """Return what a recording holds and what would become of it.
 
     Raises:
@@ -247,7 +248,7 @@ def inspect_recording(path: Path, *, ros_distro: str | None = None) -> Inspectio
 
 
 def quick_config(
-    path: Path,
+    path: AnyPath | str,
     *,
     metadata: str | None,
     api_key: str | None,

@@ -20,6 +20,7 @@ from mosaico_ingest.policies import (
     TopicLevelErrorPolicy,
     Unmodeled,
 )
+from mosaico_ingest.remote.path import AnyPath, RemotePath, as_path
 from mosaico_ingest.wire import check_metadata, check_sequence_name, check_topic_name
 
 __all__ = [
@@ -95,9 +96,9 @@ class QuarantineSettings:
 
 @dataclass(frozen=True, slots=True)
 class StoreTarget:
-    """The embedded store in a directory."""
+    """The embedded store in a directory, or behind a URL."""
 
-    path: Path
+    path: AnyPath
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,8 +131,8 @@ class ROSInjectionConfig:
         SinkError: The platform refuses the sequence's name, a topic's new name or the metadata.
     """
 
-    file_path: Path | str | Sequence[Path | str]
-    """A file or rosbag2 directory; several are the parts of one recording."""
+    file_path: AnyPath | str | Sequence[AnyPath | str]
+    """A file or rosbag2 directory, or the URL of one; several are the parts of one recording."""
     sequence_name: str
     metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])
     host: str | None = None
@@ -163,8 +164,8 @@ class ROSInjectionConfig:
     """Plan, and write nothing."""
     registry: Any = None
     """The `ROSTypeRegistry` to look definitions up in; None: the process-wide one."""
-    store: Path | str | None = None
-    """The directory of the embedded store."""
+    store: AnyPath | str | None = None
+    """The directory of the embedded store, or a URL as `s3://bucket/prefix`."""
     if_exists: IfExists = IfExists.FAIL
     messages_on_error: LoaderErrorPolicy = LoaderErrorPolicy.LOG_WARN
     adapters: Sequence[AdapterReference] = ()
@@ -214,17 +215,17 @@ class ROSInjectionConfig:
         check_metadata(self.metadata, where=self.where or "metadata")
 
     @property
-    def paths(self) -> tuple[Path, ...]:
+    def paths(self) -> tuple[AnyPath, ...]:
         """The parts of the recording; one, mostly."""
-        if isinstance(self.file_path, Path | str):
-            return (Path(self.file_path),)
-        return tuple(Path(path) for path in self.file_path)
+        if isinstance(self.file_path, Path | str | RemotePath):
+            return (as_path(self.file_path),)
+        return tuple(as_path(path) for path in self.file_path)
 
     @property
     def target(self) -> StoreTarget | ServerTarget:
         """Where the sequence goes."""
         if self.host is None:
-            return StoreTarget(Path(self.store) if self.store is not None else DEFAULT_STORE)
+            return StoreTarget(as_path(self.store) if self.store is not None else DEFAULT_STORE)
         cert = Path(self.tls_cert_path) if self.tls_cert_path is not None else None
         return ServerTarget(
             self.host, self.port, self.mosaico_api_key, cert, self.enable_tls or cert is not None

@@ -20,6 +20,7 @@ from mosaico_ingest.injector import inject
 from mosaico_ingest.plan.model import Plan
 from mosaico_ingest.plan.resolve import resolve
 from mosaico_ingest.policies import SessionLevelErrorPolicy
+from mosaico_ingest.remote.path import RemotePath
 from mosaico_ingest.report.collect import Collector
 from mosaico_ingest.report.events import (
     Event,
@@ -186,7 +187,9 @@ def _unplanned(config: ROSInjectionConfig) -> RunStarted:
 
 def place(target: StoreTarget | ServerTarget) -> str:
     """Return a target as people write it, without its key."""
-    return normpath(target.path) if isinstance(target, StoreTarget) else f"{target.host}:{target.port}"
+    if isinstance(target, ServerTarget):
+        return f"{target.host}:{target.port}"
+    return str(target.path) if isinstance(target.path, RemotePath) else normpath(target.path)
 
 
 def _failed(error: IngestError) -> RunFinished:

@@ -11,6 +11,7 @@ from pathlib import Path as File
 from mosaico_ingest.diagnostics import Finding, Severity, Span
 from mosaico_ingest.manifest.scalars import Scalar
 from mosaico_ingest.manifest.source import Path, Source, Value, load_source
+from mosaico_ingest.remote.path import is_url
 from mosaico_ingest.textfile import read_whole
 
 __all__ = ["KEY", "MAX_FILES", "bases_of", "extended"]
@@ -163,4 +164,4 @@ def _among(path: Path, patterns: tuple[Path, ...]) -> bool:
 
 def _is_relative(text: str) -> bool:
     """Say whether a path starts at the manifest's folder; one that starts with a variable is left as it is."""
-    return text != "" and not text.startswith(("/", "~", "${"))
+    return text != "" and not text.startswith(("/", "~", "${")) and not is_url(text)

@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from mosaico_ingest.diagnostics import Finding, Severity, Span
-from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.errors import IngestError, ManifestError
 from mosaico_ingest.manifest.environment import Filled, fill_in, fill_in_cell
 from mosaico_ingest.manifest.extends import extended
 from mosaico_ingest.manifest.matrix import combinations
@@ -23,6 +23,7 @@ from mosaico_ingest.manifest.scalars import resolve_plain
 from mosaico_ingest.manifest.schema import job_schema
 from mosaico_ingest.manifest.source import Path as Place
 from mosaico_ingest.manifest.source import Source, Value, load_source, member
+from mosaico_ingest.remote.path import AnyPath, as_path, is_url
 from mosaico_ingest.textfile import read_whole
 
 __all__ = [
@@ -57,8 +58,27 @@ class LoadedManifest:
         return replace(self, manifest=self.manifest.model_copy(update={"bag": bag}))
 
     def resolve(self, path: str) -> Path:
-        """Return a path of the manifest as seen from here: relative ones start in the manifest's folder."""
+        """Return a path of the manifest as seen from here: relative ones start in the manifest's folder.
+
+        Raises:
+            ManifestError: It is a URL.
+        """
+        if is_url(path):
+            raise ManifestError(f"{path}: only recordings and stores may be URLs", where=str(self.path))
         return self.path.parent / Path(path).expanduser()
+
+    def locate(self, path: str, *place: str | int) -> AnyPath:
+        """Return what may also lie behind a URL, as seen from here.
+
+        Raises:
+            ManifestError: It is a URL that is not understood; `place` is where the manifest says it.
+        """
+        if not is_url(path):
+            return self.resolve(path)
+        try:
+            return as_path(path)
+        except IngestError as err:
+            raise ManifestError(f"{err.where}: {err.what}", where=self.where(*place), hint=err.hint) from err
 
 
 def load_manifest(path: Path | str, *, env: Mapping[str, str] | None = os.environ) -> LoadedManifest:

@@ -162,7 +162,8 @@ class BagSection(_Section):
     """The recording, and what it takes to read it."""
 
     path: Paths = Field(examples=["data/session_01.db3", ["part_0.mcap", "part_1.mcap"], "data/*.mcap"])
-    """A file or rosbag2 directory; a list: the parts of one recording; a glob: one sequence for each match."""
+    """A file or rosbag2 directory, or the URL of one; a list: the parts of one recording; a glob: one sequence for each
+    match."""
     ros_distro: Stores | None = Field(default=None, examples=["ros2_humble"])
     """The distro whose definitions are used where the recording does not carry its own."""
     custom_msgs: tuple[CustomMessages, ...] = ()
@@ -253,7 +254,7 @@ class TargetSection(_Section):
     """Where sequences go: a store of files, or a Mosaico server; without both, the store `./mosaico`."""
 
     store: Text | None = Field(default=None, examples=["./mosaico"])
-    """The directory of the embedded store."""
+    """The directory of the embedded store, or a URL (`s3://bucket/prefix`, `gs://bucket/prefix`)."""
     host: Text | None = Field(default=None, examples=["mosaico.example.org"])
     """The server's name or address."""
     port: Annotated[int, Field(ge=1, le=65535)] = 6726

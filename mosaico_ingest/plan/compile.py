@@ -99,7 +99,8 @@ def _fields(loaded: LoadedManifest) -> dict[str, Any]:
 def _target(loaded: LoadedManifest) -> dict[str, Any]:
     target = loaded.manifest.target
     if target.host is None:
-        return {"store": _path(loaded, target.store)}
+        store = target.store
+        return {"store": None if store is None else loaded.locate(store, "target", "store")}
     return {
         "host": target.host,
         "port": target.port,

@@ -16,6 +16,7 @@ from mosaico_ingest.diagnostics import Finding
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.plan.document import Decisions, FilePart, Kept, Note, PlannedTopic, UnreadTopic
 from mosaico_ingest.plan.model import LeftOut, Plan, TopicPlan
+from mosaico_ingest.remote.path import AnyPath, RemotePath
 
 __all__ = ["check_digest", "decisions", "notes"]
 
@@ -123,5 +124,7 @@ def _digest(spec: AdapterSpec) -> str | None:
     return hashlib.sha256(spec.model.model_dump_json().encode()).hexdigest()[:16]
 
 
-def _seen_from(folder: Path, path: Path) -> str:
+def _seen_from(folder: Path, path: AnyPath) -> str:
+    if isinstance(path, RemotePath):
+        return str(path)
     return Path(relpath(path, folder)).as_posix()

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from mosaico_ingest.config import ServerTarget
 from mosaico_ingest.diagnostics import Finding, Severity
-from mosaico_ingest.errors import SinkError
+from mosaico_ingest.errors import SinkError, Unreachable
 from mosaico_ingest.plan.document import DestinationState, Sample
 from mosaico_ingest.plan.model import Plan, TopicPlan
 from mosaico_ingest.policies import IfExists
+from mosaico_ingest.remote.path import RemotePath
 from mosaico_ingest.sink import check_same_type
-from mosaico_ingest.store.layout import Layout
 from mosaico_ingest.store.store import Store
 from mosaico_ingest.wire import check_topic_name
 
@@ -27,19 +27,20 @@ def ask_destination(plan: Plan, samples: Iterable[Sample], *, connect: bool) -> 
     if isinstance(plan.target, ServerTarget):
         return _server(plan, plan.target, estimated, connect=connect)
     folder = plan.target.path
-    base = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    exists = Layout(folder).catalog.is_file()
+    base = None if isinstance(folder, RemotePath) else _base(folder)
+    store = None
     try:
-        taken = exists and _taken(plan, Store.open(folder, create=False))
-        problem = _refusal(plan, base, taken=taken)
-    except SinkError as error:
+        store = Store.find(folder)
+        taken = store is not None and _taken(plan, store)
+        problem = (base and _refusal_of_folder(base)) or _refusal_of_name(plan, taken=taken)
+    except (SinkError, Unreachable) as error:
         taken, problem = None, str(error)
     return DestinationState(
         kind="store",
-        exists=exists,
+        exists=store is not None,
         taken=taken,
         problem=problem,
-        free_bytes=shutil.disk_usage(base).free,
+        free_bytes=None if base is None else shutil.disk_usage(base).free,
         estimated_bytes=estimated,
     )
 
@@ -62,10 +63,11 @@ def _taken(plan: Plan, store: Store) -> bool:
     Raises:
         SinkError: Rows of the plan cannot join what is there.
     """
-    if plan.sequence not in store.names():
+    info = store.find_sequence(plan.sequence)
+    if info is None:
         return False
     if plan.if_exists is IfExists.APPEND:
-        held = {topic.name: topic.ontology for topic in store.sequence(plan.sequence).topics}
+        held = {topic.name: topic.ontology for topic in info.topics}
         for topic in plan.topics:
             name = check_topic_name(topic.target)
             if name in held:
@@ -73,12 +75,15 @@ def _taken(plan: Plan, store: Store) -> bool:
     return True
 
 
-def _refusal(plan: Plan, base: Path, *, taken: bool) -> str | None:
+def _base(folder: Path) -> Path:
+    """Return the folder itself, or what is there of the way to it."""
+    return next(path for path in (folder, *folder.absolute().parents) if path.exists())
+
+
+def _refusal_of_folder(base: Path) -> str | None:
     if not base.is_dir():
         return f"{base} is no folder"
-    if not os.access(base, os.W_OK | os.X_OK):
-        return f"{base} cannot be written"
-    return _refusal_of_name(plan, taken=taken)
+    return None if os.access(base, os.W_OK | os.X_OK) else f"{base} cannot be written"
 
 
 def _refusal_of_name(plan: Plan, *, taken: bool) -> str | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from mosaico_ingest.adapters.adapter import AdapterSpec
@@ -18,6 +17,7 @@ from mosaico_ingest.policies import (
     SessionLevelErrorPolicy,
     TopicLevelErrorPolicy,
 )
+from mosaico_ingest.remote.path import AnyPath
 
 __all__ = ["DEFAULT_MEMORY_BYTES", "LEDGER_KEY", "LeftOut", "Plan", "TopicPlan"]
 
@@ -66,7 +66,7 @@ class LeftOut:
 class Plan:
     """What will be done with one recording."""
 
-    files: tuple[Path, ...]
+    files: tuple[AnyPath, ...]
     container: str
     source_bytes: int
     resolver: Resolver

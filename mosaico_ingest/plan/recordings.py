@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from difflib import get_close_matches
 from glob import has_magic
-from pathlib import Path
 
 from mosaico_ingest.errors import ManifestError, NothingMatched
 from mosaico_ingest.manifest.load import LoadedManifest
 from mosaico_ingest.manifest.placeholders import PLACEHOLDERS, Placeholder, placeholders_in
+from mosaico_ingest.remote.path import AnyPath, RemotePath, without_options
 
 __all__ = ["Recording", "find_recordings", "sequence_name"]
 
@@ -24,11 +24,11 @@ _REFUSED = re.compile(r"[^A-Za-z0-9_-]+")
 class Recording:
     """One recording: its parts, and its position (from 1) among those of the job."""
 
-    paths: tuple[Path, ...]
+    paths: tuple[AnyPath, ...]
     index: int
 
     @property
-    def main(self) -> Path:
+    def main(self) -> AnyPath:
         """The path it is named after; a rosbag2 directory for its metadata.yaml."""
         first = self.paths[0]
         return first.parent if first.name == "metadata.yaml" else first
@@ -78,15 +78,15 @@ def _fill(placeholder: Placeholder, recording: Recording) -> str:
     return _REFUSED.sub("_", texts[placeholder.name]).strip("_")
 
 
-def _matches(loaded: LoadedManifest, pattern: str, place: tuple[str | int, ...]) -> list[Path]:
+def _matches(loaded: LoadedManifest, pattern: str, place: tuple[str | int, ...]) -> list[AnyPath]:
     """Return the file or directory `pattern` names, or the recordings it matches, sorted."""
-    path = loaded.resolve(pattern)
+    path = loaded.locate(pattern, *place)
     if path.exists():
         return [path]
     where = loaded.where(*place)
-    if not has_magic(pattern):
+    if not has_magic(without_options(pattern)):
         raise NothingMatched(f"no such file or directory: {path}", where=where, hint=_nearby(path))
-    found = sorted(_glob(path))
+    found: list[AnyPath] = sorted(_glob(path))
     recordings = [match for match in found if _is_recording(match)]
     if not recordings:
         only = f"; it matches {len(found)} other files" if found else ""
@@ -94,29 +94,32 @@ def _matches(loaded: LoadedManifest, pattern: str, place: tuple[str | int, ...])
     return recordings
 
 
-def _glob(path: Path) -> Iterable[Path]:
+def _glob(path: AnyPath) -> Iterable[AnyPath]:
+    if isinstance(path, RemotePath):
+        above = next(parent for parent in path.above if not has_magic(parent.key))
+        return above.glob(path.key.removeprefix(above.key))
     fixed = next(parent for parent in path.parents if not has_magic(str(parent)))
     return fixed.glob(str(path.relative_to(fixed)))
 
 
-def _is_recording(path: Path) -> bool:
+def _is_recording(path: AnyPath) -> bool:
     if path.is_file():
         return _RECORDING.search(path.name) is not None
     return path.is_dir() and ((path / "metadata.yaml").is_file() or _any_recording(_listed(path)))
 
 
-def _listed(folder: Path) -> list[Path]:
+def _listed(folder: AnyPath) -> list[AnyPath]:
     try:
         return list(folder.iterdir())
     except OSError:  # what a pattern meets on its way need not be ours to read
         return []
 
 
-def _any_recording(paths: Iterable[Path]) -> bool:
+def _any_recording(paths: Iterable[AnyPath]) -> bool:
     return any(_RECORDING.search(path.name) for path in paths)
 
 
-def _nearby(path: Path) -> str:
+def _nearby(path: AnyPath) -> str:
     """Say what is there instead: the part of the path that exists, and the nearest name in it."""
     folder = path.parent
     while not folder.is_dir() and folder != folder.parent:

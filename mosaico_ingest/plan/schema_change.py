@@ -14,7 +14,6 @@ from mosaico_ingest.diagnostics import Finding, Severity
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.plan.model import LEDGER_KEY, Plan, TopicPlan
 from mosaico_ingest.policies import OnSchemaChange
-from mosaico_ingest.store.layout import Layout
 from mosaico_ingest.store.store import Store
 from mosaico_ingest.wire import check_topic_name
 
@@ -68,10 +67,9 @@ def follow_schema_changes(plan: Plan, wanted: OnSchemaChange) -> Plan:
 
 def _known(target: StoreTarget, family: str | None) -> dict[str, list[_Known]]:
     """Return the definitions by topic, in the order the family's sessions were written."""
-    if not Layout(target.path).catalog.is_file():
-        return {}
+    store = Store.find(target.path)
     found: dict[str, list[tuple[str, _Known]]] = {}
-    for info in Store.open(target.path, create=False).sequences():
+    for info in store.sequences() if store else ():
         sessions = {one.id for one in info.sessions if _family(one.metadata) == family}
         for topic in info.topics:
             text = _text(topic.metadata)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from pyarrow.fs import FileInfo, FileSystem
 
-__all__ = ["AnyPath", "RemotePath", "RemoteStat", "as_path", "is_url"]
+__all__ = ["AnyPath", "RemotePath", "RemoteStat", "as_path", "is_url", "without_options"]
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/(?=[^/])|([A-Za-z][A-Za-z0-9+.-]+)://")
 """With one slash too: that is what is left of a URL that went through `Path`."""
@@ -87,6 +87,14 @@ class RemotePath:
     def place(self) -> str:
         """How its file system spells it."""
         return f"{self.root.partition('://')[2]}/{self.key}".rstrip("/")
+
+    @property
+    def above(self) -> Iterator[RemotePath]:
+        """The folders it lies in, up to the bucket."""
+        path = self
+        while path.key:
+            path = path.parent
+            yield path
 
     def resolve(self) -> RemotePath:
         """Return the path itself: there are no links."""
@@ -216,6 +224,11 @@ AnyPath: TypeAlias = "Path | RemotePath"
 def is_url(text: str) -> bool:
     """Say whether a text is a URL, and no path of a disk."""
     return _URL.match(text) is not None
+
+
+def without_options(text: str) -> str:
+    """Return a URL without what stands behind `?`; a path as it is."""
+    return text.partition("?")[0] if is_url(text) else text
 
 
 def as_path(given: str | Path | RemotePath) -> AnyPath:

@@ -9,12 +9,17 @@ from __future__ import annotations
 import os
 import sqlite3
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Collection, Generator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 from mosaico_ingest.errors import SinkError
+from mosaico_ingest.policies import IfExists
+from mosaico_ingest.remote.path import AnyPath
+from mosaico_ingest.store import entries, queries, removal
 from mosaico_ingest.store.faults import explained
+from mosaico_ingest.store.model import SequenceInfo, TopicInfo
 
 __all__ = ["FORMAT", "Catalog"]
 
@@ -88,10 +93,11 @@ CREATE TABLE reservations (
 
 
 class Catalog:
-    """The catalog at `path`; `create` makes it where it is not there."""
+    """The `Records` in the SQLite file at `path`; `create` makes it where it is not there."""
 
     def __init__(self, path: Path, *, create: bool) -> None:
         self.path = path
+        self.root = path.parent
         with explained(path):
             if create:
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -110,6 +116,84 @@ class Catalog:
         """Give a connection inside a transaction: all of it happens, or nothing."""
         with self._task("BEGIN IMMEDIATE", mode="rw") as db:
             yield db
+
+    def keep_open(self) -> sqlite3.Connection:
+        """Give an idle connection: closing the last one costs a checkpoint, closing another while it is open does not."""
+        with explained(self.path):
+            return self._connect("rw")
+
+    def claim(
+        self, session: str, sequence: str, if_exists: IfExists, *, is_live: Callable[[str], bool]
+    ) -> entries.Claim:
+        """See `Records.claim`."""
+        with self.write() as db:
+            return entries.claim(db, session, sequence, if_exists, is_live=is_live)
+
+    def commit(self, claimed: entries.Claim, new: entries.NewSession) -> list[str]:
+        """See `Records.commit`."""
+        with self.write() as db:
+            return entries.commit(db, claimed, new)
+
+    def release(self, session: str, sequence: str) -> None:  # noqa: ARG002 - the session says it all
+        """See `Records.release`."""
+        with self.write() as db:
+            entries.release(db, session)
+
+    def create(self, sequence: str, metadata: str) -> None:
+        """See `Records.create`."""
+        with self.write() as db:
+            entries.create(db, sequence, metadata)
+
+    def note(self, sequence: str, new: entries.NewNote) -> None:
+        """See `Records.note`."""
+        with self.write() as db:
+            entries.note(db, sequence, new)
+
+    def names(self) -> list[str]:
+        """See `Records.names`."""
+        with self.read() as db:
+            return queries.names(db)
+
+    def sequence(self, name: str) -> SequenceInfo | None:
+        """See `Records.sequence`."""
+        with self.read() as db:
+            return queries.sequence(db, name, self.root)
+
+    def sequences(self) -> tuple[SequenceInfo, ...]:
+        """See `Records.sequences`."""
+        with self.read() as db:
+            found = (queries.sequence(db, name, self.root) for name in queries.names(db))
+            return tuple(info for info in found if info is not None)
+
+    def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
+        """See `Records.bounds`."""
+        with self.read() as db:
+            return queries.bounds(db, topic, columns, self.root)
+
+    def delete_sequence(self, sequence: str) -> list[str]:
+        """See `Records.delete_sequence`."""
+        with self.write() as db:
+            return removal.sequence(db, sequence)
+
+    def delete_topic(self, sequence: str, topic: str) -> list[str]:
+        """See `Records.delete_topic`."""
+        with self.write() as db:
+            return removal.topic(db, sequence, topic)
+
+    def delete_session(self, sequence: str, session: str) -> list[str]:
+        """See `Records.delete_session`."""
+        with self.write() as db:
+            return removal.session(db, sequence, session)
+
+    def delete_notes(self, sequence: str, topic: str | None) -> None:
+        """See `Records.delete_notes`."""
+        with self.write() as db:
+            removal.notes(db, sequence, topic)
+
+    def forget(self, live: Collection[str]) -> set[str]:
+        """See `Records.forget`."""
+        with self.write() as db:
+            return removal.forget(db, live)
 
     @contextmanager
     def _task(self, begin: str, *, mode: str) -> Generator[sqlite3.Connection, None, None]:

@@ -21,12 +21,14 @@ __all__ = [
     "NewNote",
     "NewSession",
     "NewTopic",
+    "changed",
     "claim",
     "commit",
     "create",
     "note",
     "ontology_of",
     "release",
+    "taken",
 ]
 
 
@@ -85,7 +87,7 @@ def claim(
     """Note that a session will create or replace a sequence, or refuse because it must not or another does."""
     row = db.execute("SELECT id FROM sequences WHERE name = ?", (sequence,)).fetchone()
     if row is not None and if_exists in {IfExists.FAIL, IfExists.SKIP}:
-        raise _taken(sequence)
+        raise taken(sequence)
     if if_exists is not IfExists.APPEND:
         _reserve(db, session, sequence, is_live)
     if row is None:
@@ -97,7 +99,7 @@ def claim(
 def create(db: sqlite3.Connection, sequence: str, metadata: str) -> None:
     """Enter a sequence without a session."""
     if db.execute("SELECT 1 FROM sequences WHERE name = ?", (sequence,)).fetchone() is not None:
-        raise _taken(sequence)
+        raise taken(sequence)
     db.execute(
         "INSERT INTO sequences (name, metadata, created_ns) VALUES (?, ?, ?)",
         (sequence, metadata, time.time_ns()),
@@ -152,11 +154,11 @@ def _check_unchanged(db: sqlite3.Connection, claimed: Claim) -> list[str]:
     now = None if row is None else row["id"]
     replaces = claimed.if_exists is IfExists.REPLACE
     if now is not None and claimed.if_exists in {IfExists.FAIL, IfExists.SKIP}:
-        raise _taken(claimed.sequence)
+        raise taken(claimed.sequence)
     if claimed.sequence_id is not None and now != claimed.sequence_id:
-        raise _changed(claimed.sequence)
+        raise changed(claimed.sequence)
     if replaces and now is not None and _sessions(db, now) != claimed.sessions:
-        raise _changed(claimed.sequence)
+        raise changed(claimed.sequence)
     if not replaces or now is None:
         return []
     paths = db.execute(
@@ -241,7 +243,8 @@ def ontology_of(row: sqlite3.Row) -> OntologyType:
     )
 
 
-def _taken(sequence: str) -> SequenceExists:
+def taken(sequence: str) -> SequenceExists:
+    """Return the error for a name that is in use."""
     return SequenceExists(
         "the sequence exists",
         where=sequence,
@@ -249,5 +252,6 @@ def _taken(sequence: str) -> SequenceExists:
     )
 
 
-def _changed(sequence: str) -> SinkError:
+def changed(sequence: str) -> SinkError:
+    """Return the error for a sequence that is not what it was when the session began."""
     return SinkError("another run changed the sequence meanwhile", where=sequence, hint="run again")

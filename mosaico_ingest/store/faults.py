@@ -7,11 +7,12 @@ import os
 import sqlite3
 from collections.abc import Generator
 from contextlib import contextmanager
-from pathlib import Path
 
 import pyarrow as pa
 
-from mosaico_ingest.errors import SinkError, SinkUnavailable
+from mosaico_ingest.errors import SinkError, SinkUnavailable, Unreachable
+from mosaico_ingest.remote.faults import is_transient
+from mosaico_ingest.remote.path import AnyPath
 
 __all__ = ["NotInStore", "explained"]
 
@@ -31,11 +32,15 @@ class NotInStore(SinkError):  # noqa: N818 - the condition, as in `errors`
 
 
 @contextmanager
-def explained(where: Path | str) -> Generator[None, None, None]:
+def explained(where: AnyPath | str) -> Generator[None, None, None]:
     """Raise SinkError, with the place and a remedy, for whatever the store's ground refuses inside."""
     try:
         yield
+    except Unreachable as err:
+        raise SinkUnavailable(err.what, where=err.where, hint=err.hint) from err
     except OSError as err:
+        if is_transient(err):
+            raise SinkUnavailable(_first_line(err), where=str(where), hint="try again") from err
         code = err.errno or 0
         what = os.strerror(code) if code else _first_line(err)
         raise SinkError(what, where=str(err.filename or where), hint=_HINTS.get(code)) from err

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 
 from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.remote.path import AnyPath
 from mosaico_ingest.store.content import combined
 
 __all__ = ["Collected", "Note", "SegmentInfo", "SequenceInfo", "SessionInfo", "TopicInfo"]
@@ -19,7 +19,7 @@ __all__ = ["Collected", "Note", "SegmentInfo", "SequenceInfo", "SessionInfo", "T
 class SegmentInfo:
     """One Parquet file: rows of one topic and session, sorted by `timestamp_ns`."""
 
-    path: Path
+    path: AnyPath
     session: str
     rows: int
     stored_bytes: int

@@ -11,6 +11,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from mosaico_ingest.remote.path import AnyPath
 from mosaico_ingest.store.entries import ontology_of
 from mosaico_ingest.store.model import Note, SegmentInfo, SequenceInfo, SessionInfo, TopicInfo
 
@@ -39,9 +40,9 @@ def sequence(db: sqlite3.Connection, name: str, root: Path) -> SequenceInfo | No
 
 def bounds(
     db: sqlite3.Connection, topic: TopicInfo, columns: Collection[str], root: Path
-) -> dict[Path, dict[str, tuple[Any, Any]]]:
+) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
     """Return the known bounds of the columns asked for, by the path of the segment."""
-    found: dict[Path, dict[str, tuple[Any, Any]]] = defaultdict(dict)
+    found: dict[AnyPath, dict[str, tuple[Any, Any]]] = defaultdict(dict)
     rows = db.execute(
         "SELECT path, column_path, low, high FROM bounds JOIN segments ON segments.id = segment_id"
         " JOIN topics ON topics.id = topic_id JOIN sequences ON sequences.id = sequence_id"

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from mosaico_ingest.store.faults import explained
+from mosaico_ingest.store.files import opened
 from mosaico_ingest.store.model import SegmentInfo
 from mosaico_ingest.store.segment import sorted_rows, time_span
 
@@ -85,7 +85,7 @@ def _overlapping(segments: Iterable[SegmentInfo]) -> Iterator[list[SegmentInfo]]
 
 
 def _read(segment: SegmentInfo, schema: pa.Schema, window: Window) -> Iterator[pa.RecordBatch]:
-    with explained(segment.path), pq.ParquetFile(segment.path) as file:
+    with explained(str(segment.path)), opened(segment.path) as file:
         for group in range(file.num_row_groups):
             if not window.overlaps(*time_span(file.metadata, group)):
                 continue

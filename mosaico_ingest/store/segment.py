@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from mosaico_ingest.remote.path import AnyPath
+from mosaico_ingest.store import files
 from mosaico_ingest.store.columns import Leaf, leaves, writer_options
 from mosaico_ingest.store.content import ContentHash
-from mosaico_ingest.store.layout import fsync
 
 __all__ = ["Bounds", "Segment", "SegmentWriter", "sorted_rows", "time_span"]
 
@@ -29,7 +29,7 @@ _LARGEST_INTEGER = 1 << 63
 class Segment:
     """A finished segment, on the disk to stay."""
 
-    path: Path
+    path: AnyPath
     rows: int
     stored_bytes: int
     start_ns: int
@@ -42,12 +42,12 @@ class Segment:
 class SegmentWriter:
     """Writes row groups to `path`; the columns' codecs are chosen from the first rows."""
 
-    def __init__(self, path: Path, schema: pa.Schema, first_rows: pa.Table) -> None:
+    def __init__(self, path: AnyPath, schema: pa.Schema, first_rows: pa.Table) -> None:
         self.path = path
         self.end_ns = -(1 << 63)
         self._leaves = leaves(schema)
         self._content = ContentHash(schema)
-        self._file = pa.OSFile(str(path), "wb")
+        self._file = files.create(path)
         self._writer = pq.ParquetWriter(
             self._file,
             schema,
@@ -73,8 +73,8 @@ class SegmentWriter:
         """Finish the file, wait until it is on the disk, and read its footer back."""
         self._writer.close()
         self._file.close()
-        fsync(self.path)
-        footer = pq.read_metadata(self.path)
+        files.settle(self.path)
+        footer = files.footer(self.path)
         bounds = tuple(_bounds(self._leaves, footer))
         _, start_ns, end_ns = bounds[0]
         return Segment(

@@ -6,21 +6,21 @@ import os
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing
+from functools import partial
 from typing import Any
-
-import pyarrow.parquet as pq
 
 from mosaico_ingest import wire
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.policies import IfExists
+from mosaico_ingest.remote.path import AnyPath
 from mosaico_ingest.sink import StoredTopic, check_same_type
-from mosaico_ingest.store import entries
-from mosaico_ingest.store.catalog import Catalog
+from mosaico_ingest.store import entries, files
 from mosaico_ingest.store.content import combined
 from mosaico_ingest.store.faults import explained
-from mosaico_ingest.store.layout import Layout, new_session_id
-from mosaico_ingest.store.lease import Lease, is_live
+from mosaico_ingest.store.layout import new_session_id
+from mosaico_ingest.store.seams import Files, Records
 from mosaico_ingest.store.segment import time_span
 from mosaico_ingest.store.topic import Staging, StoreTopic
 
@@ -32,8 +32,8 @@ class StoreSession:
 
     def __init__(
         self,
-        layout: Layout,
-        catalog: Catalog,
+        layout: Files,
+        catalog: Records,
         sequence: str,
         metadata: str,
         *,
@@ -47,13 +47,14 @@ class StoreSession:
         self._metadata = metadata
         self._given: dict[str, StoreTopic] = {}
         self._notes: list[entries.NewNote] = []
-        self._staging = Staging(layout.session(self.id), buffer_bytes=buffer_bytes)
-        with explained(layout.staging):
-            layout.session(self.id).mkdir(parents=True)
-            self._lease = Lease(layout.lock(self.id))
+        self._staging = Staging(
+            layout.root, partial(layout.staged, self.id, sequence), buffer_bytes=buffer_bytes
+        )
+        self._lease = layout.begin(self.id)
+        self._held = ExitStack()
         try:
-            with catalog.write() as db:
-                self._claim = entries.claim(db, self.id, sequence, if_exists, is_live=self._is_live)
+            self._held.enter_context(closing(catalog.keep_open()))
+            self._claim = catalog.claim(self.id, sequence, if_exists, is_live=layout.is_live)
         except BaseException:
             self._leave()
             raise
@@ -86,17 +87,16 @@ class StoreSession:
         with ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="segment") as pool:
             list(pool.map(StoreTopic.close, self._staging.topics.values()))
         topics = tuple(self._placed(topic) for topic in self._staging.topics.values())
-        moves = {
+        moves: dict[AnyPath, AnyPath] = {
             segment.path: self._layout.root / path
             for topic in topics
             for path, segment in topic.segments.items()
         }
         new = entries.NewSession(self.id, self._metadata, self.created_ns, topics, tuple(self._notes))
         try:
-            with explained(self._layout.segments):
+            with explained(self._layout.root):
                 self._layout.publish(moves)
-            with self._catalog.write() as db:
-                replaced = entries.commit(db, self._claim, new)
+            replaced = self._catalog.commit(self._claim, new)
         except BaseException:
             self._layout.remove(moves.values())
             raise
@@ -108,8 +108,7 @@ class StoreSession:
         for topic in self._staging.topics.values():
             topic.abandon()
         try:
-            with self._catalog.write() as db:
-                entries.release(db, self.id)
+            self._catalog.release(self.id, self._claim.sequence)
         except SinkError:
             return  # the error that ended the session matters more, and the name is free without its lock
         finally:
@@ -129,7 +128,7 @@ class StoreSession:
         for segment in topic.segments:
             path = folder / segment.path.name
             with explained(path):
-                footer = pq.read_metadata(path)
+                footer = files.footer(path)
                 stored_bytes += path.stat().st_size
                 rows += footer.num_rows
                 for group in range(footer.num_row_groups):
@@ -140,8 +139,6 @@ class StoreSession:
         )
 
     def _leave(self) -> None:
+        self._held.close()
         self._lease.release()
         self._layout.discard(self.id)
-
-    def _is_live(self, session: str) -> bool:
-        return is_live(self._layout.lock(session))

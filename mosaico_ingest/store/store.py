@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 
 from mosaico_ingest import wire
 from mosaico_ingest.errors import SinkError
-from mosaico_ingest.store import entries, queries, removal
+from mosaico_ingest.remote.path import AnyPath, RemotePath, as_path
 from mosaico_ingest.store.catalog import Catalog
+from mosaico_ingest.store.entries import NewNote
 from mosaico_ingest.store.faults import NotInStore, explained
 from mosaico_ingest.store.layout import Layout
-from mosaico_ingest.store.lease import is_live
 from mosaico_ingest.store.model import Collected, SequenceInfo, TopicInfo
 from mosaico_ingest.store.scan import Window, scan
+from mosaico_ingest.store.seams import Files, Records
 
 __all__ = ["Store"]
 
@@ -29,39 +29,57 @@ _GRACE_S = 10.0
 class Store:
     """A folder of Parquet segments and the catalog that says what they are; made by `Store.open`."""
 
-    layout: Layout
-    catalog: Catalog
+    layout: Files
+    catalog: Records
 
     @classmethod
-    def open(cls, path: str | Path, *, create: bool = True) -> Store:
-        """Open the store in the folder `path`; it is made where there is none, unless `create` is off.
+    def open(cls, path: str | AnyPath, *, create: bool = True) -> Store:
+        """Open the store in the folder or behind the URL `path`; it is made where there is none, unless `create` is off.
 
         Raises:
             SinkError: There is no store, it cannot be written, or a newer version made it.
         """
-        layout = Layout(Path(path))
+        place = as_path(path)
+        if isinstance(place, RemotePath):
+            from mosaico_ingest.store.bucket import Bucket  # noqa: PLC0415 - only stores behind URLs need it
+            from mosaico_ingest.store.documents import Documents  # noqa: PLC0415 - the same
+
+            bucket = Bucket(place)
+            return cls(bucket, Documents(bucket, create=create))
+        layout = Layout(place)
         return cls(layout, Catalog(layout.catalog, create=create))
 
+    @classmethod
+    def find(cls, path: AnyPath) -> Store | None:
+        """Open the store in a folder or behind a URL; None where there is none."""
+        if isinstance(path, RemotePath):
+            from mosaico_ingest.store.bucket import Bucket  # noqa: PLC0415 - only stores behind URLs need it
+
+            is_there = Bucket(path).is_there()
+        else:
+            is_there = Layout(path).catalog.is_file()
+        return cls.open(path, create=False) if is_there else None
+
     @property
-    def path(self) -> Path:
+    def path(self) -> AnyPath:
         """The folder."""
         return self.layout.root
 
     def sequences(self) -> tuple[SequenceInfo, ...]:
         """Return every sequence, by name."""
-        with self.catalog.read() as db:
-            found = (queries.sequence(db, name, self.path) for name in queries.names(db))
-            return tuple(info for info in found if info is not None)
+        return self.catalog.sequences()
 
     def names(self) -> tuple[str, ...]:
         """Return the names of all sequences, sorted."""
-        with self.catalog.read() as db:
-            return tuple(queries.names(db))
+        return tuple(self.catalog.names())
 
-    def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[Path, dict[str, tuple[Any, Any]]]:
+    def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
         """Return the smallest and largest value of columns, as `pose.x`, by segment, where they are known."""
-        with self.catalog.read() as db:
-            return queries.bounds(db, topic, columns, self.path)
+        return self.catalog.bounds(topic, columns)
+
+    def find_sequence(self, name: str) -> SequenceInfo | None:
+        """Return one sequence, None where there is none of that name."""
+        return self.catalog.sequence(name)
 
     def sequence(self, name: str) -> SequenceInfo:
         """Return one sequence.
@@ -69,10 +87,9 @@ class Store:
         Raises:
             SinkError: There is none of that name; the error lists those there are.
         """
-        with self.catalog.read() as db:
-            info = queries.sequence(db, name, self.path)
-            known = queries.names(db) if info is None else []
+        info = self.catalog.sequence(name)
         if info is None:
+            known = self.catalog.names()
             raise NotInStore(f"there is no sequence {name!r}", where=str(self.path), hint=_listed(known))
         return info
 
@@ -96,20 +113,17 @@ class Store:
             SinkError: The name or the metadata is refused.
         """
         described = wire.check_metadata(metadata, where=sequence)
-        with self.catalog.write() as db:
-            entries.create(db, wire.check_sequence_name(sequence), described)
+        self.catalog.create(wire.check_sequence_name(sequence), described)
 
     def add_note(self, sequence: str, message: str, *, topic: str | None = None) -> None:
         """Attach an error to a sequence, or to one of its topics."""
-        with self.catalog.write() as db:
-            entries.note(db, sequence, entries.NewNote(topic, message, time.time_ns()))
+        self.catalog.note(sequence, NewNote(topic, message, time.time_ns()))
 
     def delete_notes(self, sequence: str, *, topic: str | None = None) -> None:
         """Remove the notes of a sequence itself, or those of one topic."""
-        with self.catalog.write() as db:
-            removal.notes(db, sequence, topic)
+        self.catalog.delete_notes(sequence, topic)
 
-    def paths(self, sequence: str, topic: str) -> tuple[Path, ...]:
+    def paths(self, sequence: str, topic: str) -> tuple[AnyPath, ...]:
         """Return the Parquet files of a topic, each sorted by `timestamp_ns`."""
         return tuple(segment.path for segment in self.topic(sequence, topic).segments)
 
@@ -136,21 +150,15 @@ class Store:
 
     def delete_sequence(self, sequence: str) -> None:
         """Remove a sequence with all it holds; SinkError where there is none."""
-        with self.catalog.write() as db:
-            paths = removal.sequence(db, sequence)
-        self.layout.remove(self.path / path for path in paths)
+        self._remove(self.catalog.delete_sequence(sequence))
 
     def delete_topic(self, sequence: str, topic: str) -> None:
         """Remove one topic; SinkError where there is none."""
-        with self.catalog.write() as db:
-            paths = removal.topic(db, sequence, f"/{topic.removeprefix('/')}")
-        self.layout.remove(self.path / path for path in paths)
+        self._remove(self.catalog.delete_topic(sequence, f"/{topic.removeprefix('/')}"))
 
     def delete_session(self, sequence: str, session: str) -> None:
         """Remove what one session added; SinkError where there is none."""
-        with self.catalog.write() as db:
-            paths = removal.session(db, sequence, session)
-        self.layout.remove(self.path / path for path in paths)
+        self._remove(self.catalog.delete_session(sequence, session))
 
     def collect_garbage(self, *, grace_s: float = _GRACE_S) -> Collected:
         """Remove what crashed writers and interrupted deletions left; live sessions are not touched.
@@ -160,9 +168,8 @@ class Store:
         with explained(self.path):
             files = list(self.layout.segment_files())
             sessions = self.layout.open_sessions()
-            live = {session for session in sessions if self._in_use(session, grace_s)}
-            with self.catalog.write() as db:
-                known = removal.forget(db, live)
+            live = {session for session in sessions if self.layout.in_use(session, grace_s)}
+            known = self.catalog.forget(live)
             orphans = [file for file in files if self._is_orphan(file, known, live)]
             dead = sorted(set(sessions) - live)
             staged = [file for session in dead for file in self.layout.staged_files(session)]
@@ -172,12 +179,10 @@ class Store:
                 self.layout.discard(session)
         return Collected(len(dead), len(orphans) + len(staged), stored_bytes)
 
-    def _in_use(self, session: str, grace_s: float) -> bool:
-        folder = self.layout.session(session)
-        young = folder.exists() and time.time() - folder.stat().st_mtime < grace_s
-        return young or is_live(self.layout.lock(session))
+    def _remove(self, paths: Iterable[str]) -> None:
+        self.layout.remove(self.path / path for path in paths)
 
-    def _is_orphan(self, file: Path, known: set[str], live: set[str]) -> bool:
+    def _is_orphan(self, file: AnyPath, known: set[str], live: set[str]) -> bool:
         return self.layout.relative(file) not in known and file.name.partition("-")[0] not in live
 
 

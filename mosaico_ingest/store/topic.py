@@ -5,14 +5,14 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from pathlib import Path
 
 import pyarrow as pa
 
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.remote.path import AnyPath
 from mosaico_ingest.sink import check_batch, topic_schema
 from mosaico_ingest.store.columns import check_columns
 from mosaico_ingest.store.faults import explained
@@ -26,17 +26,18 @@ _SEGMENT_BYTES = 512 << 20
 
 
 class Staging:
-    """The topics of a session, the folder their segments are staged in, and the memory they share."""
+    """The topics of a session, where their segments are staged, and the memory they share."""
 
-    def __init__(self, folder: Path, *, buffer_bytes: int) -> None:
-        self.folder = folder
+    def __init__(self, where: AnyPath, staged: Callable[[str, int], AnyPath], *, buffer_bytes: int) -> None:
+        self.where = where
+        self._staged = staged
         self.topics: dict[str, StoreTopic] = {}
         self._buffer_bytes = buffer_bytes
         self._numbers = itertools.count()
 
-    def next_path(self) -> Path:
-        """Return a file name no other segment of the session has."""
-        return self.folder / f"{self.folder.name}-{next(self._numbers):04}.parquet"
+    def next_path(self, topic: str) -> AnyPath:
+        """Return a path no other segment of the session has."""
+        return self._staged(topic, next(self._numbers))
 
     def relieve(self) -> None:
         """Write out the topic that holds most where all of them hold too much."""
@@ -102,7 +103,7 @@ class StoreTopic:
     @contextmanager
     def _writing(self) -> Generator[None, None, None]:
         """Hold the lock; what fails inside leaves a file nobody may finish, so the topic cannot be committed."""
-        with self._lock, explained(self._staging.folder):
+        with self._lock, explained(self._staging.where):
             self._refuse_if_broken()
             self._broken = True
             yield
@@ -122,7 +123,7 @@ class StoreTopic:
         if self._writer is not None and rows.column(0)[0].as_py() < self._writer.end_ns:
             self._finish_segment()  # a segment is sorted from its first row to its last
         if self._writer is None:
-            self._writer = SegmentWriter(self._staging.next_path(), self.schema, rows)
+            self._writer = SegmentWriter(self._staging.next_path(self.name), self.schema, rows)
         self._writer.append(rows)
         if self._writer.written_bytes >= _SEGMENT_BYTES:
             self._finish_segment()

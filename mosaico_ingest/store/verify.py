@@ -9,6 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mosaico_ingest.store.content import ContentHash
+from mosaico_ingest.store.files import opened
 from mosaico_ingest.store.model import SegmentInfo, SequenceInfo, TopicInfo
 from mosaico_ingest.store.segment import time_span
 
@@ -33,7 +34,7 @@ def verify(info: SequenceInfo) -> Iterator[Checked]:
 
 def _problem(topic: TopicInfo, segment: SegmentInfo) -> str | None:
     try:
-        with pq.ParquetFile(segment.path, page_checksum_verification=True) as file:
+        with opened(segment.path, page_checksum_verification=True) as file:
             same_columns = file.schema_arrow.equals(topic.schema)
             content = ContentHash(file.schema_arrow)
             found = (segment.path.stat().st_size, *_rows_and_span(file, content))

@@ -146,7 +146,7 @@ def _span(store: Store, topic: TopicInfo, tests: Tests, *, whole: bool) -> tuple
     span: tuple[int, int] | None = None
     for segment in _promising(store, topic, tests):
         with explained(segment.path):
-            rows = ds.dataset(segment.path, schema=topic.schema, format="parquet")
+            rows = ds.dataset(str(segment.path), schema=topic.schema, format="parquet")
             for batch in rows.to_batches(columns=[topic.schema.names[0]], filter=condition):
                 if not batch.num_rows:
                     continue

@@ -10,6 +10,7 @@ from types import TracebackType
 import pyarrow as pa
 
 from mosaico_ingest.errors import SinkError
+from mosaico_ingest.remote.path import RemotePath, as_path
 from mosaico_ingest.store.faults import explained
 from mosaico_ingest.store.server.keyring import Keyring
 from mosaico_ingest.store.server.service import Service
@@ -92,7 +93,12 @@ def serve(
     Raises:
         SinkError: The store cannot be opened, the certificate cannot be read, or the port is taken.
     """
-    store = Store.open(store_path)
+    place = as_path(store_path)
+    if isinstance(place, RemotePath):
+        raise SinkError(
+            "a server answers from a store on a disk", where=str(place), hint="read the store where it lies"
+        )
+    store = Store.open(place)
     scheme = "grpc" if tls is None else "grpc+tls"
     certificates = None if tls is None else [(_read(tls.certificate), _read(tls.key))]
     try:
