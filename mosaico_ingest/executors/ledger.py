@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mosaico_ingest.config import ServerTarget, StoreTarget
 from mosaico_ingest.diagnostics import encodable
-from mosaico_ingest.errors import BagError, SequenceExists
+from mosaico_ingest.errors import SequenceExists
+from mosaico_ingest.executors.content import content_digest, whole_digest
 from mosaico_ingest.plan.describe import decisions
 from mosaico_ingest.plan.model import LEDGER_KEY, Plan
 from mosaico_ingest.policies import IfExists
@@ -28,15 +28,12 @@ __all__ = [
     "Held",
     "Ledger",
     "Source",
-    "content_digest",
+    "certain",
     "enter",
     "held",
     "ledger_of",
     "what_to_do",
 ]
-
-_PIECE_BYTES = 1 << 20
-_PIECES = 64
 
 
 class _Part(BaseModel):
@@ -49,6 +46,16 @@ class Source(_Part):
     name: str
     size_bytes: int
     content: str
+    """Digest of its samples, see `content_digest`; behind a URL the version that is there."""
+    modified_ns: int | None = None
+    whole: str | None = None
+    """Digest of every byte, where `content` is not one and all of it was read."""
+
+    def same_content(self, other: Source) -> bool:
+        """Say whether both are about the same bytes, as far as is known."""
+        return self.content == other.content and (
+            None in {self.whole, other.whole} or self.whole == other.whole
+        )
 
 
 class Ledger(_Part):
@@ -67,7 +74,8 @@ class Ledger(_Part):
 
     def same_content(self, other: Ledger) -> bool:
         """Say whether both are about the same bytes, whatever the files are called."""
-        return [s.content for s in self.sources] == [s.content for s in other.sources]
+        pairs = zip(self.sources, other.sources, strict=False)
+        return len(self.sources) == len(other.sources) and all(one.same_content(two) for one, two in pairs)
 
 
 class Held(_Part):
@@ -91,9 +99,12 @@ def enter(plan: Plan) -> Plan | None:
     if plan.attempt is not None and plan.attempt.number > 1:
         if_exists = _take_back(plan, plan.attempt.run)
     if if_exists is IfExists.SKIP:
-        if_exists = what_to_do(ledger, held(plan.target, plan.sequence), plan.sequence)
+        found = held(plan.target, plan.sequence)
+        ledger = certain(ledger, plan.files, found)
+        if_exists = what_to_do(ledger, found, plan.sequence)
     if if_exists is None:
         return None
+    ledger = _whole(ledger, plan.files)
     kept_as = kept_name(plan.sequence) if plan.quarantine else None
     noted = ledger.model_copy(update={"quarantine": kept_as}).model_dump(mode="json")
     return replace(plan, if_exists=if_exists, kept_as=kept_as, metadata={**plan.metadata, LEDGER_KEY: noted})
@@ -101,47 +112,47 @@ def enter(plan: Plan) -> Plan | None:
 
 def ledger_of(plan: Plan) -> Ledger:
     """Read the recording's files and return what this run is going to note."""
-    sources = tuple(
-        Source(name=encodable(path.name), size_bytes=path.stat().st_size, content=_content(path))
-        for path in plan.files
-    )
+    sources = tuple(map(_source, plan.files))
     run = plan.attempt.run if plan.attempt else None
     return Ledger(tool=__version__, job=_job_digest(plan), sources=sources, family=plan.family, run=run)
 
 
-def _content(path: AnyPath) -> str:
-    """Return a name for the content; behind a URL it is the store's own, as reading all of it has its price."""
-    return path.version() if isinstance(path, RemotePath) else content_digest(path)
+def _source(path: AnyPath) -> Source:
+    """Name the content of one file; behind a URL its version does, as reading all of it has its price."""
+    stat = path.stat()
+    name, size_bytes = encodable(path.name), stat.st_size
+    if isinstance(path, RemotePath):
+        return Source(name=name, size_bytes=size_bytes, content=path.version())
+    return Source(
+        name=name, size_bytes=size_bytes, content=content_digest(path), modified_ns=stat.st_mtime_ns
+    )
 
 
-def content_digest(path: Path) -> str:
-    """Return a name for the content of a file: SHA-256 over its length and the CRC-32 of every MiB, or of 64 of them.
+def certain(ledger: Ledger, files: Sequence[AnyPath], found: Held | None) -> Ledger:
+    """Return the ledger with digests of whole files where samples leave a doubt.
 
-    Of a larger file the pieces lie evenly from its first byte to its last, so that a piece of a long recording is
-    not paid for with reading all of it. A new recording differs in each of them; it is no defence against forgery.
-
-    Raises:
-        BagError: The file cannot be read.
+    They do where a file has the samples of one that is known, and was changed, or only copied, at another time.
     """
-    digest = hashlib.sha256()
-    piece = bytearray(_PIECE_BYTES)
-    try:
-        with path.open("rb", buffering=0) as file:
-            size = path.stat().st_size
-            for position in _positions(size):
-                file.seek(position)
-                got = file.readinto(piece)
-                digest.update(zlib.crc32(memoryview(piece)[:got]).to_bytes(4, "little"))
-    except OSError as error:
-        raise BagError(f"cannot be read: {error.strerror}", where=str(path)) from error
-    digest.update(size.to_bytes(8, "little"))
-    return digest.hexdigest()[:32]
+    known = [source for each in (found.ledgers if found else ()) for source in each.sources]
+    doubtful = {
+        source.content
+        for source in ledger.sources
+        if any(one.content == source.content and one.whole for one in known)
+        and all((one.content, one.modified_ns) != (source.content, source.modified_ns) for one in known)
+    }
+    return _whole(ledger, files, contents=doubtful) if doubtful else ledger
 
 
-def _positions(size: int) -> Iterable[int]:
-    if size <= _PIECES * _PIECE_BYTES:
-        return range(0, size, _PIECE_BYTES)
-    return [number * (size - _PIECE_BYTES) // (_PIECES - 1) for number in range(_PIECES)]
+def _whole(ledger: Ledger, files: Sequence[AnyPath], *, contents: Container[str] | None = None) -> Ledger:
+    """Return the ledger with digests of whole files, of those with these `contents` or of all."""
+
+    def whole(source: Source, path: AnyPath) -> Source:
+        wanted = source.whole is None and (contents is None or source.content in contents)
+        if isinstance(path, RemotePath):
+            return source
+        return source.model_copy(update={"whole": whole_digest(path)}) if wanted else source
+
+    return ledger.model_copy(update={"sources": tuple(map(whole, ledger.sources, files))})
 
 
 def held(target: StoreTarget | ServerTarget, sequence: str) -> Held | None:
