@@ -38,6 +38,8 @@ def ros_version(distro: Stores) -> int | None:
 
 def distro_type(distro: Stores, name: str) -> MessageType | None:
     """Return a distro's type by full name, None where it has none."""
+    if name.count("/") != 2:  # noqa: PLR2004 - as in pkg/msg/Name; loading a distro takes a while
+        return None
     types = _types(distro)
     return message_type(name, types) if name in types else None
 
