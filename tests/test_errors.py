@@ -8,7 +8,7 @@ import pytest
 
 from mosaico_ingest import errors
 from mosaico_ingest.diagnostics import Finding, Severity
-from mosaico_ingest.errors import IngestError, ManifestError, SinkUnavailable
+from mosaico_ingest.errors import IngestError, ManifestError, SinkUnavailable, Unreachable
 
 KINDS = [getattr(errors, name) for name in errors.__all__]
 FINDING = Finding("unknown-key", Severity.ERROR, "unknown key")
@@ -27,8 +27,8 @@ def test_findings_survive_pickling() -> None:
     assert error.findings == (FINDING,)
 
 
-def test_only_an_unavailable_destination_is_worth_another_try() -> None:
-    assert [kind for kind in KINDS if kind.retryable] == [SinkUnavailable]
+def test_only_what_cannot_be_reached_is_worth_another_try() -> None:
+    assert [kind for kind in KINDS if kind.retryable] == [SinkUnavailable, Unreachable]
 
 
 def test_exit_codes_are_the_documented_ones() -> None:
