@@ -12,7 +12,7 @@ __all__ = ["bag"]
 
 def bag(
     path: Annotated[
-        Path, typer.Argument(metavar="BAG", help="A .bag, .db3 or .mcap file, or a rosbag2 directory.")
+        str, typer.Argument(metavar="BAG", help="A .bag, .db3 or .mcap file, a rosbag2 directory, or a URL.")
     ],
     *,
     name: Annotated[str, typer.Option("--name", "-n", help="Name of the sequence.")],
@@ -40,7 +40,10 @@ def bag(
         Path | None, typer.Option("--tls-cert", help="CA certificate the server is checked against.")
     ] = None,
     store: Annotated[
-        Path | None, typer.Option("--store", help="The embedded store to write to [default: ./mosaico].")
+        str | None,
+        typer.Option(
+            "--store", help="The embedded store, a folder or URL, to write to [default: ./mosaico]."
+        ),
     ] = None,
     report: Annotated[Path | None, typer.Option("--report", help="Write the report as JSON.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,

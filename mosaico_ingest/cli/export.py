@@ -23,9 +23,9 @@ def export(
         Path,
         typer.Option("--to", help="The recording: .mcap, .db3 (ROS 2) or .bag (ROS 1).", metavar="FILE"),
     ],
-    store: Annotated[Path, typer.Option("--store", help="The store's folder.", metavar="DIR")] = Path(
-        "mosaico"
-    ),
+    store: Annotated[
+        str, typer.Option("--store", help="The store's folder or URL.", metavar="DIR|URL")
+    ] = "mosaico",
     topics: Annotated[
         list[str] | None,
         typer.Option("--topics", "-t", help="Topic or glob; a leading ! leaves out. Repeatable."),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -11,7 +10,9 @@ __all__ = ["inspect"]
 
 
 def inspect(
-    path: Annotated[Path, typer.Argument(metavar="BAG", help="A recording: a file or a rosbag2 directory.")],
+    path: Annotated[
+        str, typer.Argument(metavar="BAG", help="A recording: a file, a rosbag2 directory, or a URL.")
+    ],
     ros_distro: Annotated[
         str | None, typer.Option("--ros-distro", help="As ros2_humble; for recordings without definitions.")
     ] = None,

@@ -21,6 +21,7 @@ from mosaico_ingest.plan.document import (
     Sample,
 )
 from mosaico_ingest.plan.drift import Difference
+from mosaico_ingest.remote.path import is_url
 from mosaico_ingest.report.units import bytes_text, count_text, seconds_text, time_text
 
 __all__ = ["print_differences", "print_plan"]
@@ -54,7 +55,7 @@ def _print_recording(recording: RecordingPlan, folder: Path, console: Console) -
     decided = recording.decisions
     place = decided.destination
     if recording.destination.kind == "store":
-        place = normpath(folder / place)
+        place = _seen_from(folder, place)
     console.print(Text(f"{decided.sequence} → {place}", style="bold"))
     console.print(_source(decided, folder), highlight=False)
     samples = {sample.target: sample for sample in recording.samples}
@@ -83,7 +84,7 @@ def _print_recording(recording: RecordingPlan, folder: Path, console: Console) -
 
 def _source(decided: Decisions, folder: Path) -> str:
     size = sum(part.size_bytes for part in decided.files)
-    names = ", ".join(normpath(folder / part.path) for part in decided.files)
+    names = ", ".join(_seen_from(folder, part.path) for part in decided.files)
     text = f"{names}: {decided.container} by its first bytes, {bytes_text(size)}, "
     text += f"{time_text(decided.start_ns)} .. {time_text(decided.end_ns)} UTC"
     if decided.start_ns is not None and decided.end_ns is not None:
@@ -91,6 +92,10 @@ def _source(decided: Decisions, folder: Path) -> str:
     if decided.read_from_ns is not None or decided.read_until_ns is not None:
         text += f", read from {time_text(decided.read_from_ns)} until {time_text(decided.read_until_ns)}"
     return text
+
+
+def _seen_from(folder: Path, path: str) -> str:
+    return path if is_url(path) else normpath(folder / path)
 
 
 def _tried(sample: Sample) -> Text:

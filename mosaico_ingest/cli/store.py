@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -11,9 +10,9 @@ __all__ = ["app"]
 
 app = typer.Typer(no_args_is_help=True, help="Look into the embedded store.")
 
-Folder = Annotated[Path, typer.Option("--store", help="The store's folder.", metavar="DIR")]
+Folder = Annotated[str, typer.Option("--store", help="The store's folder or URL.", metavar="DIR|URL")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-DEFAULT = Path("mosaico")
+DEFAULT = "mosaico"
 
 
 @app.command("ls")

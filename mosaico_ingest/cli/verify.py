@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -14,9 +13,9 @@ def verify(
     sequences: Annotated[
         list[str] | None, typer.Argument(metavar="[SEQUENCE]...", help="Which ones; all without a name.")
     ] = None,
-    store: Annotated[Path, typer.Option("--store", help="The store's folder.", metavar="DIR")] = Path(
-        "mosaico"
-    ),
+    store: Annotated[
+        str, typer.Option("--store", help="The store's folder or URL.", metavar="DIR|URL")
+    ] = "mosaico",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Read stored sequences back and hold every page and all rows against their checksums; exit 5 where they differ."""
@@ -47,7 +46,7 @@ def verify(
     if bad:
         raise VerificationError(
             f"{len(bad)} files are not as they were written",
-            where=str(store),
+            where=store,
             hint="ingest their recordings again with if_exists: replace",
         )
     if not as_json:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from mosaico_ingest.diagnostics import Span
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.manifest.source import Path, Value
+from mosaico_ingest.remote.path import without_options
 
 __all__ = [
     "all_paths",
@@ -46,15 +47,15 @@ def metadata_places(job: Job) -> Iterator[Path]:
 
 
 def recording_paths(job: Job) -> Iterator[tuple[Path, str]]:
-    """Yield each path of `bag.path` that is known, with its place."""
+    """Yield each path of `bag.path` that is known, without a URL's options, with its place."""
     path = job.manifest.bag.path
     if isinstance(path, str):
         if job.known(path):
-            yield ("bag", "path"), path
+            yield ("bag", "path"), without_options(path)
         return
     for i, part in enumerate(path):
         if job.known(part):
-            yield ("bag", "path", i), part
+            yield ("bag", "path", i), without_options(part)
 
 
 def all_paths(job: Job) -> Iterator[tuple[Path, str]]:

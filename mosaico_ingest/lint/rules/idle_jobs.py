@@ -20,12 +20,15 @@ from mosaico_ingest.diagnostics import Severity
 from mosaico_ingest.lint.globs import is_glob
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.remote.path import without_options
 
 
 def check(job: Job) -> Iterator[Problem]:
     """Yield a problem if there are more jobs than one and the path is no glob."""
     path = job.manifest.bag.path
-    if job.manifest.run.jobs > 1 and not (isinstance(path, str) and (is_glob(path) or not job.known(path))):
+    if job.manifest.run.jobs > 1 and not (
+        isinstance(path, str) and (is_glob(without_options(path)) or not job.known(path))
+    ):
         yield Problem("there is one recording, so one job", job.span("run", "jobs"), "remove it")
 
 

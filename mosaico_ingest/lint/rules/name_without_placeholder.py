@@ -20,6 +20,7 @@ from mosaico_ingest.lint.globs import is_glob
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.rule import Problem, Rule
 from mosaico_ingest.manifest.placeholders import placeholders_in
+from mosaico_ingest.remote.path import without_options
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -28,7 +29,7 @@ def check(job: Job) -> Iterator[Problem]:
     varying = any(
         placeholder.name in {"stem", "name", "index", "parent"} for placeholder in placeholders_in(name)
     )
-    if isinstance(path, str) and is_glob(path) and job.known(name) and not varying:
+    if isinstance(path, str) and is_glob(without_options(path)) and job.known(name) and not varying:
         span = job.span("sequence", "name")
         message = f"every recording that {path} matches would be named {name!r}"
         yield Problem(message, span, "put {stem} or {index} into it")

@@ -1,0 +1,42 @@
+"""`wrong-url`: a URL that cannot be reached as it is written.
+
+Recordings and stores may lie behind `s3://` and `gs://`; other places are files, and a password belongs into the
+environment.
+
+Bad:
+    bag: {path: "ftp://example.org/drives/run.mcap"}
+
+Good:
+    bag: {path: "s3://drives/run.mcap"}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.errors import IngestError
+from mosaico_ingest.lint.job import Job
+from mosaico_ingest.lint.places import all_paths
+from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.remote.path import as_path, is_url
+
+_MAY_BE_URLS = {("bag", "path"), ("target", "store")}
+
+
+def check(job: Job) -> Iterator[Problem]:
+    """Yield a problem for each URL that is not understood, or that stands where a file must be; nobody is asked."""
+    for place, path in all_paths(job):
+        if not is_url(path):
+            continue
+        if place[:2] not in _MAY_BE_URLS:
+            message = f"{'.'.join(map(str, place))} is a URL, and only recordings and stores may be"
+            yield Problem(message, job.source.span(place), "name a file")
+            continue
+        try:
+            as_path(path)
+        except IngestError as error:
+            yield Problem(f"{error.where}: {error.what}", job.source.span(place), error.hint or "")
+
+
+RULE = Rule("ING240", __name__, Severity.ERROR, __doc__, job=check)
