@@ -130,7 +130,7 @@ class _Lines:
         self._tally.add(event)
         now = time.monotonic()
         match event:
-            case RunStarted():
+            case RunStarted() if event.topics:
                 self._print(_begins(event))
                 self._next = now + PLAIN_EVERY_S
             case Noted():

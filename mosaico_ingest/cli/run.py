@@ -62,6 +62,9 @@ def run(
         Path | None,
         typer.Option("--metrics", help="Write the sums for Prometheus' textfile collector.", metavar="FILE"),
     ] = None,
+    otel: Annotated[
+        bool, typer.Option("--otel", help="Send metrics and traces where the OTEL_... variables say.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
     log: Annotated[
         str | None, typer.Option("--log", help="Log level; overrides run.log_level.", metavar="LEVEL")
@@ -74,6 +77,7 @@ def run(
     from mosaico_ingest import api
     from mosaico_ingest.cli.session import run_configs
     from mosaico_ingest.cli.shard import take_shard
+    from mosaico_ingest.cli.telemetry import telemetry
     from mosaico_ingest.cli.without_pandas import forgo_pandas
     from mosaico_ingest.report.metrics import prometheus_text
     from mosaico_ingest.report.model import RunReport
@@ -96,17 +100,19 @@ def run(
             write_whole(metrics, prometheus_text(result))
 
     forgo_pandas(configs)
-    run_configs(
-        configs,
-        report=report,
-        quiet=quiet,
-        log=log,
-        jobs=jobs,
-        executor=_on_ray(address, jobs) if executor is Place.RAY else None,
-        log_format=log_format,
-        manifests=used,
-        finished=finish,
-    )
+    with telemetry(otel) as watching:
+        run_configs(
+            configs,
+            report=report,
+            quiet=quiet,
+            log=log,
+            jobs=jobs,
+            executor=_on_ray(address, jobs) if executor is Place.RAY else None,
+            log_format=log_format,
+            manifests=used,
+            watching=watching,
+            finished=finish,
+        )
 
 
 def _on_ray(address: str | None, jobs: int | None) -> Executor:

@@ -20,7 +20,7 @@ from mosaico_ingest.cli.tables import print_report
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.executors.executor import Executor
 from mosaico_ingest.executors.local import Inline
-from mosaico_ingest.report.events import Event, RunFinished
+from mosaico_ingest.report.events import BatchObserver, Event, RunFinished, ignore_batch
 from mosaico_ingest.report.model import RunReport, UsedManifest
 from mosaico_ingest.report.write import write_report
 
@@ -37,6 +37,7 @@ def run_configs(
     executor: Executor | None = None,
     log_format: LogFormat = LogFormat.TEXT,
     manifests: Sequence[UsedManifest] = (),
+    watching: BatchObserver = ignore_batch,
     finished: Callable[[RunReport], None] = lambda _result: None,
 ) -> None:
     """Run the configurations, several at a time where asked for; exit with the report's code unless it is 0."""
@@ -50,6 +51,7 @@ def run_configs(
     def tell(position: int, event: Event) -> None:
         if isinstance(event, RunFinished) and event.error is not None:
             failures.append(event)
+        watching(position, event)
         observe(position, event)
 
     as_json = log_format is LogFormat.JSON

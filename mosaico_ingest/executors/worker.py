@@ -142,10 +142,9 @@ def run_config(config: ROSInjectionConfig, observe: Observer) -> Report:
 def failed_report(config: ROSInjectionConfig, error: IngestError, observe: Observer) -> Report:
     """Return the report of a recording of which nothing was done."""
     collector = Collector()
-    collector(_unplanned(config))
-    failed = _failed(error)
-    collector(failed)
-    observe(failed)
+    for event in (_unplanned(config), _failed(error)):
+        collector(event)
+        observe(event)
     return collector.report()
 
 

@@ -1,0 +1,153 @@
+"""This file tells an OpenTelemetry collector what a run does: metrics while it goes, a span for each recording."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from dataclasses import dataclass, field
+
+from mosaico_ingest.errors import IngestError
+from mosaico_ingest.report.events import (
+    Event,
+    Rejected,
+    RunFinished,
+    RunStarted,
+    Timed,
+    TopicClosed,
+    TopicProgress,
+)
+from mosaico_ingest.report.stopwatch import Step
+from mosaico_ingest.version import __version__
+
+try:
+    from opentelemetry.exporter.otlp.proto.http.metric_exporter import OTLPMetricExporter
+    from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
+    from opentelemetry.sdk.metrics import MeterProvider
+    from opentelemetry.sdk.metrics.export import PeriodicExportingMetricReader
+    from opentelemetry.sdk.resources import OTELResourceDetector, Resource
+    from opentelemetry.sdk.trace import TracerProvider
+    from opentelemetry.sdk.trace.export import BatchSpanProcessor
+    from opentelemetry.trace import Status, StatusCode
+except ImportError as missing:
+    raise IngestError(
+        "OpenTelemetry is not installed", hint="pip install 'mosaico-ingest[otel]'"
+    ) from missing
+
+__all__ = ["Telemetry"]
+
+_NAME = "mosaico_ingest"
+_SERVICE = "mosaico-ingest"
+
+
+@dataclass(slots=True)
+class _Recording:
+    sequence: str = ""
+    destination: str = ""
+    source_bytes: int = 0
+    seconds: dict[Step, float] = field(default_factory=dict[Step, float])
+    read: int = 0
+    rejected: int = 0
+    written: dict[str, int] = field(default_factory=lambda: defaultdict[str, int](int))
+
+
+class Telemetry:
+    """An observer of a batch; where it sends to is said by the standard variables of OpenTelemetry (`OTEL_…`).
+
+    Rows that were written are counted once their recording is done with, for an early end may take them back.
+    """
+
+    def __init__(self, *, metrics: bool = True, traces: bool = True) -> None:
+        resource = Resource.create({"service.name": _SERVICE, "service.version": __version__})
+        resource = resource.merge(OTELResourceDetector().detect())  # what the environment says counts more
+        readers = [PeriodicExportingMetricReader(OTLPMetricExporter())] if metrics else []
+        self._meters = MeterProvider(readers, resource)
+        self._tracers = TracerProvider(resource=resource)
+        if traces:
+            self._tracers.add_span_processor(BatchSpanProcessor(OTLPSpanExporter()))
+        self._tracer = self._tracers.get_tracer(_NAME, __version__)
+        self._recordings: dict[int, _Recording] = defaultdict(_Recording)
+        meter = self._meters.get_meter(_NAME, __version__)
+        self._ended = meter.create_counter(
+            f"{_NAME}.recordings", "{recording}", "Recordings by how they ended."
+        )
+        self._messages = meter.create_counter(
+            f"{_NAME}.messages", "{message}", "Messages by topic and by what became of them."
+        )
+        self._bytes = meter.create_counter(
+            f"{_NAME}.io", "By", "Bytes of recordings opened, of messages read, of rows stored."
+        )
+        self._duration = meter.create_histogram(f"{_NAME}.recording.duration", "s", "Time of a recording.")
+        self._steps = meter.create_histogram(
+            f"{_NAME}.step.duration", "s", "Time of a recording by what it was spent on."
+        )
+
+    def __call__(self, position: int, event: Event) -> None:
+        """Take one event."""
+        match event:
+            case RunStarted():
+                self._begin(position, event)
+            case TopicProgress():
+                self._progress(self._recordings[position], event)
+            case Rejected():
+                self._recordings[position].rejected += event.count
+                self._count(event.target, "rejected", event.count)
+            case TopicClosed():
+                self._bytes.add(event.stored_bytes or 0, {"kind": "stored", "topic": event.target})
+            case Timed():
+                self._recordings[position].seconds = dict(event.seconds)
+            case RunFinished():
+                self._finish(self._recordings.pop(position, _Recording()), event)
+            case _:
+                pass
+
+    def close(self) -> None:
+        """Send what has not been sent; a collector that does not answer is in the log."""
+        self._meters.shutdown()
+        self._tracers.shutdown()
+
+    def _begin(self, position: int, event: RunStarted) -> None:
+        self._recordings[position] = _Recording(event.sequence, event.destination, event.source_bytes)
+        self._bytes.add(event.source_bytes, {"kind": "source"})
+
+    def _progress(self, recording: _Recording, event: TopicProgress) -> None:
+        recording.read += event.read
+        recording.written[event.target] += event.written
+        self._count(event.target, "read", event.read)
+        self._count(event.target, "filtered", event.filtered)
+        self._count(event.target, "downsampled", event.downsampled)
+        if event.payload_bytes:
+            self._bytes.add(event.payload_bytes, {"kind": "payload", "topic": event.target})
+
+    def _count(self, topic: str, fate: str, count: int) -> None:
+        if count:
+            self._messages.add(count, {"topic": topic, "fate": fate})
+
+    def _finish(self, recording: _Recording, event: RunFinished) -> None:
+        status = {"status": event.status.value}
+        duration_s = sum(spent for step, spent in recording.seconds.items() if step is not Step.WRITE)
+        self._ended.add(1, status)
+        self._duration.record(duration_s, status)
+        for step, spent in recording.seconds.items():
+            self._steps.record(spent, {"step": step.value})
+        for topic, count in recording.written.items():
+            self._count(topic, "written", count)
+        self._trace(recording, event, duration_s)
+
+    def _trace(self, recording: _Recording, event: RunFinished, duration_s: float) -> None:
+        end_ns = time.time_ns()
+        span = self._tracer.start_span("ingest recording", start_time=end_ns - int(duration_s * 1e9))
+        span.set_attributes(
+            {
+                f"{_NAME}.sequence": recording.sequence,
+                f"{_NAME}.destination": recording.destination,
+                f"{_NAME}.status": event.status.value,
+                f"{_NAME}.source_bytes": recording.source_bytes,
+                f"{_NAME}.read": recording.read,
+                f"{_NAME}.written": sum(recording.written.values()),
+                f"{_NAME}.rejected": recording.rejected,
+                **{f"{_NAME}.step.{step.value}": spent for step, spent in recording.seconds.items()},
+            }
+        )
+        if event.error is not None:
+            span.set_status(Status(StatusCode.ERROR, event.error))
+        span.end(end_ns)
