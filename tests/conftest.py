@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from object_store import CREDENTIALS, ObjectStore, object_store
 
 # Machines are noisy: how long an example takes says nothing about the code.
 # CI tries the same examples each time, so that it judges the change; everybody else explores.
@@ -44,3 +46,13 @@ def shared() -> Path:
 def corpus(shared: Path) -> Path:
     """The folder of real recordings."""
     return shared / "corpus"
+
+
+@pytest.fixture(scope="session")
+def objects() -> Iterator[ObjectStore]:
+    """An S3 server with an empty bucket, and the credentials for it in the environment."""
+    pytest.importorskip("moto", reason="the S3 server of the tests is not installed")
+    with pytest.MonkeyPatch.context() as patch, object_store() as running:
+        for name, value in CREDENTIALS.items():
+            patch.setenv(name, value)
+        yield running

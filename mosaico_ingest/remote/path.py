@@ -239,9 +239,10 @@ def as_path(given: str | Path | RemotePath) -> AnyPath:
     """
     if isinstance(given, RemotePath) or not is_url(str(given)):
         return Path(given) if isinstance(given, str) else given
-    url = urlsplit(
-        re.sub(r"^([^:]+):/+", r"\1://" if not str(given).startswith("file:") else r"\1:///", str(given))
-    )
+    text = str(given)
+    if "://" not in text:  # it went through `Path`
+        text = text.replace(":/", ":///" if text.startswith("file:") else "://", 1)
+    url = urlsplit(text)
     if url.scheme == "file":
         return Path(unquote(url.path))
     if url.scheme not in SCHEMES:

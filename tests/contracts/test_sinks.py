@@ -10,12 +10,14 @@ from typing import Any, ClassVar, Protocol
 import pyarrow as pa
 import pytest
 from mosaicod import Mosaicod, running
+from object_store import ObjectStore
 
 from mosaico_ingest.config import ServerTarget
 from mosaico_ingest.errors import SequenceExists, SinkError
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 from mosaico_ingest.platform.sink import PlatformSink
 from mosaico_ingest.policies import IfExists
+from mosaico_ingest.remote import AnyPath, as_path
 from mosaico_ingest.sink import MemorySink, Sink, topic_schema
 from mosaico_ingest.store import Store, StoreSink
 from mosaico_ingest.store.server import serve
@@ -74,7 +76,7 @@ class InMemory:
 class InStore:
     keeps_old = True
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: AnyPath) -> None:
         self.store = Store.open(folder / "mosaico")
         self.sink = StoreSink(self.store)
 
@@ -157,6 +159,11 @@ def in_store(folder: Path) -> Generator[Destination, None, None]:
 
 
 @contextmanager
+def in_bucket(folder: Path, objects: ObjectStore) -> Generator[Destination, None, None]:
+    yield InStore(as_path(objects.url(folder.name)))
+
+
+@contextmanager
 def on_server(_: Path) -> Generator[Destination, None, None]:
     with running(Mosaicod()) as server:
         yield OnServer(server)
@@ -168,9 +175,15 @@ def on_served_store(folder: Path) -> Generator[Destination, None, None]:
         yield OnServedStore(folder, server.port)
 
 
-@pytest.fixture(params=(in_memory, in_store, on_server, on_served_store), ids=lambda make: make.__name__)
+BY_URL = pytest.param(in_bucket, marks=pytest.mark.slow, id="in_bucket")
+
+
+@pytest.fixture(
+    params=(in_memory, in_store, BY_URL, on_server, on_served_store), ids=lambda make: make.__name__
+)
 def there(request: pytest.FixtureRequest, tmp_path: Path) -> Generator[Destination, None, None]:
-    made: AbstractContextManager[Destination] = request.param(tmp_path)
+    needs = (request.getfixturevalue("objects"),) if request.param is in_bucket else ()
+    made: AbstractContextManager[Destination] = request.param(tmp_path, *needs)
     with made as destination:
         yield destination
 

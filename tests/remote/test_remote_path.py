@@ -1,0 +1,115 @@
+"""A URL becomes a path that behaves as pathlib's does; what is wrong with one is said before anybody is asked."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import pytest
+
+from mosaico_ingest.config import ROSInjectionConfig, StoreTarget
+from mosaico_ingest.errors import IngestError, ManifestError, Unreachable
+from mosaico_ingest.manifest.load import load_manifest
+from mosaico_ingest.plan.compile import compile_manifest
+from mosaico_ingest.remote import RemotePath, as_path, is_url
+from mosaico_ingest.remote.faults import reaching
+from mosaico_ingest.remote.filesystem import filesystem
+
+
+def test_a_url_has_the_parts_of_a_path() -> None:
+    path = as_path("s3://bucket/drives/a.mcap?region=eu-west-1")
+    assert isinstance(path, RemotePath)
+    assert (path.name, path.suffix, path.place) == ("a.mcap", ".mcap", "bucket/drives/a.mcap")
+    assert str(path) == "s3://bucket/drives/a.mcap"
+    assert str(path.parent / "b" / "c.bag") == "s3://bucket/drives/b/c.bag"
+    assert [str(one) for one in path.above] == ["s3://bucket/drives", "s3://bucket"]
+    assert as_path(path.url) == path
+    assert pickle.loads(pickle.dumps(path)) == path  # noqa: S301 - our own
+
+
+@pytest.mark.parametrize("given", ["s3://bucket", "s3://bucket/"])
+def test_a_bucket_is_a_folder(given: str) -> None:
+    path = as_path(given)
+    assert isinstance(path, RemotePath)
+    assert (path.name, str(path), str(path / "a")) == ("bucket", "s3://bucket", "s3://bucket/a")
+
+
+@pytest.mark.parametrize("scheme", ["s3", "gs"])
+def test_a_url_that_went_through_pathlib_is_still_one(scheme: str) -> None:
+    url = f"{scheme}://bucket/drives/a.mcap?anonymous=true"
+    assert as_path(Path(url)) == as_path(url)
+
+
+def test_a_file_url_is_a_path() -> None:
+    assert as_path("file:///data/with%20blank.mcap") == Path("/data/with blank.mcap")
+
+
+@pytest.mark.parametrize("given", ["a.mcap", "./a/b", "/a//b", "C:a", "module.name:Class", "a b:/x"])
+def test_what_is_no_url_stays_a_path(given: str) -> None:
+    assert not is_url(given)
+    assert as_path(given) == Path(given)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("ftp://host/a.mcap", "the scheme ftp:// is not known — known are s3://, gs://, file://"),
+        ("https://host/a.mcap", "https://"),
+        ("s3:///a.mcap", "no bucket"),
+        ("s3://key:secret@bucket/a.mcap", "no place for a password"),
+    ],
+)
+def test_a_url_that_is_not_understood_is_refused(given: str, said: str) -> None:
+    with pytest.raises(IngestError, match=said) as raised:
+        as_path(given)
+    assert "secret" not in str(raised.value)
+
+
+def test_an_option_that_is_not_known_is_refused() -> None:
+    with pytest.raises(IngestError, match="'regoin' is not known — known are endpoint_override"):
+        filesystem("s3://bucket", "regoin=eu-west-1")
+
+
+def test_a_google_bucket_is_served_by_its_own_client() -> None:
+    path = as_path("gs://bucket/a.mcap?anonymous=true&endpoint_override=127.0.0.1:1&scheme=http")
+    assert isinstance(path, RemotePath)
+    assert path.filesystem.type_name == "gcs"
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "said"),
+    [
+        (OSError("When reading: AWS Error NETWORK_CONNECTION during HeadObject operation: curlCode: 7"), Unreachable, "does not answer: NETWORK_CONNECTION"),
+        (OSError("AWS Error SLOW_DOWN during GetObject operation"), Unreachable, "SLOW_DOWN"),
+        (OSError("AWS Error ACCESS_DENIED during HeadObject operation"), IngestError, "access is refused"),
+        (OSError("AWS Error NO_SUCH_BUCKET during CreateMultipartUpload (Request ID: x)"), IngestError, "no such bucket"),
+        (FileNotFoundError(2, "gone"), FileNotFoundError, "gone"),
+    ],
+)  # fmt: skip
+def test_an_error_of_a_client_becomes_one_of_ours(error: OSError, kind: type[Exception], said: str) -> None:
+    with pytest.raises(kind, match=said) as raised, reaching("s3://bucket/a"):
+        raise error
+    assert type(raised.value) is kind
+
+
+def test_a_configuration_takes_urls() -> None:
+    config = ROSInjectionConfig("s3://bucket/a.mcap", sequence_name="a", store="s3://bucket/store")
+    assert config.paths == (as_path("s3://bucket/a.mcap"),)
+    assert config.target == StoreTarget(as_path("s3://bucket/store"))
+
+
+def test_a_manifest_says_where_its_url_is_wrong(tmp_path: Path) -> None:
+    job = tmp_path / "job.yaml"
+    job.write_text('version: 1\nbag: {path: "ftp://host/a.mcap"}\n')
+    with pytest.raises(ManifestError, match=r"job.yaml:2:13: ftp://host/a.mcap: the scheme"):
+        compile_manifest(load_manifest(job))
+
+
+def test_only_recordings_and_stores_may_be_urls(tmp_path: Path) -> None:
+    job = tmp_path / "job.yaml"
+    (tmp_path / "a.mcap").write_bytes(b"")
+    job.write_text(
+        "version: 1\nbag: {path: a.mcap}\nsequence: {name: a}\nquarantine: {path: 's3://bucket/rejected'}\n"
+    )
+    with pytest.raises(ManifestError, match="only recordings and stores may be URLs"):
+        compile_manifest(load_manifest(job))
