@@ -34,7 +34,7 @@ try:
 except ModuleNotFoundError as missing:
     raise IngestError("Ray is not installed", hint="pip install 'mosaico-ingest[ray]'") from missing
 
-from mosaico_ingest.executors.ray_worker import Desk, Setting, ingest
+from mosaico_ingest.executors.ray_worker import Desk, Setting, ingest, machine
 
 __all__ = ["Ray"]
 
@@ -289,7 +289,8 @@ def _desk() -> Any:  # noqa: ANN401 - Ray's handle
 
 
 def _setting(beacon: str) -> Any:  # noqa: ANN401 - Ray's reference
-    return ray.put(Setting(Announced.here(), logging.getLogger().getEffectiveLevel(), beacon))
+    level = logging.getLogger().getEffectiveLevel()
+    return ray.put(Setting(Announced.here(), level, beacon, machine()))
 
 
 def _said(error: Exception) -> str:

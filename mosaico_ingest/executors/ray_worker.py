@@ -24,7 +24,7 @@ from mosaico_ingest.executors.worker import failed_report, run_config
 from mosaico_ingest.report.events import Event, RunFinished, RunStarted
 from mosaico_ingest.report.model import Report
 
-__all__ = ["Desk", "Letter", "Setting", "ingest"]
+__all__ = ["Desk", "Letter", "Setting", "ingest", "machine", "out_of_reach"]
 
 Letter: TypeAlias = tuple[int, int, Event | logging.LogRecord]
 """The recording's position, the number of the attempt, what there is to say."""
@@ -40,6 +40,8 @@ class Setting:
     log_level: int
     beacon: str
     """The name of the file by which a worker knows that it sees the same store as the driver."""
+    machine: str
+    """Where the driver runs."""
 
 
 class Desk:
@@ -71,17 +73,17 @@ def ingest(letter: bytes, position: int, attempt: int, desk: Any, setting: Setti
     before = signal.signal(signal.SIGINT, stop)  # what Ray's cancellation raises
     try:
         with _records_sent(outbox, setting.log_level):
-            report = _run(config, outbox, stop, setting.beacon)
+            report = _run(config, outbox, stop, setting)
         outbox.flush()
     finally:
         signal.signal(signal.SIGINT, before)
     return report
 
 
-def _run(config: ROSInjectionConfig, outbox: _Outbox, stop: Stop, beacon: str) -> Report:
+def _run(config: ROSInjectionConfig, outbox: _Outbox, stop: Stop, setting: Setting) -> Report:
     try:
         stop.heed()
-        blind = _out_of_sight(config, beacon)
+        blind = out_of_reach(config, setting)
         report = failed_report(config, blind, outbox.tell) if blind else run_config(config, outbox.tell)
     except KeyboardInterrupt:
         report = failed_report(config, Interrupted("stopped before it was begun"), outbox.tell)
@@ -89,8 +91,8 @@ def _run(config: ROSInjectionConfig, outbox: _Outbox, stop: Stop, beacon: str) -
     return report
 
 
-def _out_of_sight(config: ROSInjectionConfig, beacon: str) -> IngestError | None:
-    """Return what is wrong where this node does not see the files that the driver sees."""
+def out_of_reach(config: ROSInjectionConfig, setting: Setting) -> IngestError | None:
+    """Return what is wrong where this node cannot use the files that the driver uses."""
     for path in config.paths:
         if isinstance(path, Path) and not path.exists():
             return BagError(
@@ -99,13 +101,19 @@ def _out_of_sight(config: ROSInjectionConfig, beacon: str) -> IngestError | None
                 hint="put recordings on storage that every node mounts at the same place, or name them by URL",
             )
     store = config.target.path if isinstance(config.target, StoreTarget) else None
-    if isinstance(store, Path) and not (store / beacon).exists():
-        return SinkError(
-            f"the node {_node()} does not see this store",
-            where=str(store),
-            hint="put it on storage that every node mounts at the same place, or use a server",
-        )
-    return None
+    if not isinstance(store, Path) or (setting.machine == machine() and (store / setting.beacon).exists()):
+        return None
+    return SinkError(
+        f"the node {_node()} cannot write to this store: its catalog works on one machine only",
+        where=str(store),
+        hint="use a store behind a URL, as s3://bucket/prefix, or a server",
+    )
+
+
+def machine() -> str:
+    """Return what differs from machine to machine: processes that share it share memory, as SQLite's WAL needs."""
+    boot = Path("/proc/sys/kernel/random/boot_id")
+    return boot.read_text("ascii").strip() if boot.exists() else socket.gethostname()
 
 
 def _node() -> str:

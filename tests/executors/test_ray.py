@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,9 @@ pytest.importorskip("ray", reason="Ray is not installed")
 
 from ray_cluster import NODE, two_nodes
 
+from mosaico_ingest.executors.crew import Announced
 from mosaico_ingest.executors.ray import Ray
+from mosaico_ingest.executors.ray_worker import Setting, machine, out_of_reach
 
 pytestmark = pytest.mark.slow
 
@@ -167,3 +170,18 @@ def test_no_cluster_at_an_address_is_said(tmp_path: Path) -> None:
     code, said = ended(ingest(tmp_path, "--executor", "ray", "--address", "127.0.0.1:9"))
     assert code == 1
     assert "127.0.0.1:9: cannot connect to Ray" in " ".join(said.split())
+
+
+def test_what_a_node_cannot_reach_is_said_and_never_made_anew_there(tmp_path: Path) -> None:
+    config = compile_job(make_job(tmp_path, "a", pause_s=0))[0]
+    here = Setting(Announced.here(), 0, ".run-1", machine())
+    (tmp_path / "store").mkdir()
+    assert "one machine only" in str(out_of_reach(config, here))
+    (tmp_path / "store" / here.beacon).touch()
+    assert out_of_reach(config, here) is None
+    assert "one machine only" in str(out_of_reach(config, replace(here, machine="another")))
+    assert (
+        out_of_reach(replace(config, store=None, host="localhost"), replace(here, machine="another")) is None
+    )
+    (tmp_path / "a.mcap").unlink()
+    assert "does not see the recording" in str(out_of_reach(config, here))
