@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, unquote
 
 CREDENTIALS = {
     "AWS_ACCESS_KEY_ID": "test",
@@ -52,7 +53,7 @@ class ObjectStore:
 
     def fail_after(self, requests: int, *, containing: str = "") -> None:
         """Let the server die after so many more requests whose line has this text."""
-        self._control(f"fail?{requests}&{containing}")
+        self._control(f"fail?{requests}&{quote(containing)}")
 
     def kill(self) -> None:
         self.process.kill()
@@ -124,7 +125,7 @@ class _Counting:
     def _control(self, what: str, query: str) -> str:
         if what == "fail":
             count, _, text = query.partition("&")
-            self.dies = (int(count), text)
+            self.dies = (int(count), unquote(text))
             return "{}"
         said = json.dumps({"requests": self.asked, "sent_bytes": self.sent})
         self.asked, self.sent = [], 0

@@ -1,0 +1,294 @@
+"""A recording behind a URL gives what the file gives, and no more of it is fetched than is needed."""
+
+from __future__ import annotations
+
+import random
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import zstandard
+from made_recordings import define, record
+from object_store import Counts, ObjectStore, object_store
+
+from mosaico_ingest import api
+from mosaico_ingest.bag.recording import Recording, open_recording
+from mosaico_ingest.bag.registry import ROSTypeRegistry
+from mosaico_ingest.bag.types import TypeResolver
+from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.errors import BagError, NothingMatched, Unreachable
+from mosaico_ingest.manifest.load import load_manifest
+from mosaico_ingest.plan.compile import compile_manifest
+from mosaico_ingest.plan.recordings import find_recordings
+from mosaico_ingest.policies import SessionLevelErrorPolicy
+from mosaico_ingest.remote import AnyPath, RemotePath, as_path
+from mosaico_ingest.store import Store
+
+pytestmark = pytest.mark.slow
+
+START_NS = 1_700_000_000_000_000_000
+SECOND_NS = 1_000_000_000
+BLOB = define("made/msg/Blob", "uint8[] data")
+FLOAT = define("made/msg/Float", "float64 data")
+
+
+def remote(objects: ObjectStore, key: str) -> RemotePath:
+    path = as_path(objects.url(key))
+    assert isinstance(path, RemotePath)
+    return path
+
+
+def put(objects: ObjectStore, file: Path, key: str) -> RemotePath:
+    path = remote(objects, key)
+    path.write_bytes(file.read_bytes())
+    objects.counts()
+    return path
+
+
+def opened(*paths: AnyPath) -> Recording:
+    return open_recording(paths, resolve=TypeResolver(None, [], registry=ROSTypeRegistry))
+
+
+def messages(recording: Recording) -> list[tuple[str, int, bytes]]:
+    """Return topic, time and payload of each message, in the order of time within its topic."""
+    found: list[tuple[str, int, bytes]] = []
+    for batch in recording.batches():
+        ends = (batch.starts + batch.lengths).tolist()
+        places = zip(batch.log_times.tolist(), batch.starts.tolist(), ends, strict=True)
+        found += [(batch.channel.topic, at, batch.data[start:end].tobytes()) for at, start, end in places]
+    return sorted(found)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("recordings")
+
+
+@pytest.fixture(scope="module", params=["mcap", "db3", "bag"])
+def small(request: pytest.FixtureRequest, folder: Path) -> Path:
+    """Ten seconds of two topics."""
+    version = 1 if request.param == "bag" else 2
+    number = define("made/msg/Float", "float64 data", version=version)
+    sent = [
+        (topic, number, START_NS + step * SECOND_NS // 10, {"data": step / 7})
+        for step in range(100)
+        for topic in ("/a", "/b")
+    ]
+    return record(folder / f"small.{request.param}", sent)
+
+
+@pytest.fixture(scope="module")
+def large(folder: Path) -> Path:
+    """50 MB of what does not compress, a hundred seconds; `/rare` is in the first second only."""
+    rng = random.Random(7)  # noqa: S311 - any bytes will do
+    blobs = [
+        ("/blobs", BLOB, START_NS + step * SECOND_NS // 5, {"data": list(rng.randbytes(100_000))})
+        for step in range(500)
+    ]
+    rare = [("/rare", FLOAT, START_NS + 1 + step, {"data": float(step)}) for step in range(10)]
+    return record(folder / "large.mcap", sorted(blobs + rare, key=lambda one: one[2]))
+
+
+@pytest.fixture
+def own_objects(objects: ObjectStore) -> Iterator[ObjectStore]:
+    """A server of the test's own, which it may kill; the credentials are those of the other."""
+    assert objects.port
+    with object_store() as running:
+        yield running
+
+
+def test_every_container_gives_what_the_file_gives(objects: ObjectStore, small: Path) -> None:
+    path = put(objects, small, f"every/{small.name}")
+    with opened(small) as here, opened(path) as there:
+        assert messages(there) == messages(here)
+        assert there.losses == here.losses == ()
+        assert (there.message_count, there.start_ns, there.end_ns) == (
+            here.message_count,
+            here.start_ns,
+            here.end_ns,
+        )
+        assert there.size_bytes == small.stat().st_size
+
+
+def test_what_can_only_be_read_as_a_whole_is_fetched_and_removed(
+    objects: ObjectStore, small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    packed = tmp_path / f"{small.name}.zstd"
+    packed.write_bytes(zstandard.compress(small.read_bytes()))
+    path = put(objects, packed, f"packed/{packed.name}")
+    room = tmp_path / "room"
+    room.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(room))
+    with opened(small) as here, opened(path) as there:
+        assert messages(there) == messages(here)
+        assert any(one.severity is Severity.INFO and "all of its" in one.message for one in there.findings)
+        assert list(room.iterdir())
+    assert not list(room.iterdir())
+
+
+def test_a_recording_that_does_not_fit_the_disk_is_refused(
+    objects: ObjectStore, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = record(folder / "no_room.db3", [("/a", FLOAT, START_NS, {"data": 1.0})])
+    path = put(objects, file, "no_room.db3")
+    monkeypatch.setattr("shutil.disk_usage", lambda _: shutil._ntuple_diskusage(10, 10, 0))
+    with pytest.raises(BagError, match=r"no_room.db3: \d+ bytes are to be fetched to .* and 0 are free"):
+        opened(path)
+
+
+def test_one_without_its_index_is_fetched_and_read_record_by_record(
+    objects: ObjectStore, small: Path, tmp_path: Path
+) -> None:
+    if small.suffix == ".db3":
+        return
+    cut = tmp_path / f"cut{small.suffix}"
+    cut.write_bytes(small.read_bytes()[: small.stat().st_size * 2 // 3])
+    path = put(objects, cut, f"cut/{cut.name}")
+    with opened(cut) as here, opened(path) as there:
+        assert messages(there) == messages(here)
+        assert [loss.reason for loss in there.losses] == [loss.reason for loss in here.losses]
+        assert any("it has no index" in one.message for one in there.findings)
+
+
+def test_looking_into_a_recording_takes_little_of_it(objects: ObjectStore, large: Path) -> None:
+    path = put(objects, large, "large/large.mcap")
+    with opened(path) as there:
+        assert there.message_count == 510
+    asked = objects.counts()
+    assert asked.sent_bytes < 1 << 20
+    assert len(asked.requests) <= 8
+
+
+@pytest.mark.parametrize("selection", ["time", "topic"])
+def test_a_selection_takes_a_small_part(objects: ObjectStore, large: Path, selection: str) -> None:
+    path = put(objects, large, "large/large.mcap")
+    window = (START_NS + 50 * SECOND_NS, START_NS + 51 * SECOND_NS)
+    with opened(path) as there:
+        if selection == "time":
+            batches = there.batches(start_ns=window[0], end_ns=window[1])
+        else:
+            batches = there.batches([one.id for one in there.channels if one.topic == "/rare"])
+        assert sum(map(len, batches)) == (5 if selection == "time" else 10)
+    asked = objects.counts()
+    assert asked.sent_bytes < large.stat().st_size * 0.2
+    assert len(asked.requests) <= 12
+
+
+def test_reading_all_of_it_takes_few_requests(objects: ObjectStore, large: Path) -> None:
+    path = put(objects, large, "large/large.mcap")
+    with opened(path) as there:
+        assert sum(map(len, there.batches())) == 510
+    asked = objects.counts()
+    gets = [line for line in asked.requests if line.startswith("GET")]
+    assert len(gets) <= 20
+    assert asked.sent_bytes < large.stat().st_size * 1.1
+
+
+def test_a_reader_that_stops_leaves_no_thread(objects: ObjectStore, large: Path) -> None:
+    path = put(objects, large, "large/large.mcap")
+    with opened(path) as there:
+        next(there.batches())
+    asked: Counts = objects.counts()
+    assert asked.sent_bytes < large.stat().st_size * 0.8
+
+
+def test_parts_directories_and_globs_are_found(objects: ObjectStore, tmp_path: Path) -> None:
+    for number in range(3):
+        sent = [("/a", FLOAT, START_NS + number * SECOND_NS + step, {"data": 1.0}) for step in range(4)]
+        file = record(tmp_path / f"part_{number}.mcap", sent)
+        put(objects, file, f"drives/night/part_{number}.mcap")
+    (tmp_path / "readme.txt").write_text("no recording")
+    put(objects, tmp_path / "readme.txt", "drives/night/readme.txt")
+    night = remote(objects, "drives/night")
+    with opened(night) as whole:
+        assert whole.message_count == 12
+    with opened(night / "part_0.mcap", night / "part_2.mcap") as two:
+        assert [str(file) for file in two.files] == [
+            "s3://bucket/drives/night/part_0.mcap",
+            "s3://bucket/drives/night/part_2.mcap",
+        ]
+        assert len(messages(two)) == 8
+    for pattern, names in {
+        "drives/night/part_*.mcap": ["part_0", "part_1", "part_2"],
+        "drives/*/part_[12].mcap": ["part_1", "part_2"],
+        "drives/**/part_1.mcap": ["part_1"],
+        "drives/*": ["night"],
+    }.items():
+        job = tmp_path / "job.yaml"
+        job.write_text(f'bag: {{path: "{objects.url(pattern)}"}}\nsequence: {{name: "{{stem}}"}}\n')
+        assert [one.sequence_name for one in compile_manifest(load_manifest(job))] == names
+    job.write_text(f'bag: {{path: "{objects.url("drives/none*.mcap")}"}}\nsequence: {{name: a}}\n')
+    with pytest.raises(NothingMatched, match=r"no recording matches s3://bucket/drives/none\*.mcap"):
+        find_recordings(load_manifest(job))
+
+
+def test_a_rosbag2_directory_is_read_by_its_metadata(objects: ObjectStore, tmp_path: Path) -> None:
+    sent = [("/a", FLOAT, START_NS + step, {"data": 1.0}) for step in range(4)]
+    put(objects, record(tmp_path / "x_0.mcap", sent), "rosbag2/x/x_0.mcap")
+    put(objects, record(tmp_path / "stray.mcap", sent), "rosbag2/x/stray.mcap")
+    (tmp_path / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information: {version: 5, storage_identifier: mcap, relative_file_paths: [x_0.mcap, x_1.mcap],"
+        " message_count: 4, topics_with_message_count: []}"
+    )
+    put(objects, tmp_path / "metadata.yaml", "rosbag2/x/metadata.yaml")
+    with opened(remote(objects, "rosbag2/x")) as there:
+        assert [file.name for file in there.files] == ["x_0.mcap"]
+        assert any(one.rule == "missing-part" for one in there.findings)
+
+
+def test_what_is_not_there_is_said(objects: ObjectStore) -> None:
+    with pytest.raises(BagError, match=r"s3://bucket/nowhere\.mcap: does not exist"):
+        opened(remote(objects, "nowhere.mcap"))
+
+
+def test_a_recording_that_changes_while_it_is_read_is_an_error(objects: ObjectStore, small: Path) -> None:
+    if small.suffix == ".db3":
+        return
+    path = put(objects, small, f"changing/{small.name}")
+    with opened(path) as there:
+        path.write_bytes(small.read_bytes()[:-1] + b"!")
+        with pytest.raises(Unreachable, match="changed while it was read"):
+            list(there.batches())
+
+
+def test_a_server_that_goes_away_is_an_error_and_no_loss(
+    own_objects: ObjectStore, large: Path, tmp_path: Path
+) -> None:
+    path = put(own_objects, large, "large.mcap")
+    store = tmp_path / "mosaico"
+    config = ROSInjectionConfig(
+        path, sequence_name="large", store=store, on_error=SessionLevelErrorPolicy.Delete
+    )
+    own_objects.fail_after(6, containing="GET /bucket/large.mcap")
+    (report,) = api.run([config]).recordings
+    assert report.exit_code == 1
+    assert report.error is not None
+    assert "does not answer" in report.error
+    assert Store.open(store).names() == ()
+
+
+def test_the_ledger_knows_a_recording_by_what_its_store_says(
+    objects: ObjectStore, small: Path, tmp_path: Path
+) -> None:
+    path = put(objects, small, f"ledger/{small.name}")
+    job = tmp_path / "job.yaml"
+    job.write_text(
+        f'bag: {{path: "{path.url}", ros_distro: ros2_humble}}\n'
+        "sequence: {name: drive, if_exists: skip}\non_error: {topic: ignore}\ntarget: {store: mosaico}\n"
+    )
+
+    def standing() -> str:
+        (status,) = api.job_status(job)
+        return status.standing.value
+
+    assert standing() == "new"
+    (report,) = api.run(api.compile_job(job)).recordings
+    assert report.exit_code == 0, report.error
+    objects.counts()
+    assert standing() == "done"
+    if small.suffix != ".db3":  # that one is fetched to be looked into
+        assert sum(line.startswith("GET /bucket/ledger") for line in objects.counts().requests) <= 4
+    path.write_bytes(small.read_bytes() + b"\n")
+    assert standing() in {"changed", "unreadable"}
