@@ -22,6 +22,9 @@ __all__ = ["Staging", "StoreTopic"]
 
 _GROUP_BYTES = 32 << 20
 _GROUP_ROWS = 1 << 20
+_BIG_GROUP_BYTES = 8 << 20
+_BIG_ROW_BYTES = 16 << 10
+"""Rows larger than this on average gain nothing from company: they go to the disk while others are still read."""
 _SEGMENT_BYTES = 512 << 20
 
 
@@ -75,11 +78,15 @@ class StoreTopic:
             self._batches.append(batch)
             self._rows += batch.num_rows
             self.buffered_bytes += batch.nbytes
-            full = self.buffered_bytes >= _GROUP_BYTES or self._rows >= _GROUP_ROWS
+            full = self._is_full()
         if full:
             self.flush()
         else:
             self._staging.relieve()
+
+    def _is_full(self) -> bool:
+        big = self.buffered_bytes >= _BIG_ROW_BYTES * self._rows
+        return self.buffered_bytes >= (_BIG_GROUP_BYTES if big else _GROUP_BYTES) or self._rows >= _GROUP_ROWS
 
     def flush(self) -> None:
         """Write what is in memory as one row group."""

@@ -69,8 +69,7 @@ def killed(moment: str, *arguments: object) -> int:
 
 
 def values(store: Store, topic: str = "/speed") -> list[float]:
-    found: list[float] = store.scan("drive", topic).read_all()["data"].to_pylist()
-    return sorted(found)
+    return sorted(store.scan("drive", topic).read_all()["data"].to_numpy().tolist())
 
 
 def waiting(folder: Path, job: Path) -> int:

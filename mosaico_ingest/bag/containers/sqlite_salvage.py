@@ -28,17 +28,21 @@ class Salvage:
 
     def rows(self) -> Iterator[Row]:
         """Yield every row that can be read."""
-        at: int | None = 0
-        while at is not None:
-            begin = at
+        at = 0
+        while True:
             try:
                 for row in self._from(at):
-                    at = row[0] + 1
+                    at = max(at, row[0] + 1)
                     yield row
-            except BROKEN as err:
-                at = self._next_readable(max(begin, at))
-                upto = "the end" if at is None else f"row {at}"
-                self.holes.append(Hole(max(begin, at or 0), f"{err}: rows are missing before {upto}"))
+            except BROKEN as err:  # noqa: PERF203 - each stretch may end in damage of its own
+                found = self._next_row(at)
+                upto = "the end" if found is None else f"row {found[0]}"
+                if found is None or found[0] > at:
+                    self.holes.append(Hole(at, f"{err}: rows are missing before {upto}"))
+                if found is None:
+                    return
+                yield found  # by itself: where the row behind it is damaged, a query for both may give neither
+                at = found[0] + 1
             else:
                 return
 
@@ -49,18 +53,18 @@ class Salvage:
         )
         yield from self.connection.execute(query, (rowid, limit))
 
-    def _next_readable(self, broken: int) -> int | None:
-        """Return the first row id behind `broken` from which rows can be read: by doubling steps, then halving."""
-        step, low = 1, broken
-        while not self._is_readable(low + step):
-            low, step = low + step, step * 2
-            if low + step > _LAST_ROWID:
+    def _next_row(self, broken: int) -> Row | None:
+        """Return the first row from `broken` on that can be read, None without any: by doubling steps, then halving."""
+        step, low, high = 1, broken - 1, broken
+        while not self._is_readable(high):
+            low, high, step = high, high + step, step * 2
+            if high > _LAST_ROWID:
                 return None
-        high = low + step
         while high - low > 1:
             middle = (low + high) // 2
             low, high = (low, middle) if self._is_readable(middle) else (middle, high)
-        return high
+        found = next(self._from(high, 1), None)
+        return found if found is not None and found[0] >= broken else None
 
     def _is_readable(self, rowid: int) -> bool:
         try:
