@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pyarrow as pa
@@ -16,6 +17,7 @@ from mosaico_ingest.decode.layout import PADDING, compile_layout
 from mosaico_ingest.decode.locate import locate
 from mosaico_ingest.decode.places import Frame, Int64s
 from mosaico_ingest.decode.rowwise import RowwiseDecoder
+from mosaico_ingest.diagnostics import RowFailure
 from mosaico_ingest.errors import DecodeError
 
 __all__ = ["ColumnarDecoder"]
@@ -48,16 +50,11 @@ class ColumnarDecoder:
         """Decode all messages of the batch.
 
         Raises:
-            DecodeError: The batch is larger than the 2 GiB a column can hold.
+            DecodeError: A column of the batch would be larger than the 2 GiB it can hold.
         """
         total = int(batch.lengths.sum())
         if total > _LARGEST:
-            raise DecodeError(
-                f"a batch of {total} bytes, columns hold {_LARGEST}",
-                rule="batch-size",
-                where=batch.channel.topic,
-                hint="read smaller batches",
-            )
+            return self._in_two(batch, total)
         if len(batch) <= _FEW and total <= _SMALL:
             return self._rowwise.decode(batch)
         parts = [self._by_columns(batch, order, rows) for order, rows in self._by_order(batch)]
@@ -67,6 +64,28 @@ class ColumnarDecoder:
         if left.any() or not parts:
             parts.append(self._by_rows(batch, np.flatnonzero(left)))
         return _merge(parts)
+
+    def _in_two(self, batch: RawBatch, total: int) -> Decoded:
+        """Decode a batch too large for the offsets of a column, half of its bytes after the other."""
+        if len(batch) == 1:
+            reason = f"{total} bytes, a message can have {_LARGEST}"
+            none = self._rowwise.decode(_rows(batch, slice(0)))
+            return replace(none, failures=(RowFailure(0, "too-large", reason),))
+        middle = int(np.searchsorted(np.cumsum(batch.lengths), total // 2)) + 1
+        edges = (0, min(middle, len(batch) - 1), len(batch))
+        first, second = (self.decode(_rows(batch, slice(begin, end))) for begin, end in pairwise(edges))
+        try:
+            rows = pa.concat_arrays([first.rows, second.rows])
+        except pa.ArrowInvalid as error:
+            raise DecodeError(
+                f"a batch of {total} bytes, a column holds {_LARGEST}",
+                rule="batch-size",
+                where=batch.channel.topic,
+                hint="read smaller batches",
+            ) from error
+        index = np.concatenate([first.index, second.index + edges[1]])
+        later = (replace(failure, row=failure.row + edges[1]) for failure in second.failures)
+        return Decoded(rows, index, (*first.failures, *later), first.padded + second.padded)
 
     def _by_order(self, batch: RawBatch) -> list[tuple[str, Int64s]]:
         """Return the positions of the messages of each byte order, without those of none."""
@@ -91,16 +110,19 @@ class ColumnarDecoder:
 
     def _by_rows(self, batch: RawBatch, rows: Int64s) -> Decoded:
         """Decode some messages one by one."""
-        taken = replace(
-            batch,
-            log_times=batch.log_times[rows],
-            starts=batch.starts[rows],
-            lengths=batch.lengths[rows],
-            offsets=batch.offsets[rows],
-        )
-        decoded = self._rowwise.decode(taken)
+        decoded = self._rowwise.decode(_rows(batch, rows))
         failures = tuple(replace(failure, row=int(rows[failure.row])) for failure in decoded.failures)
         return replace(decoded, index=rows[decoded.index], failures=failures)
+
+
+def _rows(batch: RawBatch, rows: Int64s | slice) -> RawBatch:
+    return replace(
+        batch,
+        log_times=batch.log_times[rows],
+        starts=batch.starts[rows],
+        lengths=batch.lengths[rows],
+        offsets=batch.offsets[rows],
+    )
 
 
 def _merge(parts: list[Decoded]) -> Decoded:

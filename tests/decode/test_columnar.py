@@ -5,12 +5,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from mosaico_ingest.bag.batch import Channel, Encoding, RawBatch
 from mosaico_ingest.bag.definition import Container, Definition, Field, MessageType, Source
 from mosaico_ingest.bag.serialize import Serializer
 from mosaico_ingest.bag.types import TypeResolver
+from mosaico_ingest.decode import columnar
 from mosaico_ingest.decode.choose import decoder_for
 from mosaico_ingest.decode.columnar import ColumnarDecoder
 from mosaico_ingest.decode.decoder import Decoded
@@ -140,10 +142,17 @@ def test_a_single_blob_is_not_copied(batch_of: BatchOf) -> None:
     assert np.shares_memory(np.frombuffer(data.buffers()[2], np.uint8), batch.data)
 
 
-def test_a_batch_beyond_what_a_column_can_hold_is_refused_before_anything_is_read(batch_of: BatchOf) -> None:
-    batch = batch_of([text(b"a")] * 2, STRING, Encoding.CDR)
+def test_parts_that_fit_no_column_together_ask_for_smaller_batches(
+    batch_of: BatchOf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def overflow(_: object) -> None:
+        raise pa.ArrowInvalid("offset overflow while concatenating arrays")
+
+    batch = batch_of([text(b"a" * 20)] * 12, STRING, Encoding.CDR)
+    monkeypatch.setattr(columnar, "_LARGEST", 200)
+    monkeypatch.setattr(columnar.pa, "concat_arrays", overflow)
     with pytest.raises(DecodeError, match="read smaller batches"):
-        ColumnarDecoder(STRING, Encoding.CDR).decode(replace(batch, lengths=np.array([2**31, 5])))
+        ColumnarDecoder(STRING, Encoding.CDR).decode(batch)
 
 
 def channel(encoding: Encoding, definition: Definition | None) -> Channel:
@@ -165,3 +174,29 @@ def test_a_channel_that_cannot_be_decoded_says_why() -> None:
     with pytest.raises(DecodeError, match="/t: no definition of a/msg/B: no text"):
         decoder_for(channel(Encoding.CDR, None))
     assert decoder_for(channel(Encoding.CDR, STRING)).shape.names == ["data"]
+
+
+@pytest.mark.parametrize("largest", [40, 64, 100, 10_000])
+def test_a_batch_too_large_for_a_column_is_decoded_in_parts(
+    largest: int, batch_of: BatchOf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    payloads = [text(b"x" * (number % 30)) for number in range(200)]
+    payloads[60] = payloads[120] = LITTLE
+    batch = batch_of(payloads, STRING, Encoding.CDR)
+    whole = ColumnarDecoder(STRING, Encoding.CDR).decode(batch)
+    monkeypatch.setattr(columnar, "_LARGEST", largest)
+    parts = ColumnarDecoder(STRING, Encoding.CDR).decode(batch)
+    assert parts.rows.equals(whole.rows)
+    assert parts.index.tolist() == whole.index.tolist()
+    assert parts.failures == whole.failures
+    assert [failure.row for failure in whole.failures] == [60, 120]
+
+
+def test_a_message_too_large_for_a_column_costs_its_row(
+    batch_of: BatchOf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batch = batch_of([text(b"ab"), text(b"x" * 500), text(b"cd")], STRING, Encoding.CDR)
+    monkeypatch.setattr(columnar, "_LARGEST", 200)
+    decoded = ColumnarDecoder(STRING, Encoding.CDR).decode(batch)
+    assert decoded.rows.field("data").to_pylist() == ["ab", "cd"]
+    assert [(failure.row, failure.rule) for failure in decoded.failures] == [(1, "too-large")]
