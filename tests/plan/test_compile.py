@@ -117,7 +117,9 @@ run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
         "registry",
         "store",
         "plan_digest",
-    }  # if_exists, a command, Python's, the host, a plan
+        "attempt",
+        "code_dir",
+    }  # if_exists, a command, Python's, the host, a plan, an executor's two
 
 
 def test_the_smallest_manifest_is_a_job(folder: Path) -> None:

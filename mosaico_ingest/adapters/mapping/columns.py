@@ -105,8 +105,10 @@ def nulls(array: Array) -> Mask | None:
     return np.asarray(array.is_null()) if array.null_count else None
 
 
-def true_where(values: Array, *, null: bool = False) -> Mask:
-    """Return where a boolean column holds; `null` stands for what is null."""
+def true_where(values: Array | Scalar, *, null: bool = False) -> Mask:
+    """Return where a boolean column holds; `null` stands for what is null; of one value, shape (1,)."""
+    if isinstance(values, pa.Scalar):
+        return np.array([values.as_py() if values.is_valid else null])
     known = pc.fill_null(values, null) if values.null_count else values
     trues = known.true_count
     if trues in {0, len(known)}:

@@ -79,7 +79,7 @@ def _ordered(left: Kind, right: Kind) -> Kind:
 def _to_int64(refuse: Refuse, values: Array) -> Array:
     if values.type != arrays.uint64():
         return values if values.type == arrays.int64() else pc.cast(values, arrays.int64())
-    bad = np.atleast_1d(true_where(pc.greater(values, arrays.scalar(INT64[1], arrays.uint64()))))
+    bad = true_where(pc.greater(values, arrays.scalar(INT64[1], arrays.uint64())))
     if bad.any():
         refuse(bad, "overflow", lambda i: f"{values[i]} has more than 63 bits")
         values = nullified(values, bad)
