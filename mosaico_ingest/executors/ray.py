@@ -259,7 +259,7 @@ def _unreachable(address: str | None, error: Exception) -> IngestError:
     return IngestError(
         f"cannot connect to Ray: {_said(error)}",
         where=address,
-        hint="see `ray status --address` for the cluster",
+        hint="`ray status --address` says more; a cluster may want a token (RAY_AUTH_MODE, RAY_AUTH_TOKEN)",
     )
 
 
