@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 from mosaico_ingest.errors import IngestError, Unreachable
 
-__all__ = ["is_transient", "reaching"]
+__all__ = ["explained", "is_transient", "reaching"]
 
 _REFUSED = re.compile(
     r"ACCESS_DENIED|INVALID_ACCESS_KEY|INVALID_SIGNATURE|INVALID_CLIENT_TOKEN|SIGNATURE_DOES_NOT_MATCH"

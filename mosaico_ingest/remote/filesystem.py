@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["SCHEMES", "filesystem"]
 
-_ATTEMPTS = 6
+_ATTEMPTS = 5
 """How often a request is made, with a pause that doubles, before its failure is believed."""
 _CONNECT_S, _REQUEST_S = 5.0, 30.0
 _RETRY_S = 30.0

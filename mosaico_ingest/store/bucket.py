@@ -95,10 +95,16 @@ class Bucket:
             list(pool.map(_remove, paths))
 
     def discard(self, session: str) -> None:
-        """Remove what a session has begun and not published."""
-        self.remove(self._begun.pop(session, ()))
+        """Remove what a session has begun and not published; where the store does not answer, that is left to garbage collection."""
+        begun = self._begun.pop(session, [])
         self._beats.pop(session, None)
-        _remove(self._session(session))
+        try:
+            self._session(session).unlink()
+        except FileNotFoundError:  # garbage collection was here; what was written since is ours to remove
+            pass
+        except (IngestError, OSError):
+            return
+        self.remove(begun)
 
     def open_sessions(self) -> list[str]:
         """Return the sessions that have begun and not ended, live or not."""

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 import pyarrow as pa
 
 from mosaico_ingest.errors import SinkError, SinkUnavailable, Unreachable
+from mosaico_ingest.remote.faults import explained as unreachable
 from mosaico_ingest.remote.faults import is_transient
 from mosaico_ingest.remote.path import AnyPath
 
@@ -40,7 +41,8 @@ def explained(where: AnyPath | str) -> Generator[None, None, None]:
         raise SinkUnavailable(err.what, where=err.where, hint=err.hint) from err
     except OSError as err:
         if is_transient(err):
-            raise SinkUnavailable(_first_line(err), where=str(where), hint="try again") from err
+            lost = unreachable(err, str(where))
+            raise SinkUnavailable(lost.what, where=lost.where, hint=lost.hint) from err
         code = err.errno or 0
         what = os.strerror(code) if code else _first_line(err)
         raise SinkError(what, where=str(err.filename or where), hint=_HINTS.get(code)) from err

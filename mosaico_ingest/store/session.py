@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from mosaico_ingest import wire
-from mosaico_ingest.errors import SinkError
+from mosaico_ingest.errors import SinkError, SinkUnavailable
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.remote.path import AnyPath
@@ -98,21 +98,32 @@ class StoreSession:
                 self._layout.publish(moves)
             replaced = self._catalog.commit(self._claim, new)
         except BaseException:
-            self._layout.remove(moves.values())
+            if not self._may_be_entered():
+                self._layout.remove(moves.values())
             raise
         self._leave()
         self._layout.remove(self._layout.root / path for path in replaced)
 
     def discard(self) -> None:
         """Leave no trace."""
-        for topic in self._staging.topics.values():
-            topic.abandon()
+        with ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="segment") as pool:
+            list(pool.map(StoreTopic.abandon, self._staging.topics.values()))
         try:
             self._catalog.release(self.id, self._claim.sequence)
         except SinkError:
             return  # the error that ended the session matters more, and the name is free without its lock
         finally:
             self._leave()
+
+    def _may_be_entered(self) -> bool:
+        """Say whether the catalog has the session although its commit failed: an answer can be lost, what it says not."""
+        try:
+            info = self._catalog.sequence(self._claim.sequence)
+        except SinkUnavailable:
+            return True
+        except SinkError:
+            return False
+        return info is not None and any(session.id == self.id for session in info.sessions)
 
     def _placed(self, topic: StoreTopic) -> entries.NewTopic:
         folder = self._layout.topic(self._claim.sequence, topic.name)
