@@ -26,7 +26,6 @@ from mosaico_ingest.report.events import (
     RunStarted,
     TopicProgress,
     Unreadable,
-    ignore_batch,
 )
 from mosaico_ingest.report.units import bytes_text, count_text
 
@@ -38,11 +37,8 @@ MAX_ROWS = 30
 
 
 @contextmanager
-def display(recordings: int, *, quiet: bool) -> Generator[BatchObserver]:
+def display(recordings: int) -> Generator[BatchObserver]:
     """Yield the observer that draws one recording or a batch of them, on standard error."""
-    if quiet:
-        yield ignore_batch
-        return
     console = Terminal(stderr=True)
     if not console.is_terminal:
         lines = BatchLines(console, recordings) if recordings > 1 else _Lines(console)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -11,12 +11,9 @@ import typer
 
 from mosaico_ingest import api
 from mosaico_ingest.cli.collector import collect_as_usual
-from mosaico_ingest.cli.errors import print_error
 from mosaico_ingest.cli.log_format import LogFormat
 from mosaico_ingest.cli.logs import JsonLines, set_up_logging
-from mosaico_ingest.cli.progress import display
 from mosaico_ingest.cli.signals import interrupt_on_terminate
-from mosaico_ingest.cli.tables import print_report
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.executors.executor import Executor
 from mosaico_ingest.executors.local import Inline
@@ -55,8 +52,7 @@ def run_configs(
         observe(position, event)
 
     as_json = log_format is LogFormat.JSON
-    shown = nullcontext(JsonLines()) if as_json else display(len(configs), quiet=quiet)
-    with shown as observe:
+    with _display(len(configs), as_json=as_json, quiet=quiet) as observe:
         chosen = executor or _executor(configs, jobs, prepare)
         result = api.run(configs, executor=chosen, observe=tell, manifests=manifests)
     finished(result)
@@ -65,11 +61,29 @@ def run_configs(
     }:
         write_report(result, target)
     if not quiet and not as_json:
+        from mosaico_ingest.cli.tables import print_report
+
         print_report(result)
-    for failure in () if as_json else failures:
-        print_error(failure.error or "", failure.findings)
+    if failures and not as_json:
+        _print_failures(failures)
     if result.exit_code:
         raise typer.Exit(result.exit_code)
+
+
+def _display(recordings: int, *, as_json: bool, quiet: bool) -> AbstractContextManager[BatchObserver]:
+    """Return what shows the run while it goes; what draws is slow to import, and only people want it drawn."""
+    if as_json or quiet:
+        return nullcontext(JsonLines() if as_json else ignore_batch)
+    from mosaico_ingest.cli.progress import display
+
+    return display(recordings)
+
+
+def _print_failures(failures: Sequence[RunFinished]) -> None:
+    from mosaico_ingest.cli.errors import print_error
+
+    for failure in failures:
+        print_error(failure.error or "", failure.findings)
 
 
 def _executor(
