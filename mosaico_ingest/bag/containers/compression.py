@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from mosaico_ingest.errors import BagError
 
 __all__ = [
-    "ZSTD_MAGIC",
     "Packed",
     "inflate",
     "inflate_all",
@@ -26,7 +25,6 @@ __all__ = [
     "inflate_some",
 ]
 
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _STEP_BYTES = 1 << 12
 """What is inflated at once: zstd makes at most 128 MiB of it, so that a bomb is noticed on the way."""
 _LZ4_RATIO = 255

@@ -17,7 +17,6 @@ from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.containers.compression import Packed, inflate_all, inflate_some
 from mosaico_ingest.bag.containers.mcap_index import McapIndex, Piece, read_index, read_pieces
 from mosaico_ingest.bag.containers.mcap_records import (
-    MAGIC,
     RECORD,
     ChunkHead,
     McapChannel,
@@ -42,7 +41,7 @@ from mosaico_ingest.bag.containers.source import Source
 from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.errors import BagError
 
-__all__ = ["MAGIC", "McapPart"]
+__all__ = ["McapPart"]
 
 _ENCODINGS = {"cdr": Encoding.CDR, "ros1": Encoding.ROS1}
 _ENTRY = np.dtype([("time", "<i8"), ("offset", "<u8")])

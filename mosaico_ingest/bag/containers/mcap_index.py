@@ -8,8 +8,8 @@ from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
 from mosaico_ingest.bag.containers.compression import inflate_some
+from mosaico_ingest.bag.containers.magics import MCAP
 from mosaico_ingest.bag.containers.mcap_records import (
-    MAGIC,
     RECORD,
     McapChannel,
     Op,
@@ -89,7 +89,7 @@ def read_index(source: Source) -> McapIndex:
     if problem:
         index.holes.append(Hole(source.size, f"{problem}; the file was read record by record", count=0))
     source.bring_near()
-    _Walk(source, index).over(len(MAGIC), source.size)
+    _Walk(source, index).over(len(MCAP), source.size)
     return index
 
 
@@ -97,7 +97,7 @@ def read_pieces(source: Source, index: McapIndex) -> tuple[list[Piece], list[Hol
     """Return all pieces by time, also those that the summary does not name, and what is broken between its chunks."""
     known = sorted(index.pieces, key=lambda piece: piece.offset)
     found = McapIndex()
-    at = len(MAGIC)
+    at = len(MCAP)
     if not index.walked:
         walk = _Walk(source, found)
         for piece in known:
@@ -109,16 +109,16 @@ def read_pieces(source: Source, index: McapIndex) -> tuple[list[Piece], list[Hol
 
 
 def _summary(source: Source) -> McapIndex | None:
-    tail_at = source.size - _FOOTER_BYTES - len(MAGIC)
-    if tail_at < len(MAGIC):
+    tail_at = source.size - _FOOTER_BYTES - len(MCAP)
+    if tail_at < len(MCAP):
         raise BagError("the file ends without a footer")
-    tail = source.read(tail_at, _FOOTER_BYTES + len(MAGIC))
-    if tail[0] != Op.FOOTER or tail[-len(MAGIC) :] != MAGIC:
+    tail = source.read(tail_at, _FOOTER_BYTES + len(MCAP))
+    if tail[0] != Op.FOOTER or tail[-len(MCAP) :] != MCAP:
         raise BagError("the file ends without a footer")
     begin, _, crc = struct.unpack_from("<QQI", tail, RECORD.size)
     if not begin:
         return None
-    if not len(MAGIC) <= begin <= tail_at:
+    if not len(MCAP) <= begin <= tail_at:
         raise BagError(f"the footer puts the summary at {begin}, outside the file")
     data = source.read(begin, tail_at - begin)
     if crc and zlib.crc32(tail[: RECORD.size + 16], zlib.crc32(data)) != crc:

@@ -10,7 +10,6 @@ from mosaico_ingest.bag.containers.source import Fields
 from mosaico_ingest.errors import BagError
 
 __all__ = [
-    "MAGIC",
     "RECORD",
     "ChunkHead",
     "McapChannel",
@@ -22,7 +21,6 @@ __all__ = [
     "schema_of",
 ]
 
-MAGIC = b"\x89MCAP0\r\n"
 RECORD = struct.Struct("<BQ")
 """Every record begins with its kind and the number of bytes that follow."""
 

@@ -1,4 +1,7 @@
-"""This file opens a file of a recording by what it holds, whatever its name and wherever it lies."""
+"""This file opens a file of a recording by what it holds, whatever its name and wherever it lies.
+
+Of the modules that read, only the one for what is found is imported.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,8 @@ from functools import partial
 from pathlib import Path
 from stat import S_ISREG
 
-from mosaico_ingest.bag.containers import mcap, ros1, sqlite
-from mosaico_ingest.bag.containers.compression import ZSTD_MAGIC, inflate_file
+from mosaico_ingest.bag.containers.compression import inflate_file
+from mosaico_ingest.bag.containers.magics import MCAP, ROS1, SQLITE, ZSTD
 from mosaico_ingest.bag.containers.part import Hole, Part
 from mosaico_ingest.bag.containers.source import FileSource, Source
 from mosaico_ingest.errors import BagError
@@ -18,10 +21,30 @@ from mosaico_ingest.remote.path import AnyPath, RemotePath
 
 __all__ = ["is_recording", "open_part"]
 
-_INDEXED: Mapping[bytes, Callable[[Source], Part]] = {mcap.MAGIC: mcap.McapPart, ros1.MAGIC: ros1.Ros1Part}
-"""What is read by position, and so also behind a URL, without reading all of it."""
-_MAGICS = (ZSTD_MAGIC, sqlite.MAGIC, *_INDEXED)
 _LOOK_BYTES = 16
+
+
+def _mcap(source: Source) -> Part:
+    from mosaico_ingest.bag.containers.mcap import McapPart
+
+    return McapPart(source)
+
+
+def _ros1(source: Source) -> Part:
+    from mosaico_ingest.bag.containers.ros1 import Ros1Part
+
+    return Ros1Part(source)
+
+
+def _sqlite(path: Path, name: AnyPath) -> Part:
+    from mosaico_ingest.bag.containers.sqlite import SqlitePart
+
+    return SqlitePart(path, name)
+
+
+_INDEXED: Mapping[bytes, Callable[[Source], Part]] = {MCAP: _mcap, ROS1: _ros1}
+"""What is read by position, and so also behind a URL, without reading all of it."""
+_MAGICS = (ZSTD, SQLITE, *_INDEXED)
 
 
 def is_recording(path: AnyPath) -> bool:
@@ -39,14 +62,14 @@ def open_part(path: AnyPath, stack: ExitStack) -> Part:
     if isinstance(path, RemotePath):
         return _open_remote(path, stack)
     head = _head(path)
-    if not head.startswith(ZSTD_MAGIC):
+    if not head.startswith(ZSTD):
         return _open(path, path, head, stack)
     return _inflated(path, path, stack)
 
 
 def _open_remote(path: RemotePath, stack: ExitStack) -> Part:
     """Open an object in place, or fetch it where it can only be read as a whole."""
-    from mosaico_ingest.bag.containers.remote import RemoteSource, fetch  # noqa: PLC0415 - only jobs with URLs need it
+    from mosaico_ingest.bag.containers.remote import RemoteSource, fetch
 
     source = RemoteSource(path)
     head = source.read_some(0, _LOOK_BYTES)
@@ -54,11 +77,11 @@ def _open_remote(path: RemotePath, stack: ExitStack) -> Part:
         if head.startswith(magic):
             return _entered(partial(kind, source), path, stack)
     source.close()
-    if not head.startswith((ZSTD_MAGIC, sqlite.MAGIC)):
+    if not head.startswith((ZSTD, SQLITE)):
         raise _no_recording(head, path)
     folder = _folder(stack)
     near = fetch(path, folder)
-    if head.startswith(ZSTD_MAGIC):
+    if head.startswith(ZSTD):
         part = _inflated(near, path, stack)
         near.unlink()
     else:
@@ -105,8 +128,8 @@ def _open(path: Path, name: AnyPath, head: bytes, stack: ExitStack) -> Part:
     for magic, kind in _INDEXED.items():
         if head.startswith(magic):
             return _entered(partial(kind, FileSource(path, name)), name, stack)
-    if head.startswith(sqlite.MAGIC):
-        return _entered(partial(sqlite.SqlitePart, path, name), name, stack)
+    if head.startswith(SQLITE):
+        return _entered(partial(_sqlite, path, name), name, stack)
     raise _no_recording(head, name)
 
 

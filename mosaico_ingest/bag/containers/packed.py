@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mosaico_ingest.bag.containers.compression import ZSTD_MAGIC, inflate_message
+from mosaico_ingest.bag.containers.compression import inflate_message
+from mosaico_ingest.bag.containers.magics import ZSTD
 from mosaico_ingest.bag.containers.part import Hole, Slab
 from mosaico_ingest.bag.containers.slab import stretches
 from mosaico_ingest.errors import BagError
@@ -12,7 +13,7 @@ from mosaico_ingest.errors import BagError
 __all__ = ["inflate_messages"]
 
 _LIMIT_BYTES = 256 << 20
-_MAGIC = np.frombuffer(ZSTD_MAGIC, "<u4")[0]
+_MAGIC = np.frombuffer(ZSTD, "<u4")[0]
 
 
 def inflate_messages(slab: Slab, holes: list[Hole]) -> Slab:
@@ -22,8 +23,8 @@ def inflate_messages(slab: Slab, holes: list[Hole]) -> Slab:
     """
     if not (_is_packed(slab, 0) or _is_packed(slab, -1)):
         return slab
-    long_enough = slab.lengths >= len(ZSTD_MAGIC)
-    heads = stretches(slab.data, slab.starts[long_enough], len(ZSTD_MAGIC)).view("<u4").reshape(-1)
+    long_enough = slab.lengths >= len(ZSTD)
+    heads = stretches(slab.data, slab.starts[long_enough], len(ZSTD)).view("<u4").reshape(-1)
     packed = np.flatnonzero(long_enough)[heads == _MAGIC]
     is_packed = np.zeros(len(slab), np.bool_)
     is_packed[packed] = True
@@ -46,4 +47,4 @@ def inflate_messages(slab: Slab, holes: list[Hole]) -> Slab:
 
 def _is_packed(slab: Slab, row: int) -> bool:
     start = int(slab.starts[row])
-    return slab.data[start : start + min(int(slab.lengths[row]), len(ZSTD_MAGIC))].tobytes() == ZSTD_MAGIC
+    return slab.data[start : start + min(int(slab.lengths[row]), len(ZSTD))].tobytes() == ZSTD

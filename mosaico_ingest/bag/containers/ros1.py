@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.containers.compression import Packed, inflate_all, inflate_some
 from mosaico_ingest.bag.containers.part import Block, Hole, Loaded, Slab, Stream, Want, in_groups, orphans
-from mosaico_ingest.bag.containers.ros1_index import MAGIC, Piece, Ros1Index, read_index
+from mosaico_ingest.bag.containers.ros1_index import Piece, Ros1Index, read_index
 from mosaico_ingest.bag.containers.ros1_records import (
     ChunkHead,
     Op,
@@ -29,7 +29,7 @@ from mosaico_ingest.bag.containers.source import Source
 from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.errors import BagError
 
-__all__ = ["MAGIC", "Ros1Part"]
+__all__ = ["Ros1Part"]
 
 _LAYOUTS = 4
 """How many different layouts of message headers a connection may have before chunks are read record by record."""

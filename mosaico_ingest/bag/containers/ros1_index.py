@@ -26,9 +26,8 @@ from mosaico_ingest.bag.containers.ros1_records import (
 from mosaico_ingest.bag.containers.source import Source, Window
 from mosaico_ingest.errors import BagError
 
-__all__ = ["MAGIC", "Piece", "Ros1Index", "read_index"]
+__all__ = ["Piece", "Ros1Index", "read_index"]
 
-MAGIC = b"#ROS"
 _VERSION = b"#ROSBAG V2.0\n"
 _RUN_BYTES = 4 << 20
 """How much of the messages outside chunks is read at once."""

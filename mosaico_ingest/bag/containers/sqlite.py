@@ -33,9 +33,8 @@ from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.remote.path import AnyPath
 
-__all__ = ["MAGIC", "SqlitePart"]
+__all__ = ["SqlitePart"]
 
-MAGIC = b"SQLite format 3\x00"
 _PAGE_BYTES = 4 << 20
 _PAGE_ROWS = 1 << 16
 _ROW_TYPES = [int, int, int, bytes]

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import zstandard
 
-from mosaico_ingest.bag.containers.mcap_records import MAGIC, RECORD, Op
+from mosaico_ingest.bag.containers.magics import MCAP
+from mosaico_ingest.bag.containers.mcap_records import RECORD, Op
 from mosaico_ingest.bag.definition import Definition
 from mosaico_ingest.bag.names import short_msgtype
 from mosaico_ingest.errors import BagError
@@ -50,7 +51,7 @@ class McapWriter:
         self._chunk_indexes: list[bytes] = []
         self._start_ns: int | None = None
         self._end_ns = 0
-        self._file.write(MAGIC)
+        self._file.write(MCAP)
         self._began = False
 
     def channel(self, topic: str, definition: Definition) -> int:
@@ -103,7 +104,7 @@ class McapWriter:
                 summary += group
         footer = RECORD.pack(Op.FOOTER, 20) + struct.pack("<QQ", start, start + len(summary))
         checked = summary + offsets + footer
-        self._file.write(checked + struct.pack("<I", zlib.crc32(checked)) + MAGIC)
+        self._file.write(checked + struct.pack("<I", zlib.crc32(checked)) + MCAP)
         self._file.close()
 
     def abandon(self) -> None:
