@@ -9,7 +9,8 @@ from dataclasses import dataclass, field, replace
 
 from mosaico_ingest.bag.batch import Channel, Encoding
 from mosaico_ingest.bag.containers.part import Part, Stream
-from mosaico_ingest.bag.definition import Definition, Embedded, Resolver
+from mosaico_ingest.bag.definition import Definition, Embedded, Resolver, Source
+from mosaico_ingest.bag.hashes import difference
 from mosaico_ingest.bag.names import normalize_msgtype
 from mosaico_ingest.errors import BagError
 
@@ -33,13 +34,19 @@ class _Types:
             )
         asked = (stream.msgtype, stream.embedded, stream.ros_version)
         if asked not in self.known:
-            try:
-                self.known[asked] = self.resolver.resolve(
-                    stream.msgtype, stream.embedded, ros_version=stream.ros_version
-                )
-            except BagError as err:
-                self.known[asked] = str(err)
-        return self.known[asked]
+            self.known[asked] = self._resolve(stream)
+        found = self.known[asked]
+        if isinstance(found, str) or found.source in {Source.BAG, Source.CUSTOM}:
+            return found
+        other = difference(found, stream.attributes)
+        remedy = "give the right one with custom_msgs"
+        return f"another definition of {found.root} is known: {other} — {remedy}" if other else found
+
+    def _resolve(self, stream: Stream) -> Definition | str:
+        try:
+            return self.resolver.resolve(stream.msgtype, stream.embedded, ros_version=stream.ros_version)
+        except BagError as err:
+            return str(err)
 
 
 class ChannelTable:

@@ -26,6 +26,8 @@ class Source(str, Enum):
     BAG = "bag"
     CUSTOM = "custom"
     DISTRO = "distro"
+    PACKAGE = "package"
+    """A public package that no distro's core has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +90,7 @@ class Embedded:
 
 
 class Resolver(Protocol):
-    """Finds the definition of a type: embedded first, then the caller's own, then the distro's."""
+    """Finds the definition of a type: embedded first, then the caller's own, then the distro's and known packages'."""
 
     def resolve(self, msgtype: str, embedded: Embedded | None, *, ros_version: int) -> Definition:
         """Return the definition of `msgtype`, any spelling of the name.

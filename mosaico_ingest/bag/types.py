@@ -12,6 +12,7 @@ from mosaico_ingest.bag.distros import BEFORE_IRON, BUILTIN, ROS1, ROS2, agreed_
 from mosaico_ingest.bag.link import link
 from mosaico_ingest.bag.msgtext import flatten
 from mosaico_ingest.bag.names import normalize_msgtype
+from mosaico_ingest.bag.packages import package_type
 from mosaico_ingest.bag.registry import (
     Registered,
     ROSTypeRegistry,
@@ -29,6 +30,8 @@ __all__ = ["CustomMessages", "TypeResolver"]
 CustomMessages = tuple[str, Path, Stores | str | None]
 """A package, the directory of its `.msg` files (or one file), and the distro it is for (None: all)."""
 
+_PACKAGE = "the public package "
+_GIVE_IT = "if yours have other fields, give them with custom_msgs"
 _UNSAID = frozenset({"unknown", ""})
 _LANGUAGES = frozenset({"ros1msg", "ros2msg", "ros2idl", "omgidl", "idl", "msg"}) | _UNSAID
 
@@ -43,7 +46,7 @@ class _Place:
 
 
 class TypeResolver:
-    """Finds definitions: in the recording, then the run's own, then announced ones, then the distro's.
+    """Finds definitions: in the recording, then the run's own, then announced ones, then the distro's, then known packages'.
 
     Each nested type is looked for on its own in the same order. Without a distro a standard type is taken where all
     distros of the ROS version agree on it, with a finding. What the registry holds is copied when a resolver is made.
@@ -95,9 +98,8 @@ class TypeResolver:
         for who in dict.fromkeys(self._assumed.values()):
             names = ", ".join(name for name, known in self._assumed.items() if known == who)
             message = f"the recording does not define these types, they are read as in {who}: {names}"
-            findings.append(
-                Finding("assumed-definition", Severity.INFO, message, help="set ros_distro to be sure")
-            )
+            remedy = _GIVE_IT if who.startswith(_PACKAGE) else "set ros_distro to be sure"
+            findings.append(Finding("assumed-definition", Severity.INFO, message, help=remedy))
         return tuple(findings)
 
     def resolve(self, msgtype: str, embedded: Embedded | None, *, ros_version: int) -> Definition:
@@ -139,6 +141,8 @@ class TypeResolver:
             places += self._agreements(embedded, version)
         elif ros_version(distro) == version:
             places.append(_Place(distro.value, Source.DISTRO, lambda name: distro_type(distro, name)))
+        if version == 2:  # noqa: PLR2004 - a ROS 1 recording always has its definitions
+            places.append(_Place("the packages this tool knows", Source.PACKAGE, self._package))
         if embedded and embedded.encoding not in _UNSAID and _is_empty(embedded.text):
             # A text without fields is such a type, unless a distro knows the type: recorders that lack a definition
             # write an empty one, or a comment.
@@ -180,6 +184,12 @@ class TypeResolver:
             return known
 
         return _Place(f"what {who.partition(',')[0]} agree on", Source.DISTRO, find)
+
+    def _package(self, name: str) -> MessageType | None:
+        known = package_type(name)
+        if known:
+            self._assumed.setdefault(name, f"{_PACKAGE}{name.partition('/')[0]}")
+        return known
 
     def _hint(self, places: list[_Place], version: int) -> str:
         searched = f"searched: {', '.join(place.label for place in places)}"

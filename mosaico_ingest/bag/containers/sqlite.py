@@ -37,6 +37,8 @@ __all__ = ["SqlitePart"]
 
 _PAGE_BYTES = 4 << 20
 _PAGE_ROWS = 1 << 16
+_EVENT = "_Event"
+"""The type of a service's events; its definition is that of the service, under the service's name."""
 _ROW_TYPES = [int, int, int, bytes]
 
 
@@ -236,7 +238,7 @@ def _stream(row: dict[str, Any], counts: dict[int, int] | None, definitions: dic
         str(row["type"]),
         Encoding.CDR if encoding == "cdr" else Encoding.OTHER,
         2,
-        definitions.get(str(row["type"])),
+        definitions.get(str(row["type"])) or definitions.get(str(row["type"]).removesuffix(_EVENT)),
         None if counts is None else counts.get(int(row["id"]), 0),
         attributes=attributes,
     )

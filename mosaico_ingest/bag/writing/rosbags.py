@@ -8,10 +8,9 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Writer as Rosbag1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2
-from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from mosaico_ingest.bag.definition import Definition
+from mosaico_ingest.bag.hashes import md5sum, rihs01
 from mosaico_ingest.errors import BagError
 
 __all__ = ["Ros1Writer", "SqliteWriter"]
@@ -37,11 +36,10 @@ class SqliteWriter:
             what = f"there is another definition of {definition.root}, and .db3 holds one"
             raise BagError(what, where=topic, hint="write .mcap")
         try:
-            rihs01 = _types(definition, topic).hash_rihs01(definition.root)
-        except KeyError as error:  # how rosbags says that it does not know wstring
-            what = f"{definition.root} needs {error}, which cannot be described in .db3"
-            raise BagError(what, where=topic, hint="write .mcap") from error
-        opened = self._bag.add_connection(topic, definition.root, msgdef=definition.text, rihs01=rihs01)
+            digest = rihs01(definition)
+        except BagError as error:
+            raise BagError(f"{error.what}, as .db3 wants it", where=topic, hint="write .mcap") from error
+        opened = self._bag.add_connection(topic, definition.root, msgdef=definition.text, rihs01=digest)
         self._connections.append(opened)
         return len(self._connections) - 1
 
@@ -72,8 +70,11 @@ class Ros1Writer:
         """Open a channel; a bag holds no definitions of ROS 2."""
         if definition.ros_version != 1:
             raise BagError(f"{definition.root} is of ROS 2", where=topic, hint="write .mcap or .db3")
-        _, md5sum = _types(definition, topic).generate_msgdef(definition.root, ros_version=1)
-        opened = self._bag.add_connection(topic, definition.root, msgdef=definition.text, md5sum=md5sum)
+        try:
+            digest = md5sum(definition)
+        except BagError as error:
+            raise BagError(error.what, where=topic) from error
+        opened = self._bag.add_connection(topic, definition.root, msgdef=definition.text, md5sum=digest)
         self._connections.append(opened)
         return len(self._connections) - 1
 
@@ -88,13 +89,3 @@ class Ros1Writer:
     def abandon(self) -> None:
         """Close the file as it is."""
         self._bag.abort()
-
-
-def _types(definition: Definition, topic: str) -> Typestore:
-    """Return the definition as rosbags knows it, for the digests it makes."""
-    store = get_typestore(Stores.EMPTY)
-    try:
-        store.register(get_types_from_msg(definition.text, definition.root))
-    except TypesysError as error:
-        raise BagError(f"{definition.root} cannot be written: {error}", where=topic) from error
-    return store
