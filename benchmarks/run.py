@@ -2,6 +2,7 @@
 
     ./dev bench                               all workloads, three runs each
     ./dev bench --quick                       short recordings, one run each
+    ./dev bench --long                        four and five times the length, to see what is start-up; 3 GB more
     ./dev bench --peer ~/sdk/bin/python       also the official injector (a venv with mosaicolabs), into a server
                                               that throws everything away
     ./dev bench --recording drive.mcap        a recording of one's own
@@ -26,7 +27,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from measure import Sample, run, typical
-from workloads import BY_NAME, SHORT, WORKLOADS, Workload
+from workloads import BY_NAME, LONG, SHORT, WORKLOADS, Workload
 
 HERE = Path(__file__).parent
 MOST_PEAK_MB = 512
@@ -148,7 +149,7 @@ def cases(arguments: argparse.Namespace) -> list[Case]:
     """Return what to measure; recordings that are not there are made."""
     if arguments.recording:
         return [Case(path.name, path, path) for path in arguments.recording]
-    chosen = [*SHORT, *WORKLOADS[3:]] if arguments.quick else list(WORKLOADS)
+    chosen = [*SHORT, *WORKLOADS[3:]] if arguments.quick else LONG if arguments.long else WORKLOADS
     wanted = [workload for workload in chosen if not arguments.only or workload.name in arguments.only]
     return [_case(workload, arguments.data) for workload in wanted]
 
@@ -199,6 +200,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--quick", action="store_true", help="short recordings, one run each")
+    parser.add_argument("--long", action="store_true", help="long recordings")
     parser.add_argument("--runs", type=int, default=0, help="runs of each (3)")
     parser.add_argument("--only", action="append", help="a workload's name; repeatable")
     parser.add_argument(
@@ -226,7 +228,7 @@ def main() -> None:
         "runs": runs,
         "workloads": [result.record() for result in results],
     }
-    if not arguments.recording and not arguments.only:
+    if not (arguments.recording or arguments.only or arguments.long):
         figures["start_up_s"] = seconds = start_up(arguments.data, runs)
         print(*(f"{name}: {took:.2f} s" for name, took in seconds.items()), sep="\n")
     arguments.json.write_text(json.dumps(figures, indent=1) + "\n")

@@ -369,7 +369,15 @@ SHORT = (
     Workload("cameras-8s", cameras(4), 8, 2),
     Workload("lidar-6s", LIDAR, 6, 3),
 )
-BY_NAME = {workload.name: workload for workload in (*WORKLOADS, *SHORT)}
+LONG = (
+    Workload("telemetry-1200s", TELEMETRY, 1200, 1, peer="telemetry-30s", least_peer=100, most_floor=1.5),
+    Workload("mixed-100s", MIXED, 100, 4, peer="mixed", least_peer=20, most_floor=2),
+    Workload("mixed-sqlite-100s", MIXED, 100, 4, ".db3", "none", "mixed-sqlite", 20, 2),
+    Workload("mixed-ros1-100s", MIXED, 100, 4, ".bag", "none", "mixed-ros1", 20, 2),
+    Workload("layouts-150s", LAYOUTS, 150, 5, peer="layouts", least_peer=20),
+)
+"""The same for longer: what is left of start-up, and whether memory stays."""
+BY_NAME = {workload.name: workload for workload in (*WORKLOADS, *SHORT, *LONG)}
 
 
 def _schedule(workload: Workload) -> list[list[int]]:
