@@ -7,7 +7,7 @@ import importlib.util
 import re
 import sys
 import traceback
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -23,7 +23,7 @@ from mosaico_ingest.adapters.python_adapter import PythonAdapterSpec, is_adapter
 from mosaico_ingest.adapters.unmodeled import UnmodeledSpec
 from mosaico_ingest.errors import AdapterError
 
-__all__ = ["KnownAdapters", "adapter_spec", "load_adapter_reference"]
+__all__ = ["KnownAdapters", "adapter_spec", "load_adapter_reference", "what_was_meant"]
 
 _MAPPING_SUFFIXES = frozenset({".yaml", ".yml"})
 
@@ -64,18 +64,22 @@ def load_adapter_reference(ref: str, base_dir: Path) -> AdapterSpec:
         return _load_mapping(base_dir / ref)
     place, colon, qualname = ref.rpartition(":")
     if not colon or not place or not qualname:
-        near = get_close_matches(ref, BY_NAME, n=1, cutoff=0.6)
-        ways = "or write a YAML path, module:Class or file.py:Class"
-        raise AdapterError(
-            f"no adapter is called {ref!r}",
-            hint=f"did you mean {near[0]}?" if near else f"see `ingest adapters list`, {ways}",
-        )
+        raise AdapterError(f"no adapter is called {ref!r}", hint=what_was_meant(ref, BY_NAME))
     module = _load_file(base_dir / place) if place.endswith(".py") else _load_module(place, base_dir)
     found = _attribute(module, qualname, ref)
     spec = adapter_spec(found, base_dir)
     if isinstance(spec, PythonAdapterSpec):
         return PythonAdapterSpec(spec.adapter, origin=(load_adapter_reference, (ref, base_dir)))
     return spec
+
+
+def what_was_meant(ref: str, known: Iterable[str] = ()) -> str:
+    """Return what to write instead of a name that no adapter has."""
+    if ref.endswith(".py"):
+        return f"name the class in it: {ref}:Class"
+    if near := get_close_matches(ref, list(known), n=1, cutoff=0.6):
+        return f"did you mean {near[0]}?"
+    return "see `ingest adapters list`, or write a YAML path, module:Class or file.py:Class"
 
 
 @dataclass(frozen=True, slots=True)

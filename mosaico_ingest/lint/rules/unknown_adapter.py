@@ -8,6 +8,11 @@ Bad:
     adapters:
       override: {/lidar: LidarAdaptor}
 
+Bad:
+    bag: {path: data/run.mcap}
+    adapters:
+      load: [wheels.py]
+
 Good:
     bag: {path: data/run.mcap}
     adapters:
@@ -19,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from mosaico_ingest.adapters.builtin import BY_NAME
+from mosaico_ingest.adapters.reference import what_was_meant
 from mosaico_ingest.adapters.unmodeled import UnmodeledSpec
 from mosaico_ingest.bridge import installed_adapters
 from mosaico_ingest.diagnostics import Severity
@@ -33,17 +39,15 @@ _UNMODELED = UnmodeledSpec().name
 
 def check(job: Job) -> Iterator[Problem]:
     """Yield a problem for each name that no adapter has."""
-    loaded = loaded_names(job)
-    if loaded is None:
-        return  # one that is loaded cannot be read, which is said elsewhere; it may have the name
-    known = {*BY_NAME, _UNMODELED, *loaded}
+    loaded = loaded_names(job)  # None where one cannot be read, which is said elsewhere; it may have the name
+    known = {*BY_NAME, _UNMODELED, *(loaded or ())}
     for place, reference in adapter_references(job):
-        is_name = python_reference(reference) is None and not is_mapping_file(reference)
-        if is_name and job.known(reference) and reference not in known and not _installed(reference):
-            close = nearest(reference, known)
-            hint = (
-                f"did you mean {close}?" if close else "name a built-in adapter, a YAML file, or module:Class"
-            )
+        if python_reference(reference) or is_mapping_file(reference) or not job.known(reference):
+            continue
+        is_file = reference.endswith(".py")
+        if is_file or not (loaded is None or reference in known or _installed(reference)):
+            close = None if is_file else nearest(reference, known)
+            hint = f"did you mean {close}?" if close else what_was_meant(reference)
             yield Problem(f"no adapter is called {reference!r}", job.source.span(place), hint)
 
 
