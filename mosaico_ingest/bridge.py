@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from mosaico_ingest.adapters.adapter import AdapterSpec
 from mosaico_ingest.adapters.base import registered_adapters
@@ -15,15 +15,16 @@ from mosaico_ingest.adapters.builtin import BY_TYPE
 from mosaico_ingest.adapters.image import PngImageSpec
 from mosaico_ingest.adapters.python_adapter import PythonAdapterSpec
 from mosaico_ingest.adapters.reference import adapter_spec
-from mosaico_ingest.adapters.single import translate
 from mosaico_ingest.adapters.unmodeled import UnmodeledSpec
-from mosaico_ingest.bag.message import ROSMessage
 from mosaico_ingest.bag.names import normalize_msgtype
 from mosaico_ingest.config import AdapterReference, ImageFormat, ROSInjectionConfig
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.ontology.message import Message
 from mosaico_ingest.ontology.types import SerializationFormat
 from mosaico_ingest.patterns import first_match
+
+if TYPE_CHECKING:
+    from mosaico_ingest.bag.message import ROSMessage
+    from mosaico_ingest.ontology.message import Message
 
 __all__ = ["ENTRY_POINTS", "ROSBridge", "Reason", "Resolution", "installed_adapters"]
 
@@ -144,6 +145,8 @@ class ROSBridge:
         Raises:
             AdapterError: No adapter takes the type, or the message does not fit.
         """
+        from mosaico_ingest.adapters.single import translate  # noqa: PLC0415 - a run has no single messages
+
         found = cls().resolve(msg.topic, msg.msg_type)
         if found.unmodeled:
             raise AdapterError(

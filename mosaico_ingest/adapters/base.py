@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from mosaico_ingest.bag.message import ROSMessage
 from mosaico_ingest.bag.names import normalize_msgtype
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.ontology.message import Message
-from mosaico_ingest.ontology.serializable import Serializable
+
+if TYPE_CHECKING:
+    from mosaico_ingest.bag.message import ROSMessage
+    from mosaico_ingest.ontology.message import Message
+    from mosaico_ingest.ontology.serializable import Serializable
 
 __all__ = ["ROSAdapterBase", "register_default_adapter", "registered_adapters", "ros_types_of"]
 
-T = TypeVar("T", bound=Serializable)
+T = TypeVar("T", bound="Serializable")
 A = TypeVar("A", bound=type[Any])
 
 _registered: dict[str, type[Any]] = {}
@@ -40,6 +42,8 @@ class ROSAdapterBase(Generic[T]):
     @classmethod
     def translate(cls, ros_msg: ROSMessage, **kwargs: Any) -> Message:  # noqa: ANN401 - passed on to from_dict
         """Return the object with its time; to be overridden where the topic or the time of a message matter."""
+        from mosaico_ingest.ontology.message import Message  # noqa: PLC0415 - the models are slow to import
+
         convert: Callable[..., T] = cls.from_dict  # one that is overridden may take more
         return Message(timestamp_ns=ros_msg.bag_timestamp_ns, data=convert(ros_msg.data, **kwargs))
 

@@ -1,14 +1,18 @@
-"""This file finds a model by its tag and imports no more of the ontology than that one needs."""
+"""This file finds a model by its tag and imports no more of the ontology than that one needs, for its columns none."""
 
 from __future__ import annotations
 
 from difflib import get_close_matches
 from importlib import import_module
+from typing import TYPE_CHECKING
 
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.ontology.serializable import DEFINED, Serializable
-from mosaico_ingest.ontology.tags import MODULES
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.columns import builtin_type
+from mosaico_ingest.ontology.tags import DEFINED, MODULES
+
+if TYPE_CHECKING:
+    from mosaico_ingest.ontology.serializable import Serializable
+    from mosaico_ingest.ontology.types import OntologyType
 
 __all__ = ["UnknownTag", "model", "ontology_type", "tags"]
 
@@ -39,7 +43,7 @@ def ontology_type(tag: str) -> OntologyType:
     Raises:
         UnknownTag: There is none; names the nearest.
     """
-    return model(tag).ontology_type()
+    return builtin_type(tag) if tag in MODULES else model(tag).ontology_type()
 
 
 def tags() -> tuple[str, ...]:

@@ -11,13 +11,10 @@ from typing_extensions import Self
 
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.ontology.schema import struct_of
-from mosaico_ingest.ontology.tags import MODULES
+from mosaico_ingest.ontology.tags import DEFINED, MODULES
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 
-__all__ = ["DEFINED", "Serializable"]
-
-DEFINED: dict[str, type[Serializable]] = {}
-"""Every model class by tag, from the moment it is defined; a later one of the same tag replaces it."""
+__all__ = ["Serializable"]
 
 _MISFITS = (pa.ArrowException, OverflowError, TypeError, ValueError)
 

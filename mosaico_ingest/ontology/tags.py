@@ -4,8 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
-__all__ = ["MODULES"]
+if TYPE_CHECKING:
+    from mosaico_ingest.ontology.serializable import Serializable
+
+__all__ = ["DEFINED", "MODULES"]
+
+DEFINED: dict[str, type[Serializable]] = {}
+"""Every model class by tag, from the moment it is defined; a later one of the same tag replaces it."""
 
 MODULES: Mapping[str, str] = MappingProxyType(
     {

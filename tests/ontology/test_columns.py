@@ -9,6 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mosaico_ingest.ontology.columns import FILE
+from mosaico_ingest.ontology.columns_file import columns_file
 from mosaico_ingest.ontology.registry import model, ontology_type
 from mosaico_ingest.ontology.tags import MODULES
 
@@ -24,6 +26,17 @@ def test_columns_and_format_are_the_ones_readers_know(tag: str) -> None:
 
 def test_every_known_fingerprint_has_a_model() -> None:
     assert set(GOLDEN) == set(MODULES)
+
+
+@pytest.mark.parametrize("tag", sorted(MODULES))
+def test_a_model_has_the_columns_of_the_file_that_is_read_in_its_place(tag: str) -> None:
+    known, made = ontology_type(tag), model(tag).ontology_type()
+    assert known == made
+    assert known.struct.equals(made.struct, check_metadata=True)
+
+
+def test_the_file_of_columns_is_up_to_date() -> None:
+    assert FILE.read_text(encoding="utf-8") == columns_file(), "run ./dev docs"
 
 
 def test_columns_equal_the_reference_name_by_name(shared: Path) -> None:

@@ -1,0 +1,29 @@
+"""This file writes `columns.json` from the models of the built-in tags."""
+
+from __future__ import annotations
+
+import json
+
+from mosaico_ingest.ontology.columns import FILE, written_fields
+from mosaico_ingest.ontology.registry import model
+from mosaico_ingest.ontology.tags import MODULES
+from mosaico_ingest.ontology.types import OntologyType
+
+__all__ = ["columns_file"]
+
+
+def columns_file() -> str:
+    """Return the file: an entry for each tag, a line for each column."""
+    entries = (_entry(tag, model(tag).ontology_type()) for tag in sorted(MODULES))
+    return "{\n" + ",\n".join(entries) + "\n}\n"
+
+
+def _entry(tag: str, made: OntologyType) -> str:
+    columns = ",\n".join(
+        f'  "{name}": {json.dumps(kind)}' for name, kind in written_fields(made.struct).items()
+    )
+    return f' "{tag}": {{"format": "{made.serialization_format.value}", "columns": {{\n{columns}\n }}}}'
+
+
+if __name__ == "__main__":
+    FILE.write_text(columns_file(), encoding="utf-8")
