@@ -57,6 +57,18 @@ def test_packing_keeps_every_message_and_nothing_else(rows: list[Row]) -> None:
     assert len(packed.data) == sum(len(payload) for _, payload in rows)
 
 
+@pytest.mark.parametrize("lengths", [[4] * 1000, [*range(1000)]], ids=["equal", "random"])
+def test_what_is_packed_holds_nothing_of_the_block_it_came_in(lengths: list[int]) -> None:
+    """A rare topic waits long for company; were its times views of the block's, every block would stay in memory."""
+    whole = slab_of([(number, b"x" * length) for number, length in enumerate(lengths)])
+    for part in (pack(whole.rows(slice(1, 3))), pack(whole.rows(np.array([1, 2])))):
+        held = [part.log_times, part.data, part.starts, part.lengths, part.offsets]
+        owners = [values if values.base is None else values.base for values in held]
+        assert all(
+            isinstance(owner, np.ndarray) and owner.size <= max(2, sum(lengths[1:3])) for owner in owners
+        )
+
+
 def test_packing_many_bytes_of_many_lengths_goes_through_the_index_in_steps() -> None:
     rows = [(number, bytes([number % 251]) * (number * 331)) for number in range(120)]
     rows.append((120, b"x" * (3 << 20)))

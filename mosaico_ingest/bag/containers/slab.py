@@ -105,7 +105,13 @@ def pack(slab: Slab) -> Slab:
 
 
 def _with(slab: Slab, data: Bytes, starts: Longs) -> Slab:
-    return Slab(slab.key, slab.log_times, data, starts, slab.lengths, slab.offsets)
+    times, lengths, offsets = map(_own, (slab.log_times, slab.lengths, slab.offsets))
+    return Slab(slab.key, times, data, starts, lengths, offsets)
+
+
+def _own(values: Longs) -> Longs:
+    """Return the values without what else lies in their buffer: a rare topic's messages wait long for company."""
+    return values if values.base is None else values.copy()
 
 
 def _gather(slab: Slab) -> Bytes:
