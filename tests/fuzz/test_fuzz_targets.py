@@ -19,6 +19,10 @@ MSG = (
 )
 BODY = b'{"locator": "a/b", "session_uuid": "x", "user_metadata": {"a": {"b": 1}}, "timestamp_ns_start": 3}'
 METADATA = b"rosbag2_bagfile_information: {version: 5, relative_file_paths: [a.db3], message_count: 3}\n"
+_FIELDS = (
+    b"\4\0\0\0op=\2\7\0\0\0topic=a\6\0\0\0type=a\5\0\0\0md5=a\x08\0\0\0sec=\1\0\0\0\x09\0\0\0nsec=\2\0\0\0"
+)
+ROSRECORD = b"#ROSRECORD V1.2\n" + (bytes([len(_FIELDS)]) + b"\0\0\0" + _FIELDS + b"\2\0\0\0hi") * 20
 NASTY = (
     b"\xff" * 4,
     b"\0" * 8,
@@ -52,6 +56,7 @@ def _seeds() -> dict[str, list[bytes]]:
             bag[:20_000] + bag[-4_000:],
             b"#ROSBAG V2.0\n" + bytes(200),
             b"SQLite format 3\0" + bytes(4080),
+            ROSRECORD,
         ],
         "definition": [
             b"\1" + MSG + b"\0\0\0\0\0\1\0\0" + b"\1\0\0\0" * 20,

@@ -32,8 +32,9 @@ def _mcap(source: Source) -> Part:
 
 def _ros1(source: Source) -> Part:
     from mosaico_ingest.bag.containers.ros1 import Ros1Part
+    from mosaico_ingest.bag.containers.rosrecord import MAGIC, RosrecordPart
 
-    return Ros1Part(source)
+    return RosrecordPart(source) if source.read_some(0, len(MAGIC)) == MAGIC else Ros1Part(source)
 
 
 def _sqlite(path: Path, name: AnyPath) -> Part:

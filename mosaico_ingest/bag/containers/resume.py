@@ -1,10 +1,11 @@
-"""This file finds the next chunk behind bytes that are no records, in files whose own index is lost."""
+"""This file finds the next chunk or message behind bytes that are no records, in files whose own index is lost."""
 
 from __future__ import annotations
 
 import re
 import struct
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,12 +13,29 @@ from mosaico_ingest.bag.containers import mcap_records, ros1_records
 from mosaico_ingest.bag.containers.source import Source, Window
 from mosaico_ingest.errors import BagError
 
-__all__ = ["next_mcap_chunk", "next_ros1_chunk"]
+__all__ = ["next_mcap_chunk", "next_ros1_chunk", "next_ros1_message"]
 
 _STEP_BYTES = 1 << 20
+_OVERLAP_BYTES = 1 << 10
+"""More than what is recognised at once."""
 _HEAD_BYTES = 256
 """More than the fixed part of any chunk record."""
-_ROS1_CHUNK = re.compile(rb"\x04\x00\x00\x00op=\x05")
+
+
+@dataclass(frozen=True, slots=True)
+class _Ros1Kind:
+    """How the records of a kind are recognised."""
+
+    op: int
+    fields: frozenset[bytes]
+    before: int
+    """How far before its `op=` a header may begin."""
+
+
+_ROS1_CHUNK = _Ros1Kind(ros1_records.Op.CHUNK, frozenset({b"compression", b"size"}), 128)
+_ROS1_MESSAGE = _Ros1Kind(
+    ros1_records.Op.MESSAGE, frozenset({b"topic", b"type", b"md5", b"sec", b"nsec"}), 512
+)
 
 
 def next_mcap_chunk(source: Source, at: int, stop: int) -> int | None:
@@ -38,15 +56,26 @@ def next_mcap_chunk(source: Source, at: int, stop: int) -> int | None:
 
 def next_ros1_chunk(source: Source, at: int, stop: int) -> int | None:
     """Return where the next whole chunk of a ROS 1 bag begins, between `at` and `stop`."""
+    return _search(source, at, stop, _candidates(_ROS1_CHUNK), _has(source, stop, _ROS1_CHUNK))
 
-    def is_chunk(place: int) -> bool:
+
+def next_ros1_message(source: Source, at: int, stop: int) -> int | None:
+    """Return where the next whole message of a bag of version 1.2 begins, between `at` and `stop`."""
+    return _search(source, at, stop, _candidates(_ROS1_MESSAGE), _has(source, stop, _ROS1_MESSAGE))
+
+
+def _has(source: Source, stop: int, kind: _Ros1Kind) -> Callable[[int], bool]:
+    """Return what says whether a whole record of a kind begins somewhere."""
+    window = Window(source)
+
+    def fits(place: int) -> bool:
         try:
-            record = ros1_records.record_at(Window(source), place, stop)
+            record = ros1_records.record_at(window, place, stop)
         except BagError:
             return False
-        return record.op == ros1_records.Op.CHUNK and {b"compression", b"size"} <= record.header.keys()
+        return record.op == kind.op and kind.fields <= record.header.keys()
 
-    return _search(source, at, stop, _ros1_candidates, is_chunk)
+    return fits
 
 
 def _search(
@@ -63,7 +92,7 @@ def _search(
                 return at + place
         if len(data) < _STEP_BYTES:
             return None
-        at += _STEP_BYTES - _HEAD_BYTES
+        at += _STEP_BYTES - _OVERLAP_BYTES
     return None
 
 
@@ -78,10 +107,17 @@ def _mcap_candidates(data: bytes) -> Iterator[int]:
     yield from np.flatnonzero(likely).tolist()
 
 
-def _ros1_candidates(data: bytes) -> Iterator[int]:
-    """Yield where a record header begins that reaches over the field `op=` of a chunk."""
-    for found in _ROS1_CHUNK.finditer(data):
-        for begin in range(max(found.start() - _HEAD_BYTES // 2, 0), found.start() - 3):
-            (size,) = struct.unpack_from("<I", data, begin)
-            if found.end() - begin - 4 <= size <= _HEAD_BYTES:
-                yield begin
+def _candidates(kind: _Ros1Kind) -> Callable[[bytes], Iterator[int]]:
+    """Return what yields where a record header begins that reaches over the field `op=` of a kind."""
+    field = re.compile(re.escape(b"\x04\x00\x00\x00op=" + bytes([kind.op])))
+
+    def candidates(data: bytes) -> Iterator[int]:
+        tried = 0
+        for found in field.finditer(data):
+            for begin in range(max(found.start() - kind.before, tried), found.start() - 3):
+                (size,) = struct.unpack_from("<I", data, begin)
+                if found.end() - begin - 4 <= size <= 2 * kind.before:
+                    yield begin
+            tried = max(found.start() - 3, tried)
+
+    return candidates

@@ -67,7 +67,7 @@ def read_index(source: Source) -> Ros1Index:
     if line != _VERSION:
         version = re.split(rb"[\r\n]", window.peek(0, 32))[0].decode("ascii", "replace")
         raise BagError(
-            f"bag format {version!r}; V2.0 is read",
+            f"bag format {version!r}; V2.0 and V1.2 are read",
             where=str(source.path),
             hint="convert it with `rosbag fix`",
         )
