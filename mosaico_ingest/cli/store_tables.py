@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import pyarrow as pa
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from mosaico_ingest.cli.tables import open_console, print_json
+from mosaico_ingest.plan.model import LEDGER_KEY
 from mosaico_ingest.report.units import bytes_text, count_text, seconds_text, time_text
 from mosaico_ingest.store import SequenceInfo, TopicInfo
 
 __all__ = ["print_sequence", "print_sequences", "print_topic"]
 
-LONGEST_VALUE = 160
+LONGEST_VALUE = 100
 """Characters of one value before it is cut; images and clouds are long."""
+_TYPE_WIDTH, _CELL_WIDTH = 28, 24
 
 
 def print_sequences(sequences: Sequence[SequenceInfo], *, as_json: bool) -> None:
@@ -50,8 +53,7 @@ def print_sequence(info: SequenceInfo, *, as_json: bool) -> None:
         return
     console = open_console()
     console.print(Text(info.name, style="bold"))
-    for key, value in info.metadata.items():
-        console.print(f"  {key}: {value}")
+    _print_metadata(info.metadata, console)
     table = _table("topic", ontology=False, rows=True, size=True, start=False, duration=True)
     for topic in info.topics:
         size = bytes_text(topic.stored_bytes)
@@ -72,7 +74,7 @@ def print_sequence(info: SequenceInfo, *, as_json: bool) -> None:
 
 
 def print_topic(info: TopicInfo, reader: pa.RecordBatchReader, *, rows: int, as_json: bool) -> None:
-    """Print a topic's schema, counts, time span, metadata, files and first rows."""
+    """Print a topic's counts, time span, files, metadata, columns and first rows."""
     first = _first_rows(reader, rows)
     if as_json:
         print_json(json.dumps({**_topic_json(info), "first_rows": first}, indent=2, default=_plain))
@@ -83,18 +85,54 @@ def print_topic(info: TopicInfo, reader: pa.RecordBatchReader, *, rows: int, as_
     console.print(f"{facts}, {time_text(info.start_ns)} .. {time_text(info.end_ns)} UTC")
     for segment in info.segments:
         console.print(Text(f"  {segment.path}"), soft_wrap=True)
-    console.print("schema", style="dim")
-    for field in info.schema:
-        console.print(
-            Text(f"  {field.name}: {field.type}{'' if field.nullable else ' not null'}"), soft_wrap=True
-        )
-    console.print("metadata", style="dim")
-    for key, value in info.metadata.items():
-        console.print(Text(f"  {key}: {_short(value)}"), soft_wrap=True)
-    if first:
-        console.print("first rows", style="dim")
-    for row in first:
-        console.print(Text(f"  {_short(row)}"), soft_wrap=True)
+    _print_metadata(info.metadata, console)
+    console.print(_columns(info.schema, first))
+
+
+def _columns(schema: pa.Schema, first: Sequence[Mapping[str, Any]]) -> Table:
+    """Return a line for each column, those of structs too: its path, its type, its values in the first rows."""
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    table.add_column("column", no_wrap=True)
+    table.add_column("type", style="cyan", max_width=_TYPE_WIDTH, no_wrap=True)
+    for number in range(len(first)):
+        table.add_column(f"row {number + 1}", max_width=_CELL_WIDTH, no_wrap=True)
+    for path, kind, values in _leaves(schema, first):
+        table.add_row(Text(path), Text(kind), *(Text(_cell(value)) for value in values))
+    return table
+
+
+def _leaves(
+    fields: Iterable[pa.Field[Any]], rows: Sequence[Mapping[str, Any] | None], above: str = ""
+) -> Iterator[tuple[str, str, list[Any]]]:
+    """Yield path, type and values of each column; those of a struct that no row has are one."""
+    for field in fields:
+        path = f"{above}{field.name}"
+        values = [None if row is None else row[field.name] for row in rows]
+        if not pa.types.is_struct(field.type):
+            yield path, f"{field.type}{'' if field.nullable else ' not null'}", values
+        elif rows and all(value is None for value in values):
+            yield f"{path}.*", f"{field.type.num_fields} columns", values
+        else:
+            yield from _leaves(field.type, values, f"{path}.")
+
+
+def _print_metadata(metadata: Mapping[str, Any], console: Console) -> None:
+    for key, value in metadata.items():
+        if key == LEDGER_KEY and isinstance(value, dict) and "sources" in value:
+            names = ", ".join(str(source["name"]) for source in value["sources"])
+            lines = {key: f"{value.get('tool')} from {names}"}
+        else:
+            lines = (
+                {f"{key}.{name}": part for name, part in value.items()}
+                if isinstance(value, dict)
+                else {key: value}
+            )
+        for name, part in lines.items():
+            console.print(Text(f"  {name}: {_cell(part)}"), soft_wrap=True)
+
+
+def _cell(value: object) -> str:
+    return "-" if value is None else _cut(value).replace("\n", "\\n")
 
 
 def _first_rows(reader: pa.RecordBatchReader, rows: int) -> list[dict[str, Any]]:
@@ -148,15 +186,6 @@ def _topic_json(info: TopicInfo) -> dict[str, Any]:
         "files": [str(segment.path) for segment in info.segments],
         "schema": {field.name: str(field.type) for field in info.schema},
     }
-
-
-def _short(value: object) -> str:
-    text = (
-        _cut(value)
-        if not isinstance(value, dict)
-        else f"{{{', '.join(f'{k}: {_cut(v)}' for k, v in value.items())}}}"
-    )
-    return text.replace("\n", "\\n")
 
 
 def _cut(value: object) -> str:

@@ -121,6 +121,8 @@ def _print_recording(report: Report, console: Console) -> None:
         console.print(f"{report.sequence}: skipped, the same content is there already", highlight=False)
     if report.status is RunStatus.SKIPPED or not report.topics:
         return
+    if report.status is RunStatus.FAILED and not report.totals.read:
+        return  # the error says it all
     columns = COLUMNS if console.width >= ROOMY else tuple(c for c in COLUMNS if c not in {"rate", "payload"})
     table = Table(box=None, pad_edge=False, header_style="dim")
     table.add_column("topic", overflow="ellipsis", no_wrap=True)

@@ -248,7 +248,7 @@ def taken(sequence: str) -> SequenceExists:
     return SequenceExists(
         "the sequence exists",
         where=sequence,
-        hint="choose another name, or sequence.if_exists: append or replace",
+        hint="choose another name, or set sequence.if_exists: skip (where the content is the same), append or replace",
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -76,15 +77,22 @@ def test_a_second_run_says_that_the_name_is_taken(project: Path) -> None:
     done = ingest("configs/quickstart.yaml", cwd=project)
     assert done.returncode == 1
     assert "quickstart_drive" in done.stderr
+    assert "if_exists: skip" in done.stderr
     assert "Traceback" not in done.stderr
+    assert "/imu" not in done.stdout, "no table of a run that read nothing"
 
 
 def test_the_store_can_be_looked_into(project: Path) -> None:
     listed = json.loads(ingest("store", "ls", "--json", cwd=project).stdout)
     assert [sequence["name"] for sequence in listed] == ["quickstart_drive"]
     shown = ingest("store", "show", "quickstart_drive/imu", cwd=project).stdout
-    assert "acceleration" in shown
     assert "1,000 rows" in shown
+    lines = {line.split()[0]: line.split() for line in shown.splitlines() if line}
+    assert lines["acceleration.z"] == ["acceleration.z", "double", "9.81", "9.81", "9.81"]
+    assert lines["acceleration.header.*"][1:] == ["3", "columns", "-", "-", "-"]
+    assert "_ros_.msgtype: sensor_msgs/msg/Imu" in shown
+    sequence = ingest("store", "show", "quickstart_drive", cwd=project).stdout
+    assert re.search(r"mosaico_ingest: \S+ from drive\.mcap\n", sequence)
 
 
 def test_the_recording_is_what_its_script_writes(tmp_path: Path) -> None:
