@@ -5,10 +5,19 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from enum import Enum
+from functools import lru_cache
 
 import pyarrow as pa
 
 __all__ = ["OntologyType", "SerializationFormat", "fingerprint"]
+
+
+_PLAIN: dict[pa.DataType, pa.DataType] = {
+    pa.large_string(): pa.string(),
+    pa.string_view(): pa.string(),
+    pa.large_binary(): pa.binary(),
+    pa.binary_view(): pa.binary(),
+}
 
 
 class SerializationFormat(str, Enum):
@@ -33,13 +42,8 @@ class OntologyType:
         return fingerprint(self.struct)
 
 
+@lru_cache(maxsize=256)
 def fingerprint(struct: pa.StructType) -> str:
     """Return the first ten hex digits of the SHA-1 of the struct's spelling; top-level large and view types count as plain."""
-    plain: dict[pa.DataType, pa.DataType] = {
-        pa.large_string(): pa.string(),
-        pa.string_view(): pa.string(),
-        pa.large_binary(): pa.binary(),
-        pa.binary_view(): pa.binary(),
-    }
-    fields = [pa.field(field.name, plain.get(field.type) or field.type, field.nullable) for field in struct]
+    fields = [pa.field(field.name, _PLAIN.get(field.type) or field.type, field.nullable) for field in struct]
     return hashlib.sha1(str(pa.struct(fields)).encode(), usedforsecurity=False).hexdigest()[:10]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import pyarrow as pa
@@ -18,6 +19,8 @@ _SAMPLES = 16
 _PIECE_BYTES = _SAMPLE_BYTES // _SAMPLES
 _TOO_LITTLE = 1 << 12
 _WORTH_IT = 0.9
+_SCHEMAS = 256
+"""How many are remembered; the topics of one recording are those of the next."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +41,7 @@ class Leaf:
         return ".".join(self.steps)
 
 
+@lru_cache(maxsize=_SCHEMAS)
 def leaves(schema: pa.Schema) -> tuple[Leaf, ...]:
     """Return the columns in the order Parquet numbers them."""
     return tuple(
@@ -64,6 +68,7 @@ def _walk(at: Leaf) -> Iterator[Leaf]:
         yield at
 
 
+@lru_cache(maxsize=_SCHEMAS)
 def check_columns(schema: pa.Schema) -> None:
     """Raise what Parquet says against the columns, before there is a file or a row."""
     if len(set(schema.names)) != len(schema.names):
@@ -75,9 +80,10 @@ def writer_options(columns: tuple[Leaf, ...], rows: pa.Table) -> dict[str, Any]:
     """Return what `pq.ParquetWriter` is told: by type, and for blobs by how a sample of the first rows shrinks.
 
     Splitting the bytes of floats makes them smaller and faster to write than plain or dictionary pages;
-    JPEGs and their like only cost time in a second compressor.
+    JPEGs and their like only cost time in a second compressor, and so do rows that fit into one block of a disk.
     """
-    packed = {leaf.parquet_path for leaf in columns if _is_blob(leaf) and not _shrinks(leaf, rows)}
+    few = rows.nbytes < _TOO_LITTLE
+    packed = {leaf.parquet_path for leaf in columns if few or (_is_blob(leaf) and not _shrinks(leaf, rows))}
     zstd = [leaf.parquet_path for leaf in columns if leaf.parquet_path not in packed]
     encodings = {leaf.parquet_path: "BYTE_STREAM_SPLIT" for leaf in columns if _splits(leaf.type)}
     encodings[columns[0].parquet_path] = "DELTA_BINARY_PACKED"

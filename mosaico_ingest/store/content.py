@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -52,28 +53,6 @@ class _Column(Protocol):
     def digest(self) -> bytes: ...
 
 
-def _column(kind: pa.DataType) -> _Column:
-    nested: dict[type[pa.DataType], Callable[[Any], _Column]] = {
-        pa.StructType: _Structs,
-        pa.ListType: _Lists,
-        pa.LargeListType: _Lists,
-        pa.FixedSizeListType: _Lists,
-        pa.MapType: _Maps,
-    }
-    if type(kind) in nested:
-        return nested[type(kind)](kind)
-    if isinstance(kind, pa.DictionaryType):
-        return _Decoded(kind.value_type)
-    if any(is_text(kind) for is_text in _TEXTS):
-        return _Texts()
-    if pa.types.is_string_view(kind) or pa.types.is_binary_view(kind):
-        return _Decoded(pa.large_binary())
-    return _Decoded(pa.uint8()) if pa.types.is_boolean(kind) else _Numbers()
-
-
-_TEXTS = (pa.types.is_string, pa.types.is_large_string, pa.types.is_binary, pa.types.is_large_binary)
-
-
 class _Nulls:
     """Which values are null, as the lengths of runs: first of values, then of nulls, and so on."""
 
@@ -83,8 +62,9 @@ class _Nulls:
         self._run = 0
 
     def add(self, array: pa.Array[Any]) -> None:
-        if array.null_count in {0, len(array)}:
-            self._extend(np.array([len(array)]), valid=array.null_count == 0)
+        nulls = array.null_count
+        if nulls in {0, len(array)}:
+            self._extend_by(len(array), valid=nulls == 0)
             return
         valid = array.is_valid().to_numpy(zero_copy_only=False)
         edges = np.flatnonzero(valid[1:] != valid[:-1]) + 1
@@ -94,6 +74,14 @@ class _Nulls:
         ended = self._hash.copy()
         ended.update(self._run.to_bytes(8, "little"))
         return ended.digest()
+
+    def _extend_by(self, run: int, *, valid: bool) -> None:
+        """Append one run, as most chunks are."""
+        if valid is self._valid:
+            self._run += run
+        else:
+            self._hash.update(self._run.to_bytes(8, "little"))
+            self._valid, self._run = valid, run
 
     def _extend(self, runs: NDArray[np.int64], *, valid: bool) -> None:
         """Append runs, the first of which is of values or not; a run is known once the next one begins."""
@@ -215,6 +203,33 @@ class _Decoded:
 
     def digest(self) -> bytes:
         return self._values.digest()
+
+
+def _column(kind: pa.DataType) -> _Column:
+    make = _NESTED.get(type(kind))
+    if make is not None:
+        return make(kind)
+    if isinstance(kind, pa.DictionaryType):
+        return _Decoded(kind.value_type)
+    return _PLAIN.get(kind, _Numbers)()
+
+
+_NESTED: dict[type[pa.DataType], Callable[[Any], _Column]] = {
+    pa.StructType: _Structs,
+    pa.ListType: _Lists,
+    pa.LargeListType: _Lists,
+    pa.FixedSizeListType: _Lists,
+    pa.MapType: _Maps,
+}
+_PLAIN: dict[pa.DataType, Callable[[], _Column]] = {
+    pa.string(): _Texts,
+    pa.large_string(): _Texts,
+    pa.binary(): _Texts,
+    pa.large_binary(): _Texts,
+    pa.string_view(): partial(_Decoded, pa.large_binary()),
+    pa.binary_view(): partial(_Decoded, pa.large_binary()),
+    pa.bool_(): partial(_Decoded, pa.uint8()),
+}
 
 
 def _piece(buffer: pa.Buffer | None, start: int, size: int) -> memoryview:

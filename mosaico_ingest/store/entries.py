@@ -130,7 +130,10 @@ def commit(db: sqlite3.Connection, claimed: Claim, new: NewSession) -> list[str]
         "INSERT INTO sessions VALUES (?, ?, ?, ?, ?)",
         (new.id, sequence_id, new.metadata, new.created_ns, time.time_ns()),
     )
+    held = _types(db, sequence_id)
     for topic in new.topics:
+        if topic.name in held:
+            check_same_type(held[topic.name], topic.ontology, where=topic.name)
         _enter_segments(db, _topic(db, sequence_id, new.id, topic), new.id, topic.segments)
     db.executemany(
         "INSERT INTO notes (sequence_id, topic, message, created_ns) VALUES (?, ?, ?, ?)",
@@ -178,9 +181,6 @@ def _sequence(db: sqlite3.Connection, claimed: Claim, new: NewSession) -> int:
 
 
 def _topic(db: sqlite3.Connection, sequence_id: int, session: str, topic: NewTopic) -> int:
-    held = _types(db, sequence_id).get(topic.name)
-    if held is not None:
-        check_same_type(held, topic.ontology, where=topic.name)
     db.execute(
         "INSERT INTO topics (sequence_id, session_id, name, ontology_tag, serialization_format, fingerprint,"
         " arrow_schema, metadata, created_ns) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"

@@ -31,7 +31,7 @@ __all__ = ["Layout", "encoded", "fsync", "new_session_id"]
 _UNSAFE = re.compile(rb"[^A-Za-z0-9_-]")
 _LONGEST = 200
 _ATTEMPTS = 5
-_AT_ONCE = 4
+_AT_ONCE = 8
 _CROCKFORD = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
 
 
@@ -103,13 +103,17 @@ class Layout:
             yield from (Path(folder, name) for name in files)
 
     def publish(self, moves: Mapping[AnyPath, AnyPath]) -> None:
-        """Move finished files to their places, so that they are there after a power cut."""
+        """Move finished files to their places, so that they are there, and whole, after a power cut."""
+        paths = [(Path(str(staged)), Path(str(target))) for staged, target in moves.items()]
         changed: set[Path] = set()
-        for staged, target in ((Path(str(one)), Path(str(other))) for one, other in moves.items()):
-            changed |= {folder.parent for folder in target.parents if not folder.exists()} | {target.parent}
-            _move(staged, target)
         with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="fsync") as pool:
-            list(pool.map(fsync, changed))  # a disk takes several together in the time of one
+            list(pool.map(fsync, (staged for staged, _ in paths)))  # a disk takes several in the time of one
+            for staged, target in paths:
+                changed |= {folder.parent for folder in target.parents if not folder.exists()} | {
+                    target.parent
+                }
+                _move(staged, target)
+            list(pool.map(fsync, changed))
 
     def remove(self, paths: Iterable[AnyPath]) -> None:
         """Remove segment files and the folders that are empty then; garbage collection gets what resists."""

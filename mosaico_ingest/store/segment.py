@@ -27,7 +27,7 @@ _LARGEST_INTEGER = 1 << 63
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A finished segment, on the disk to stay."""
+    """A finished segment."""
 
     path: AnyPath
     rows: int
@@ -48,6 +48,7 @@ class SegmentWriter:
         self._leaves = leaves(schema)
         self._content = ContentHash(schema)
         self._file = files.create(path)
+        self._footer: list[pq.FileMetaData] = []
         self._writer = pq.ParquetWriter(
             self._file,
             schema,
@@ -55,6 +56,7 @@ class SegmentWriter:
             sorting_columns=[pq.SortingColumn(0)],
             write_batch_size=4096,
             write_page_checksum=True,
+            metadata_collector=self._footer,
             **writer_options(self._leaves, first_rows),
         )
 
@@ -70,11 +72,10 @@ class SegmentWriter:
         self.end_ns = rows.column(0)[-1].as_py()
 
     def close(self) -> Segment:
-        """Finish the file, wait until it is on the disk, and read its footer back."""
+        """Finish the file; it may not be on the disk yet."""
         self._writer.close()
         self._file.close()
-        files.settle(self.path)
-        footer = files.footer(self.path)
+        (footer,) = self._footer
         bounds = tuple(_bounds(self._leaves, footer))
         _, start_ns, end_ns = bounds[0]
         return Segment(
@@ -89,7 +90,9 @@ class SegmentWriter:
 
     def abandon(self) -> None:
         """Close the file without caring for its content."""
-        with suppress(OSError, pa.ArrowException):
+        with suppress(
+            OSError, pa.ArrowException, RuntimeError
+        ):  # the last: that there is no footer to collect
             self._writer.close()
         with suppress(OSError, pa.ArrowException):
             self._file.close()

@@ -14,6 +14,7 @@ from mosaico_ingest.errors import SinkError
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote.path import AnyPath
 from mosaico_ingest.sink import check_batch, topic_schema
+from mosaico_ingest.store import files
 from mosaico_ingest.store.columns import check_columns
 from mosaico_ingest.store.faults import explained
 from mosaico_ingest.store.segment import Segment, SegmentWriter, sorted_rows
@@ -134,6 +135,9 @@ class StoreTopic:
         self._writer.append(rows)
         if self._writer.written_bytes >= _SEGMENT_BYTES:
             self._finish_segment()
+            files.settle(
+                self.segments[-1].path
+            )  # as much as this goes to the disk while others are still read
 
     def _finish_segment(self) -> None:
         if self._writer is not None:
