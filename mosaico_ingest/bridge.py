@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -19,6 +19,7 @@ from mosaico_ingest.adapters.unmodeled import UnmodeledSpec
 from mosaico_ingest.bag.names import normalize_msgtype
 from mosaico_ingest.config import AdapterReference, ImageFormat, ROSInjectionConfig
 from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import SerializationFormat
 from mosaico_ingest.patterns import first_match
 
@@ -34,7 +35,7 @@ ENTRY_POINTS = "mosaico_ingest.adapters"
 Reason = Literal["override", "loaded", "registered", "entry point", "built-in", "unmodeled"]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Resolution:
     """The adapter of a topic and which rule chose it; the first of the reasons that applies does."""
 

@@ -10,6 +10,7 @@ from typing import Any, Literal, TypeAlias, TypeVar, get_args
 
 from mosaico_ingest.diagnostics import Span
 from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.patterns import first_match
 from mosaico_ingest.policies import (
     IfExists,
@@ -53,7 +54,7 @@ CustomMessages: TypeAlias = tuple[str, Path, Stores | None]
 _Choice = TypeVar("_Choice", bound=Enum)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class TimeBound:
     """A moment: ns since the epoch, or ns from the recording's first message (negative: back from its last)."""
 
@@ -67,7 +68,7 @@ class TimeBound:
         return (end_ns if self.ns < 0 else start_ns) + self.ns
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class TimeRange:
     """Part of a recording: `start` is in, `end` is out; None is its own start or end."""
 
@@ -75,7 +76,7 @@ class TimeRange:
     end: TimeBound | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Limit:
     """At most so many messages, or at most this share of them, from 0 to 1; one of the two is None."""
 
@@ -83,7 +84,7 @@ class Limit:
     share: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class QuarantineSettings:
     """Where rejected messages are kept and how many: of one topic, and of all together (None: all of them)."""
 
@@ -94,14 +95,14 @@ class QuarantineSettings:
     """So many failures from the very start of a topic end it."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class StoreTarget:
     """The embedded store in a directory, or behind a URL."""
 
     path: AnyPath
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ServerTarget:
     """A Mosaico server."""
 
@@ -112,7 +113,7 @@ class ServerTarget:
     tls: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Attempt:
     """Which try of which run this is: a later one takes back what an earlier one committed before it died."""
 
@@ -173,7 +174,7 @@ class ROSInjectionConfig:
     unmodeled: Unmodeled = Unmodeled.KEEP
     base_dir: Path = Path()
     """Where the relative paths of adapter references start."""
-    time_range: TimeRange = TimeRange()
+    time_range: TimeRange = field(default_factory=TimeRange)
     images: Mapping[str, ImageFormat] = field(default_factory=dict[str, ImageFormat])
     """How raw images are stored, by topic name or glob; raw where it is not given."""
     rename: Mapping[str, str] = field(default_factory=dict[str, str])

@@ -6,6 +6,8 @@ import re
 from dataclasses import dataclass
 from enum import Enum
 
+from mosaico_ingest.frozen import frozen
+
 __all__ = ["Edit", "Finding", "RowFailure", "Severity", "Span", "Stage", "encodable", "one_line"]
 
 _ESCAPED_BYTES = 0xDC00
@@ -53,7 +55,7 @@ class Span:
         return f"{self.file}:{self.line}:{self.column}"
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Edit:
     """A change that mends a finding: the text of `span` becomes `text`."""
 
@@ -61,7 +63,7 @@ class Edit:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Finding:
     """One thing to know: which rule, where, what, and the remedy."""
 
@@ -92,7 +94,7 @@ class Stage(str, Enum):
     WRITE = "write"
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class RowFailure:
     """One row that could not go on: its position in the batch that was given, the rule it broke, and why."""
 

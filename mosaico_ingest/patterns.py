@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
+
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["Selection", "first_match", "select"]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Selection:
     """The topics that are in, and for every topic the position of the pattern that decided (None: the default)."""
 

@@ -12,6 +12,7 @@ import pyarrow.compute as pc
 
 from mosaico_ingest import wire
 from mosaico_ingest.errors import SequenceExists, SinkError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.policies import IfExists
 
@@ -33,7 +34,7 @@ ENVELOPE = pa.field("timestamp_ns", pa.int64(), nullable=False)
 """The first column of every batch: when the message was recorded, ns since the epoch."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class StoredTopic:
     """What the destination says it holds of one topic of this session after the commit."""
 

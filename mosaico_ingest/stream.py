@@ -17,6 +17,7 @@ from mosaico_ingest.decode.choose import decoder_for
 from mosaico_ingest.decode.decoder import Decoder
 from mosaico_ingest.diagnostics import RowFailure, Stage
 from mosaico_ingest.errors import AdapterError, BagError, DecodeError, IngestError, SinkError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.required import fill_required
 from mosaico_ingest.plan.model import TopicPlan
 from mosaico_ingest.policies import LoaderErrorPolicy, TopicLevelErrorPolicy
@@ -30,7 +31,7 @@ from mosaico_ingest.write_buffer import WriteBuffer
 __all__ = ["Stream"]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Lost:
     """A message that did not go through, at its position in the raw batch."""
 
@@ -38,7 +39,7 @@ class _Lost:
     failure: RowFailure
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Translated:
     """What became of a raw batch: rows, where they were in it, what was lost, what was sampled away."""
 

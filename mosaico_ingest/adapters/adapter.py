@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,12 +10,13 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.bag.definition import Definition
 from mosaico_ingest.diagnostics import RowFailure
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import OntologyType
 
 __all__ = ["Adapted", "Adapter", "AdapterSpec", "Envelope"]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Envelope:
     """What is known of the rows beside their content."""
 
@@ -26,7 +26,7 @@ class Envelope:
     """ns since the epoch, shape (n,)."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Adapted:
     """The rows that fit, which of the given rows they were, and the ones that did not."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -11,13 +10,14 @@ import pyarrow as pa
 from mosaico_ingest.adapters.adapter import Adapter
 from mosaico_ingest.adapters.mapping.load import MappingSpec, load_adapter
 from mosaico_ingest.bag.definition import Definition
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["BUILTIN", "BY_NAME", "BY_TYPE", "Builtin", "find_builtin"]
 
 CATALOG = Path(__file__).parent / "catalog"
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Builtin:
     """An adapter of the catalog; its file is read when it is first bound."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from mosaico_ingest.adapters.adapter import AdapterSpec
@@ -14,12 +13,13 @@ from mosaico_ingest.adapters.mapping.load import MappingSpec
 from mosaico_ingest.adapters.mapping.model import Form, Scalar, Value
 from mosaico_ingest.adapters.python_adapter import PythonAdapterSpec, ontology_of
 from mosaico_ingest.bag.names import normalize_msgtype
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import OntologyType
 
 __all__ = ["ColumnOrigin", "Description", "describe"]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ColumnOrigin:
     """One column of the records, or a field of one, and where its values come from."""
 
@@ -31,7 +31,7 @@ class ColumnOrigin:
     """An expression, or what stands for one; None: it is null."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Description:
     """An adapter in words."""
 

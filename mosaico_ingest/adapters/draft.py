@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from textwrap import indent
 from typing import Any, cast
 
@@ -19,6 +18,7 @@ from mosaico_ingest.adapters.yamltext import flow, key
 from mosaico_ingest.bag.definition import Definition
 from mosaico_ingest.bag.shape import ros_shape
 from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.registry import ontology_type, tags
 
 __all__ = ["Example", "draft"]
@@ -27,7 +27,7 @@ _LONG = 1500
 """How many characters of a message a test spells out; a longer one is named by its place in the recording."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Example:
     """A recorded message for the draft's test."""
 

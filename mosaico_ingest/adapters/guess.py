@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import keyword
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import pyarrow as pa
 
@@ -15,6 +14,7 @@ from mosaico_ingest.adapters.mapping.kinds import Unfit, is_number, kind_of, spe
 from mosaico_ingest.adapters.yamltext import key, word
 from mosaico_ingest.bag.definition import Container, Definition, Field
 from mosaico_ingest.bag.shape import BYTES, TEXTS, ros_shape
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.registry import ontology_type
 
 __all__ = ["Guess", "guess_columns", "guess_type"]
@@ -25,7 +25,7 @@ _TELLING = 4
 """From how many letters on a column's name is looked for inside longer ones."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Guess:
     """What may fill a column."""
 
@@ -37,7 +37,7 @@ class Guess:
     fields: tuple[Guess, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Candidate:
     """A field of the message, however deep, but not inside a list."""
 

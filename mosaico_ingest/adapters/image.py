@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 import zlib
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ import pyarrow as pa
 from mosaico_ingest.adapters.adapter import Adapted, Adapter, AdapterSpec, Envelope
 from mosaico_ingest.bag.definition import Definition
 from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import OntologyType
 
 __all__ = ["PngImageSpec", "greyscale_pixels", "greyscale_png", "without_png"]
@@ -76,7 +76,7 @@ def _chunk(kind: bytes, body: bytes) -> bytes:
     return b"".join((struct.pack(">I", len(body)), kind, body, struct.pack(">I", checksum)))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class PngImageSpec:
     """An image adapter whose raw rows are stored as PNG; of other ontologies it changes nothing."""
 
@@ -103,7 +103,7 @@ class PngImageSpec:
         return _PngImages(adapter) if adapter.ontology.tag == "Image" else adapter
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _PngImages:
     inner: Adapter
 

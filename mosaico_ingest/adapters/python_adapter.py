@@ -17,6 +17,7 @@ from mosaico_ingest.bag.definition import Definition
 from mosaico_ingest.bag.message import ROSMessage
 from mosaico_ingest.diagnostics import RowFailure
 from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 
 __all__ = ["PythonAdapterSpec", "is_adapter_class", "ontology_of"]
@@ -27,7 +28,7 @@ _ROWS_AS_DICTS = 256
 """How many messages are Python objects at a time; an image topic shall not be all in memory twice."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class PythonAdapterSpec:
     """An adapter class: a subclass of `ROSAdapterBase`, ours or the official SDK's."""
 
@@ -60,7 +61,7 @@ class PythonAdapterSpec:
         return self.origin or (PythonAdapterSpec, (self.adapter, self.default))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class PythonAdapter:
     """Calls an adapter class for rows; whatever it raises rejects the row it was raised for."""
 

@@ -9,7 +9,6 @@ import sys
 import traceback
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager
-from dataclasses import dataclass
 from difflib import get_close_matches
 from hashlib import sha1
 from pathlib import Path
@@ -22,6 +21,7 @@ from mosaico_ingest.adapters.mapping.load import load_adapter
 from mosaico_ingest.adapters.python_adapter import PythonAdapterSpec, is_adapter_class
 from mosaico_ingest.adapters.unmodeled import UnmodeledSpec
 from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["KnownAdapters", "adapter_spec", "load_adapter_reference", "what_was_meant"]
 
@@ -82,7 +82,7 @@ def what_was_meant(ref: str, known: Iterable[str] = ()) -> str:
     return "see `ingest adapters list`, or write a YAML path, module:Class or file.py:Class"
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class KnownAdapters:
     """Finds the adapters a mapping may use: the built-in ones, and those of the files beside it."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -10,6 +9,7 @@ import pyarrow as pa
 
 from mosaico_ingest.adapters.adapter import Adapted, Envelope
 from mosaico_ingest.bag.definition import Definition
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 
 __all__ = ["UnmodeledSpec"]
@@ -19,7 +19,7 @@ _ONE_MEMBER = pa.struct([("structure_needs_at_least_one_member", pa.uint8())])
 """What a nested message without fields becomes, as ROS 2 itself spells it: Parquet has no struct without fields."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class UnmodeledSpec:
     """Keeps a message as it is; fits every type, and is nobody's default."""
 
@@ -37,7 +37,7 @@ class UnmodeledSpec:
         return UnmodeledAdapter(OntologyType(tag, struct, self.serialization_format), renamed)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class UnmodeledAdapter:
     """Hands the rows on without copying; at most fields get another name, or a member where they have none."""
 

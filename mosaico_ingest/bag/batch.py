@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mosaico_ingest.bag.definition import Definition
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["Channel", "Encoding", "Loss", "RawBatch"]
 
@@ -24,7 +25,7 @@ class Encoding(str, Enum):
     """Not a ROS encoding (protobuf, json, …): named, never decoded."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Channel:
     """Messages of one type on one topic, written the same way; a topic may have several."""
 
@@ -44,7 +45,7 @@ class Channel:
     """What else the recording says: QoS profiles, caller id, md5, raw encoding name."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class RawBatch:
     """n messages of one channel in log-time order, their payloads inside one buffer."""
 
@@ -70,7 +71,7 @@ class RawBatch:
         return self.data[start : start + int(self.lengths[row])].tobytes()
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Loss:
     """Something of a recording that could not be read, and why."""
 

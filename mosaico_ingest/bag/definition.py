@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
+
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["Constant", "Container", "Definition", "Embedded", "Field", "MessageType", "Resolver", "Source"]
 
@@ -30,7 +31,7 @@ class Source(str, Enum):
     """A public package that no distro's core has."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Field:
     """One field: `type` is a primitive (`float64`, `string`, `wstring`, …) or a full message type name."""
 
@@ -44,7 +45,7 @@ class Field:
     """What `string<=N` says (0: unbounded); the bytes do not depend on it."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Constant:
     """A named value of a message type, as `uint8 STATUS_FIX=0`."""
 
@@ -53,7 +54,7 @@ class Constant:
     value: str | bool | int | float
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class MessageType:
     """A message type's own fields and constants; `name` is `pkg/msg/Name`, also for ROS 1."""
 
@@ -62,7 +63,7 @@ class MessageType:
     constants: tuple[Constant, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Definition:
     """A message type with every type it needs, and where it came from."""
 
@@ -80,7 +81,7 @@ class Definition:
         return self.types[self.root]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Embedded:
     """The definition text a recording carries for a type, as it stands there."""
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from mosaico_ingest.bag.containers.opening import is_recording
 from mosaico_ingest.bag.metadata import FILE_NAME, Metadata, read_metadata
 from mosaico_ingest.diagnostics import Finding, Severity
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.path import AnyPath
 
 __all__ = ["Found", "discover"]
@@ -18,7 +18,7 @@ __all__ = ["Found", "discover"]
 _SUFFIX = ".zstd"
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Found:
     """The files of one recording, the metadata that describe all of them, and what is odd about either."""
 

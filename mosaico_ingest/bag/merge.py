@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Generator, Iterable, Iterator
-from dataclasses import dataclass
 
 from mosaico_ingest.bag.containers.part import EARLIEST_NS, LATEST_NS, Block
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["Turn", "in_turn"]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Turn:
     """One block, the part it is of, and the time no later block goes behind."""
 

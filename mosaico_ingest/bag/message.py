@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from mosaico_ingest.frozen import frozen
+
 __all__ = ["ROSHeader", "ROSMessage"]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ROSHeader:
     """The `std_msgs/Header` of a message."""
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import yaml
 
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.path import AnyPath
 from mosaico_ingest.textfile import read_whole
 
@@ -17,7 +17,7 @@ FILE_NAME = "metadata.yaml"
 _LIMIT_BYTES = 16 << 20
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class TopicHint:
     """What the metadata say of a topic."""
 
@@ -29,7 +29,7 @@ class TopicHint:
     """As the storage spells it; empty where this version of the metadata has another form."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Metadata:
     """The parts of `metadata.yaml` that can be compared with the storage."""
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 
 from mosaico_ingest.bag.definition import Constant, Container, Field, MessageType
 from mosaico_ingest.bag.names import DURATION, TIME, short_msgtype
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["PRIMITIVES", "SEPARATOR", "Section", "flatten", "parse_msg", "sections"]
 
@@ -35,7 +35,7 @@ _MAX_SIZE = 2**31 - 1
 _BUILTIN = {"time": TIME, "duration": DURATION}
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Section:
     """The text of one type among several; the first may have no name of its own."""
 

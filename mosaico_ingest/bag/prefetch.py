@@ -6,9 +6,10 @@ import queue
 import threading
 from collections.abc import Generator, Iterator
 from contextlib import closing, suppress
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Generic, TypeVar
+
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["Prefetched"]
 
@@ -16,7 +17,7 @@ T = TypeVar("T")
 _LOOK_SECONDS = 0.1
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _End:
     error: BaseException | None
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import weakref
 from collections.abc import Collection, Generator, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -23,6 +22,7 @@ from mosaico_ingest.bag.merge import Turn, in_turn
 from mosaico_ingest.bag.prefetch import Prefetched
 from mosaico_ingest.diagnostics import Finding
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.path import AnyPath, RemotePath
 
 __all__ = ["Recording", "open_recording"]
@@ -68,7 +68,7 @@ def _open_parts(files: Sequence[AnyPath], stack: ExitStack) -> tuple[list[Part],
     return parts, [Loss(err.where or "", 0, f"this part cannot be opened: {err.what}") for err in failed]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Step:
     """What one block gave, ready to be gathered."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import ClassVar
@@ -12,6 +11,7 @@ from mosaico_ingest.bag.definition import MessageType
 from mosaico_ingest.bag.names import normalize_msgtype
 from mosaico_ingest.bag.schemas import read_types
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.policies import Stores
 from mosaico_ingest.textfile import read_whole
 
@@ -20,7 +20,7 @@ __all__ = ["ROSTypeRegistry", "Registered", "directory_types", "register_source"
 _SUFFIXES = (".msg", ".idl")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Registered:
     """A definition text somebody gave: the type it is for, and every type it defines."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from mosaico_ingest.bag.registry import (
 from mosaico_ingest.bag.schemas import read_types
 from mosaico_ingest.diagnostics import Finding, Severity
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.policies import Stores
 
 __all__ = ["CustomMessages", "TypeResolver"]
@@ -36,7 +36,7 @@ _UNSAID = frozenset({"unknown", ""})
 _LANGUAGES = frozenset({"ros1msg", "ros2msg", "ros2idl", "omgidl", "idl", "msg"}) | _UNSAID
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Place:
     """One place where types are looked for."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -11,11 +10,12 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.bag.batch import RawBatch
 from mosaico_ingest.diagnostics import RowFailure
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["Decoded", "Decoder"]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Decoded:
     """The rows that could be decoded, which messages they were, and the ones that could not."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -11,6 +10,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from mosaico_ingest.decode.places import Int64s, expand
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["Array", "Cells", "array_of", "bytes_at", "cells", "offsets_of", "spans"]
 
@@ -23,7 +23,7 @@ _FAR = 1 << 28
 """Bytes from the first to the last value from which on taking, which reserves half as many, could be refused."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Cells:
     """`count` pieces of one size: the first begins at `begin` in `data`, each other `stride` bytes further."""
 

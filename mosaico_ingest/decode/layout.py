@@ -15,6 +15,7 @@ import numpy as np
 from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.definition import Container, Definition, Field, MessageType
 from mosaico_ingest.bag.shape import NUMBERS, TEXTS
+from mosaico_ingest.frozen import frozen
 
 __all__ = [
     "PADDING",
@@ -45,7 +46,7 @@ _MAX_ALIGN = 8
 _UNITS = {"string": 1, "wstring": 4}
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Block:
     """`size` bytes that start at a multiple of `align`."""
 
@@ -53,7 +54,7 @@ class Block:
     size: int
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Text:
     """A length word and that many units of text."""
 
@@ -63,7 +64,7 @@ class Text:
     """Whether a NUL ends the text and is counted, as in a CDR `string`."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Run:
     """A length word and that many cells, one every `stride` bytes."""
 
@@ -73,7 +74,7 @@ class Run:
     """The most elements there may be; 0: any number."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Loop:
     """Elements that have to be walked one after the other."""
 
@@ -86,7 +87,7 @@ class Loop:
 Step: TypeAlias = Block | Text | Run | Loop
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Body:
     """The steps of one message or element."""
 
@@ -95,7 +96,7 @@ class Body:
     """Bytes an instance has at least, alignment apart."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Leaf:
     """A number in a block; `dims` are (count, stride) of the fixed arrays around it within the block."""
 
@@ -105,7 +106,7 @@ class Leaf:
     dims: tuple[tuple[int, int], ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Words:
     """A text."""
 
@@ -113,7 +114,7 @@ class Words:
     text: Text
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Grid:
     """A fixed array within a block."""
 
@@ -121,7 +122,7 @@ class Grid:
     item: Column
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Items:
     """The elements of a run or a loop; the leaves of `item` point into the cell or the body."""
 
@@ -130,7 +131,7 @@ class Items:
     item: Column
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Record:
     """A struct."""
 
@@ -140,7 +141,7 @@ class Record:
 Column: TypeAlias = Leaf | Words | Grid | Items | Record
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Layout:
     """How the messages of one definition are walked, and the columns they become."""
 
@@ -190,7 +191,7 @@ class _Draft:
         return Body(tuple(self.steps), sum(_least(step) for step in self.steps))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Compiler:
     definition: Definition
     aligned: bool

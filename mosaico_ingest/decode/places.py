@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["Frame", "Int64s", "Located", "Place", "Places", "expand", "join"]
 
 Int64s: TypeAlias = NDArray[np.int64]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Frame:
     """n messages of one byte order in a buffer; alignment counts from `origins`, shapes (n,)."""
 
@@ -38,7 +39,7 @@ class Frame:
         return np.ndarray((count,), f"{self.order}u4", self.data.data, 0, (1,))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Place:
     """Where one step lies in each of m instances of its body, in the order of the messages."""
 
@@ -74,7 +75,7 @@ Places: TypeAlias = tuple[Place, ...]
 """One for each step of a body."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Located:
     """The n messages that fit the layout, and where their steps lie."""
 

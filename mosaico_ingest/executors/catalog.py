@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from os.path import relpath
 from pathlib import Path
@@ -29,6 +29,7 @@ from mosaico_ingest.diagnostics import Finding
 from mosaico_ingest.errors import AdapterError, BagError
 from mosaico_ingest.executors.recorded import definition_in, message_in
 from mosaico_ingest.executors.worker import make_plan
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.manifest.load import load_manifest
 from mosaico_ingest.plan.compile import compile_manifest
 
@@ -47,7 +48,7 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Known:
     """An adapter that can be named."""
 
@@ -60,7 +61,7 @@ class Known:
     summary: str
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Explained:
     """An adapter in words, and what is known of the type it was explained for."""
 
@@ -74,7 +75,7 @@ class Explained:
     """Adapters that take the type where they are named for a topic."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class TopicChoice:
     """Which adapter a topic gets, and why."""
 
@@ -87,7 +88,7 @@ class TopicChoice:
     why: str
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class TestResult:
     """What testing one adapter file showed."""
 

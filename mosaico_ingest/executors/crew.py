@@ -6,7 +6,6 @@ import os
 import pickle
 import signal
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -18,13 +17,14 @@ from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.interrupts import Stop
 from mosaico_ingest.executors.worker import failed_report, run_config
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.policies import Stores
 from mosaico_ingest.report.events import Event
 
 __all__ = ["Announced", "do_nothing", "work"]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Announced:
     """The types and adapters a program has registered, which a new process does not know of."""
 

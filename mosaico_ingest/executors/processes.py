@@ -18,6 +18,7 @@ from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.batch import Batch
 from mosaico_ingest.executors.crew import Announced, do_nothing, work
 from mosaico_ingest.executors.interrupts import counted_interrupts
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.plan.model import DEFAULT_MEMORY_BYTES
 from mosaico_ingest.report.events import BatchObserver
 from mosaico_ingest.report.model import Report
@@ -32,7 +33,7 @@ _LOOK_S = 0.2
 _LEAST_BYTES = 32 << 20
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Processes:
     """The executor for one machine: at most `jobs` recordings at a time, each in a process of its own.
 

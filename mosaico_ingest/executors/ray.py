@@ -21,6 +21,7 @@ from mosaico_ingest.executors.interrupts import counted_interrupts
 from mosaico_ingest.executors.processes import ATTEMPTS
 from mosaico_ingest.executors.shipment import absolute, pack
 from mosaico_ingest.executors.worker import place
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.plan.model import DEFAULT_MEMORY_BYTES
 from mosaico_ingest.report.events import BatchObserver, RunStarted
 from mosaico_ingest.report.model import Report
@@ -55,7 +56,7 @@ _PACKAGE = str(Path(__file__).parents[1])
 _NODE_ERRORS = (ray_errors.NodeDiedError, ray_errors.ObjectLostError)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Ray:
     """The executor for a cluster: connects to the one at `address`, or starts Ray on this machine.
 

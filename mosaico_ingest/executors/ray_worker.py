@@ -9,7 +9,6 @@ import socket
 import time
 from collections.abc import Generator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -21,6 +20,7 @@ from mosaico_ingest.errors import BagError, IngestError, Interrupted, SinkError
 from mosaico_ingest.executors.crew import Announced
 from mosaico_ingest.executors.interrupts import Stop
 from mosaico_ingest.executors.worker import failed_report, run_config
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.report.events import Event, RunFinished, RunStarted
 from mosaico_ingest.report.model import Report
 
@@ -32,7 +32,7 @@ Letter: TypeAlias = tuple[int, int, Event | logging.LogRecord]
 _SEND_EVERY_S = 0.2
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Setting:
     """What all tasks of a run have in common."""
 

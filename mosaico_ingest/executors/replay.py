@@ -6,7 +6,7 @@ import sqlite3
 import sys
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from mosaico_ingest.diagnostics import encodable
 from mosaico_ingest.errors import ManifestError, SinkUnavailable
 from mosaico_ingest.executors.content import content_digest
 from mosaico_ingest.executors.ledger import held
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.policies import IfExists, SessionLevelErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.quarantine.kept import Kept, find_kept
 from mosaico_ingest.store.lease import Lease
@@ -35,7 +36,7 @@ class Whereabouts(Enum):
     """The run that kept them is not part of the sequence: it was stopped, or what it made was replaced or removed."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Replay:
     """Kept messages, what the destination knows of them, and the configuration that brings them in."""
 

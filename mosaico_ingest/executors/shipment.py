@@ -6,12 +6,13 @@ import shutil
 import sys
 import sysconfig
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from os.path import abspath
 from pathlib import Path
 
 from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.config import ROSInjectionConfig, StoreTarget
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.path import AnyPath
 
 __all__ = ["absolute", "pack"]
@@ -48,7 +49,7 @@ def pack(configs: Iterable[ROSInjectionConfig], folder: Path) -> list[ROSInjecti
     return [box.add(config) for config in configs]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Box:
     folder: Path
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from enum import Enum
 
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.errors import IngestError, SequenceExists
 from mosaico_ingest.executors.ledger import certain, held, ledger_of, what_to_do
 from mosaico_ingest.executors.worker import make_plan
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.policies import IfExists
 
 __all__ = ["RecordingStatus", "Standing", "standings"]
@@ -30,7 +30,7 @@ class Standing(str, Enum):
     """The recording cannot be opened, or the job does not fit it."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class RecordingStatus:
     """One recording: what it becomes, how it stands, and why where that is not plain."""
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 from mosaico_ingest.bag.batch import RawBatch
 from mosaico_ingest.bag.recording import Recording
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.plan.document import Sample, SampleRejection
 from mosaico_ingest.plan.model import Plan, TopicPlan
 from mosaico_ingest.policies import LoaderErrorPolicy, TopicLevelErrorPolicy
@@ -52,7 +53,7 @@ class _Tally:
             )
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Trial:
     stream: Stream
     tally: _Tally

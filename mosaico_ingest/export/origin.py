@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any, cast
 
 from mosaico_ingest.adapters.metadata import ROS_METADATA_KEY
 from mosaico_ingest.bag.definition import Definition, Embedded
 from mosaico_ingest.bag.types import TypeResolver
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.policies import Stores
 from mosaico_ingest.store.model import TopicInfo
 
@@ -20,7 +20,7 @@ _TIME_1 = re.compile(r"^(?:time|duration)(?:\[\d*\])?\s", re.MULTILINE)
 _TIME_2 = re.compile(r"^builtin_interfaces/(?:Time|Duration)(?:\[[<=\d]*\])?\s", re.MULTILINE)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Origin:
     """The messages a topic was made of."""
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from enum import Enum
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
 
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.lint.suppress import MARKER
 
 __all__ = ["Document", "Kind", "documents_in", "kind_of"]
@@ -28,7 +28,7 @@ class Kind(str, Enum):
     MESSAGE = "message"
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Document:
     """A text to judge."""
 

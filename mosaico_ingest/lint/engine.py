@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from mosaico_ingest.diagnostics import Finding, Severity, Span
 from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.lint.adapter import adapter_findings
 from mosaico_ingest.lint.document import Document, Kind, documents_in
 from mosaico_ingest.lint.fix import apply_fixes
@@ -32,7 +33,7 @@ _OF_WHOLE = frozenset({"missing-key", "unset-variable"})
 _EXIT_CODES = {Severity.INFO: 10, Severity.WARNING: 11, Severity.ERROR: 12}
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Judged:
     """A file with what was found in it."""
 
@@ -45,7 +46,7 @@ class Judged:
     """The files it extends."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class LintReport:
     """Every file that was judged, in the order of their paths."""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from mosaico_ingest.diagnostics import Finding, Span
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.manifest.environment import fill_in
 from mosaico_ingest.manifest.load import check_manifest
 from mosaico_ingest.manifest.model import Manifest
@@ -26,7 +26,7 @@ _MISSING = "missing"
 """Stands for a text that must be there and is not, so that the rest can be judged."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Job:
     """A manifest; what the model refuses is left out of it, and reported by itself."""
 

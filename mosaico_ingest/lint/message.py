@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from mosaico_ingest.diagnostics import Span
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["Declaration", "MessageFile", "read_message"]
 
@@ -16,7 +16,7 @@ _DECLARATION = re.compile(
 )
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Declaration:
     """One line: a field or a constant."""
 
@@ -28,7 +28,7 @@ class Declaration:
     name_span: Span
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class MessageFile:
     """A definition text."""
 

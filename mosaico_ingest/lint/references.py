@@ -5,10 +5,10 @@ from __future__ import annotations
 import ast
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from importlib.machinery import PathFinder
 from pathlib import Path
 
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.manifest.source import Path as Place
 from mosaico_ingest.manifest.source import load_source
@@ -25,7 +25,7 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class PythonReference:
     """`module:Class` or `file.py:Class`."""
 

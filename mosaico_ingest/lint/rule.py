@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from textwrap import dedent
 
 from mosaico_ingest.diagnostics import Edit, Finding, Severity, Span
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.message import MessageFile
 
 __all__ = ["Problem", "Rule"]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Problem:
     """What a rule found; the engine adds the rule's name and severity."""
 
@@ -23,7 +23,7 @@ class Problem:
     fix: Edit | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Rule:
     """A rule; without a check of its own it names what is found while the text is read."""
 

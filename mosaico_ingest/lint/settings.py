@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from pathlib import Path
@@ -13,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mosaico_ingest.diagnostics import Finding, Severity, Span
 from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.lint.rules import RULES
 from mosaico_ingest.manifest.load import read_text
 from mosaico_ingest.manifest.problems import explain, nearest
@@ -44,7 +44,7 @@ class _File(BaseModel):
     lint: _Lint = _Lint()
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Settings:
     """How much each rule matters here, and which files are left alone."""
 

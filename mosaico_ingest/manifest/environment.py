@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from mosaico_ingest.diagnostics import Finding, Severity
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.manifest.matrix import combinations, variables
 from mosaico_ingest.manifest.source import Path, Source, Value
 
@@ -53,7 +54,7 @@ def _filled(source: Source, known: _Variables) -> Filled:
     return filled
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Variables:
     """What variables stand for; the first that knows one says."""
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path as File
 
 from mosaico_ingest.diagnostics import Finding
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.manifest.load import check_manifest, read_manifest, refusal, stand_alone
 from mosaico_ingest.manifest.matrix import combinations
 from mosaico_ingest.manifest.source import Path, Source, Value
@@ -14,7 +14,7 @@ from mosaico_ingest.manifest.source import Path, Source, Value
 __all__ = ["Expanded", "expand_manifest"]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Expanded:
     """One job, as a document that extends nothing and has no matrix."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from mosaico_ingest.diagnostics import Finding, Severity, Span
 from mosaico_ingest.errors import IngestError, ManifestError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.manifest.environment import Filled, fill_in, fill_in_cell
 from mosaico_ingest.manifest.extends import extended
 from mosaico_ingest.manifest.matrix import combinations
@@ -38,7 +39,7 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class LoadedManifest:
     """A manifest that holds together, with the place of everything in it."""
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["PLACEHOLDERS", "Placeholder", "placeholders_in"]
 
@@ -14,7 +15,7 @@ _WIDTH = re.compile(r"0?[0-9]")
 _BRACED = re.compile(r"\{([^{}]*)\}")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Placeholder:
     """`{index:03}` at `start:end` of a name."""
 

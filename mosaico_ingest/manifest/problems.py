@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any
 
@@ -13,6 +12,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from mosaico_ingest.diagnostics import Edit, Finding, Severity, Span
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.manifest.source import Path, Source, Value, member
 
 __all__ = ["explain", "keys_at", "nearest", "place_of"]
@@ -33,7 +33,7 @@ _BRACED = re.compile(r"\{\w+\}")
 _PLAIN = re.compile(r"[^\s\"'\\#&*!|>@`%\[\],]+")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Problem:
     error: ErrorDetails
     path: Path

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["Scalar", "Trap", "resolve_plain"]
 
@@ -29,7 +30,7 @@ _OTHER_NUMBER = re.compile(
 )
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Trap:
     """A scalar that YAML readers understand differently."""
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import yaml
 
 from mosaico_ingest.diagnostics import Finding, Severity, Span
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.manifest.compose import Composer, LimitExceeded, Path, Value, member
 
 __all__ = ["MAX_CHARACTERS", "Path", "Source", "Value", "load_source", "member"]
@@ -46,7 +47,7 @@ _REMEDIES = (
 _UNPRINTABLE = re.compile(r"[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Source:
     """A YAML document: its value, the place of everything in it, and what is wrong with its writing.
 

@@ -11,12 +11,13 @@ class Sonar(Serializable):
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import pyarrow as pa
 from pydantic import Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
+
+from mosaico_ingest.frozen import frozen
 
 __all__ = [
     "FixedSize",
@@ -47,12 +48,12 @@ Float32 = Annotated[float, pa.float32()]
 Float64 = Annotated[float, pa.float64()]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Nullable:
     """Marks a column that may hold nulls although the model wants a value."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class FixedSize:
     """Marks a list of exactly `length` values."""
 

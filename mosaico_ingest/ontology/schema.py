@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import types
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from enum import Enum
 from functools import cache
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -13,6 +12,7 @@ import pyarrow as pa
 from pydantic import BaseModel
 
 from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.fields import FixedSize, Nullable
 
 __all__ = ["struct_of"]
@@ -36,7 +36,7 @@ def struct_of(model: type[BaseModel]) -> pa.StructType:
     return _struct(model, ())
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Column:
     """An annotation taken apart: the bare type and what was said about it."""
 

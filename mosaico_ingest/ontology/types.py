@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
 
 import pyarrow as pa
+
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["OntologyType", "SerializationFormat", "fingerprint"]
 
@@ -28,7 +29,7 @@ class SerializationFormat(str, Enum):
     IMAGE = "image"
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class OntologyType:
     """What a topic's rows are; `struct` has every column but `timestamp_ns`."""
 

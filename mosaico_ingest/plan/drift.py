@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.plan.document import Decisions
 
 __all__ = ["Difference", "differences"]
@@ -17,7 +17,7 @@ _NAMES = {"topics": ("topic", "target"), "left_out": ("left out", "topic"), "fil
 """How an item of a list is called, and the key that tells it from the others."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Difference:
     """One thing that is not the same; what is not there on one side is None."""
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from mosaico_ingest.adapters.adapter import AdapterSpec
 from mosaico_ingest.bag.definition import Resolver
 from mosaico_ingest.config import Attempt, QuarantineSettings, ServerTarget, StoreTarget
 from mosaico_ingest.diagnostics import Finding, Span
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.policies import (
     IfExists,
@@ -26,7 +26,7 @@ LEDGER_KEY = "mosaico_ingest"
 DEFAULT_MEMORY_BYTES = 256 * 1024 * 1024
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class TopicPlan:
     """One stream: the channels it is made of, what it becomes, and why."""
 
@@ -50,7 +50,7 @@ class TopicPlan:
     """Where each of its definitions was found, and the digest of its text, as `bag 1f0c9a22b7e4d8a3`."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class LeftOut:
     """A topic of the recording that will not be read, and why."""
 
@@ -62,7 +62,7 @@ class LeftOut:
     """Where the manifest says so."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Plan:
     """What will be done with one recording."""
 

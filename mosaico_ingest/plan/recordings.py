@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
 from datetime import datetime, timezone
 from difflib import get_close_matches
 from glob import has_magic
 
 from mosaico_ingest.errors import ManifestError, NothingMatched
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.manifest.load import LoadedManifest
 from mosaico_ingest.manifest.placeholders import PLACEHOLDERS, Placeholder, placeholders_in
 from mosaico_ingest.remote.path import AnyPath, RemotePath, without_options
@@ -20,7 +20,7 @@ _RECORDING = re.compile(r"\.(bag|db3|mcap)(\.(zstd|zst|lz4|gz|bz2))?$", re.IGNOR
 _REFUSED = re.compile(r"[^A-Za-z0-9_-]+")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Recording:
     """One recording: its parts, and its position (from 1) among those of the job."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from difflib import unified_diff
 from typing import Any, cast
 
@@ -12,6 +12,7 @@ from mosaico_ingest.adapters.metadata import ROS_METADATA_KEY
 from mosaico_ingest.config import StoreTarget
 from mosaico_ingest.diagnostics import Finding, Severity
 from mosaico_ingest.errors import IngestError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.plan.model import LEDGER_KEY, Plan, TopicPlan
 from mosaico_ingest.policies import OnSchemaChange
 from mosaico_ingest.store.store import Store
@@ -20,7 +21,7 @@ from mosaico_ingest.wire import check_topic_name
 __all__ = ["follow_schema_changes"]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Known:
     """A definition that a sequence of the family has for a topic."""
 

@@ -7,7 +7,6 @@ import ssl
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from ipaddress import ip_address
 from typing import Any, TypeVar, cast
 
@@ -17,6 +16,7 @@ import pyarrow.flight as fl
 
 from mosaico_ingest.config import ServerTarget
 from mosaico_ingest.errors import SinkError, SinkUnavailable
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.platform.faults import Address, Refused, check_tls, late, reraise
 from mosaico_ingest.platform.patience import OutOfPatience, within
 from mosaico_ingest.wire import bodies
@@ -45,7 +45,7 @@ _Answer = TypeVar("_Answer", bound=Body)
 _Result = TypeVar("_Result")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Uploaded:
     """What a server says it holds of a topic."""
 

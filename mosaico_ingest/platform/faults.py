@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import socket
 import ssl
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import NoReturn
 
 from mosaico_ingest.errors import IngestError, SinkError, SinkUnavailable
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.wire.actions import Permission
 from mosaico_ingest.wire.conditions import Condition, condition_of, text_of
 from mosaico_ingest.wire.keys import key_problem
@@ -32,7 +33,7 @@ class Refused(SinkError):  # noqa: N818 - the condition, as in `errors`
         self.condition = condition
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Address:
     """Where a server is and how it is spoken to."""
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 from mosaico_ingest import wire
 from mosaico_ingest.config import ServerTarget
 from mosaico_ingest.errors import IngestError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.platform.client import connect
 from mosaico_ingest.platform.faults import add_hint
 from mosaico_ingest.platform.session import PlatformSession
@@ -21,7 +21,7 @@ __all__ = ["PlatformSink"]
 _BUFFER_BYTES = 96 << 20
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class PlatformSink:
     """Writes sequences to a server; one session holds at most about `buffer_bytes` in memory.
 

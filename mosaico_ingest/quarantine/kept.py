@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from mosaico_ingest.errors import BagError, NothingMatched
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.quarantine.quarantine import INDEX, MESSAGES, retire
 
 __all__ = ["Kept", "find_kept"]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Kept:
     """The messages one run kept, and the sequence they belong to."""
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import unquote, urlsplit
 
 from mosaico_ingest.errors import IngestError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.faults import reaching
 from mosaico_ingest.remote.filesystem import SCHEMES, filesystem
 
@@ -27,7 +28,7 @@ _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/(?=[^/])|([A-Za-z][A-Za-z0-9+.-]+
 """With one slash too: that is what is left of a URL that went through `Path`."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class RemoteStat:
     """What is known of an object without reading it; named as in `os.stat_result`."""
 

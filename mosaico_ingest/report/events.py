@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from enum import Enum
 from typing import TypeAlias
 
 from mosaico_ingest.diagnostics import Finding, Stage
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.report.stopwatch import Step
 from mosaico_ingest.report.timeline import TimelineReport
 
@@ -58,7 +58,7 @@ class TopicStatus(str, Enum):
     """Not selected, or nothing here can read it."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Expected:
     """A topic of the plan, as the display and the report need it."""
 
@@ -73,7 +73,7 @@ class Expected:
     left_out: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class RunStarted:
     """The plan stands and the work begins."""
 
@@ -84,7 +84,7 @@ class RunStarted:
     topics: tuple[Expected, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class TopicProgress:
     """More messages of one stream went through; every number is an increment."""
 
@@ -98,7 +98,7 @@ class TopicProgress:
     end_ns: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Rejected:
     """Messages of one stream that could not go on for one reason; `first_*` is about the first of them."""
 
@@ -113,7 +113,7 @@ class Rejected:
     """How many of them lie in the quarantine."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Unreadable:
     """A stretch of the recording that could not be read."""
 
@@ -124,14 +124,14 @@ class Unreadable:
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Noted:
     """A finding about the recording that does not stop the run."""
 
     finding: Finding
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Quarantined:
     """Rejected messages lie in a file, from which they can be replayed."""
 
@@ -139,7 +139,7 @@ class Quarantined:
     """Its path."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class TopicClosed:
     """A stream came to its end."""
 
@@ -151,14 +151,14 @@ class TopicClosed:
     checksum: str | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Timed:
     """What the recording's time was spent on, in seconds."""
 
     seconds: Mapping[Step, float]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class RunFinished:
     """The recording is done with, one way or another."""
 

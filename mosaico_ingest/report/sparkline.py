@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.report.markup import Markup, element
 from mosaico_ingest.report.model import TopicReport
 from mosaico_ingest.report.timeline import TimelineReport
@@ -19,7 +19,7 @@ _FEW = 4.0
 _LEAST_STRETCHES = 8
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Gap:
     """A time without rows in the middle of a topic, ns since the epoch."""
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["Leaf", "check_columns", "leaves", "writer_options"]
 
@@ -23,7 +24,7 @@ _SCHEMAS = 256
 """How many are remembered; the topics of one recording are those of the next."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Leaf:
     """One Parquet column: a value without children."""
 

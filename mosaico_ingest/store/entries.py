@@ -5,11 +5,11 @@ from __future__ import annotations
 import sqlite3
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import pyarrow as pa
 
 from mosaico_ingest.errors import SequenceExists, SinkError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.sink import check_same_type
@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Claim:
     """The sequence as it was when the session began; the commit insists on finding it so."""
 
@@ -44,7 +44,7 @@ class Claim:
     """What its topics hold, for a session that appends to them."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class NewTopic:
     """A topic of the session, and its segments under the paths the catalog will know them by."""
 
@@ -56,7 +56,7 @@ class NewTopic:
     segments: Mapping[str, Segment]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class NewNote:
     """An error to attach."""
 
@@ -65,7 +65,7 @@ class NewNote:
     created_ns: int
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class NewSession:
     """All a session wrote."""
 

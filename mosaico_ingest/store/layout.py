@@ -19,9 +19,9 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.path import AnyPath
 from mosaico_ingest.store.faults import explained
 from mosaico_ingest.store.lease import Lease, is_live
@@ -35,7 +35,7 @@ _AT_ONCE = 8
 _CROCKFORD = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Layout:
     """The paths of the store at `root`."""
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import pyarrow as pa
 
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote.path import AnyPath
 from mosaico_ingest.store.content import combined
@@ -15,7 +15,7 @@ from mosaico_ingest.store.content import combined
 __all__ = ["Collected", "Note", "SegmentInfo", "SequenceInfo", "SessionInfo", "TopicInfo"]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class SegmentInfo:
     """One Parquet file: rows of one topic and session, sorted by `timestamp_ns`."""
 
@@ -30,7 +30,7 @@ class SegmentInfo:
     """Of the values of its rows, see `ContentHash`; None where it was written before there were any."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class TopicInfo:
     """One topic: its type, its columns, and the segments that hold its rows."""
 
@@ -72,7 +72,7 @@ class TopicInfo:
         return combined(segment.checksum for segment in self.segments)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class SessionInfo:
     """One writing session that was committed."""
 
@@ -84,7 +84,7 @@ class SessionInfo:
     completed_ns: int
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Note:
     """An error somebody attached to a sequence, or to one of its topics."""
 
@@ -93,7 +93,7 @@ class Note:
     created_ns: int
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class SequenceInfo:
     """One sequence with everything the catalog knows of it."""
 
@@ -126,7 +126,7 @@ class SequenceInfo:
         return max(_known(topic.end_ns for topic in self.topics), default=None)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Collected:
     """What garbage collection removed."""
 

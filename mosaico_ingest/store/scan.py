@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
 
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.store.faults import explained
 from mosaico_ingest.store.files import opened
 from mosaico_ingest.store.model import SegmentInfo
@@ -18,7 +18,7 @@ __all__ = ["Window", "count", "scan"]
 _BATCH_ROWS = 1 << 16
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Window:
     """A span of time, its start in, its end out; None is open."""
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.path import AnyPath
 from mosaico_ingest.store import files
 from mosaico_ingest.store.columns import Leaf, leaves, writer_options
@@ -25,7 +25,7 @@ _LONGEST_TEXT = 256
 _LARGEST_INTEGER = 1 << 63
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Segment:
     """A finished segment."""
 

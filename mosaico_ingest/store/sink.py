@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 from mosaico_ingest import wire
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.sink import Session
 from mosaico_ingest.store.session import StoreSession
@@ -18,7 +18,7 @@ __all__ = ["StoreSink"]
 _BUFFER_BYTES = 96 << 20
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class StoreSink:
     """Writes sequences into a store; one session holds at most about `buffer_bytes` in memory."""
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import pyarrow as pa
 
 from mosaico_ingest import wire
 from mosaico_ingest.errors import SinkError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.path import AnyPath, RemotePath, as_path
 from mosaico_ingest.store.catalog import Catalog
 from mosaico_ingest.store.entries import NewNote
@@ -25,7 +25,7 @@ __all__ = ["Store"]
 _GRACE_S = 10.0
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Store:
     """A folder of Parquet segments and the catalog that says what they are; made by `Store.open`."""
 

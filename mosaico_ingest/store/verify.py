@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.store.content import ContentHash
 from mosaico_ingest.store.files import opened
 from mosaico_ingest.store.model import SegmentInfo, SequenceInfo, TopicInfo
@@ -16,7 +16,7 @@ from mosaico_ingest.store.segment import time_span
 __all__ = ["Checked", "verify"]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Checked:
     """One segment that was read to its end, and what is wrong with it."""
 

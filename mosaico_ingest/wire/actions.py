@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import Enum
 from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.wire import bodies
 from mosaico_ingest.wire.bodies import Body
 
@@ -60,7 +60,7 @@ class Permission(str, Enum):
         return order.index(self) >= order.index(needed)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Action(Generic[Question, Answer]):
     """A call: what is asked, what is answered (`Empty`: nothing)."""
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from mosaico_ingest.adapters.mapping.arrow import Array, arrays
 from mosaico_ingest.adapters.mapping.columns import open_list
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["CLOUD_FUNCTIONS", "CloudField", "make_clouds"]
 
@@ -23,7 +23,7 @@ CLOUD_FUNCTIONS: Mapping[str, tuple[str, int]] = {
 """What a function reads from a cloud: numpy's name of it, and the number PointField has for it."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class CloudField:
     """A field of the points of every row."""
 

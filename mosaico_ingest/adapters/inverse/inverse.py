@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Protocol
 
 import pyarrow as pa
@@ -27,6 +27,7 @@ from mosaico_ingest.adapters.mapping.load import MappingAdapter
 from mosaico_ingest.adapters.mapping.typed import FieldOf, Typed, Whole
 from mosaico_ingest.adapters.unmodeled import UnmodeledAdapter
 from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["Inverse", "Restored", "invert"]
 
@@ -34,7 +35,7 @@ _IMAGE = "Image"
 """The one type whose rows `topic_settings` may have packed."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Restored:
     """A batch of messages, and how far they are what was stored."""
 
@@ -69,7 +70,7 @@ def invert(adapter: Adapter, shape: pa.StructType, metadata: Mapping[str, Any]) 
     raise AdapterError("an adapter written in Python has no way back")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Kept:
     """Of messages that kept their shape: exact."""
 
@@ -82,7 +83,7 @@ class _Kept:
         return Restored(struct_of(columns, self.shape, None, len(rows)))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Mapped:
     """Of messages that went through a mapping."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -20,6 +19,7 @@ from mosaico_ingest.adapters.mapping.columns import (
     var_list,
 )
 from mosaico_ingest.adapters.mapping.kinds import is_list
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["EACH", "Parts", "Place"]
 
@@ -35,7 +35,7 @@ _ONTOLOGY_NAMES = {
 """What the ontology calls the fields of a header and of a time."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Mark:
     """An element of a list, or a value that says why another was left out; where the whole is known, that stands."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,6 +28,7 @@ from mosaico_ingest.adapters.mapping.typed import (
     Typed,
     Whole,
 )
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["Undo"]
 
@@ -37,7 +37,7 @@ _MOVES = frozenset({"ros_time", "ros_header"})
 _OPERANDS = 2
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Scope:
     """Where names are looked up, and the lists that were opened on the way there."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -15,23 +15,24 @@ from mosaico_ingest.adapters.mapping.evaluate import Evaluation, Refusal, RowsRe
 from mosaico_ingest.adapters.mapping.fit import convert, refuse_nulls
 from mosaico_ingest.adapters.mapping.functions.registry import Refuse
 from mosaico_ingest.adapters.mapping.typed import Typed
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["Absent", "ByAdapter", "ByFields", "Computed", "Filled", "Looked", "Source", "fill", "fill_struct"]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Absent:
     """Nothing: null in every row."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Computed:
     """An expression."""
 
     typed: Typed
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Looked:
     """A value looked up in a table."""
 
@@ -44,7 +45,7 @@ class Looked:
     """For a value that is not there; None: the row is rejected."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ByAdapter:
     """What another adapter makes of a nested message."""
 
@@ -54,7 +55,7 @@ class ByAdapter:
     msgtype: str
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ByFields:
     """A struct, field by field; with `of`, names are read inside it."""
 
@@ -65,7 +66,7 @@ class ByFields:
 Source: TypeAlias = "Absent | Computed | Looked | ByAdapter | ByFields"
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Filled:
     """One column of the ontology and where it comes from."""
 

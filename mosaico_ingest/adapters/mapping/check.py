@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from mosaico_ingest.adapters.mapping.arrow import arrays, pt
@@ -48,6 +48,7 @@ from mosaico_ingest.adapters.mapping.typed import (
     Whole,
 )
 from mosaico_ingest.bag.definition import MessageType
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["CAST_TYPES", "Checker", "Report", "Scope", "constant"]
 
@@ -68,7 +69,7 @@ Report = Callable[[str, str, Place, "str | None"], None]
 _UNKNOWN, _TYPE = "unknown-field", "type"
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Scope:
     """Where names are looked up: a message and the types it is made of."""
 

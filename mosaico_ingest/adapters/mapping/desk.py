@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from mosaico_ingest.adapters.mapping.arrow import DataType, pt
@@ -16,6 +16,7 @@ from mosaico_ingest.adapters.mapping.kinds import Kind, Unfit, is_list, spell
 from mosaico_ingest.adapters.mapping.model import Scalar
 from mosaico_ingest.adapters.mapping.typed import Const, Typed, Written
 from mosaico_ingest.diagnostics import Finding, Severity
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.manifest.source import Path, Source
 
 __all__ = ["SPECIAL", "Desk", "Slot"]
@@ -28,7 +29,7 @@ SPECIAL = {
 """What looks like a function and is not: fewest and most arguments, spelling."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Slot:
     """A column to be filled: what it must be, where the file says so, and where names are read."""
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import ast
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import TypeAlias
+
+from mosaico_ingest.frozen import frozen
 
 __all__ = [
     "Attribute",
@@ -42,7 +44,7 @@ class ExpressionError(Exception):
         self.hint = hint
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Literal:
     """A number, text, `true`, `false` or `null`."""
 
@@ -50,7 +52,7 @@ class Literal:
     at: Place = field(compare=False)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Name:
     """A field or constant of the message."""
 
@@ -58,7 +60,7 @@ class Name:
     at: Place = field(compare=False)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Attribute:
     """`of.name`."""
 
@@ -68,7 +70,7 @@ class Attribute:
     name_at: Place = field(compare=False)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Each:
     """`of[]`: every element of a list."""
 
@@ -76,7 +78,7 @@ class Each:
     at: Place = field(compare=False)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Item:
     """`of[index]`."""
 
@@ -85,7 +87,7 @@ class Item:
     at: Place = field(compare=False)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ListOf:
     """`[a, b, c]`."""
 
@@ -93,7 +95,7 @@ class ListOf:
     at: Place = field(compare=False)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Call:
     """A function or an operator, by its name (`sqrt`, `+`, `==`)."""
 
@@ -103,7 +105,7 @@ class Call:
     name_at: Place = field(compare=False)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Choice:
     """`then if condition else otherwise`."""
 

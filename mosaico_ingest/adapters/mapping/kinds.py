@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import pyarrow as pa
 
 from mosaico_ingest.adapters.mapping.arrow import DataType, arrays, pt
+from mosaico_ingest.frozen import frozen
 
 __all__ = [
     "INT64",
@@ -41,7 +42,7 @@ class Unfit(Exception):  # noqa: N818 - a condition of two types, turned into a 
         self.hint = hint
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Kind:
     """The static type of an expression; of a computed float, `type` is the widest float field in it."""
 

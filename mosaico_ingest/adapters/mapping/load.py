@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextvars import ContextVar
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -25,6 +25,7 @@ from mosaico_ingest.bag.definition import Definition, MessageType
 from mosaico_ingest.bag.names import normalize_msgtype
 from mosaico_ingest.diagnostics import Finding, RowFailure, Severity
 from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.manifest.source import Source, load_source
 from mosaico_ingest.ontology.registry import UnknownTag, ontology_type
 from mosaico_ingest.ontology.types import OntologyType
@@ -41,7 +42,7 @@ _Known: TypeAlias = tuple[str, int, tuple[MessageType, ...]]
 """All of a definition that decides how a mapping is compiled."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class MappingAdapter:
     """A mapping bound to one message definition; satisfies `Adapter`."""
 
@@ -82,7 +83,7 @@ class MappingAdapter:
             return {}
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class MappingSpec:
     """An adapter file that reads well; satisfies `AdapterSpec`, and survives pickling if its look-up does."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -20,6 +19,7 @@ from mosaico_ingest.bag.definition import Definition, Embedded, Resolver
 from mosaico_ingest.bag.names import normalize_msgtype
 from mosaico_ingest.bag.shape import ros_shape
 from mosaico_ingest.errors import BagError, IngestError
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["Outcome", "ReadRecorded", "message_row", "run_tests"]
 
@@ -30,7 +30,7 @@ _RELATIVE, _ABSOLUTE = 1e-6, 1e-9
 """How far numbers may differ: float32 columns keep about seven digits."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Outcome:
     """The result of one test."""
 

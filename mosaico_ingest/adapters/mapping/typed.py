@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import TypeAlias
 
 from mosaico_ingest.adapters.mapping.arrow import DataType
 from mosaico_ingest.adapters.mapping.expression import LiteralValue, Node
 from mosaico_ingest.adapters.mapping.functions.registry import Function
 from mosaico_ingest.adapters.mapping.kinds import Kind
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.manifest.source import Path
 
 __all__ = [
@@ -27,7 +28,7 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Const:
     """The same value for every row."""
 
@@ -36,7 +37,7 @@ class Const:
     text: str = field(compare=False, default="")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Whole:
     """The message itself."""
 
@@ -44,7 +45,7 @@ class Whole:
     text: str = field(compare=False, default="self")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class FieldOf:
     """A field of a message."""
 
@@ -54,7 +55,7 @@ class FieldOf:
     text: str = field(compare=False, default="")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class EachOf:
     """A list, opened."""
 
@@ -63,7 +64,7 @@ class EachOf:
     text: str = field(compare=False, default="")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Fold:
     """The innermost open list, closed for a function that takes it whole."""
 
@@ -72,7 +73,7 @@ class Fold:
     text: str = field(compare=False, default="")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ItemOf:
     """One element of a list."""
 
@@ -82,7 +83,7 @@ class ItemOf:
     text: str = field(compare=False, default="")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ListValue:
     """Values side by side."""
 
@@ -91,7 +92,7 @@ class ListValue:
     text: str = field(compare=False, default="")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Cast:
     """A number in a type it may not fit."""
 
@@ -101,7 +102,7 @@ class Cast:
     text: str = field(compare=False, default="")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Apply:
     """A function of other values."""
 
@@ -112,7 +113,7 @@ class Apply:
     text: str = field(compare=False, default="")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ChoiceOf:
     """One of two values."""
 
@@ -123,7 +124,7 @@ class ChoiceOf:
     text: str = field(compare=False, default="")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Written:
     """An expression as written and as understood; `typed` is None where there is no message to type it by."""
 

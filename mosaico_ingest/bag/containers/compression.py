@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import bz2
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,6 +14,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.frozen import frozen
 
 __all__ = [
     "Packed",
@@ -70,7 +70,7 @@ def inflate(data: bytes | memoryview, compression: str, size: int) -> bytes | me
     return whole
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Packed:
     """A chunk's data as they lie in the file, and what the chunk says of them."""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from operator import itemgetter
@@ -40,6 +39,7 @@ from mosaico_ingest.bag.containers.slab import Bytes, by_key, keep_each, stretch
 from mosaico_ingest.bag.containers.source import Source
 from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["McapPart"]
 
@@ -59,7 +59,7 @@ _FIXED_BYTES = _HEAD.itemsize - RECORD.size
 """How much of a message record's length is not payload."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Chunk:
     """A piece as it was read, and its data."""
 

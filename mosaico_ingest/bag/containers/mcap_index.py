@@ -23,6 +23,7 @@ from mosaico_ingest.bag.containers.part import LATEST_NS, Hole
 from mosaico_ingest.bag.containers.resume import next_mcap_chunk
 from mosaico_ingest.bag.containers.source import Fields, Source, Window
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["McapIndex", "Piece", "read_index", "read_pieces"]
 
@@ -33,7 +34,7 @@ _RUN_BYTES = 4 << 20
 _MESSAGE = struct.Struct("<HIQ")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Piece:
     """Records that are read at once: a chunk with the message indexes behind it, or messages outside chunks."""
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 from mosaico_ingest.bag.containers.source import Fields
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.frozen import frozen
 
 __all__ = [
     "RECORD",
@@ -33,7 +33,7 @@ class Op:
     DATA_END = 0x0F
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Schema:
     """A message type as the file describes it."""
 
@@ -42,7 +42,7 @@ class Schema:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class McapChannel:
     """A channel as the file describes it."""
 
@@ -52,7 +52,7 @@ class McapChannel:
     metadata: dict[str, str]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ChunkHead:
     """A chunk's own fields; `begin` and `end` bound its data within the bytes it was read from."""
 

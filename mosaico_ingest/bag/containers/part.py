@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.definition import Embedded
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.path import AnyPath
 
 __all__ = [
@@ -34,7 +35,7 @@ BLOCK_BYTES, MOST_PIECES = 8 << 20, 64
 T = TypeVar("T")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Stream:
     """One connection as its file describes it."""
 
@@ -52,7 +53,7 @@ class Stream:
     attributes: dict[str, str] = field(default_factory=dict[str, str])
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Slab:
     """n messages inside one buffer, of one stream; every start and length has been checked against the buffer."""
 
@@ -84,7 +85,7 @@ class Slab:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Hole:
     """What could not be read of one file: `bag.batch.Loss` before streams have become channels."""
 
@@ -103,7 +104,7 @@ def orphans(counts: Mapping[int, int] | None, known: Collection[int]) -> list[Ho
     ]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Loaded:
     """What one block gave."""
 
@@ -111,7 +112,7 @@ class Loaded:
     holes: list[Hole]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Block:
     """A piece of a file that is read at once; none of its messages is older than `start_ns`."""
 
@@ -133,7 +134,7 @@ def in_groups(pieces: Iterable[T], size: Callable[[T], int], *, most: int = MOST
         yield group
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Want:
     """Which messages to read: streams by key, and times from `start_ns` up to, not including, `end_ns`."""
 

@@ -8,11 +8,11 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 from mosaico_ingest.bag.containers.source import FileSource
 from mosaico_ingest.errors import BagError, Unreachable
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.faults import reaching
 from mosaico_ingest.remote.path import RemotePath
 
@@ -29,7 +29,7 @@ _REQUESTS = 4
 """How many requests are under way at a time; with their answers they hold at most 32 MiB."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Stretch:
     start: int
     data: bytes

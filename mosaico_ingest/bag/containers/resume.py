@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from mosaico_ingest.bag.containers import mcap_records, ros1_records
 from mosaico_ingest.bag.containers.source import Source, Window
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["next_mcap_chunk", "next_ros1_chunk", "next_ros1_message"]
 
@@ -22,7 +22,7 @@ _HEAD_BYTES = 256
 """More than the fixed part of any chunk record."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Ros1Kind:
     """How the records of a kind are recognised."""
 

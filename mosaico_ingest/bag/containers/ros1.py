@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -28,6 +27,7 @@ from mosaico_ingest.bag.containers.slab import Bytes, by_key, keep, keep_each, s
 from mosaico_ingest.bag.containers.source import Source
 from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["Ros1Part"]
 
@@ -37,7 +37,7 @@ _CHUNKS = 16
 """How many chunks are read at once: only they themselves know to what size they inflate."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Chunk:
     """A piece as it was read: its data, and the index records behind it."""
 
@@ -301,7 +301,7 @@ def _words(heads: Bytes, at: int, count: int) -> NDArray[np.uint32]:
     return np.ascontiguousarray(heads[:, at : at + 4 * count]).view("<u4")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Layout:
     """How a message record begins: what lies where before its payload."""
 

@@ -25,6 +25,7 @@ from mosaico_ingest.bag.containers.ros1_records import (
 )
 from mosaico_ingest.bag.containers.source import Source, Window
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["Piece", "Ros1Index", "read_index"]
 
@@ -33,7 +34,7 @@ _RUN_BYTES = 4 << 20
 """How much of the messages outside chunks is read at once."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Piece:
     """A chunk and the index records behind it, read at once; or messages outside chunks."""
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.frozen import frozen
 
 __all__ = [
     "ENTRY",
@@ -42,7 +42,7 @@ class Op:
     MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Record:
     """Where a record's data are, and what its header says."""
 
@@ -53,7 +53,7 @@ class Record:
     end: int
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Message:
     """A message record as the slow way finds it."""
 
@@ -64,7 +64,7 @@ class Message:
     end: int
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Connection:
     """A connection as the file describes it."""
 
@@ -74,7 +74,7 @@ class Connection:
     attributes: dict[str, str]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ChunkHead:
     """A chunk's own fields; `begin` and `end` bound its data within the bytes it was read from."""
 

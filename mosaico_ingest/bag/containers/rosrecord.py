@@ -6,7 +6,6 @@ Their index, where there is one, is not used: it names messages only, and every 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -20,6 +19,7 @@ from mosaico_ingest.bag.containers.slab import by_key, keep_each
 from mosaico_ingest.bag.containers.source import Source, Window
 from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["MAGIC", "RosrecordPart"]
 
@@ -29,7 +29,7 @@ _RUN_BYTES = 4 << 20
 """How much of the file is read at once."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Name:
     """What a message says about itself; each is a stream of its own."""
 
@@ -38,7 +38,7 @@ class _Name:
     md5sum: str
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Run:
     """Messages that are read at once: their streams, times, and where they and their payloads lie."""
 

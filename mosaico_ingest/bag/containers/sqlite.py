@@ -8,7 +8,6 @@ import sqlite3
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,6 +30,7 @@ from mosaico_ingest.bag.containers.slab import by_key
 from mosaico_ingest.bag.containers.sqlite_salvage import BROKEN, Row, Salvage
 from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.path import AnyPath
 
 __all__ = ["SqlitePart"]
@@ -42,7 +42,7 @@ _EVENT = "_Event"
 _ROW_TYPES = [int, int, int, bytes]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Done:
     """How far reading by time has come: up to `time_ns`, and of that very time these rows."""
 
@@ -60,7 +60,7 @@ class _Done:
         return row[2] > self.time_ns or (row[2] == self.time_ns and row[0] not in self.rows)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Columns:
     """What the tables of this file have; rosbag2 added columns and tables over the years."""
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from datetime import datetime, timezone
 from typing import Any
 
 from mosaico_ingest import wire
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.store.model import Note
 from mosaico_ingest.store.server import query
 from mosaico_ingest.store.server.flights import split_locator
@@ -26,7 +26,7 @@ _PROTOCOL = bodies.SemVer(major=0, minor=7, patch=0)
 _EMPTY = bodies.Empty()
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Behind:
     """What answers are made from."""
 

@@ -6,13 +6,13 @@ import math
 import operator
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from fnmatch import translate
 from typing import Any, Final, Protocol, cast
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.store.server.refusals import Refusal
 from mosaico_ingest.wire.conditions import Condition
 
@@ -50,7 +50,7 @@ _COMPARISONS: Mapping[str, Callable[[Any, Any], Any]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Comparison:
     """`$eq $neq $lt $leq $gt $geq`: how a value stands to another."""
 
@@ -77,7 +77,7 @@ class Comparison:
         return compared
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Outside:
     """`$outside [low, high]`: below or above."""
 
@@ -97,7 +97,7 @@ class Outside:
         return (column < pc.scalar(self.low)) | (column > pc.scalar(self.high))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Choice:
     """`$in [a, b, …]`: one of them."""
 
@@ -116,7 +116,7 @@ class Choice:
         return column.isin(pa.array(list[Any](self.choices)).cast(kind))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Glob:
     """`$match pattern`: a whole text, with `*`, `?`, `[…]`, and `#` for a digit."""
 
@@ -138,7 +138,7 @@ class Glob:
         return translate(self.pattern.replace("#", "[0-9]"))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Presence:
     """`$ex`, `$nex`: whether there is a value."""
 

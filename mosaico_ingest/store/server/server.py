@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
 import pyarrow as pa
 
 from mosaico_ingest.errors import SinkError
+from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.path import RemotePath, as_path
 from mosaico_ingest.store.faults import explained
 from mosaico_ingest.store.server.keyring import Keyring
@@ -26,7 +26,7 @@ _GRACE_S = 10.0
 _TIDY_S = 30.0
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Tls:
     """The PEM files of the certificate chain a server shows, and of its private key."""
 

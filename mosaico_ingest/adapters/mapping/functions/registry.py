@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any, Protocol, TypeAlias
 
@@ -14,6 +13,7 @@ from mosaico_ingest.adapters.mapping.arrow import Array, DataType, arrays, pc, p
 from mosaico_ingest.adapters.mapping.columns import Mask
 from mosaico_ingest.adapters.mapping.kinds import Kind, Unfit, is_list, is_number, kind_of, spell
 from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.frozen import frozen
 
 __all__ = [
     "ANY",
@@ -46,7 +46,7 @@ class Refuse(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Take:
     """What a parameter accepts, and how the argument is made ready for it."""
 
@@ -66,7 +66,7 @@ class Take:
 Gives: TypeAlias = "Callable[..., Kind]"
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Function:
     """A function over whole columns: arguments are arrays of one length, or scalars where literal."""
 
