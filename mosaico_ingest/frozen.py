@@ -34,11 +34,10 @@ def _nothing(_of: object) -> tuple[()]:
     return ()
 
 
-def _equal(self: Any, other: object) -> bool:  # noqa: ANN401 - any class made here
-    kind = self.__class__
-    if kind is not other.__class__:
+def _equal(self: Any, other: Any) -> bool:  # noqa: ANN401 - any class made here
+    if self.__class__ is not other.__class__:
         return NotImplemented
-    values = kind.__compared__
+    values = self.__class__.__compared__
     return values(self) == values(other)
 
 
