@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 
 from mosaico_ingest.frozen import frozen
 
-__all__ = ["Edit", "Finding", "RowFailure", "Severity", "Span", "Stage", "encodable", "one_line"]
+__all__ = ["Edit", "Finding", "RowFailure", "Severity", "Span", "Stage", "a_few", "encodable", "one_line"]
 
 _ESCAPED_BYTES = 0xDC00
 """Where Python puts the bytes of a file name that it cannot decode."""
@@ -25,6 +26,13 @@ def encodable(text: str) -> str:
 def one_line(text: str) -> str:
     r"""Return the text with everything that does not print spelled as an escape, as `\x1b` or `\n`."""
     return _UNPRINTABLE.sub(_spelled, text)
+
+
+def a_few(names: Iterable[str], *, most: int = 8) -> str:
+    """Return the first names in the order of letters, and how many more there are."""
+    known = sorted(names)
+    more = f" and {len(known) - most:,} more" if len(known) > most else ""
+    return f"{', '.join(known[:most])}{more}"
 
 
 def _spelled(match: re.Match[str]) -> str:

@@ -24,6 +24,7 @@ def init(
     """Draft a manifest: every topic with its type, count and adapter, and what one may want to change."""
     from mosaico_ingest import api
     from mosaico_ingest.plan.draft import draft_manifest
+    from mosaico_ingest.report.units import counted
 
     if out is not None and out.exists() and not force:
         raise typer.BadParameter(f"{out} is there already; --force replaces it", param_hint="--out")
@@ -36,5 +37,5 @@ def init(
     folder.mkdir(parents=True, exist_ok=True)
     out.write_text(text, encoding="utf-8")
     typer.echo(
-        f"{out}: {sum(topic.problem is None for topic in found.topics)} topics; run it with `ingest {out}`"
+        f"{out}: {counted(sum(topic.problem is None for topic in found.topics), 'topic')}; run it with `ingest {out}`"
     )

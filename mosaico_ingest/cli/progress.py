@@ -27,7 +27,7 @@ from mosaico_ingest.report.events import (
     TopicProgress,
     Unreadable,
 )
-from mosaico_ingest.report.units import bytes_text, count_text
+from mosaico_ingest.report.units import bytes_text, count_text, counted
 
 __all__ = ["display"]
 
@@ -196,4 +196,4 @@ class _Board:
 def _begins(start: RunStarted) -> str:
     taken = sum(not topic.left_out for topic in start.topics)
     size = bytes_text(start.source_bytes)
-    return f"{start.sequence}: {taken} topics from {', '.join(start.files)} ({size}) to {start.destination}"
+    return f"{start.sequence}: {counted(taken, 'topic')} from {', '.join(start.files)} ({size}) to {start.destination}"

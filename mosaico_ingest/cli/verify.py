@@ -23,7 +23,7 @@ def verify(
 
     from mosaico_ingest.cli.tables import print_json
     from mosaico_ingest.errors import VerificationError
-    from mosaico_ingest.report.units import bytes_text, count_text
+    from mosaico_ingest.report.units import bytes_text, counted
     from mosaico_ingest.store import Store
     from mosaico_ingest.store.verify import verify as verify_sequence
 
@@ -45,9 +45,11 @@ def verify(
             typer.echo(f"{one['sequence']}{one['topic']}: {one['file']}: {one['problem']}", err=True)
     if bad:
         raise VerificationError(
-            f"{len(bad)} files are not as they were written",
+            f"{counted(len(bad), 'file')} not as written",
             where=store,
             hint="ingest their recordings again with if_exists: replace",
         )
     if not as_json:
-        typer.echo(f"{len(checked)} sequences, {count_text(rows)} rows in {bytes_text(size)}: all as written")
+        typer.echo(
+            f"{counted(len(checked), 'sequence')}, {counted(rows, 'row')} in {bytes_text(size)}: all as written"
+        )

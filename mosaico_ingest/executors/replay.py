@@ -11,7 +11,7 @@ from enum import Enum
 from pathlib import Path
 
 from mosaico_ingest.config import QuarantineSettings, ROSInjectionConfig, StoreTarget, TimeRange
-from mosaico_ingest.diagnostics import encodable
+from mosaico_ingest.diagnostics import a_few, encodable
 from mosaico_ingest.errors import ManifestError, SinkUnavailable
 from mosaico_ingest.executors.content import content_digest
 from mosaico_ingest.executors.ledger import held
@@ -81,11 +81,10 @@ def replays(folder: Path, configs: Sequence[ROSInjectionConfig]) -> tuple[Replay
 
 def _replay(kept: Kept, known: dict[str, ROSInjectionConfig]) -> Replay:
     if kept.sequence not in known:
-        names = ", ".join(sorted(known)[:8])
         raise ManifestError(
             f"{kept.messages.name} belongs to the sequence {kept.sequence!r}, which the manifest does not make",
             where=next((config.where for config in known.values()), None),
-            hint=f"it makes {names}",
+            hint=f"it makes {a_few(known)}",
         )
     config = known[kept.sequence]
     return Replay(kept, _whereabouts(kept, config), _configuration(kept, config))

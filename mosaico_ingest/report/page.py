@@ -14,7 +14,7 @@ from mosaico_ingest.report.markup import Markup, element, join, table
 from mosaico_ingest.report.model import Report, RunReport, TopicReport
 from mosaico_ingest.report.page_time import steps_line, time_section
 from mosaico_ingest.report.sparkline import sparkline
-from mosaico_ingest.report.units import bytes_text, count_text, seconds_text, time_text
+from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text, time_text
 
 __all__ = ["STATUS_WORDS", "html_page"]
 
@@ -66,7 +66,7 @@ def _headline(report: RunReport) -> str:
     if not report.recordings:
         return "nothing was ingested"
     bad = sum(one.status in _BAD for one in report.recordings)
-    return f"{count_text(len(report.recordings))} recordings, {count_text(bad) if bad else 'none'} failed"
+    return f"{counted(len(report.recordings), 'recording')}, {count_text(bad) if bad else 'none'} failed"
 
 
 def _subtitle(report: RunReport) -> Markup:
@@ -223,7 +223,7 @@ def _topics(taken: list[TopicReport]) -> Markup:
     during = f"from {time_text(span[0])} to {time_text(span[1])} UTC" if times else "no rows"
     head = ("Topic", "Ontology", "Read", "Written", "Rejected", "Rate", "Stored", "Rows over time (gaps red)")
     rows = [_topic(topic, span) for topic in sorted(taken, key=lambda topic: topic.target)]
-    return table(f"{len(taken)} topics, {during}", head, rows, {2, 3, 4, 5, 6})
+    return table(f"{counted(len(taken), 'topic')}, {during}", head, rows, {2, 3, 4, 5, 6})
 
 
 def _topic(topic: TopicReport, span: tuple[int, int]) -> tuple[str, ...]:

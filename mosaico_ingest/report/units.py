@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import datetime, timezone
 
-__all__ = ["bytes_text", "count_text", "seconds_text", "time_text"]
+__all__ = ["bytes_text", "count_text", "counted", "seconds_text", "time_text"]
 
 _STEP = 1000.0
 
@@ -21,6 +21,11 @@ def bytes_text(size: float) -> str:
 def count_text(count: int) -> str:
     """Return a count with thin groups, as `12,345`."""
     return f"{count:,}"
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a count with what is counted, as `1 topic` or `12 topics`."""
+    return f"{count_text(count)} {noun}{'' if count == 1 else 's'}"
 
 
 def seconds_text(seconds: float) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 import pyarrow as pa
 
 from mosaico_ingest import wire
+from mosaico_ingest.diagnostics import a_few
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.path import AnyPath, RemotePath, as_path
@@ -195,4 +196,4 @@ def _chosen(schema: pa.Schema, columns: Sequence[str], *, where: str) -> pa.Sche
 
 
 def _listed(known: Sequence[str]) -> str:
-    return f"there are {', '.join(known)}" if known else "there are none"
+    return f"there are {a_few(known)}" if known else "there are none"

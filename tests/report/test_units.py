@@ -1,0 +1,19 @@
+"""Numbers and lists for people."""
+
+from __future__ import annotations
+
+import pytest
+
+from mosaico_ingest.diagnostics import a_few
+from mosaico_ingest.report.units import counted
+
+
+@pytest.mark.parametrize(("count", "text"), [(0, "0 rows"), (1, "1 row"), (12_345, "12,345 rows")])
+def test_one_is_singular(count: int, text: str) -> None:
+    assert counted(count, "row") == text
+
+
+def test_a_list_says_how_much_of_it_is_not_shown() -> None:
+    assert a_few(["b", "a"]) == "a, b"
+    assert a_few("hgfedcba") == "a, b, c, d, e, f, g, h"
+    assert a_few([f"/t{n:04}" for n in range(1500)], most=2) == "/t0000, /t0001 and 1,498 more"
