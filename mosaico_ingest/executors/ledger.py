@@ -83,7 +83,7 @@ class Held(_Part):
 
     ledgers: tuple[Ledger, ...]
     complete: bool
-    """False where an error that ended a run is attached to it."""
+    """False where an error that ended a run is attached to it, or a server has no session of it that was finished."""
 
 
 def enter(plan: Plan) -> Plan | None:
@@ -223,7 +223,7 @@ def _held_by_server(target: ServerTarget, sequence: str) -> Held | None:
         if info is None:
             return None
         notes = client.act(actions.SEQUENCE_NOTIFICATION_LIST, bodies.Located(locator=sequence)).notifications
-    complete = not notes and all(session.locked for session in info.sessions)
+    complete = not notes and bool(info.sessions) and all(session.locked for session in info.sessions)
     return Held(ledgers=_ledgers([info.user_metadata]), complete=complete)
 
 

@@ -1,0 +1,248 @@
+"""The same job again, against a server: done once, completed where it was cut short, never twice."""
+
+from __future__ import annotations
+
+import os
+import random
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mosaicod import Proxy
+
+from mosaico_ingest.store import Store
+
+from .conftest import WriteBag, number
+
+WriteJob = Callable[..., Path]
+pytestmark = pytest.mark.slow  # a server and several clients for each test
+SKIP = {"name": "drive", "if_exists": "skip"}
+ROWS = 20_000
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "mosaico_ingest", *map(str, arguments)]
+
+
+def ran(*arguments: object) -> tuple[int, str]:
+    """Run the command; return its exit code and what it said."""
+    done = subprocess.run(  # noqa: S603 - our own command
+        command(*arguments), capture_output=True, text=True, check=False, timeout=120
+    )
+    assert "Traceback" not in done.stderr, done.stderr
+    return done.returncode, done.stdout + done.stderr
+
+
+@contextmanager
+def serving(folder: Path, port: int = 0) -> Generator[tuple[int, subprocess.Popen[str]], None, None]:
+    """Serve `served`, in a process of its own; give its port and the process."""
+    arguments = command("serve", "--port", port, "--store", folder / "served")
+    server = subprocess.Popen(  # noqa: S603 - our own command
+        arguments, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=folder
+    )
+    assert server.stdout is not None
+    found = re.search(r":(\d+)$", server.stdout.readline())
+    try:
+        assert found is not None
+        yield int(found[1]), server
+    finally:
+        server.send_signal(signal.SIGTERM)
+        try:
+            server.wait(timeout=20)
+        finally:
+            server.kill()
+            server.stdout.close()
+
+
+@pytest.fixture
+def port(tmp_path: Path) -> Generator[int, None, None]:
+    """The port of a server over `served`."""
+    with serving(tmp_path) as (found, _):
+        yield found
+
+
+def to(port: int) -> dict[str, Any]:
+    return {"target": {"host": "127.0.0.1", "port": port}}
+
+
+def speeds(folder: Path, topic: str = "/speed") -> list[float]:
+    return Store.open(folder / "served").scan("drive", topic).read_all()["data"].to_pylist()
+
+
+def test_the_same_job_again_does_nothing_and_says_so(
+    write_bag: WriteBag, write_job: WriteJob, tmp_path: Path, port: int
+) -> None:
+    write_bag({"/speed": [number(1), number(2)]})
+    job = write_job(sequence=SKIP, **to(port))
+    assert ran("run", job)[0] == 0
+    before = Store.open(tmp_path / "served").sequence("drive")
+    code, said = ran("run", job)
+    assert code == 0
+    assert "the same content is there already" in said
+    assert Store.open(tmp_path / "served").sequence("drive") == before
+
+
+def test_changed_content_is_refused_and_replaced_when_told_to(
+    write_bag: WriteBag, write_job: WriteJob, tmp_path: Path, port: int
+) -> None:
+    write_bag({"/speed": [number(1)]})
+    job = write_job(sequence=SKIP, **to(port))
+    assert ran("run", job)[0] == 0
+    (tmp_path / "drive.db3").unlink()
+    write_bag({"/speed": [number(2)]})
+    code, said = ran("run", job)
+    assert code == 1
+    assert "made from other content (drive.db3)" in " ".join(said.split())
+    assert speeds(tmp_path) == [1]
+    write_job(sequence={**SKIP, "if_exists": "replace"}, **to(port))
+    assert ran("run", job)[0] == 0
+    assert speeds(tmp_path) == [2]
+    write_job(sequence=SKIP, **to(port))
+    assert ran("run", job)[0] == 0
+    assert speeds(tmp_path) == [2]
+
+
+def test_append_brings_new_topics_and_no_row_twice(
+    write_bag: WriteBag, write_job: WriteJob, tmp_path: Path, port: int
+) -> None:
+    write_bag({"/speed": [number(1)], "/height": [number(3)]})
+    add = {"name": "drive", "if_exists": "append"}
+    job = write_job(sequence=add, topics=["/speed"], **to(port))
+    assert ran("run", job)[0] == 0
+    write_job(sequence=add, topics=["/height"], **to(port))
+    assert ran("run", job)[0] == 0
+    assert (speeds(tmp_path), speeds(tmp_path, "/height")) == ([1], [3])
+    code, said = ran("run", job)
+    assert code == 1
+    assert "a server adds no rows to one" in " ".join(said.split())
+    assert (speeds(tmp_path), speeds(tmp_path, "/height")) == ([1], [3])
+
+
+def kill_and_look(job: Path, folder: Path, rounds: int) -> tuple[int, int]:
+    """Kill the first run of a job at any moment and run it again; return how often what was there, and was not."""
+    moments = random.Random()  # noqa: S311 - any moment will do
+    whole = nothing = 0
+    for _ in range(rounds):
+        process = subprocess.Popen(  # noqa: S603 - our own command
+            command("run", "-q", job), stderr=subprocess.DEVNULL, start_new_session=True
+        )
+        try:
+            process.wait(0.5 + moments.random() * 1.5)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait(timeout=20)
+        store = Store.open(folder / "served")
+        rows = store.sequence("drive").rows if "drive" in store.names() else 0
+        assert rows in {0, ROWS}, "a reader sees all of it or nothing"
+        whole, nothing = whole + (rows == ROWS), nothing + (rows == 0)
+        code, said = ran("run", job)
+        assert code == 0, said
+        assert ("the same content is there already" in said) == (rows == ROWS)
+        assert speeds(folder) == [1.0] * ROWS
+        assert ran("run", job)[0] == 0
+        assert ran("store", "rm", "drive", "--yes", "--store", folder / "served")[0] == 0
+    return whole, nothing
+
+
+def test_a_killed_client_leaves_all_or_nothing_and_the_next_run_completes_it(
+    write_bag: WriteBag, write_job: WriteJob, tmp_path: Path, port: int
+) -> None:
+    write_bag({"/speed": [number(1)] * ROWS})
+    _, nothing = kill_and_look(write_job(sequence=SKIP, **to(port)), tmp_path, 6)
+    assert nothing, "the moments were not where they matter"
+
+
+def test_a_killed_server_costs_the_run_and_the_next_one_completes_it(
+    write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [number(1)] * ROWS})
+    with serving(tmp_path) as (port, server):
+        job = write_job(sequence=SKIP, **to(port))
+        client = subprocess.Popen(  # noqa: S603 - our own command
+            command("run", "-q", job), stderr=subprocess.PIPE, text=True
+        )
+        while not list((tmp_path / "served" / "staging").glob("*")) and client.poll() is None:
+            time.sleep(0.01)
+        server.kill()
+        _, said = client.communicate(timeout=60)
+    assert client.returncode == 1, said
+    assert said.startswith("error: ")
+    assert "Traceback" not in said
+    with serving(tmp_path, port):
+        code, said = ran("run", job)
+        assert code == 0, said
+        assert speeds(tmp_path) == [1.0] * ROWS
+        assert "the same content is there already" in ran("run", job)[1]
+
+
+class Forgetful(Proxy):
+    """A line on which the answer to one question is lost, then everything, then nothing more."""
+
+    def __init__(self, port: int, word: bytes, *, mended: bool = True) -> None:
+        self.word: bytes | None = word
+        self.asked = threading.Event()
+        self._mended = mended
+        super().__init__(port)
+
+    def _pump(self, source: socket.socket, sink: socket.socket) -> None:  # type: ignore[override]  # it knows its line
+        try:
+            while data := source.recv(65536):
+                if self.asked.is_set() and self.word:
+                    continue
+                sink.sendall(data)
+                if self.word and self.word in data:
+                    self.asked.set()
+                    threading.Timer(1.0, self._recover).start()
+            sink.shutdown(socket.SHUT_WR)
+        except OSError:
+            return
+
+    def _recover(self) -> None:
+        self.cut()
+        self.word = None
+        if self._mended:
+            self.mend()
+
+
+@pytest.mark.parametrize(
+    ("if_exists", "word"),
+    [("skip", b"sequence_create"), *((each, b"session_finalize") for each in ("skip", "append", "replace"))],
+)
+def test_a_lost_answer_is_looked_up_and_nothing_is_written_twice(
+    if_exists: str, *, word: bytes, write_bag: WriteBag, write_job: WriteJob, tmp_path: Path, port: int
+) -> None:
+    write_bag({"/speed": [number(1), number(2)]})
+    line = Forgetful(port, word)
+    job = write_job(sequence={**SKIP, "if_exists": if_exists}, **to(line.port))
+    code, said = ran("run", job)
+    assert line.asked.is_set()
+    assert code == 0, said
+    assert speeds(tmp_path) == [1, 2]
+
+
+@pytest.mark.parametrize("if_exists", ["skip", "append", "replace"])
+def test_a_client_that_dies_before_it_hears_that_all_is_there(
+    if_exists: str, write_bag: WriteBag, write_job: WriteJob, tmp_path: Path, port: int
+) -> None:
+    write_bag({"/speed": [number(1), number(2)]})
+    line = Forgetful(port, b"session_finalize", mended=False)
+    sequence = {**SKIP, "if_exists": if_exists}
+    job = write_job(sequence=sequence, **to(line.port))
+    process = subprocess.Popen(command("run", "-q", job), stderr=subprocess.DEVNULL)  # noqa: S603 - our own command
+    assert line.asked.wait(30)
+    time.sleep(0.3)
+    process.kill()
+    process.wait(timeout=20)
+    assert speeds(tmp_path) == [1, 2]
+    code, said = ran("run", write_job(sequence=sequence, **to(port)))
+    assert code == (1 if if_exists == "append" else 0), said
+    assert speeds(tmp_path) == [1, 2]
