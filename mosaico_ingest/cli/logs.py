@@ -10,11 +10,11 @@ from datetime import datetime, timezone
 from typing import Any
 
 from mosaico_ingest.cli.log_format import LogFormat
+from mosaico_ingest.cli.tally import Tally, Underway
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.report.events import (
     Event,
     Noted,
-    Rejected,
     RunFinished,
     RunStarted,
     TopicProgress,
@@ -55,38 +55,51 @@ class _JsonRecords(logging.Formatter):
 class JsonLines:
     """An observer of a batch that writes a JSON object a line: what began, what is to know, how far, how it ended."""
 
-    def __init__(self) -> None:
-        self._names: dict[int, str] = {}
-        self._read: dict[int, int] = {}
-        self._rejected: dict[int, int] = {}
+    def __init__(self, tally: Tally) -> None:
+        self._tally = tally
         self._next = time.monotonic() + PROGRESS_EVERY_S
 
     def __call__(self, position: int, event: Event) -> None:
         """Take one event."""
+        before = self._tally.at_work.get(position)
+        self._tally.add(position, event)
+        known = self._tally.at_work.get(position, before)
         match event:
             case RunStarted():
-                self._names[position] = event.sequence
-                self._read[position] = self._rejected[position] = 0
-                self._say(position, "started", files=event.files, source_bytes=event.source_bytes)
-            case TopicProgress():
-                self._read[position] += event.read
-                if time.monotonic() >= self._next:
-                    self._next = time.monotonic() + PROGRESS_EVERY_S
-                    self._say(position, "progress", read=self._read[position])
-            case Rejected():
-                self._rejected[position] += event.count
+                self._say(position, known, "started", files=event.files, source_bytes=event.source_bytes)
+            case TopicProgress() if known is not None and time.monotonic() >= self._next:
+                self._next = time.monotonic() + PROGRESS_EVERY_S
+                self._say(position, known, "progress", read=known.read, batch=self._totals())
             case Noted():
-                self._say(position, "note", message=str(event.finding))
+                self._say(position, known, "note", message=str(event.finding))
             case Unreadable():
-                self._say(position, "unreadable", topic=event.target, count=event.count, message=event.reason)
+                lost = {"topic": event.target, "count": event.count, "message": event.reason}
+                self._say(position, known, "unreadable", **lost)
             case RunFinished():
-                counts = {"read": self._read.get(position, 0), "rejected": self._rejected.get(position, 0)}
-                self._say(position, "finished", status=event.status.value, error=event.error, **counts)
+                counts = (
+                    {"read": known.read, "rejected": known.rejected} if known else {"read": 0, "rejected": 0}
+                )
+                self._say(position, known, "finished", status=event.status.value, error=event.error, **counts)
             case _:
                 pass
 
-    def _say(self, position: int, event: str, **more: Any) -> None:  # noqa: ANN401 - whatever JSON can say
-        said = {"recording": position, "sequence": self._names.get(position), **more}
+    def _totals(self) -> dict[str, Any]:
+        """Return how far the whole is; `left_s` is null while nothing can be said."""
+        tally = self._tally
+        return {
+            "recordings": tally.recordings,
+            "done": tally.done,
+            "failed": tally.failed,
+            "in_work": [one.start.sequence for one in tally.at_work.values()],
+            "read": tally.read,
+            "rejected": tally.rejected,
+            "payload_bytes": tally.payload_bytes,
+            "elapsed_s": round(tally.elapsed_s, 3),
+            "left_s": None if tally.left_s is None else round(tally.left_s, 3),
+        }
+
+    def _say(self, position: int, known: Underway | None, event: str, **more: Any) -> None:  # noqa: ANN401 - whatever JSON can say
+        said = {"recording": position, "sequence": known.start.sequence if known else None, **more}
         sys.stderr.write(_line(event, said) + "\n")
 
 

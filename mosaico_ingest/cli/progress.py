@@ -15,6 +15,7 @@ from rich.text import Text
 
 from mosaico_ingest.cli.batch_progress import BatchBoard, BatchLines, print_nothing
 from mosaico_ingest.cli.console import Terminal
+from mosaico_ingest.cli.tally import Tally
 from mosaico_ingest.report.events import (
     BatchObserver,
     Event,
@@ -37,14 +38,14 @@ MAX_ROWS = 30
 
 
 @contextmanager
-def display(recordings: int) -> Generator[BatchObserver]:
+def display(tally: Tally) -> Generator[BatchObserver]:
     """Yield the observer that draws one recording or a batch of them, on standard error."""
     console = Terminal(stderr=True)
     if not console.is_terminal:
-        lines = BatchLines(console, recordings) if recordings > 1 else _Lines(console)
+        lines = BatchLines(console, tally) if tally.recordings > 1 else _Lines(console)
         yield lines if isinstance(lines, BatchLines) else _alone(lines)
         return
-    board = BatchBoard(recordings) if recordings > 1 else _Board()
+    board = BatchBoard(tally) if tally.recordings > 1 else _Board()
     with Live(get_renderable=board.render, console=console, refresh_per_second=8, transient=True) as live:
         board.say = live.console.print
         yield board if isinstance(board, BatchBoard) else _alone(board)

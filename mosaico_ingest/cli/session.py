@@ -14,6 +14,7 @@ from mosaico_ingest.cli.collector import collect_as_usual
 from mosaico_ingest.cli.log_format import LogFormat
 from mosaico_ingest.cli.logs import JsonLines, set_up_logging
 from mosaico_ingest.cli.signals import interrupt_on_terminate
+from mosaico_ingest.cli.tally import Tally, sizes_of
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.executors.executor import Executor
 from mosaico_ingest.executors.local import Inline
@@ -52,7 +53,7 @@ def run_configs(
         observe(position, event)
 
     as_json = log_format is LogFormat.JSON
-    with _display(len(configs), as_json=as_json, quiet=quiet) as observe:
+    with _display(configs, as_json=as_json, quiet=quiet) as observe:
         chosen = executor or _executor(configs, jobs, prepare)
         result = api.run(configs, executor=chosen, observe=tell, manifests=manifests)
     finished(result)
@@ -70,13 +71,18 @@ def run_configs(
         raise typer.Exit(result.exit_code)
 
 
-def _display(recordings: int, *, as_json: bool, quiet: bool) -> AbstractContextManager[BatchObserver]:
+def _display(
+    configs: Sequence[ROSInjectionConfig], *, as_json: bool, quiet: bool
+) -> AbstractContextManager[BatchObserver]:
     """Return what shows the run while it goes; what draws is slow to import, and only people want it drawn."""
-    if as_json or quiet:
-        return nullcontext(JsonLines() if as_json else ignore_batch)
+    if quiet and not as_json:
+        return nullcontext(ignore_batch)
+    tally = Tally(sizes_of(configs) if len(configs) > 1 else [1] * len(configs))
+    if as_json:
+        return nullcontext(JsonLines(tally))
     from mosaico_ingest.cli.progress import display
 
-    return display(recordings)
+    return display(tally)
 
 
 def _print_failures(failures: Sequence[RunFinished]) -> None:
