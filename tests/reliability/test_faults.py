@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -93,57 +93,6 @@ def test_a_signal_stops_a_job_within_a_second_or_two(
     assert process.returncode == 130
     assert said.startswith("error: ")
     assert Store.open(tmp_path / "store").names() == ()
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 1 MiB, where this user may mount one."""
-    folder = tmp_path / "small"
-    folder.mkdir()
-    mount, umount = shutil.which("mount"), shutil.which("umount")
-    if mount is None or umount is None:
-        pytest.skip("there is no mount command")
-    made = subprocess.run(  # noqa: S603 - a system command with our own arguments
-        [mount, "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)],
-        capture_output=True,
-        check=False,
-        text=True,
-    )
-    if made.returncode:
-        pytest.skip(f"no file system may be mounted here: {made.stderr.strip()}")
-    yield folder
-    subprocess.run([umount, str(folder)], check=True)  # noqa: S603 - as above
-
-
-def test_a_full_disk_is_said_and_leaves_the_old_sequence(
-    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, small_disk: Path
-) -> None:
-    job = write_job(sequence=REPLACE, target={"store": str(small_disk / "store")})
-    write_bag({"/speed": [number(1)]})
-    assert run_job(job).status is RunStatus.COMPLETED
-    (job.parent / "drive.db3").unlink()
-    noise = random.Random(1)  # noqa: S311 - numbers that do not compress
-    write_bag({"/speed": [number(noise.random()) for _ in range(150_000)]})
-    report = run_job(job)
-    assert (report.status, report.exit_code) == (RunStatus.FAILED, 1)
-    assert "No space left" in str(report.error)
-    store = Store.open(small_disk / "store")
-    assert speeds(store) == [1.0]
-    assert store.layout.open_sessions() == []
-
-
-def test_a_store_that_cannot_be_written_is_said(
-    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, small_disk: Path
-) -> None:
-    write_bag({"/speed": [number(1)]})
-    job = write_job(sequence=REPLACE, target={"store": str(small_disk / "store")})
-    run_job(job)
-    remount = [str(shutil.which("mount")), "-o", "remount,ro", str(small_disk)]
-    subprocess.run(remount, check=True)  # noqa: S603 - as above
-    report = run_job(job)
-    assert report.exit_code == 1
-    assert str(small_disk / "store") in str(report.error)
-    assert speeds(Store.open(small_disk / "store", create=False)) == [1.0]
 
 
 @pytest.mark.parametrize("in_the_way", ["store", "store/catalog.sqlite"])

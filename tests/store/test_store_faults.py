@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pyarrow as pa
 import pytest
+from disks import MEBIBYTE, read_only, small_disk
 
 from mosaico_ingest.errors import SinkError, SinkUnavailable
 from mosaico_ingest.ontology.types import OntologyType
@@ -104,31 +105,18 @@ def test_a_segment_deleted_under_way_is_said_so(
         session.stored()
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write everywhere")
 def test_a_folder_that_cannot_be_written_is_said_so(store: Store) -> None:
-    store.path.chmod(0o500)
-    try:
+    with read_only(store.path):
         assert Store.open(store.path, create=False).sequences() == ()
         with pytest.raises(SinkError, match="written"), StoreSink(store).open("s", {}):
             pytest.fail("the session opened")
-    finally:
-        store.path.chmod(0o700)
 
 
 @pytest.fixture
 def little_space(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 2 MB."""
-    folder = tmp_path / "small"
-    folder.mkdir()
-    mount, umount = shutil.which("mount"), shutil.which("umount")
-    if mount is None or umount is None or os.geteuid() != 0:
-        pytest.skip("mounting a small file system takes the superuser")
-    command = [mount, "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(folder)]
-    done = subprocess.run(command, check=False, capture_output=True)  # noqa: S603 - fixed arguments
-    if done.returncode:
-        pytest.skip("no small file system can be mounted here")
-    yield folder
-    subprocess.run([umount, folder], check=True)  # noqa: S603 - fixed arguments
+    """A file system of 2 MiB."""
+    with small_disk(tmp_path / "small", 2 * MEBIBYTE) as folder:
+        yield folder
 
 
 def test_a_full_disk_fails_the_session_and_leaves_nothing(

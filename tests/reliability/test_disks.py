@@ -1,0 +1,163 @@
+"""No room, or no leave to write: one line that says so, the old state, and the next run completes it."""
+
+from __future__ import annotations
+
+import os
+import random
+import struct
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zstandard
+from disks import MEBIBYTE, filled, read_only, small_disk
+
+from mosaico_ingest.store import Store
+
+from .conftest import CUT, WriteBag, number
+
+WriteJob = Callable[..., Path]
+REPLACE = {"name": "drive", "if_exists": "replace"}
+
+
+def ran(*arguments: object, **environment: str) -> tuple[int, str]:
+    """Run the command; return its exit code and its errors."""
+    done = subprocess.run(  # noqa: S603 - our own command
+        [sys.executable, "-m", "mosaico_ingest", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+        env={**os.environ, **environment},
+    )
+    assert "Traceback" not in done.stderr, done.stderr
+    return done.returncode, done.stderr
+
+
+def the_error(said: str) -> str:
+    """Return the one line that says what went wrong."""
+    (line,) = [line for line in said.splitlines() if line.startswith("error: ")]
+    return line
+
+
+def speeds(store: Path) -> list[float]:
+    return Store.open(store, create=False).scan("drive", "/speed").read_all()["data"].to_pylist()
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 2 MiB."""
+    with small_disk(tmp_path / "small", 2 * MEBIBYTE) as folder:
+        yield folder
+
+
+@pytest.fixture
+def noise() -> list[bytes]:
+    """Numbers that take 640 kB in a recording, and no less in a store."""
+    source = random.Random(1)  # noqa: S311 - they only must not compress
+    return [number(struct.unpack("<d", struct.pack("<Q", source.getrandbits(62)))[0]) for _ in range(80_000)]
+
+
+def test_a_full_disk_is_said_leaves_the_old_and_the_next_run_completes_it(
+    write_bag: WriteBag, write_job: WriteJob, disk: Path, noise: list[bytes]
+) -> None:
+    store = disk / "store"
+    job = write_job(sequence=REPLACE, target={"store": str(store)})
+    write_bag({"/speed": [number(1)]})
+    assert ran("run", "-q", job)[0] == 0
+    (job.parent / "drive.db3").unlink()
+    write_bag({"/speed": noise})
+    with filled(disk, left_bytes=300_000):
+        code, said = ran("run", "-q", job)
+        assert code == 1
+        assert "No space left" in the_error(said)
+        assert "free some space" in the_error(said)
+        assert speeds(store) == [1.0]
+        assert len(list(store.rglob("*.parquet"))) == 1
+        assert ran("verify", "--store", store)[0] == 0
+    assert ran("run", "-q", job) == (0, "")
+    assert len(speeds(store)) == len(noise)
+
+
+@pytest.mark.parametrize("left_bytes", [0, 4096, 40_000, 200_000])
+def test_a_first_run_that_found_no_room_leaves_nothing_that_can_be_seen(
+    left_bytes: int, write_bag: WriteBag, write_job: WriteJob, disk: Path, noise: list[bytes]
+) -> None:
+    store = disk / "store"
+    job = write_job(target={"store": str(store)})
+    write_bag({"/speed": noise})
+    with filled(disk, left_bytes=left_bytes):
+        code, said = ran("run", "-q", job)
+        assert code == 1
+        assert str(disk) in the_error(said)
+    assert not list(store.rglob("*.parquet"))
+    assert ran("run", "-q", job) == (0, "")
+    assert len(speeds(store)) == len(noise)
+
+
+def test_a_store_that_may_only_be_read_is_said_and_can_be_read(
+    write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
+) -> None:
+    store = tmp_path / "store"
+    job = write_job(sequence=REPLACE)
+    write_bag({"/speed": [number(1)]})
+    assert ran("run", "-q", job)[0] == 0
+    (tmp_path / "drive.db3").unlink()
+    write_bag({"/speed": [number(2)]})
+    with read_only(store):
+        code, said = ran("run", "-q", job)
+        assert code == 1
+        assert str(store) in the_error(said)
+        assert speeds(store) == [1.0]
+        for reading in (("store", "ls"), ("store", "show", "drive"), ("verify",)):
+            assert ran(*reading, "--store", store)[0] == 0
+        for writing in (("store", "rm", "drive", "--yes"), ("store", "gc")):
+            code, said = ran(*writing, "--store", store)
+            assert code == 1, writing
+            assert str(store) in the_error(said)
+    assert ran("run", "-q", job) == (0, "")
+    assert speeds(store) == [2.0]
+
+
+def test_a_quarantine_without_room_is_an_error_and_no_message_is_lost_in_silence(
+    write_bag: WriteBag, write_job: WriteJob, disk: Path, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [number(1), CUT, number(2)]})
+    job = write_job(quarantine={"path": str(disk / "quarantine")})
+    with filled(disk):
+        code, said = ran("run", "-q", job)
+        assert code == 1
+        assert str(disk) in the_error(said)
+    assert "drive" not in Store.open(tmp_path / "store").names()
+    assert ran("run", "-q", job)[0] == 4
+    assert speeds(tmp_path / "store") == [1.0, 2.0]
+
+
+def test_a_report_without_room_is_an_error_after_the_commit(
+    write_bag: WriteBag, write_job: WriteJob, disk: Path, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [number(1)]})
+    with filled(disk):
+        code, said = ran("run", "-q", write_job(), "--report", disk / "run.json")
+    assert code == 1
+    assert str(disk / "run.json") in the_error(said)
+    assert speeds(tmp_path / "store") == [1.0]
+
+
+def test_a_temporary_folder_without_room_is_said(
+    write_bag: WriteBag, write_job: WriteJob, disk: Path, tmp_path: Path, noise: list[bytes]
+) -> None:
+    packed = tmp_path / "packed.db3.zstd"
+    packed.write_bytes(zstandard.compress(write_bag({"/speed": noise}).read_bytes()))
+    custom = [{"package": "own_msgs", "path": "definitions"}]
+    job = write_job(bag={"path": packed.name, "custom_msgs": custom})
+    with filled(disk, left_bytes=100_000):
+        code, said = ran("run", "-q", job, TMPDIR=str(disk))
+        assert code == 1
+        assert "cannot be decompressed" in the_error(said)
+        assert "TMPDIR" in the_error(said)
+        assert {path.name for path in disk.iterdir()} == {"ballast"}
+    assert ran("run", "-q", job, TMPDIR=str(tmp_path)) == (0, "")
+    assert len(speeds(tmp_path / "store")) == len(noise)
