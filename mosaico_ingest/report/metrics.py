@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 from mosaico_ingest.report.events import RunStatus
 from mosaico_ingest.report.model import RunReport
+from mosaico_ingest.report.stopwatch import Step
 
 __all__ = ["prometheus_text"]
 
@@ -27,6 +28,14 @@ def _lines(report: RunReport) -> Iterator[str]:
     yield from _gauge("messages", "Messages of the last run by what became of them.")
     for fate in ("read", "written", "filtered", "downsampled", "rejected"):
         yield f'{_PREFIX}_messages{{fate="{fate}"}} {sum(getattr(one, fate) for one in totals)}'
+    unread = sum(loss.count or 0 for one in report.recordings for loss in one.losses)
+    yield f'{_PREFIX}_messages{{fate="unreadable"}} {unread}'
+    yield from _gauge(
+        "step_seconds", "Time of the last run by what it was spent on; write goes on beside the rest."
+    )
+    for step in Step:
+        spent = sum(getattr(one.steps, step.value) for one in report.recordings)
+        yield f'{_PREFIX}_step_seconds{{step="{step.value}"}} {spent:.6g}'
     ended = max((one.started_at.timestamp() + one.duration_s for one in report.recordings), default=0)
     single: tuple[tuple[str, str, float], ...] = (
         ("source_bytes", "Size of the recordings.", sum(one.source_bytes for one in report.recordings)),

@@ -15,6 +15,7 @@ from mosaico_ingest.cli.app import app
 from mosaico_ingest.cli.shard import take_shard
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.report.model import RunReport
+from mosaico_ingest.report.stopwatch import Step
 from mosaico_ingest.store import Store
 
 DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
@@ -74,7 +75,12 @@ def test_json_lines_and_metrics_say_how_it_went(job: Path) -> None:
     events = [json.loads(line) for line in done.stderr.splitlines()]
     assert [one["event"] for one in events if one["sequence"] == "b"] == ["started", "finished"]
     assert {one["read"] for one in events if one["event"] == "finished"} == {1000}
-    assert 'mosaico_ingest_messages{fate="written"} 3000' in metrics.read_text().splitlines()
+    lines = metrics.read_text().splitlines()
+    assert 'mosaico_ingest_messages{fate="written"} 3000' in lines
+    assert 'mosaico_ingest_messages{fate="unreadable"} 0' in lines
+    spent = dict(line.split() for line in lines if line.startswith("mosaico_ingest_step_seconds"))
+    assert float(spent['mosaico_ingest_step_seconds{step="commit"}']) > 0
+    assert len(spent) == len(Step)
 
 
 @given(st.lists(st.integers()), st.integers(1, 12))
