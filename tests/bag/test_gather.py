@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Generator, Iterator
 from itertools import pairwise
+from random import Random
 
 import numpy as np
 import pytest
@@ -51,10 +52,10 @@ ROWS = st.lists(st.tuples(st.integers(0, 50), st.binary(max_size=12)), min_size=
 
 
 @given(ROWS)
-def test_packing_keeps_every_message_and_nothing_else(rows: list[Row]) -> None:
+def test_packing_keeps_every_message_and_little_else(rows: list[Row]) -> None:
     packed = pack(slab_of(rows))
     assert rows_of(packed) == rows
-    assert len(packed.data) == sum(len(payload) for _, payload in rows)
+    assert len(packed.data) <= sum(len(payload) + 3 for _, payload in rows)
 
 
 @pytest.mark.parametrize("lengths", [[4] * 1000, [*range(1000)]], ids=["equal", "random"])
@@ -65,14 +66,16 @@ def test_what_is_packed_holds_nothing_of_the_block_it_came_in(lengths: list[int]
         held = [part.log_times, part.data, part.starts, part.lengths, part.offsets]
         owners = [values if values.base is None else values.base for values in held]
         assert all(
-            isinstance(owner, np.ndarray) and owner.size <= max(2, sum(lengths[1:3])) for owner in owners
+            isinstance(owner, np.ndarray) and owner.size <= max(2, sum(lengths[1:3]) + 6) for owner in owners
         )
 
 
-def test_packing_many_bytes_of_many_lengths_goes_through_the_index_in_steps() -> None:
-    rows = [(number, bytes([number % 251]) * (number * 331)) for number in range(120)]
-    rows.append((120, b"x" * (3 << 20)))
-    assert rows_of(pack(slab_of(rows))) == rows
+@given(st.lists(st.integers(0, 700), min_size=1, max_size=60), st.randoms(use_true_random=False))
+def test_packing_many_lengths_in_words_keeps_every_byte(lengths: list[int], random: Random) -> None:
+    rows = [(number, random.randbytes(length)) for number, length in enumerate(lengths)]
+    packed = pack(slab_of(rows, gap=0))
+    assert rows_of(packed) == rows
+    assert len(packed.data) <= sum(lengths) + len(rows) * max(4, min(64, sum(lengths) // len(rows) // 4))
 
 
 @given(ROWS)

@@ -13,8 +13,8 @@ __all__ = ["Bytes", "by_key", "in_time", "keep", "keep_each", "pack", "stretches
 
 _FEW_ROWS = 8
 """With fewer rows to a length on average, one index for every byte is cheaper than one step for every length."""
-_INDEX_BYTES = 1 << 20
-"""How many bytes are gathered through an index at once; the index is eight times as large."""
+_SMALLEST_WORD, _LARGEST_WORD = 4, 64
+"""Messages of many lengths are gathered in words, so that an index is needed for each word and not for each byte."""
 
 Bytes = NDArray[np.uint8]
 Longs = NDArray[np.int64]
@@ -84,7 +84,7 @@ def in_time(slab: Slab) -> Slab:
 
 
 def pack(slab: Slab) -> Slab:
-    """Return the same messages in a buffer of their own that holds nothing else, equal lengths side by side."""
+    """Return the same messages in a buffer of their own, equal lengths side by side, or each filled up to whole words."""
     lengths = slab.lengths
     shortest, longest = int(lengths.min()), int(lengths.max())
     if shortest == longest:
@@ -92,7 +92,7 @@ def pack(slab: Slab) -> Slab:
         return _with(slab, data, np.arange(len(slab), dtype=np.int64) * shortest)
     kinds = np.unique(lengths)
     if len(kinds) * _FEW_ROWS > len(lengths):
-        return _with(slab, _gather(slab), np.cumsum(lengths) - lengths)
+        return _with(slab, *_gather(slab))
     starts = np.empty(len(slab), np.int64)
     pieces: list[Bytes] = []
     end = 0
@@ -114,21 +114,26 @@ def _own(values: Longs) -> Longs:
     return values if values.base is None else values.copy()
 
 
-def _gather(slab: Slab) -> Bytes:
-    """Return the payloads one after the other, through an index of bytes."""
-    ends = np.cumsum(slab.lengths)
-    out = np.empty(int(ends[-1]), np.uint8)
-    first = 0
-    while first < len(ends):
-        begin = int(ends[first] - slab.lengths[first])
-        last = max(int(np.searchsorted(ends, begin + _INDEX_BYTES, side="right")), first + 1)
-        lengths = slab.lengths[first:last]
-        if last == first + 1:
-            start = int(slab.starts[first])
-            out[begin : int(ends[first])] = slab.data[start : start + int(lengths[0])]
-        else:
-            shift = slab.starts[first:last] - (ends[first:last] - lengths)
-            index = np.arange(begin, int(ends[last - 1]), dtype=np.int64) + np.repeat(shift, lengths)
-            out[begin : int(ends[last - 1])] = slab.data[index]
-        first = last
-    return out
+def _gather(slab: Slab) -> tuple[Bytes, Longs]:
+    """Return the payloads one after the other, in whole words, and where each begins."""
+    data, size = slab.data, _word_bytes(slab)
+    words = -(-slab.lengths // size)
+    ends = np.cumsum(words)
+    starts = (ends - words) * size
+    index = np.repeat(slab.starts - starts, words)
+    index += np.arange(0, len(index) * size, size)
+    room = len(data) - size
+    index[index > room] = 0  # the last words of the last messages, see below
+    out = np.ndarray(room + 1, f"V{size}", data, strides=1)[index].view(np.uint8)
+    for row in np.flatnonzero(slab.starts + words * size > len(data)).tolist():
+        start, length = int(slab.starts[row]), int(slab.lengths[row])
+        out[starts[row] : starts[row] + length] = data[start : start + length]
+    return out, starts
+
+
+def _word_bytes(slab: Slab) -> int:
+    """Return a power of two of which an average message has four to eight, or 1 where the buffer has not even one."""
+    if len(slab.data) < _LARGEST_WORD:
+        return 1
+    average = slab.payload_bytes // len(slab)
+    return min(max(1 << max(average.bit_length() - 3, 0), _SMALLEST_WORD), _LARGEST_WORD)
