@@ -1,21 +1,23 @@
-"""This file is the distros' own message types, loaded when the first one is asked for."""
+"""This file is the distros' own message types, read from `distros.json`: to load them from rosbags takes 0.1 s.
+
+The file says of each type which distros have it in which form, as `.msg` text with full names.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from functools import cache, lru_cache
-
-from rosbags.interfaces.typing import Typesdict
-from rosbags.typesys import Stores as RosbagsStores
-from rosbags.typesys import get_typestore
+from pathlib import Path
 
 from mosaico_ingest.bag.definition import Field, MessageType
+from mosaico_ingest.bag.msgtext import parse_msg
 from mosaico_ingest.bag.names import DURATION, TIME
-from mosaico_ingest.bag.schemas import message_type
 from mosaico_ingest.policies import Stores
 
-__all__ = ["BEFORE_IRON", "BUILTIN", "ROS1", "ROS2", "agreed_type", "distro_type", "ros_version"]
+__all__ = ["BEFORE_IRON", "BUILTIN", "FILE", "ROS1", "ROS2", "agreed_type", "distro_type", "ros_version"]
 
+FILE = Path(__file__).with_name("distros.json")
 _PARTS = (Field("sec", "int32"), Field("nanosec", "uint32"))
 BUILTIN: Mapping[str, MessageType] = {name: MessageType(name, _PARTS) for name in (TIME, DURATION)}
 """The types every distro has and a ROS 1 text spells `time` and `duration`."""
@@ -38,10 +40,9 @@ def ros_version(distro: Stores) -> int | None:
 
 def distro_type(distro: Stores, name: str) -> MessageType | None:
     """Return a distro's type by full name, None where it has none."""
-    if name.count("/") != 2:  # noqa: PLR2004 - as in pkg/msg/Name; loading a distro takes a while
-        return None
-    types = _types(distro)
-    return message_type(name, types) if name in types else None
+    forms = _known().get(name, {})
+    text = next((text for having, text in forms.items() if distro.value in having.split()), None)
+    return None if text is None else _form(name, text)
 
 
 @lru_cache(maxsize=4096)
@@ -52,5 +53,10 @@ def agreed_type(name: str, distros: tuple[Stores, ...]) -> MessageType | None:
 
 
 @cache
-def _types(distro: Stores) -> Typesdict:
-    return get_typestore(RosbagsStores(distro.value)).fielddefs
+def _known() -> Mapping[str, Mapping[str, str]]:
+    return json.loads(FILE.read_bytes())
+
+
+@cache
+def _form(name: str, text: str) -> MessageType:
+    return parse_msg(text, name)

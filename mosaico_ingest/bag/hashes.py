@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-
-from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
+from typing import TYPE_CHECKING
 
 from mosaico_ingest.bag.definition import Definition
 from mosaico_ingest.errors import BagError
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 __all__ = ["difference", "md5sum", "rihs01"]
 
@@ -52,6 +53,13 @@ def difference(definition: Definition, attributes: Mapping[str, str]) -> str | N
 
 
 def _store(definition: Definition) -> Typestore:
+    from rosbags.typesys import (  # noqa: PLC0415 - slow to import, and few recordings carry hashes and no definitions
+        Stores,
+        TypesysError,
+        get_types_from_msg,
+        get_typestore,
+    )
+
     store = get_typestore(Stores.EMPTY)
     try:
         store.register(get_types_from_msg(definition.text, definition.root))

@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 from mosaico_ingest.bag.definition import Constant, Container, Field, MessageType
 from mosaico_ingest.bag.names import DURATION, TIME, short_msgtype
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.frozen import frozen
 
-__all__ = ["PRIMITIVES", "SEPARATOR", "Section", "flatten", "parse_msg", "sections"]
+__all__ = ["PRIMITIVES", "SEPARATOR", "Section", "flatten", "parse_msg", "sections", "spell"]
 
 SEPARATOR = "=" * 80
 
@@ -185,11 +186,18 @@ def _collect(
 
 def _own_text(message: MessageType, ros_version: int) -> str:
     hidden = _hidden(ros_version)
+    fields = (
+        replace(field, type=hidden.get(field.type) or short_msgtype(field.type)) for field in message.fields
+    )
+    return spell(replace(message, fields=tuple(fields)))
+
+
+def spell(message: MessageType) -> str:
+    """Return the text of one type, its fields' types spelled as they are."""
     lines = [f"{constant.type} {constant.name}={constant.value}" for constant in message.constants]
     for field in message.fields:
-        kind = hidden.get(field.type) or short_msgtype(field.type)
         bound = f"<={field.string_bound}" if field.string_bound else ""
-        lines.append(f"{kind}{bound}{_brackets(field)} {field.name}")
+        lines.append(f"{field.type}{bound}{_brackets(field)} {field.name}")
     return "".join(f"{line}\n" for line in lines)
 
 
