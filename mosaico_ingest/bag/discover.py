@@ -16,6 +16,7 @@ from mosaico_ingest.remote.path import AnyPath
 __all__ = ["Found", "discover"]
 
 _SUFFIX = ".zstd"
+_NAMED = (".bag", ".db3", ".mcap")
 
 
 @frozen
@@ -25,6 +26,8 @@ class Found:
     files: tuple[AnyPath, ...]
     metadata: Metadata | None
     findings: tuple[Finding, ...]
+    missing: tuple[AnyPath, ...] = ()
+    """Parts that the metadata list beside others that are there."""
 
 
 def discover(paths: Sequence[AnyPath]) -> Found:
@@ -38,7 +41,8 @@ def discover(paths: Sequence[AnyPath]) -> Found:
     found = [_one(path) for path in paths]
     files = tuple(dict.fromkeys(file for one in found for file in one.files))
     findings = tuple(finding for one in found for finding in one.findings)
-    return Found(files, found[0].metadata if len(found) == 1 else None, findings)
+    missing = tuple(file for one in found for file in one.missing)
+    return Found(files, found[0].metadata if len(found) == 1 else None, findings, missing)
 
 
 def _one(path: AnyPath) -> Found:
@@ -107,6 +111,7 @@ def _listed(metadata: Metadata) -> Found:
             missing.append(name)
         else:
             files.append(file)
+    gone = tuple(folder / name for name in missing) if files else ()
     if not files:
         files = _recordings(folder)
         if not files:
@@ -124,13 +129,17 @@ def _listed(metadata: Metadata) -> Found:
         )
         for name in missing
     )
-    return Found(tuple(files), metadata, findings)
+    return Found(tuple(files), metadata, findings, gone)
 
 
 def _recordings(folder: AnyPath) -> list[AnyPath]:
-    return sorted(
-        (entry for entry in _entries(folder) if entry.is_file() and is_recording(entry)), key=_natural
-    )
+    """Return what is a recording, and what is only called so: a part that is empty or damaged is a loss, not nothing."""
+    files = (entry for entry in _entries(folder) if entry.is_file())
+    return sorted((file for file in files if _is_named(file) or is_recording(file)), key=_natural)
+
+
+def _is_named(file: AnyPath) -> bool:
+    return file.name.removesuffix(_SUFFIX).endswith(_NAMED)
 
 
 def _entries(folder: AnyPath) -> list[AnyPath]:

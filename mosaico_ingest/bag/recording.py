@@ -57,7 +57,7 @@ def _open_parts(files: Sequence[AnyPath], stack: ExitStack) -> tuple[list[Part],
         except BagError as err:  # noqa: PERF203 - each file may fail for itself
             failed.append(err)
     if not parts:
-        raise failed[0]
+        raise _none_opened(failed)
     kinds = sorted({part.container for part in parts})
     if len(kinds) > 1:
         raise BagError(
@@ -66,6 +66,14 @@ def _open_parts(files: Sequence[AnyPath], stack: ExitStack) -> tuple[list[Part],
             hint="name the files of one format",
         )
     return parts, [Loss(err.where or "", 0, f"this part cannot be opened: {err.what}") for err in failed]
+
+
+def _none_opened(failed: Sequence[BagError]) -> BagError:
+    first = failed[0]
+    if len(failed) == 1:
+        return first
+    what = f"{first.what}; nor can any of the {len(failed) - 1} other parts be opened"
+    return BagError(what, where=first.where, hint=first.hint)
 
 
 @frozen
@@ -96,6 +104,8 @@ class Recording:
         self._running: weakref.WeakSet[Generator[RawBatch, None, None]] = weakref.WeakSet()
         self._losses: dict[Loss, None] = dict.fromkeys(losses)
         self.files: tuple[AnyPath, ...] = found.files
+        self.missing: tuple[AnyPath, ...] = found.missing
+        """Parts that are not there, though the metadata list them; they are among the losses too."""
         self.container: str = parts[0].container
         """`mcap`, `sqlite3` or `ros1`."""
         self.size_bytes: int = sum(file.stat().st_size for file in found.files)
@@ -108,6 +118,7 @@ class Recording:
         for number, part in enumerate(parts):
             self._note(number, part.holes)
         oddities = compare(parts, self.channels, self.losses, found.metadata)
+        self._losses |= dict.fromkeys(Loss(str(file), 0, "this part is not there") for file in found.missing)
         self.findings: tuple[Finding, ...] = (*found.findings, *oddities)
         """What to know before reading; what reading itself finds broken is in `losses`."""
 

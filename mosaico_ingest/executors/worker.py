@@ -31,6 +31,7 @@ from mosaico_ingest.report.events import (
     RunStarted,
     RunStatus,
     Timed,
+    Unreadable,
 )
 from mosaico_ingest.report.model import Report
 from mosaico_ingest.report.stopwatch import Step, Stopwatch
@@ -111,6 +112,8 @@ def execute(
         if entered is None:
             tell(RunFinished(RunStatus.SKIPPED, 0))
             return collector.report(), None
+        for path in plan.missing:
+            tell(Unreadable(None, None, None, f"{path}: this part is not there"))
         with open_recording(plan.files, resolve=plan.resolver) as recording:
             destination = sink or sink_for(plan.target, buffer_bytes=plan.memory_bytes // 4)
             watch.lap(Step.PREPARE)

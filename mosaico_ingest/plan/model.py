@@ -90,6 +90,8 @@ class Plan:
     """Where rejected messages are kept."""
     kept_as: str | None = None
     """The name of the file they are kept in, as the ledger of the run has it."""
+    missing: tuple[AnyPath, ...] = ()
+    """Parts of the recording that are not there, though its metadata list them."""
     family: str | None = None
     """What the sequences of the same job, for other recordings, have in common."""
     memory_bytes: int = DEFAULT_MEMORY_BYTES

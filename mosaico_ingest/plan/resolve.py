@@ -71,6 +71,7 @@ def resolve(
         read_from_ns=read_from_ns,
         read_until_ns=read_until_ns,
         quarantine=config.quarantine,
+        missing=recording.missing,
         family=config.family or config.sequence_name,
         memory_bytes=config.memory_bytes or DEFAULT_MEMORY_BYTES,
         attempt=config.attempt,

@@ -73,12 +73,13 @@ def test_a_directory_and_its_metadata_are_the_same_recording(split: Path, record
         assert recording.findings == ()
 
 
-def test_a_part_that_is_missing_is_a_finding(split: Path, recordings: Any) -> None:
+def test_a_part_that_is_missing_is_a_finding_and_a_loss(split: Path, recordings: Any) -> None:
     (split / "part_9.mcap").unlink()
     with open_recording(split, resolve=recordings.blind) as recording:
         assert len(recordings.received(recording)) == 60
         assert "missing-part" in [finding.rule for finding in recording.findings]
         assert any("part_9.mcap" in finding.message for finding in recording.findings)
+        assert [(Path(loss.file).name, loss.count) for loss in recording.losses] == [("part_9.mcap", None)]
 
 
 def test_one_part_alone_says_that_there_are_others(split: Path, recordings: Any) -> None:
@@ -177,6 +178,8 @@ def test_metadata_that_list_nothing_that_is_there_fall_back_on_what_is(split: Pa
     write_metadata(split, info | {"relative_file_paths": ["gone.mcap"]})
     assert len(discover([split]).files) == 3
     assert rules(split, recordings) == ["missing-part"]
+    with open_recording(split, resolve=recordings.blind) as recording:
+        assert recording.losses == ()
     for file in split.glob("*.mcap"):
         file.unlink()
     with pytest.raises(BagError, match=r"none of the files it lists is there: gone\.mcap"):
@@ -191,5 +194,19 @@ def test_a_part_that_cannot_be_opened_is_a_loss_and_a_finding(split: Path, recor
         assert [loss.reason for loss in recording.losses] == ["this part cannot be opened: the file is empty"]
     for file in split.glob("*.mcap"):
         file.write_bytes(b"")
-    with pytest.raises(BagError, match="the file is empty"):
+    with pytest.raises(BagError, match="the file is empty; nor can any of the 2 other parts be opened"):
+        open_recording(split, resolve=recordings.blind)
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n" + bytes(50), b"anything"])
+def test_a_damaged_part_counts_without_metadata_too(split: Path, recordings: Any, content: bytes) -> None:
+    (split / "metadata.yaml").unlink()
+    (split / "part_9.mcap").write_bytes(content)
+    (split / "notes.txt").write_bytes(b"not mine")
+    with open_recording(split, resolve=recordings.blind) as recording:
+        assert len(recordings.received(recording)) == 60
+        assert {Path(loss.file).name for loss in recording.losses} == {"part_9.mcap"}
+    for number in (8, 10):
+        (split / f"part_{number}.mcap").write_bytes(content)
+    with pytest.raises(BagError, match=r"part_8\.mcap"):
         open_recording(split, resolve=recordings.blind)
