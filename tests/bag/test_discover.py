@@ -198,7 +198,7 @@ def test_a_part_that_cannot_be_opened_is_a_loss_and_a_finding(split: Path, recor
         open_recording(split, resolve=recordings.blind)
 
 
-@pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n" + bytes(50), b"anything"])
+@pytest.mark.parametrize("content", [b"", b"\x89MC", b"anything"])
 def test_a_damaged_part_counts_without_metadata_too(split: Path, recordings: Any, content: bytes) -> None:
     (split / "metadata.yaml").unlink()
     (split / "part_9.mcap").write_bytes(content)
