@@ -23,18 +23,22 @@ from mosaico_ingest.store import Store
 
 pytest.importorskip("ray", reason="Ray is not installed")
 
-from ray_cluster import NODE, two_nodes
+from ray_cluster import two_nodes
 
 from mosaico_ingest.executors.crew import Announced
 from mosaico_ingest.executors.ray import Ray
 from mosaico_ingest.executors.ray_worker import Setting, machine, out_of_reach
 
-pytestmark = pytest.mark.slow
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.xdist_group("ray"),
+]  # one cluster, not one for each worker of pytest
 
 DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
 ADAPTER = """
 import logging
 import time
+from pathlib import Path
 
 from imu_factor import FACTOR
 
@@ -49,7 +53,8 @@ class Slow(ROSAdapterBase[IMU]):
 
     @classmethod
     def from_dict(cls, ros_data):
-        time.sleep(PAUSE)
+        while not Path(WAIT).exists():
+            time.sleep(0.01)
         if not cls.said:
             logging.getLogger("slow").warning("at work")
             cls.said = True
@@ -63,12 +68,12 @@ def cluster() -> Iterator[Any]:
         yield both
 
 
-def make_job(folder: Path, names: str, *, pause_s: float) -> Path:
-    """A job whose adapter is a file beside it, which needs another one."""
+def make_job(folder: Path, names: str, *, wait_for: str = "") -> Path:
+    """A job whose adapter is a file beside it, which needs another one; it waits for a file to be there."""
     (folder / "adapters").mkdir(parents=True)
     for name in names:
         shutil.copy(DRIVE, folder / f"{name}.mcap")
-    (folder / "adapters" / "imu.py").write_text(ADAPTER.replace("PAUSE", str(pause_s)))
+    (folder / "adapters" / "imu.py").write_text(ADAPTER.replace("WAIT", repr(str(folder / wait_for))))
     (folder / "adapters" / "imu_factor.py").write_text("FACTOR = 2.0\n")
     manifest = folder / "job.yaml"
     manifest.write_text(
@@ -104,7 +109,7 @@ def outcome(folder: Path) -> list[dict[str, Any]]:
 def test_a_cluster_does_what_one_machine_does(cluster: Any, tmp_path: Path) -> None:
     here, there = tmp_path / "here", tmp_path / "there"
     for folder in (here, there):
-        make_job(folder, "abcd", pause_s=0)
+        make_job(folder, "abcd")
     code, said = ended(ingest(here))
     assert code == 0, said
     code, said = ended(
@@ -122,27 +127,8 @@ def test_a_cluster_does_what_one_machine_does(cluster: Any, tmp_path: Path) -> N
     assert not list((there / "store").glob(".run-*"))
 
 
-def test_a_node_that_goes_costs_no_recording(cluster: Any, tmp_path: Path) -> None:
-    jobs = compile_job(make_job(tmp_path, "ab", pause_s=0.005))
-    begun: list[int] = []
-
-    def end_a_node_once_both_are_at_work(position: int, event: Event) -> None:
-        if isinstance(event, RunStarted):
-            begun.append(position)
-            if len(begun) == 2:
-                cluster.remove_node(cluster.worker_nodes.copy().pop(), allow_graceful=False)
-
-    try:
-        reports = list(Ray(cluster.address).map(jobs, end_a_node_once_both_are_at_work))
-    finally:
-        cluster.add_node(**NODE)
-    assert [(report.exit_code, report.totals.written) for report in reports] == [(0, 1000)] * 2
-    assert len(begun) == 3
-    assert [one.rows for one in Store.open(tmp_path / "store").sequences()] == [1000, 1000]
-
-
 def test_an_interrupt_leaves_what_the_policy_says_and_130(cluster: Any, tmp_path: Path) -> None:
-    make_job(tmp_path, "abcd", pause_s=0.05)
+    make_job(tmp_path, "abcd", wait_for="never")
     process = ingest(tmp_path, "--executor", "ray", "--address", cluster.address, "--log-format", "json")
     assert process.stderr is not None
     started = 0
@@ -158,22 +144,40 @@ def test_an_interrupt_leaves_what_the_policy_says_and_130(cluster: Any, tmp_path
     assert Store.open(tmp_path / "store").names() == ()
 
 
+def test_a_node_that_goes_costs_no_recording(cluster: Any, tmp_path: Path) -> None:
+    """It takes the node, so it comes last of those who use the cluster."""
+    jobs = compile_job(make_job(tmp_path, "ab", wait_for="go"))
+    begun: list[int] = []
+
+    def end_a_node_once_both_are_at_work(position: int, event: Event) -> None:
+        if isinstance(event, RunStarted):
+            begun.append(position)
+            if len(begun) == 2:
+                cluster.remove_node(cluster.worker_nodes.copy().pop(), allow_graceful=False)
+                (tmp_path / "go").touch()
+
+    reports = list(Ray(cluster.address).map(jobs, end_a_node_once_both_are_at_work))
+    assert [(report.exit_code, report.totals.written) for report in reports] == [(0, 1000)] * 2
+    assert len(begun) == 3
+    assert [one.rows for one in Store.open(tmp_path / "store").sequences()] == [1000, 1000]
+
+
 def test_without_an_address_ray_is_started_here(tmp_path: Path) -> None:
-    make_job(tmp_path, "ab", pause_s=0)
-    code, said = ended(ingest(tmp_path, "--executor", "ray", "--jobs", "2"))
+    make_job(tmp_path, "ab")
+    code, said = ended(ingest(tmp_path, "--executor", "ray", "--jobs", "1"))
     assert code == 0, said
     assert Store.open(tmp_path / "store").names() == ("a", "b")
 
 
 def test_no_cluster_at_an_address_is_said(tmp_path: Path) -> None:
-    make_job(tmp_path, "a", pause_s=0)
+    make_job(tmp_path, "a")
     code, said = ended(ingest(tmp_path, "--executor", "ray", "--address", "127.0.0.1:9"))
     assert code == 1
     assert "127.0.0.1:9: cannot connect to Ray" in " ".join(said.split())
 
 
 def test_what_a_node_cannot_reach_is_said_and_never_made_anew_there(tmp_path: Path) -> None:
-    config = compile_job(make_job(tmp_path, "a", pause_s=0))[0]
+    config = compile_job(make_job(tmp_path, "a"))[0]
     here = Setting(Announced.here(), 0, ".run-1", machine())
     (tmp_path / "store").mkdir()
     assert "one machine only" in str(out_of_reach(config, here))

@@ -12,16 +12,16 @@ import ray
 from ray.cluster_utils import Cluster
 
 _ALONE = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
-NODE: dict[str, Any] = {"num_cpus": 1, "memory": 2 << 30, "object_store_memory": 80 << 20}
+_NODE: dict[str, Any] = {"num_cpus": 1, "memory": 2 << 30, "object_store_memory": 80 << 20}
 
 
 @contextmanager
 def two_nodes() -> Generator[Cluster]:
     """Start a head and another node, one CPU each; stop both in the end."""
     with patch.dict(os.environ, _ALONE):
-        cluster = Cluster(initialize_head=True, head_node_args={**NODE, "include_dashboard": False})
+        cluster = Cluster(initialize_head=True, head_node_args={**_NODE, "include_dashboard": False})
         try:
-            cluster.add_node(**NODE)
+            cluster.add_node(**_NODE)
             cluster.wait_for_nodes(30)
             yield cluster
         finally:
