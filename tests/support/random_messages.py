@@ -51,7 +51,9 @@ def _struct(kind: pa.StructType, chance: random.Random | None) -> dict[str, Any]
 
 
 def _float(kind: pa.DataType, chance: random.Random) -> float:
-    value = chance.choice([0.0, -0.0, 1.0, float("nan"), float("inf"), chance.gauss(0, 10), chance.random()])
+    value = chance.choice(
+        [0.0, -0.0, 1.0, -1.0, float("nan"), float("inf"), chance.gauss(0, 10), chance.random()]
+    )
     return pa.scalar(value, kind).as_py()
 
 
