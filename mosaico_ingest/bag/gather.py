@@ -14,8 +14,10 @@ from mosaico_ingest.bag.containers.slab import in_time, pack
 
 __all__ = ["Gather", "compact"]
 
-BATCH_BYTES = 8 << 20
-"""A batch ends at about this many bytes of payload."""
+_FIRST_BYTES, BATCH_BYTES = 1 << 20, 8 << 20
+"""A channel's first batch ends at about this many bytes of payload, each other at twice as many, up to the latter.
+
+So the stages that follow begin while little has been read."""
 _BIG_BYTES = 16 << 10
 """Messages larger than this on average are not copied: the batch points into the block they came in."""
 _ROW_BYTES = 32
@@ -29,6 +31,7 @@ class _Waiting:
     slabs: list[Slab] = field(default_factory=list[Slab])
     rows: int = 0
     held_bytes: int = 0
+    most_bytes: int = _FIRST_BYTES
 
     def add(self, slab: Slab) -> None:
         self.slabs.append(slab)
@@ -76,12 +79,13 @@ class Gather:
         return sum(waiting.held_bytes for waiting in self._waiting.values())
 
     def _is_full(self, waiting: _Waiting, rows: int = 1, payload_bytes: int = 0) -> bool:
-        return waiting.rows + rows > self._rows or waiting.held_bytes + payload_bytes > BATCH_BYTES
+        return waiting.rows + rows > self._rows or waiting.held_bytes + payload_bytes > waiting.most_bytes
 
     def _flush(self, channel: int, floor_ns: int) -> Iterator[RawBatch]:
         """Give the messages up to `floor_ns`, keep the others."""
-        slabs = self._waiting[channel].slabs
-        waiting = self._waiting[channel] = _Waiting()
+        full = self._waiting[channel]
+        slabs = full.slabs
+        waiting = self._waiting[channel] = _Waiting(most_bytes=min(2 * full.most_bytes, BATCH_BYTES))
         if slabs and not any(_is_view(slab) for slab in slabs):
             slabs = [_joined(slabs)]
         ready: list[Slab] = []

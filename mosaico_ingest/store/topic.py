@@ -21,7 +21,8 @@ from mosaico_ingest.store.segment import Segment, SegmentWriter, sorted_rows
 
 __all__ = ["Staging", "StoreTopic"]
 
-_GROUP_BYTES = 32 << 20
+_FIRST_GROUP_BYTES, _GROUP_BYTES = 4 << 20, 32 << 20
+"""The first row group, and the largest; between them each is twice the one before, so that writing begins early."""
 _GROUP_ROWS = 1 << 20
 _BIG_GROUP_BYTES = 8 << 20
 _BIG_ROW_BYTES = 16 << 10
@@ -65,6 +66,7 @@ class StoreTopic:
         self._staging = staging
         self._batches: list[pa.RecordBatch] = []
         self._rows = 0
+        self._most_bytes = _FIRST_GROUP_BYTES
         self._broken = False
         self._writer: SegmentWriter | None = None
         self._lock = threading.Lock()
@@ -87,7 +89,10 @@ class StoreTopic:
 
     def _is_full(self) -> bool:
         big = self.buffered_bytes >= _BIG_ROW_BYTES * self._rows
-        return self.buffered_bytes >= (_BIG_GROUP_BYTES if big else _GROUP_BYTES) or self._rows >= _GROUP_ROWS
+        return (
+            self.buffered_bytes >= (_BIG_GROUP_BYTES if big else self._most_bytes)
+            or self._rows >= _GROUP_ROWS
+        )
 
     def flush(self) -> None:
         """Write what is in memory as one row group."""
@@ -125,6 +130,7 @@ class StoreTopic:
         batches, self._batches = self._batches, []
         self._rows = self.buffered_bytes = 0
         if batches:
+            self._most_bytes = min(2 * self._most_bytes, _GROUP_BYTES)
             self._write_group(sorted_rows(batches, self.schema))
 
     def _write_group(self, rows: pa.Table) -> None:

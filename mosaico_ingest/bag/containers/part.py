@@ -30,7 +30,7 @@ __all__ = [
 
 EARLIEST_NS, LATEST_NS = -(2**63), 2**63 - 1
 """The first and last time stamps there are; the last is in the year 2262."""
-BLOCK_BYTES, MOST_PIECES = 8 << 20, 64
+_FIRST_BYTES, BLOCK_BYTES, MOST_PIECES = 1 << 20, 8 << 20, 64
 """Up to how many bytes, and how many chunks, are read at once: what is done once a block is done less often."""
 T = TypeVar("T")
 
@@ -123,12 +123,13 @@ class Block:
 def in_groups(pieces: Iterable[T], size: Callable[[T], int], *, most: int = MOST_PIECES) -> Iterator[list[T]]:
     """Yield neighbours together, as long as they have no more than `BLOCK_BYTES` and are no more than `most`."""
     group: list[T] = []
-    held_bytes = 0
+    held_bytes, most_bytes = 0, _FIRST_BYTES
     for piece in pieces:
         held_bytes += size(piece)
-        if group and (held_bytes > BLOCK_BYTES or len(group) == most):
+        if group and (held_bytes > most_bytes or len(group) == most):
             yield group
             group, held_bytes = [], size(piece)
+            most_bytes = min(2 * most_bytes, BLOCK_BYTES)
         group.append(piece)
     if group:
         yield group
