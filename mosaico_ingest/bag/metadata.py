@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import yaml
-
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.path import AnyPath
@@ -46,6 +44,8 @@ def read_metadata(path: AnyPath) -> Metadata:
     Raises:
         BagError: It is no YAML, or not of rosbag2's shape.
     """
+    import yaml  # noqa: PLC0415 - slow to import, and few recordings come with metadata
+
     try:
         if path.stat().st_size > _LIMIT_BYTES:
             raise BagError(f"larger than {_LIMIT_BYTES} bytes", where=str(path))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mosaico_ingest.adapters.mapping.arrow import DataType, pt
 from mosaico_ingest.adapters.mapping.check import Checker, Scope, constant
@@ -17,7 +17,9 @@ from mosaico_ingest.adapters.mapping.model import Scalar
 from mosaico_ingest.adapters.mapping.typed import Const, Typed, Written
 from mosaico_ingest.diagnostics import Finding, Severity
 from mosaico_ingest.frozen import frozen
-from mosaico_ingest.manifest.source import Path, Source
+
+if TYPE_CHECKING:
+    from mosaico_ingest.manifest.source import Path, Source
 
 __all__ = ["SPECIAL", "Desk", "Slot"]
 
@@ -54,17 +56,17 @@ class Slot:
 class Desk:
     """The file being read, and what was found wrong with it so far."""
 
-    def __init__(self, text: Source) -> None:
+    def __init__(self, source: Callable[[], Source]) -> None:
         self.findings: list[Finding] = []
-        self._text = text
+        self._source = source
 
     def report(self, path: Path, message: str, help_: str | None = None, *, rule: str = "mapping") -> None:
         """Note a mistake about a key or value."""
-        self.findings.append(Finding(rule, Severity.ERROR, message, self._text.key_span(path), help_))
+        self.findings.append(Finding(rule, Severity.ERROR, message, self._source().key_span(path), help_))
 
     def report_inside(self, path: Path, place: Place, rule: str, message: str, help_: str | None) -> None:
         """Note a mistake in a part of an expression."""
-        span = self._text.inner_span(path, *place)
+        span = self._source().inner_span(path, *place)
         self.findings.append(Finding(rule, Severity.ERROR, message, span, help_))
 
     def misfit(self, at: Written | Path, unfit: Unfit) -> None:
@@ -72,7 +74,7 @@ class Desk:
         if isinstance(at, Written):
             self.report_inside(at.path, at.node.at, "misfit", str(unfit), unfit.hint)
         else:
-            span = self._text.span(at)
+            span = self._source().span(at)
             self.findings.append(Finding("misfit", Severity.ERROR, str(unfit), span, unfit.hint))
 
     def demand(self, at: Written | Path, kind: Kind, target: DataType) -> bool:

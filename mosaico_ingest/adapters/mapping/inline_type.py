@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, TypeAlias
 
 import pyarrow as pa
 
 from mosaico_ingest.adapters.mapping.arrow import DataType, arrays
 from mosaico_ingest.adapters.mapping.model import FieldType, InlineType, TypedField
-from mosaico_ingest.manifest.source import Path
 from mosaico_ingest.ontology.registry import UnknownTag, ontology_type
 from mosaico_ingest.ontology.tags import MODULES
 from mosaico_ingest.ontology.types import OntologyType
+
+if TYPE_CHECKING:
+    from mosaico_ingest.manifest.source import Path
 
 __all__ = ["make_type"]
 
@@ -31,7 +34,7 @@ _LIST = re.compile(r"list\[\s*(?P<element>.+?)\s*(,\s*(?P<size>\d+)\s*)?\]")
 _ENVELOPE = "timestamp_ns"
 _LIST_OF_STRUCTS = "list"
 
-Report = Callable[[Path, str, "str | None"], None]
+Report: TypeAlias = "Callable[[Path, str, str | None], None]"
 """Takes a mistake: the path of the value, what, what to do."""
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextvars import ContextVar
 from dataclasses import field, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -26,12 +26,14 @@ from mosaico_ingest.bag.names import normalize_msgtype
 from mosaico_ingest.diagnostics import Finding, RowFailure, Severity
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.frozen import frozen
-from mosaico_ingest.manifest.source import Source, load_source
 from mosaico_ingest.ontology.registry import UnknownTag, ontology_type
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.textfile import read_whole
 
-__all__ = ["MappingAdapter", "MappingSpec", "load_adapter"]
+if TYPE_CHECKING:
+    from mosaico_ingest.manifest.source import Source
+
+__all__ = ["MappingAdapter", "MappingSpec", "known_adapter", "load_adapter"]
 
 _BINDING: ContextVar[tuple[tuple[str, str], ...]] = ContextVar("binding", default=())
 """The adapters being bound and the types they are bound to, to notice one that uses itself."""
@@ -88,7 +90,8 @@ class MappingSpec:
     """An adapter file that reads well; satisfies `AdapterSpec`, and survives pickling if its look-up does."""
 
     model: MappingFile
-    source: Source
+    written: Source | Path
+    """Its text and the place of everything in it, or the file that has them."""
     ontology: OntologyType
     adapters: AdapterLookup | None = None
     """Finds the adapters that `use` names; a module-level function."""
@@ -96,6 +99,11 @@ class MappingSpec:
         default_factory=dict["_Known", "MappingAdapter"], compare=False, repr=False
     )
     """What it has been compiled to: a batch has the same few types in each of its recordings."""
+
+    @property
+    def source(self) -> Source:
+        """Its text and the place of everything in it; read now where only its file is known."""
+        return _source(self.written) if isinstance(self.written, Path) else self.written
 
     @property
     def name(self) -> str:
@@ -134,7 +142,7 @@ class MappingSpec:
 
     def __reduce__(self) -> tuple[type[MappingSpec], tuple[object, ...]]:
         """Leave what was compiled behind: it is quickly made anew, and large."""
-        return MappingSpec, (self.model, self.source, self.ontology, self.adapters)
+        return MappingSpec, (self.model, self.written, self.ontology, self.adapters)
 
     def _compile(
         self, definition: Definition, shape: pa.StructType
@@ -158,7 +166,7 @@ class MappingSpec:
     def _compiled(
         self, definition: Definition, shape: pa.StructType, variant: str
     ) -> tuple[MappingAdapter | None, tuple[Finding, ...]]:
-        desk = Desk(self.source)
+        desk = Desk(lambda: self.source)
         compiler = Compiler(desk, definition, self.adapters)
         scope = Scope(Kind(shape, msgtype=definition.root), definition.types)
         record = compiler.record(self.model, self.ontology, scope, variant)
@@ -180,17 +188,29 @@ def load_adapter(
     Raises:
         AdapterError: It cannot be read or is not a mapping; `findings` has one for each mistake.
     """
+    source = _source(path_or_text, file)
+    spec, findings = _read(source, adapters)
+    if spec is None or findings:
+        raise _refused("this is no valid adapter", source, findings)
+    return spec
+
+
+def known_adapter(value: object, path: Path, *, adapters: AdapterLookup) -> MappingSpec:
+    """Return the adapter that `value`, read from the file at `path`, is known to be: what is in the file is not checked."""
+    model = MappingFile.model_validate(value)
+    return MappingSpec(model, path, ontology_type(str(model.ontology)), adapters)
+
+
+def _source(path_or_text: Path | str, file: str | None = None) -> Source:
+    from mosaico_ingest.manifest.source import load_source  # noqa: PLC0415 - built-in adapters are known without YAML
+
     if isinstance(path_or_text, Path):
         file = file or str(path_or_text)
         try:
             path_or_text = read_whole(path_or_text).decode()
         except (OSError, UnicodeDecodeError) as error:
             raise AdapterError(f"the adapter file cannot be read: {error}", where=file) from error
-    source = load_source(path_or_text, file=file or "<adapter>")
-    spec, findings = _read(source, adapters)
-    if spec is None or findings:
-        raise _refused("this is no valid adapter", source, findings)
-    return spec
+    return load_source(path_or_text, file=file or "<adapter>")
 
 
 def _read(source: Source, adapters: AdapterLookup | None) -> tuple[MappingSpec | None, tuple[Finding, ...]]:
@@ -203,7 +223,7 @@ def _read(source: Source, adapters: AdapterLookup | None) -> tuple[MappingSpec |
         from mosaico_ingest.manifest.problems import explain  # noqa: PLC0415 - the same
 
         return None, tuple(finding for _, finding in explain(error, source=source, schema=adapter_schema()))
-    desk = Desk(source)
+    desk = Desk(lambda: source)
     if (model.ros_type is None) == (model.variants is None):
         desk.report(
             ("adapter",), "either ros_type or variants says what the adapter takes", "give one of them"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from mosaico_ingest.adapters.mapping.arrow import DataType, arrays, pt
 from mosaico_ingest.adapters.mapping.build import Looked
@@ -13,7 +14,9 @@ from mosaico_ingest.adapters.mapping.fit import demand
 from mosaico_ingest.adapters.mapping.kinds import Unfit, join, spell, within
 from mosaico_ingest.adapters.mapping.model import Form, Scalar
 from mosaico_ingest.adapters.mapping.typed import FieldOf, Typed, Written
-from mosaico_ingest.manifest.source import Path
+
+if TYPE_CHECKING:
+    from mosaico_ingest.manifest.source import Path
 
 __all__ = ["compile_lookup"]
 

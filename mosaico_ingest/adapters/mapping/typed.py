@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import field
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from mosaico_ingest.adapters.mapping.arrow import DataType
 from mosaico_ingest.adapters.mapping.expression import LiteralValue, Node
 from mosaico_ingest.adapters.mapping.functions.registry import Function
 from mosaico_ingest.adapters.mapping.kinds import Kind
 from mosaico_ingest.frozen import frozen
-from mosaico_ingest.manifest.source import Path
+
+if TYPE_CHECKING:
+    from mosaico_ingest.manifest.source import Path
 
 __all__ = [
     "Apply",
