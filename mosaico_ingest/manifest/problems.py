@@ -174,7 +174,12 @@ def _unknown_key(problem: _Problem) -> Finding:
     span = problem.source.key_span(problem.path)
     section = f"in {_name(parent)}" if parent else "at the top level"
     close = _suggestion(problem)
-    remedy = f"did you mean {close!r}? " if close else _elsewhere(word, problem.schema)
+    if close:
+        remedy = f"did you mean {close!r}? "
+    elif {"value", "fields"} <= set(allowed):  # a mapping's value
+        remedy = f"a struct is written {{fields: {{{word}: …}}}}; "
+    else:
+        remedy = _elsewhere(word, problem.schema)
     fix = (
         Edit(span, close)
         if close and _plain(close).replace("_", "") == _plain(word).replace("_", "")

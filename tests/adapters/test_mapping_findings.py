@@ -135,6 +135,7 @@ def findings_of(text: str) -> list[tuple[Finding, str]]:
         ("count: {value: status, map: {1: 2}, else: serial}", "misfit", "serial", "string for int32"),
         ("count: {value: big, map: {1: 2}, else: keep}", "misfit", "big", "may not fit"),
         ("count: {value: status, mapp: {1: 2}}", "unknown-key", "mapp", "unknown key 'mapp'"),
+        ("point: {x: soc}", "unknown-key", "x", "unknown key 'x' in fields.point"),
         ("count: {value: status, use: PoseAdapter, of: self}", "form", "count", "value and use are given"),
         ("count: {of: header}", "form", "count", "nothing says where"),
         ("count: {value: status, else: 3}", "form", "count", "`else` goes with map"),
@@ -151,6 +152,12 @@ def test_a_mistake_in_a_field_is_one_finding_at_its_place(
     found = findings_of(f"{FILE}  {field}\n")
     assert [(finding.rule, text) for finding, text in found] == [(rule, under)], [str(f) for f, _ in found]
     assert message in found[0][0].message
+
+
+def test_whoever_writes_a_struct_as_a_plain_mapping_is_told_how() -> None:
+    [(finding, _)] = findings_of(f"{FILE}  point: {{x: soc}}\n")
+    assert finding.help is not None
+    assert finding.help.startswith("a struct is written {fields: {x: …}}; ")
 
 
 @pytest.mark.parametrize(
