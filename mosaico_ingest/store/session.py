@@ -85,7 +85,9 @@ class StoreSession:
     def commit(self) -> None:
         """Finish every topic, move the segments to their places, and enter them in the catalog at once."""
         with ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="segment") as pool:
-            list(pool.map(StoreTopic.close, self._staging.topics.values()))
+            # the largest first, so that no thread is left with it at the end
+            waiting = sorted(self._staging.topics.values(), key=lambda topic: -topic.buffered_bytes)
+            list(pool.map(StoreTopic.close, waiting))
         topics = tuple(self._placed(topic) for topic in self._staging.topics.values())
         moves: dict[AnyPath, AnyPath] = {
             segment.path: self._layout.root / path
