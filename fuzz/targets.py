@@ -21,6 +21,7 @@ except ImportError:  # only the long run needs it
 with atheris.instrument_imports(include=["mosaico_ingest"]) if atheris else nullcontext():
     from mosaico_ingest.adapters.mapping.load import load_adapter
     from mosaico_ingest.bag.batch import Channel, Encoding, RawBatch
+    from mosaico_ingest.bag.containers import mcap, ros1, rosrecord, sqlite
     from mosaico_ingest.bag.definition import Embedded
     from mosaico_ingest.bag.metadata import read_metadata
     from mosaico_ingest.bag.recording import open_recording
@@ -33,6 +34,9 @@ with atheris.instrument_imports(include=["mosaico_ingest"]) if atheris else null
     from mosaico_ingest.wire.codec import JSON, Malformed
 
 __all__ = ["TARGETS"]
+
+READERS = (mcap, ros1, rosrecord, sqlite)
+"""Imported above to be watched: they are loaded with the first file of their kind."""
 
 _RESOLVER = TypeResolver("ros2_humble")
 

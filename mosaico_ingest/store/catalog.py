@@ -238,9 +238,9 @@ class Catalog:
                     db.execute(f"PRAGMA application_id = {_APPLICATION}")
                     db.execute(f"PRAGMA user_version = {FORMAT}")
                 db.execute("COMMIT")
-            elif create:
-                _complete(db)
             found = self._format(db)
+            if create and found == FORMAT:  # a newer one is not ours to change
+                _complete(db)
         if found > FORMAT:
             raise SinkError(
                 f"the store has format {found}, this version knows up to {FORMAT}",

@@ -35,7 +35,8 @@ def verify(info: SequenceInfo) -> Iterator[Checked]:
 def _problem(topic: TopicInfo, segment: SegmentInfo) -> str | None:
     try:
         with opened(segment.path, page_checksum_verification=True) as file:
-            same_columns = file.schema_arrow.equals(topic.schema)
+            if not file.schema_arrow.equals(topic.schema):
+                return "its columns are not those of its topic"
             content = ContentHash(file.schema_arrow)
             found = (segment.path.stat().st_size, *_rows_and_span(file, content))
     except (OSError, pa.ArrowException) as error:
@@ -44,8 +45,6 @@ def _problem(topic: TopicInfo, segment: SegmentInfo) -> str | None:
     if found != wanted:
         form = "{} bytes, {} rows in [{}, {}]"
         return f"the catalog says {form.format(*wanted)}, the file has {form.format(*found)}"
-    if not same_columns:
-        return "its columns are not those of its topic"
     if segment.checksum not in {None, content.hexdigest()}:
         return f"its rows have the checksum {content.hexdigest()}, those that were written {segment.checksum}"
     return None
@@ -58,4 +57,4 @@ def _rows_and_span(file: pq.ParquetFile, content: ContentHash) -> tuple[int, int
         content.add(batch)
         rows += batch.num_rows
     spans = [time_span(file.metadata, group) for group in range(file.num_row_groups)]
-    return rows, min(low for low, _ in spans), max(high for _, high in spans)
+    return rows, min((low for low, _ in spans), default=0), max((high for _, high in spans), default=0)

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
@@ -23,6 +24,7 @@ from mosaico_ingest.injector import _missing
 from mosaico_ingest.report.events import Event, Noted, RunStatus, Unreadable
 from mosaico_ingest.sink import MemorySink, StoredTopic
 from mosaico_ingest.store import Store
+from mosaico_ingest.store.verify import verify
 
 from .conftest import RunJob, WriteBag, number
 
@@ -116,6 +118,27 @@ def test_verify_finds_what_changed_on_the_disk(
         segment.write_bytes(data if damage == "flip" else data[:-20])
     with pytest.raises(SystemExit) as ended:
         main(arguments)
+    assert ended.value.code == 5
+
+
+@pytest.mark.parametrize("table", [{}, {"timestamp_ns": []}, {"timestamp_ns": ["a"], "data": [1.0]}, None])
+def test_verify_finds_another_file_in_the_place_of_one(
+    table: dict[str, list[object]] | None,
+    write_bag: WriteBag,
+    write_job: WriteJob,
+    run_job: RunJob,
+    tmp_path: Path,
+) -> None:
+    write_bag({"/speed": [number(1)]})
+    run_job(write_job())
+    store = Store.open(tmp_path / "store")
+    (segment,) = store.paths("drive", "/speed")
+    rows = pq.read_table(segment)
+    pq.write_table(rows.slice(0, 0) if table is None else pa.table(table), segment)
+    (checked,) = verify(store.sequence("drive"))
+    assert checked.problem
+    with pytest.raises(SystemExit) as ended:
+        main(["verify", "--store", str(tmp_path / "store")])
     assert ended.value.code == 5
 
 

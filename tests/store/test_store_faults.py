@@ -8,6 +8,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
@@ -38,8 +39,53 @@ def test_a_store_that_is_not_there_is_said_so(tmp_path: Path) -> None:
 def test_a_newer_store_is_left_alone(store: Store) -> None:
     with closing(sqlite3.connect(store.layout.catalog)) as db:
         db.execute(f"PRAGMA user_version = {FORMAT + 1}")
-    with pytest.raises(SinkError, match=f"format {FORMAT + 1}.*upgrade"):
-        Store.open(store.path)
+        db.execute("ALTER TABLE segments DROP COLUMN checksum")
+        before = db.execute("SELECT sql FROM sqlite_master").fetchall()
+        with pytest.raises(SinkError, match=f"format {FORMAT + 1}.*upgrade"):
+            Store.open(store.path)
+        assert db.execute("SELECT sql FROM sqlite_master").fetchall() == before
+
+
+def test_a_catalog_that_is_still_empty_is_no_store_to_read(tmp_path: Path) -> None:
+    (tmp_path / "catalog.sqlite").touch()
+    with pytest.raises(SinkError, match="there is no store here"):
+        Store.open(tmp_path, create=False)
+
+
+def test_a_store_is_made_once_another_lets_go_of_its_file(tmp_path: Path) -> None:
+    """The switch to the write-ahead log does not wait for a lock by itself."""
+    held = sqlite3.connect(tmp_path / "catalog.sqlite", isolation_level=None, check_same_thread=False)
+    with closing(held):
+        held.execute("BEGIN EXCLUSIVE")
+        timer = threading.Timer(0.3, held.rollback)
+        timer.start()
+        assert Store.open(tmp_path).names() == ()
+        timer.join()
+        assert held.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+
+
+def open_catalogs(store: Store) -> int:
+    """Return how many handles of its catalog this process has."""
+    catalog = store.layout.catalog.resolve()
+    return sum(link.exists() and link.resolve() == catalog for link in Path("/proc/self/fd").iterdir())
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="open files are listed in /proc")
+def test_a_session_holds_the_catalog_open_and_nobody_off(
+    sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
+) -> None:
+    log = store.layout.catalog.with_name("catalog.sqlite-wal")
+    with sink.open("s", {}) as session:
+        session.topic("/t", sample, {}).write(rows([1]))
+        assert open_catalogs(store)
+        with sink.open("other", {}) as other:
+            other.topic("/t", sample, {}).write(rows([1]))
+        assert log.stat().st_size, "its end was no checkpoint, as somebody is left"
+    assert open_catalogs(store) == 0
+    assert not log.exists() or not log.stat().st_size, "the last one's end was"
+    with pytest.raises(SinkError, match="exists"), sink.open("s", {}):
+        pytest.fail("the session opened")
+    assert open_catalogs(store) == 0
 
 
 def test_another_programs_file_is_left_alone(tmp_path: Path) -> None:
