@@ -97,6 +97,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
     collect_rarely()
+    # numpy's OpenBLAS starts a thread for each core, and idle ones spin: 40 ms of CPU, and nothing here multiplies matrices.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         app(_with_command([argument for argument in given if argument != "--debug"]), prog_name="ingest")
     except IngestError as error:
