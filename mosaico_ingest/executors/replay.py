@@ -12,7 +12,7 @@ from pathlib import Path
 
 from mosaico_ingest.config import QuarantineSettings, ROSInjectionConfig, StoreTarget, TimeRange
 from mosaico_ingest.diagnostics import a_few, encodable
-from mosaico_ingest.errors import ManifestError, SinkUnavailable
+from mosaico_ingest.errors import ManifestError, NothingMatched, SinkUnavailable
 from mosaico_ingest.executors.content import content_digest
 from mosaico_ingest.executors.ledger import held
 from mosaico_ingest.frozen import frozen
@@ -50,8 +50,11 @@ def alone(folder: Path) -> Generator[None, None, None]:
     """Hold a quarantine's lock, so that no two replays bring the same messages in.
 
     Raises:
+        NothingMatched: There is no such folder.
         SinkUnavailable: Another replay holds it.
     """
+    if not folder.is_dir():
+        raise NothingMatched("there is no such folder", where=str(folder), hint="name a quarantine's folder")
     lock = folder / _LOCK
     try:
         lease = Lease(lock)

@@ -49,4 +49,5 @@ def _kept(folder: Path) -> Iterator[Kept]:
             if first.endswith("\n"):  # else its run was killed before it had kept a message
                 yield Kept(messages, str(json.loads(first)["sequence"]))
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise BagError(f"this is no index of a quarantine: {error}", where=str(index)) from error
+            why = getattr(error, "strerror", None) or error
+            raise BagError(f"this is no index of a quarantine: {why}", where=str(index)) from error

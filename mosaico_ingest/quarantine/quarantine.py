@@ -146,9 +146,17 @@ class Quarantine:
 
 
 def retire(messages: Path, why: str) -> None:
-    """Rename messages and their index, so that no replay takes them."""
-    for path in (messages, messages.with_suffix(INDEX)):
-        path.rename(path.with_name(f"{path.name}.{why}"))
+    """Rename messages and their index, so that no replay takes them.
+
+    Raises:
+        SinkError: The folder refuses; what was brought in already is recognised by the next replay.
+    """
+    try:
+        for path in (messages, messages.with_suffix(INDEX)):
+            path.rename(path.with_name(f"{path.name}.{why}"))
+    except OSError as error:
+        where = str(error.filename or messages)
+        raise SinkError(f"cannot be marked as {why}: {error.strerror}", where=where) from error
 
 
 def _allows(limit: Limit | None, kept: int, promised: int | None, read: int) -> bool:

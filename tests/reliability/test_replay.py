@@ -208,3 +208,64 @@ def test_a_mapping_with_other_columns_leaves_everything_as_it_was(
     assert command("replay", "-q", folder, "-m", other) != 0
     assert values(Store.open(tmp_path / "store")) == [1]
     assert waiting(folder, other) == 1
+
+
+def test_messages_that_cannot_be_marked_are_said_and_not_brought_in_again(
+    spoilt: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, store = tmp_path / "quarantine", Store.open(tmp_path / "store")
+    (messages,) = folder.glob("*.mcap")
+    in_the_way = folder / f"{messages.name}.replayed"
+    in_the_way.mkdir()
+    for code in (1, 1):
+        assert command("replay", "-q", folder, "-m", spoilt) == code
+        error = capsys.readouterr().err
+        assert error.startswith("error: ")
+        assert "cannot be marked as replayed" in error
+        assert values(store) == list(range(5))
+    in_the_way.rmdir()
+    assert command("replay", "-q", folder, "-m", spoilt) == 3, "what is left does not fit"
+    assert values(store) == list(range(5))
+
+
+@pytest.mark.parametrize(
+    "content", [None, '{"sequence": "drive"\n', "[1]\n", '{"topic": "/speed"}\n', b"\xff\xfe\n"]
+)
+def test_a_folder_that_is_no_quarantine_is_one_error(
+    content: str | bytes | None, spoilt: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command("replay", "-q", tmp_path / "nowhere", "-m", spoilt) == 3
+    assert "there is no such folder" in capsys.readouterr().err
+    (index,) = (tmp_path / "quarantine").glob("*.jsonl")
+    index.unlink()
+    if content is not None:
+        index.write_bytes(content if isinstance(content, bytes) else content.encode())
+    assert command("replay", "-q", tmp_path / "quarantine", "-m", spoilt) == 1
+    error = capsys.readouterr().err
+    assert "this is no index of a quarantine" in error
+    assert str(index) in error
+
+
+def test_messages_of_a_sequence_the_manifest_does_not_make_are_named(
+    spoilt: Path, write_job: WriteJob, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = write_job(quarantine={}, sequence={"name": "other"}, file="other.yaml")
+    assert command("replay", "-q", tmp_path / "quarantine", "-m", other) == 2
+    error = capsys.readouterr().err
+    assert "belongs to the sequence 'drive'" in error
+    assert "it makes other" in error
+    assert waiting(tmp_path / "quarantine", spoilt) == 6
+
+
+def test_a_run_killed_before_it_kept_a_message_leaves_nothing_to_replay(spoilt: Path, tmp_path: Path) -> None:
+    (index,) = (tmp_path / "quarantine").glob("*.jsonl")
+    index.write_text('{"sequence": "dr')
+    assert command("replay", "-q", tmp_path / "quarantine", "-m", spoilt) == 3
+
+
+def test_messages_of_a_sequence_that_was_removed_are_left_alone(
+    spoilt: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Store.open(tmp_path / "store").delete_sequence("drive")
+    assert command("replay", tmp_path / "quarantine", "-m", spoilt) == 3
+    assert "is not part of its sequence" in capsys.readouterr().err

@@ -246,3 +246,20 @@ def test_a_client_that_dies_before_it_hears_that_all_is_there(
     code, said = ran("run", write_job(sequence=sequence, **to(port)))
     assert code == (1 if if_exists == "append" else 0), said
     assert speeds(tmp_path) == [1, 2]
+
+
+def test_a_replay_brings_a_topic_of_which_nothing_was_good_once(
+    write_bag: WriteBag, write_job: WriteJob, tmp_path: Path, port: int
+) -> None:
+    write_bag({"/speed": [number(1), number(2)], "/std/speed": [number(3)]})
+    kept: dict[str, Any] = {"quarantine": {}, **to(port)}
+    assert ran("run", "-q", write_job(definition="float64 data\nfloat64 more", **kept))[0] == 4
+    replay = ("replay", "-q", tmp_path / "quarantine", "-m", write_job(**kept))
+    assert ran(*replay)[0] == 0
+    assert (speeds(tmp_path), speeds(tmp_path, "/std/speed")) == ([1, 2], [3])
+    for done in (tmp_path / "quarantine").glob("*.replayed"):
+        done.rename(done.with_suffix(""))  # as where the replay was killed before it could say so
+    code, said = ran(*replay)
+    assert code == 1
+    assert "a server adds no rows to one" in " ".join(said.split())
+    assert speeds(tmp_path) == [1, 2]
