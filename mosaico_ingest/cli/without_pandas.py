@@ -1,4 +1,4 @@
-"""This file keeps pyarrow from importing pandas and dateutil, which takes longer than reading a short recording."""
+"""This file keeps pyarrow from importing pandas, which takes longer than reading a short recording."""
 
 from __future__ import annotations
 
@@ -11,23 +11,21 @@ from mosaico_ingest.config import ROSInjectionConfig
 
 __all__ = ["forgo_pandas"]
 
-_UNWANTED = {"pandas", "dateutil"}
-
 
 class _Absent:
-    """Finds neither pandas nor dateutil, and leaves every other module to those who look after it."""
+    """Finds no pandas, and leaves every other module to those who look after it."""
 
     @staticmethod
     def find_spec(name: str, *_where: object) -> ModuleSpec | None:
-        if name in _UNWANTED:
+        if name == "pandas":
             raise ModuleNotFoundError(name)
         return None
 
 
 def forgo_pandas(configs: Sequence[ROSInjectionConfig] = ()) -> None:
-    """Let pyarrow look for both, once and in vain, unless adapters in Python run: they may hand it series or month spans.
+    """Let pyarrow look for pandas, once and in vain, unless adapters in Python run: they may hand it series.
 
-    Whoever imports them later gets them; only pyarrow no longer recognises their objects inside lists.
+    Whoever imports pandas later gets it; only pyarrow no longer recognises its objects inside lists.
     """
     if "pandas" in sys.modules or any(map(_runs_python, configs)) or _adapters_installed():
         return
