@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 from mosaico_ingest.bag.batch import Channel, Encoding
+from mosaico_ingest.bag.definition import Definition
 from mosaico_ingest.decode.columnar import ColumnarDecoder
 from mosaico_ingest.decode.decoder import Decoder
 from mosaico_ingest.errors import DecodeError
+from mosaico_ingest.frozen import frozen
 
 __all__ = ["decoder_for"]
 
@@ -28,4 +32,26 @@ def decoder_for(channel: Channel) -> Decoder:
             rule="definition",
             where=channel.topic,
         )
-    return ColumnarDecoder(channel.definition, channel.encoding)
+    return _decoder(_Known(channel.definition), channel.encoding)
+
+
+@frozen
+class _Known:
+    """A definition, told from others by what a decoder needs to know of it."""
+
+    definition: Definition
+
+    def __hash__(self) -> int:
+        return hash((self.definition.root, self.definition.text))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, _Known):
+            return NotImplemented
+        own, others = self.definition, other.definition
+        return (own.root, own.ros_version, own.types) == (others.root, others.ros_version, others.types)
+
+
+@lru_cache(maxsize=128)
+def _decoder(known: _Known, encoding: Encoding) -> Decoder:
+    """Return a decoder, the same one for each recording of a batch: it remembers nothing of what it decodes."""
+    return ColumnarDecoder(known.definition, encoding)
