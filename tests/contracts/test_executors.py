@@ -126,7 +126,7 @@ def on_ray(killed_once: Path) -> Iterator[Executor]:  # noqa: ARG001 - to be set
         yield Ray()
 
 
-RAY = pytest.param("ray", marks=[pytest.mark.slow, pytest.mark.xdist_group("ray")])
+RAY = pytest.param("ray", marks=pytest.mark.slow)
 
 
 def _executor(request: pytest.FixtureRequest) -> Executor:

@@ -29,10 +29,7 @@ from mosaico_ingest.executors.crew import Announced
 from mosaico_ingest.executors.ray import Ray
 from mosaico_ingest.executors.ray_worker import Setting, machine, out_of_reach
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.xdist_group("ray"),
-]  # one cluster, not one for each worker of pytest
+pytestmark = pytest.mark.slow
 
 DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
 ADAPTER = """

@@ -73,6 +73,7 @@ def job(folder: Path, text: str, name: str = "job.yaml") -> str:
     return name
 
 
+@pytest.mark.slow
 def test_names_stay_in_the_store_and_off_the_terminal(tmp_path: Path, ingest: Ingest) -> None:
     record(tmp_path / "drive", TOPICS, text=ESCAPES)
     name = job(
@@ -89,6 +90,7 @@ def test_names_stay_in_the_store_and_off_the_terminal(tmp_path: Path, ingest: In
     ingest("store", "show", "s/ok")
 
 
+@pytest.mark.slow
 def test_file_names_of_any_bytes_are_read_and_reported(tmp_path: Path, ingest: Ingest) -> None:
     content = record(tmp_path / "drive").read_bytes()
     folder = os.fsencode(tmp_path / "all")
@@ -171,6 +173,7 @@ def test_a_hostile_job_is_refused(tmp_path: Path, ingest: Ingest, kind: str) -> 
     assert not (tmp_path / "mosaico").exists()
 
 
+@pytest.mark.slow
 def test_only_a_job_that_names_a_module_runs_it(tmp_path: Path, ingest: Ingest) -> None:
     record(tmp_path / "drive")
     sprung = tmp_path / "sprung"

@@ -18,6 +18,8 @@ from mosaico_ingest.store import Store
 
 from .conftest import CUT, WriteBag, number
 
+pytestmark = pytest.mark.slow
+
 WriteJob = Callable[..., Path]
 REPLACE = {"name": "drive", "if_exists": "replace"}
 
