@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pytest
@@ -16,7 +17,8 @@ import pytest
 from mosaico_ingest.errors import SequenceExists, SinkError
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.policies import IfExists
-from mosaico_ingest.store import Store, StoreSink
+from mosaico_ingest.store import Store, StoreSink, layout
+from mosaico_ingest.store.catalog import Catalog
 
 WRITER = Path(__file__).with_name("writer_process.py")
 Rows = Callable[..., pa.RecordBatch]
@@ -190,3 +192,38 @@ def test_what_is_deleted_takes_its_files_along(
     ):
         with pytest.raises(SinkError, match="no sequence 'drive'"):
             gone()
+
+
+def test_what_the_catalog_names_is_on_the_disk_before_it_is_named(
+    store: Store, sink: StoreSink, rows: Rows, sample: OntologyType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A power cut cannot be had in a test; that files, then their folders, are settled before the commit can."""
+    done: list[tuple[str, Path]] = []
+    settle, move, enter = layout.fsync, layout._move, Catalog.commit
+
+    def fsync(path: Path) -> None:
+        settle(path)
+        done.append(("fsync", path))
+
+    def moved(staged: Path, target: Path) -> None:
+        move(staged, target)
+        done.append((f"from {staged}", target))
+
+    def commit(self: Catalog, *given: Any) -> list[str]:
+        done.append(("commit", self.path))
+        return enter(self, *given)
+
+    monkeypatch.setattr(layout, "fsync", fsync)
+    monkeypatch.setattr(layout, "_move", moved)
+    monkeypatch.setattr(Catalog, "commit", commit)
+    with sink.open("drive", {}) as session:
+        for name in ("/a", "/b/c"):
+            session.topic(name, sample, {}).write(rows([1, 2]))
+    named = done.index(("commit", store.path / "catalog.sqlite"))
+    for name in ("/a", "/b/c"):
+        (path,) = store.paths("drive", name)
+        at, step = next((at, step) for at, (step, target) in enumerate(done) if target == path)
+        assert done.index(("fsync", Path(step.removeprefix("from ")))) < at
+        folders = [folder for folder in path.parents if folder.is_relative_to(store.path / "segments")]
+        assert len(folders) > 2
+        assert all(at < done.index(("fsync", folder)) < named for folder in folders)
