@@ -7,8 +7,8 @@ import gc
 __all__ = ["collect_as_usual", "collect_rarely"]
 
 _USUAL = gc.get_threshold()
-_RARELY = 50_000
-"""Objects made between two collections; what an import makes is never garbage."""
+_RARELY = 500_000
+"""Objects made between two collections, more than all imports make: what an import makes is never garbage."""
 
 
 def collect_rarely() -> None:
