@@ -119,17 +119,26 @@ def compile_recording(manifest: Path, recording: Path) -> tuple[ROSInjectionConf
     )
 
 
-def plan_job(manifest: Path, *, folder: Path | None = None, connect: bool = False) -> PlanDocument:
+def plan_job(
+    manifest: Path,
+    *,
+    configs: Sequence[ROSInjectionConfig] | None = None,
+    folder: Path | None = None,
+    connect: bool = False,
+) -> PlanDocument:
     """Return what a manifest would do, tried on the first messages of each topic; writes nothing.
 
     The document names the manifest as seen from `folder` (the current one). A server is asked only with `connect`.
+    `configs` are what the manifest compiles to, where that is done already.
 
     Raises:
         IngestError: The job cannot be done; the message says why.
     """
     from mosaico_ingest.executors.preview import plan_document
 
-    return plan_document(compile_job(manifest), job=manifest, folder=folder or Path(), connect=connect)
+    return plan_document(
+        configs or compile_job(manifest), job=manifest, folder=folder or Path(), connect=connect
+    )
 
 
 def plan_differences(path: Path, document: PlanDocument) -> tuple[Difference, ...]:

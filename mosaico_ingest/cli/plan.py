@@ -28,9 +28,12 @@ def plan(
     from mosaico_ingest import api
     from mosaico_ingest.cli.plan_tables import print_differences, print_plan
     from mosaico_ingest.cli.tables import print_json
+    from mosaico_ingest.cli.without_pandas import forgo_pandas
     from mosaico_ingest.plan.document import write_plan
 
-    document = api.plan_job(manifest, folder=out.parent if out else None, connect=connect)
+    configs = api.compile_job(manifest)
+    forgo_pandas(configs)
+    document = api.plan_job(manifest, configs=configs, folder=out.parent if out else None, connect=connect)
     if out is not None:
         write_plan(document, out)
     if as_json:

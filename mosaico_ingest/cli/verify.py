@@ -22,11 +22,13 @@ def verify(
     import json
 
     from mosaico_ingest.cli.tables import print_json
+    from mosaico_ingest.cli.without_pandas import forgo_pandas
     from mosaico_ingest.errors import VerificationError
     from mosaico_ingest.report.units import bytes_text, counted
     from mosaico_ingest.store import Store
     from mosaico_ingest.store.verify import verify as verify_sequence
 
+    forgo_pandas()
     opened = Store.open(store, create=False)
     infos = [opened.sequence(name) for name in sequences] if sequences else opened.sequences()
     checked = {info.name: list(verify_sequence(info)) for info in infos}

@@ -21,7 +21,7 @@ print(len(pyarrow.array([1]).to_pandas()))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["run", "bag", "inspect"])
+@pytest.mark.parametrize("command", ["run", "bag", "inspect", "plan"])
 def test_no_command_on_a_recording_imports_pandas_and_whoever_asks_still_gets_it(
     command: str, tmp_path: Path
 ) -> None:
@@ -34,6 +34,7 @@ def test_no_command_on_a_recording_imports_pandas_and_whoever_asks_still_gets_it
         "run": [str(job), "-q"],
         "bag": [str(DRIVE), "--name", "drive", "--store", str(tmp_path / "store"), "-q"],
         "inspect": [str(DRIVE)],
+        "plan": [str(job)],
     }
     run = subprocess.run(  # noqa: S603 - our own program
         [sys.executable, "-c", PROGRAM, command, *arguments[command]],
