@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from functools import cache
 from pathlib import Path
 from statistics import median
 
@@ -16,8 +17,13 @@ VAGUE = {"utils", "util", "helpers", "helper", "common", "misc", "manager"}
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
+@cache
+def tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
 def functions(path: Path) -> list[Function]:
-    return [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, Function)]
+    return [node for node in ast.walk(tree(path)) if isinstance(node, Function)]
 
 
 def body_lines(function: Function) -> int:
@@ -54,7 +60,7 @@ def test_docstrings_are_at_most_a_quarter_of_the_lines() -> None:
         if "rules" in path.parts:  # a rule's docstring is its page
             continue
         total += sum(bool(line.strip()) for line in path.read_text().splitlines())
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(tree(path)):
             if isinstance(node, ast.Module | ast.ClassDef | Function) and ast.get_docstring(node):
                 text = node.body[0]
                 documented += (text.end_lineno or 0) - text.lineno + 1
@@ -66,4 +72,4 @@ def test_no_module_has_a_name_that_says_nothing() -> None:
 
 
 def test_every_module_says_what_it_is() -> None:
-    assert not [path for path in FILES if not ast.get_docstring(ast.parse(path.read_text()))]
+    assert not [path for path in FILES if not ast.get_docstring(tree(path))]
