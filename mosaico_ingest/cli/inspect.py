@@ -20,8 +20,10 @@ def inspect(
 ) -> None:
     """List topics, types, counts, rates, time span, definitions and the adapter each topic would get."""
     from mosaico_ingest import api
+    from mosaico_ingest.cli.collector import collect_as_usual
     from mosaico_ingest.cli.tables import print_inspection
     from mosaico_ingest.cli.without_pandas import forgo_pandas
 
+    collect_as_usual()
     forgo_pandas()
     print_inspection(api.inspect_recording(path, ros_distro=ros_distro), as_json=as_json)

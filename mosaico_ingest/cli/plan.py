@@ -26,11 +26,13 @@ def plan(
     Exit codes: 0 the job can run, 1 it cannot or the plan has drifted, 4 some messages would be rejected.
     """
     from mosaico_ingest import api
+    from mosaico_ingest.cli.collector import collect_as_usual
     from mosaico_ingest.cli.plan_tables import print_differences, print_plan
     from mosaico_ingest.cli.tables import print_json
     from mosaico_ingest.cli.without_pandas import forgo_pandas
     from mosaico_ingest.plan.document import write_plan
 
+    collect_as_usual()
     configs = api.compile_job(manifest)
     forgo_pandas(configs)
     document = api.plan_job(manifest, configs=configs, folder=out.parent if out else None, connect=connect)

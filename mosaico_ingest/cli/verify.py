@@ -21,6 +21,7 @@ def verify(
     """Read stored sequences back and hold every page and all rows against their checksums; exit 5 where they differ."""
     import json
 
+    from mosaico_ingest.cli.collector import collect_as_usual
     from mosaico_ingest.cli.tables import print_json
     from mosaico_ingest.cli.without_pandas import forgo_pandas
     from mosaico_ingest.errors import VerificationError
@@ -28,6 +29,7 @@ def verify(
     from mosaico_ingest.store import Store
     from mosaico_ingest.store.verify import verify as verify_sequence
 
+    collect_as_usual()
     forgo_pandas()
     opened = Store.open(store, create=False)
     infos = [opened.sequence(name) for name in sequences] if sequences else opened.sequences()
