@@ -6,6 +6,7 @@ import os
 import pickle
 import signal
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -15,6 +16,7 @@ from mosaico_ingest.adapters.base import register_default_adapter, registered_ad
 from mosaico_ingest.bag.registry import Registered, ROSTypeRegistry
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.errors import IngestError, Interrupted
+from mosaico_ingest.executors.held import Hold, held_catalogs
 from mosaico_ingest.executors.interrupts import Stop
 from mosaico_ingest.executors.worker import failed_report, run_config
 from mosaico_ingest.frozen import frozen
@@ -56,14 +58,12 @@ def work(pipe: Connection, announced: Announced, prepare: Callable[[], None], jo
     pa.set_cpu_count(max(1, (os.cpu_count() or 1) // jobs))
     prepare()
     announced.announce()
-    try:
+    with held_catalogs() as hold, suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while not stop.asked:
-            _ingest(pipe, pipe.recv_bytes(), stop)
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        return
+            _ingest(pipe, pipe.recv_bytes(), stop, hold)
 
 
-def _ingest(pipe: Connection, letter: bytes, stop: Stop) -> None:
+def _ingest(pipe: Connection, letter: bytes, stop: Stop, hold: Hold) -> None:
     def tell(event: Event) -> None:
         stop.hold()  # an interrupt in the middle of a message would leave half of it in the pipe
         pipe.send(event)
@@ -81,3 +81,4 @@ def _ingest(pipe: Connection, letter: bytes, stop: Stop) -> None:
         report = failed_report(config, Interrupted("stopped before it was begun"), tell)
     stop.hold()
     pipe.send(report)
+    hold(config.target)

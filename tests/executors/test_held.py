@@ -1,0 +1,45 @@
+"""Between two recordings of a batch the catalog stays open; afterwards nothing of it is left."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.executors.held import held_catalogs
+from mosaico_ingest.executors.local import Inline
+from mosaico_ingest.store import Store
+
+DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
+
+
+def config(folder: Path, name: str) -> ROSInjectionConfig:
+    return ROSInjectionConfig(file_path=DRIVE, sequence_name=name, topics=["/imu"], store=folder / "store")
+
+
+def test_the_log_of_the_catalog_is_there_between_recordings_only(tmp_path: Path) -> None:
+    log = tmp_path / "store/catalog.sqlite-wal"
+    there = [log.exists() for _ in Inline().map([config(tmp_path, name) for name in "abc"], lambda *_: None)]
+    assert there == [False, True, True]
+    assert not log.exists()
+    assert Store.open(tmp_path / "store", create=False).names() == ("a", "b", "c")
+
+
+def test_a_store_that_is_removed_meanwhile_is_made_anew(tmp_path: Path) -> None:
+    """Letting go of the old catalog must not take the files of the new one."""
+    with held_catalogs() as hold:
+        for name in "ab":
+            list(Inline().map([config(tmp_path, name)], lambda *_: None))
+            hold(config(tmp_path, name).target)
+            if name == "a":
+                shutil.rmtree(tmp_path / "store")
+        kept = Store.open(tmp_path / "store", create=False).catalog.keep_open()
+    assert (tmp_path / "store/catalog.sqlite-wal").exists()
+    kept.close()
+    assert Store.open(tmp_path / "store", create=False).names() == ("b",)
+
+
+def test_where_there_is_no_store_nothing_is_held_or_made(tmp_path: Path) -> None:
+    with held_catalogs() as hold:
+        hold(config(tmp_path, "a").target)
+    assert list(tmp_path.iterdir()) == []
