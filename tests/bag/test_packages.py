@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from mosaico_ingest.bag import packages
-from mosaico_ingest.bag.definition import Source
+from mosaico_ingest.bag.definition import Definition, Embedded, Source
 from mosaico_ingest.bag.hashes import md5sum, rihs01
 from mosaico_ingest.bag.loader import ROSLoader
 from mosaico_ingest.bag.recording import Recording, open_recording
@@ -65,9 +65,30 @@ def test_the_fields_are_those_that_ros_hashes() -> None:
     assert rihs01(TypeResolver().resolve("test_msgs/msg/Strings", None, ros_version=2)) == STRINGS
 
 
-def test_a_ros_1_hash_is_that_of_ros_1() -> None:
-    text = TypeResolver(Stores.ROS1_NOETIC).resolve("std_msgs/String", None, ros_version=1)
-    assert md5sum(text) == "992ce8a1687cec8c8bd883ec73ca41d1"
+def in_ros_1(name: str) -> Definition:
+    """Return a type of a package as ROS 1 would have it, which is the same but for the header."""
+    package = name.partition("/")[0]
+    text = Path(packages.__file__).with_suffix("").joinpath(f"{package}.msg").read_text()
+    parts = dict(part.split("\n", 1) for part in text.split(f"{'=' * 80}\n"))
+    root = parts.pop(f"MSG: {name}")
+    rest = "".join(f"{'=' * 80}\n{head}\n{body}" for head, body in parts.items())
+    return TypeResolver(Stores.ROS1_NOETIC).resolve(name, Embedded("ros1msg", root + rest), ros_version=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "digest"),
+    [
+        ("ackermann_msgs/AckermannDrive", "3512e91b48d69674a0e86fadf1ea8231"),
+        ("ackermann_msgs/AckermannDriveStamped", "1fd5d7f58889cefd44d29f6653240d0c"),
+        ("can_msgs/Frame", "64ae5cebf967dc6aae4e78f5683a5b25"),
+        ("livox_ros_driver2/CustomMsg", "e4d6829bdfe657cb6c21a746c86b21a6"),
+        ("livox_ros_driver2/CustomPoint", "109a3cc548bb1f96626be89a5008bd6d"),
+        ("nmea_msgs/Sentence", "9f221efc5f4b3bac7ce4af102b32308b"),
+    ],
+)
+def test_the_fields_are_those_that_ros_1_hashes(name: str, digest: str) -> None:
+    """The hashes are those that ROS 1 bags and generated code carry."""
+    assert md5sum(in_ros_1(name)) == digest
 
 
 @pytest.mark.parametrize("distro", [None, Stores.ROS2_HUMBLE])
