@@ -27,7 +27,18 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 
 
 def test_help_imports_neither_arrow_nor_rosbags_nor_pydantic() -> None:
-    code = "import sys; import mosaico_ingest.cli.app; print([m for m in HEAVY if m in sys.modules])"
+    code = "import sys; from mosaico_ingest.cli.app import command_line; command_line(); print([m for m in HEAVY if m in sys.modules])"
     heavy = "HEAVY = ('pyarrow', 'rosbags', 'pydantic', 'numpy', 'yaml'); "
     done = subprocess.run([sys.executable, "-c", heavy + code], capture_output=True, text=True, check=True)  # noqa: S603 - our own code
     assert done.stdout.strip() == "[]"
+
+
+def test_a_command_imports_no_other_command() -> None:
+    code = (
+        "import sys; from mosaico_ingest.cli.app import COMMANDS, GROUPS, main\n"
+        "try: main(['bag', '--help'])\n"
+        "except SystemExit: pass\n"
+        "print([name for name in (*COMMANDS, *GROUPS) if f'mosaico_ingest.cli.{name}' in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # noqa: S603 - our own code
+    assert done.stdout.splitlines()[-1] == "['bag']"

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from mosaico_ingest.cli.app import app
+from mosaico_ingest.cli.app import command_line
 
 RUN = CliRunner()
 JOB = "bag:\n  path: x.mcap\n  ros_distro: humble\ntopics:\n  - !/cam/*\n"
@@ -22,7 +22,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_the_text_is_for_people(folder: Path) -> None:
-    result = RUN.invoke(app, ["lint", "job.yaml", "--quiet"])
+    result = RUN.invoke(command_line(), ["lint", "job.yaml", "--quiet"])
     assert result.exit_code == 12
     assert result.stdout == (
         "job.yaml:3:15: error[wrong-value] bag.ros_distro cannot be 'humble'\n"
@@ -42,29 +42,29 @@ def test_the_text_is_for_people(folder: Path) -> None:
 
 
 def test_a_fix_leaves_nothing_to_say(folder: Path) -> None:
-    result = RUN.invoke(app, ["lint", "--fix", "job.yaml"])
+    result = RUN.invoke(command_line(), ["lint", "--fix", "job.yaml"])
     assert (result.exit_code, result.stdout) == (0, "")
     assert "1 file, 0 findings, 2 changes made" in result.stderr
     assert '"!/cam/*"' in (folder / "job.yaml").read_text()
 
 
 def test_sarif_does_not_fail_for_findings(folder: Path) -> None:
-    result = RUN.invoke(app, ["lint", "--format", "sarif", "job.yaml"])
+    result = RUN.invoke(command_line(), ["lint", "--format", "sarif", "job.yaml"])
     assert result.exit_code == 0
     assert json.loads(result.stdout)["version"] == "2.1.0"
     assert folder
 
 
 def test_standard_input_is_judged(folder: Path) -> None:
-    result = RUN.invoke(app, ["lint", "-", "--format", "github"], input=JOB)
+    result = RUN.invoke(command_line(), ["lint", "-", "--format", "github"], input=JOB)
     assert result.stdout.startswith("::error file=-,line=3,col=15")
     assert folder
 
 
 def test_no_env_misses_no_variable(folder: Path) -> None:
     (folder / "job.yaml").write_text("bag: {path: '${NOT_SET_ANYWHERE}'}\n")
-    assert RUN.invoke(app, ["lint", "job.yaml"]).exit_code == 12
-    assert RUN.invoke(app, ["lint", "job.yaml", "--no-env"]).exit_code == 0
+    assert RUN.invoke(command_line(), ["lint", "job.yaml"]).exit_code == 12
+    assert RUN.invoke(command_line(), ["lint", "job.yaml", "--no-env"]).exit_code == 0
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_no_env_misses_no_variable(folder: Path) -> None:
     ],
 )
 def test_a_wrong_call_is_a_usage_error(folder: Path, arguments: list[str], words: str) -> None:
-    result = RUN.invoke(app, ["lint", *arguments], env={"COLUMNS": "200"})
+    result = RUN.invoke(command_line(), ["lint", *arguments], env={"COLUMNS": "200"})
     assert result.exit_code == 2
     assert words in " ".join(result.stderr.split())
     assert folder
@@ -85,11 +85,11 @@ def test_a_wrong_call_is_a_usage_error(folder: Path, arguments: list[str], words
 
 def test_nothing_to_judge_is_three(folder: Path) -> None:
     (folder / "job.yaml").unlink()
-    assert RUN.invoke(app, ["lint", "."]).exit_code == 3
+    assert RUN.invoke(command_line(), ["lint", "."]).exit_code == 3
 
 
 @pytest.mark.parametrize("word", ["yaml-tag", "ING003"])
 def test_a_rule_explains_itself(word: str) -> None:
-    result = RUN.invoke(app, ["lint", "--explain", word])
+    result = RUN.invoke(command_line(), ["lint", "--explain", word])
     assert result.stdout.startswith("# yaml-tag (ING003)\n")
-    assert "| ING003 | [yaml-tag]" in RUN.invoke(app, ["lint", "--explain", "all"]).stdout
+    assert "| ING003 | [yaml-tag]" in RUN.invoke(command_line(), ["lint", "--explain", "all"]).stdout

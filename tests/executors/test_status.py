@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner, Result
 
-from mosaico_ingest.cli.app import app
+from mosaico_ingest.cli.app import command_line
 from mosaico_ingest.cli.shard import take_shard
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.report.model import RunReport
@@ -31,7 +31,7 @@ def job(tmp_path: Path) -> Path:
 
 
 def ingest(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+    return CliRunner().invoke(command_line(), [str(argument) for argument in arguments])
 
 
 def standing(job: Path) -> dict[str, str]:

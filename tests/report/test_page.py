@@ -12,7 +12,7 @@ from urllib.parse import unquote
 import pytest
 from typer.testing import CliRunner
 
-from mosaico_ingest.cli.app import app
+from mosaico_ingest.cli.app import command_line
 from mosaico_ingest.diagnostics import Stage
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.markdown import markdown_summary
@@ -206,7 +206,9 @@ def test_the_command_writes_the_page_and_the_summary(tmp_path: Path) -> None:
     source = tmp_path / "run.json"
     source.write_text(RUNS["small"].model_dump_json())
     page, summary = tmp_path / "out.html", tmp_path / "out.md"
-    done = CliRunner().invoke(app, ["report", str(source), "--html", str(page), "--markdown", str(summary)])
+    done = CliRunner().invoke(
+        command_line(), ["report", str(source), "--html", str(page), "--markdown", str(summary)]
+    )
     assert done.exit_code == 0, done.output
     assert page.read_text() == html_page(RUNS["small"], tmp_path)
     assert summary.read_text() == markdown_summary(RUNS["small"])

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from mosaico_ingest.cli.app import app
+from mosaico_ingest.cli.app import command_line
 from mosaico_ingest.report.stopwatch import Step, Stopwatch
 from mosaico_ingest.report.write import read_report
 
@@ -29,7 +29,7 @@ def test_the_steps_of_a_recording_add_up_to_its_duration(tmp_path: Path) -> None
         f"bag: {{path: {DRIVE}}}\ntopics: [/imu, /odom]\ntarget: {{store: s}}\n"
     )
     run = tmp_path / "run.json"
-    done = CliRunner().invoke(app, ["run", str(tmp_path / "job.yaml"), "--report", str(run), "-q"])
+    done = CliRunner().invoke(command_line(), ["run", str(tmp_path / "job.yaml"), "--report", str(run), "-q"])
     assert done.exit_code == 0, done.output
     report = read_report(run)
     one = report.recordings[0]
