@@ -5,6 +5,7 @@ Their index, where there is one, is not used: it names messages only, and every 
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterator
 from functools import partial
 
@@ -66,7 +67,7 @@ class RosrecordPart:
             raise
         self.notes.append("a bag of version 1.2, read record by record; `rosbag fix` makes it one of 2.0")
         self.holes: list[Hole] = walk.holes
-        found = np.array(walk.messages, np.int64).reshape(-1, 5)
+        found = np.frombuffer(walk.messages, np.int64).reshape(-1, 5)
         self._runs = sorted(_runs(found), key=lambda run: int(run.times.min()))
         self.streams: tuple[Stream, ...] = walk.streams(np.bincount(found[:, 0], minlength=len(walk.keys)))
         self.message_count: int | None = len(found)
@@ -120,10 +121,12 @@ class _Walk:
     def __init__(self, source: Source) -> None:
         self._source = source
         self.keys: dict[_Name, int] = {}
+        self._known: dict[tuple[bytes | None, ...], int] = {}
+        """The keys by what stands in the records, which need not be decoded for each."""
         self._texts: dict[_Name, str] = {}
         self._latched = set[int]()
         self._index_at: int | None = None
-        self.messages: list[tuple[int, int, int, int, int]] = []
+        self.messages = array("q")
         """Of each its stream, time, record, and where its payload begins and ends."""
         self.holes: list[Hole] = []
 
@@ -158,11 +161,18 @@ class _Walk:
             self._index_at = number(record.header, b"index_pos", 8)
         elif record.op == _MESSAGE:
             seconds, rest = number(record.header, b"sec", 4), number(record.header, b"nsec", 4)
-            key = self.keys.setdefault(_name(record.header), len(self.keys))
+            key = self._key(record.header)
             if record.header.get(b"latching") in {b"1", b"\1"}:
                 self._latched.add(key)
             time_ns = seconds * 1_000_000_000 + rest
-            self.messages.append((key, time_ns, record.at, record.begin, record.end))
+            self.messages.extend((key, time_ns, record.at, record.begin, record.end))
+
+    def _key(self, header: Header) -> int:
+        raw = header.get(b"topic"), header.get(b"type"), header.get(b"md5")
+        key = self._known.get(raw)
+        if key is None:
+            key = self._known[raw] = self.keys.setdefault(_name(header), len(self.keys))
+        return key
 
     def streams(self, counts: NDArray[np.intp]) -> tuple[Stream, ...]:
         """Return the streams; a message without a definition of its topic has that of another of its type."""
