@@ -5,9 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from importlib.machinery import ModuleSpec
-from importlib.metadata import entry_points
 
 from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.errors import AdapterError
 
 __all__ = ["forgo_pandas"]
 
@@ -46,6 +46,9 @@ def _runs_python(config: ROSInjectionConfig) -> bool:
 
 
 def _adapters_installed() -> bool:
-    from mosaico_ingest.bridge import ENTRY_POINTS
+    from mosaico_ingest.bridge import installed_adapters
 
-    return bool(entry_points(group=ENTRY_POINTS))
+    try:
+        return bool(installed_adapters())
+    except AdapterError:
+        return True  # whoever wants to use them is told what is wrong
