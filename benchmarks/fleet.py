@@ -30,7 +30,7 @@ HERE = Path(__file__).parent
 COUNT = 64
 SEED = 8
 MOST_OVERHEAD_MS = 50
-LOOK_S = 0.05
+LOOK_S = 0.25
 KINDS = {"telemetry": TELEMETRY, "mixed": MIXED, "lidar": LIDAR, "cameras": cameras(1)}
 SUFFIXES = (".mcap", ".mcap", ".db3", ".bag")
 FEW = tuple(replace(topic, hertz=10) for topic in TELEMETRY)
@@ -69,8 +69,8 @@ def tiny(folder: Path, topics: tuple[Topic, ...]) -> Path:
     return folder
 
 
-def batch(folder: Path, recordings: Path, pattern: str, way: Sequence[str]) -> Sample:
-    """Run a job over a folder of recordings into a new store in `folder`, as a whole process."""
+def batch(folder: Path, recordings: Path, pattern: str, way: Sequence[str], *, look: bool) -> Sample:
+    """Run a job over a folder of recordings into a new store in `folder`, as a whole process; look at its memory or not."""
     name = Path(tempfile.mkdtemp(dir=folder))
     job, report = name / "job.yaml", name / "run.json"
     job.write_text(
@@ -79,10 +79,11 @@ def batch(folder: Path, recordings: Path, pattern: str, way: Sequence[str]) -> S
     command = [sys.executable, "-m", "mosaico_ingest", "run", job, "--report", report, "--quiet", *way]
     start = time.perf_counter()
     with subprocess.Popen(list(map(str, command)), cwd=name, stdout=subprocess.DEVNULL) as child:
-        peaks: dict[int, int] = {}
-        while child.poll() is None:
+        peaks = {child.pid: 0}
+        while look and child.poll() is None:
             peaks |= _peaks(child.pid)
             time.sleep(LOOK_S)
+        child.wait()
     wall_s = time.perf_counter() - start
     if child.returncode:
         raise SystemExit(f"{' '.join(map(str, command))} failed ({child.returncode})")
@@ -116,8 +117,10 @@ def _descends(number: int, ancestor: int, parents: dict[int, int]) -> bool:
     return number == ancestor
 
 
-def typical(folder: Path, recordings: Path, pattern: str, way: Sequence[str], runs: int) -> Sample:
-    samples = [batch(folder, recordings, pattern, way) for _ in range(runs)]
+def typical(
+    folder: Path, recordings: Path, pattern: str, way: Sequence[str], runs: int, *, look: bool = False
+) -> Sample:
+    samples = [batch(folder, recordings, pattern, way, look=look) for _ in range(runs)]
     return Sample(median(one.wall_s for one in samples), max(one.peak_bytes for one in samples))
 
 
@@ -132,7 +135,7 @@ def measure_fleet(recordings: Path, ways: dict[str, tuple[str, ...]], runs: int)
     alone_s = 0.0
     for name, way in ways.items():
         with tempfile.TemporaryDirectory(dir=HERE / "data") as folder:
-            took = typical(Path(folder), recordings, "*", way, runs)
+            took = typical(Path(folder), recordings, "*", way, runs, look=True)
         alone_s = alone_s or took.wall_s
         print(
             f"| {name} | {took.wall_s:.1f} s | {alone_s / took.wall_s:.2f} "
