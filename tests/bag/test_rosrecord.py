@@ -145,6 +145,7 @@ def test_without_a_definition_the_distros_is_taken_if_the_hash_is_its_own(tmp_pa
     assert "another definition of std_msgs/msg/String is known" in (known["/wrong"] or "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("indexed", [False, True])
 def test_a_bag_cut_off_at_any_byte_gives_what_is_left_and_says_so(
     tmp_path: Path, recordings: Any, texts: list[Any], *, indexed: bool

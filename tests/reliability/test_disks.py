@@ -62,6 +62,7 @@ def noise() -> list[bytes]:
     return [number(struct.unpack("<d", struct.pack("<Q", source.getrandbits(62)))[0]) for _ in range(80_000)]
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_said_leaves_the_old_and_the_next_run_completes_it(
     write_bag: WriteBag, write_job: WriteJob, disk: Path, noise: list[bytes]
 ) -> None:
@@ -83,6 +84,7 @@ def test_a_full_disk_is_said_leaves_the_old_and_the_next_run_completes_it(
     assert len(speeds(store)) == len(noise)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("left_bytes", [0, 4096, 40_000, 200_000])
 def test_a_first_run_that_found_no_room_leaves_nothing_that_can_be_seen(
     left_bytes: int, write_bag: WriteBag, write_job: WriteJob, disk: Path, noise: list[bytes]
@@ -99,6 +101,7 @@ def test_a_first_run_that_found_no_room_leaves_nothing_that_can_be_seen(
     assert len(speeds(store)) == len(noise)
 
 
+@pytest.mark.slow
 def test_a_store_that_may_only_be_read_is_said_and_can_be_read(
     write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
 ) -> None:
