@@ -25,6 +25,7 @@ _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 _WHOLE = re.compile(r"[-+]?(0x[0-9a-fA-F]+|0?o?[0-9]+)")
 _LONGEST_NUMBER = 1000
 _OCTAL = re.compile(r"[-+]?0o?[0-7]+")
+_PADDED = re.compile(r"[-+]?0[0-9]+")
 _OTHER_NUMBER = re.compile(
     r"[-+]?(0b[01_]+|0x[0-9a-fA-F]*_[0-9a-fA-F_]*|[0-9][0-9_]*_[0-9_]*(\.[0-9_]*)?|[0-9]+(:[0-5]?[0-9])+(\.[0-9]*)?)"
 )
@@ -56,17 +57,26 @@ def resolve_plain(text: str) -> tuple[Scalar, Trap | None]:
 
 
 def _number(text: str) -> tuple[Scalar, Trap | None]:
-    if _OCTAL.fullmatch(text) and text.lstrip("+-") != "0":
-        decimal = str(int(text.replace("o", ""), 8))
-        message = f"{text} is {decimal} to some YAML readers (octal) and something else to others"
-        return text, Trap("yaml-number", message, f'write {decimal}, or "{text}" for the text')
+    trap = _trap(text)
+    if trap is not None:
+        return text, trap
     if _INTEGER.fullmatch(text):
         return int(text), None
     if _HEXADECIMAL.fullmatch(text):
         return int(text, 16), None
-    if _FLOAT.fullmatch(text):
-        return float(text), None
-    if _OTHER_NUMBER.fullmatch(text):
-        message = f"{text} is a number to some YAML readers and text to others"
-        return text, Trap("yaml-number", message, f'write the digits alone, or "{text}" for the text')
-    return text, None
+    return (float(text) if _FLOAT.fullmatch(text) else text), None
+
+
+def _trap(text: str) -> Trap | None:
+    if _OCTAL.fullmatch(text) and text.lstrip("+-") != "0":
+        digits = str(int(text.replace("o", ""), 8))
+        says = f"{text} is {digits} to some YAML readers (octal) and something else to others"
+    elif _PADDED.fullmatch(text):
+        digits = str(int(text))
+        says = f"{text} is {digits} to some YAML readers and text to others"
+    elif _OTHER_NUMBER.fullmatch(text):
+        digits = "the digits alone"
+        says = f"{text} is a number to some YAML readers and text to others"
+    else:
+        return None
+    return Trap("yaml-number", says, f'write {digits}, or "{text}" for the text')
