@@ -24,12 +24,12 @@ def package_type(name: str) -> MessageType | None:
 
 @cache
 def _known() -> frozenset[str]:
-    return frozenset(path.stem for path in _FOLDER.glob("*.msg"))
+    return frozenset(path.stem for path in _FOLDER.glob("*.txt"))
 
 
 @cache
 def _types(package: str) -> Mapping[str, MessageType]:
     if package not in _known():
         return {}
-    path = _FOLDER / f"{package}.msg"
+    path = _FOLDER / f"{package}.txt"
     return read_types(path.read_text(encoding="utf-8"), package, where=str(path))

@@ -19,7 +19,7 @@ from mosaico_ingest.policies import Stores
 
 NAMES = sorted(
     name
-    for file in Path(packages.__file__).with_suffix("").glob("*.msg")
+    for file in Path(packages.__file__).with_suffix("").glob("*.txt")
     for name in read_types(file.read_text(), file.stem)
 )
 HELLO = b"\x00\x01\x00\x00\x03\x00\x00\x00hi\x00"
@@ -68,7 +68,7 @@ def test_the_fields_are_those_that_ros_hashes() -> None:
 def in_ros_1(name: str) -> Definition:
     """Return a type of a package as ROS 1 would have it, which is the same but for the header."""
     package = name.partition("/")[0]
-    text = Path(packages.__file__).with_suffix("").joinpath(f"{package}.msg").read_text()
+    text = Path(packages.__file__).with_suffix("").joinpath(f"{package}.txt").read_text()
     parts = dict(part.split("\n", 1) for part in text.split(f"{'=' * 80}\n"))
     root = parts.pop(f"MSG: {name}")
     rest = "".join(f"{'=' * 80}\n{head}\n{body}" for head, body in parts.items())
