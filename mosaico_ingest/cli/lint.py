@@ -40,9 +40,11 @@ def lint(
 
     Exit codes: 0 clean, 1 failure, 2 usage, 3 nothing to judge, 10 infos, 11 warnings, 12 errors; SARIF: 0 for findings.
     """
+    from mosaico_ingest.cli.collector import collect_as_usual
     from mosaico_ingest.lint.engine import STDIN, lint_paths
     from mosaico_ingest.lint.formats import FORMATS
 
+    collect_as_usual()
     if explain is not None:
         typer.echo(_explanation(explain), nl=False)
         return
