@@ -130,13 +130,17 @@ def test_append_brings_new_topics_and_no_row_twice(
 def kill_and_look(job: Path, folder: Path, rounds: int) -> tuple[int, int]:
     """Kill the first run of a job at any moment and run it again; return how often what was there, and was not."""
     moments = random.Random()  # noqa: S311 - any moment will do
+    began = time.monotonic()
+    assert ran("run", job)[0] == 0
+    took = time.monotonic() - began
+    assert ran("store", "rm", "drive", "--yes", "--store", folder / "served")[0] == 0
     whole = nothing = 0
     for _ in range(rounds):
         process = subprocess.Popen(  # noqa: S603 - our own command
             command("run", "-q", job), stderr=subprocess.DEVNULL, start_new_session=True
         )
         try:
-            process.wait(0.5 + moments.random() * 1.5)
+            process.wait(took * (0.3 + 0.8 * moments.random()))
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
         process.wait(timeout=20)
