@@ -43,3 +43,6 @@ def report(
         typer.echo(f"wrote {markdown}", err=True)
     if html is None and markdown is None:
         print_report(found)
+        for one in found.recordings:
+            if one.error is not None:
+                typer.echo(f"error: {one.error}")

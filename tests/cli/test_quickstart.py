@@ -82,6 +82,13 @@ def test_a_second_run_says_that_the_name_is_taken(project: Path) -> None:
     assert "/imu" not in done.stdout, "no table of a run that read nothing"
 
 
+def test_the_report_of_a_run_that_failed_says_why(project: Path) -> None:
+    assert ingest("run", "configs/quickstart.yaml", "--report", "failed.json", cwd=project).returncode == 1
+    shown = ingest("report", "failed.json", cwd=project)
+    assert shown.returncode == 0
+    assert "error: quickstart_drive: the sequence exists" in shown.stdout
+
+
 def test_the_store_can_be_looked_into(project: Path) -> None:
     listed = json.loads(ingest("store", "ls", "--json", cwd=project).stdout)
     assert [sequence["name"] for sequence in listed] == ["quickstart_drive"]
