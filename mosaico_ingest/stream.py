@@ -124,7 +124,7 @@ class Stream:
         taken = (positions + self.seen) % self.plan.every == 0
         self.seen += len(batch)
         keep = positions[taken]
-        sampled = batch if taken.all() else _take(batch, keep)
+        sampled = batch if taken.all() else batch.rows(keep)
         decoded = self._decoders[batch.channel.id].decode(sampled)
         self.watch.lap(Step.DECODE)
         self.padded += decoded.padded
@@ -285,16 +285,6 @@ class Stream:
                     sum(failure.row in aside for failure in failures),
                 )
             )
-
-
-def _take(batch: RawBatch, keep: NDArray[np.int64]) -> RawBatch:
-    return replace(
-        batch,
-        log_times=batch.log_times[keep],
-        starts=batch.starts[keep],
-        lengths=batch.lengths[keep],
-        offsets=batch.offsets[keep],
-    )
 
 
 def _record_batch(log_times: NDArray[np.int64], rows: pa.StructArray) -> pa.RecordBatch:

@@ -65,6 +65,17 @@ class RawBatch:
         """Return the number of messages."""
         return len(self.log_times)
 
+    def rows(self, choice: NDArray[np.int64] | slice) -> RawBatch:
+        """Return some of the messages, over the same buffer."""
+        return RawBatch(
+            self.channel,
+            self.log_times[choice],
+            self.data,
+            self.starts[choice],
+            self.lengths[choice],
+            self.offsets[choice],
+        )
+
     def payload(self, row: int) -> bytes:
         """Return the bytes of one message."""
         start = int(self.starts[row])

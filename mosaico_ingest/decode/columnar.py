@@ -69,11 +69,11 @@ class ColumnarDecoder:
         """Decode a batch too large for the offsets of a column, half of its bytes after the other."""
         if len(batch) == 1:
             reason = f"{total} bytes, a message can have {_LARGEST}"
-            none = self._rowwise.decode(_rows(batch, slice(0)))
+            none = self._rowwise.decode(batch.rows(slice(0)))
             return replace(none, failures=(RowFailure(0, "too-large", reason),))
         middle = int(np.searchsorted(np.cumsum(batch.lengths), total // 2)) + 1
         edges = (0, min(middle, len(batch) - 1), len(batch))
-        first, second = (self.decode(_rows(batch, slice(begin, end))) for begin, end in pairwise(edges))
+        first, second = (self.decode(batch.rows(slice(begin, end))) for begin, end in pairwise(edges))
         try:
             rows = pa.concat_arrays([first.rows, second.rows])
         except pa.ArrowInvalid as error:
@@ -110,19 +110,9 @@ class ColumnarDecoder:
 
     def _by_rows(self, batch: RawBatch, rows: Int64s) -> Decoded:
         """Decode some messages one by one."""
-        decoded = self._rowwise.decode(_rows(batch, rows))
+        decoded = self._rowwise.decode(batch.rows(rows))
         failures = tuple(replace(failure, row=int(rows[failure.row])) for failure in decoded.failures)
         return replace(decoded, index=rows[decoded.index], failures=failures)
-
-
-def _rows(batch: RawBatch, rows: Int64s | slice) -> RawBatch:
-    return replace(
-        batch,
-        log_times=batch.log_times[rows],
-        starts=batch.starts[rows],
-        lengths=batch.lengths[rows],
-        offsets=batch.offsets[rows],
-    )
 
 
 def _merge(parts: list[Decoded]) -> Decoded:
