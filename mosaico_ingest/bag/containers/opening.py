@@ -13,7 +13,7 @@ from pathlib import Path
 from stat import S_ISREG
 
 from mosaico_ingest.bag.containers.compression import inflate_file
-from mosaico_ingest.bag.containers.magics import MCAP, ROS1, SQLITE, ZSTD
+from mosaico_ingest.bag.containers.magics import MCAP, ROS1, ROSRECORD, SQLITE, ZSTD
 from mosaico_ingest.bag.containers.part import Hole, Part
 from mosaico_ingest.bag.containers.source import FileSource, Source
 from mosaico_ingest.errors import BagError
@@ -32,9 +32,14 @@ def _mcap(source: Source) -> Part:
 
 def _ros1(source: Source) -> Part:
     from mosaico_ingest.bag.containers.ros1 import Ros1Part
-    from mosaico_ingest.bag.containers.rosrecord import MAGIC, RosrecordPart
 
-    return RosrecordPart(source) if source.read_some(0, len(MAGIC)) == MAGIC else Ros1Part(source)
+    return Ros1Part(source)
+
+
+def _rosrecord(source: Source) -> Part:
+    from mosaico_ingest.bag.containers.rosrecord import RosrecordPart
+
+    return RosrecordPart(source)
 
 
 def _sqlite(path: Path, name: AnyPath) -> Part:
@@ -43,8 +48,8 @@ def _sqlite(path: Path, name: AnyPath) -> Part:
     return SqlitePart(path, name)
 
 
-_INDEXED: Mapping[bytes, Callable[[Source], Part]] = {MCAP: _mcap, ROS1: _ros1}
-"""What is read by position, and so also behind a URL, without reading all of it."""
+_INDEXED: Mapping[bytes, Callable[[Source], Part]] = {MCAP: _mcap, ROSRECORD: _rosrecord, ROS1: _ros1}
+"""What is read by position, and so also behind a URL, without reading all of it; the first that fits is taken."""
 _MAGICS = (ZSTD, SQLITE, *_INDEXED)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mosaico_ingest.bag.batch import Encoding
+from mosaico_ingest.bag.containers.magics import ROSRECORD
 from mosaico_ingest.bag.containers.part import Block, Hole, Loaded, Slab, Stream, Want
 from mosaico_ingest.bag.containers.resume import next_ros1_message
 from mosaico_ingest.bag.containers.ros1_records import Header, Record, number, record_at
@@ -22,9 +23,8 @@ from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.frozen import frozen
 
-__all__ = ["MAGIC", "RosrecordPart"]
+__all__ = ["RosrecordPart"]
 
-MAGIC = b"#ROSRECORD V1.2"
 _DEFINITION, _MESSAGE, _FILE = 1, 2, 3
 _RUN_BYTES = 4 << 20
 """How much of the file is read at once."""
@@ -135,8 +135,8 @@ class _Walk:
         source, stop = self._source, self._source.size
         source.bring_near()
         window = Window(source)
-        line = window.peek(0, len(MAGIC) + 2)
-        at = len(line) - len(line[len(MAGIC) :].lstrip(b"\r\n"))
+        line = window.peek(0, len(ROSRECORD) + 2)
+        at = len(line) - len(line[len(ROSRECORD) :].lstrip(b"\r\n"))
         while at < stop:
             at = self._step(window, at, stop)
         if self._index_at == 0:
