@@ -83,9 +83,9 @@ class Gather:
 
     def _flush(self, channel: int, floor_ns: int) -> Iterator[RawBatch]:
         """Give the messages up to `floor_ns`, keep the others."""
-        full = self._waiting[channel]
-        slabs = full.slabs
-        waiting = self._waiting[channel] = _Waiting(most_bytes=min(2 * full.most_bytes, BATCH_BYTES))
+        before = self._waiting[channel]
+        slabs = before.slabs
+        waiting = self._waiting[channel] = _Waiting(most_bytes=min(2 * before.most_bytes, BATCH_BYTES))
         if slabs and not any(_is_view(slab) for slab in slabs):
             slabs = [_joined(slabs)]
         ready: list[Slab] = []

@@ -69,9 +69,11 @@ class Serializer:
         elif field.type in FORMATS and (
             scalar or (field.container is Container.ARRAY and field.type not in BLOBS)
         ):
-            if not steps or not isinstance(steps[-1], _Block):
-                steps.append(_Block(self._order, aligned=self._cdr))
-            steps[-1].add(path, FORMATS[field.type], None if scalar else field.size)  # pyright: ignore[reportAttributeAccessIssue] - it is a block, as was seen to
+            block = steps[-1] if steps else None
+            if not isinstance(block, _Block):
+                block = _Block(self._order, aligned=self._cdr)
+                steps.append(block)
+            block.add(path, FORMATS[field.type], None if scalar else field.size)
         elif scalar:
             steps.append(_Text(path, self._texts(field)))
         else:

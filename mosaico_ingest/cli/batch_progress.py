@@ -92,11 +92,8 @@ def headline(batch: Tally) -> str:
     if batch.read:
         parts += [f"{count_text(batch.read)} messages"]
         parts += [f"{count_text(batch.rejected)} rejected"] if batch.rejected else []
-        rates = (
-            count_text(round(batch.read / batch.elapsed_s)),
-            bytes_text(batch.payload_bytes / batch.elapsed_s),
-        )
-        parts += ["{} msg/s, {}/s".format(*rates)]
+        rate = count_text(round(batch.read / batch.elapsed_s))
+        parts += [f"{rate} msg/s, {bytes_text(batch.payload_bytes / batch.elapsed_s)}/s"]
     parts += [f"{seconds_text(batch.left_s)} left"] if batch.left_s is not None else []
     return ", ".join(parts)
 

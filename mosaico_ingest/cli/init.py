@@ -36,6 +36,5 @@ def init(
         return
     folder.mkdir(parents=True, exist_ok=True)
     out.write_text(text, encoding="utf-8")
-    typer.echo(
-        f"{out}: {counted(sum(topic.problem is None for topic in found.topics), 'topic')}; run it with `ingest {out}`"
-    )
+    taken = sum(topic.problem is None for topic in found.topics)
+    typer.echo(f"{out}: {counted(taken, 'topic')}; run it with `ingest {out}`")

@@ -117,18 +117,20 @@ def _leaves(
 
 
 def _print_metadata(metadata: Mapping[str, Any], console: Console) -> None:
+    for name, value in _metadata_lines(metadata):
+        console.print(Text(f"  {name}: {_cell(value)}"), soft_wrap=True)
+
+
+def _metadata_lines(metadata: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield names and values; of what the ledger keeps for programs, the few words a person wants."""
     for key, value in metadata.items():
-        if key == LEDGER_KEY and isinstance(value, dict) and "sources" in value:
-            names = ", ".join(str(source["name"]) for source in value["sources"])
-            lines = {key: f"{value.get('tool')} from {names}"}
+        if not isinstance(value, dict) or not value:
+            yield key, value
+        elif key == LEDGER_KEY and "sources" in value:
+            names = (str(source["name"]) for source in value["sources"])
+            yield key, f"{value.get('tool')} from {', '.join(names)}"
         else:
-            lines = (
-                {f"{key}.{name}": part for name, part in value.items()}
-                if isinstance(value, dict)
-                else {key: value}
-            )
-        for name, part in lines.items():
-            console.print(Text(f"  {name}: {_cell(part)}"), soft_wrap=True)
+            yield from ((f"{key}.{name}", part) for name, part in value.items())
 
 
 def _cell(value: object) -> str:

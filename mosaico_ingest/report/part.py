@@ -18,7 +18,7 @@ class Part(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _encodable(cls, values: Any) -> Any:  # noqa: ANN401 - whatever stands for a part
+    def _spell_texts(cls, values: Any) -> Any:  # noqa: ANN401 - whatever stands for a part
         """Look at all fields at once: a validator for each made every part slow to build."""
         return (
             {name: _encodable(value) for name, value in values.items()}

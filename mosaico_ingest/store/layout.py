@@ -109,9 +109,8 @@ class Layout:
         with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="fsync") as pool:
             list(pool.map(fsync, (staged for staged, _ in paths)))  # a disk takes several in the time of one
             for staged, target in paths:
-                changed |= {folder.parent for folder in target.parents if not folder.exists()} | {
-                    target.parent
-                }
+                changed.add(target.parent)
+                changed |= {folder.parent for folder in target.parents if not folder.exists()}
                 _move(staged, target)
             list(pool.map(fsync, changed))
 

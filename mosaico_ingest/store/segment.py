@@ -90,9 +90,8 @@ class SegmentWriter:
 
     def abandon(self) -> None:
         """Close the file without caring for its content."""
-        with suppress(
-            OSError, pa.ArrowException, RuntimeError
-        ):  # the last: that there is no footer to collect
+        # a RuntimeError says that there is no footer to collect
+        with suppress(OSError, pa.ArrowException, RuntimeError):
             self._writer.close()
         with suppress(OSError, pa.ArrowException):
             self._file.close()

@@ -141,9 +141,8 @@ class StoreTopic:
         self._writer.append(rows)
         if self._writer.written_bytes >= _SEGMENT_BYTES:
             self._finish_segment()
-            files.settle(
-                self.segments[-1].path
-            )  # as much as this goes to the disk while others are still read
+            # as much as this goes to the disk while others are still read
+            files.settle(self.segments[-1].path)
 
     def _finish_segment(self) -> None:
         if self._writer is not None:

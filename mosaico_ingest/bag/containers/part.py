@@ -31,7 +31,9 @@ __all__ = [
 EARLIEST_NS, LATEST_NS = -(2**63), 2**63 - 1
 """The first and last time stamps there are; the last is in the year 2262."""
 _FIRST_BYTES, BLOCK_BYTES, MOST_PIECES = 1 << 20, 8 << 20, 64
-"""Up to how many bytes, and how many chunks, are read at once: what is done once a block is done less often."""
+"""Up to how many bytes, at first and later on, and how many chunks are read at once.
+
+What is done once a block is done less often with larger ones; the first is small, so that the next stage begins early."""
 T = TypeVar("T")
 
 
@@ -121,7 +123,7 @@ class Block:
 
 
 def in_groups(pieces: Iterable[T], size: Callable[[T], int], *, most: int = MOST_PIECES) -> Iterator[list[T]]:
-    """Yield neighbours together, as long as they have no more than `BLOCK_BYTES` and are no more than `most`."""
+    """Yield neighbours together, up to `most`; of bytes few at first, then twice as many each time, up to `BLOCK_BYTES`."""
     group: list[T] = []
     held_bytes, most_bytes = 0, _FIRST_BYTES
     for piece in pieces:
