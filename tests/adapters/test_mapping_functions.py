@@ -150,6 +150,7 @@ FORMATS = [
     ("rgb8; png compressed ", "png"),
     ("16UC1; compressedDepth png", "png"),
     ("16UC1; compressedDepth", "png"),
+    ("16UC1; compressedDepth rvl", "raw"),
     ("jpeg compressed bgr8", "jpeg"),
     ("rgb8; compressed", "raw"),
     ("a b c d", "raw"),

@@ -114,9 +114,12 @@ def compressed_format(s: Array) -> Array:
 
 
 def _codec(said: str) -> str:
-    """Return the codec in a format text, as in `bgr8; jpeg compressed bgr8` or `16UC1; compressedDepth png`."""
+    """Return the codec in a format text, as in `bgr8; jpeg compressed bgr8` or `16UC1; compressedDepth png`.
+
+    Depth without a word behind it, and no text at all, are PNG as the transports' default is.
+    """
     words = [word for word in re.split(r"[;,\s]+", said.lower()) if word]
     known = [_CODECS[word] for word in words if word in _CODECS]
-    if not words or ("compresseddepth" in words and not known):
-        return "png"
-    return known[0] if known else "raw"
+    if known:
+        return known[0]
+    return "png" if not words or words[-1] == "compresseddepth" else "raw"
