@@ -24,6 +24,8 @@ __all__ = ["PythonAdapterSpec", "is_adapter_class", "ontology_of"]
 
 _BASE = "ROSAdapterBase"
 """What the base class of adapters is called, here and in the official SDK."""
+_SDK_FIRST = "typestore"
+"""The first parameter of `schema_metadata` in newer SDKs: what it returns is known here already."""
 _ROWS_AS_DICTS = 256
 """How many messages are Python objects at a time; an image topic shall not be all in memory twice."""
 
@@ -75,13 +77,13 @@ class PythonAdapter:
         return self._by_messages(rows, envelope)
 
     def topic_metadata(self, first_row: pa.StructScalar | None) -> dict[str, Any]:
-        """Return what `schema_metadata` reads from the first message; it has to take the message for that.
+        """Return what `schema_metadata` reads from the first message; the newer SDK's is given no message.
 
         Raises:
             AdapterError: It raised something.
         """
         method = getattr(self.adapter, "schema_metadata", None)
-        if first_row is None or method is None or "ros_data" not in signature(method).parameters:
+        if first_row is None or method is None or _SDK_FIRST in signature(method).parameters:
             return {}
         try:
             return dict(method(first_row.as_py()) or {})

@@ -168,6 +168,16 @@ def test_metadata_is_read_from_the_first_message(define: Callable[..., Definitio
     assert PythonAdapterSpec(SpeedAdapter).bind(definition, rows.type).topic_metadata(rows[0]) == {}
 
 
+def test_metadata_is_read_whatever_the_message_is_called() -> None:
+    class Renaming(SpeedAdapter):
+        @classmethod
+        def schema_metadata(cls, message: dict[str, Any], **_: Any) -> dict[str, Any] | None:  # type: ignore[override] - as users write it
+            return {"first": message["data"]}
+
+    row = pa.array([{"data": 2.0}])[0]
+    assert PythonAdapter(Renaming, Speed.ontology_type()).topic_metadata(row) == {"first": 2.0}
+
+
 def test_metadata_that_cannot_be_read_breaks_the_adapter() -> None:
     class Failing(SpeedAdapter):
         @classmethod
