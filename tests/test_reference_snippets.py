@@ -334,3 +334,10 @@ def test_the_command_line_takes_the_same_words(
     sequence = Store.open(Path("mosaico")).sequence("Test_Run_01")
     assert len(sequence.topics) == topics
     assert sequence.metadata.get("operator") == ("Alice" if "--metadata" in arguments else None)
+
+
+def test_the_command_line_lists_its_options_by_the_short_word_too(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as leave:
+        main(["bag", "-h"])
+    assert not leave.value.code
+    assert "--ros-distro" in capsys.readouterr().out
