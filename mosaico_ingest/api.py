@@ -283,11 +283,12 @@ def _metadata(given: str | None) -> dict[str, Any]:
     """Read metadata given as JSON, or as the file that holds it."""
     if given is None:
         return {}
-    text, where = given, "--metadata"
+    text: str | bytes = given
+    where = "--metadata"
     if not given.lstrip().startswith("{"):
         where = given
         try:
-            text = read_whole(Path(given)).decode()
+            text = read_whole(Path(given))
         except OSError as error:
             raise ManifestError(
                 f"is neither a JSON object nor a file that can be read ({error.strerror})",

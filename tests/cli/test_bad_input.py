@@ -126,6 +126,13 @@ def test_metadata_that_is_not_an_object(ingest: Ingest) -> None:
     assert "--metadata" in err
 
 
+def test_metadata_in_a_file_that_is_not_text(ingest: Ingest, tmp_path: Path) -> None:
+    (tmp_path / "metadata.json").write_bytes(b"\x80\xff")
+    code, _, err = ingest("bag", str(QUICKSTART), "--name", "x", "--metadata", "metadata.json")
+    assert code == 2
+    assert "metadata.json: is not JSON" in err
+
+
 def test_a_distro_that_does_not_exist(ingest: Ingest) -> None:
     code, _, err = ingest("bag", str(QUICKSTART), "--name", "x", "--ros-distro", "ros2_hmble")
     assert code == 2
