@@ -159,7 +159,7 @@ def _candidates(folder: AnyPath, name: str) -> Iterator[AnyPath]:
 
 def _natural(path: AnyPath) -> list[tuple[int, str]]:
     """Sort `part_10` behind `part_9`."""
-    return [(int(piece), "") if piece.isdigit() else (-1, piece) for piece in re.split(r"(\d+)", path.name)]
+    return [(int(piece), "") if piece.isdecimal() else (-1, piece) for piece in re.split(r"(\d+)", path.name)]
 
 
 def _unreadable(err: BagError) -> Finding:

@@ -210,3 +210,10 @@ def test_a_damaged_part_counts_without_metadata_too(split: Path, recordings: Any
         (split / f"part_{number}.mcap").write_bytes(content)
     with pytest.raises(BagError, match=r"part_8\.mcap"):
         open_recording(split, resolve=recordings.blind)
+
+
+def test_a_digit_that_is_no_decimal_is_a_letter_among_names(split: Path) -> None:
+    part = split / "part_10.mcap"
+    part.rename(split / "part_5\N{SUPERSCRIPT TWO}1.mcap")
+    (split / "metadata.yaml").unlink()
+    assert len(discover([split]).files) == 3
