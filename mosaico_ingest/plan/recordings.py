@@ -99,7 +99,9 @@ def _glob(path: AnyPath) -> Iterable[AnyPath]:
         above = next(parent for parent in path.above if not has_magic(parent.key))
         return above.glob(path.key.removeprefix(above.key))
     fixed = next(parent for parent in path.parents if not has_magic(str(parent)))
-    return fixed.glob(str(path.relative_to(fixed)))
+    # Beside other characters `**` is `*`, as behind URLs; Python before 3.13 refuses it there.
+    parts = (part if part == "**" else re.sub(r"\*+", "*", part) for part in path.relative_to(fixed).parts)
+    return fixed.glob("/".join(parts))
 
 
 def _is_recording(path: AnyPath) -> bool:

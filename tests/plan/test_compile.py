@@ -150,6 +150,10 @@ def test_a_recursive_glob_works(folder: Path) -> None:
     assert [config.sequence_name for config in compiled(folder, 'bag: {path: "**/*.bag"}')] == ["run_a"]
 
 
+def test_two_stars_beside_other_characters_are_one(folder: Path) -> None:
+    assert [config.sequence_name for config in compiled(folder, 'bag: {path: "data/**.bag"}')] == ["run_a"]
+
+
 def test_placeholders_stand_for_parts_of_the_path(folder: Path) -> None:
     (config,) = compiled(folder, 'bag: {path: data/run_a.bag}\nsequence: {name: "{name}_{date}_{index}"}')
     assert config.sequence_name == "run_a_bag_1970-01-02_1"
