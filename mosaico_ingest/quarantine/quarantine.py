@@ -169,9 +169,8 @@ def _allows(limit: Limit | None, kept: int, promised: int | None, read: int) -> 
 
 
 def _sequence_of(index: Path) -> str | None:
-    with index.open(encoding="utf-8") as lines:
-        first = lines.readline()
     try:
-        return str(json.loads(first)["sequence"])
+        with index.open(encoding="utf-8") as lines:
+            return str(json.loads(lines.readline())["sequence"])
     except (ValueError, KeyError, TypeError):
         return None

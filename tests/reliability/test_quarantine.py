@@ -141,8 +141,10 @@ def test_a_replacement_leaves_nothing_of_the_old_to_replay(
     write_bag({"/speed": [number(1), CUT]})
     job = write_job(quarantine={}, sequence={"name": "drive", "if_exists": "replace"})
     run_job(job)
-    run_job(job)
-    assert len(list((tmp_path / "quarantine").glob("*.mcap"))) == 1
+    for suffix in (".mcap", ".jsonl"):  # somebody else's files, which say nothing of a sequence
+        (tmp_path / "quarantine" / f"foreign{suffix}").write_bytes(b"\xff\xfe")
+    assert run_job(job).exit_code == 4
+    assert len(list((tmp_path / "quarantine").glob("drive*.mcap"))) == 1
 
 
 def test_an_empty_quarantine_says_so(
