@@ -86,7 +86,7 @@ def explain(
 @app.command("test")
 def run_tests(
     adapters: Annotated[
-        list[str] | None, typer.Argument(metavar="NAME|FILE...", help="Adapters whose tests to run.")
+        list[str] | None, typer.Argument(metavar="NAME|FILE", help="Adapters whose tests to run.")
     ] = None,
     every: Annotated[bool, typer.Option("--all", help="All built-in adapters.")] = False,
     distro: Distro = None,
@@ -124,7 +124,7 @@ def init(
     ] = None,
     ontology: Annotated[
         str | None,
-        typer.Option("--ontology", metavar="TAG", help="What it becomes [default: a type of its own]."),
+        typer.Option("--ontology", metavar="TAG", help="What it becomes.", show_default="a type of its own"),
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", metavar="FILE", help="Write it there, if nothing is there.")

@@ -18,10 +18,10 @@ def bag(
     name: Annotated[str, typer.Option("--name", "-n", help="Name of the sequence.")],
     topics: Annotated[
         list[str] | None,
-        typer.Option("--topics", help="Topic pattern, as /cam/*; !/cam/debug* takes away. Repeatable."),
+        typer.Option("--topics", "-t", help="Topic pattern, as /cam/*; !/cam/debug* takes away. Repeatable."),
     ] = None,
     more_topics: Annotated[
-        list[str] | None, typer.Argument(metavar="[TOPIC...]", help="More patterns, after --topics.")
+        list[str] | None, typer.Argument(metavar="TOPIC", help="More patterns, after --topics.")
     ] = None,
     metadata: Annotated[
         str | None,
@@ -31,23 +31,33 @@ def bag(
         str | None, typer.Option("--ros-distro", help="As ros2_humble; for recordings without definitions.")
     ] = None,
     host: Annotated[str | None, typer.Option("--host", help="A Mosaico server instead of the store.")] = None,
-    port: Annotated[int, typer.Option("--port", help="Its port.")] = 6726,
+    port: Annotated[int, typer.Option("--port", help="The server's port.")] = 6726,
     api_key: Annotated[
         str | None,
         typer.Option("--api-key", envvar="MOSAICO_API_KEY", help="Its API key.", show_envvar=True),
     ] = None,
     tls_cert: Annotated[
-        Path | None, typer.Option("--tls-cert", help="CA certificate the server is checked against.")
+        Path | None,
+        typer.Option("--tls-cert", metavar="FILE", help="CA certificate the server is checked against, PEM."),
     ] = None,
     store: Annotated[
         str | None,
+        typer.Option("--store", help="The store to write to.", metavar="DIR|URL", show_default="mosaico"),
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option("--report", metavar="FILE", help="Write the report as JSON.")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
+    log: Annotated[
+        str | None,
         typer.Option(
-            "--store", help="The embedded store, a folder or URL, to write to [default: ./mosaico]."
+            "--log",
+            "-l",
+            help="DEBUG, INFO, WARNING, ERROR or CRITICAL.",
+            metavar="LEVEL",
+            show_default="INFO",
         ),
     ] = None,
-    report: Annotated[Path | None, typer.Option("--report", help="Write the report as JSON.")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
-    log: Annotated[str | None, typer.Option("--log", "-l", help="Log level.", metavar="LEVEL")] = None,
 ) -> None:
     """Ingest one recording, without a manifest."""
     from mosaico_ingest import api

@@ -14,12 +14,12 @@ def init(
     path: Annotated[Path, typer.Argument(metavar="BAG", help="A recording: a file or a rosbag2 directory.")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Write it here [default: print it].", metavar="JOB.yaml"),
+        typer.Option("--out", "-o", help="Where to write it.", metavar="JOB.yaml", show_default="print it"),
     ] = None,
     ros_distro: Annotated[
         str | None, typer.Option("--ros-distro", help="As ros2_humble; for recordings without definitions.")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+    force: Annotated[bool, typer.Option("--force", "-f", help="Replace a file that is there.")] = False,
 ) -> None:
     """Draft a manifest: every topic with its type, count and adapter, and what one may want to change."""
     from mosaico_ingest import api

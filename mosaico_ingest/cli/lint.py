@@ -20,9 +20,7 @@ _TEXT = "text"
 def lint(
     paths: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="FILE|DIR|-...", help="What to judge; a folder with all below it; - is stdin."
-        ),
+        typer.Argument(metavar="FILE|DIR|-", help="What to judge; a folder with all below it; - is stdin."),
     ] = None,
     *,
     output: Annotated[

@@ -29,7 +29,13 @@ def replay(
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
     log: Annotated[
-        str | None, typer.Option("--log", help="Log level; overrides run.log_level.", metavar="LEVEL")
+        str | None,
+        typer.Option(
+            "--log",
+            "-l",
+            help="DEBUG, INFO, WARNING, ERROR or CRITICAL; overrides run.log_level.",
+            metavar="LEVEL",
+        ),
     ] = None,
 ) -> None:
     """Add quarantined messages to the sequences they belong to; what fails again stays in the quarantine."""

@@ -13,9 +13,7 @@ __all__ = ["report"]
 def report(
     paths: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="RUN.json...", help="What `ingest run --report RUN.json` wrote; several add up."
-        ),
+        typer.Argument(metavar="RUN.json", help="What `ingest run --report RUN.json` wrote; several add up."),
     ],
     *,
     html: Annotated[

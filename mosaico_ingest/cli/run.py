@@ -25,7 +25,7 @@ class Place(str, Enum):
 
 def run(
     manifests: Annotated[
-        list[Path] | None, typer.Argument(metavar="JOB.yaml...", help="Job manifests, run in order.")
+        list[Path] | None, typer.Argument(metavar="JOB.yaml", help="Job manifests, run in order.")
     ] = None,
     *,
     plan: Annotated[
@@ -67,7 +67,13 @@ def run(
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
     log: Annotated[
-        str | None, typer.Option("--log", help="Log level; overrides run.log_level.", metavar="LEVEL")
+        str | None,
+        typer.Option(
+            "--log",
+            "-l",
+            help="DEBUG, INFO, WARNING, ERROR or CRITICAL; overrides run.log_level.",
+            metavar="LEVEL",
+        ),
     ] = None,
     log_format: Annotated[
         LogFormat, typer.Option("--log-format", help="What is said while it runs: for people, or JSON lines.")

@@ -23,7 +23,9 @@ class Document(str, Enum):
 
 
 def schema(
-    document: Annotated[Document | None, typer.Argument(help="Which file's schema to print.")] = None,
+    document: Annotated[
+        Document | None, typer.Argument(metavar="DOCUMENT", help="Which file's schema to print.")
+    ] = None,
     write: Annotated[
         Path | None,
         typer.Option("--write", metavar="DIR", help="Write NAME.schema.json into DIR, for editors."),
@@ -33,7 +35,7 @@ def schema(
         typer.Option("--check", metavar="DIR", help="Fail where a file in DIR is not up to date."),
     ] = None,
 ) -> None:
-    """Print, write or check the JSON Schemas (draft 2020-12); without a name, of all of them."""
+    """Print, write or check the JSON Schemas (draft 2020-12); to write or check all of them, name none."""
     wanted = [document] if document else list(Document)
     if write is None and check is None and document is None:
         raise typer.BadParameter("name one of " + ", ".join(one.value for one in Document))

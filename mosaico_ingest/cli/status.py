@@ -13,7 +13,7 @@ STYLES = {"done": "green", "new": "cyan", "changed": "yellow", "failed": "red", 
 
 
 def status(
-    manifests: Annotated[list[Path], typer.Argument(metavar="JOB.yaml...", help="Job manifests.")],
+    manifests: Annotated[list[Path], typer.Argument(metavar="JOB.yaml", help="Job manifests.")],
     *,
     check: Annotated[bool, typer.Option("--check", help="Exit 1 unless every recording is done.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,

@@ -40,7 +40,7 @@ def show(
     from mosaico_ingest.store import Store
 
     opened = Store.open(store, create=False)
-    sequence, slash, topic = what.partition("/")
+    sequence, slash, topic = what.lstrip("/").partition("/")
     if not slash or not topic:
         print_sequence(opened.sequence(sequence), as_json=as_json)
         return
@@ -62,7 +62,9 @@ def gc(store: Folder = DEFAULT) -> None:
 
 @app.command("rm")
 def remove(
-    sequence: Annotated[str, typer.Argument(help="The sequence to remove, with all its files.")],
+    sequence: Annotated[
+        str, typer.Argument(metavar="SEQUENCE", help="The sequence to remove, with all its files.")
+    ],
     store: Folder = DEFAULT,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
 ) -> None:

@@ -11,7 +11,7 @@ __all__ = ["verify"]
 
 def verify(
     sequences: Annotated[
-        list[str] | None, typer.Argument(metavar="[SEQUENCE]...", help="Which ones; all without a name.")
+        list[str] | None, typer.Argument(metavar="SEQUENCE", help="Which ones; all without a name.")
     ] = None,
     store: Annotated[
         str, typer.Option("--store", help="The store's folder or URL.", metavar="DIR|URL")

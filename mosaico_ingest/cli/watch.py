@@ -31,7 +31,9 @@ def watch(
     once: Annotated[
         bool, typer.Option("--once", help="Ingest what is there and comes to rest, then leave.")
     ] = False,
-    log: Annotated[str, typer.Option("--log", help="Log level.", metavar="LEVEL")] = "WARNING",
+    log: Annotated[
+        str, typer.Option("--log", "-l", help="DEBUG, INFO, WARNING, ERROR or CRITICAL.", metavar="LEVEL")
+    ] = "WARNING",
 ) -> None:
     """Ingest what arrives in a folder, until it is interrupted; what is in the destination already is left alone."""
     import time

@@ -1,0 +1,41 @@
+"""What `--help` says arrives whole, and the same thing has the same name everywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from mosaico_ingest.cli.app import command_line
+
+
+def _commands(command: Any, name: str = "ingest") -> Iterator[tuple[str, Any]]:
+    yield name, command
+    for inner in getattr(command, "commands", {}).values():
+        yield from _commands(inner, f"{name} {inner.name}")
+
+
+COMMANDS = dict(_commands(get_command(command_line())))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_no_help_has_brackets_which_the_display_takes_for_markup(name: str) -> None:
+    for parameter in COMMANDS[name].params:
+        assert "[" not in (getattr(parameter, "help", None) or ""), parameter.name
+
+
+def test_a_short_option_means_the_same_in_every_command() -> None:
+    meaning: dict[str, str] = {}
+    for name, command in COMMANDS.items():
+        for parameter in command.params:
+            for short in (o for o in parameter.opts if o[0] == "-" and o[1] != "-"):
+                long = next(o for o in parameter.opts if o.startswith("--"))
+                assert meaning.setdefault(short, long) == long, name
+
+
+@pytest.mark.parametrize(("command", "said"), [("init", "(print it)"), ("bag", "(mosaico)")])
+def test_what_happens_without_an_option_is_said(command: str, said: str) -> None:
+    assert said in CliRunner().invoke(command_line(), [command, "--help"], env={"COLUMNS": "150"}).output
