@@ -7,14 +7,16 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pytest
 from flight_calls import Client, refused
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.store import Store, StoreSink
 from mosaico_ingest.store.server import Server
+from mosaico_ingest.store.server.filters import Glob
 from mosaico_ingest.store.server.query import run
 from mosaico_ingest.wire.bodies import Query
 from mosaico_ingest.wire.conditions import Condition
@@ -100,6 +102,7 @@ ALL = [f"{drive}/{topic}" for drive in ("drive_1", "drive_2") for topic in ("emp
         ({"ontology": {"Pose.at.x": {"$outside": [0, 1500]}}}, []),
         ({"ontology": {"Pose.at.x": {"$in": [5.0, 7]}}}, POSES[:1]),
         ({"ontology": {"Pose.at.zone": {"$match": "zone [2]"}, "Pose.ok": {"$eq": True}}}, POSES),
+        ({"ontology": {"Pose.at.zone": {"$match": "*n*#"}}}, POSES),
         ({"ontology": {"Pose.at.x": {"$eq": 5}, "Pose.ok": {"$eq": True}}}, []),
         ({"ontology": {"Pose.at": {"$nex": None}}}, POSES),
         ({"ontology": {"Pose.gone": {"$ex": None}}}, []),
@@ -172,6 +175,17 @@ def test_a_query_that_makes_no_sense_is_refused(
         session.topic("/pose", POSE, {}).write(poses(range(10), 0))
     with refused(Condition.INVALID):
         client.call("query", **question)
+
+
+@given(st.text("ab*?[!]-#1\n.", max_size=8), st.lists(st.text("ab]-1\n.", max_size=5), max_size=8))
+def test_a_column_is_matched_as_its_values_are(pattern: str, texts: list[str]) -> None:
+    glob = Glob(pattern)
+    table = pa.table({"text": pa.array(texts, pa.string())})
+    try:
+        kept = table.filter(glob.column(pc.field("text"), pa.string())).column(0).to_pylist()
+    except pa.ArrowInvalid:
+        assume(condition=False)
+    assert kept == [text for text in texts if glob.holds(text)]
 
 
 def test_a_query_goes_over_the_wire(server: Server, client: Client) -> None:

@@ -116,6 +116,10 @@ class Choice:
         return column.isin(pa.array(list[Any](self.choices)).cast(kind))
 
 
+_GLOB_PART = re.compile(r"(?P<stars>\*+)|\[!?\]?[^\]]*\]|.", re.DOTALL)
+"""Stars, a set, or a character; `translate` writes each but the stars as `(?s:…)\\Z`."""
+
+
 @frozen
 class Glob:
     """`$match pattern`: a whole text, with `*`, `?`, `[…]`, and `#` for a digit."""
@@ -124,18 +128,22 @@ class Glob:
 
     def holds(self, value: Any) -> bool:  # noqa: ANN401 - see Test
         """Return whether the value is a text of that form."""
-        return isinstance(value, str) and re.match(self._expression(), value) is not None
+        return isinstance(value, str) and re.match(translate(self._glob), value) is not None
 
     def may_hold(self, low: Any, high: Any) -> bool:  # noqa: ANN401, ARG002 - see Test
         """Return that it may."""
         return True
 
     def column(self, column: pc.Expression, kind: pa.DataType) -> pc.Expression:  # noqa: ARG002 - text only
-        """Return the match in Arrow's dialect, which spells the end of the text differently."""
-        return pc.match_substring_regex(column, "^" + re.sub(r"\\[zZ]$", "$", self._expression()))
+        """Return the match in the dialect of RE2, which lacks what `translate` makes of several stars."""
+        parts = (
+            ".*" if part["stars"] else translate(part[0])[4:-3] for part in _GLOB_PART.finditer(self._glob)
+        )
+        return pc.match_substring_regex(column, f"^(?s:{''.join(parts)})$")
 
-    def _expression(self) -> str:
-        return translate(self.pattern.replace("#", "[0-9]"))
+    @property
+    def _glob(self) -> str:
+        return self.pattern.replace("#", "[0-9]")
 
 
 @frozen
