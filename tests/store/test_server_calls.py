@@ -14,9 +14,10 @@ import pyarrow.flight as fl
 import pytest
 from flight_calls import Client, descriptor_of, refused
 
-from mosaico_ingest.errors import SinkError
+from mosaico_ingest.errors import SinkError, SinkUnavailable
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.store import Store, StoreSink
+from mosaico_ingest.store.catalog import Catalog
 from mosaico_ingest.store.server import Server, serve
 from mosaico_ingest.wire.conditions import Condition
 
@@ -219,6 +220,23 @@ def test_a_topic_is_put_once_by_its_uuid_with_a_time_column(client: Client, rows
         client.call("session_finalize", session_uuid=session)
     with refused(Condition.PRECONDITION, "finalized"):
         client.create_topic(session, "drive/gps")
+
+
+def test_a_session_that_could_not_be_finalized_is_not_called_final(
+    client: Client, rows: Rows, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def busy(*_: object) -> list[str]:
+        raise SinkUnavailable("the catalog is busy with another process")
+
+    client.call("sequence_create", locator="drive", user_metadata={})
+    session = client.call("session_create", locator="drive")["uuid"]
+    client.put("drive/imu", client.create_topic(session, "drive/imu"), rows([1]))
+    with monkeypatch.context() as patched:
+        patched.setattr(Catalog, "commit", busy)
+        with refused(Condition.UNAVAILABLE, "busy"):
+            client.call("session_finalize", session_uuid=session)
+    with refused(Condition.NOT_FOUND, "no open session"):
+        client.call("session_finalize", session_uuid=session)
 
 
 def test_columns_are_put_in_order_and_the_time_column_may_be_nullable(client: Client) -> None:

@@ -142,6 +142,8 @@ class Uploads:
             opened.session.commit()
         except BaseException:
             opened.session.discard()
+            with self._lock:
+                self._finalized.discard(uuid)  # asked again, there is no such session
             raise
 
     def discard_session(self, locator: str) -> bool:
