@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from mosaico_ingest import wire
-from mosaico_ingest.errors import SinkError, SinkUnavailable
+from mosaico_ingest.errors import IngestError, SinkError
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.remote.path import AnyPath
@@ -118,13 +118,14 @@ class StoreSession:
             self._leave()
 
     def _may_be_entered(self) -> bool:
-        """Say whether the catalog has the session although its commit failed: an answer can be lost, what it says not."""
+        """Say whether the catalog has the session although its commit failed, as its answer may be lost.
+
+        Where it cannot be read it may have: files that nobody needs go with the garbage, lost ones do not come back.
+        """
         try:
             info = self._catalog.sequence(self._claim.sequence)
-        except SinkUnavailable:
+        except IngestError:
             return True
-        except SinkError:
-            return False
         return info is not None and any(session.id == self.id for session in info.sessions)
 
     def _placed(self, topic: StoreTopic) -> entries.NewTopic:

@@ -14,6 +14,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pytest
@@ -22,7 +23,7 @@ from disks import MEBIBYTE, read_only, small_disk
 from mosaico_ingest.errors import SinkError, SinkUnavailable
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.store import Store, StoreSink
-from mosaico_ingest.store.catalog import FORMAT
+from mosaico_ingest.store.catalog import FORMAT, Catalog
 from mosaico_ingest.store.faults import explained
 from mosaico_ingest.store.lease import Lease, is_live
 from mosaico_ingest.store.segment import SegmentWriter
@@ -88,6 +89,26 @@ def test_a_session_holds_the_catalog_open_and_nobody_off(
     assert open_catalogs(store) == 0
 
 
+def test_files_stay_where_nobody_can_say_whether_they_were_entered(
+    sink: StoreSink, store: Store, rows: Rows, sample: OntologyType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entered = Catalog.commit
+
+    def commit(catalog: Catalog, *session: Any) -> None:
+        entered(catalog, *session)
+        raise SinkError("the catalog refuses: disk I/O error")
+
+    def unreadable(*_: object) -> None:
+        raise SinkError("the catalog refuses: disk I/O error")
+
+    with monkeypatch.context() as patched, pytest.raises(SinkError, match="disk I/O"):
+        patched.setattr(Catalog, "commit", commit)
+        patched.setattr(Catalog, "sequence", unreadable)
+        with sink.open("s", {}) as session:
+            session.topic("/t", sample, {}).write(rows([1]))
+    assert store.scan("s", "/t").read_all().num_rows == 1
+
+
 def test_another_programs_file_is_left_alone(tmp_path: Path) -> None:
     with closing(sqlite3.connect(tmp_path / "catalog.sqlite")) as db:
         db.execute("CREATE TABLE theirs (x)")
@@ -135,6 +156,7 @@ def test_a_catalog_deleted_under_way_fails_the_session(
     with pytest.raises(SinkError, match=r"catalog"), sink.open("s", {}) as session:
         session.topic("/t", sample, {}).write(rows([1]))
         store.layout.catalog.unlink()
+    Store.open(store.path).collect_garbage(grace_s=0)
     assert list(store.layout.segment_files()) == []
 
 
