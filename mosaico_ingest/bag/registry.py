@@ -15,7 +15,14 @@ from mosaico_ingest.frozen import frozen
 from mosaico_ingest.policies import Stores
 from mosaico_ingest.textfile import read_whole
 
-__all__ = ["ROSTypeRegistry", "Registered", "directory_types", "register_source", "store_of"]
+__all__ = [
+    "ROSTypeRegistry",
+    "Registered",
+    "definition_files",
+    "directory_types",
+    "register_source",
+    "store_of",
+]
 
 _SUFFIXES = (".msg", ".idl")
 
@@ -138,7 +145,7 @@ def directory_types(package: str, path: Path) -> Iterator[Registered]:
     Raises:
         BagError: There are none, or one cannot be read.
     """
-    files = _definition_files(path)
+    files = definition_files(path)
     if not files:
         there = "has no .msg or .idl file" if path.is_dir() else "does not exist"
         raise BagError(
@@ -150,7 +157,8 @@ def directory_types(package: str, path: Path) -> Iterator[Registered]:
         yield register_source(f"{package.removesuffix('/msg')}/msg/{file.stem}", file)
 
 
-def _definition_files(path: Path) -> list[Path]:
+def definition_files(path: Path) -> list[Path]:
+    """Return the definition files of a directory, of its `msg` folder, or the one file itself."""
     if path.is_file():
         return [path]
     for folder in (path, path / "msg"):

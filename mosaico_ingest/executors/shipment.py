@@ -11,6 +11,7 @@ from os.path import abspath
 from pathlib import Path
 
 from mosaico_ingest.adapters.builtin import BY_NAME
+from mosaico_ingest.bag.registry import definition_files
 from mosaico_ingest.config import ROSInjectionConfig, StoreTarget
 from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.path import AnyPath
@@ -40,7 +41,7 @@ def absolute(config: ROSInjectionConfig) -> ROSInjectionConfig:
 
 
 def pack(configs: Iterable[ROSInjectionConfig], folder: Path) -> list[ROSInjectionConfig]:
-    """Copy adapters, `.msg` files and certificates into `folder`; return configurations for who is in a copy of it.
+    """Copy adapters, definitions and certificates into `folder`; return configurations for who is in a copy of it.
 
     Adapters keep the names the manifests give them, so the plan is the same. One named by an absolute path, and
     what is installed, must be there on every machine.
@@ -57,7 +58,7 @@ class _Box:
         for reference in (*config.adapters, *config.adapter_override.values()):
             self._add_adapter(reference, config.base_dir)
         for _, path, _ in config.custom_msgs:
-            self._add_all([Path(path)] if Path(path).is_file() else Path(path).rglob("*.msg"))
+            self._add_all(definition_files(Path(path)))
         cert = config.tls_cert_path
         self._add_all([] if cert is None else [Path(cert)])
         self._add_all([], folder=config.base_dir)

@@ -9,20 +9,9 @@ from mosaico_ingest.bag.distros import distro_type
 from mosaico_ingest.bag.names import normalize_msgtype
 from mosaico_ingest.policies import Stores
 
-__all__ = ["definition_files", "is_known"]
+__all__ = ["is_known"]
 
 _SUFFIXES = (".msg", ".idl")
-
-
-def definition_files(path: Path) -> list[Path]:
-    """Return the definition files of a directory, of its `msg` folder, or the one file itself."""
-    if path.is_file():
-        return [path]
-    for folder in (path, path / "msg"):
-        files = sorted(file for suffix in _SUFFIXES for file in folder.glob(f"*{suffix}"))
-        if files:
-            return files
-    return []
 
 
 def is_known(kind: str, path: Path | None) -> bool:

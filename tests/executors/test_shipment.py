@@ -52,6 +52,9 @@ def job(tmp_path: Path) -> Path:
     (jobs / "huge.bin").write_bytes(b"no code")
     (tmp_path / "here" / "drives").mkdir()
     shutil.copy(QUICKSTART / "drive.mcap", tmp_path / "here" / "drives")
+    (tmp_path / "here" / "acme_msgs" / "Lamp.idl").write_text(
+        "module acme_msgs { module msg { struct Lamp { boolean on; }; }; };"
+    )
     (jobs / "job.yaml").write_text(JOB)
     return jobs / "job.yaml"
 
@@ -83,6 +86,7 @@ def test_nothing_but_code_and_definitions_is_sent(job: Path, tmp_path: Path) -> 
         "__init__.py",
         "scale.py",
         "job.yaml",
+        "Lamp.idl",
         *(path.name for path in (QUICKSTART / "acme_msgs").rglob("*.msg")),
         *(path.name for path in (QUICKSTART / "adapters").iterdir() if path.suffix == ".yaml"),
     }

@@ -20,8 +20,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from mosaico_ingest.bag.registry import definition_files
 from mosaico_ingest.diagnostics import Severity
-from mosaico_ingest.lint.definitions import definition_files
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.rule import Problem, Rule
 
