@@ -60,8 +60,14 @@ class Arrivals:
         return True
 
 
-def _recordings(folder: Path) -> Iterator[Path]:
-    """Yield files, and rosbag2 directories as one; one that is not finished has no metadata.yaml yet."""
+def _recordings(folder: Path, above: frozenset[Path] = frozenset()) -> Iterator[Path]:
+    """Yield files, and rosbag2 directories as one; one that is not finished has no metadata.yaml yet.
+
+    A link that leads back to a folder `above` is not followed.
+    """
+    here = folder.resolve()
+    if here in above:
+        return
     try:
         entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
     except OSError:  # it went away, or is none of ours
@@ -71,7 +77,7 @@ def _recordings(folder: Path) -> Iterator[Path]:
         return
     for entry in entries:
         if entry.is_dir():
-            yield from _recordings(entry)
+            yield from _recordings(entry, above | {here})
         elif _RECORDING.search(entry.name) and not _is_split(entry):
             yield entry
 

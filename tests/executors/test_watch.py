@@ -40,6 +40,13 @@ def test_hidden_empty_and_other_files_are_passed_over(tmp_path: Path) -> None:
     assert arrivals.settled(1) == (tmp_path / "a.mcap",)
 
 
+def test_a_link_that_leads_back_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "day").mkdir()
+    (tmp_path / "day" / "a.mcap").write_bytes(b"1")
+    (tmp_path / "day" / "back").symlink_to(tmp_path, target_is_directory=True)
+    assert Arrivals(tmp_path, rest_s=0).settled(0) == (tmp_path / "day" / "a.mcap",)
+
+
 def test_a_rosbag2_directory_is_one_recording_once_its_metadata_is_there(tmp_path: Path) -> None:
     folder = tmp_path / "deep" / "drive"
     folder.mkdir(parents=True)
