@@ -243,7 +243,10 @@ def as_path(given: str | Path | RemotePath) -> AnyPath:
     text = str(given)
     if "://" not in text:  # it went through `Path`
         text = text.replace(":/", ":///" if text.startswith("file:") else "://", 1)
-    url = urlsplit(text)
+    try:
+        url = urlsplit(text, allow_fragments=False)  # an object's name may have a #
+    except ValueError as error:
+        raise IngestError(f"the URL cannot be read: {error}", where=str(given)) from error
     if url.scheme == "file":
         return Path(unquote(url.path))
     if url.scheme not in SCHEMES:

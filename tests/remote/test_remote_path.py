@@ -40,6 +40,10 @@ def test_a_url_that_went_through_pathlib_is_still_one(scheme: str) -> None:
     assert as_path(Path(url)) == as_path(url)
 
 
+def test_a_hash_belongs_to_an_objects_name() -> None:
+    assert as_path("s3://bucket/run#1.mcap?region=eu") == RemotePath("s3://bucket", "run#1.mcap", "region=eu")
+
+
 def test_a_file_url_is_a_path() -> None:
     assert as_path("file:///data/with%20blank.mcap") == Path("/data/with blank.mcap")
 
@@ -56,6 +60,7 @@ def test_what_is_no_url_stays_a_path(given: str) -> None:
         ("ftp://host/a.mcap", "the scheme ftp:// is not known — known are s3://, gs://, file://"),
         ("https://host/a.mcap", "https://"),
         ("s3:///a.mcap", "no bucket"),
+        ("s3://[bucket/a.mcap", "cannot be read: Invalid IPv6 URL"),
         ("s3://key:secret@bucket/a.mcap", "no place for a password"),
     ],
 )
