@@ -22,6 +22,7 @@ from mosaico_ingest.adapters.python_adapter import PythonAdapterSpec, is_adapter
 from mosaico_ingest.adapters.unmodeled import UnmodeledSpec
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.frozen import frozen
+from mosaico_ingest.textfile import read_whole
 
 __all__ = ["KnownAdapters", "adapter_spec", "load_adapter_reference", "what_was_meant"]
 
@@ -94,8 +95,16 @@ class KnownAdapters:
             return BY_NAME[name]
         said = re.compile(rf"^adapter:\s*['\"]?{re.escape(name)}['\"]?\s*(#|$)", re.MULTILINE)
         files = sorted(path for path in self.folder.iterdir() if path.suffix in _MAPPING_SUFFIXES)
-        found = next((path for path in files if said.search(path.read_text("utf-8", errors="replace"))), None)
+        found = next((path for path in files if said.search(_text_of(path))), None)
         return None if found is None else _load_mapping(found)
+
+
+def _text_of(path: Path) -> str:
+    """Return what a file beside a mapping says; nothing where it cannot be read."""
+    try:
+        return read_whole(path).decode("utf-8", "replace")
+    except OSError:
+        return ""
 
 
 def _load_mapping(path: Path) -> AdapterSpec:
@@ -153,6 +162,9 @@ def _load_file(path: Path) -> ModuleType:
 def _also_searched(folder: Path) -> Generator[None]:
     """Let imports find modules in `folder`, after everything that is installed."""
     entry = str(folder.resolve())
+    if entry in sys.path:  # and there it stays
+        yield
+        return
     sys.path.append(entry)
     try:
         yield

@@ -200,6 +200,7 @@ def test_a_mapping_uses_another_one_of_the_same_folder(
         "version: 1\nadapter: FlatPointAdapter  # without height\nros_type: geometry_msgs/msg/Point32\n"
         "ontology: Point3d\nfields: {x: x, y: y, z: 0.0}\n"
     )
+    (tmp_path / "older.yaml").mkdir()  # passed over, as whatever else cannot be read
     (tmp_path / "outline.yaml").write_text(
         "version: 1\nadapter: OutlineAdapter\nros_type: geometry_msgs/msg/Polygon\nontology: Polygon\n"
         "fields: {points: {use: FlatPointAdapter, of: 'points[]'}}\n"
@@ -212,6 +213,18 @@ def test_a_mapping_uses_another_one_of_the_same_folder(
         rows, Envelope("/p", definition.root, np.zeros(1, np.int64))
     )
     assert [(p["x"], p["z"]) for p in adapted.rows[0]["points"].as_py()] == [(1.0, 0.0)]
+
+
+def test_loading_a_module_leaves_the_search_path_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "ticks.py").write_text(
+        "from mosaico_ingest import ROSAdapterBase\nclass Ticks(ROSAdapterBase):\n    ros_msgtype = 'a/msg/B'\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    before = list(sys.path)
+    ROSBridge(loaded=["ticks.py:Ticks"], base_dir=tmp_path)
+    assert sys.path == before
 
 
 def test_the_image_setting_wraps_whatever_adapter_is_chosen(define: Callable[..., Definition]) -> None:
