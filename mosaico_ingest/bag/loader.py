@@ -167,7 +167,7 @@ class ROSLoader:
         except DecodeError as error:
             if self._policy is LoaderErrorPolicy.RAISE:
                 place = f"{channel.topic} at {int(batch.log_times[row])} ns"
-                raise DecodeError(error.what, rule=error.rule, where=place) from None
+                raise DecodeError(error.what, rule=error.rule, where=place, hint=error.hint) from None
             if not self.rejected[channel.topic] and self._policy is LoaderErrorPolicy.LOG_WARN:
                 _LOG.warning("%s: %s", channel.topic, error)
             self.rejected[channel.topic] += 1

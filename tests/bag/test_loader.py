@@ -14,6 +14,7 @@ from rosbags.typesys import get_typestore
 
 from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.definition import Embedded
+from mosaico_ingest.bag.deserialize import Deserializer
 from mosaico_ingest.bag.loader import ROSLoader
 from mosaico_ingest.bag.message import ROSHeader, ROSMessage
 from mosaico_ingest.bag.recording import open_recording
@@ -121,6 +122,12 @@ class TestPolicies:
             with pytest.raises(DecodeError, match=r"^/text at 8000000000 ns: data: ") as caught:
                 list(loader)
             assert caught.value.rule == "string-length"
+
+    def test_raise_says_what_the_bytes_would_fit(self, bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(Deserializer, "_remedy", lambda *_: "they would fit the definition of ros2_iron")
+        loader = ROSLoader(bag, error_policy=LoaderErrorPolicy.RAISE)
+        with loader, pytest.raises(DecodeError, match="they would fit the definition of ros2_iron"):
+            list(loader)
 
     def test_log_warn_says_so_and_goes_on(self, bag: Path, caplog: pytest.LogCaptureFixture) -> None:
         with caplog.at_level(logging.WARNING, "mosaico_ingest.bag"), ROSLoader(bag) as loader:
