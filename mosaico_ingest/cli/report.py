@@ -31,7 +31,10 @@ def report(
 
     parts = [read_report(path) for path in paths]
     found = parts[0].model_copy(
-        update={"recordings": tuple(one for part in parts for one in part.recordings)}
+        update={
+            "manifests": tuple(dict.fromkeys(one for part in parts for one in part.manifests)),
+            "recordings": tuple(one for part in parts for one in part.recordings),
+        }
     )
     if html is not None:
         write_whole(html, html_page(found, html.parent))

@@ -87,7 +87,7 @@ def run(
     from mosaico_ingest.cli.without_pandas import forgo_pandas
     from mosaico_ingest.report.metrics import prometheus_text
     from mosaico_ingest.report.model import RunReport
-    from mosaico_ingest.report.write import write_whole
+    from mosaico_ingest.report.write import check_file, write_whole
 
     if bool(manifests) == (plan is not None):
         raise typer.BadParameter("name manifests, or a plan with --plan", param_hint="JOB.yaml")
@@ -98,6 +98,8 @@ def run(
         used = [api.used_manifest(Path(name)) for name in sorted({c.where for c in configs if c.where})]
     if shard is not None:
         configs = take_shard(configs, shard)
+    if metrics is not None:
+        check_file(metrics)
     if address is not None and executor is not Place.RAY:
         raise typer.BadParameter("is for --executor ray", param_hint="--address")
 

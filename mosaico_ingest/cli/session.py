@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
+from typing import ParamSpec
 
 import typer
 
@@ -16,13 +17,17 @@ from mosaico_ingest.cli.logs import JsonLines, set_up_logging
 from mosaico_ingest.cli.signals import interrupt_on_terminate
 from mosaico_ingest.cli.tally import Tally, sizes_of
 from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.diagnostics import Finding
+from mosaico_ingest.errors import SinkError
 from mosaico_ingest.executors.executor import Executor
 from mosaico_ingest.executors.local import Inline
 from mosaico_ingest.report.events import BatchObserver, Event, RunFinished, ignore_batch
 from mosaico_ingest.report.model import RunReport, UsedManifest
-from mosaico_ingest.report.write import write_report
+from mosaico_ingest.report.write import check_file, write_report
 
 __all__ = ["run_configs"]
+
+P = ParamSpec("P")
 
 
 def run_configs(
@@ -45,6 +50,9 @@ def run_configs(
     interrupt_on_terminate()
     collect_as_usual()
     failures: list[RunFinished] = []
+    targets = {path for path in (report, *map(_report_path, configs)) if path is not None}
+    for target in targets:
+        check_file(target)
 
     def tell(position: int, event: Event) -> None:
         if isinstance(event, RunFinished) and event.error is not None:
@@ -56,19 +64,21 @@ def run_configs(
     with _display(configs, as_json=as_json, quiet=quiet) as observe:
         chosen = executor or _executor(configs, jobs, prepare)
         result = api.run(configs, executor=chosen, observe=tell, manifests=manifests)
-    finished(result)
-    for target in {
-        path for path in (report, *(_report_path(config) for config in configs)) if path is not None
-    }:
-        write_report(result, target)
+    unwritten = [
+        *_refusal(finished, result),
+        *(one for target in targets for one in _refusal(write_report, result, target)),
+    ]
     if not quiet and not as_json:
         from mosaico_ingest.cli.tables import print_report
 
         print_report(result)
-    if failures and not as_json:
-        _print_failures(failures)
-    if result.exit_code:
-        raise typer.Exit(result.exit_code)
+    errors = [] if as_json else [(failure.error or "", failure.findings) for failure in failures]
+    errors += [(str(error), error.findings) for error in unwritten]
+    if errors:
+        _print_errors(errors)
+    code = SinkError.exit_code if unwritten and result.exit_code in {0, 4} else result.exit_code
+    if code:
+        raise typer.Exit(code)
 
 
 def _display(
@@ -85,11 +95,19 @@ def _display(
     return display(tally)
 
 
-def _print_failures(failures: Sequence[RunFinished]) -> None:
+def _refusal(write: Callable[P, None], *given: P.args, **named: P.kwargs) -> Iterator[SinkError]:
+    """Yield what keeps a file from being written: it costs that file, not what else there is to say of the run."""
+    try:
+        write(*given, **named)
+    except SinkError as error:
+        yield error
+
+
+def _print_errors(errors: Iterable[tuple[str, Sequence[Finding]]]) -> None:
     from mosaico_ingest.cli.errors import print_error
 
-    for failure in failures:
-        print_error(failure.error or "", failure.findings)
+    for error, findings in errors:
+        print_error(error, findings)
 
 
 def _executor(

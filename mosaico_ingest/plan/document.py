@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from pathlib import Path
 from typing import Literal
 
 from pydantic import Field, JsonValue, ValidationError
 
 from mosaico_ingest.diagnostics import Severity, Stage
-from mosaico_ingest.errors import ManifestError, SinkError
+from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.policies import (
     IfExists,
     LoaderErrorPolicy,
@@ -18,6 +17,7 @@ from mosaico_ingest.policies import (
     TopicLevelErrorPolicy,
 )
 from mosaico_ingest.report.part import Part
+from mosaico_ingest.report.write import write_whole
 from mosaico_ingest.textfile import read_whole
 
 __all__ = [
@@ -228,12 +228,7 @@ def write_plan(document: PlanDocument, path: Path) -> None:
     """Write a plan file, whole or not at all.
 
     Raises:
+        ManifestError: It is a folder.
         SinkError: It cannot be written.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(document.model_dump_json(indent=2) + "\n", encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise SinkError(f"cannot write the plan: {error.strerror}", where=str(path)) from error
+    write_whole(path, document.model_dump_json(indent=2) + "\n")

@@ -10,7 +10,17 @@ from pydantic import ValidationError
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.report.model import RunReport
 
-__all__ = ["read_report", "write_report", "write_whole"]
+__all__ = ["check_file", "read_report", "write_report", "write_whole"]
+
+
+def check_file(path: Path) -> None:
+    """Refuse what cannot be a file to write, before there is anything to write.
+
+    Raises:
+        ManifestError: It is a folder.
+    """
+    if path.is_dir():
+        raise ManifestError("is a folder", where=str(path), hint="name a file")
 
 
 def write_report(report: RunReport, path: Path) -> None:
@@ -26,15 +36,17 @@ def write_whole(path: Path, text: str) -> None:
     """Write a text file, whole or not at all.
 
     Raises:
+        ManifestError: It is a folder.
         SinkError: The file cannot be written.
     """
+    check_file(path)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         partial.write_text(text, encoding="utf-8")
         partial.replace(path)
     except OSError as error:
-        raise SinkError(f"cannot write the report: {error.strerror}", where=str(path)) from error
+        raise SinkError(f"cannot be written: {error.strerror}", where=str(path)) from error
 
 
 def read_report(path: Path) -> RunReport:

@@ -159,3 +159,29 @@ def test_a_read_only_folder(ingest: Ingest, tmp_path: Path, monkeypatch: pytest.
         code, _, err = ingest(manifest)
     assert code == 1
     assert "mosaico" in err
+
+
+@pytest.mark.parametrize("option", ["--report", "--metrics"])
+def test_a_folder_in_place_of_a_file_to_write_is_said_before_anything_is_ingested(
+    ingest: Ingest, tmp_path: Path, option: str
+) -> None:
+    code, _, err = ingest(job(tmp_path, GOOD), option, ".")
+    assert (code, err) == (2, "error: .: is a folder — name a file\n")
+    assert not (tmp_path / "mosaico").exists()
+
+
+def test_a_file_that_cannot_be_written_costs_nothing_but_itself(ingest: Ingest, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    code, out, err = ingest(job(tmp_path, GOOD), "--metrics", "file/x.prom", "--report", "run.json")
+    assert code == 1
+    assert "messages written" in out
+    assert "file/x.prom: cannot be written: " in err
+    assert (tmp_path / "run.json").exists()
+
+
+def test_a_plan_that_cannot_be_written_is_said(ingest: Ingest, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    code, _, err = ingest("plan", job(tmp_path, GOOD), "--out", "file/plan.json")
+    assert code == 1
+    assert "file/plan.json: cannot be written: " in err
+    assert ingest("plan", "job.yaml", "--out", ".")[0] == 2
