@@ -141,6 +141,7 @@ def _pump(
 ) -> None:
     """Move every batch of the recording through its stream, writing on a thread of its own."""
     by_channel = {channel: stream for stream in streams for channel in stream.plan.channels}
+    said = frozenset(recording.losses)  # by a finding of the recording itself
     buffer = WriteBuffer(max_bytes=plan.memory_bytes // 4)
     try:
         _feed(plan, recording, by_channel, buffer, watch)
@@ -152,6 +153,8 @@ def _pump(
             observe(Noted(_padded(stream)))
     for loss in recording.losses:
         stream = by_channel.get(loss.channel) if loss.channel is not None else None
+        if loss.count == 0 and loss in said:
+            continue
         if loss.count == 0:
             observe(Noted(Finding("detour", Severity.INFO, f"{loss.file} at {loss.offset}: {loss.reason}")))
         else:

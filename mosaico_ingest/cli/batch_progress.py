@@ -10,10 +10,10 @@ from rich.table import Table
 from rich.text import Text
 
 from mosaico_ingest.cli.tally import Tally, Underway
-from mosaico_ingest.report.events import Event, Noted, RunFinished, Unreadable
-from mosaico_ingest.report.units import bytes_text, count_text, seconds_text
+from mosaico_ingest.report.events import Event, Noted, RunFinished, RunStatus, Unreadable
+from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text
 
-__all__ = ["BatchBoard", "BatchLines", "print_nothing"]
+__all__ = ["BatchBoard", "BatchLines", "print_nothing", "unreadable_text"]
 
 LINE_EVERY_S = 5.0
 
@@ -35,7 +35,7 @@ class BatchLines:
             case Noted():
                 self._print(f"{name}: note: {event.finding}")
             case Unreadable():
-                self._print(f"{name}: unreadable: {event.reason}")
+                self._print(f"{name}: {unreadable_text(event)}")
             case RunFinished():
                 self._print(f"{name}: {_ending(recording, event)}")
             case _:
@@ -64,7 +64,7 @@ class BatchBoard:
             case Noted():
                 self.say(Text(f"{name}: note: {event.finding}", style="yellow"))
             case Unreadable():
-                self.say(Text(f"{name}: unreadable: {event.reason}", style="red"))
+                self.say(Text(f"{name}: {unreadable_text(event)}", style="red"))
             case RunFinished() if event.error is not None:
                 self.say(Text(f"{name}: {_ending(recording, event)}", style="red"))
             case _:
@@ -90,7 +90,7 @@ def headline(batch: Tally) -> str:
     parts = [f"{batch.done} of {batch.recordings} recordings"]
     parts += [f"{batch.failed} failed"] if batch.failed else []
     if batch.read:
-        parts += [f"{count_text(batch.read)} messages"]
+        parts += [counted(batch.read, "message")]
         parts += [f"{count_text(batch.rejected)} rejected"] if batch.rejected else []
         rate = count_text(round(batch.read / batch.elapsed_s))
         parts += [f"{rate} msg/s, {bytes_text(batch.payload_bytes / batch.elapsed_s)}/s"]
@@ -105,6 +105,17 @@ def print_nothing(*_: object) -> None:
 def _ending(recording: Underway | None, event: RunFinished) -> str:
     if event.error is not None:
         return f"{event.status.value}: {event.error}"
+    if event.status is RunStatus.SKIPPED:
+        return event.status.value
     read = recording.read if recording else 0
     rejected = f", {count_text(recording.rejected)} rejected" if recording and recording.rejected else ""
-    return f"{event.status.value}, {count_text(read)} messages{rejected}"
+    return f"{event.status.value}, {counted(read, 'message')}{rejected}"
+
+
+def unreadable_text(event: Unreadable) -> str:
+    """Return what could not be read, as far as that can be told: how much, of which topic, where, and why."""
+    what = counted(event.count, "message") if event.count else ""
+    of = f"of {event.target}" if what and event.target else event.target or ""
+    at = "" if event.offset is None else f"at {event.offset}"
+    place = " ".join(part for part in (what, of, at) if part)
+    return f"unreadable: {place}: {event.reason}" if place else f"unreadable: {event.reason}"

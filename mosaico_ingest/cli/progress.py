@@ -13,7 +13,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from mosaico_ingest.cli.batch_progress import BatchBoard, BatchLines, print_nothing
+from mosaico_ingest.cli.batch_progress import BatchBoard, BatchLines, print_nothing, unreadable_text
 from mosaico_ingest.cli.console import Terminal
 from mosaico_ingest.cli.tally import Tally
 from mosaico_ingest.report.events import (
@@ -133,7 +133,7 @@ class _Lines:
             case Noted():
                 self._print(f"note: {event.finding}")
             case Unreadable():
-                self._print(f"unreadable: {event.reason}")
+                self._print(unreadable_text(event))
             case TopicProgress() if now >= self._next:
                 self._print(self._tally.headline())
                 self._next = now + PLAIN_EVERY_S
@@ -162,7 +162,7 @@ class _Board:
             case Noted():
                 self.say(Text(f"note: {event.finding}", style="yellow"))
             case Unreadable():
-                self.say(Text(f"unreadable: {event.reason}", style="red"))
+                self.say(Text(unreadable_text(event), style="red"))
             case _:
                 pass
 

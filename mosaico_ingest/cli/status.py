@@ -38,8 +38,10 @@ def status(
             table.add_column(name, overflow="fold")
         for one in found:
             style = STYLES[one.standing.value]
-            said = Text(f"{', '.join(one.files)}{f': {one.why}' if one.why else ''}")
-            table.add_row(one.sequence, Text(one.standing.value, style=style), said)
+            files = ", ".join(one.files)
+            known = one.why.startswith(files)  # an error says where it is from
+            said = one.why if known else f"{files}: {one.why}" if one.why else files
+            table.add_row(one.sequence, Text(one.standing.value, style=style), Text(said))
         console = open_console()
         console.print(table)
         counts = Counter(one.standing.value for one in found)

@@ -12,7 +12,7 @@ from mosaico_ingest.cli.console import Terminal
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.inspection import Inspection
 from mosaico_ingest.report.model import Report, RunReport, TopicReport
-from mosaico_ingest.report.units import bytes_text, count_text, seconds_text, time_text
+from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text, time_text
 
 __all__ = ["open_console", "print_inspection", "print_json", "print_report"]
 
@@ -40,14 +40,12 @@ def print_inspection(found: Inspection, *, as_json: bool) -> None:
         print_json(found.model_dump_json(indent=2))
         return
     console = open_console()
-    span = f"{time_text(found.start_ns)} .. {time_text(found.end_ns)} UTC"
+    span = ""
     if found.duration_s is not None:
-        span += f" ({seconds_text(found.duration_s)})"
-    messages = "?" if found.messages is None else count_text(found.messages)
+        span = f", {time_text(found.start_ns)} .. {time_text(found.end_ns)} UTC ({seconds_text(found.duration_s)})"
+    messages = "? messages" if found.messages is None else counted(found.messages, "message")
     console.print(Text(f"{', '.join(found.files)}", style="bold"))
-    console.print(
-        f"{found.container}, {bytes_text(found.size_bytes)}, {messages} messages, {span}", highlight=False
-    )
+    console.print(f"{found.container}, {bytes_text(found.size_bytes)}, {messages}{span}")
     table = Table(box=None, pad_edge=False, header_style="dim")
     for name, right in (
         ("topic", False),
@@ -73,12 +71,12 @@ def print_inspection(found: Inspection, *, as_json: bool) -> None:
             topic.adapter,
             style=style,
         )
-    console.print(table)
+    console.print(table if found.topics else "no topics")
     for topic in found.topics:
-        if topic.problem:
-            console.print(Text(f"{topic.topic}: {topic.problem}", style="yellow"))
+        if topic.problem and not any(topic.problem in finding for finding in found.findings):
+            console.print(Text(f"{topic.topic}: {topic.problem}", style="yellow"), soft_wrap=True)
     for finding in found.findings:
-        console.print(Text(f"note: {finding}", style="yellow"))
+        console.print(Text(f"note: {finding}", style="yellow"), soft_wrap=True)
 
 
 def print_report(report: RunReport) -> None:
@@ -110,10 +108,8 @@ def _print_batch(report: RunReport, console: Console) -> None:
             seconds_text(one.duration_s),
         )
     console.print(table)
-    bad = sum(one.exit_code not in {0, 4} for one in report.recordings)
-    written = count_text(sum(one.totals.written for one in report.recordings))
-    line = f"{len(report.recordings)} recordings, {bad} failed, {written} messages written"
-    console.print(Text(line, style="red" if bad else "green"), soft_wrap=True)
+    style = "green" if report.exit_code in {0, 4} else "red"
+    console.print(Text(report.headline, style=style), soft_wrap=True)
 
 
 def _print_recording(report: Report, console: Console) -> None:
@@ -178,6 +174,9 @@ def _print_totals(report: Report, console: Console) -> None:
     parts = [f"{count_text(totals.written)} of {count_text(totals.read)} messages written"]
     if totals.rejected:
         parts.append(f"{count_text(totals.rejected)} rejected")
+    if report.losses:
+        lost = sum(loss.count or 0 for loss in report.losses)
+        parts.append(f"{count_text(lost)} unreadable" if lost else "some unreadable")
     if totals.downsampled:
         parts.append(f"{count_text(totals.downsampled)} sampled away")
     if totals.stored_bytes:

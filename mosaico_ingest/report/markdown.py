@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from mosaico_ingest.report.kept import replay_command
 from mosaico_ingest.report.model import Report, RunReport
 from mosaico_ingest.report.slowness import STEP_WORDS, longest_step, slowest, total_seconds
-from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text
+from mosaico_ingest.report.units import bytes_text, count_text, seconds_text
 
 __all__ = ["markdown_summary"]
 
@@ -18,13 +18,8 @@ _MOST_ROWS = 100
 
 def markdown_summary(report: RunReport) -> str:
     """Return headline, a row for each recording, and what was rejected or went wrong."""
-    bad = [one for one in report.recordings if one.exit_code not in {0, 4}]
-    written = count_text(sum(one.totals.written for one in report.recordings))
-    headline = (
-        f"{counted(len(report.recordings), 'recording')}, {len(bad)} failed, {written} messages written"
-    )
     ordered = sorted(report.recordings, key=lambda one: one.exit_code == 0)
-    lines = [f"## Ingestion: {headline}", ""]
+    lines = [f"## Ingestion: {report.headline}", ""]
     if ordered:
         lines += ["| sequence | status | read | written | rejected | stored | time |"]
         lines += ["|---|---|---:|---:|---:|---:|---:|", *map(_row, ordered[:_MOST_ROWS])]

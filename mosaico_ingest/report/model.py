@@ -10,6 +10,7 @@ from mosaico_ingest.diagnostics import Stage
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.part import Part
 from mosaico_ingest.report.timeline import TimelineReport
+from mosaico_ingest.report.units import count_text, counted
 
 __all__ = [
     "Loss",
@@ -204,6 +205,16 @@ class RunReport(_Part):
     """Name and version of the program that wrote this."""
     manifests: tuple[UsedManifest, ...] = ()
     recordings: tuple[Report, ...]
+
+    @property
+    def headline(self) -> str:
+        """How many recordings, what became of them, and how many messages were written."""
+        failed = sum(one.exit_code not in {0, 4} for one in self.recordings)
+        skipped = sum(one.status is RunStatus.SKIPPED for one in self.recordings)
+        written = sum(one.totals.written for one in self.recordings)
+        parts = [counted(len(self.recordings), "recording"), f"{count_text(failed)} failed"]
+        parts += [f"{count_text(skipped)} skipped"] if skipped else []
+        return f"{', '.join(parts)}, {counted(written, 'message')} written"
 
     @computed_field
     @property

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from disks import read_only
+from rosbags.rosbag1 import Writer
 
 from mosaico_ingest.cli.app import main
 
@@ -185,3 +186,31 @@ def test_a_plan_that_cannot_be_written_is_said(ingest: Ingest, tmp_path: Path) -
     assert code == 1
     assert "file/plan.json: cannot be written: " in err
     assert ingest("plan", "job.yaml", "--out", ".")[0] == 2
+
+
+def test_what_a_damaged_recording_lost_is_said_once_with_its_place(ingest: Ingest, tmp_path: Path) -> None:
+    (tmp_path / "cut.mcap").write_bytes(QUICKSTART.read_bytes()[:300_000])
+    code, out, err = ingest("bag", "cut.mcap", "--name", "cut")
+    assert code == 4
+    assert err.count("without a footer") == 1
+    assert "unreadable: at 43: this chunk is cut off" in err
+    assert ", some unreadable, " in out
+
+
+def test_a_batch_says_how_many_recordings_were_skipped(ingest: Ingest, tmp_path: Path) -> None:
+    for name in ("a", "b", "c", "d"):
+        (tmp_path / f"{name}.mcap").write_bytes(QUICKSTART.read_bytes())
+    text = 'version: 1\nbag: {path: "*.mcap"}\nsequence: {if_exists: skip}\ntopics: [/battery]\n'
+    assert "4 recordings, 0 failed, 40 messages written" in ingest(job(tmp_path, text))[1]
+    _, out, err = ingest("job.yaml")
+    assert "4 recordings, 0 failed, 4 skipped, 0 messages written" in out
+    assert "a: skipped\n" in err
+
+
+def test_an_inspection_of_nothing_says_so(ingest: Ingest, tmp_path: Path) -> None:
+    with Writer(tmp_path / "none.bag"):
+        pass
+    first, *rest = ingest("inspect", "none.bag")[1].splitlines()
+    assert (first, rest[-1]) == ("none.bag", "no topics")
+    assert rest[0].startswith("ros1, ")
+    assert rest[0].endswith(", 0 messages")
