@@ -84,6 +84,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         # The reader of our output has gone, as in `ingest inspect x | head`: that is no error of ours.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
+    except OSError as error:  # a full disk, a file that may not be written: no mistake of ours
+        if debug:
+            raise
+        _complain(IngestError(error.strerror or str(error), where=error.filename and str(error.filename)))
+        sys.exit(IngestError.exit_code)
 
 
 def _with_command(arguments: list[str]) -> list[str]:

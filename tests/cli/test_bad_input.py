@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 from collections.abc import Callable
 from pathlib import Path
@@ -151,6 +152,17 @@ def test_debug_shows_the_traceback(tmp_path: Path) -> None:
 
     with pytest.raises(ManifestError):
         main(["--debug", str(tmp_path / "nowhere.yaml")])
+
+
+def test_a_file_that_may_not_be_written(ingest: Ingest, tmp_path: Path) -> None:
+    (tmp_path / "job.yaml").write_text("bag: {path: data/run.mcap}\ntopics: [!/cam]\n")
+    (tmp_path / "job.yaml").chmod(0o400)
+    refused = "(Read-only file system|Permission denied)"
+    with read_only(tmp_path):
+        code, _, err = ingest("lint", "--fix", str(tmp_path / "job.yaml"))
+        assert (code, bool(re.search(f"job.yaml: {refused}", err))) == (1, True)
+        code, _, err = ingest("schema", "job", "--write", str(tmp_path / "schemas"))
+        assert (code, bool(re.search(f"job.schema.json: cannot be written: {refused}", err))) == (1, True)
 
 
 def test_a_read_only_folder(ingest: Ingest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
