@@ -134,6 +134,7 @@ def init(
 ) -> None:
     """Write a first draft of an adapter: every field of the type, guesses by equal names."""
     from mosaico_ingest.executors.catalog import draft_adapter
+    from mosaico_ingest.textfile import write_whole
 
     if record is not None and bag is None:
         raise typer.BadParameter("it is read from a recording: give --bag", param_hint="--record")
@@ -150,8 +151,7 @@ def init(
     if out is None:
         typer.echo(text, nl=False)
         return
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(text, encoding="utf-8")
+    write_whole(out, text)
     typer.echo(f"{out} written; try it: ingest adapters test {out}")
 
 

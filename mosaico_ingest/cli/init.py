@@ -25,6 +25,7 @@ def init(
     from mosaico_ingest import api
     from mosaico_ingest.plan.draft import draft_manifest
     from mosaico_ingest.report.units import counted
+    from mosaico_ingest.textfile import write_whole
 
     if out is not None and out.exists() and not force:
         raise typer.BadParameter(f"{out} is there already; --force replaces it", param_hint="--out")
@@ -34,7 +35,6 @@ def init(
     if out is None:
         typer.echo(text, nl=False)
         return
-    folder.mkdir(parents=True, exist_ok=True)
-    out.write_text(text, encoding="utf-8")
+    write_whole(out, text)
     taken = sum(topic.problem is None for topic in found.topics)
     typer.echo(f"{out}: {counted(taken, 'topic')}; run it with `ingest {out}`")

@@ -27,7 +27,8 @@ def report(
     from mosaico_ingest.cli.tables import print_report
     from mosaico_ingest.report.markdown import markdown_summary
     from mosaico_ingest.report.page import html_page
-    from mosaico_ingest.report.write import read_report, write_whole
+    from mosaico_ingest.report.write import read_report
+    from mosaico_ingest.textfile import write_whole
 
     parts = [read_report(path) for path in paths]
     found = parts[0].model_copy(

@@ -87,7 +87,7 @@ def run(
     from mosaico_ingest.cli.without_pandas import forgo_pandas
     from mosaico_ingest.report.metrics import prometheus_text
     from mosaico_ingest.report.model import RunReport
-    from mosaico_ingest.report.write import check_file, write_whole
+    from mosaico_ingest.textfile import check_file, write_whole
 
     if bool(manifests) == (plan is not None):
         raise typer.BadParameter("name manifests, or a plan with --plan", param_hint="JOB.yaml")

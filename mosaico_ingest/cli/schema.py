@@ -36,6 +36,8 @@ def schema(
     ] = None,
 ) -> None:
     """Print, write or check the JSON Schemas (draft 2020-12); to write or check all of them, name none."""
+    from mosaico_ingest.textfile import write_whole
+
     wanted = [document] if document else list(Document)
     if write is None and check is None and document is None:
         raise typer.BadParameter("name one of " + ", ".join(one.value for one in Document))
@@ -43,8 +45,7 @@ def schema(
     for one in wanted:
         text = _text(one)
         if write is not None:
-            write.mkdir(parents=True, exist_ok=True)
-            _file(write, one).write_text(text, encoding="utf-8")
+            write_whole(_file(write, one), text)
         elif check is not None:
             stale += _is_stale(_file(check, one), text)
         else:

@@ -23,7 +23,8 @@ from mosaico_ingest.executors.executor import Executor
 from mosaico_ingest.executors.local import Inline
 from mosaico_ingest.report.events import BatchObserver, Event, RunFinished, ignore_batch
 from mosaico_ingest.report.model import RunReport, UsedManifest
-from mosaico_ingest.report.write import check_file, write_report
+from mosaico_ingest.report.write import write_report
+from mosaico_ingest.textfile import check_file
 
 __all__ = ["run_configs"]
 

@@ -17,8 +17,7 @@ from mosaico_ingest.policies import (
     TopicLevelErrorPolicy,
 )
 from mosaico_ingest.report.part import Part
-from mosaico_ingest.report.write import write_whole
-from mosaico_ingest.textfile import read_whole
+from mosaico_ingest.textfile import read_whole, write_whole
 
 __all__ = [
     "Decisions",
