@@ -7,7 +7,8 @@ import operator
 import re
 from collections.abc import Callable, Mapping
 from fnmatch import translate
-from typing import Any, Final, Protocol, cast
+from functools import reduce
+from typing import Any, Final, Protocol
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -40,6 +41,8 @@ class Test(Protocol):
 
 _HUGE = 2**1023
 """Whole numbers up to here are some float."""
+_GLOB_WORDS = re.compile(r"\[!?\]?[^]]*\]|.", re.DOTALL)
+"""A choice in brackets, or one character."""
 _COMPARISONS: Mapping[str, Callable[[Any, Any], Any]] = {
     "$eq": operator.eq,
     "$neq": operator.ne,
@@ -71,10 +74,9 @@ class Comparison:
             _COMPARISONS[self.operator](low if self.operator in {"$lt", "$leq"} else high, self.bound)
         )
 
-    def column(self, column: pc.Expression, kind: pa.DataType) -> pc.Expression:  # noqa: ARG002 - Arrow promotes
+    def column(self, column: pc.Expression, kind: pa.DataType) -> pc.Expression:
         """Return the comparison."""
-        compared: pc.Expression = _COMPARISONS[self.operator](column, self.bound)
-        return compared
+        return _compared(self.operator, column, self.bound, kind)
 
 
 @frozen
@@ -92,9 +94,9 @@ class Outside:
         """Return whether the span reaches outside."""
         return not _alike(low, self.low) or bool(low < self.low or high > self.high)
 
-    def column(self, column: pc.Expression, kind: pa.DataType) -> pc.Expression:  # noqa: ARG002 - Arrow promotes
+    def column(self, column: pc.Expression, kind: pa.DataType) -> pc.Expression:
         """Return both comparisons."""
-        return (column < pc.scalar(self.low)) | (column > pc.scalar(self.high))
+        return _compared("$lt", column, self.low, kind) | _compared("$gt", column, self.high, kind)
 
 
 @frozen
@@ -113,11 +115,8 @@ class Choice:
 
     def column(self, column: pc.Expression, kind: pa.DataType) -> pc.Expression:
         """Return the membership."""
-        return column.isin(pa.array(list[Any](self.choices)).cast(kind))
-
-
-_GLOB_PART = re.compile(r"(?P<stars>\*+)|\[!?\]?[^\]]*\]|.", re.DOTALL)
-"""Stars, a set, or a character; `translate` writes each but the stars as `(?s:…)\\Z`."""
+        equal = (_compared("$eq", column, choice, kind) for choice in self.choices)
+        return reduce(operator.or_, equal)
 
 
 @frozen
@@ -128,22 +127,19 @@ class Glob:
 
     def holds(self, value: Any) -> bool:  # noqa: ANN401 - see Test
         """Return whether the value is a text of that form."""
-        return isinstance(value, str) and re.match(translate(self._glob), value) is not None
+        return isinstance(value, str) and re.fullmatch(self._expression(), value) is not None
 
     def may_hold(self, low: Any, high: Any) -> bool:  # noqa: ANN401, ARG002 - see Test
         """Return that it may."""
         return True
 
     def column(self, column: pc.Expression, kind: pa.DataType) -> pc.Expression:  # noqa: ARG002 - text only
-        """Return the match in the dialect of RE2, which lacks what `translate` makes of several stars."""
-        parts = (
-            ".*" if part["stars"] else translate(part[0])[4:-3] for part in _GLOB_PART.finditer(self._glob)
-        )
-        return pc.match_substring_regex(column, f"^(?s:{''.join(parts)})$")
+        """Return the match."""
+        return pc.match_substring_regex(column, f"^{self._expression()}$")
 
-    @property
-    def _glob(self) -> str:
-        return self.pattern.replace("#", "[0-9]")
+    def _expression(self) -> str:
+        """Return the pattern in words that Python and Arrow share: fnmatch alone looks ahead where there are several `*`."""
+        return f"(?s:{''.join(map(_spelled, _GLOB_WORDS.findall(self.pattern)))})"
 
 
 @frozen
@@ -166,22 +162,53 @@ class Presence:
         return ~absent if self.wanted else absent
 
 
+def _spelled(word: str) -> str:
+    """Return one word of a glob as a regular expression."""
+    if word == "*":
+        return ".*"
+    expression = translate("[0-9]" if word == "#" else word.replace("#", "0-9"))
+    return expression[len("(?s:") : -len(r")\Z")].replace("(?!)", r"[^\s\S]")  # nothing, as of [z-a]
+
+
 def tests_of(conditions: object, *, of: str) -> list[Test]:
     """Return the tests in `{operator: value, …}`, or refuse what is no such thing."""
     if not isinstance(conditions, Mapping):
         raise Refusal(Condition.INVALID, f"{of}: {conditions!r} is not {{operator: value}}")
-    return [
-        test for name, operand in conditions.items() for test in _tests(str(name), _storable(operand), of)
-    ]
+    return [test for name, operand in conditions.items() for test in _tests(str(name), operand, of)]
 
 
-def _storable(operand: object) -> object:
-    """Return an operand whose numbers Arrow can hold: whole ones beyond 64 bits as the nearest float."""
-    if isinstance(operand, list):
-        return [_storable(each) for each in cast("list[object]", operand)]  # JSON has no other lists
-    if isinstance(operand, int) and not -(2**63) <= operand < 2**63:
-        return float(operand) if abs(operand) < _HUGE else math.copysign(math.inf, operand)
-    return operand
+def _compared(name: str, column: pc.Expression, bound: str | float, kind: pa.DataType) -> pc.Expression:
+    """Return a comparison; whole numbers are compared as such, since Arrow refuses those no float can hold."""
+    if pa.types.is_integer(kind) and not isinstance(bound, str | bool):
+        return _compared_whole(name, column, bound, kind)
+    if isinstance(bound, int) and not isinstance(bound, bool):
+        bound = float(bound) if abs(bound) < _HUGE else math.copysign(math.inf, bound)
+    compared: pc.Expression = _COMPARISONS[name](column, bound)
+    return compared
+
+
+def _compared_whole(name: str, column: pc.Expression, bound: float, kind: pa.DataType) -> pc.Expression:
+    signed = pa.types.is_signed_integer(kind)
+    high = 2 ** (kind.bit_width - signed) - 1
+    low = -high - 1 if signed else 0
+
+    def above(limit: int) -> pc.Expression:
+        if limit < low:
+            return column >= pa.scalar(low, kind)
+        return column > pa.scalar(min(limit, high), kind)
+
+    if math.isnan(bound):
+        return ~above(high) if name == "$neq" else above(high)
+    near = max(low - 1, min(bound, high + 1))
+    at, below = math.floor(near), math.ceil(near) - 1
+    match name:
+        case "$gt" | "$leq":
+            return above(at) if name == "$gt" else ~above(at)
+        case "$geq" | "$lt":
+            return above(below) if name == "$geq" else ~above(below)
+        case _:
+            equal = above(below) & ~above(at)
+            return equal if name == "$eq" else ~equal
 
 
 def _tests(name: str, operand: object, of: str) -> list[Test]:
