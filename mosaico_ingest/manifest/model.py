@@ -212,7 +212,8 @@ class AdaptersSection(_Section):
     )
     """Adapters that serve every topic of their types: YAML files, `module:Class` or `file.py:Class`."""
     override: dict[Text, Text] = Field(default={}, examples=[{"/lidar/*": "LidarAdapter"}])
-    """The adapter for a topic name or glob: one of the above, or the name of a built-in one."""
+    """The adapter for a topic name or glob: one of the above, or the name of a built-in one. A topic's own name counts before
+    globs, the first glob before later ones."""
     unmodeled: Unmodeled = Unmodeled.KEEP
     """What to do with a type that no adapter takes: keep its ROS shape, skip its topics, fail."""
     serialization_formats: dict[Text, Literal["default", "ragged", "image"]] = Field(
@@ -230,7 +231,7 @@ class OnErrorSection(_Section):
         default=TopicLevelErrorPolicy.Raise, examples=["raise", {"default": "raise", "/gps/*": "ignore"}]
     )
     """After an error in a topic: raise (end the run), ignore (reject the message), finalize (close the topic); one word,
-    or one for each name or glob, `default` for the rest."""
+    or one for each name or glob, own names before globs, the first glob before later ones, `default` for the rest."""
     message: LoaderErrorPolicy = LoaderErrorPolicy.LOG_WARN
     """For a message whose bytes do not fit its type: ignore (count it), log_warn (and say so), raise (end the run)."""
 
@@ -288,7 +289,7 @@ class RunSection(_Section):
     report: Text | None = Field(default=None, examples=["report.json"])
     """The file the run's report is written to."""
     memory: SizeText | None = Field(default=None, examples=["512MiB"])
-    """How much memory batches may take."""
+    """How much memory batches may take, all `jobs` together; 256 MiB if not said."""
     jobs: Annotated[int, Field(ge=1, le=1024)] = 1
     """How many recordings are ingested at the same time."""
 
@@ -312,9 +313,9 @@ class Manifest(_Section):
     sequence: SequenceSection = SequenceSection()
     """What the recording becomes."""
     topics: tuple[Text, ...] = Field(default=(), examples=[["/cam*", "!/cam/debug*"]])
-    """Globs in order, the last that matches decides, `!` leaves out; without any, every topic."""
+    """Globs in order, the last that matches decides, `!` leaves out, `*` stands for `/` too; without any, every topic."""
     topic_settings: dict[Text, TopicSettings] = Field(default={}, examples=[{"/camera/*": {"every": 3}}])
-    """What is special about a topic name or glob."""
+    """What is special about a topic name or glob. Each setting is that of the topic's own name, else of the first glob that has it."""
     adapters: AdaptersSection = AdaptersSection()
     """How messages become ontology records where the built-in adapters are not wanted."""
     on_error: OnErrorSection = OnErrorSection()
