@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias, TypeVar, get_args
 
 from mosaico_ingest.diagnostics import Span
-from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.frozen import frozen
 from mosaico_ingest.patterns import first_match
 from mosaico_ingest.policies import (
@@ -128,8 +128,7 @@ class ROSInjectionConfig:
     Nothing said about the destination is the embedded store `./mosaico`, a `store` is that store, a `host` a server.
 
     Raises:
-        ManifestError: A value is not what it must be, or two contradict each other.
-        SinkError: The platform refuses the sequence's name, a topic's new name or the metadata.
+        ManifestError: A value is not what it must be, two contradict each other, or the platform refuses a name or the metadata.
     """
 
     file_path: AnyPath | str | Sequence[AnyPath | str]
@@ -211,9 +210,12 @@ class ROSInjectionConfig:
         self._normalise_policies()
         self._normalise_adapters()
         self._check_destination()
-        self._check_topics()
-        check_sequence_name(self.sequence_name)
-        check_metadata(self.metadata, where=self.where or "metadata")
+        try:
+            self._check_topics()
+            check_sequence_name(self.sequence_name)
+            check_metadata(self.metadata, where=self.where or "metadata")
+        except SinkError as error:
+            raise ManifestError(error.what, where=error.where, hint=error.hint) from error
 
     @property
     def paths(self) -> tuple[AnyPath, ...]:
@@ -308,7 +310,7 @@ class ROSInjectionConfig:
         for topic, metadata in self.topic_metadata.items():
             check_metadata(metadata, where=f"{self.where or 'topic_metadata'}: topic {topic}")
         for topic, name in self.rename.items():
-            check_topic_name(name)
+            self._check_new_name(topic, name)
             if any(character in topic for character in "*?["):
                 raise self._error(f"rename[{topic!r}] is for every topic of a glob", "name one topic")
         for topic, step in self.every.items():
@@ -331,6 +333,13 @@ class ROSInjectionConfig:
         except ValueError as err:
             allowed = ", ".join(str(choice.value) for choice in kind)
             raise self._error(f"{name} is {value!r}", f"allowed: {allowed}") from err
+
+    def _check_new_name(self, topic: str, name: str) -> None:
+        try:
+            check_topic_name(name)
+        except SinkError as error:
+            error.where = f"{self.where or 'rename'}: topic {topic}"
+            raise
 
     def _error(self, what: str, hint: str) -> ManifestError:
         return ManifestError(what, where=self.where, hint=hint)

@@ -5,11 +5,23 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from difflib import get_close_matches
 from enum import Enum
 
 from mosaico_ingest.frozen import frozen
 
-__all__ = ["Edit", "Finding", "RowFailure", "Severity", "Span", "Stage", "a_few", "encodable", "one_line"]
+__all__ = [
+    "Edit",
+    "Finding",
+    "RowFailure",
+    "Severity",
+    "Span",
+    "Stage",
+    "a_few",
+    "encodable",
+    "offered",
+    "one_line",
+]
 
 _ESCAPED_BYTES = 0xDC00
 """Where Python puts the bytes of a file name that it cannot decode."""
@@ -33,6 +45,15 @@ def a_few(names: Iterable[str], *, most: int = 8) -> str:
     known = sorted(names)
     more = f" and {len(known) - most:,} more" if len(known) > most else ""
     return f"{', '.join(known[:most])}{more}"
+
+
+def offered(names: Iterable[str], wanted: Iterable[str] = ()) -> str:
+    """Return what there is in place of what was wanted, as a hint: the nearest, then a few."""
+    known = sorted(names)
+    close = (get_close_matches(word.lstrip("!"), known, n=1, cutoff=0.5) for word in wanted)
+    near = dict.fromkeys(name for found in close for name in found)
+    listed = f"there are {a_few(known)}" if known else "there are none"
+    return f"the nearest is {a_few(near)}; {listed}" if near else listed
 
 
 def _spelled(match: re.Match[str]) -> str:

@@ -47,9 +47,7 @@ def discover(paths: Sequence[AnyPath]) -> Found:
 
 def _one(path: AnyPath) -> Found:
     if not path.exists():
-        raise BagError(
-            "does not exist", where=str(path), hint="check the path; relative ones start at the manifest"
-        )
+        raise BagError("does not exist", where=str(path), hint="check the path")
     if path.is_dir():
         return _directory(path)
     if path.name == FILE_NAME:

@@ -10,7 +10,7 @@ from mosaico_ingest.adapters.adapter import AdapterSpec
 from mosaico_ingest.adapters.reference import adapter_spec
 from mosaico_ingest.bag.writing import RecordingWriter, open_writer
 from mosaico_ingest.bag.writing.opening import ROS_VERSIONS
-from mosaico_ingest.diagnostics import a_few
+from mosaico_ingest.diagnostics import offered
 from mosaico_ingest.errors import AdapterError, BagError, NothingMatched
 from mosaico_ingest.export.account import ExportReport, TopicExport
 from mosaico_ingest.export.origin import origin_of, version_of
@@ -74,8 +74,8 @@ def _selected(found: SequenceInfo, patterns: Sequence[str]) -> tuple[TopicInfo, 
     names = [topic.name for topic in found.topics]
     selection = select(patterns, names)
     if not selection.selected:
-        what = f"no topic matches {list(patterns)}" if names else "the sequence has no topic"
-        raise NothingMatched(what, where=found.name, hint=f"there are {a_few(names)}" if names else None)
+        what = f"no topic matches {', '.join(map(repr, patterns))}" if names else "the sequence has no topic"
+        raise NothingMatched(what, where=found.name, hint=offered(names, patterns) if names else None)
     return tuple(topic for topic in found.topics if topic.name in selection.selected)
 
 

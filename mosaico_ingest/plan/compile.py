@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from mosaico_ingest.config import Limit, QuarantineSettings, ROSInjectionConfig, TimeBound, TimeRange
-from mosaico_ingest.errors import ManifestError, SinkError
+from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.manifest.load import LoadedManifest
 from mosaico_ingest.manifest.units import parse_instant, parse_limit, parse_offset, parse_size
 from mosaico_ingest.plan.recordings import Recording, find_recordings, sequence_name
@@ -31,8 +31,8 @@ def compile_manifest(loaded: LoadedManifest) -> tuple[ROSInjectionConfig, ...]:
 
     Raises:
         NothingMatched: A file is not there, or a glob matches no recording.
-        ManifestError: Two recordings would get the same name, or a file the manifest names cannot be used.
-        SinkError: The platform refuses the sequence's name or metadata.
+        ManifestError: Two recordings would get the same name, the platform refuses one, or a file the manifest names
+            cannot be used.
     """
     recordings = find_recordings(loaded)
     names = [sequence_name(loaded, recording) for recording in recordings]
@@ -48,7 +48,7 @@ def _config(
 ) -> ROSInjectionConfig:
     try:
         return ROSInjectionConfig(file_path=recording.paths, sequence_name=name, **fields)
-    except SinkError as err:
+    except ManifestError as err:
         if err.where is None:
             err.where = loaded.where("sequence", "name")
         raise

@@ -9,7 +9,7 @@ from mosaico_ingest.bag.recording import Recording
 from mosaico_ingest.bag.types import TypeResolver
 from mosaico_ingest.bridge import ROSBridge
 from mosaico_ingest.config import DEFAULT_TOPIC, ROSInjectionConfig, TimeBound, TimeRange
-from mosaico_ingest.diagnostics import Finding, Severity, Span, a_few, encodable
+from mosaico_ingest.diagnostics import Finding, Severity, Span, encodable, offered
 from mosaico_ingest.errors import AdapterError, BagError, NothingMatched
 from mosaico_ingest.patterns import Selection, first_match, select
 from mosaico_ingest.plan.describe import check_digest
@@ -147,9 +147,9 @@ def _nothing(config: ROSInjectionConfig, recording: Recording, left: list[LeftOu
     if not left:
         return NothingMatched("the recording has no topic", where=where)
     if config.topics and all("`topics`" in one.why for one in left):
-        names = a_few({one.topic for one in left})
+        what = f"no topic matches {', '.join(map(repr, config.topics))}"
         return NothingMatched(
-            f"no topic matches {list(config.topics)}", where=where, hint=f"the recording has {names}"
+            where=where, what=what, hint=offered({one.topic for one in left}, config.topics)
         )
     first = left[0]
     return NothingMatched(

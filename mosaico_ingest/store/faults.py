@@ -23,6 +23,8 @@ _HINTS = {
     errno.EROFS: "choose a target.store that can be written",
     errno.EACCES: "choose a target.store that can be written",
     errno.EPERM: "choose a target.store that can be written",
+    errno.EEXIST: "a file is in the way; choose another target.store",
+    errno.ENOTDIR: "a file is in the way; choose another target.store",
     errno.EMFILE: "raise the limit of open files (ulimit -n)",
     errno.ENOENT: "the store was changed by something else; check it and run again",
 }

@@ -9,7 +9,7 @@ from typing import Any
 import pyarrow as pa
 
 from mosaico_ingest import wire
-from mosaico_ingest.diagnostics import a_few
+from mosaico_ingest.diagnostics import offered
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.path import AnyPath, RemotePath, as_path
@@ -91,7 +91,9 @@ class Store:
         info = self.catalog.sequence(name)
         if info is None:
             known = self.catalog.names()
-            raise NotInStore(f"there is no sequence {name!r}", where=str(self.path), hint=_listed(known))
+            raise NotInStore(
+                f"there is no sequence {name!r}", where=str(self.path), hint=offered(known, [name])
+            )
         return info
 
     def topic(self, sequence: str, topic: str) -> TopicInfo:
@@ -103,7 +105,7 @@ class Store:
         topics = {info.name: info for info in self.sequence(sequence).topics}
         name = f"/{topic.removeprefix('/')}"
         if name not in topics:
-            raise NotInStore(f"there is no topic {name!r}", where=sequence, hint=_listed(list(topics)))
+            raise NotInStore(f"there is no topic {name!r}", where=sequence, hint=offered(topics, [name]))
         return topics[name]
 
     def create_sequence(self, sequence: str, metadata: Mapping[str, Any]) -> None:
@@ -190,10 +192,8 @@ class Store:
 def _chosen(schema: pa.Schema, columns: Sequence[str], *, where: str) -> pa.Schema:
     unknown = [name for name in columns if name not in schema.names]
     if unknown:
-        raise SinkError(f"there is no column {unknown[0]!r}", where=where, hint=_listed(schema.names))
+        raise SinkError(
+            f"there is no column {unknown[0]!r}", where=where, hint=offered(schema.names, unknown[:1])
+        )
     wanted = dict.fromkeys([schema.names[0], *columns])
     return pa.schema([schema.field(name) for name in wanted])
-
-
-def _listed(known: Sequence[str]) -> str:
-    return f"there are {a_few(known)}" if known else "there are none"

@@ -39,7 +39,7 @@ def _refuse(name: str, bad: re.Match[str] | None, *, kind: str, allowed: str) ->
     if bad is not None:
         hint = "set sequence.name" if kind == "sequence" else "rename it in topic_settings"
         raise SinkError(
-            f"{kind} name {name!r} has {bad.group()!r} at position {bad.start()}; allowed is {allowed}",
+            f"{kind} name {name!r} has {bad.group()!r}; allowed is {allowed}",
             hint=hint,
         )
 

@@ -226,3 +226,44 @@ def test_an_inspection_of_nothing_says_so(ingest: Ingest, tmp_path: Path) -> Non
     assert (first, rest[-1]) == ("none.bag", "no topics")
     assert rest[0].startswith("ros1, ")
     assert rest[0].endswith(", 0 messages")
+
+
+@pytest.mark.parametrize(
+    ("settings", "place"),
+    [
+        ("sequence: {name: a/b}", "job.yaml:2:18: sequence name 'a/b' has '/'"),
+        ("sequence: {metadata: {a.b: 1}}", "job.yaml: metadata key 'a.b'"),
+        ('topic_settings: {/imu: {rename: "/a b"}}', "job.yaml: topic /imu: topic name '/a b' has ' '"),
+        ("topic_settings: {/imu: {metadata: {a.b: 1}}}", "job.yaml: topic /imu: metadata key 'a.b'"),
+    ],
+)
+def test_a_name_that_the_platform_refuses_is_a_mistake_of_the_manifest(
+    ingest: Ingest, tmp_path: Path, settings: str, place: str
+) -> None:
+    code, _, err = ingest(job(tmp_path, f"bag: {{path: {QUICKSTART}}}\n{settings}\n"))
+    assert (code, err.count("\n")) == (2, 1)
+    assert err.startswith(f"error: {place}")
+
+
+def test_a_name_that_is_not_there_is_answered_with_the_nearest(ingest: Ingest) -> None:
+    code, _, err = ingest("bag", str(QUICKSTART), "--name", "drive", "--topics", "gps/fx", "--topics", "imu")
+    assert code == 3
+    assert "no topic matches 'gps/fx', 'imu' — the nearest is /gps/fix, /imu; there are " in err
+    ingest("bag", str(QUICKSTART), "--name", "drive", "--topics", "/imu")
+    assert "the nearest is drive; there are drive\n" in ingest("store", "show", "drvie")[2]
+    assert (
+        "the nearest is /imu; there are /imu\n" in ingest("export", "drive", "--to", "x.mcap", "-t", "/iu")[2]
+    )
+
+
+def test_a_file_where_the_store_should_be_is_said(ingest: Ingest, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    code, _, err = ingest("bag", str(QUICKSTART), "--name", "drive", "--store", "file")
+    assert code == 1
+    assert "error: file: File exists — a file is in the way; choose another target.store\n" in err
+
+
+def test_an_adapter_file_that_is_not_there_is_named_once(ingest: Ingest) -> None:
+    ingest("bag", str(QUICKSTART), "--name", "drive", "--topics", "/imu")
+    err = ingest("export", "drive", "--to", "x.mcap", "--adapter", "no.yaml")[2]
+    assert err == "error: no.yaml: the adapter file cannot be read: No such file or directory\n"

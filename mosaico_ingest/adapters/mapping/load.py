@@ -208,8 +208,10 @@ def _source(path_or_text: Path | str, file: str | None = None) -> Source:
         file = file or str(path_or_text)
         try:
             path_or_text = read_whole(path_or_text).decode()
-        except (OSError, UnicodeDecodeError) as error:
-            raise AdapterError(f"the adapter file cannot be read: {error}", where=file) from error
+        except OSError as error:
+            raise AdapterError(f"the adapter file cannot be read: {error.strerror}", where=file) from error
+        except UnicodeDecodeError as error:
+            raise AdapterError(f"the adapter file is no UTF-8: {error}", where=file) from error
     return load_source(path_or_text, file=file or "<adapter>")
 
 
