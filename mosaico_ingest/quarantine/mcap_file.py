@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
@@ -12,14 +11,13 @@ from typing import BinaryIO
 from typing_extensions import Self
 
 from mosaico_ingest.bag.batch import Channel, Encoding
+from mosaico_ingest.bag.containers.magics import MCAP
+from mosaico_ingest.bag.containers.mcap_records import RECORD, Op, record_bytes, text_bytes, texts_bytes
 from mosaico_ingest.bag.definition import Definition, Source
+from mosaico_ingest.bag.names import short_msgtype
 
 __all__ = ["McapFile"]
 
-_MAGIC = b"\x89MCAP0\r\n"
-_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE = range(1, 6)
-_STATISTICS, _DATA_END = 0x0B, 0x0F
-_RECORD = struct.Struct("<BQ")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 _LIBRARY = "mosaico-ingest"
 
@@ -41,8 +39,8 @@ class McapFile:
         self._schemas: dict[int, bytes] = {}
         self._counts: dict[int, int] = {}
         self._span: tuple[int, int] | None = None
-        self._file.write(_MAGIC)
-        self._put(_HEADER, _text("") + _text(_LIBRARY))
+        self._file.write(MCAP)
+        self._put(Op.HEADER, text_bytes("") + text_bytes(_LIBRARY))
 
     def __enter__(self) -> Self:
         return self
@@ -59,7 +57,7 @@ class McapFile:
             self._open(channel)
         count = self._counts[number] = self._counts.get(number, 0) + 1
         head = _MESSAGE_HEAD.pack(number + 1, count, log_time_ns, log_time_ns)
-        self._put(_MESSAGE, head + payload)
+        self._put(Op.MESSAGE, head + payload)
         low, high = self._span or (log_time_ns, log_time_ns)
         self._span = min(low, log_time_ns), max(high, log_time_ns)
 
@@ -67,13 +65,13 @@ class McapFile:
         """Write the summary and close the file; twice does no harm."""
         if self._file.closed:
             return
-        self._put(_DATA_END, struct.pack("<I", 0))
+        self._put(Op.DATA_END, struct.pack("<I", 0))
         start = self._file.tell()
         summary = b"".join((*self._schemas.values(), *self._channels.values(), self._statistics()))
         self._file.write(summary)
-        footer = _RECORD.pack(_FOOTER, 20) + struct.pack("<QQ", start, 0)
+        footer = RECORD.pack(Op.FOOTER, 20) + struct.pack("<QQ", start, 0)
         crc = zlib.crc32(summary + footer)
-        self._file.write(footer + struct.pack("<I", crc) + _MAGIC)
+        self._file.write(footer + struct.pack("<I", crc) + MCAP)
         self._file.close()
 
     def _open(self, channel: Channel) -> None:
@@ -81,12 +79,18 @@ class McapFile:
         ros1 = channel.encoding is Encoding.ROS1
         known = channel.definition
         embedded = known is not None and known.source is Source.BAG
-        schema = struct.pack("<H", number) + _text(_schema_name(channel, known))
-        schema += _text("ros1msg" if ros1 else "ros2msg") + _text(known.text if known and embedded else "")
+        schema = struct.pack("<H", number) + text_bytes(_schema_name(channel, known))
+        schema += text_bytes("ros1msg" if ros1 else "ros2msg") + text_bytes(
+            known.text if known and embedded else ""
+        )
         kept = {key: value for key, value in channel.attributes.items() if key == "offered_qos_profiles"}
-        body = struct.pack("<HH", number, number) + _text(channel.topic) + _text(channel.encoding.value)
-        self._schemas[channel.id] = _record(_SCHEMA, schema)
-        self._channels[channel.id] = _record(_CHANNEL, body + _texts(kept))
+        body = (
+            struct.pack("<HH", number, number)
+            + text_bytes(channel.topic)
+            + text_bytes(channel.encoding.value)
+        )
+        self._schemas[channel.id] = record_bytes(Op.SCHEMA, schema)
+        self._channels[channel.id] = record_bytes(Op.CHANNEL, body + texts_bytes(kept))
         self._file.write(self._schemas[channel.id] + self._channels[channel.id])
 
     def _statistics(self) -> bytes:
@@ -104,26 +108,12 @@ class McapFile:
             high,
             len(counts),
         )
-        return _record(_STATISTICS, head + counts)
+        return record_bytes(Op.STATISTICS, head + counts)
 
     def _put(self, kind: int, body: bytes) -> None:
-        self._file.write(_record(kind, body))
+        self._file.write(record_bytes(kind, body))
 
 
 def _schema_name(channel: Channel, known: Definition | None) -> str:
     name = known.root if known is not None else channel.msgtype
-    return name.replace("/msg/", "/") if channel.encoding is Encoding.ROS1 else name
-
-
-def _record(kind: int, body: bytes) -> bytes:
-    return _RECORD.pack(kind, len(body)) + body
-
-
-def _text(text: str) -> bytes:
-    data = text.encode()
-    return struct.pack("<I", len(data)) + data
-
-
-def _texts(entries: Mapping[str, str]) -> bytes:
-    body = b"".join(_text(key) + _text(value) for key, value in entries.items())
-    return struct.pack("<I", len(body)) + body
+    return short_msgtype(name) if channel.encoding is Encoding.ROS1 else name

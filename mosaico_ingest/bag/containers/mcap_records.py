@@ -1,9 +1,9 @@
-"""This file takes the records of an MCAP file apart: kinds, lengths, schemas, channels, chunk heads."""
+"""This file takes the records of an MCAP file apart, kinds, schemas, channels, chunk heads, and spells new ones."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from mosaico_ingest.bag.containers.source import Fields
 from mosaico_ingest.errors import BagError
@@ -17,8 +17,11 @@ __all__ = [
     "Schema",
     "channel_of",
     "chunk_head",
+    "record_bytes",
     "records_in",
     "schema_of",
+    "text_bytes",
+    "texts_bytes",
 ]
 
 RECORD = struct.Struct("<BQ")
@@ -30,6 +33,7 @@ class Op:
 
     HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
     STATISTICS = 0x0B
+    SUMMARY_OFFSET = 0x0E
     DATA_END = 0x0F
 
 
@@ -105,3 +109,20 @@ def records_in(data: bytes) -> Iterator[tuple[int, int, int]]:
             raise BagError(f"a record of {length} bytes with {len(data) - at} left")
         yield op, at, at + length
         at += length
+
+
+def record_bytes(op: int, content: bytes | bytearray) -> bytes:
+    """Return a record of a kind."""
+    return RECORD.pack(op, len(content)) + content
+
+
+def text_bytes(text: str) -> bytes:
+    """Return a text behind its length."""
+    data = text.encode()
+    return struct.pack("<I", len(data)) + data
+
+
+def texts_bytes(texts: Mapping[str, str]) -> bytes:
+    """Return a map of texts behind its length in bytes."""
+    data = b"".join(text_bytes(part) for item in texts.items() for part in item)
+    return struct.pack("<I", len(data)) + data

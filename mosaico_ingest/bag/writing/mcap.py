@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import zstandard
 
 from mosaico_ingest.bag.containers.magics import MCAP
-from mosaico_ingest.bag.containers.mcap_records import RECORD, Op
+from mosaico_ingest.bag.containers.mcap_records import RECORD, Op, record_bytes, text_bytes, texts_bytes
 from mosaico_ingest.bag.definition import Definition
 from mosaico_ingest.bag.names import short_msgtype
 from mosaico_ingest.errors import BagError
@@ -20,7 +19,6 @@ from mosaico_ingest.version import __version__
 __all__ = ["McapWriter"]
 
 _CHUNK_BYTES = 4 << 20
-_SUMMARY_OFFSET = 0x0E
 _MESSAGE = struct.Struct("<HIQQ")
 _MAX_CHANNELS = 65535
 
@@ -62,7 +60,7 @@ class McapWriter:
         self._versions.append(version)
         encoding = "ros1" if version == 1 else "cdr"
         content = struct.pack("<HH", number, self._schema(definition))
-        self._add(Op.CHANNEL, content + _text(topic) + _text(encoding) + _texts({}))
+        self._add(Op.CHANNEL, content + text_bytes(topic) + text_bytes(encoding) + texts_bytes({}))
         self._counts[number] = 0
         return number
 
@@ -92,7 +90,7 @@ class McapWriter:
         groups = [
             (Op.SCHEMA, [record for record in self._records if record[0] == Op.SCHEMA]),
             (Op.CHANNEL, [record for record in self._records if record[0] == Op.CHANNEL]),
-            (Op.STATISTICS, [_record(Op.STATISTICS, self._statistics())]),
+            (Op.STATISTICS, [record_bytes(Op.STATISTICS, self._statistics())]),
             (Op.CHUNK_INDEX, self._chunk_indexes),
         ]
         summary, offsets = b"", b""
@@ -100,7 +98,7 @@ class McapWriter:
             group = b"".join(records)
             if group:
                 place = struct.pack("<BQQ", op, start + len(summary), len(group))
-                offsets += _record(_SUMMARY_OFFSET, place)
+                offsets += record_bytes(Op.SUMMARY_OFFSET, place)
                 summary += group
         footer = RECORD.pack(Op.FOOTER, 20) + struct.pack("<QQ", start, start + len(summary))
         checked = summary + offsets + footer
@@ -116,7 +114,7 @@ class McapWriter:
         if not self._began:
             versions = set(self._versions)
             profile = f"ros{versions.pop()}" if len(versions) == 1 else ""
-            self._put(Op.HEADER, _text(profile) + _text(f"mosaico-ingest {__version__}"))
+            self._put(Op.HEADER, text_bytes(profile) + text_bytes(f"mosaico-ingest {__version__}"))
             self._began = True
         for record in self._pending:
             self._file.write(record)
@@ -129,19 +127,19 @@ class McapWriter:
             number = self._schemas[key] = len(self._schemas) + 1
             name = short_msgtype(definition.root) if version == 1 else definition.root
             data = definition.text.encode()
-            content = struct.pack("<H", number) + _text(name) + _text(f"ros{version}msg")
+            content = struct.pack("<H", number) + text_bytes(name) + text_bytes(f"ros{version}msg")
             self._add(Op.SCHEMA, content + struct.pack("<I", len(data)) + data)
         return self._schemas[key]
 
     def _add(self, op: int, content: bytes) -> None:
-        record = _record(op, content)
+        record = record_bytes(op, content)
         self._records.append(record)
         self._pending.append(record)
 
     def _put(self, op: int, content: bytes) -> int:
         """Write a record and return where it begins."""
         at = self._file.tell()
-        self._file.write(_record(op, content))
+        self._file.write(record_bytes(op, content))
         return at
 
     def _flush(self) -> None:
@@ -151,7 +149,7 @@ class McapWriter:
         data = bytes(chunk.data)
         packed = zstandard.compress(data, 3)
         span = struct.pack("<QQ", chunk.start_ns, chunk.end_ns)
-        head = span + struct.pack("<QI", len(data), zlib.crc32(data)) + _text("zstd")
+        head = span + struct.pack("<QI", len(data), zlib.crc32(data)) + text_bytes("zstd")
         at = self._put(Op.CHUNK, head + struct.pack("<Q", len(packed)) + packed)
         length = self._file.tell() - at
         places = b""
@@ -159,9 +157,9 @@ class McapWriter:
             where = self._put(Op.MESSAGE_INDEX, struct.pack("<HI", channel, len(entries)) + entries)
             places += struct.pack("<HQ", channel, where)
         content = span + struct.pack("<QQ", at, length) + struct.pack("<I", len(places)) + places
-        content += struct.pack("<Q", self._file.tell() - at - length) + _text("zstd")
+        content += struct.pack("<Q", self._file.tell() - at - length) + text_bytes("zstd")
         content += struct.pack("<QQ", len(packed), len(data))
-        self._chunk_indexes.append(_record(Op.CHUNK_INDEX, content))
+        self._chunk_indexes.append(record_bytes(Op.CHUNK_INDEX, content))
 
     def _statistics(self) -> bytes:
         counts = b"".join(struct.pack("<HQ", channel, count) for channel, count in self._counts.items())
@@ -173,17 +171,3 @@ class McapWriter:
             + struct.pack("<I", len(counts))
             + counts
         )
-
-
-def _record(op: int, content: bytes | bytearray) -> bytes:
-    return RECORD.pack(op, len(content)) + content
-
-
-def _text(text: str) -> bytes:
-    data = text.encode()
-    return struct.pack("<I", len(data)) + data
-
-
-def _texts(texts: Mapping[str, str]) -> bytes:
-    data = b"".join(_text(part) for item in texts.items() for part in item)
-    return struct.pack("<I", len(data)) + data
