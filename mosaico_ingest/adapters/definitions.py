@@ -48,7 +48,7 @@ class KnownTypes:
             BagError: It is not known.
         """
         mapping = mapping_of(spec) if spec else None
-        text = mapping.model.definition if mapping and msgtype == mapping.ros_types[0] else None
+        text = mapping.own_text(msgtype) if mapping else None
         embedded = Embedded("ros2msg", text) if text else None
         try:
             return self.resolve(msgtype, embedded, ros_version=self._first)

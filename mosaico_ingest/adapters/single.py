@@ -11,8 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from mosaico_ingest.adapters.adapter import Adapter, AdapterSpec, Envelope
-from mosaico_ingest.adapters.builtin import Builtin
-from mosaico_ingest.adapters.mapping.load import MappingSpec
+from mosaico_ingest.adapters.definitions import mapping_of
 from mosaico_ingest.adapters.python_adapter import PythonAdapterSpec
 from mosaico_ingest.bag.definition import Definition
 from mosaico_ingest.bag.message import ROSMessage
@@ -79,10 +78,9 @@ def _bind(
 
 def _candidates(spec: AdapterSpec, own: tuple[str, ...]) -> Iterator[Definition]:
     """Yield what the message may look like: its own type in any distro, then the other types the adapter takes."""
-    mapping = spec.mapping if isinstance(spec, Builtin) else spec
-    text = mapping.model.definition if isinstance(mapping, MappingSpec) else None
+    mapping = mapping_of(spec)
     for name in dict.fromkeys((*own, *spec.ros_types)):
-        yield from _versions(name, text if name == spec.ros_types[0] else None)
+        yield from _versions(name, mapping.own_text(name) if mapping else None)
 
 
 @cache

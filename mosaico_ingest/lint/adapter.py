@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import cache
 
+from mosaico_ingest.adapters.definitions import KnownTypes
 from mosaico_ingest.adapters.mapping.load import MappingSpec, load_adapter
 from mosaico_ingest.adapters.reference import KnownAdapters
-from mosaico_ingest.bag.definition import Definition, Embedded
+from mosaico_ingest.bag.definition import Definition
 from mosaico_ingest.bag.shape import ros_shape
-from mosaico_ingest.bag.types import TypeResolver
 from mosaico_ingest.diagnostics import Finding, Severity, Span
 from mosaico_ingest.errors import AdapterError, BagError
 from mosaico_ingest.lint.document import Document
-from mosaico_ingest.policies import Stores
 
 __all__ = ["adapter_findings"]
-
-_DISTROS = ((2, Stores.LATEST), (1, Stores.ROS1_NOETIC))
 
 
 def adapter_findings(document: Document) -> Iterator[Finding]:
@@ -40,18 +37,12 @@ def adapter_findings(document: Document) -> Iterator[Finding]:
 
 def _definition(spec: MappingSpec, msgtype: str) -> Definition | None:
     """Return the definition in the file itself, or else that of a distro; None where there is none."""
-    own = None if spec.model.definition is None else Embedded("ros2msg", spec.model.definition)
-    known = (_resolved(msgtype, own, version, distro) for version, distro in _DISTROS)
-    return next((definition for definition in known if definition is not None), None)
-
-
-def _resolved(msgtype: str, own: Embedded | None, version: int, distro: Stores) -> Definition | None:
     try:
-        return _resolver(distro).resolve(msgtype, own, ros_version=version)
+        return _known_types().find(msgtype, spec)
     except BagError:
         return None
 
 
 @cache
-def _resolver(distro: Stores) -> TypeResolver:
-    return TypeResolver(distro)
+def _known_types() -> KnownTypes:
+    return KnownTypes()

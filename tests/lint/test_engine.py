@@ -214,6 +214,20 @@ fields:
     assert rules(judged(project, text % "PackAdapter", "adapters/other.yaml")) == ["misfit"]
 
 
+def test_the_text_of_a_definition_is_that_of_the_first_type(project: Path) -> None:
+    text = """\
+version: 1
+adapter: TwoTypesAdapter
+ros_type: [acme_msgs/msg/Heat, sensor_msgs/msg/Temperature]
+ontology: Temperature
+fields: {value: degrees}
+definition: float64 degrees
+"""
+    found = judged(project, text, "adapters/two.yaml")
+    assert rules(found) == ["unknown-field"]
+    assert "sensor_msgs/msg/Temperature" in found.findings[0].message
+
+
 def test_without_fix_nothing_is_written(project: Path) -> None:
     judged(project, BROKEN)
     assert (project / "job.yaml").read_text() == BROKEN

@@ -120,6 +120,10 @@ class MappingSpec:
         """Whether it is used for its types without being asked for."""
         return self.model.default
 
+    def own_text(self, msgtype: str) -> str | None:
+        """Return the `.msg` text the file gives of a type; it can only be that of the first it takes."""
+        return self.model.definition if msgtype == self.ros_types[0] else None
+
     def check(self, definition: Definition, shape: pa.StructType) -> tuple[Finding, ...]:
         """Return every mistake the mapping has for a message type; none means that it binds."""
         return self._compile(definition, shape)[1]

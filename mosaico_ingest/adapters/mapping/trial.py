@@ -91,8 +91,8 @@ def _run(spec: MappingSpec, case: Case, resolver: Resolver, recorded: ReadRecord
 
 def _definition(spec: MappingSpec, case: Case, resolver: Resolver) -> Definition:
     msgtype = normalize_msgtype(case.ros_type) if case.ros_type else spec.ros_types[0]
-    text = spec.model.definition
-    embedded = Embedded("ros2msg", text) if text and msgtype == spec.ros_types[0] else None
+    text = spec.own_text(msgtype)
+    embedded = Embedded("ros2msg", text) if text else None
     try:
         return resolver.resolve(msgtype, embedded, ros_version=2)
     except BagError as unknown:
