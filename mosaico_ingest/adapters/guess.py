@@ -13,7 +13,8 @@ from mosaico_ingest.adapters.mapping.fit import demand
 from mosaico_ingest.adapters.mapping.kinds import Unfit, is_number, kind_of, spell
 from mosaico_ingest.adapters.yamltext import key, word
 from mosaico_ingest.bag.definition import Container, Definition, Field
-from mosaico_ingest.bag.shape import BYTES, TEXTS, ros_shape
+from mosaico_ingest.bag.msgtext import BYTES
+from mosaico_ingest.bag.shape import TEXTS, ros_shape
 from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.registry import ontology_type
 

@@ -20,18 +20,16 @@ from typing import Any
 from mosaico_ingest.bag.alternatives import distro_definitions
 from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.definition import Container, Definition, Field, MessageType
+from mosaico_ingest.bag.msgtext import BYTES
 from mosaico_ingest.errors import BagError, DecodeError
 
-__all__ = ["BLOBS", "FORMATS", "Deserializer", "min_size"]
+__all__ = ["FORMATS", "Deserializer", "min_size"]
 
 FORMATS: Mapping[str, str] = {
     "bool": "B", "byte": "B", "char": "B", "uint8": "B", "int8": "b", "uint16": "H", "int16": "h",
     "uint32": "I", "int32": "i", "uint64": "Q", "int64": "q", "float32": "f", "float64": "d",
 }  # fmt: skip
 """The `struct` letter of each primitive of a fixed size; any non-zero `bool` is true."""
-
-BLOBS = frozenset({"byte", "char", "uint8"})
-"""A sequence of these is `bytes`."""
 
 _SIZES = {kind: Struct(f"<{letter}").size for kind, letter in FORMATS.items()}
 _MAX_EMPTY = 1 << 16
@@ -252,7 +250,7 @@ def _numbers(field: Field, path: str) -> _Read:
     def read(cursor: _Cursor) -> bytes | list[Any]:
         count = _count(cursor, field, path, size) if fixed is None else fixed
         start = cursor.take(count * size, size, path) if count else cursor.pos
-        if kind in BLOBS and fixed is None:
+        if kind in BYTES and fixed is None:
             return cursor.data[start : start + count]
         values = unpack_from(f"{cursor.order}{count}{letter}", cursor.data, start)
         return list(map(bool, values)) if kind == "bool" else list(values)

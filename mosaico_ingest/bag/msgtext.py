@@ -12,7 +12,7 @@ from mosaico_ingest.bag.names import DURATION, TIME, short_msgtype
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.frozen import frozen
 
-__all__ = ["PRIMITIVES", "SEPARATOR", "Section", "flatten", "parse_msg", "sections", "spell"]
+__all__ = ["BYTES", "PRIMITIVES", "SEPARATOR", "Section", "flatten", "parse_msg", "sections", "spell"]
 
 SEPARATOR = "=" * 80
 
@@ -23,6 +23,9 @@ PRIMITIVES = frozenset(
     }
 )  # fmt: skip
 """The types that are not messages; `time` and `duration` are read as messages of two fields."""
+
+BYTES = frozenset({"byte", "char", "uint8"})
+"""The primitives whose sequences are one binary value, `bytes` in Python."""
 
 _SEPARATOR_LINE = re.compile(r"^={10,}[ \t\r]*(?:\n|\Z)", re.MULTILINE)
 _HEAD = re.compile(r"\s*(?P<kind>MSG|IDL):[ \t]*(?P<name>\S+)[ \t\r]*(?:\n|\Z)")

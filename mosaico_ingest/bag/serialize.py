@@ -12,7 +12,8 @@ from typing import Any, Protocol
 
 from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.definition import Container, Definition, Field
-from mosaico_ingest.bag.deserialize import BLOBS, FORMATS
+from mosaico_ingest.bag.deserialize import FORMATS
+from mosaico_ingest.bag.msgtext import BYTES
 from mosaico_ingest.errors import BagError
 
 __all__ = ["Serializer"]
@@ -67,7 +68,7 @@ class Serializer:
         if scalar and field.is_message:
             self._add_message(steps, field.type, path)
         elif field.type in FORMATS and (
-            scalar or (field.container is Container.ARRAY and field.type not in BLOBS)
+            scalar or (field.container is Container.ARRAY and field.type not in BYTES)
         ):
             block = steps[-1] if steps else None
             if not isinstance(block, _Block):
@@ -80,7 +81,7 @@ class Serializer:
             steps.append(_Many(path, field, self._words("I"), self._elements(field)))
 
     def _elements(self, field: Field) -> _Elements:
-        if field.type in BLOBS:
+        if field.type in BYTES:
             return _Bytes()
         if field.type in FORMATS:
             return self._words(FORMATS[field.type])

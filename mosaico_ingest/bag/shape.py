@@ -6,9 +6,10 @@ import numpy as np
 import pyarrow as pa
 
 from mosaico_ingest.bag.definition import Container, Definition, Field, MessageType
+from mosaico_ingest.bag.msgtext import BYTES
 from mosaico_ingest.errors import DecodeError
 
-__all__ = ["BYTES", "NUMBERS", "TEXTS", "ros_shape"]
+__all__ = ["NUMBERS", "TEXTS", "ros_shape"]
 
 NUMBERS = {
     "bool": "?",
@@ -28,8 +29,6 @@ NUMBERS = {
 """The numpy type of every primitive but the texts, in the bytes and in the column."""
 
 TEXTS = frozenset({"string", "wstring"})
-BYTES = frozenset({"byte", "char", "uint8"})
-"""The primitives whose sequences are one binary value."""
 
 
 def ros_shape(definition: Definition) -> pa.StructType:
