@@ -40,7 +40,9 @@ class IngestError(Exception):
     """What went wrong, where, with which value, and what to do; one line when printed."""
 
     exit_code: ClassVar[int] = 1
+    """What the command exits with."""
     retryable: ClassVar[bool] = False
+    """Whether running again may help; for whoever runs jobs from Python."""
 
     def __init__(
         self,

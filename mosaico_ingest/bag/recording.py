@@ -9,6 +9,8 @@ from functools import partial
 from pathlib import Path
 from types import TracebackType
 
+from typing_extensions import Self
+
 from mosaico_ingest.bag.batch import Channel, Encoding, Loss, RawBatch
 from mosaico_ingest.bag.channels import ChannelTable
 from mosaico_ingest.bag.containers.opening import open_part
@@ -122,7 +124,7 @@ class Recording:
         self.findings: tuple[Finding, ...] = (*found.findings, *oddities)
         """What to know before reading; what reading itself finds broken is in `losses`."""
 
-    def __enter__(self) -> Recording:  # noqa: PYI034 - never subclassed, and `Self` is not in 3.10
+    def __enter__(self) -> Self:
         """Return the recording."""
         return self
 

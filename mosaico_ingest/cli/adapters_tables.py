@@ -15,6 +15,7 @@ from rich.text import Text
 from mosaico_ingest.cli.render import render_findings, texts_of
 from mosaico_ingest.cli.tables import open_console, print_json
 from mosaico_ingest.executors.catalog import Explained, Known, TestResult, TopicChoice
+from mosaico_ingest.report.units import counted
 
 __all__ = ["print_adapters", "print_explained", "print_tests", "print_topics"]
 
@@ -100,7 +101,9 @@ def print_tests(results: Sequence[TestResult], *, as_json: bool) -> None:
     for one in results:
         _print_result(one, console)
     tests = [outcome for one in results for outcome in one.outcomes]
-    line = f"{len(results)} adapter{'' if len(results) == 1 else 's'}, {sum(one.passed for one in tests)} of {len(tests)} tests passed"
+    line = (
+        f"{counted(len(results), 'adapter')}, {sum(one.passed for one in tests)} of {len(tests)} tests passed"
+    )
     misfits = sum(bool(one.findings) for one in results)
     line += f", {misfits} do not fit their types" if misfits else ""
     style = "green" if all(one.passed for one in results) else "bold red"

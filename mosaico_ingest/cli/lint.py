@@ -76,15 +76,13 @@ def _print_text(report: LintReport, *, quiet: bool) -> None:
 
 
 def _summary(report: LintReport) -> str:
+    from mosaico_ingest.report.units import counted
+
     if not report.files:
         return "nothing to judge: no manifest, adapter or .msg file"
     found, fixed = len(report.findings), sum(judged.fixed for judged in report.files)
-    mended = f", {_count(fixed, 'change')} made" if fixed else ""
-    return f"{_count(len(report.files), 'file')}, {_count(found, 'finding')}{mended}"
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+    mended = f", {counted(fixed, 'change')} made" if fixed else ""
+    return f"{counted(len(report.files), 'file')}, {counted(found, 'finding')}{mended}"
 
 
 def _explanation(rule: str) -> str:

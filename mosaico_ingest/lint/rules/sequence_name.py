@@ -40,8 +40,8 @@ def check(job: Job) -> Iterator[Problem]:
     try:
         check_sequence_name(plain)
     except SinkError:
-        allowed = re.compile(r"[^A-Za-z0-9_-]").search(plain)
-        start = allowed.start() if allowed else 0
+        refused = re.search(r"[^A-Za-z0-9_-]", plain)
+        start = refused.start() if refused else 0
         span = job.source.inner_span(("sequence", "name"), start, start + 1)
         yield Problem(
             f"{plain[start]!r} cannot be in the name of a sequence", span, "use letters, digits, _ and -"

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import TracebackType
 
 import pyarrow as pa
+from typing_extensions import Self
 
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.frozen import frozen
@@ -68,7 +69,7 @@ class Server:
         while not self._stopped.wait(min(idle_s / 4, _TIDY_S)):
             self._service.drop_idle(idle_s)
 
-    def __enter__(self) -> Server:  # noqa: PYI034 - Self comes with Python 3.11, and nobody derives from this
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(
