@@ -1,0 +1,80 @@
+"""Topics that other ingesters drop, garble or end a run for arrive whole, all from one recording."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+from made_recordings import define, record
+
+from mosaico_ingest import RosbagInjector, ROSInjectionConfig
+from mosaico_ingest.store import Store
+
+BAR = "=" * 80
+Rows = list[dict[str, Any]]
+AWKWARD: Mapping[str, tuple[str, str, Rows, Rows]] = {
+    "/bounded": (
+        "a/msg/Bounded",
+        "int32[<=3] few\nstring<=5 word\n",
+        [{"few": [], "word": ""}, {"few": [7, 8], "word": "ab"}],
+        [{"few": [], "word": ""}, {"few": [7, 8], "word": "ab"}],
+    ),
+    "/wide": ("a/msg/Wide", "wstring text\n", [{"text": "żółw"}], [{"text": "żółw"}]),
+    "/same": ("a/msg/Same", "int32 A=1\nint32 v\n", [{"v": 1}], [{"v": 1}]),
+    "/other_same": ("b/msg/Same", "int32 B=2\nint32 v\n", [{"v": 2}], [{"v": 2}]),
+    "/header_is_text": (
+        "a/msg/Letter",
+        "string header\nint32 v\n",
+        [{"header": "hi", "v": 3}],
+        [{"header": "hi", "v": 3}],
+    ),
+    "/header_of_its_own": (
+        "a/msg/Packet",
+        f"a/Preamble header\n{BAR}\nMSG: a/Preamble\nint32 length\n",
+        [{"header": {"length": 4}}],
+        [{"header": {"length": 4}}],
+    ),
+    "/empty": ("std_msgs/msg/Empty", "", [{}, {}], [{}, {}]),
+    "/constants_only": ("a/msg/Codes", "int32 OK=0\n", [{}], [{}]),
+    "/limits": ("a/msg/Limits", "float64 NONE=nan\nfloat64 FAR=inf\nint32 v\n", [{"v": 5}], [{"v": 5}]),
+    "/stamped": ("a/msg/Stamped", "int64 timestamp_ns\n", [{"timestamp_ns": 6}], [{"timestamp_ns_": 6}]),
+    "/_hidden": ("std_msgs/msg/Int32", "int32 data\n", [{"data": 7}], [{"data": 7}]),
+    "/arrays": (
+        "a/msg/Arrays",
+        "bool[2] flags\nuint8[] bytes\nfloat32[2] fixed\n",
+        [{"flags": [True, False], "bytes": b"\x00\xff", "fixed": [0.5, 1.5]}],
+        [{"flags": [True, False], "bytes": b"\x00\xff", "fixed": [0.5, 1.5]}],
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    folder = tmp_path_factory.mktemp("awkward")
+    made = record(
+        folder / "awkward.mcap",
+        [
+            (topic, define(msgtype, text), 10 + at, row)
+            for topic, (msgtype, text, rows, _) in AWKWARD.items()
+            for at, row in enumerate(rows)
+        ],
+    )
+    report = RosbagInjector(ROSInjectionConfig(made, "awkward", store=folder / "store")).run()
+    assert report is not None
+    assert report.totals.read == report.totals.written == sum(len(rows) for *_, rows in AWKWARD.values())
+    return Store.open(folder / "store")
+
+
+@pytest.mark.parametrize("topic", AWKWARD)
+def test_every_row_arrives(stored: Store, topic: str) -> None:
+    rows = stored.scan("awkward", topic).read_all().to_pylist()
+    assert [row.pop("timestamp_ns") for row in rows] == [10 + at for at in range(len(rows))]
+    assert rows == AWKWARD[topic][3]
+
+
+def test_types_of_one_short_name_keep_their_own_origin(stored: Store) -> None:
+    origins = [stored.topic("awkward", topic).metadata["_ros_"] for topic in ("/same", "/other_same")]
+    assert [origin["msgtype"] for origin in origins] == ["a/msg/Same", "b/msg/Same"]
+    assert [origin["enums"] for origin in origins] == [{"A": 1}, {"B": 2}]
+    assert [origin["msgdef"] for origin in origins] == ["int32 A=1\nint32 v\n", "int32 B=2\nint32 v\n"]
