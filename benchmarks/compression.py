@@ -1,11 +1,12 @@
 """How much smaller recordings get, and against one Parquet file a batch, as the platform keeps its chunks.
 
-Usage: compression.py RECORDING... — the chunks hold the same rows, as many at a time as the official client sends
+The chunks hold the same rows, as many at a time as the official client sends
 (about 25 MB of Arrow data), in Parquet files with zstd and pyarrow's other defaults.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import shutil
 import sys
@@ -39,8 +40,13 @@ def chunks_bytes(store: Path, folder: Path) -> int:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("recordings", metavar="RECORDING", nargs="+", type=Path)
+    recordings = parser.parse_args().recordings
     print(ROW.format("recording", "source MB", "store MB", "saved", "chunks MB", "ours/it", "time s"))
-    for recording in map(Path, sys.argv[1:]):
+    for recording in recordings:
         with tempfile.TemporaryDirectory(dir=recording.parent) as folder:
             store, report = Path(folder) / "store", Path(folder) / "report.json"
             command = [sys.executable, "-m", "mosaico_ingest", "bag", recording, "--name", "run", "-q"]
