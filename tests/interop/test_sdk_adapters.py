@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import runpy
+from dataclasses import fields
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -121,3 +122,9 @@ def _taken(adapter: Any, message: dict[str, Any]) -> bool:
     except Exception:  # noqa: BLE001 - whatever it raises is how it rejects a message
         return False
     return True
+
+
+def test_every_setting_of_the_sdk_is_on_the_page_for_movers() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "migration.md").read_text(encoding="utf-8")
+    missing = {field.name for field in fields(sdk.ROSInjectionConfig) if f"`{field.name}`" not in page}
+    assert missing == set()
