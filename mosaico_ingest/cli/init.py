@@ -22,7 +22,10 @@ def init(
     force: Annotated[bool, typer.Option("--force", "-f", help="Replace a file that is there.")] = False,
 ) -> None:
     """Draft a manifest: every topic with its type, count and adapter, and what one may want to change."""
+    from shlex import quote
+
     from mosaico_ingest import api
+    from mosaico_ingest.errors import NothingMatched
     from mosaico_ingest.plan.draft import draft_manifest
     from mosaico_ingest.report.units import counted
     from mosaico_ingest.textfile import write_whole
@@ -30,11 +33,18 @@ def init(
     if out is not None and out.exists() and not force:
         raise typer.BadParameter(f"{out} is there already; --force replaces it", param_hint="--out")
     found = api.inspect_recording(path, ros_distro=ros_distro)
+    if not found.topics:
+        raise NothingMatched("the recording has no topic", where=str(path))
     folder = out.parent if out is not None else Path()
     text = draft_manifest(found, path, folder=folder, ros_distro=ros_distro)
+    taken = len({topic.topic for topic in found.topics if topic.problem is None})
     if out is None:
         typer.echo(text, nl=False)
-        return
-    write_whole(out, text)
-    taken = sum(topic.problem is None for topic in found.topics)
-    typer.echo(f"{out}: {counted(taken, 'topic')}; run it with `ingest {out}`")
+    else:
+        write_whole(out, text)
+        then = f"; run it with `ingest {quote(str(out))}`" if taken else ""
+        typer.echo(f"{out}: {counted(taken, 'topic')}{then}")
+    if not taken:
+        first = found.topics[0]
+        why = f"{first.topic}: {first.problem}"
+        raise NothingMatched("no topic can be ingested as it is", where=str(path), hint=why)

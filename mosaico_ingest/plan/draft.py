@@ -9,9 +9,12 @@ from os.path import relpath
 from pathlib import Path
 
 from mosaico_ingest.adapters.unmodeled import UnmodeledSpec
+from mosaico_ingest.bag.batch import Encoding
+from mosaico_ingest.bag.definition import Source
 from mosaico_ingest.manifest.text import plain
 from mosaico_ingest.policies import Stores
 from mosaico_ingest.report.inspection import InspectedTopic, Inspection
+from mosaico_ingest.report.units import bytes_text, counted, seconds_text
 
 __all__ = ["draft_manifest", "draft_name"]
 
@@ -62,19 +65,28 @@ def draft_name(recording: Path) -> str:
 
 
 def _bag(found: Inspection, path: str, ros_distro: Stores | str | None) -> Iterator[str]:
-    span = "" if found.duration_s is None else f", {found.duration_s:.1f} s"
-    messages = "" if found.messages is None else f", {found.messages} messages"
-    undefined = sorted({topic.msgtype for topic in found.topics if topic.definition == "none"})
-    yield f"# {found.container}, {found.size_bytes} bytes{messages}{span}"
+    span = "" if found.duration_s is None else f", {seconds_text(found.duration_s)}"
+    messages = "" if found.messages is None else f", {counted(found.messages, 'message')}"
+    ours = [topic for topic in found.topics if topic.encoding != Encoding.OTHER.value]
+    undefined = sorted({topic.msgtype for topic in ours if topic.definition == "none"})
+    yield f"# {found.container}, {bytes_text(found.size_bytes)}{messages}{span}"
     yield "bag:"
-    carried = path.lower().endswith(".db3") and ros_distro is None and not undefined
-    yield f"  path: {plain(path)}{'  # ingest: ignore[distro-missing] (it carries its definitions)' * carried}"
+    silenced = path.lower().endswith(".db3") and ros_distro is None and not undefined
+    mark = f"  # ingest: ignore[distro-missing] ({_known_from(ours)})" if silenced else ""
+    yield f"  path: {plain(path)}{mark}"
     if ros_distro is not None:
         yield f"  ros_distro: {Stores(ros_distro).value}"
     if undefined:
         yield f"  # no definition is known of {', '.join(undefined)}; say where they are:"
         for package in dict.fromkeys(msgtype.partition("/")[0] for msgtype in undefined):
             yield f"  # custom_msgs: [{{package: {package}, path: definitions/{package}}}]"
+
+
+def _known_from(topics: Sequence[InspectedTopic]) -> str:
+    assumed = sorted({topic.definition for topic in topics} - {Source.BAG.value})
+    places = {Source.DISTRO.value: "as in all distros", Source.PACKAGE.value: "as in public packages"}
+    how = " or ".join(places[source] for source in assumed)
+    return f"it carries no definitions; they are read {how}" if assumed else "it carries its definitions"
 
 
 def _topics(found: Inspection) -> Iterator[str]:

@@ -18,7 +18,7 @@ class InspectedTopic(Part):
     rate_hz: float | None
     """Messages a second over the recording's span."""
     definition: str
-    """Where the definition was found: bag, custom, distro or none."""
+    """Where the definition was found: bag, custom, distro, package or none."""
     adapter: str
     """The adapter it would get."""
     ontology: str | None

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from jsonschema import Draft202012Validator
+from rosbags.rosbag1 import Writer
 
 from mosaico_ingest.cli.app import main
 from mosaico_ingest.plan.document import PlanDocument
@@ -272,3 +273,16 @@ def test_a_drafted_manifest_lints_clean_and_runs(ingest: Ingest) -> None:
     assert ingest("init", "configs/quickstart/drive.mcap", "--out", "job.yaml")[0] == 2
     assert ingest("init", "configs/quickstart/drive.mcap", "--out", "job.yaml", "--force")[0] == 0
     assert ingest("init", "configs/quickstart/drive.mcap")[1].count("\n") > 30
+
+
+def test_a_command_that_is_suggested_can_be_copied(ingest: Ingest) -> None:
+    _, said = ingest("init", "configs/quickstart/drive.mcap", "--out", "my job.yaml")
+    assert "`ingest 'my job.yaml'`" in said
+
+
+def test_a_recording_of_nothing_makes_no_job(ingest: Ingest) -> None:
+    with Writer("none.bag"):
+        pass
+    code, said = ingest("init", "none.bag", "--out", "job.yaml")
+    assert (code, said) == (3, "error: none.bag: the recording has no topic\n")
+    assert not Path("job.yaml").exists()

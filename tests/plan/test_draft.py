@@ -1,0 +1,55 @@
+"""A drafted manifest says of a recording only what is true."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mosaico_ingest.plan.draft import draft_manifest
+from mosaico_ingest.report.inspection import InspectedTopic, Inspection
+
+
+def draft(definition: str, encoding: str = "cdr") -> str:
+    topic = InspectedTopic(
+        topic="/a",
+        msgtype="own_msgs/msg/A",
+        encoding=encoding,
+        count=1,
+        rate_hz=None,
+        definition=definition,
+        adapter="Unmodeled",
+        ontology="A",
+        problem="is not known" if definition == "none" else None,
+    )
+    found = Inspection(
+        files=("a.db3",),
+        container="sqlite3",
+        size_bytes=2_000,
+        messages=1,
+        start_ns=0,
+        end_ns=0,
+        topics=(topic,),
+    )
+    return draft_manifest(found, Path("a.db3"), folder=Path())
+
+
+@pytest.mark.parametrize(
+    ("definition", "said"),
+    [
+        ("bag", "(it carries its definitions)"),
+        ("distro", "(it carries no definitions; they are read as in all distros)"),
+        ("package", "(it carries no definitions; they are read as in public packages)"),
+    ],
+)
+def test_it_says_whose_definitions_are_used(definition: str, said: str) -> None:
+    assert said in draft(definition)
+
+
+def test_it_asks_for_the_definitions_of_ros_messages_only() -> None:
+    assert "custom_msgs: [{package: own_msgs" in draft("none")
+    assert "custom_msgs" not in draft("none", "other")
+
+
+def test_its_head_is_for_people() -> None:
+    assert "# sqlite3, 2.0 kB, 1 message, 0.00 s\n" in draft("bag")
