@@ -10,6 +10,7 @@ from mosaico_ingest.bag.recording import Recording
 from mosaico_ingest.bridge import ROSBridge
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.diagnostics import Finding, Severity
+from mosaico_ingest.errors import IngestError
 from mosaico_ingest.executors.trial import try_messages
 from mosaico_ingest.executors.worker import foresee, open_for
 from mosaico_ingest.patterns import first_match
@@ -29,13 +30,37 @@ def plan_document(
     """Return what a manifest's configurations would do, as a document for `folder`.
 
     Raises:
-        IngestError: One of them cannot be done; the message says why.
+        IngestError: One of them cannot be done; of several that cannot, `findings` says why of each.
     """
+    planned: list[RecordingPlan] = []
+    refused: list[IngestError] = []
+    for config in configs:
+        try:
+            planned.append(preview(config, connect=connect))
+        except IngestError as error:
+            if len(configs) == 1:
+                raise
+            refused.append(error)
+    if refused:
+        raise _all_of(refused, len(configs))
     return PlanDocument(
         tool=f"mosaico-ingest {__version__}",
         job=Path(relpath(job, folder)).as_posix(),
-        recordings=tuple(preview(config, connect=connect) for config in configs),
+        recordings=tuple(planned),
     )
+
+
+def _all_of(refused: Sequence[IngestError], count: int) -> IngestError:
+    """Return one error for all of them, with the exit code that is the least."""
+    findings = [
+        finding
+        for error in refused
+        for finding in error.findings or (Finding("refused", Severity.ERROR, str(error)),)
+    ]
+    one = min(refused, key=lambda error: error.exit_code)
+    one.what, one.where, one.hint = f"{len(refused)} of {count} recordings cannot be ingested", None, None
+    one.findings = tuple(dict.fromkeys(findings))
+    return one
 
 
 def preview(config: ROSInjectionConfig, *, connect: bool) -> RecordingPlan:

@@ -286,3 +286,17 @@ def test_a_recording_of_nothing_makes_no_job(ingest: Ingest) -> None:
     code, said = ingest("init", "none.bag", "--out", "job.yaml")
     assert (code, said) == (3, "error: none.bag: the recording has no topic\n")
     assert not Path("job.yaml").exists()
+
+
+def test_a_plan_of_many_recordings_says_of_each_why_it_cannot_be_ingested(ingest: Ingest) -> None:
+    Path("a.mcap").write_text("no recording")
+    shutil.copy("configs/quickstart/drive.mcap", "b.mcap")
+    with Writer("c.bag"):
+        pass
+    Path("job.yaml").write_text('bag: {path: "[abc].*"}\n')
+    code, said = ingest("plan", "job.yaml")
+    assert code == 1
+    assert "a.mcap: not a recording" in said
+    assert "c.bag: the recording has no topic" in said
+    Path("a.mcap").unlink()
+    assert ingest("plan", "job.yaml", "--json") == (3, "error[refused] c.bag: the recording has no topic\n")
