@@ -50,7 +50,7 @@ def a_few(names: Iterable[str], *, most: int = 8) -> str:
 def offered(names: Iterable[str], wanted: Iterable[str] = ()) -> str:
     """Return what there is in place of what was wanted, as a hint: the nearest, then a few."""
     known = sorted(names)
-    close = (get_close_matches(word.lstrip("!"), known, n=1, cutoff=0.5) for word in wanted)
+    close = (get_close_matches(word, known, n=1, cutoff=0.5) for word in wanted if word[:1] != "!")
     near = dict.fromkeys(name for found in close for name in found)
     listed = f"there are {a_few(known)}" if known else "there are none"
     return f"the nearest is {a_few(near)}; {listed}" if near else listed

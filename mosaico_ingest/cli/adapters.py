@@ -40,9 +40,13 @@ def list_adapters(
 ) -> None:
     """List the built-in adapters and those of installed packages."""
     from mosaico_ingest.cli.adapters_tables import print_adapters
+    from mosaico_ingest.errors import NothingMatched
     from mosaico_ingest.executors.catalog import known_adapters
 
-    print_adapters(known_adapters(takes), as_json=as_json)
+    found = known_adapters(takes)
+    if not found:
+        raise NothingMatched(f"no adapter takes {takes!r}", hint="see `ingest adapters list`")
+    print_adapters(found, as_json=as_json)
 
 
 @app.command()

@@ -32,22 +32,23 @@ def plan_document(
     Raises:
         IngestError: One of them cannot be done; of several that cannot, `findings` says why of each.
     """
-    planned: list[RecordingPlan] = []
-    refused: list[IngestError] = []
-    for config in configs:
-        try:
-            planned.append(preview(config, connect=connect))
-        except IngestError as error:
-            if len(configs) == 1:
-                raise
-            refused.append(error)
+    tried = [_tried(config, connect=connect) for config in configs]
+    planned = tuple(one for one in tried if isinstance(one, RecordingPlan))
+    refused = [one for one in tried if isinstance(one, IngestError)]
     if refused:
-        raise _all_of(refused, len(configs))
+        raise refused[0] if len(tried) == 1 else _all_of(refused, len(tried))
     return PlanDocument(
         tool=f"mosaico-ingest {__version__}",
         job=Path(relpath(job, folder)).as_posix(),
-        recordings=tuple(planned),
+        recordings=planned,
     )
+
+
+def _tried(config: ROSInjectionConfig, *, connect: bool) -> RecordingPlan | IngestError:
+    try:
+        return preview(config, connect=connect)
+    except IngestError as error:
+        return error
 
 
 def _all_of(refused: Sequence[IngestError], count: int) -> IngestError:

@@ -71,6 +71,12 @@ def test_the_list_can_be_of_one_type(ingest: Ingest, glob: str) -> None:
     assert "PoseAdapter" not in names
 
 
+def test_a_type_that_no_adapter_takes_is_said(ingest: Ingest) -> None:
+    code, out, err = ingest("list", "--type", "nowhere_msgs/*")
+    assert (code, out) == (3, "")
+    assert "no adapter takes 'nowhere_msgs/*'" in err
+
+
 def test_show_prints_the_file_as_it_is(ingest: Ingest) -> None:
     assert ingest("show", "IMUAdapter")[1] == BY_NAME["IMUAdapter"].path.read_text()
     assert ingest("show", PACK)[1] == PACK.read_text()

@@ -249,6 +249,8 @@ def test_a_name_that_is_not_there_is_answered_with_the_nearest(ingest: Ingest) -
     code, _, err = ingest("bag", str(QUICKSTART), "--name", "drive", "--topics", "gps/fx", "--topics", "imu")
     assert code == 3
     assert "no topic matches 'gps/fx', 'imu' — the nearest is /gps/fix, /imu; there are " in err
+    err = ingest("bag", str(QUICKSTART), "--name", "drive", "--topics", "!/imu*", "--topics", "/x")[2]
+    assert "the nearest" not in err
     ingest("bag", str(QUICKSTART), "--name", "drive", "--topics", "/imu")
     assert "the nearest is drive; there are drive\n" in ingest("store", "show", "drvie")[2]
     assert (
