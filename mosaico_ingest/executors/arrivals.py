@@ -8,9 +8,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from mosaico_ingest.bag.containers.magics import RECORDING_NAME
+
 __all__ = ["Arrivals"]
 
-_RECORDING = re.compile(r"\.(bag|db3|mcap)(\.(zstd|zst|lz4|gz|bz2))?$", re.IGNORECASE)
 _METADATA = "metadata.yaml"
 _FIRST_RETRY_S, _LAST_RETRY_S = 60.0, 3600.0
 _Look = tuple[tuple[str, int, int], ...]
@@ -78,7 +79,7 @@ def _recordings(folder: Path, above: frozenset[Path] = frozenset()) -> Iterator[
     for entry in entries:
         if entry.is_dir():
             yield from _recordings(entry, above | {here})
-        elif _RECORDING.search(entry.name) and not _is_split(entry):
+        elif RECORDING_NAME.search(entry.name) and not _is_split(entry):
             yield entry
 
 

@@ -8,6 +8,7 @@ from datetime import datetime, timezone
 from difflib import get_close_matches
 from glob import has_magic
 
+from mosaico_ingest.bag.containers.magics import RECORDING_NAME
 from mosaico_ingest.errors import ManifestError, NothingMatched
 from mosaico_ingest.frozen import frozen
 from mosaico_ingest.manifest.load import LoadedManifest
@@ -16,7 +17,6 @@ from mosaico_ingest.remote.path import AnyPath, RemotePath, without_options
 
 __all__ = ["Recording", "find_recordings", "sequence_name"]
 
-_RECORDING = re.compile(r"\.(bag|db3|mcap)(\.(zstd|zst|lz4|gz|bz2))?$", re.IGNORECASE)
 _REFUSED = re.compile(r"[^A-Za-z0-9_-]+")
 
 
@@ -74,7 +74,11 @@ def _fill(placeholder: Placeholder, recording: Recording) -> str:
     if placeholder.name == "date":
         changed = datetime.fromtimestamp(main.stat().st_mtime, tz=timezone.utc)
         return f"{changed:%Y-%m-%d}"
-    texts = {"stem": _RECORDING.sub("", main.name), "name": main.name, "parent": main.resolve().parent.name}
+    texts = {
+        "stem": RECORDING_NAME.sub("", main.name),
+        "name": main.name,
+        "parent": main.resolve().parent.name,
+    }
     return _REFUSED.sub("_", texts[placeholder.name]).strip("_")
 
 
@@ -106,7 +110,7 @@ def _glob(path: AnyPath) -> Iterable[AnyPath]:
 
 def _is_recording(path: AnyPath) -> bool:
     if path.is_file():
-        return _RECORDING.search(path.name) is not None
+        return RECORDING_NAME.search(path.name) is not None
     return path.is_dir() and ((path / "metadata.yaml").is_file() or _any_recording(_listed(path)))
 
 
@@ -118,7 +122,7 @@ def _listed(folder: AnyPath) -> list[AnyPath]:
 
 
 def _any_recording(paths: Iterable[AnyPath]) -> bool:
-    return any(_RECORDING.search(path.name) for path in paths)
+    return any(RECORDING_NAME.search(path.name) for path in paths)
 
 
 def _nearby(path: AnyPath) -> str:
@@ -130,5 +134,5 @@ def _nearby(path: AnyPath) -> str:
     close = get_close_matches(path.name, names, n=1, cutoff=0.5)
     if close:
         return f"{folder} has {close[0]!r}"
-    recordings = [name for name in names if _RECORDING.search(name)]
+    recordings = [name for name in names if RECORDING_NAME.search(name)]
     return f"{folder} has {', '.join(recordings[:5]) or 'no recording'}"

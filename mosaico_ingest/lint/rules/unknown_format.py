@@ -11,24 +11,23 @@ Good:
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from mosaico_ingest.bag.containers.magics import RECORDING_NAME
 from mosaico_ingest.diagnostics import Severity
 from mosaico_ingest.lint.globs import is_glob
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.places import recording_paths
 from mosaico_ingest.lint.rule import Problem, Rule
 
-_KNOWN = re.compile(r"\.(bag|db3|mcap)(\.(zstd|zst|lz4|gz|bz2))?$|metadata\.yaml$", re.IGNORECASE)
-
 
 def check(job: Job) -> Iterator[Problem]:
     """Yield a problem for each part with the suffix of something else."""
     for place, path in recording_paths(job):
         suffix = Path(path).suffix
-        if suffix and not is_glob(suffix) and not _KNOWN.search(path) and not job.resolve(path).is_dir():
+        known = RECORDING_NAME.search(path) or path.lower().endswith("metadata.yaml")
+        if suffix and not is_glob(suffix) and not known and not job.resolve(path).is_dir():
             remedy = "recordings are .bag, .db3 and .mcap files, and rosbag2 directories"
             yield Problem(f"{path} does not look like a recording", job.source.span(place), remedy)
 
