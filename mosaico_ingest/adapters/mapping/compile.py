@@ -8,10 +8,10 @@ from dataclasses import replace
 from typing import TypeAlias
 
 from mosaico_ingest.adapters.adapter import AdapterSpec
+from mosaico_ingest.adapters.mapping.analyzer import Analyzer, Slot, is_short_cast
 from mosaico_ingest.adapters.mapping.arrow import DataType, pt
 from mosaico_ingest.adapters.mapping.build import Absent, ByAdapter, ByFields, Computed, Filled, Source
 from mosaico_ingest.adapters.mapping.check import Scope
-from mosaico_ingest.adapters.mapping.desk import Desk, Slot, is_short_cast
 from mosaico_ingest.adapters.mapping.functions.registry import nearest
 from mosaico_ingest.adapters.mapping.kinds import is_list, kind_of, spell
 from mosaico_ingest.adapters.mapping.lookup_table import compile_lookup
@@ -30,8 +30,10 @@ AdapterLookup: TypeAlias = Callable[[str], "AdapterSpec | None"]
 class Compiler:
     """Compiles one file; with a definition for one message type, without it as far as one can see."""
 
-    def __init__(self, desk: Desk, definition: Definition | None, adapters: AdapterLookup | None) -> None:
-        self._desk = desk
+    def __init__(
+        self, analyzer: Analyzer, definition: Definition | None, adapters: AdapterLookup | None
+    ) -> None:
+        self._analyzer = analyzer
         self._definition = definition
         self._adapters = adapters
 
@@ -45,9 +47,9 @@ class Compiler:
         if variant is not None:
             return self._record(model, slot.at("variants", variant), dict(model.variants[variant]))
         for name, wrap in model.variants.items():
-            known = len(self._desk.findings)
+            known = len(self._analyzer.findings)
             self._record(model, slot.at("variants", name), dict(wrap))
-            if len(self._desk.findings) > known:  # the same fields would be found wrong with each
+            if len(self._analyzer.findings) > known:  # the same fields would be found wrong with each
                 break
         return None
 
@@ -57,9 +59,9 @@ class Compiler:
         for key, value in values.items():
             path = ("schema_metadata", key)
             if isinstance(value, Form):
-                self._desk.report(path, "metadata is an expression or a plain value", "drop the mapping")
+                self._analyzer.report(path, "metadata is an expression or a plain value", "drop the mapping")
                 continue
-            compiled = self._desk.scalar(path, value, scope)
+            compiled = self._analyzer.scalar(path, value, scope)
             typed = compiled.typed if isinstance(compiled, Written) else compiled
             if typed is not None:
                 found[key] = typed
@@ -69,7 +71,7 @@ class Compiler:
         said = wrap.pop("of", None)
         of = self._of(slot.at("of"), said)
         replaced = self._targets(wrap, slot)
-        inner = replace(slot, path=("fields",), scope=self._desk.inside(of, slot.scope))
+        inner = replace(slot, path=("fields",), scope=self._analyzer.inside(of, slot.scope))
         fields = self._targets(model.fields, inner, skip=wrap.keys())
         self._require(inner, {*model.fields, *wrap})
         if slot.scope is None or fields is None or replaced is None or (said is not None and of is None):
@@ -81,9 +83,9 @@ class Compiler:
         if said is None:
             return None
         if not isinstance(said, str):
-            self._desk.report(slot.path, "`of` is an expression", "name the field that holds the message")
+            self._analyzer.report(slot.path, "`of` is an expression", "name the field that holds the message")
             return None
-        return self._desk.expression(slot.path, said, slot.scope)
+        return self._analyzer.expression(slot.path, said, slot.scope)
 
     def _targets(
         self, values: Mapping[str, Value], owner: Slot, *, skip: AbstractSet[str] = frozenset()
@@ -99,7 +101,7 @@ class Compiler:
         if position < 0:
             names = [field.name for field in owner.type]
             help_ = f"{nearest(name, names) or ''} it has {', '.join(names)}".strip()
-            self._desk.report(path, f"{owner.title} has no field {name!r}", help_, rule="unknown-target")
+            self._analyzer.report(path, f"{owner.title} has no field {name!r}", help_, rule="unknown-target")
             return None
         field = owner.type.field(position)
         full = owner.inside(name)
@@ -109,19 +111,19 @@ class Compiler:
         missing = [field.name for field in owner.type if not field.nullable and field.name not in given]
         if missing:
             message = f"{owner.title} requires {', '.join(missing)}"
-            self._desk.report(owner.path, message, "say where each comes from", rule="missing-target")
+            self._analyzer.report(owner.path, message, "say where each comes from", rule="missing-target")
 
     def _field(self, field: DataType, value: Value, slot: Slot) -> Filled | None:
         form = value if isinstance(value, Form) else Form.model_validate({"value": value})
         if problem := _form_problem(form):
-            self._desk.report(slot.path, *problem, rule="form")
+            self._analyzer.report(slot.path, *problem, rule="form")
             return None
         replaced = self._with(form.replaced, slot.at("with")) if form.replaced else ()
         when = self._condition(form.when, slot.at("when")) if form.when else None
         source = self._source(form, slot, slot if form is not value else slot.at("value"))
         if not field.nullable and isinstance(source, Absent):
             message = f"{slot.name} is required, it cannot be null"
-            self._desk.report(slot.path, message, "give it a value", rule="missing-target")
+            self._analyzer.report(slot.path, message, "give it a value", rule="missing-target")
             return None
         if source is None or replaced is None or (form.when and when is None):
             return None
@@ -133,17 +135,19 @@ class Compiler:
         if form.fields is not None:
             return self._by_fields(form.fields, slot, form.of, set(form.replaced or ()))
         if form.map is not None:
-            return compile_lookup(self._desk, form, slot)
+            return compile_lookup(self._analyzer, form, slot)
         return self._computed(form.value, written)
 
     def _computed(self, value: Scalar, slot: Slot) -> Source | None:
         if value is None:
             return Absent()
-        desk = self._desk
-        compiled = desk.scalar(slot.path, value, slot.scope)
+        analyzer = self._analyzer
+        compiled = analyzer.scalar(slot.path, value, slot.scope)
         if compiled is None or isinstance(compiled, Const):
             return (
-                Computed(compiled) if compiled and desk.demand(slot.path, compiled.kind, slot.type) else None
+                Computed(compiled)
+                if compiled and analyzer.demand(slot.path, compiled.kind, slot.type)
+                else None
             )
         typed = compiled.typed
         if typed is None:
@@ -151,18 +155,18 @@ class Compiler:
         if isinstance(typed, Const) and typed.value is None:
             return Absent()
         if is_short_cast(compiled.node):
-            typed = desk.cast(compiled, slot)
+            typed = analyzer.cast(compiled, slot)
             return None if typed is None else Computed(typed)
-        return Computed(typed) if desk.demand(compiled, typed.kind, slot.type) else None
+        return Computed(typed) if analyzer.demand(compiled, typed.kind, slot.type) else None
 
     def _condition(self, text: str, slot: Slot) -> Typed | None:
-        written = self._desk.expression(slot.path, text, slot.scope)
+        written = self._analyzer.expression(slot.path, text, slot.scope)
         if written is None or written.typed is None:
             return None
         if written.typed.kind.axes or not pt.is_boolean(written.typed.kind.type):
             message = f"`when` is true or false for the whole value, not {spell(written.typed.kind)}"
             hint = "compare it: x != 0; any(…) of a list"
-            self._desk.report_inside(slot.path, written.node.at, "type", message, hint)
+            self._analyzer.report_inside(slot.path, written.node.at, "type", message, hint)
             return None
         return written.typed
 
@@ -170,7 +174,7 @@ class Compiler:
         element = _innermost(slot.type)
         if not pt.is_struct(element):
             message = f"`with` sets fields of a struct, {slot.name} is {spell(element)}"
-            self._desk.report(slot.path, message, "drop it", rule="form")
+            self._analyzer.report(slot.path, message, "drop it", rule="form")
             return None
         return self._targets(values, replace(slot, type=element))
 
@@ -183,13 +187,13 @@ class Compiler:
         typed = of.typed if of else None
         element = _innermost(slot.type) if of and not typed else slot.type
         if of and typed:
-            element = self._desk.peeled(of, typed.kind, slot.type)
+            element = self._analyzer.peeled(of, typed.kind, slot.type)
             if element is None:
                 return None
-        inner = replace(slot.at("fields"), type=element, scope=self._desk.inside(of, slot.scope))
+        inner = replace(slot.at("fields"), type=element, scope=self._analyzer.inside(of, slot.scope))
         if not pt.is_struct(element):
             message = f"{slot.name} is {spell(element)}, it has no fields"
-            self._desk.report(inner.path, message, "give an expression", rule="misfit")
+            self._analyzer.report(inner.path, message, "give an expression", rule="misfit")
             return None
         fields = self._targets(values, inner, skip=skip)
         self._require(inner, {*values, *skip})
@@ -198,27 +202,32 @@ class Compiler:
         return ByFields(typed, _complete(fields, inner))
 
     def _by_adapter(self, use: str, slot: Slot, text: str) -> Source | None:
-        desk = self._desk
-        of = desk.expression((*slot.path, "of"), text, slot.scope)
-        if of is None or of.typed is None or desk.inside(of, slot.scope) is None or self._definition is None:
+        analyzer = self._analyzer
+        of = analyzer.expression((*slot.path, "of"), text, slot.scope)
+        if (
+            of is None
+            or of.typed is None
+            or analyzer.inside(of, slot.scope) is None
+            or self._definition is None
+        ):
             return None
         at, element = (*slot.path, "use"), of.typed.kind.element
         spec = self._adapters(use) if self._adapters else None
         if spec is None:
             hint = "`ingest adapters list` names them"
-            desk.report(at, f"there is no adapter {use!r}", hint, rule="unknown-adapter")
+            analyzer.report(at, f"there is no adapter {use!r}", hint, rule="unknown-adapter")
             return None
         if element.msgtype is None or element.msgtype not in spec.ros_types:
             message = f"{use} takes {', '.join(spec.ros_types)}, not {spell(element)}"
-            desk.report(at, message, "use another adapter, or say {of: …, fields: {…}}", rule="misfit")
+            analyzer.report(at, message, "use another adapter, or say {of: …, fields: {…}}", rule="misfit")
             return None
         try:
             adapter = spec.bind(replace(self._definition, root=element.msgtype), element.type)
         except AdapterError as error:
-            desk.report(at, f"{use} cannot be used here: {error.what}", error.hint, rule="misfit")
+            analyzer.report(at, f"{use} cannot be used here: {error.what}", error.hint, rule="misfit")
             return None
         made = replace(kind_of(adapter.ontology.struct), axes=of.typed.kind.axes)
-        fits = desk.demand(of, made, slot.type)
+        fits = analyzer.demand(of, made, slot.type)
         return ByAdapter(of.typed, adapter, use, element.msgtype) if fits else None
 
 

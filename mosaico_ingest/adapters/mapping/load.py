@@ -12,10 +12,10 @@ import pyarrow as pa
 from pydantic import ValidationError
 
 from mosaico_ingest.adapters.adapter import Adapted, Envelope
+from mosaico_ingest.adapters.mapping.analyzer import Analyzer
 from mosaico_ingest.adapters.mapping.build import Filled, fill
 from mosaico_ingest.adapters.mapping.check import Scope
 from mosaico_ingest.adapters.mapping.compile import AdapterLookup, Compiler
-from mosaico_ingest.adapters.mapping.desk import Desk
 from mosaico_ingest.adapters.mapping.evaluate import Evaluation, Refusal, RowsRefused
 from mosaico_ingest.adapters.mapping.inline_type import make_type
 from mosaico_ingest.adapters.mapping.kinds import Kind
@@ -170,14 +170,14 @@ class MappingSpec:
     def _compiled(
         self, definition: Definition, shape: pa.StructType, variant: str
     ) -> tuple[MappingAdapter | None, tuple[Finding, ...]]:
-        desk = Desk(lambda: self.source)
-        compiler = Compiler(desk, definition, self.adapters)
+        analyzer = Analyzer(lambda: self.source)
+        compiler = Compiler(analyzer, definition, self.adapters)
         scope = Scope(Kind(shape, msgtype=definition.root), definition.types)
         record = compiler.record(self.model, self.ontology, scope, variant)
         metadata = compiler.metadata(self.model.schema_metadata, scope)
         if record is None:
-            return None, tuple(desk.findings)
-        return MappingAdapter(self.ontology, record, metadata, definition.root), tuple(desk.findings)
+            return None, tuple(analyzer.findings)
+        return MappingAdapter(self.ontology, record, metadata, definition.root), tuple(analyzer.findings)
 
 
 def _known(definition: Definition) -> _Known:
@@ -229,27 +229,27 @@ def _read(source: Source, adapters: AdapterLookup | None) -> tuple[MappingSpec |
         from mosaico_ingest.manifest.problems import explain  # noqa: PLC0415 - the same
 
         return None, tuple(finding for _, finding in explain(error, source=source, schema=adapter_schema()))
-    desk = Desk(lambda: source)
+    analyzer = Analyzer(lambda: source)
     if (model.ros_type is None) == (model.variants is None):
-        desk.report(
+        analyzer.report(
             ("adapter",), "either ros_type or variants says what the adapter takes", "give one of them"
         )
-    ontology = _ontology(model, desk)
+    ontology = _ontology(model, analyzer)
     if ontology is None:
-        return None, tuple(desk.findings)
-    compiler = Compiler(desk, None, adapters)
+        return None, tuple(analyzer.findings)
+    compiler = Compiler(analyzer, None, adapters)
     compiler.record(model, ontology, None, None)
     compiler.metadata(model.schema_metadata, None)
-    return MappingSpec(model, source, ontology, adapters), tuple(desk.findings)
+    return MappingSpec(model, source, ontology, adapters), tuple(analyzer.findings)
 
 
-def _ontology(model: MappingFile, desk: Desk) -> OntologyType | None:
+def _ontology(model: MappingFile, analyzer: Analyzer) -> OntologyType | None:
     if isinstance(model.ontology, InlineType):
-        return make_type(model.ontology, desk.report)
+        return make_type(model.ontology, analyzer.report)
     try:
         return ontology_type(model.ontology)
     except UnknownTag as unknown:
-        desk.report(("ontology",), unknown.what, unknown.hint, rule="unknown-tag")
+        analyzer.report(("ontology",), unknown.what, unknown.hint, rule="unknown-tag")
         return None
 
 

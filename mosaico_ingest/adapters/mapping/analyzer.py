@@ -1,4 +1,4 @@
-"""This file reads the expressions of an adapter file and notes every mistake at its place."""
+"""This file reads and types the expressions of an adapter file, and reports every mistake at its place."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mosaico_ingest.frozen import frozen
 if TYPE_CHECKING:
     from mosaico_ingest.manifest.source import Path, Source
 
-__all__ = ["SPECIAL", "Desk", "Slot"]
+__all__ = ["SPECIAL", "Analyzer", "Slot"]
 
 SPECIAL = {
     "cast": (1, 2, "cast(x) or cast(x, 'int32')"),
@@ -53,8 +53,8 @@ class Slot:
         return f"{self.name}.{name}" if self.name else name
 
 
-class Desk:
-    """The file being read, and what was found wrong with it so far."""
+class Analyzer:
+    """Analyses the expressions of one file; `findings` holds what is wrong with it so far."""
 
     def __init__(self, source: Callable[[], Source]) -> None:
         self.findings: list[Finding] = []
