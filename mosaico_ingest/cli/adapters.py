@@ -41,7 +41,7 @@ def list_adapters(
     """List the built-in adapters and those of installed packages."""
     from mosaico_ingest.cli.adapters_tables import print_adapters
     from mosaico_ingest.errors import NothingMatched
-    from mosaico_ingest.executors.catalog import known_adapters
+    from mosaico_ingest.executors.adapters import known_adapters
 
     found = known_adapters(takes)
     if not found:
@@ -52,7 +52,7 @@ def list_adapters(
 @app.command()
 def show(adapter: Named) -> None:
     """Print an adapter's file, to read or to copy."""
-    from mosaico_ingest.executors.catalog import source_text
+    from mosaico_ingest.executors.adapters import source_text
 
     typer.echo(source_text(_spec(adapter)), nl=False)
 
@@ -75,7 +75,7 @@ def explain(
 ) -> None:
     """Say where every column comes from, what is left out, or which adapter each topic gets and why."""
     from mosaico_ingest.cli.adapters_tables import print_explained, print_topics
-    from mosaico_ingest.executors.catalog import explain_adapter, explain_topics
+    from mosaico_ingest.executors.adapters import explain_adapter, explain_topics
 
     if sum(one is not None for one in (adapter, job, bag)) != 1:
         raise typer.BadParameter("give one of NAME|TYPE|FILE, --job and --bag")
@@ -103,7 +103,7 @@ def run_tests(
     """
     from mosaico_ingest.adapters.builtin import BUILTIN
     from mosaico_ingest.cli.adapters_tables import print_tests
-    from mosaico_ingest.executors.catalog import run_adapter_tests
+    from mosaico_ingest.executors.adapters import run_adapter_tests
 
     if bool(adapters) == every:
         raise typer.BadParameter("name adapters or files, or give --all")
@@ -137,7 +137,7 @@ def init(
     folders: Folders = None,
 ) -> None:
     """Write a first draft of an adapter: every field of the type, guesses by equal names."""
-    from mosaico_ingest.executors.catalog import draft_adapter
+    from mosaico_ingest.executors.adapters import draft_adapter
     from mosaico_ingest.textfile import write_whole
 
     if record is not None and bag is None:
@@ -160,7 +160,7 @@ def init(
 
 
 def _spec(adapter: str) -> AdapterSpec:
-    from mosaico_ingest.executors.catalog import find_adapter
+    from mosaico_ingest.executors.adapters import find_adapter
 
     return find_adapter(adapter)
 

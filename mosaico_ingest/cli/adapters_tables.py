@@ -14,7 +14,7 @@ from rich.text import Text
 
 from mosaico_ingest.cli.render import render_findings, texts_of
 from mosaico_ingest.cli.tables import open_console, print_json
-from mosaico_ingest.executors.catalog import Explained, Known, TestResult, TopicChoice
+from mosaico_ingest.executors.adapters import Explained, Known, TestResult, TopicChoice
 from mosaico_ingest.report.units import counted
 
 __all__ = ["print_adapters", "print_explained", "print_tests", "print_topics"]

@@ -16,8 +16,8 @@ from multiprocessing.reduction import ForkingPickler
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.batch import Batch
-from mosaico_ingest.executors.crew import Announced, do_nothing, work
 from mosaico_ingest.executors.interrupts import counted_interrupts
+from mosaico_ingest.executors.worker_process import Registrations, do_nothing, work
 from mosaico_ingest.frozen import frozen
 from mosaico_ingest.plan.model import DEFAULT_MEMORY_BYTES
 from mosaico_ingest.report.events import BatchObserver
@@ -27,8 +27,8 @@ __all__ = ["Processes"]
 
 ATTEMPTS = 2
 """How often a recording is begun whose process died under it."""
-_LEAVE_S = 10.0
-_LOOK_S = 0.2
+_SHUTDOWN_S = 10.0
+_POLL_S = 0.2
 """How long a request to stop may go unnoticed."""
 _LEAST_BYTES = 32 << 20
 
@@ -49,16 +49,16 @@ class Processes:
         """Yield the report of each configuration; see `Executor.map`."""
         jobs = max(1, min(self.jobs, len(configs)))
         shared = [replace(config, memory_bytes=_share(config.memory_bytes, jobs)) for config in configs]
-        crew = _Crew(Batch(shared, observe), jobs, self.attempts, partial(_start, self.prepare, jobs))
+        pool = _Pool(Batch(shared, observe), jobs, self.attempts, partial(_start, self.prepare, jobs))
         with counted_interrupts() as interrupts:
             try:
-                yield from crew.reports(interrupts)
+                yield from pool.reports(interrupts)
             finally:
-                crew.leave()
+                pool.shut_down()
 
 
 @dataclass(slots=True)
-class _Hand:
+class _Worker:
     """A process, our end of the pipe to it, and the recording it has in work."""
 
     process: SpawnProcess
@@ -67,105 +67,108 @@ class _Hand:
 
 
 @dataclass(slots=True)
-class _Crew:
+class _Pool:
     batch: Batch
     jobs: int
     attempts: int
-    hire: Callable[[], _Hand]
-    hands: list[_Hand] = field(default_factory=list[_Hand])
+    spawn: Callable[[], _Worker]
+    workers: list[_Worker] = field(default_factory=list[_Worker])
     interrupted: int = 0
 
     def reports(self, interrupts: list[int]) -> Iterator[Report]:
         """Yield reports in order, as soon as those before them are there too."""
-        while self.batch.waiting or any(hand.task is not None for hand in self.hands):
+        while self.batch.waiting or any(worker.task is not None for worker in self.workers):
             self._assign()
-            self._listen()
+            self._poll()
             if len(interrupts) > self.interrupted:
                 self._interrupt()
             yield from self.batch.reports()
         yield from self.batch.rest()
 
-    def leave(self) -> None:
+    def shut_down(self) -> None:
         """End every process: the idle by closing their pipes, one still at work by interrupting it."""
-        for hand in self.hands:
-            if hand.task is not None:
-                _signal(hand, signal.SIGINT)
-            hand.pipe.close()
-        for hand in self.hands:
-            hand.process.join(_LEAVE_S)
-            if hand.process.is_alive():
-                hand.process.kill()
-                hand.process.join()
+        for worker in self.workers:
+            if worker.task is not None:
+                _signal(worker, signal.SIGINT)
+            worker.pipe.close()
+        for worker in self.workers:
+            worker.process.join(_SHUTDOWN_S)
+            if worker.process.is_alive():
+                worker.process.kill()
+                worker.process.join()
 
     def _assign(self) -> None:
         while self.batch.waiting:
-            hand = next((hand for hand in self.hands if hand.task is None), None)
-            if hand is None:
-                if len(self.hands) == self.jobs:
+            worker = next((worker for worker in self.workers if worker.task is None), None)
+            if worker is None:
+                if len(self.workers) == self.jobs:
                     return
-                hand = self.hire()
-                self.hands.append(hand)
-            self._give(hand, self.batch.waiting.popleft())
+                worker = self.spawn()
+                self.workers.append(worker)
+            self._send(worker, self.batch.waiting.popleft())
 
-    def _give(self, hand: _Hand, task: int) -> None:
+    def _send(self, worker: _Worker, task: int) -> None:
         try:
-            letter = ForkingPickler.dumps(replace(self.batch.configs[task], attempt=self.batch.begin(task)))
+            pickled = ForkingPickler.dumps(replace(self.batch.configs[task], attempt=self.batch.begin(task)))
         except Exception as error:  # noqa: BLE001 - pickle raises what the object's class raises
             self.batch.fail(task, _unsendable(error))
             return
-        hand.task = task
+        worker.task = task
         with suppress(BrokenPipeError):  # a process that is gone is noticed where we listen
-            hand.pipe.send_bytes(letter)
+            worker.pipe.send_bytes(pickled)
 
-    def _listen(self) -> None:
-        at_work = [hand.pipe for hand in self.hands if hand.task is not None]
-        ready = set(wait(at_work, _LOOK_S)) if at_work else set[object]()
-        for hand in self.hands[:]:
-            if hand.task is not None and hand.pipe in ready:
-                self._hear(hand, hand.task)
+    def _poll(self) -> None:
+        at_work = [worker.pipe for worker in self.workers if worker.task is not None]
+        ready = set(wait(at_work, _POLL_S)) if at_work else set[object]()
+        for worker in self.workers[:]:
+            if worker.task is not None and worker.pipe in ready:
+                self._receive(worker, worker.task)
 
-    def _hear(self, hand: _Hand, task: int) -> None:
+    def _receive(self, worker: _Worker, task: int) -> None:
         try:
-            said = hand.pipe.recv()
+            message = worker.pipe.recv()
         except (EOFError, OSError):
-            self._bury(hand, task)
+            self._worker_died(worker, task)
             return
-        if isinstance(said, Report):
-            hand.task = None
-            self.batch.finish(task, said)
-        elif isinstance(said, IngestError):
-            hand.task = None
-            self.batch.fail(task, said)
+        if isinstance(message, Report):
+            worker.task = None
+            self.batch.finish(task, message)
+        elif isinstance(message, IngestError):
+            worker.task = None
+            self.batch.fail(task, message)
         else:
-            self.batch.tell(task, said)
+            self.batch.tell(task, message)
 
-    def _bury(self, hand: _Hand, task: int) -> None:
+    def _worker_died(self, worker: _Worker, task: int) -> None:
         """Account for a process that died: its recording is begun anew, or has failed."""
-        hand.process.join()
-        hand.pipe.close()
-        self.hands.remove(hand)
+        worker.process.join()
+        worker.pipe.close()
+        self.workers.remove(worker)
         if self.interrupted:
             self.batch.fail(task, Interrupted("stopped before the end of the recording"))
         elif self.batch.begun[task] < self.attempts:
             self.batch.again(task)
         else:
-            self.batch.fail(task, _died(hand.process.exitcode, self.attempts))
+            self.batch.fail(task, _died(worker.process.exitcode, self.attempts))
 
     def _interrupt(self) -> None:
         """Begin nothing more and let what is in work end as its policy says; asked twice, end it at once."""
         self.batch.waiting.clear()
-        for hand in self.hands:
-            if hand.task is not None:
-                _signal(hand, signal.SIGKILL if self.interrupted else signal.SIGINT)
+        for worker in self.workers:
+            if worker.task is not None:
+                _signal(worker, signal.SIGKILL if self.interrupted else signal.SIGINT)
         self.interrupted += 1
 
 
-def _start(prepare: Callable[[], None], jobs: int) -> _Hand:
+def _start(prepare: Callable[[], None], jobs: int) -> _Worker:
     spawning = multiprocessing.get_context("spawn")  # threads run here, so forking would be a gamble
     ours, theirs = spawning.Pipe()
     try:
         process = spawning.Process(
-            target=work, args=(theirs, Announced.here(), prepare, jobs), name="ingest-worker", daemon=True
+            target=work,
+            args=(theirs, Registrations.current(), prepare, jobs),
+            name="ingest-worker",
+            daemon=True,
         )
         process.start()
     except Exception as error:
@@ -173,16 +176,16 @@ def _start(prepare: Callable[[], None], jobs: int) -> _Hand:
         raise _unsendable(error) from error
     finally:
         theirs.close()
-    return _Hand(process, ours)
+    return _Worker(process, ours)
 
 
 def _share(memory_bytes: int | None, jobs: int) -> int:
     return max((memory_bytes or DEFAULT_MEMORY_BYTES) // jobs, _LEAST_BYTES)
 
 
-def _signal(hand: _Hand, number: signal.Signals) -> None:
-    if hand.process.pid is not None and hand.process.is_alive():
-        os.kill(hand.process.pid, number)
+def _signal(worker: _Worker, number: signal.Signals) -> None:
+    if worker.process.pid is not None and worker.process.is_alive():
+        os.kill(worker.process.pid, number)
 
 
 def _unsendable(error: Exception) -> IngestError:

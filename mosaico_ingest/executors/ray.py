@@ -16,11 +16,11 @@ from typing import Any
 from mosaico_ingest.config import ROSInjectionConfig, StoreTarget
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.batch import Batch
-from mosaico_ingest.executors.crew import Announced
 from mosaico_ingest.executors.interrupts import counted_interrupts
 from mosaico_ingest.executors.processes import ATTEMPTS
 from mosaico_ingest.executors.shipment import absolute, pack
 from mosaico_ingest.executors.worker import place
+from mosaico_ingest.executors.worker_process import Registrations
 from mosaico_ingest.frozen import frozen
 from mosaico_ingest.plan.model import DEFAULT_MEMORY_BYTES
 from mosaico_ingest.report.events import BatchObserver, RunStarted
@@ -35,7 +35,7 @@ try:
 except ModuleNotFoundError as missing:
     raise IngestError("Ray is not installed", hint="pip install 'mosaico-ingest[ray]'") from missing
 
-from mosaico_ingest.executors.ray_worker import Desk, Setting, ingest, machine
+from mosaico_ingest.executors.ray_worker import Mailbox, Setting, ingest, machine
 
 __all__ = ["Ray"]
 
@@ -43,9 +43,9 @@ _log = logging.getLogger(__name__)
 
 NODES = 3
 """How many nodes may go under a recording before it has failed: a node that goes is not its doing, mostly."""
-_LOOK_S = 0.1
-_LEAVE_S = 10.0
-_KNOCK_S = 5.0
+_POLL_S = 0.1
+_SHUTDOWN_S = 10.0
+_CONNECT_S = 5.0
 _AT_ONCE = 1000
 """How many tasks Ray is given at a time, so that it sees how many nodes there is work for."""
 _WORKER_BYTES = 256 << 20
@@ -83,8 +83,8 @@ class Ray:
             if not ray.is_initialized():
                 sent = stack.enter_context(_connected(self.address, self.jobs, sent))
             beacon = stack.enter_context(_beacon(sent, batch.run))
-            run = _Run(batch, sent, self.jobs or _AT_ONCE, self.attempts, _desk(), _setting(beacon))
-            stack.callback(run.leave)
+            run = _Run(batch, sent, self.jobs or _AT_ONCE, self.attempts, _start_mailbox(), _setting(beacon))
+            stack.callback(run.shut_down)
             interrupts = stack.enter_context(counted_interrupts())
             try:
                 yield from run.reports(interrupts)
@@ -98,7 +98,7 @@ class _Run:
     sent: Sequence[ROSInjectionConfig]
     at_once: int
     attempts: int
-    desk: Any
+    mailbox: Any
     setting: Any
     tasks: dict[Any, int] = field(default_factory=dict[Any, int])
     """The recording each of Ray's references stands for."""
@@ -112,8 +112,8 @@ class _Run:
         while self.batch.waiting or self.tasks:
             while self.batch.waiting and len(self.tasks) < self.at_once:
                 self._begin(self.batch.waiting.popleft(), int(largest_bytes))
-            done, _ = ray.wait(list(self.tasks), timeout=_LOOK_S) if self.tasks else ([], [])
-            self._hear()  # whatever a task had to say came in before it was done
+            done, _ = ray.wait(list(self.tasks), timeout=_POLL_S) if self.tasks else ([], [])
+            self._receive()  # whatever a task had to say came in before it was done
             for task in done:
                 self._take(task, self.tasks.pop(task))
             if len(interrupts) > self.interrupted:
@@ -121,21 +121,21 @@ class _Run:
             yield from self.batch.reports()
         yield from self.batch.rest()
 
-    def leave(self) -> None:
+    def shut_down(self) -> None:
         """End what is still in work."""
         with suppress(ray_errors.RayError):
             for force in (False, True):
                 self._cancel(force=force)
                 if self.tasks:
-                    done, _ = ray.wait(list(self.tasks), num_returns=len(self.tasks), timeout=_LEAVE_S)
+                    done, _ = ray.wait(list(self.tasks), num_returns=len(self.tasks), timeout=_SHUTDOWN_S)
                     self.tasks = {task: position for task, position in self.tasks.items() if task not in done}
-            ray.kill(self.desk)
+            ray.kill(self.mailbox)
 
     def _begin(self, position: int, largest_bytes: int) -> None:
         attempt = self.batch.begin(position)
         config = replace(self.sent[position], attempt=attempt)
         try:
-            letter = cloudpickle.dumps(config)  # pyright: ignore[reportPrivateImportUsage] - its module re-exports it
+            pickled = cloudpickle.dumps(config)  # pyright: ignore[reportPrivateImportUsage] - its module re-exports it
         except Exception as error:  # noqa: BLE001 - pickle raises what the object's class raises
             self.batch.fail(position, IngestError(f"the job cannot be sent to another machine: {error}"))
             return
@@ -148,10 +148,10 @@ class _Run:
             max_retries=0,
             scheduling_strategy="SPREAD",
         )
-        self.tasks[task.remote(letter, position, attempt.number, self.desk, self.setting)] = position
+        self.tasks[task.remote(pickled, position, attempt.number, self.mailbox, self.setting)] = position
 
-    def _hear(self) -> None:
-        for position, attempt, said in ray.get(self.desk.fetch.remote()):
+    def _receive(self) -> None:
+        for position, attempt, said in ray.get(self.mailbox.fetch.remote()):
             if isinstance(said, logging.LogRecord):
                 logging.getLogger(said.name).handle(said)
             elif attempt == self.batch.begun[position]:
@@ -165,14 +165,14 @@ class _Run:
         except ray_errors.RuntimeEnvSetupError as error:
             self.batch.fail(position, IngestError(f"Ray could not send the job's files: {_said(error)}"))
         except ray_errors.RayError as error:
-            self._bury(position, error)
+            self._task_died(position, error)
         else:
             if isinstance(said, Report):
                 self.batch.finish(position, self._as_given(position, said))
             else:
                 self.batch.fail(position, said)
 
-    def _bury(self, position: int, error: ray_errors.RayError) -> None:
+    def _task_died(self, position: int, error: ray_errors.RayError) -> None:
         """Account for a task that came to nothing: its recording is begun anew, or has failed."""
         if self.interrupted:
             if position in self.started:
@@ -229,7 +229,7 @@ def _connected(
             f"{address} is the address of Ray's client server",
             hint="run on a machine of the cluster, with --address auto, or by `ray job submit`",
         )
-    _knock(address)
+    _check_reachable(address)
     with tempfile.TemporaryDirectory(prefix="mosaico-ingest-") as folder:
         sent = configs
         options: dict[str, Any] = {**_HERE, "num_cpus": jobs}
@@ -246,12 +246,12 @@ def _connected(
             ray.shutdown()
 
 
-def _knock(address: str | None) -> None:
+def _check_reachable(address: str | None) -> None:
     """Find out whether anybody is at `host:port`: Ray would try for minutes."""
     host, _, port = (address or "").rpartition(":")
     if port.isdecimal():
         try:
-            socket.create_connection((host, int(port)), _KNOCK_S).close()
+            socket.create_connection((host, int(port)), _CONNECT_S).close()
         except OSError as error:
             raise _unreachable(address, error) from error
 
@@ -283,15 +283,15 @@ def _beacon(configs: Sequence[ROSInjectionConfig], run: str) -> Generator[str]:
                 folder.rmdir()  # where nothing came of it
 
 
-def _desk() -> Any:  # noqa: ANN401 - Ray's handle
-    """Start the desk on the driver's own node, whose end would be the run's end anyway."""
+def _start_mailbox() -> Any:  # noqa: ANN401 - Ray's handle
+    """Start the mailbox on the driver's own node, whose end would be the run's end anyway."""
     here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
-    return ray.remote(Desk).options(num_cpus=0, scheduling_strategy=here).remote()
+    return ray.remote(Mailbox).options(num_cpus=0, scheduling_strategy=here).remote()
 
 
 def _setting(beacon: str) -> Any:  # noqa: ANN401 - Ray's reference
     level = logging.getLogger().getEffectiveLevel()
-    return ray.put(Setting(Announced.here(), level, beacon, machine()))
+    return ray.put(Setting(Registrations.current(), level, beacon, machine()))
 
 
 def _said(error: Exception) -> str:

@@ -1,4 +1,4 @@
-"""This file is what happens on a node of a Ray cluster: a recording comes in, events go to the desk, a report comes out."""
+"""This file is what happens on a node of a Ray cluster: a recording comes in, events go to the mailbox, a report comes out."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ import ray
 
 from mosaico_ingest.config import ROSInjectionConfig, StoreTarget
 from mosaico_ingest.errors import BagError, IngestError, Interrupted, SinkError
-from mosaico_ingest.executors.crew import Announced
 from mosaico_ingest.executors.interrupts import Stop
 from mosaico_ingest.executors.worker import failed_report, run_config
+from mosaico_ingest.executors.worker_process import Registrations
 from mosaico_ingest.frozen import frozen
 from mosaico_ingest.report.events import Event, RunFinished, RunStarted
 from mosaico_ingest.report.model import Report
 
-__all__ = ["Desk", "Letter", "Setting", "ingest", "machine", "out_of_reach"]
+__all__ = ["Mailbox", "Notice", "Setting", "ingest", "machine", "out_of_reach"]
 
-Letter: TypeAlias = tuple[int, int, Event | logging.LogRecord]
+Notice: TypeAlias = tuple[int, int, Event | logging.LogRecord]
 """The recording's position, the number of the attempt, what there is to say."""
 
 _SEND_EVERY_S = 0.2
@@ -36,7 +36,7 @@ _SEND_EVERY_S = 0.2
 class Setting:
     """What all tasks of a run have in common."""
 
-    announced: Announced
+    registrations: Registrations
     log_level: int
     beacon: str
     """The name of the file by which a worker knows that it sees the same store as the driver."""
@@ -44,32 +44,38 @@ class Setting:
     """Where the driver runs."""
 
 
-class Desk:
-    """The actor beside the driver that takes letters in until they are fetched; the driver asks, so that it never waits."""
+class Mailbox:
+    """The actor beside the driver that takes in what workers say until it is fetched; the driver asks, so that it never waits."""
 
     def __init__(self) -> None:
-        self._letters: list[Letter] = []
+        self._notices: list[Notice] = []
 
-    def post(self, letters: list[Letter]) -> None:
-        """Take letters in."""
-        self._letters += letters
+    def post(self, notices: list[Notice]) -> None:
+        """Take in what workers have to say."""
+        self._notices += notices
 
-    def fetch(self) -> list[Letter]:
+    def fetch(self) -> list[Notice]:
         """Hand out what has come in."""
-        letters, self._letters = self._letters, []
-        return letters
+        notices, self._notices = self._notices, []
+        return notices
 
 
-def ingest(letter: bytes, position: int, attempt: int, desk: Any, setting: Setting) -> Report | IngestError:  # noqa: ANN401 - Ray's handle of the desk
+def ingest(
+    pickled: bytes,
+    position: int,
+    attempt: int,
+    mailbox: Any,  # noqa: ANN401 - Ray's handle of the actor
+    setting: Setting,
+) -> Report | IngestError:
     """Ingest one recording; what cannot even be begun is an error."""
     try:
-        config: ROSInjectionConfig = pickle.loads(letter)  # noqa: S301 - from our own driver
+        config: ROSInjectionConfig = pickle.loads(pickled)  # noqa: S301 - from our own driver
     except Exception as error:  # noqa: BLE001 - the border: a class's own code runs here
         return IngestError(f"the job cannot be read on {_node()}: {type(error).__name__}: {error}")
     pa.set_cpu_count(1)
-    setting.announced.announce()
+    setting.registrations.register()
     stop = Stop()
-    outbox = _Outbox(desk, position, attempt, stop)
+    outbox = _Outbox(mailbox, position, attempt, stop)
     before = signal.signal(signal.SIGINT, stop)  # what Ray's cancellation raises
     try:
         with _records_sent(outbox, setting.log_level):
@@ -123,11 +129,11 @@ def _node() -> str:
 class _Outbox:
     """Collects what there is to say and posts it a few times a second."""
 
-    def __init__(self, desk: Any, position: int, attempt: int, stop: Stop) -> None:  # noqa: ANN401 - Ray's handle
-        self._desk = desk
+    def __init__(self, mailbox: Any, position: int, attempt: int, stop: Stop) -> None:  # noqa: ANN401 - Ray's handle
+        self._mailbox = mailbox
         self._address = (position, attempt)
         self._stop = stop
-        self._letters: list[Letter] = []
+        self._notices: list[Notice] = []
         self._posted_at = 0.0
 
     def tell(self, event: Event) -> None:
@@ -141,16 +147,16 @@ class _Outbox:
 
     def put(self, said: Event | logging.LogRecord) -> None:
         """Take something that goes with the next event."""
-        self._letters.append((*self._address, said))
+        self._notices.append((*self._address, said))
 
     def flush(self) -> None:
         """Post everything and wait until it is there, so that no report comes before its events."""
         ray.get(self._post())
 
     def _post(self) -> Any:  # noqa: ANN401 - Ray's reference
-        letters, self._letters = self._letters, []
+        notices, self._notices = self._notices, []
         self._posted_at = time.monotonic()
-        return self._desk.post.remote(letters)
+        return self._mailbox.post.remote(notices)
 
 
 class _Records(logging.Handler):

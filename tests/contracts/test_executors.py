@@ -278,7 +278,7 @@ def test_memory_is_shared_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     seen: list[int | None] = []
     jobs = configs(tmp_path, "abcd", memory_bytes=400 << 20)
     monkeypatch.setattr(
-        "mosaico_ingest.executors.processes._Crew.reports",
+        "mosaico_ingest.executors.processes._Pool.reports",
         lambda self, _: iter(seen.extend(config.memory_bytes for config in self.batch.configs) or ()),
     )
     assert list(Processes(4).map(jobs, ignore_batch)) == []

@@ -25,9 +25,9 @@ pytest.importorskip("ray", reason="Ray is not installed")
 
 from ray_cluster import two_nodes
 
-from mosaico_ingest.executors.crew import Announced
 from mosaico_ingest.executors.ray import Ray
 from mosaico_ingest.executors.ray_worker import Setting, machine, out_of_reach
+from mosaico_ingest.executors.worker_process import Registrations
 
 pytestmark = pytest.mark.slow
 
@@ -175,7 +175,7 @@ def test_no_cluster_at_an_address_is_said(tmp_path: Path) -> None:
 
 def test_what_a_node_cannot_reach_is_said_and_never_made_anew_there(tmp_path: Path) -> None:
     config = compile_job(make_job(tmp_path, "a"))[0]
-    here = Setting(Announced.here(), 0, ".run-1", machine())
+    here = Setting(Registrations.current(), 0, ".run-1", machine())
     (tmp_path / "store").mkdir()
     assert "one machine only" in str(out_of_reach(config, here))
     (tmp_path / "store" / here.beacon).touch()

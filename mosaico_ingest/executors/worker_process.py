@@ -23,22 +23,22 @@ from mosaico_ingest.frozen import frozen
 from mosaico_ingest.policies import Stores
 from mosaico_ingest.report.events import Event
 
-__all__ = ["Announced", "do_nothing", "work"]
+__all__ = ["Registrations", "do_nothing", "work"]
 
 
 @frozen
-class Announced:
+class Registrations:
     """The types and adapters a program has registered, which a new process does not know of."""
 
     types: Mapping[Stores | None, Mapping[str, Registered]]
     adapters: tuple[type[Any], ...]
 
     @classmethod
-    def here(cls) -> Announced:
+    def current(cls) -> Registrations:
         """Return those of this process."""
         return cls(ROSTypeRegistry.snapshot(), tuple(dict.fromkeys(registered_adapters().values())))
 
-    def announce(self) -> None:
+    def register(self) -> None:
         """Register them in this process."""
         ROSTypeRegistry.restore(self.types)
         for adapter in self.adapters:
@@ -49,7 +49,7 @@ def do_nothing() -> None:
     """Prepare nothing."""
 
 
-def work(pipe: Connection, announced: Announced, prepare: Callable[[], None], jobs: int) -> None:
+def work(pipe: Connection, registrations: Registrations, prepare: Callable[[], None], jobs: int) -> None:
     """Ingest what comes through the pipe until its other end is closed."""
     os.setsid()  # Ctrl-C reaches the parent only, which passes it on once
     stop = Stop()
@@ -57,20 +57,20 @@ def work(pipe: Connection, announced: Announced, prepare: Callable[[], None], jo
     signal.signal(signal.SIGTERM, stop)
     pa.set_cpu_count(max(1, (os.cpu_count() or 1) // jobs))
     prepare()
-    announced.announce()
+    registrations.register()
     with held_catalogs() as hold, suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while not stop.asked:
             _ingest(pipe, pipe.recv_bytes(), stop, hold)
 
 
-def _ingest(pipe: Connection, letter: bytes, stop: Stop, hold: Hold) -> None:
+def _ingest(pipe: Connection, pickled: bytes, stop: Stop, hold: Hold) -> None:
     def tell(event: Event) -> None:
         stop.hold()  # an interrupt in the middle of a message would leave half of it in the pipe
         pipe.send(event)
         stop.heed()
 
     try:
-        config: ROSInjectionConfig = pickle.loads(letter)  # noqa: S301 - from our own parent
+        config: ROSInjectionConfig = pickle.loads(pickled)  # noqa: S301 - from our own parent
     except Exception as error:  # noqa: BLE001 - the border: a class's own code runs here
         pipe.send(IngestError(f"the job cannot be read in another process: {type(error).__name__}: {error}"))
         return
