@@ -74,9 +74,9 @@ class BatchBoard:
         """Return the picture."""
         batch = self._batch
         table = Table(box=None, pad_edge=False, header_style="dim")
-        table.add_column("recording", overflow="ellipsis", no_wrap=True)
+        table.add_column("recording", overflow="ellipsis")
         for column in ("read", "of", "rejected"):
-            table.add_column(column, justify="right")
+            table.add_column(column, justify="right", no_wrap=True)
         for one in tuple(batch.at_work.values()):
             promised = count_text(one.promised) if one.promised else "?"
             table.add_row(one.start.sequence, count_text(one.read), promised, count_text(one.rejected))

@@ -99,7 +99,7 @@ def _print(report: ExportReport) -> None:
     table = Table(box=None, pad_edge=False, header_style="dim")
     for name in ("topic", "type", "adapter"):
         table.add_column(name, overflow="fold")
-    table.add_column("messages", justify="right")
+    table.add_column("messages", justify="right", no_wrap=True)
     for topic in report.topics:
         if not topic.left_out:
             table.add_row(topic.topic, topic.msgtype, topic.adapter, count_text(topic.messages))

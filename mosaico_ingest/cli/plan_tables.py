@@ -61,7 +61,8 @@ def _print_recording(recording: RecordingPlan, folder: Path, console: Console) -
     samples = {sample.target: sample for sample in recording.samples}
     table = Table(box=None, pad_edge=False, header_style="dim")
     for name in ("topic", "type", "messages", "becomes", "adapter", "because", "sample"):
-        table.add_column(name, justify="right" if name == "messages" else "left", overflow="fold")
+        count = name == "messages"
+        table.add_column(name, justify="right" if count else "left", overflow="fold", no_wrap=count)
     for topic in decided.topics:
         renamed = "" if topic.target == topic.topic else f" → {topic.target}"
         every = "" if topic.every == 1 else f" / {topic.every}"

@@ -175,10 +175,10 @@ class _Board:
 
     def _table(self) -> Table:
         table = Table(box=None, pad_edge=False, header_style="dim")
-        table.add_column("topic", overflow="ellipsis", no_wrap=True)
-        table.add_column("ontology", style="cyan", no_wrap=True)
+        table.add_column("topic", overflow="ellipsis")
+        table.add_column("ontology", style="cyan", overflow="ellipsis")
         for column in ("read", "written", "rejected"):
-            table.add_column(column, justify="right")
+            table.add_column(column, justify="right", no_wrap=True)
         counts = sorted(self._tally.topics.values(), key=lambda count: -count.read)
         for count in counts[:MAX_ROWS]:
             rejected = Text(count_text(count.rejected), style="red" if count.rejected else "dim")

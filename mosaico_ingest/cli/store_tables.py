@@ -151,7 +151,7 @@ def _table(first: str, **columns: bool) -> Table:
     table = Table(box=None, pad_edge=False, header_style="dim")
     table.add_column(first, overflow="fold")
     for name, right in columns.items():
-        table.add_column(name, justify="right" if right else "left")
+        table.add_column(name, justify="right" if right else "left", no_wrap=right)
     return table
 
 

@@ -56,7 +56,7 @@ def print_inspection(found: Inspection, *, as_json: bool) -> None:
         ("becomes", False),
         ("adapter", False),
     ):
-        table.add_column(name, justify="right" if right else "left", overflow="fold")
+        table.add_column(name, justify="right" if right else "left", overflow="fold", no_wrap=right)
     for topic in found.topics:
         count = "?" if topic.count is None else count_text(topic.count)
         rate = "" if topic.rate_hz is None else f"{topic.rate_hz:.1f} Hz"
@@ -121,8 +121,8 @@ def _print_recording(report: Report, console: Console) -> None:
         return  # the error says it all
     columns = COLUMNS if console.width >= ROOMY else tuple(c for c in COLUMNS if c not in {"rate", "payload"})
     table = Table(box=None, pad_edge=False, header_style="dim")
-    table.add_column("topic", overflow="ellipsis", no_wrap=True)
-    table.add_column("ontology", style="cyan", no_wrap=True)
+    table.add_column("topic", overflow="fold")
+    table.add_column("ontology", style="cyan", overflow="fold")
     for column in columns:
         table.add_column(column, justify="right", no_wrap=True)
     for topic in report.topics:
