@@ -119,4 +119,5 @@ def _chosen(config: ROSInjectionConfig, plan: Plan) -> Iterator[Finding]:
 def _left_out(plan: Plan) -> Iterator[Finding]:
     """Yield a note for each topic that is not read, with the line of the manifest that says so."""
     for topic in plan.left_out:
-        yield Finding("left-out", Severity.INFO, f"{topic.topic}: {topic.why}", topic.span)
+        severity = Severity.WARNING if topic.lost else Severity.INFO
+        yield Finding("left-out", severity, f"{topic.topic}: {topic.why}", topic.span)

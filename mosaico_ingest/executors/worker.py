@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from os.path import normpath
 from pathlib import Path
@@ -114,6 +114,8 @@ def execute(
             return collector.report(), None
         for path in plan.missing:
             tell(Unreadable(None, None, None, f"{path}: this part is not there"))
+        for lost in _undefined(plan):
+            tell(lost)
         with open_recording(plan.files, resolve=plan.resolver) as recording:
             destination = sink or sink_for(plan.target, buffer_bytes=plan.memory_bytes // 4)
             watch.lap(Step.PREPARE)
@@ -175,6 +177,17 @@ def _started(plan: Plan) -> RunStarted:
         source_bytes=plan.source_bytes,
         topics=(*taken, *left),
     )
+
+
+def _undefined(plan: Plan) -> Iterator[Unreadable]:
+    """Yield what is lost for want of a definition; how much that is of a stretch of time, the index does not say."""
+    taken = {topic.target for topic in plan.topics}
+    whole = plan.read_from_ns is None and plan.read_until_ns is None
+    for topic in plan.left_out:
+        if topic.lost:
+            target = None if topic.topic in taken else topic.topic
+            reason = f"no definition of {topic.msgtype} can be used"
+            yield Unreadable(target, topic.count if whole else None, None, reason)
 
 
 def _unplanned(config: ROSInjectionConfig) -> RunStarted:

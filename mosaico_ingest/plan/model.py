@@ -60,6 +60,8 @@ class LeftOut:
     why: str
     span: Span | None = None
     """Where the manifest says so."""
+    lost: bool = False
+    """Nobody asked for that: its messages cannot be read for want of their definition."""
 
 
 @frozen

@@ -27,6 +27,7 @@ def resolve(
 
     Raises:
         NothingMatched: No topic is left, or the recording has no message.
+        BagError: Nobody defines a topic's type, and unreadable messages shall end the run.
         AdapterError: An adapter does not fit its topic, or a type without adapter is not wanted; `findings` has
             every mistake of every topic.
         IngestError: The configuration is for one plan only, and this is another.

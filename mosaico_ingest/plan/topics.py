@@ -14,10 +14,10 @@ from mosaico_ingest.bag.shape import ros_shape
 from mosaico_ingest.bridge import ROSBridge
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.diagnostics import Finding, Severity, Span
-from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.errors import AdapterError, BagError
 from mosaico_ingest.patterns import Selection, first_match
 from mosaico_ingest.plan.model import LeftOut, TopicPlan
-from mosaico_ingest.policies import Unmodeled
+from mosaico_ingest.policies import LoaderErrorPolicy, Unmodeled
 
 __all__ = ["decide", "merge"]
 
@@ -31,6 +31,7 @@ def decide(
 
     Raises:
         AdapterError: An override does not fit, or the type has no adapter and the job says to fail then.
+        BagError: Nobody defines the type, and unreadable messages shall end the run.
     """
     if channel.topic not in selection.selected:
         return _not_selected(config, channel, selection)
@@ -38,7 +39,7 @@ def decide(
         encoding = channel.attributes.get("encoding", "unknown")
         return _left_out(channel, channel.problem or f"not a ROS encoding: {encoding}")
     if channel.definition is None:
-        return _left_out(channel, channel.problem or f"no definition of {channel.msgtype} is known")
+        return _lost(config, channel, channel.problem or f"no definition of {channel.msgtype} is known")
     found = bridge.resolve(channel.topic, channel.msgtype)
     if found.unmodeled and config.unmodeled is not Unmodeled.KEEP:
         if config.unmodeled is Unmodeled.FAIL:
@@ -118,6 +119,12 @@ def _free_name(plan: TopicPlan, used: set[str]) -> str:
 
 def _left_out(channel: Channel, why: str, place: Span | None = None) -> LeftOut:
     return LeftOut(channel.topic, channel.msgtype, channel.count, why, place)
+
+
+def _lost(config: ROSInjectionConfig, channel: Channel, why: str) -> LeftOut:
+    if channel.count != 0 and config.messages_on_error is LoaderErrorPolicy.RAISE:
+        raise BagError(why, where=channel.topic)
+    return replace(_left_out(channel, why), lost=channel.count != 0)
 
 
 def _not_selected(config: ROSInjectionConfig, channel: Channel, selection: Selection) -> LeftOut:

@@ -141,8 +141,12 @@ class Collector:
             findings=tuple(self._findings),
         )
 
+    def _unread(self, expected: Expected) -> _Sum:
+        lost = (loss.count or 0 for loss in self._losses if loss.topic == expected.topic)
+        return _Sum(unreadable=sum(lost))
+
     def _topic(self, expected: Expected) -> TopicReport:
-        total = self._sums[expected.target] if not expected.left_out else _Sum()
+        total = self._sums[expected.target] if not expected.left_out else self._unread(expected)
         rejections = tuple(total.rejections.values())
         return TopicReport(
             topic=expected.topic,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,14 +14,16 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
+from made_recordings import define, record
 
 from mosaico_ingest import api
 from mosaico_ingest.bag.batch import Loss
 from mosaico_ingest.cli.app import main
 from mosaico_ingest.config import ROSInjectionConfig
-from mosaico_ingest.errors import VerificationError
+from mosaico_ingest.errors import BagError, VerificationError
 from mosaico_ingest.executors.worker import execute, make_plan
 from mosaico_ingest.injector import _missing
+from mosaico_ingest.policies import LoaderErrorPolicy
 from mosaico_ingest.report.events import Event, Noted, RunStatus, Unreadable
 from mosaico_ingest.sink import MemorySink, StoredTopic
 from mosaico_ingest.store import Store
@@ -82,6 +85,49 @@ def test_the_sums_of_a_damaged_recording_hold(tmp_path: Path) -> None:
     for topic in taken:
         assert topic.promised == topic.read + topic.unreadable
         assert topic.read == topic.written + topic.filtered + topic.downsampled + topic.rejected
+
+
+@pytest.fixture
+def undefined(tmp_path: Path) -> Path:
+    """A recording without definitions; no distro knows the type of one of its two topics."""
+    number = define("std_msgs/msg/Int32", "int32 data\n")
+    own = define("own_msgs/msg/Thing", "int32 a\n")
+    bag = record(
+        tmp_path / "old.db3",
+        [
+            message
+            for at in range(3)
+            for message in (("/known", number, at, {"data": at}), ("/own", own, at, {"a": at}))
+        ],
+    )
+    with closing(sqlite3.connect(bag)) as db:
+        db.execute("DELETE FROM message_definitions")
+        db.commit()
+    return bag
+
+
+def test_messages_of_a_type_nobody_defines_are_lost_and_not_left_out_on_purpose(undefined: Path) -> None:
+    config = ROSInjectionConfig(undefined, "old", ros_distro="ros2_humble", store=undefined.parent / "store")
+    (report,) = api.run([config]).recordings
+    assert (report.status, report.exit_code) == (RunStatus.REJECTED, 4)
+    assert [(topic.topic, topic.promised, topic.read, topic.unreadable) for topic in report.topics] == [
+        ("/known", 3, 3, 0),
+        ("/own", 3, 0, 3),
+    ]
+    assert [(loss.topic, loss.count, loss.reason) for loss in report.losses] == [
+        ("/own", 3, "no definition of own_msgs/msg/Thing can be used")
+    ]
+    (chosen,) = api.run([replace(config, sequence_name="chosen", topics=("!/own",))]).recordings
+    assert chosen.exit_code == 0
+
+
+def test_a_type_nobody_defines_ends_a_run_that_shall_lose_nothing(undefined: Path) -> None:
+    config = ROSInjectionConfig(
+        undefined, "old", store=undefined.parent / "store", messages_on_error=LoaderErrorPolicy.RAISE
+    )
+    with pytest.raises(BagError, match=r"/own: the definition of own_msgs/msg/Thing is not known"):
+        api.RosbagInjector(config).run()
+    api.RosbagInjector(replace(config, topics=("/known",))).run()
 
 
 def test_a_destination_that_loses_rows_fails_the_run(
