@@ -40,32 +40,32 @@ def inject(
     watch = watch or Stopwatch()
     failure: BaseException | None = None
     missing: list[str] = []
-    aside = _quarantine(plan)
+    quarantine = _open_quarantine(plan)
     streams: tuple[Stream, ...] = ()
     try:
         with sink.open(plan.sequence, plan.metadata, if_exists=plan.if_exists) as session:
-            streams = _open_streams(plan, recording, session, observe, aside=aside, watch=watch)
+            streams = _open_streams(plan, recording, session, observe, quarantine=quarantine, watch=watch)
             try:
                 _pump(plan, recording, streams, observe, watch)
                 missing = _missing(plan, recording, streams, observe)
                 _check_not_empty(plan, streams)
             except BaseException as error:
                 # Every way to end early, Ctrl-C too, is the session policy's to judge.
-                failure = _named(error)
+                failure = _as_interrupt(error)
                 if plan.on_error is SessionLevelErrorPolicy.Delete or not any(s.rows for s in streams):
                     raise failure from error
                 session.note_error(str(failure))
-            if aside is not None:
-                aside.close()
+            if quarantine is not None:
+                quarantine.close()
     except BaseException as error:
-        named = _named(error)
-        _forsake(streams, aside, named, observe)
-        if named is error:
+        reported = _as_interrupt(error)
+        _account_for_discard(streams, quarantine, reported, observe)
+        if reported is error:
             raise
-        raise named from error
-    if aside is not None:
-        _put_away(aside, plan.if_exists, observe)
-    wrong = missing + _close(session.stored(), streams, observe, forgive=failure)
+        raise reported from error
+    if quarantine is not None:
+        _report_quarantine(quarantine, plan.if_exists, observe)
+    wrong = missing + _close(session.stored(), streams, observe, failure=failure)
     if failure is not None:
         raise failure
     if wrong:
@@ -74,27 +74,27 @@ def inject(
         )
 
 
-def _put_away(aside: Quarantine, if_exists: IfExists, observe: Observer) -> None:
+def _report_quarantine(quarantine: Quarantine, if_exists: IfExists, observe: Observer) -> None:
     """Say what is kept of a session that is committed; what was kept of one it replaced is no longer needed."""
     if if_exists is IfExists.REPLACE:
-        aside.supersede()
-    if aside.kept:
-        observe(Noted(_kept(aside)))
-        observe(Quarantined(str(aside.messages_path)))
+        quarantine.supersede()
+    if quarantine.kept:
+        observe(Noted(_kept(quarantine)))
+        observe(Quarantined(str(quarantine.messages_path)))
 
 
-def _forsake(
-    streams: tuple[Stream, ...], aside: Quarantine | None, error: BaseException, observe: Observer
+def _account_for_discard(
+    streams: tuple[Stream, ...], quarantine: Quarantine | None, error: BaseException, observe: Observer
 ) -> None:
     """Account for a session that leaves nothing behind."""
     for stream in streams:
         _take_back(stream, stream.rows, f"the session was discarded: {error}", observe)
         observe(TopicClosed(stream.plan.target, stream.status, 0, error=stream.error))
-    if aside is not None:
-        aside.discard()
+    if quarantine is not None:
+        quarantine.discard()
 
 
-def _quarantine(plan: Plan) -> Quarantine | None:
+def _open_quarantine(plan: Plan) -> Quarantine | None:
     if plan.quarantine is None:
         return None
     counts = [topic.count for topic in plan.topics]
@@ -102,16 +102,17 @@ def _quarantine(plan: Plan) -> Quarantine | None:
     return Quarantine(plan.quarantine, plan.sequence, promised, name=plan.kept_as)
 
 
-def _kept(aside: Quarantine) -> Finding:
+def _kept(quarantine: Quarantine) -> Finding:
     return Finding(
         "quarantined",
         Severity.WARNING,
-        f"{aside.kept} messages lie in {aside.messages_path}",
-        help=f"mend the manifest, then `ingest replay {aside.messages_path.parent} --manifest JOB.yaml`",
+        f"{quarantine.kept} messages lie in {quarantine.messages_path}",
+        help=f"mend the manifest, then `ingest replay {quarantine.messages_path.parent} --manifest JOB.yaml`",
     )
 
 
-def _named(error: BaseException) -> BaseException:
+def _as_interrupt(error: BaseException) -> BaseException:
+    """Return Ctrl-C as an error of ours, any other as it is."""
     if isinstance(error, KeyboardInterrupt):
         return Interrupted("stopped before the end of the recording", hint="run the job again for all of it")
     return error
@@ -123,13 +124,13 @@ def _open_streams(
     session: Session,
     observe: Observer,
     *,
-    aside: Quarantine | None,
+    quarantine: Quarantine | None,
     watch: Stopwatch,
 ) -> tuple[Stream, ...]:
     channels = {channel.id: channel for channel in recording.channels}
     streams: list[Stream] = []
     for topic in plan.topics:
-        stream = Stream(topic, plan.on_message_error, session, observe, quarantine=aside, watch=watch)
+        stream = Stream(topic, plan.on_message_error, session, observe, quarantine=quarantine, watch=watch)
         for channel_id in topic.channels:
             stream.bind(channels[channel_id])
         streams.append(stream)
@@ -233,7 +234,7 @@ def _close(
     streams: tuple[Stream, ...],
     observe: Observer,
     *,
-    forgive: BaseException | None,
+    failure: BaseException | None,
 ) -> list[str]:
     """Close each stream in the report; return how the destination differs from what was written.
 
@@ -244,8 +245,8 @@ def _close(
     for stream in streams:
         found = held.get(stream.plan.target)
         rows = found.rows if found else 0
-        if forgive is not None:
-            _take_back(stream, stream.rows - rows, f"not written before the run ended: {forgive}", observe)
+        if failure is not None:
+            _take_back(stream, stream.rows - rows, f"not written before the run ended: {failure}", observe)
         elif (stream.rows, stream.start_ns, stream.end_ns) != _held(found):
             wrong.append(
                 f"{stream.plan.target}: wrote {stream.rows} rows in [{stream.start_ns}, {stream.end_ns}], "

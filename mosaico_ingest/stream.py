@@ -108,10 +108,10 @@ class Stream:
             self._reject_rest(batch, 0)
             return
         done = self._translate(batch)
-        fatal, aside = self._judge(batch, done)
+        fatal, quarantined = self._judge(batch, done)
         end = len(batch) if fatal is None else fatal.failure.row + 1
         self._count(batch, end, downsampled=int((done.skipped < end).sum()))
-        self._reject(batch, (lost for lost in done.lost if lost.failure.row < end), aside)
+        self._reject(batch, (lost for lost in done.lost if lost.failure.row < end), quarantined)
         kept = int(np.searchsorted(done.index, end))
         if kept:
             rows = _record_batch(done.log_times[:kept], done.rows[:kept])
@@ -145,22 +145,22 @@ class Stream:
         return _Translated(adapted.rows, times, index[adapted.index], tuple(lost), positions[~taken])
 
     def _judge(self, batch: RawBatch, done: _Translated) -> tuple[_Lost | None, set[int]]:
-        """Put lost messages aside in their order; return the one that ends the topic, and the rows put aside."""
-        aside: set[int] = set()
+        """Quarantine lost messages in their order; return the one that ends the topic, and the rows that were quarantined."""
+        quarantined: set[int] = set()
         first_good = int(done.index[0]) if len(done.index) else len(batch)
         for lost in done.lost:
             row = lost.failure.row
             self._leading += self.rows == 0 and row < first_good
-            if self._set_aside(batch, lost):
-                aside.add(row)
+            if self._try_quarantine(batch, lost):
+                quarantined.add(row)
             elif self._ends_topic(lost):
-                return lost, aside
+                return lost, quarantined
             if self.quarantine is not None and self._leading == self.quarantine.systematic:
                 reason = f"none of the first {self._leading} messages could be used: {lost.failure.reason}"
-                return replace(lost, failure=replace(lost.failure, reason=reason)), aside
-        return None, aside
+                return replace(lost, failure=replace(lost.failure, reason=reason)), quarantined
+        return None, quarantined
 
-    def _set_aside(self, batch: RawBatch, lost: _Lost) -> bool:
+    def _try_quarantine(self, batch: RawBatch, lost: _Lost) -> bool:
         return self.quarantine is not None and self.quarantine.take(
             batch,
             lost.failure,
@@ -266,7 +266,7 @@ class Stream:
             )
         )
 
-    def _reject(self, batch: RawBatch, lost: Iterable[_Lost], aside: set[int]) -> None:
+    def _reject(self, batch: RawBatch, lost: Iterable[_Lost], quarantined: set[int]) -> None:
         """Say what was lost, once for each rule, with the first message as the example."""
         groups: dict[tuple[Stage, str], list[RowFailure]] = {}
         for one in lost:
@@ -282,7 +282,7 @@ class Stream:
                     first.reason,
                     int(batch.log_times[first.row]),
                     int(batch.offsets[first.row]),
-                    sum(failure.row in aside for failure in failures),
+                    sum(failure.row in quarantined for failure in failures),
                 )
             )
 

@@ -12,7 +12,7 @@ from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.diagnostics import Finding, Severity
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.executors.trial import try_messages
-from mosaico_ingest.executors.worker import foresee, open_for
+from mosaico_ingest.executors.worker import open_for, preflight
 from mosaico_ingest.patterns import first_match
 from mosaico_ingest.plan.describe import decisions, notes
 from mosaico_ingest.plan.destination import ask_destination, space_finding
@@ -77,8 +77,8 @@ def preview(config: ROSInjectionConfig, *, connect: bool) -> RecordingPlan:
         losses = tuple(_losses(recording))
     decided = decisions(plan, folder=config.base_dir)
     state = ask_destination(plan, samples, connect=connect)
-    foreseen = foresee(plan) if connect and state.exists else None
-    found = (finding for finding in (space_finding(state), foreseen) if finding is not None)
+    warning = preflight(plan) if connect and state.exists else None
+    found = (finding for finding in (space_finding(state), warning) if finding is not None)
     return RecordingPlan(
         digest=decided.digest,
         decisions=decided,

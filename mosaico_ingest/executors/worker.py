@@ -39,7 +39,7 @@ from mosaico_ingest.sink import Sink
 from mosaico_ingest.store.sink import StoreSink
 from mosaico_ingest.store.store import Store
 
-__all__ = ["execute", "failed_report", "foresee", "make_plan", "open_for", "run_config", "sink_for"]
+__all__ = ["execute", "failed_report", "make_plan", "open_for", "preflight", "run_config", "sink_for"]
 
 _log = logging.getLogger(__name__)
 
@@ -77,11 +77,11 @@ def sink_for(target: StoreTarget | ServerTarget, *, buffer_bytes: int) -> Sink:
     return PlatformSink(target, buffer_bytes)
 
 
-def foresee(plan: Plan) -> Finding | None:
+def preflight(plan: Plan) -> Finding | None:
     """Return what a server's key would not let the session policy do; the server is asked."""
     if not isinstance(plan.target, ServerTarget) or plan.on_error is not SessionLevelErrorPolicy.Delete:
         return None
-    from mosaico_ingest.platform.foresight import delete_finding  # noqa: PLC0415 - as in sink_for
+    from mosaico_ingest.platform.preflight import delete_finding  # noqa: PLC0415 - as in sink_for
 
     return delete_finding(plan.target, plan.sequence)
 
@@ -105,9 +105,9 @@ def execute(
     for finding in plan.findings:
         tell(Noted(finding))
     try:
-        foreseen = None if sink else foresee(plan)
-        if foreseen is not None:
-            tell(Noted(foreseen))
+        warning = None if sink else preflight(plan)
+        if warning is not None:
+            tell(Noted(warning))
         entered = plan if sink else enter(plan)
         if entered is None:
             tell(RunFinished(RunStatus.SKIPPED, 0))

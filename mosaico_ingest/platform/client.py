@@ -17,8 +17,8 @@ import pyarrow.flight as fl
 from mosaico_ingest.config import ServerTarget
 from mosaico_ingest.errors import SinkError, SinkUnavailable
 from mosaico_ingest.frozen import frozen
+from mosaico_ingest.platform.deadlines import DeadlinePassed, within
 from mosaico_ingest.platform.faults import Address, Refused, check_tls, late, reraise
-from mosaico_ingest.platform.patience import OutOfPatience, within
 from mosaico_ingest.wire import bodies
 from mosaico_ingest.wire.actions import API_KEY_HEADER, INFO, VERSION, Action, Permission
 from mosaico_ingest.wire.bodies import Body
@@ -207,7 +207,7 @@ class PlatformClient:
     def _once(self, call: Callable[[], _Result], doing: str, needs: Permission) -> _Result:
         try:
             return within(self._answer_s + _MARGIN_S, call)
-        except OutOfPatience as error:
+        except DeadlinePassed as error:
             raise late(self.address, doing) from error
         except pa.ArrowException as error:
             reraise(error, self.address, doing=doing, needs=needs)
@@ -232,14 +232,14 @@ def connect(
             client.handshake()
         yield client
     finally:
-        with suppress(OutOfPatience):
+        with suppress(DeadlinePassed):
             within(_CLOSE_S, flight.close)  # it waits for calls under way, which may be stuck
 
 
 def _was_slow(error: SinkUnavailable) -> bool:
     """Say whether the server was there and did not answer in time: asking again would only load it more."""
     cause = error.__cause__
-    return isinstance(cause, OutOfPatience) or condition_of(cause or error) is Condition.TIMED_OUT
+    return isinstance(cause, DeadlinePassed) or condition_of(cause or error) is Condition.TIMED_OUT
 
 
 def _address(target: ServerTarget) -> Address:

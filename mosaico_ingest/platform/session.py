@@ -11,8 +11,8 @@ from mosaico_ingest.config import ServerTarget
 from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.platform.client import PlatformClient, Uploaded, connect
+from mosaico_ingest.platform.deadlines import in_thread
 from mosaico_ingest.platform.faults import Refused, add_hint
-from mosaico_ingest.platform.patience import begun
 from mosaico_ingest.platform.upload import Memory, Upload
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.sink import StoredTopic
@@ -106,7 +106,7 @@ class PlatformSession:
     def commit(self) -> None:
         """Wait until the server has every topic, then make them visible at once."""
         self._drop_broken()
-        for closing in [begun(upload.close) for upload in self._uploads.values()]:
+        for closing in [in_thread(upload.close) for upload in self._uploads.values()]:
             closing.result()
         for path, message in self._notes:
             self._send_note(path, message)
@@ -121,7 +121,7 @@ class PlatformSession:
 
     def discard(self) -> str | None:
         """Leave no trace; return what had to stay behind or is lost, None where nothing is."""
-        for ending in [begun(upload.abandon) for upload in self._uploads.values()]:
+        for ending in [in_thread(upload.abandon) for upload in self._uploads.values()]:
             ending.result()
         remarks = [self._remove()]
         if self._replaced:

@@ -10,8 +10,8 @@ import pyarrow.flight as fl
 
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.platform.deadlines import DeadlinePassed, within
 from mosaico_ingest.platform.faults import Address, late, reraise
-from mosaico_ingest.platform.patience import OutOfPatience, within
 from mosaico_ingest.platform.sizes import framing_bytes, row_spans
 from mosaico_ingest.sink import check_batch, topic_schema
 from mosaico_ingest.wire.actions import Permission
@@ -102,7 +102,7 @@ class Upload:
             self._waiting.clear()
             self.waiting_bytes = 0
             within(_LOCK_S, self._stream.close)
-        except (pa.ArrowException, OutOfPatience) as error:
+        except (pa.ArrowException, DeadlinePassed) as error:
             self.broken = self.broken or SinkError(type(error).__name__, where=self.name)
         finally:
             self._lock.release()
@@ -117,7 +117,7 @@ class Upload:
     def _guarded(self, call: Callable[[], object]) -> None:
         try:
             within(_UPLOAD_S, call)
-        except OutOfPatience as error:
+        except DeadlinePassed as error:
             self._stuck = True
             self.broken = self._late()
             raise self.broken from error

@@ -22,7 +22,7 @@ from mosaico_ingest.ontology import Integer64
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.platform.client import connect
 from mosaico_ingest.platform.faults import Address
-from mosaico_ingest.platform.foresight import delete_finding
+from mosaico_ingest.platform.preflight import delete_finding
 from mosaico_ingest.platform.sink import PlatformSink
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.sink import topic_schema

@@ -20,109 +20,109 @@ from mosaico_ingest.wire.actions import Action
 from mosaico_ingest.wire.bodies import Body
 from mosaico_ingest.wire.conditions import Condition
 
-__all__ = ["ANSWERS", "Behind"]
+__all__ = ["ANSWERS", "Backend"]
 
 _PROTOCOL = bodies.SemVer(major=0, minor=7, patch=0)
 _EMPTY = bodies.Empty()
 
 
 @frozen
-class Behind:
+class Backend:
     """What answers are made from."""
 
     store: Store
     uploads: Uploads
 
 
-def _info(_: Behind, __: bodies.Empty) -> bodies.Info:
+def _info(_: Backend, __: bodies.Empty) -> bodies.Info:
     version = f"{_PROTOCOL.major}.{_PROTOCOL.minor}.{_PROTOCOL.patch}"
     return bodies.Info(
         version=f"{version}+mosaico-ingest.{__version__}", semver=_PROTOCOL, config=bodies.Limits()
     )
 
 
-def _version(_: Behind, __: bodies.Empty) -> bodies.Version:
+def _version(_: Backend, __: bodies.Empty) -> bodies.Version:
     return bodies.Version(version=f"{_PROTOCOL.major}.{_PROTOCOL.minor}.{_PROTOCOL.patch}")
 
 
-def _sequence_create(behind: Behind, question: bodies.SequenceCreate) -> bodies.Empty:
+def _sequence_create(backend: Backend, question: bodies.SequenceCreate) -> bodies.Empty:
     with checked():
         wire.check_sequence_name(question.locator)
         wire.check_metadata(question.user_metadata, where=question.locator)
-    behind.store.create_sequence(question.locator, question.user_metadata)
+    backend.store.create_sequence(question.locator, question.user_metadata)
     return _EMPTY
 
 
-def _sequence_delete(behind: Behind, question: bodies.Located) -> bodies.Empty:
+def _sequence_delete(backend: Backend, question: bodies.Located) -> bodies.Empty:
     name = _sequence(question.locator)
-    behind.uploads.discard_sequence(name)
-    behind.store.delete_sequence(name)
+    backend.uploads.discard_sequence(name)
+    backend.store.delete_sequence(name)
     return _EMPTY
 
 
-def _session_create(behind: Behind, question: bodies.Located) -> bodies.SessionCreated:
-    opened = behind.uploads.open(_sequence(question.locator))
+def _session_create(backend: Backend, question: bodies.Located) -> bodies.SessionCreated:
+    opened = backend.uploads.open(_sequence(question.locator))
     return bodies.SessionCreated(uuid=opened.uuid, locator=opened.locator)
 
 
-def _session_finalize(behind: Behind, question: bodies.SessionFinalize) -> bodies.Empty:
-    behind.uploads.finalize(question.session_uuid)
+def _session_finalize(backend: Backend, question: bodies.SessionFinalize) -> bodies.Empty:
+    backend.uploads.finalize(question.session_uuid)
     return _EMPTY
 
 
-def _session_delete(behind: Behind, question: bodies.Located) -> bodies.Empty:
+def _session_delete(backend: Backend, question: bodies.Located) -> bodies.Empty:
     sequence, _, session = question.locator.partition(":")
-    if not behind.uploads.discard_session(question.locator):
-        behind.store.delete_session(_sequence(sequence), session)
+    if not backend.uploads.discard_session(question.locator):
+        backend.store.delete_session(_sequence(sequence), session)
     return _EMPTY
 
 
-def _topic_create(behind: Behind, question: bodies.TopicCreate) -> bodies.TopicCreated:
-    return bodies.TopicCreated(uuid=behind.uploads.add_topic(question))
+def _topic_create(backend: Backend, question: bodies.TopicCreate) -> bodies.TopicCreated:
+    return bodies.TopicCreated(uuid=backend.uploads.add_topic(question))
 
 
-def _topic_delete(behind: Behind, question: bodies.Located) -> bodies.Empty:
+def _topic_delete(backend: Backend, question: bodies.Located) -> bodies.Empty:
     sequence, topic = _topic(question.locator)
-    if not behind.uploads.discard_topic(sequence, topic):
-        behind.store.delete_topic(sequence, topic)
+    if not backend.uploads.discard_topic(sequence, topic):
+        backend.store.delete_topic(sequence, topic)
     return _EMPTY
 
 
-def _sequence_note(behind: Behind, question: bodies.NotificationCreate) -> bodies.Empty:
-    behind.store.add_note(_sequence(question.locator), question.msg)
+def _sequence_note(backend: Backend, question: bodies.NotificationCreate) -> bodies.Empty:
+    backend.store.add_note(_sequence(question.locator), question.msg)
     return _EMPTY
 
 
-def _sequence_notes(behind: Behind, question: bodies.Located) -> bodies.Notifications:
-    notes = behind.store.sequence(_sequence(question.locator)).notes
+def _sequence_notes(backend: Backend, question: bodies.Located) -> bodies.Notifications:
+    notes = backend.store.sequence(_sequence(question.locator)).notes
     return _told([note for note in notes if note.topic is None], question.locator)
 
 
-def _sequence_purge(behind: Behind, question: bodies.Located) -> bodies.Empty:
-    behind.store.delete_notes(_sequence(question.locator))
+def _sequence_purge(backend: Backend, question: bodies.Located) -> bodies.Empty:
+    backend.store.delete_notes(_sequence(question.locator))
     return _EMPTY
 
 
-def _topic_note(behind: Behind, question: bodies.NotificationCreate) -> bodies.Empty:
-    sequence, topic = _present(behind, question.locator)
-    behind.store.add_note(sequence, question.msg, topic=topic)
+def _topic_note(backend: Backend, question: bodies.NotificationCreate) -> bodies.Empty:
+    sequence, topic = _present(backend, question.locator)
+    backend.store.add_note(sequence, question.msg, topic=topic)
     return _EMPTY
 
 
-def _topic_notes(behind: Behind, question: bodies.Located) -> bodies.Notifications:
-    sequence, topic = _present(behind, question.locator)
-    notes = behind.store.sequence(sequence).notes
+def _topic_notes(backend: Backend, question: bodies.Located) -> bodies.Notifications:
+    sequence, topic = _present(backend, question.locator)
+    notes = backend.store.sequence(sequence).notes
     return _told([note for note in notes if note.topic == topic], question.locator)
 
 
-def _topic_purge(behind: Behind, question: bodies.Located) -> bodies.Empty:
-    sequence, topic = _present(behind, question.locator)
-    behind.store.delete_notes(sequence, topic=topic)
+def _topic_purge(backend: Backend, question: bodies.Located) -> bodies.Empty:
+    sequence, topic = _present(backend, question.locator)
+    backend.store.delete_notes(sequence, topic=topic)
     return _EMPTY
 
 
-def _query(behind: Behind, question: bodies.Query) -> bodies.QueryResult:
-    return query.run(behind.store, question)
+def _query(backend: Backend, question: bodies.Query) -> bodies.QueryResult:
+    return query.run(backend.store, question)
 
 
 def _sequence(locator: str) -> str:
@@ -139,10 +139,10 @@ def _topic(locator: str) -> tuple[str, str]:
     return sequence, topic
 
 
-def _present(behind: Behind, locator: str) -> tuple[str, str]:
+def _present(backend: Backend, locator: str) -> tuple[str, str]:
     sequence, topic = _topic(locator)
-    if not behind.uploads.has_topic(sequence, topic):
-        behind.store.topic(sequence, topic)
+    if not backend.uploads.has_topic(sequence, topic):
+        backend.store.topic(sequence, topic)
     return sequence, topic
 
 
@@ -160,7 +160,7 @@ def _told(notes: list[Note], locator: str) -> bodies.Notifications:
     )
 
 
-ANSWERS: Mapping[Action[Any, Any], Callable[[Behind, Any], Body]] = {
+ANSWERS: Mapping[Action[Any, Any], Callable[[Backend, Any], Body]] = {
     actions.INFO: _info,
     actions.VERSION: _version,
     actions.QUERY: _query,

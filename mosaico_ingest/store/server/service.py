@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.flight as fl
 
 from mosaico_ingest.store.server.access import MIDDLEWARE, KeyCheck, require
-from mosaico_ingest.store.server.answers import ANSWERS, Behind
+from mosaico_ingest.store.server.answers import ANSWERS, Backend
 from mosaico_ingest.store.server.flights import Flights
 from mosaico_ingest.store.server.keyring import Keyring
 from mosaico_ingest.store.server.refusals import Refusal, answered
@@ -35,7 +35,7 @@ class Service(fl.FlightServerBase):
     ) -> None:
         self._uploads = Uploads(store)
         self._flights = Flights(store, self._uploads)
-        self._behind = Behind(store, self._uploads)
+        self._backend = Backend(store, self._uploads)
         middleware = {MIDDLEWARE: KeyCheck(keyring)}
         super().__init__(location, tls_certificates=certificates, middleware=middleware)  # pyright: ignore[reportArgumentType] - PEM is bytes
 
@@ -103,7 +103,7 @@ class Service(fl.FlightServerBase):
                 raise Refusal(Condition.UNIMPLEMENTED, f"action {action.type!r} is not implemented")
             require(context, known.permission)
             question = JSON.decode(known.question, action.body.to_pybytes() or b"{}")
-            return iter([JSON.encode_answer(known, ANSWERS[known](self._behind, question))])
+            return iter([JSON.encode_answer(known, ANSWERS[known](self._backend, question))])
 
 
 def _told(batches: Iterator[pa.RecordBatch]) -> Generator[pa.RecordBatch, None, None]:

@@ -1,4 +1,4 @@
-"""This file waits for a server, but not for ever, and so that Ctrl-C is heard: Flight itself does neither."""
+"""This file makes a call with a deadline, on a thread of its own, so that Ctrl-C is heard: Flight itself does neither."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeout
 from typing import TypeVar
 
-__all__ = ["OutOfPatience", "begun", "within"]
+__all__ = ["DeadlinePassed", "in_thread", "within"]
 
 _Result = TypeVar("_Result")
 
-OutOfPatience = FutureTimeout
+DeadlinePassed = FutureTimeout
 """The call has not ended in time; its thread goes on, since nothing can end it but the server."""
 
 
@@ -20,12 +20,12 @@ def within(seconds: float, call: Callable[[], _Result]) -> _Result:
     """Return what the call returns, or raise what it raises.
 
     Raises:
-        OutOfPatience: It takes longer.
+        DeadlinePassed: It takes longer.
     """
-    return begun(call).result(seconds)
+    return in_thread(call).result(seconds)
 
 
-def begun(call: Callable[[], _Result]) -> Future[_Result]:
+def in_thread(call: Callable[[], _Result]) -> Future[_Result]:
     """Run the call on a thread that does not keep the process."""
     outcome: Future[_Result] = Future()
 
