@@ -195,7 +195,7 @@ class Recording:
         for turn in in_turn(sources):
             yield self._step(numbers[turn.part], turn)
         for number in numbers:
-            self._parts[number].confirm()
+            self._parts[number].check_unchanged()
 
     def _step(self, number: int, turn: Turn) -> _Step:
         try:

@@ -1,4 +1,4 @@
-"""This file keeps the books of a batch whose recordings are ingested elsewhere: waiting, begun how often, done."""
+"""This file tracks a batch whose recordings run in other processes: which wait, how often each was begun, which are done."""
 
 from __future__ import annotations
 

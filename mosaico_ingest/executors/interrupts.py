@@ -1,4 +1,4 @@
-"""This file hears requests to stop without being torn out of its work: where they are asked for, and where they are heeded."""
+"""This file defers interrupts: an executor counts them, and a worker raises them only between two messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""This file takes one topic back: which adapter made its rows, and the messages they were."""
+"""This file restores the messages of one topic: it finds the adapter that made the rows, and inverts it."""
 
 from __future__ import annotations
 

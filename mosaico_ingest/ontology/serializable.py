@@ -81,13 +81,13 @@ class Serializable(BaseModel):
 
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> Self:
-        """Return the model of one row as Arrow gives it; a struct without any value counts as none.
+        """Return the model of one row as Arrow gives it; a struct of nulls alone counts as null.
 
         Raises:
             AdapterError: The values break the model's rules; names the field and the value.
         """
         try:
-            return cls.model_validate({name: _without_hollow(value) for name, value in row.items()})
+            return cls.model_validate({name: _without_empty(value) for name, value in row.items()})
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             place = ".".join((cls.__ontology_tag__, *map(str, first["loc"])))
@@ -115,9 +115,9 @@ def _misfit(row: dict[str, Any], columns: pa.StructType) -> str | None:
     return None
 
 
-def _without_hollow(value: Any) -> Any:  # noqa: ANN401 - any cell
+def _without_empty(value: Any) -> Any:  # noqa: ANN401 - any cell
     """Return `value` with every struct of nothing but nulls replaced by None."""
     if not isinstance(value, dict):
         return value
-    cells = {name: _without_hollow(cell) for name, cell in value.items()}
+    cells = {name: _without_empty(cell) for name, cell in value.items()}
     return cells if any(cell is not None for cell in cells.values()) else None

@@ -1,4 +1,4 @@
-"""This file turns what a file system behind a URL complains about into errors of ours."""
+"""This file turns errors of a file system behind a URL into our own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""This file is what a session says to the catalog: the name it wants, and what it wrote."""
+"""This file writes sessions to the SQLite catalog: the claim on a name when one begins, all it wrote when it commits."""
 
 from __future__ import annotations
 

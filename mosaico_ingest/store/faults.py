@@ -1,4 +1,4 @@
-"""This file turns what the disk, SQLite and Arrow complain about into one line of ours."""
+"""This file turns errors of the disk, SQLite and Arrow into a SinkError of one line."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class NotInStore(SinkError):  # noqa: N818 - the condition, as in `errors`
 
 @contextmanager
 def explained(where: AnyPath | str) -> Generator[None, None, None]:
-    """Raise SinkError, with the place and a remedy, for whatever the store's ground refuses inside."""
+    """Raise SinkError, with the place and a remedy, for what the disk, SQLite or Arrow refuses inside."""
     try:
         yield
     except Unreachable as err:

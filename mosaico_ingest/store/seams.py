@@ -1,4 +1,4 @@
-"""This file is what a store stands on: files that hold rows, and records that say which of them count."""
+"""This file is the seams of a store: `Files` hold the rows, `Records` say which of them count."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The way back: an adapter that is bound to a message type, and stored rows in; messages in the ROS shape out.
+"""Adapters inverted: an adapter bound to a message type and stored rows in, messages in the ROS shape out.
 
-What a mapping moves it moves back; what it computes is undone where that is possible. Whether it was possible is not
-believed but tried: the messages go through the adapter once more, and what then differs is counted.
+Values that a mapping moved are moved back, those it computed are computed back where that is possible. The result is
+checked: the messages are adapted once more, and rows that differ are counted.
 """
 
 from __future__ import annotations

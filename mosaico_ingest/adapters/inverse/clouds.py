@@ -1,4 +1,4 @@
-"""This file makes PointCloud2 messages of columns of points: packed, one line, little-endian."""
+"""This file packs columns of points into PointCloud2 messages: unordered (height 1), little-endian."""
 
 from __future__ import annotations
 

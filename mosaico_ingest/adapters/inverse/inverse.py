@@ -1,4 +1,4 @@
-"""This file takes stored rows back to the messages they were made of, and tries whether that went well."""
+"""This file restores messages from stored rows, and checks the result by adapting them again."""
 
 from __future__ import annotations
 

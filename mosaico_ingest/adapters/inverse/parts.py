@@ -37,7 +37,7 @@ _ONTOLOGY_NAMES = {
 
 @frozen
 class _Mark:
-    """An element of a list, or a value that says why another was left out; where the whole is known, that stands."""
+    """A value that a field, or one element of its list, must have had in some rows; used where the field itself is not known."""
 
     index: int | None
     """Which element of the list; None: the value itself."""

@@ -1,4 +1,4 @@
-"""This file is what undoes a function: from what it gave, what it was given."""
+"""This file inverts functions: from a result to the argument."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""This file walks a compiled mapping backwards: for every column it says which fields of the message it came from."""
+"""This file inverts a compiled mapping: it assigns the values of each column to the message fields they came from."""
 
 from __future__ import annotations
 

@@ -168,7 +168,10 @@ class Evaluation:
     def _refuse_lengths(self, left: tuple[Axis, ...], right: tuple[Axis, ...], text: str) -> None:
         depth = next(i for i, (a, b) in enumerate(zip(left, right, strict=False)) if not a.like(b))
         a, b = left[depth].lengths, right[depth].lengths
-        taken, self._taken = self._taken, []  # rows of other branches would stand askew as well
+        taken, self._taken = (
+            self._taken,
+            [],
+        )  # in branches that are not taken, too, the elements would be misaligned
         try:
             refuse = self.refuser(left[:depth], text)
             refuse(a != b, "length", lambda i: f"lists of {a[i]} and {b[i]} elements")

@@ -1,4 +1,4 @@
-"""This file inflates chunks, files and messages, and believes no announced size before the bytes are there."""
+"""This file inflates chunks, files and messages; memory grows with the bytes that come out, not with the announced size."""
 
 from __future__ import annotations
 

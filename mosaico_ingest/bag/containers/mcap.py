@@ -108,15 +108,17 @@ class McapPart:
         if holes:
             yield Block(EARLIEST_NS, lambda: Loaded([], list(holes)))
         wanted = [
-            piece for piece in pieces if want.times(piece.start_ns, piece.end_ns) and piece.has_any(want.keys)
+            piece
+            for piece in pieces
+            if want.overlaps(piece.start_ns, piece.end_ns) and piece.has_any(want.keys)
         ]
-        self._source.expect((piece.offset, piece.stop) for piece in wanted)
+        self._source.prefetch((piece.offset, piece.stop) for piece in wanted)
         for group in in_groups(wanted, lambda piece: max(piece.size, piece.stop - piece.offset)):
             yield Block(min(group[0].start_ns, LATEST_NS), partial(self._load, group, want))
 
-    def confirm(self) -> None:
-        """Say that all was read; see `Source.confirm`."""
-        self._source.confirm()
+    def check_unchanged(self) -> None:
+        """See `Source.check_unchanged`."""
+        self._source.check_unchanged()
 
     def close(self) -> None:
         """Let go of the file."""

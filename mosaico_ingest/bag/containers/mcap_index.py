@@ -89,7 +89,7 @@ def read_index(source: Source) -> McapIndex:
     index = McapIndex(data_end=source.size)
     if problem:
         index.holes.append(Hole(source.size, f"{problem}; the file was read record by record", count=0))
-    source.bring_near()
+    source.fetch_whole()
     _Walk(source, index).over(len(MCAP), source.size)
     return index
 

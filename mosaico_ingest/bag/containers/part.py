@@ -145,7 +145,7 @@ class Want:
     start_ns: int = EARLIEST_NS
     end_ns: int = LATEST_NS + 1
 
-    def times(self, first_ns: int, last_ns: int) -> bool:
+    def overlaps(self, first_ns: int, last_ns: int) -> bool:
         """Return whether anything between the two times, both inclusive, may be wanted."""
         return first_ns < self.end_ns and last_ns >= self.start_ns
 
@@ -171,8 +171,8 @@ class Part(Protocol):
         """Yield what holds wanted messages, by ascending `start_ns`."""
         ...
 
-    def confirm(self) -> None:
-        """Say that all was read; raise where the file has changed since it was opened."""
+    def check_unchanged(self) -> None:
+        """Raise where the file has changed since it was opened; called once all of it was read."""
         ...
 
     def close(self) -> None:

@@ -80,20 +80,20 @@ class RemoteSource:
         expected = self._ahead.take(offset, stop) if self._ahead else None
         return self._look(offset, stop) if expected is None else expected
 
-    def expect(self, stretches: Iterable[tuple[int, int]]) -> None:
+    def prefetch(self, stretches: Iterable[tuple[int, int]]) -> None:
         """Begin to fetch what will be read next, in this order; each stretch is its first byte and the one behind."""
         self._forget()
         if self._near is None:
             self._ahead = _Ahead(self._fetch, _requests(iter(stretches)))
 
-    def bring_near(self) -> None:
+    def fetch_whole(self) -> None:
         """Fetch the whole object to a temporary folder, for many small reads; `close` removes it."""
         if self._near is None:
             self._folder = tempfile.TemporaryDirectory(prefix="mosaico-")
             self._near = FileSource(_save(self, Path(self._folder.name)), self.path)
             self.notes.append(f"it has no index, so all of its {self.size} bytes were fetched first")
 
-    def confirm(self) -> None:
+    def check_unchanged(self) -> None:
         """Raise where the object is no longer the one that was opened."""
         self._forget()
         self._check_version()
@@ -210,7 +210,7 @@ def fetch(path: RemotePath, folder: Path) -> Path:
     source = RemoteSource(path)
     try:
         target = _save(source, folder)
-        source.confirm()
+        source.check_unchanged()
     finally:
         source.close()
     return target
@@ -227,7 +227,7 @@ def _save(source: RemoteSource, folder: Path) -> Path:
         )
     target = folder / source.path.name
     steps = [(at, min(at + _REQUEST_BYTES, source.size)) for at in range(0, source.size, _REQUEST_BYTES)]
-    source.expect(steps)
+    source.prefetch(steps)
     try:
         with target.open("wb") as file:
             for start, stop in steps:

@@ -91,15 +91,15 @@ class Ros1Part:
         wanted = [
             piece
             for piece in self._pieces
-            if piece.is_cut or (want.times(piece.start_ns, piece.end_ns) and piece.counts.keys() & keys)
+            if piece.is_cut or (want.overlaps(piece.start_ns, piece.end_ns) and piece.counts.keys() & keys)
         ]
-        self._source.expect((piece.offset, piece.stop) for piece in wanted)
+        self._source.prefetch((piece.offset, piece.stop) for piece in wanted)
         for group in in_groups(wanted, lambda piece: piece.stop - piece.offset, most=_CHUNKS):
             yield Block(group[0].start_ns, partial(self._load, group, want))
 
-    def confirm(self) -> None:
-        """Say that all was read; see `Source.confirm`."""
-        self._source.confirm()
+    def check_unchanged(self) -> None:
+        """See `Source.check_unchanged`."""
+        self._source.check_unchanged()
 
     def close(self) -> None:
         """Let go of the file."""

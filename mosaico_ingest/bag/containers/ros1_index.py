@@ -83,14 +83,14 @@ def read_index(source: Source) -> Ros1Index:
     index_at = number(head.header, b"index_pos", 8)
     problem = None if index_at else "the bag was not closed and has no index"
     if index_at:
-        source.expect([(index_at, source.size)])
+        source.prefetch([(index_at, source.size)])
         try:
             return _from_index(source, window, head, index_at)
         except BagError as err:
             problem = f"its index is damaged ({err.what})"
     index = Ros1Index()
     index.holes.append(Hole(len(_VERSION), f"{problem}; the file was read record by record", count=0))
-    source.bring_near()
+    source.fetch_whole()
     _Walk(source, index).over(head.end, source.size)
     return index
 

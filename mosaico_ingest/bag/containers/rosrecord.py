@@ -78,12 +78,12 @@ class RosrecordPart:
         """Yield the stretches of the file that hold wanted messages."""
         keys = np.array(list(want.keys), np.int64)
         for run in self._runs:
-            if want.times(int(run.times.min()), int(run.times.max())) and np.isin(run.keys, keys).any():
+            if want.overlaps(int(run.times.min()), int(run.times.max())) and np.isin(run.keys, keys).any():
                 yield Block(int(run.times.min()), partial(self._load, run, want))
 
-    def confirm(self) -> None:
-        """Say that all was read; see `Source.confirm`."""
-        self._source.confirm()
+    def check_unchanged(self) -> None:
+        """See `Source.check_unchanged`."""
+        self._source.check_unchanged()
 
     def close(self) -> None:
         """Let go of the file."""
@@ -133,7 +133,7 @@ class _Walk:
     def over(self) -> None:
         """Look at every record; where one does not fit, go on at the next message."""
         source, stop = self._source, self._source.size
-        source.bring_near()
+        source.fetch_whole()
         window = Window(source)
         line = window.peek(0, len(ROSRECORD) + 2)
         at = len(line) - len(line[len(ROSRECORD) :].lstrip(b"\r\n"))

@@ -110,7 +110,7 @@ def _with(slab: Slab, data: Bytes, starts: Longs) -> Slab:
 
 
 def _own(values: Longs) -> Longs:
-    """Return the values without what else lies in their buffer: a rare topic's messages wait long for company."""
+    """Return a copy of a view: messages of a rare topic wait long, and a view keeps the whole buffer alive."""
     return values if values.base is None else values.copy()
 
 

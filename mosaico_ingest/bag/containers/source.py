@@ -42,16 +42,16 @@ class Source(Protocol):
         """Return up to `size` bytes from `offset` on, fewer only where the file ends."""
         ...
 
-    def expect(self, stretches: Iterable[tuple[int, int]]) -> None:
+    def prefetch(self, stretches: Iterable[tuple[int, int]]) -> None:
         """Announce what will be read next, in this order, each as its first byte and the one behind its last."""
         ...
 
-    def bring_near(self) -> None:
-        """Announce that all of it will be read in small steps."""
+    def fetch_whole(self) -> None:
+        """Prepare for all of it being read in small steps."""
         ...
 
-    def confirm(self) -> None:
-        """Say that all of it was read; raise where it has changed since it was opened."""
+    def check_unchanged(self) -> None:
+        """Raise where it has changed since it was opened; called once all of it was read."""
         ...
 
     def close(self) -> None:
@@ -106,13 +106,13 @@ class FileSource:
             raise BagError(f"cannot be read at {offset}: {err.strerror}", where=str(self.path)) from err
         return data
 
-    def expect(self, stretches: Iterable[tuple[int, int]]) -> None:
+    def prefetch(self, stretches: Iterable[tuple[int, int]]) -> None:
         """Do nothing: the system reads ahead by itself."""
 
-    def bring_near(self) -> None:
+    def fetch_whole(self) -> None:
         """Do nothing: it is here."""
 
-    def confirm(self) -> None:
+    def check_unchanged(self) -> None:
         """Do nothing: an open file stays what it is, unless it is written to."""
 
     def close(self) -> None:

@@ -120,8 +120,8 @@ class SqlitePart:
         holes = salvage.holes or [Hole(0, f"{reason}; every row could be read in another way", count=0)]
         yield Block(done.time_ns, lambda: Loaded([], holes))
 
-    def confirm(self) -> None:
-        """Do nothing; see `FileSource.confirm`."""
+    def check_unchanged(self) -> None:
+        """Do nothing; see `FileSource.check_unchanged`."""
 
     def close(self) -> None:
         """Let go of the file and of the copy, if there had to be one."""
