@@ -45,7 +45,7 @@ def adapter_spec(adapter: object, base_dir: Path) -> AdapterSpec:
     elif hasattr(adapter, "bind") and hasattr(adapter, "ros_types"):
         return cast("AdapterSpec", adapter)  # it has what the protocol asks for
     raise AdapterError(
-        f"{_spell(adapter)} is no adapter", hint="give a class with ros_msgtype and from_dict, or a reference"
+        f"{_spell(adapter)} is no adapter", hint="give a subclass of ROSAdapterBase, or a reference to one"
     )
 
 
