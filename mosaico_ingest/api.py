@@ -85,7 +85,7 @@ class RosbagInjector:
 
 
 def compile_job(manifest: Path) -> tuple[ROSInjectionConfig, ...]:
-    """Return the configurations a manifest stands for, one for each recording.
+    """Return the configurations a manifest compiles to, one for each recording.
 
     Raises:
         ManifestError: Its `findings` say where and what.

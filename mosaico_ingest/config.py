@@ -196,11 +196,11 @@ class ROSInjectionConfig:
     family: str | None = None
     """What sequences with the same topics have in common; None: the sequence is alone."""
     on_schema_change: OnSchemaChange | None = None
-    """What to do when a topic's definition is not what it was in the family; None: nobody looks."""
+    """What to do when a topic's definition is not what it was in the family; None: it is not compared."""
     plan_digest: str | None = None
     """The `digest` of the only plan that may be run; None: whatever the recording calls for."""
     attempt: Attempt | None = None
-    """Set by who may begin the recording more than once."""
+    """Set by executors that may begin a recording more than once."""
     code_dir: Path | None = None
     """Where the relative paths of adapter references start instead of `base_dir`, on a machine they were sent to."""
 

@@ -112,7 +112,7 @@ def _kept(quarantine: Quarantine) -> Finding:
 
 
 def _as_interrupt(error: BaseException) -> BaseException:
-    """Return Ctrl-C as an error of ours, any other as it is."""
+    """Return Ctrl-C as `Interrupted`, any other error as it is."""
     if isinstance(error, KeyboardInterrupt):
         return Interrupted("stopped before the end of the recording", hint="run the job again for all of it")
     return error

@@ -73,7 +73,7 @@ class Session(Protocol):
         ...
 
     def note_error(self, message: str, *, topic: str | None = None) -> None:
-        """Attach an error to the sequence, or to one of its topics, for whoever looks at it later."""
+        """Attach an error to the sequence, or to one of its topics, where readers of the destination see it."""
         ...
 
     def stored(self) -> tuple[StoredTopic, ...]:

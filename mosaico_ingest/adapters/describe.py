@@ -28,7 +28,7 @@ class ColumnOrigin:
     type: str
     required: bool
     origin: str | None
-    """An expression, or what stands for one; None: it is null."""
+    """An expression, or a form in one line; None: it is null."""
 
 
 @frozen

@@ -27,7 +27,7 @@ _BASE = "ROSAdapterBase"
 _SDK_FIRST = "typestore"
 """The first parameter of `schema_metadata` in newer SDKs: what it returns is known here already."""
 _ROWS_AS_DICTS = 256
-"""How many messages are Python objects at a time; an image topic shall not be all in memory twice."""
+"""How many messages are Python objects at a time; an image topic must not be in memory twice as a whole."""
 
 
 @frozen

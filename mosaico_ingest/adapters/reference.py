@@ -30,7 +30,7 @@ _MAPPING_SUFFIXES = frozenset({".yaml", ".yml"})
 
 
 def adapter_spec(adapter: object, base_dir: Path) -> AdapterSpec:
-    """Return the spec of whatever stands for an adapter: a spec, a class, or a reference as text or path.
+    """Return the spec an adapter is given by: a spec itself, a class, or a reference as text or path.
 
     Raises:
         AdapterError: It stands for none.

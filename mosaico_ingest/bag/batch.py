@@ -1,4 +1,4 @@
-"""This file is what comes out of a recording: channels, and messages of one channel in batches."""
+"""This file is what a recording yields: channels, and messages of one channel in batches."""
 
 from __future__ import annotations
 

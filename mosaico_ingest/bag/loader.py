@@ -74,7 +74,7 @@ class ROSLoader:
         self.close()
 
     def close(self) -> None:
-        """Let go of the files."""
+        """Close the files."""
         self._recording.close()
 
     @property

@@ -1,4 +1,4 @@
-"""This file is where a program announces message types once, for every recording it opens afterwards."""
+"""This file is the process-wide registry of message types, for every recording that is opened afterwards."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""This file is `ingest keys`: who may do what on a served store."""
+"""This file is `ingest keys`: the API keys of a served store."""
 
 from __future__ import annotations
 

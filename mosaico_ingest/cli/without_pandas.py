@@ -23,7 +23,7 @@ class _Absent:
 
 
 def forgo_pandas(configs: Sequence[ROSInjectionConfig] = ()) -> None:
-    """Let pyarrow look for pandas, once and in vain, unless adapters in Python run: they may hand it series.
+    """Make pyarrow conclude that there is no pandas, unless adapters in Python run: they may pass series.
 
     Whoever imports pandas later gets it; only pyarrow no longer recognises its objects inside lists.
     """
@@ -51,4 +51,4 @@ def _adapters_installed() -> bool:
     try:
         return bool(installed_adapters())
     except AdapterError:
-        return True  # whoever wants to use them is told what is wrong
+        return True  # using them says what is wrong

@@ -1,4 +1,4 @@
-"""This file decodes all messages of a batch at once, and leaves those it cannot vouch for to the row-wise decoder."""
+"""This file decodes all messages of a batch at once, and leaves those that may not fit to the row-wise decoder."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def _recordings(folder: Path, above: frozenset[Path] = frozenset()) -> Iterator[
         return
     try:
         entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
-    except OSError:  # it went away, or is none of ours
+    except OSError:  # it has gone, or may not be listed
         return
     if any(entry.name == _METADATA for entry in entries):
         yield folder

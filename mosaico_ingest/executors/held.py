@@ -25,7 +25,7 @@ def held_catalogs() -> Generator[Hold]:
             path = target.path if isinstance(target, StoreTarget) else None
             if not isinstance(path, Path) or path in known:
                 return
-            with suppress(SinkError):  # whoever needs the store will say so
+            with suppress(SinkError):  # opening the store for the run says what is wrong
                 store = Store.find(path)
                 if store is not None:
                     open_ones.enter_context(closing(store.catalog.keep_open()))

@@ -1,4 +1,4 @@
-"""This file is what happens on a node of a Ray cluster: a recording comes in, events go to the mailbox, a report comes out."""
+"""This file is the task on a node of a Ray cluster: it ingests one recording, sends events to the mailbox, returns the report."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def absolute(config: ROSInjectionConfig) -> ROSInjectionConfig:
 
 
 def pack(configs: Iterable[ROSInjectionConfig], folder: Path) -> list[ROSInjectionConfig]:
-    """Copy adapters, definitions and certificates into `folder`; return configurations for who is in a copy of it.
+    """Copy adapters, definitions and certificates into `folder`; return configurations that are valid inside a copy of it.
 
     Adapters keep the names the manifests give them, so the plan is the same. One named by an absolute path, and
     what is installed, must be there on every machine.

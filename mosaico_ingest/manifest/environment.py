@@ -56,7 +56,7 @@ def _filled(source: Source, known: _Variables) -> Filled:
 
 @frozen
 class _Variables:
-    """What variables stand for; the first that knows one says."""
+    """The values of variables; of several sources the first that has one wins."""
 
     cell: Mapping[str, str]
     env: Mapping[str, str] | None

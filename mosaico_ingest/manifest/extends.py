@@ -90,7 +90,7 @@ def _finding(message: str, span: Span, remedy: str) -> Finding:
 
 @dataclass(slots=True)
 class _Join:
-    """What comes of joining two values: which paths are the base's, and which the document took away."""
+    """Joins two values, and records which paths came from the base and which the document removed."""
 
     taken: set[Path] = field(default_factory=set[Path])
     dropped: set[Path] = field(default_factory=set[Path])

@@ -219,7 +219,7 @@ def _with_text_keys(value: Value, path: Place, source: Source, findings: list[Fi
 
 
 def _validate(source: Source, filled: Filled) -> tuple[Manifest | None, list[Finding]]:
-    """Validate; a variable may stand for a number, and one that is not known for anything."""
+    """Validate; a filled-in text may have to be a number, and what an unknown variable would be is not judged."""
     manifest, mistakes = _attempt(source, filled.value)
     retry = [place for place, _ in mistakes if place in filled.changed]
     if retry:

@@ -10,7 +10,7 @@ __all__ = ["KEY", "MAX_JOBS", "combinations", "variables"]
 
 KEY = "matrix"
 MAX_JOBS = 1000
-"""How many jobs one manifest may stand for."""
+"""How many jobs one manifest may expand to."""
 
 
 def combinations(document: Value) -> list[dict[str, str]]:

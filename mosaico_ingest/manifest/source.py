@@ -1,4 +1,4 @@
-"""This file reads YAML text and keeps the place of every value, so that whoever finds fault can point at it."""
+"""This file reads YAML text and keeps the position of every value, so that each finding can point at it."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def late(address: Address, doing: str) -> SinkUnavailable:
 
 
 def reraise(error: Exception, address: Address, *, doing: str, needs: Permission) -> NoReturn:
-    """Raise what Flight complained about as an error of ours.
+    """Raise an error of Flight as one of our own.
 
     Raises:
         Refused: The server said no.

@@ -21,7 +21,7 @@ __all__ = ["Memory", "Upload"]
 _UPLOAD_S = 600.0
 """How long the server may take for one message: ten minutes are 75 kB/s for the largest."""
 _LOCK_S = 2.0
-"""At the end nobody writes any more; who still holds the lock then is stuck in a call."""
+"""At the end all writers are done; a lock that is still held then belongs to a call that is stuck."""
 
 
 class Memory:

@@ -24,7 +24,7 @@ _SDK = re.compile(r"^.*?AWS Error |\s*\(Request ID: [^)]*\)")
 
 @contextmanager
 def reaching(where: str) -> Generator[None, None, None]:
-    """Raise an error of ours for what goes wrong on the way to `where`; that nothing is there stays FileNotFoundError.
+    """Raise our own error for what goes wrong on the way to `where`; a missing object stays a FileNotFoundError.
 
     Raises:
         Unreachable: Nobody answers, or not in time; the client has tried several times.
@@ -39,7 +39,7 @@ def reaching(where: str) -> Generator[None, None, None]:
 
 
 def explained(err: OSError, where: str) -> IngestError:
-    """Return what an error of a file system means for whoever asked for `where`."""
+    """Return the error of ours for one of a file system, about `where`."""
     said = _SDK.sub("", str(err).strip().splitlines()[0] if str(err).strip() else type(err).__name__)
     if is_transient(err):
         return Unreachable(f"does not answer: {said}", where=where, hint="check the address and the network")

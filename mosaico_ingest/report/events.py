@@ -186,8 +186,8 @@ BatchObserver: TypeAlias = Callable[[int, Event], None]
 
 
 def ignore_events(_event: Event) -> None:
-    """Do nothing: the observer of whoever does not want one."""
+    """Do nothing: the default observer."""
 
 
 def ignore_batch(_position: int, _event: Event) -> None:
-    """Do nothing: the observer of a batch nobody watches."""
+    """Do nothing: the default observer of a batch."""

@@ -1,4 +1,4 @@
-"""This file draws how a topic's rows spread over its recording: bars of one height scale, gaps on the ground line."""
+"""This file draws how a topic's rows spread over its recording: bars on one scale, gaps on the base line."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ class Bucket:
         return self.is_live(session)
 
     def publish(self, moves: Mapping[AnyPath, AnyPath]) -> None:
-        """Let go of finished files, which are in their places already."""
+        """Forget finished files, which are in their places already."""
         for session, begun in list(self._begun.items()):
             if any(path in moves for path in begun):
                 self._beats[session].check()
@@ -100,7 +100,9 @@ class Bucket:
         self._beats.pop(session, None)
         try:
             self._session(session).unlink()
-        except FileNotFoundError:  # garbage collection was here; what was written since is ours to remove
+        except (
+            FileNotFoundError
+        ):  # garbage collection removed it; files written since are still to be removed
             pass
         except (IngestError, OSError):
             return

@@ -232,7 +232,7 @@ class Catalog:
             if create and self._format(db) == 0:
                 _use_wal(db)
                 db.execute("BEGIN IMMEDIATE")
-                if self._format(db) == 0:  # nobody else was faster
+                if self._format(db) == 0:  # no other process was faster
                     for statement in _TABLES.split(";"):
                         db.execute(statement)
                     db.execute(f"PRAGMA application_id = {_APPLICATION}")
@@ -265,7 +265,7 @@ def _complete(db: sqlite3.Connection) -> None:
     """Add what catalogs of the same format once did without."""
     if not _has_checksums(db):
         db.execute("BEGIN IMMEDIATE")
-        if not _has_checksums(db):  # nobody else was faster
+        if not _has_checksums(db):  # no other process was faster
             db.execute("ALTER TABLE segments ADD COLUMN checksum TEXT")
         db.execute("COMMIT")
 

@@ -24,7 +24,7 @@ class Lease:
             raise
 
     def release(self) -> None:
-        """Let go of the file."""
+        """Release the lock."""
         self._db.close()
 
 

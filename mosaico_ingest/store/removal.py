@@ -1,4 +1,4 @@
-"""This file takes things out of the catalog and says which files nobody needs then."""
+"""This file deletes from the catalog, and returns which files are no longer referenced."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ class Lease(Protocol):
     """Shows that a writer lives."""
 
     def release(self) -> None:
-        """Let go; twice does no harm."""
+        """Release it; releasing twice does no harm."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""This file is the store as a whole: open it, ask what is in it, read it, remove from it, tidy it."""
+"""This file is the store as a whole: open, query, read, delete, collect garbage."""
 
 from __future__ import annotations
 

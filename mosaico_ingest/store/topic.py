@@ -26,7 +26,7 @@ _FIRST_GROUP_BYTES, _GROUP_BYTES = 4 << 20, 32 << 20
 _GROUP_ROWS = 1 << 20
 _BIG_GROUP_BYTES = 8 << 20
 _BIG_ROW_BYTES = 16 << 10
-"""Rows larger than this on average gain nothing from company: they go to the disk while others are still read."""
+"""Rows larger than this on average gain nothing from larger groups: they are written while others are still read."""
 _SEGMENT_BYTES = 512 << 20
 
 
@@ -106,7 +106,7 @@ class StoreTopic:
             self._finish_segment()
 
     def abandon(self) -> None:
-        """Let go of the memory and of the open file."""
+        """Drop what is in memory, and close the open file."""
         with self._lock:
             self._batches.clear()
             if self._writer is not None:
@@ -115,7 +115,7 @@ class StoreTopic:
 
     @contextmanager
     def _writing(self) -> Generator[None, None, None]:
-        """Hold the lock; what fails inside leaves a file nobody may finish, so the topic cannot be committed."""
+        """Hold the lock; a failure inside leaves an unfinished file, so the topic can no longer be committed."""
         with self._lock, explained(self._staging.where):
             self._refuse_if_broken()
             self._broken = True

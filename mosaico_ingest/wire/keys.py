@@ -14,7 +14,7 @@ _FORM = re.compile(r"msco_([a-z0-9]{32})_([0-9a-f]{8})")
 
 
 def new_key() -> str:
-    """Return a key nobody has."""
+    """Return a new random key."""
     secret = "".join(secrets.choice(_ALPHABET) for _ in range(32))
     return f"msco_{secret}_{_checksum(secret)}"
 

@@ -1,4 +1,4 @@
-"""This file puts messages together from the values of single fields; what nobody knows is zero, empty or false."""
+"""This file assembles messages from the values of single fields; unknown fields are zero, empty or false."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class Undo:
         """Columns that could not be undone, and what they are computed as."""
 
     def record(self, record: Filled, rows: Array) -> None:
-        """Take a whole record back."""
+        """Invert a whole record."""
         self._column(record, rows, _Scope())
         for (place, index, value), where in self._held.items():
             self._parts.mark(place, index, where, value)
@@ -275,7 +275,7 @@ def _place(typed: Typed, scope: _Scope) -> Place | None:
 
 
 def _marked_place(typed: Typed, scope: _Scope) -> tuple[Place, int | None] | None:
-    """Return the field that stands for a value, and which element of it; None where it computes something."""
+    """Return the field an expression names, and which element of it; None where it computes something."""
     index = typed.index if isinstance(typed, ItemOf) else None
     place = _place(typed.of if isinstance(typed, ItemOf) else typed, scope)
     if place is None or place.count(EACH) != len(scope.axes) or (index is not None and index < 0):

@@ -106,7 +106,7 @@ def nulls(array: Array) -> Mask | None:
 
 
 def true_where(values: Array | Scalar, *, null: bool = False) -> Mask:
-    """Return where a boolean column holds; `null` stands for what is null; of one value, shape (1,)."""
+    """Return where a boolean column is true; nulls count as `null`; of a scalar, shape (1,)."""
     if isinstance(values, pa.Scalar):
         return np.array([values.as_py() if values.is_valid else null])
     known = pc.fill_null(values, null) if values.null_count else values

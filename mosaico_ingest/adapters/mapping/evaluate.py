@@ -46,7 +46,7 @@ Refusal: TypeAlias = tuple[str, str]
 
 
 class RowsRefused(Exception):  # noqa: N818 - a signal: go on without these rows
-    """Rows that do not fit; whoever evaluates leaves them out and evaluates the others again."""
+    """Rows that do not fit; the caller evaluates the others again, without them."""
 
     def __init__(self, refusals: dict[int, Refusal]) -> None:
         super().__init__(f"{len(refusals)} rows")

@@ -30,7 +30,7 @@ _STEP_BYTES = 1 << 12
 _LZ4_RATIO = 255
 """What lz4 can reach at best."""
 _ZSTD_RATIO = 64
-"""Up to here the announced size is allocated at once; beyond, memory grows with what really comes out."""
+"""Up to this ratio the announced size is allocated at once; beyond, memory grows with the bytes that come out."""
 _TOGETHER_BYTES = 64 << 20
 """Up to here the announced sizes of several chunks are allocated at once."""
 _FAILURES = (zstandard.ZstdError, RuntimeError, OSError, EOFError, ValueError, MemoryError)

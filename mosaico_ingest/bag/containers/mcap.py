@@ -121,7 +121,7 @@ class McapPart:
         self._source.check_unchanged()
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._source.close()
 
     def _load(self, pieces: Sequence[Piece], want: Want) -> Loaded:

@@ -1,4 +1,4 @@
-"""This file reads recordings behind URLs: in few large requests, several at a time, ahead of whoever needs them."""
+"""This file reads recordings behind URLs: in few large requests, several at a time, ahead of the reader."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class RemoteSource:
             )
 
     def close(self) -> None:
-        """Let go of the object and of what was fetched; twice does no harm."""
+        """Close the object, and remove what was fetched; closing twice does no harm."""
         self._forget()
         self._file.close()
         if self._near is not None and self._folder is not None:
@@ -118,7 +118,7 @@ class RemoteSource:
             self._ahead = None
 
     def _look(self, start: int, stop: int) -> bytes:
-        """Return a stretch nobody announced, with some of what lies around it."""
+        """Return a stretch that was not prefetched; some of what lies around it is kept."""
         for known in self._looks:
             if known.has(start, stop):
                 return known.cut(start, stop)

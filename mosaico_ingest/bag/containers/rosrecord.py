@@ -86,7 +86,7 @@ class RosrecordPart:
         self._source.check_unchanged()
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._source.close()
 
     def _load(self, run: _Run, want: Want) -> Loaded:

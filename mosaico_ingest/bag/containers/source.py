@@ -55,7 +55,7 @@ class Source(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of it; twice does no harm."""
+        """Close it; closing twice does no harm."""
         ...
 
 

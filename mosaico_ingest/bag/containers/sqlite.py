@@ -124,7 +124,7 @@ class SqlitePart:
         """Do nothing; see `FileSource.check_unchanged`."""
 
     def close(self) -> None:
-        """Let go of the file and of the copy, if there had to be one."""
+        """Close the file, and remove the copy, if there had to be one."""
         self._stack.close()
 
     def _read_streams(self) -> tuple[Stream, ...]:

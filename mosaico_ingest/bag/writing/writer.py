@@ -29,5 +29,5 @@ class RecordingWriter(Protocol):
         ...
 
     def abandon(self) -> None:
-        """Let go of the file, which stays unfinished."""
+        """Close the file, which stays unfinished."""
         ...

@@ -54,7 +54,7 @@ class Keyring:
         return tuple(self._keys.values())
 
     def add(self, permission: Permission, *, description: str = "", expires: datetime | None = None) -> str:
-        """Make a key, keep its hash in the file, and return it; nobody can tell it afterwards.
+        """Make a key, keep its hash in the file, and return it; it cannot be recovered afterwards.
 
         Raises:
             SinkError: The file cannot be written, or `expires` has no time zone.
