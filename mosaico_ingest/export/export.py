@@ -24,7 +24,7 @@ __all__ = ["export_sequence"]
 def export_sequence(
     store: Store,
     sequence: str,
-    path: Path,
+    path: Path | str,
     *,
     topics: Sequence[str] = (),
     start_ns: int | None = None,
@@ -42,6 +42,7 @@ def export_sequence(
         SinkError: There is no such sequence, or it cannot be read.
         AdapterError: One of `adapters` is none.
     """
+    path = Path(path)
     found = store.sequence(sequence)
     chosen = _selected(found, topics)
     specs = [adapter_spec(reference, Path()) for reference in adapters]
