@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from made_recordings import define
 from mosaico_ingest.bag.recording import open_recording
 from mosaico_ingest.bag.types import TypeResolver
 from mosaico_ingest.bag.writing import open_writer
+from mosaico_ingest.bag.writing.rosbags import SqliteWriter
 from mosaico_ingest.errors import BagError
 
 TEXT = define("std_msgs/msg/String", "string data\n")
@@ -66,6 +68,18 @@ def test_an_exception_leaves_what_was_there(tmp_path: Path) -> None:
             raise KeyboardInterrupt
         assert path.read_bytes() == b"mine"
     assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_a_database_that_cannot_be_written_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise sqlite3.OperationalError("database or disk is full")
+
+    monkeypatch.setattr(SqliteWriter, "write", full)
+    with pytest.raises(BagError, match=r"out.db3: cannot be written: database or disk is full"):
+        write_many(tmp_path / "out.db3", payloads=1, size=1)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_recording_without_a_message_can_be_read(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 import tempfile
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -53,7 +54,7 @@ def open_writer(path: Path, *, replace: bool = False) -> Generator[RecordingWrit
             writer.abandon()
             raise
         part.replace(path)
-    except OSError as error:
+    except (OSError, sqlite3.Error) as error:
         raise BagError(f"cannot be written: {error}", where=str(path)) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
