@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from every_kind import every_kind
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
@@ -33,23 +34,7 @@ from mosaico_ingest.adapters.mapping.typed import (
     Whole,
 )
 
-INNER = pa.struct([("v", pa.int16()), ("t", pa.string()), ("n", pa.list_(pa.float32()))])
-MESSAGE = pa.struct(
-    [
-        ("b", pa.bool_()),
-        ("i", pa.int8()),
-        ("u", pa.uint8()),
-        ("k", pa.int64()),
-        ("w", pa.uint64()),
-        ("f", pa.float32()),
-        ("d", pa.float64()),
-        ("s", pa.string()),
-        ("x", pa.list_(pa.int32())),
-        ("y", pa.list_(pa.float64(), 3)),
-        ("m", pa.list_(INNER)),
-        ("p", INNER),
-    ]
-)
+MESSAGE = every_kind()
 
 
 class RefusedError(Exception):
