@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -78,3 +79,30 @@ def test_types_of_one_short_name_keep_their_own_origin(stored: Store) -> None:
     assert [origin["msgtype"] for origin in origins] == ["a/msg/Same", "b/msg/Same"]
     assert [origin["enums"] for origin in origins] == [{"A": 1}, {"B": 2}]
     assert [origin["msgdef"] for origin in origins] == ["int32 A=1\nint32 v\n", "int32 B=2\nint32 v\n"]
+
+
+@pytest.mark.parametrize(
+    ("topics", "rename", "clash"),
+    [
+        (("/a", "/b"), {"/b": "/a"}, "/a and /b have one name in the sequence, /a"),
+        (("imu", "/imu"), {}, "imu and /imu have one name in the sequence, imu"),
+    ],
+    ids=["renamed onto another", "with and without a slash"],
+)
+def test_two_topics_of_one_name_are_both_kept_and_named(
+    tmp_path: Path, topics: tuple[str, str], rename: dict[str, str], clash: str
+) -> None:
+    number = define("std_msgs/msg/Int32", "int32 data\n")
+    made = record(tmp_path / "two.mcap", [(topic, number, 5, {"data": 1}) for topic in topics])
+    config = ROSInjectionConfig(made, "two", rename=rename, store=tmp_path / "store")
+    report = RosbagInjector(config).run()
+    assert report is not None
+    assert report.totals.written == 2
+    first, second = (topic.target for topic in report.topics)
+    assert second.endswith(f"{topics[0].removeprefix('/')}/Int32")
+    assert [finding for finding in report.findings if "name-clash" in finding] == [
+        f"warning[name-clash] {clash} — the second one is stored as {second}"
+    ]
+    kept = Store.open(tmp_path / "store").sequence("two").topics
+    assert [topic.rows for topic in kept] == [1, 1]
+    assert first == topics[0]

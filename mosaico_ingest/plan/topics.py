@@ -79,7 +79,7 @@ def _definition(definition: Definition) -> str:
 
 def merge(taken: list[TopicPlan], more: TopicPlan) -> Finding | None:
     """Add a channel's plan: to the stream with the same topic and columns, else as a stream of its own."""
-    same_topic = [plan for plan in taken if plan.target == more.target]
+    same_name = [plan for plan in taken if _bare(plan.target) == _bare(more.target)]
     for position, plan in enumerate(taken):
         same = plan.target == more.target and plan.msgtype == more.msgtype and plan.ontology == more.ontology
         if same and plan.topic == more.topic:
@@ -91,19 +91,27 @@ def merge(taken: list[TopicPlan], more: TopicPlan) -> Finding | None:
                 definitions=tuple(dict.fromkeys((*plan.definitions, *more.definitions))),
             )
             return None
-    if not same_topic:
+    if not same_name:
         taken.append(more)
         return None
-    target = _free_name(more, {plan.target for plan in taken})
+    target = _free_name(more, {_bare(plan.target) for plan in taken})
     taken.append(replace(more, target=target))
-    return Finding(
-        "two-types-on-a-topic",
-        Severity.WARNING,
-        f"{more.topic} carries {same_topic[0].msgtype} and {more.msgtype}"
-        if same_topic[0].msgtype != more.msgtype
-        else f"{more.topic} carries two definitions of {more.msgtype}",
-        help=f"the second one is stored as {target}",
-    )
+    rule, what = _clash(same_name[0], more)
+    return Finding(rule, Severity.WARNING, what, help=f"the second one is stored as {target}")
+
+
+def _clash(first: TopicPlan, second: TopicPlan) -> tuple[str, str]:
+    """Return the rule and the words for two streams of one name."""
+    if first.topic != second.topic:
+        return "name-clash", f"{first.topic} and {second.topic} have one name in the sequence, {first.target}"
+    if first.msgtype != second.msgtype:
+        return "two-types-on-a-topic", f"{second.topic} carries {first.msgtype} and {second.msgtype}"
+    return "two-types-on-a-topic", f"{second.topic} carries two definitions of {second.msgtype}"
+
+
+def _bare(name: str) -> str:
+    """Return a topic's name as the destination knows it: with or without the first slash it is one."""
+    return name.removeprefix("/")
 
 
 def _setting(settings: Mapping[str, T], topic: str, default: T) -> T:
@@ -114,7 +122,7 @@ def _setting(settings: Mapping[str, T], topic: str, default: T) -> T:
 def _free_name(plan: TopicPlan, used: set[str]) -> str:
     base = f"{plan.target}/{plan.msgtype.rpartition('/')[2]}"
     candidates = (base, *(f"{base}_{number}" for number in range(2, len(used) + 3)))
-    return next(name for name in candidates if name not in used)
+    return next(name for name in candidates if _bare(name) not in used)
 
 
 def _left_out(channel: Channel, why: str, place: Span | None = None) -> LeftOut:
