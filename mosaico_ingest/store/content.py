@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from xxhash import xxh3_128
+from xxhash import xxh3_128, xxh3_128_digest
 
 __all__ = ["ContentHash", "combined"]
 
@@ -50,32 +50,63 @@ class _Column(Protocol):
         """Take one chunk, which is not empty."""
         ...
 
+    def add_nulls(self, count: int) -> None:
+        """Take a chunk in which every value is null."""
+        ...
+
     def digest(self) -> bytes: ...
+
+
+class _Bytes:
+    """Bytes that come in pieces; most columns of most files never have any, and then no state to hash with either."""
+
+    def __init__(self) -> None:
+        self._hash: Any = None
+
+    def update(self, piece: bytes | memoryview) -> None:
+        if self._hash is None:
+            self._hash = xxh3_128()
+        self._hash.update(piece)
+
+    def digest(self, end: bytes = b"") -> bytes:
+        """Return the checksum of all pieces so far and `end`."""
+        if self._hash is None:
+            return xxh3_128_digest(end)
+        ended = self._hash.copy()
+        ended.update(end)
+        return ended.digest()
 
 
 class _Nulls:
     """Which values are null, as the lengths of runs: first of values, then of nulls, and so on."""
 
     def __init__(self) -> None:
-        self._hash = xxh3_128()
+        self._hash = _Bytes()
         self._valid = True
         self._run = 0
 
-    def add(self, array: pa.Array[Any]) -> None:
+    def add(self, array: pa.Array[Any]) -> int:
+        """Take a chunk; return how many of its values are null."""
         nulls = array.null_count
-        if nulls in {0, len(array)}:
-            self._extend_by(len(array), valid=nulls == 0)
-            return
+        if not nulls or nulls == len(array):
+            self.extend_by(len(array), valid=not nulls)
+            return nulls
         valid = array.is_valid().to_numpy(zero_copy_only=False)
         edges = np.flatnonzero(valid[1:] != valid[:-1]) + 1
         self._extend(np.diff(edges, prepend=0, append=len(array)), valid=bool(valid[0]))
+        return nulls
+
+    def present(self, array: pa.Array[Any]) -> Any:  # noqa: ANN401 - any Arrow array; the stubs have no common base
+        """Take a chunk; return its values without the nulls, None where all are null."""
+        nulls = self.add(array)
+        if nulls == len(array):
+            return None
+        return array.drop_null() if nulls else array
 
     def digest(self) -> bytes:
-        ended = self._hash.copy()
-        ended.update(self._run.to_bytes(8, "little"))
-        return ended.digest()
+        return self._hash.digest(self._run.to_bytes(8, "little"))
 
-    def _extend_by(self, run: int, *, valid: bool) -> None:
+    def extend_by(self, run: int, *, valid: bool) -> None:
         """Append one run, as most chunks are."""
         if valid is self._valid:
             self._run += run
@@ -99,14 +130,16 @@ class _Numbers:
 
     def __init__(self) -> None:
         self._nulls = _Nulls()
-        self._hash = xxh3_128()
+        self._hash = _Bytes()
 
     def add(self, array: pa.Array[Any]) -> None:
-        self._nulls.add(array)
-        values = array.drop_null() if array.null_count else array
-        if len(values):
+        values = self._nulls.present(array)
+        if values is not None:
             width = values.type.bit_width // 8
             self._hash.update(_piece(values.buffers()[1], values.offset * width, len(values) * width))
+
+    def add_nulls(self, count: int) -> None:
+        self._nulls.extend_by(count, valid=False)
 
     def digest(self) -> bytes:
         return self._nulls.digest() + self._hash.digest()
@@ -115,23 +148,24 @@ class _Numbers:
 class _Texts:
     """Values of any length."""
 
-    def __init__(self) -> None:
+    def __init__(self, offset: type[np.int32 | np.int64]) -> None:
         self._nulls = _Nulls()
-        self._lengths = xxh3_128()
-        self._hash = xxh3_128()
+        self._lengths = _Bytes()
+        self._hash = _Bytes()
+        self._offset = np.dtype(offset)
 
     def add(self, array: pa.Array[Any]) -> None:
-        self._nulls.add(array)
-        values = array.drop_null() if array.null_count else array
-        if not len(values):
+        values = self._nulls.present(array)
+        if values is None:
             return
-        large = pa.types.is_large_string(values.type) or pa.types.is_large_binary(values.type)
         _, offsets, data = values.buffers()
-        kind = np.dtype(np.int64 if large else np.int32)
-        stretch = _piece(offsets, values.offset * kind.itemsize, (len(values) + 1) * kind.itemsize)
-        ends = np.frombuffer(stretch, kind)
+        width = self._offset.itemsize
+        ends = np.frombuffer(_piece(offsets, values.offset * width, (len(values) + 1) * width), self._offset)
         self._lengths.update(np.diff(ends).astype("<i8").tobytes())
         self._hash.update(_piece(data, int(ends[0]), int(ends[-1] - ends[0])))
+
+    def add_nulls(self, count: int) -> None:
+        self._nulls.extend_by(count, valid=False)
 
     def digest(self) -> bytes:
         return self._nulls.digest() + self._lengths.digest() + self._hash.digest()
@@ -144,17 +178,21 @@ class _Lists:
         self, kind: pa.ListType[Any] | pa.LargeListType[Any] | pa.FixedSizeListType[Any, Any]
     ) -> None:
         self._nulls = _Nulls()
-        self._lengths = xxh3_128()
+        self._lengths = _Bytes()
         self._items = _column(kind.value_type)
 
     def add(self, array: pa.Array[Any]) -> None:
-        self._nulls.add(array)
-        lists: Any = array.drop_null() if array.null_count else array
+        lists = self._nulls.present(array)
+        if lists is None:
+            return
         if isinstance(lists, pa.ListArray | pa.LargeListArray):
             self._lengths.update(np.diff(lists.offsets.to_numpy()).astype("<i8").tobytes())
         items = lists.flatten()
         if len(items):
             self._items.add(items)
+
+    def add_nulls(self, count: int) -> None:
+        self._nulls.extend_by(count, valid=False)
 
     def digest(self) -> bytes:
         return self._nulls.digest() + self._lengths.digest() + self._items.digest()
@@ -168,10 +206,18 @@ class _Structs:
         self._fields = [_column(field.type) for field in kind]
 
     def add(self, array: pa.Array[Any]) -> None:
-        self._nulls.add(array)
+        if self._nulls.add(array) == len(array):
+            for field in self._fields:
+                field.add_nulls(len(array))
+            return
         structs: Any = array
         for field, values in zip(self._fields, structs.flatten(), strict=True):
             field.add(values)
+
+    def add_nulls(self, count: int) -> None:
+        self._nulls.extend_by(count, valid=False)
+        for field in self._fields:
+            field.add_nulls(count)
 
     def digest(self) -> bytes:
         return self._nulls.digest() + b"".join(field.digest() for field in self._fields)
@@ -187,6 +233,9 @@ class _Maps:
     def add(self, array: pa.Array[Any]) -> None:
         self._lists.add(array.cast(self._entries))
 
+    def add_nulls(self, count: int) -> None:
+        self._lists.add_nulls(count)
+
     def digest(self) -> bytes:
         return self._lists.digest()
 
@@ -200,6 +249,9 @@ class _Decoded:
 
     def add(self, array: pa.Array[Any]) -> None:
         self._values.add(array.cast(self._kind))
+
+    def add_nulls(self, count: int) -> None:
+        self._values.add_nulls(count)
 
     def digest(self) -> bytes:
         return self._values.digest()
@@ -222,10 +274,10 @@ _NESTED: dict[type[pa.DataType], Callable[[Any], _Column]] = {
     pa.MapType: _Maps,
 }
 _PLAIN: dict[pa.DataType, Callable[[], _Column]] = {
-    pa.string(): _Texts,
-    pa.large_string(): _Texts,
-    pa.binary(): _Texts,
-    pa.large_binary(): _Texts,
+    pa.string(): partial(_Texts, np.int32),
+    pa.large_string(): partial(_Texts, np.int64),
+    pa.binary(): partial(_Texts, np.int32),
+    pa.large_binary(): partial(_Texts, np.int64),
     pa.string_view(): partial(_Decoded, pa.large_binary()),
     pa.binary_view(): partial(_Decoded, pa.large_binary()),
     pa.bool_(): partial(_Decoded, pa.uint8()),
