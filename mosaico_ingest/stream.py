@@ -18,7 +18,7 @@ from mosaico_ingest.decode.decoder import Decoder
 from mosaico_ingest.diagnostics import RowFailure, Stage
 from mosaico_ingest.errors import AdapterError, BagError, DecodeError, IngestError, SinkError
 from mosaico_ingest.frozen import frozen
-from mosaico_ingest.ontology.required import fill_required
+from mosaico_ingest.ontology.required import RequiredFields
 from mosaico_ingest.plan.model import TopicPlan
 from mosaico_ingest.policies import LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.quarantine.quarantine import Quarantine
@@ -80,6 +80,7 @@ class Stream:
     watch: Stopwatch = field(default_factory=Stopwatch)
     _decoders: dict[int, Decoder] = field(default_factory=dict[int, Decoder])
     _adapters: dict[int, Adapter] = field(default_factory=dict[int, Adapter])
+    _columns: _Columns | None = None
     _writer: TopicWriter | None = None
     _configuration: dict[str, Any] | None = None
     """What the adapter says of the topic, from its first message."""
@@ -114,7 +115,9 @@ class Stream:
         self._reject(batch, (lost for lost in done.lost if lost.failure.row < end), quarantined)
         kept = int(np.searchsorted(done.index, end))
         if kept:
-            rows = _record_batch(done.log_times[:kept], done.rows[:kept])
+            if self._columns is None or self._columns.kind != done.rows.type:
+                self._columns = _Columns(done.rows.type)
+            rows = self._columns.batch(done.log_times[:kept], done.rows[:kept])
             self._write(rows, batch, done.index, buffer)
         if fatal is not None:
             self._end(fatal, batch, end)
@@ -287,8 +290,15 @@ class Stream:
             )
 
 
-def _record_batch(log_times: NDArray[np.int64], rows: pa.StructArray) -> pa.RecordBatch:
-    """Put the time stamps before the ontology's columns."""
-    schema = pa.schema([ENVELOPE, *rows.type])
-    columns = fill_required(rows).flatten()
-    return pa.RecordBatch.from_arrays([pa.array(log_times), *columns], schema=schema)
+class _Columns:
+    """The columns of a topic's batches; what their type alone decides is found once."""
+
+    def __init__(self, kind: pa.StructType) -> None:
+        self.kind = kind
+        self._schema = pa.schema([ENVELOPE, *kind])
+        self._required = RequiredFields(kind)
+
+    def batch(self, log_times: NDArray[np.int64], rows: pa.StructArray) -> pa.RecordBatch:
+        """Put the time stamps before the ontology's columns."""
+        columns = self._required.fill(rows).flatten()
+        return pa.RecordBatch.from_arrays([pa.array(log_times), *columns], schema=self._schema)

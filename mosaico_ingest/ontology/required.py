@@ -2,67 +2,124 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from collections.abc import Callable
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.types as pt
 
-__all__ = ["fill_required"]
+__all__ = ["AbsentRows", "RequiredFields", "fill_required"]
 
 _arrays: Any = pa
 """The stubs do not know `type` beside `mask`."""
+_KEPT_BYTES = 1 << 20
+_Fill: TypeAlias = Callable[[Any], Any]
+"""Fills an array, or returns the array itself where there is nothing to fill."""
+
+
+class RequiredFields:
+    """Where the required fields of a struct are, found once for all batches of a topic."""
+
+    def __init__(self, kind: pa.StructType) -> None:
+        self._fill = _filling(kind)
+
+    def fill(self, rows: pa.StructArray) -> pa.StructArray:
+        """Return the same rows, where a required field that is null because its struct is null holds zero instead.
+
+        No value that can be seen changes. Parquet's writer refuses `struct<a: int32 not null>` with a null in `a`
+        although the struct itself is null there.
+        """
+        return rows if self._fill is None else cast("pa.StructArray", self._fill(rows))  # a struct stays one
+
+
+class AbsentRows:
+    """Rows of one type that are all null, with zeros where fields are required; few of them are made only once."""
+
+    def __init__(self, kind: Any) -> None:  # noqa: ANN401 - any Arrow type; the stubs have no common base with children
+        self._kind = kind
+        self._fill = _filling(kind)
+        self._kept: Any = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travel without what was made."""
+        return AbsentRows, (self._kind,)
+
+    def of(self, count: int) -> Any:  # noqa: ANN401 - an array of whatever type it is
+        """Return `count` nulls."""
+        if self._kept is not None and count <= len(self._kept):
+            return self._kept.slice(0, count)
+        rows: Any = pa.nulls(count, self._kind)
+        rows = rows if self._fill is None else self._fill(rows)
+        if rows.nbytes <= _KEPT_BYTES:
+            self._kept = rows
+        return rows
 
 
 def fill_required(rows: pa.StructArray) -> pa.StructArray:
-    """Return the same rows, where a required field that is null because its struct is null holds zero instead.
-
-    No value that can be seen changes. Parquet's writer refuses `struct<a: int32 not null>` with a null in `a`
-    although the struct itself is null there.
-    """
-    return cast("pa.StructArray", _filled(rows))  # a struct stays one
+    """Do what `RequiredFields.fill` does, once."""
+    return RequiredFields(rows.type).fill(rows)
 
 
-def _filled(array: Any) -> Any:  # noqa: ANN401 - any Arrow array; the stubs have no common base with children
-    if not _has_required(array.type):
-        return array
-    if pt.is_struct(array.type):
-        return _filled_struct(array)
-    return _filled_fixed(array) if pt.is_fixed_size_list(array.type) else _filled_list(array)
+def _filling(kind: Any) -> _Fill | None:  # noqa: ANN401 - as above
+    """Return how to fill arrays of a type, None where nothing inside is required."""
+    if pt.is_struct(kind):
+        return _filling_struct(list(kind))
+    if pt.is_fixed_size_list(kind):
+        inner = _filling(kind.value_type)
+        return None if inner is None else lambda array: _filled_fixed(array, inner)
+    if pt.is_list(kind):
+        inner = _filling(kind.value_type)
+        return None if inner is None else lambda array: _filled_list(array, inner)
+    return None
 
 
-def _filled_fixed(array: Any) -> Any:  # noqa: ANN401 - as above
+def _filling_struct(fields: list[pa.Field[Any]]) -> _Fill | None:
+    inner = [_filling(field.type) for field in fields]
+    watched = [
+        (position, fill, field.nullable)
+        for position, (field, fill) in enumerate(zip(fields, inner, strict=True))
+        if fill is not None or not field.nullable
+    ]
+
+    def filled_struct(array: Any) -> Any:  # noqa: ANN401 - as above
+        changed: dict[int, Any] = {}
+        for position, fill, nullable in watched:
+            child = array.field(position)
+            new = child if fill is None else fill(child)
+            if not nullable and child.null_count:
+                new = _without_nulls(new)
+            if new is not child:
+                changed[position] = new
+        if not changed:
+            return array
+        children = [changed[i] if i in changed else array.field(i) for i in range(len(fields))]
+        mask = pc.is_null(array) if array.null_count else None
+        return pa.StructArray.from_arrays(children, fields=fields, mask=mask)
+
+    return filled_struct if watched else None
+
+
+def _filled_fixed(array: Any, fill: _Fill) -> Any:  # noqa: ANN401 - as above
     size = array.type.list_size
     values = array.values.slice(array.offset * size, len(array) * size)
-    filled = _filled(values)
+    filled = fill(values)
     if filled is values:
         return array
     mask = pc.is_null(array) if array.null_count else None
     return _arrays.FixedSizeListArray.from_arrays(filled, type=array.type, mask=mask)
 
 
-def _filled_list(array: Any) -> Any:  # noqa: ANN401 - as above
+def _filled_list(array: Any, fill: _Fill) -> Any:  # noqa: ANN401 - as above
     values = array.values
-    filled = _filled(values)
+    filled = fill(values)
     if filled is values:
         return array
     # A null offset is a null list; `mask` does not go with a slice.
     absent = np.append(array.is_null().to_numpy(zero_copy_only=False), False)
     offsets = pa.array(array.offsets.to_numpy(), pa.int32(), mask=absent)
     return pa.ListArray.from_arrays(offsets, filled, type=array.type)
-
-
-def _filled_struct(array: Any) -> Any:  # noqa: ANN401 - as above
-    children = [array.field(position) for position in range(array.type.num_fields)]
-    filled = [
-        _without_nulls(_filled(child)) if not field.nullable and child.null_count else _filled(child)
-        for child, field in zip(children, array.type, strict=True)
-    ]
-    if all(new is old for new, old in zip(filled, children, strict=True)):
-        return array
-    mask = pc.is_null(array) if array.null_count else None
-    return pa.StructArray.from_arrays(filled, fields=list(array.type), mask=mask)
 
 
 def _without_nulls(array: Any) -> Any:  # noqa: ANN401 - as above
@@ -81,12 +138,3 @@ def _zero(kind: pa.DataType) -> pa.Scalar[Any]:
     if pt.is_binary(kind) or pt.is_large_binary(kind):
         return pa.scalar(b"", kind)
     return pa.scalar(False if pt.is_boolean(kind) else 0, kind)
-
-
-def _has_required(kind: pa.DataType) -> bool:
-    """Whether there is a required field somewhere inside."""
-    if pt.is_struct(kind):
-        return any(not field.nullable or _has_required(field.type) for field in kind)
-    if pt.is_list(kind) or pt.is_fixed_size_list(kind):
-        return _has_required(kind.value_type)
-    return False

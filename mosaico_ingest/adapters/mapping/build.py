@@ -16,6 +16,7 @@ from mosaico_ingest.adapters.mapping.fit import convert, refuse_nulls
 from mosaico_ingest.adapters.mapping.functions.registry import Refuse
 from mosaico_ingest.adapters.mapping.typed import Typed
 from mosaico_ingest.frozen import frozen
+from mosaico_ingest.ontology.required import AbsentRows
 
 __all__ = ["Absent", "ByAdapter", "ByFields", "Computed", "Filled", "Looked", "Source", "fill", "fill_struct"]
 
@@ -23,6 +24,8 @@ __all__ = ["Absent", "ByAdapter", "ByFields", "Computed", "Filled", "Looked", "S
 @frozen
 class Absent:
     """Nothing: null in every row."""
+
+    rows: AbsentRows
 
 
 @frozen
@@ -117,7 +120,7 @@ def _fill(evaluation: Evaluation, field: Filled) -> Array:
         types = _types(field.type, column.axes)
         values = _converted(evaluation, column, types[-1], source.typed.text)
     elif isinstance(source, Absent):
-        return arrays.nulls(len(evaluation), field.type)
+        return source.rows.of(len(evaluation))
     else:
         column = _base(evaluation, field)
         types = _types(field.type, column.axes)
@@ -152,7 +155,7 @@ def _base(evaluation: Evaluation, field: Filled) -> Column:
     source = field.source
     match source:
         case Absent():
-            return Column(arrays.nulls(len(evaluation), field.type))
+            return Column(source.rows.of(len(evaluation)))
         case Computed():
             column = evaluation.of(source.typed)
             element = _types(field.type, column.axes)[-1]

@@ -19,6 +19,7 @@ from mosaico_ingest.adapters.mapping.model import Form, MappingFile, Scalar, Val
 from mosaico_ingest.adapters.mapping.typed import Const, Typed, Written
 from mosaico_ingest.bag.definition import Definition
 from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.ontology.required import AbsentRows
 from mosaico_ingest.ontology.types import OntologyType
 
 __all__ = ["AdapterLookup", "Compiler"]
@@ -140,7 +141,7 @@ class Compiler:
 
     def _computed(self, value: Scalar, slot: Slot) -> Source | None:
         if value is None:
-            return Absent()
+            return Absent(AbsentRows(slot.type))
         analyzer = self._analyzer
         compiled = analyzer.scalar(slot.path, value, slot.scope)
         if compiled is None or isinstance(compiled, Const):
@@ -153,7 +154,7 @@ class Compiler:
         if typed is None:
             return None
         if isinstance(typed, Const) and typed.value is None:
-            return Absent()
+            return Absent(AbsentRows(slot.type))
         if is_short_cast(compiled.node):
             typed = analyzer.cast(compiled, slot)
             return None if typed is None else Computed(typed)
@@ -262,4 +263,6 @@ def _complete(fields: tuple[Filled, ...], owner: Slot) -> tuple[Filled, ...]:
 
 
 def _absent(field: DataType, owner: Slot) -> Filled:
-    return Filled(owner.inside(field.name), field.name, field.type, nullable=True, source=Absent())
+    return Filled(
+        owner.inside(field.name), field.name, field.type, nullable=True, source=Absent(AbsentRows(field.type))
+    )
