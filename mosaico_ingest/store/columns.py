@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import lru_cache
 from typing import Any
 
@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 
 from mosaico_ingest.frozen import frozen
 
-__all__ = ["Leaf", "check_columns", "leaves", "writer_options"]
+__all__ = ["Columns", "Leaf", "columns_of"]
 
 _LEVEL = 1
 _SAMPLE_BYTES = 1 << 18
@@ -42,14 +42,42 @@ class Leaf:
         return ".".join(self.steps)
 
 
+class Columns:
+    """The Parquet columns of one schema, and how each is written.
+
+    Raises:
+        pa.ArrowInvalid: Parquet has no room for them; said before there is a file or a row.
+    """
+
+    def __init__(self, schema: pa.Schema) -> None:
+        if len(set(schema.names)) != len(schema.names):
+            raise pa.ArrowInvalid(f"a column name is used twice: {schema.names}")
+        pq.ParquetWriter(pa.BufferOutputStream(), schema, use_compliant_nested_type=False).close()
+        self.schema = schema
+        self.leaves = tuple(
+            leaf
+            for field in schema
+            for leaf in _walk(Leaf(field.name, (field.name,), field.type, repeated=False))
+        )
+        """In the order Parquet numbers them."""
+        self._few = _options(self.leaves, {leaf.parquet_path for leaf in self.leaves})
+
+    def writer_options(self, rows: pa.Table) -> dict[str, Any]:
+        """Return what `pq.ParquetWriter` is told: by type, and for blobs by how a sample of the first rows shrinks.
+
+        Splitting the bytes of floats makes them smaller and faster to write than plain or dictionary pages;
+        JPEGs and their like only cost time in a second compressor, and so do rows that fit into one block of a disk.
+        """
+        if rows.nbytes < _TOO_LITTLE:
+            return self._few
+        packed = (leaf for leaf in self.leaves if _is_blob(leaf) and not _shrinks(leaf, rows))
+        return _options(self.leaves, {leaf.parquet_path for leaf in packed})
+
+
 @lru_cache(maxsize=_SCHEMAS)
-def leaves(schema: pa.Schema) -> tuple[Leaf, ...]:
-    """Return the columns in the order Parquet numbers them."""
-    return tuple(
-        leaf
-        for field in schema
-        for leaf in _walk(Leaf(field.name, (field.name,), field.type, repeated=False))
-    )
+def columns_of(schema: pa.Schema) -> Columns:
+    """Return the columns of a schema; see `Columns`."""
+    return Columns(schema)
 
 
 def _walk(at: Leaf) -> Iterator[Leaf]:
@@ -69,22 +97,8 @@ def _walk(at: Leaf) -> Iterator[Leaf]:
         yield at
 
 
-@lru_cache(maxsize=_SCHEMAS)
-def check_columns(schema: pa.Schema) -> None:
-    """Raise what Parquet says against the columns, before there is a file or a row."""
-    if len(set(schema.names)) != len(schema.names):
-        raise pa.ArrowInvalid(f"a column name is used twice: {schema.names}")
-    pq.ParquetWriter(pa.BufferOutputStream(), schema, use_compliant_nested_type=False).close()
-
-
-def writer_options(columns: tuple[Leaf, ...], rows: pa.Table) -> dict[str, Any]:
-    """Return what `pq.ParquetWriter` is told: by type, and for blobs by how a sample of the first rows shrinks.
-
-    Splitting the bytes of floats makes them smaller and faster to write than plain or dictionary pages;
-    JPEGs and their like only cost time in a second compressor, and so do rows that fit into one block of a disk.
-    """
-    few = rows.nbytes < _TOO_LITTLE
-    packed = {leaf.parquet_path for leaf in columns if few or (_is_blob(leaf) and not _shrinks(leaf, rows))}
+def _options(columns: tuple[Leaf, ...], packed: Collection[str]) -> dict[str, Any]:
+    """Return the writer's options; `packed` are the paths of columns that no codec makes smaller."""
     zstd = [leaf.parquet_path for leaf in columns if leaf.parquet_path not in packed]
     encodings = {leaf.parquet_path: "BYTE_STREAM_SPLIT" for leaf in columns if _splits(leaf.type)}
     encodings[columns[0].parquet_path] = "DELTA_BINARY_PACKED"

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.path import AnyPath
 from mosaico_ingest.store import files
-from mosaico_ingest.store.columns import Leaf, leaves, writer_options
+from mosaico_ingest.store.columns import Columns, Leaf
 from mosaico_ingest.store.content import ContentHash
 
 __all__ = ["Bounds", "Segment", "SegmentWriter", "sorted_rows", "time_span"]
@@ -42,22 +42,22 @@ class Segment:
 class SegmentWriter:
     """Writes row groups to `path`; the columns' codecs are chosen from the first rows."""
 
-    def __init__(self, path: AnyPath, schema: pa.Schema, first_rows: pa.Table) -> None:
+    def __init__(self, path: AnyPath, columns: Columns, first_rows: pa.Table) -> None:
         self.path = path
         self.end_ns = -(1 << 63)
-        self._leaves = leaves(schema)
-        self._content = ContentHash(schema)
+        self._columns = columns
+        self._content = ContentHash(columns.schema)
         self._file = files.create(path)
         self._footer: list[pq.FileMetaData] = []
         self._writer = pq.ParquetWriter(
             self._file,
-            schema,
+            columns.schema,
             use_compliant_nested_type=False,  # a list item's name is part of the type readers look for
             sorting_columns=[pq.SortingColumn(0)],
             write_batch_size=4096,
             write_page_checksum=True,
             metadata_collector=self._footer,
-            **writer_options(self._leaves, first_rows),
+            **columns.writer_options(first_rows),
         )
 
     @property
@@ -76,7 +76,7 @@ class SegmentWriter:
         self._writer.close()
         self._file.close()
         (footer,) = self._footer
-        bounds = tuple(_bounds(self._leaves, footer))
+        bounds = tuple(_bounds(self._columns.leaves, footer))
         _, start_ns, end_ns = bounds[0]
         return Segment(
             self.path,

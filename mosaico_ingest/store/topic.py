@@ -15,7 +15,7 @@ from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote.path import AnyPath
 from mosaico_ingest.sink import check_batch, topic_schema
 from mosaico_ingest.store import files
-from mosaico_ingest.store.columns import check_columns
+from mosaico_ingest.store.columns import columns_of
 from mosaico_ingest.store.faults import explained
 from mosaico_ingest.store.segment import Segment, SegmentWriter, sorted_rows
 
@@ -59,7 +59,7 @@ class StoreTopic:
         self.ontology = ontology
         self.metadata = metadata
         self.schema = topic_schema(ontology)
-        check_columns(self.schema)
+        self._columns = columns_of(self.schema)
         self.created_ns = time.time_ns()
         self.buffered_bytes = 0
         self.segments: list[Segment] = []
@@ -137,7 +137,7 @@ class StoreTopic:
         if self._writer is not None and rows.column(0)[0].as_py() < self._writer.end_ns:
             self._finish_segment()  # a segment is sorted from its first row to its last
         if self._writer is None:
-            self._writer = SegmentWriter(self._staging.next_path(self.name), self.schema, rows)
+            self._writer = SegmentWriter(self._staging.next_path(self.name), self._columns, rows)
         self._writer.append(rows)
         if self._writer.written_bytes >= _SEGMENT_BYTES:
             self._finish_segment()
