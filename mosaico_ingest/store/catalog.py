@@ -112,9 +112,9 @@ class Catalog:
             yield db
 
     @contextmanager
-    def write(self) -> Generator[sqlite3.Connection, None, None]:
-        """Give a connection inside a transaction: all of it happens, or nothing."""
-        with self._task("BEGIN IMMEDIATE", mode="rw") as db:
+    def write(self, *, lasting: bool = True) -> Generator[sqlite3.Connection, None, None]:
+        """Give a connection inside a transaction: all of it happens, or nothing; a power cut may undo what need not last."""
+        with self._task("BEGIN IMMEDIATE", mode="rw", lasting=lasting) as db:
             yield db
 
     def keep_open(self) -> sqlite3.Connection:
@@ -125,8 +125,8 @@ class Catalog:
     def claim(
         self, session: str, sequence: str, if_exists: IfExists, *, is_live: Callable[[str], bool]
     ) -> entries.Claim:
-        """See `Records.claim`."""
-        with self.write() as db:
+        """See `Records.claim`; a claim means nothing once its writer is dead, as it is after a power cut."""
+        with self.write(lasting=False) as db:
             return entries.claim(db, session, sequence, if_exists, is_live=is_live)
 
     def commit(self, claimed: entries.Claim, new: entries.NewSession) -> list[str]:
@@ -136,7 +136,7 @@ class Catalog:
 
     def release(self, session: str, sequence: str) -> None:  # noqa: ARG002 - the session says it all
         """See `Records.release`."""
-        with self.write() as db:
+        with self.write(lasting=False) as db:
             entries.release(db, session)
 
     def create(self, sequence: str, metadata: str) -> None:
@@ -196,8 +196,14 @@ class Catalog:
             return removal.forget(db, live)
 
     @contextmanager
-    def _task(self, begin: str, *, mode: str) -> Generator[sqlite3.Connection, None, None]:
+    def _task(
+        self, begin: str, *, mode: str, lasting: bool = True
+    ) -> Generator[sqlite3.Connection, None, None]:
         with explained(self.path), closing(self._connect(mode)) as db:
+            if not lasting:
+                db.execute(
+                    "PRAGMA synchronous = NORMAL"
+                )  # a WAL stays whole, its last transactions may be missing
             db.execute(begin)
             try:
                 yield db

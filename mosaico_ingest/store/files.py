@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mosaico_ingest.remote.path import AnyPath, RemotePath
-from mosaico_ingest.store.layout import fsync
+from mosaico_ingest.store import layout
 
 __all__ = ["create", "footer", "opened", "settle"]
 
@@ -21,7 +21,7 @@ def create(path: AnyPath) -> pa.NativeFile:
 def settle(path: AnyPath) -> None:
     """Wait until a closed file is there to stay; a store behind a URL has said so already."""
     if not isinstance(path, RemotePath):
-        fsync(path)
+        layout.fsync(path)
 
 
 def opened(path: AnyPath, **options: Any) -> pq.ParquetFile:  # noqa: ANN401 - those of `pq.ParquetFile`

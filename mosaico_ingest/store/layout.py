@@ -17,7 +17,6 @@ import secrets
 import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
@@ -31,7 +30,6 @@ __all__ = ["Layout", "encoded", "fsync", "new_session_id"]
 _UNSAFE = re.compile(rb"[^A-Za-z0-9_-]")
 _LONGEST = 200
 _ATTEMPTS = 5
-_AT_ONCE = 8
 _CROCKFORD = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
 
 
@@ -103,16 +101,14 @@ class Layout:
             yield from (Path(folder, name) for name in files)
 
     def publish(self, moves: Mapping[AnyPath, AnyPath]) -> None:
-        """Move finished files to their places, so that they are there, and whole, after a power cut."""
-        paths = [(Path(str(staged)), Path(str(target))) for staged, target in moves.items()]
+        """Move finished files to their places, so that they are still there after a power cut."""
         changed: set[Path] = set()
-        with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="fsync") as pool:
-            list(pool.map(fsync, (staged for staged, _ in paths)))  # a disk takes several in the time of one
-            for staged, target in paths:
-                changed.add(target.parent)
-                changed |= {folder.parent for folder in target.parents if not folder.exists()}
-                _move(staged, target)
-            list(pool.map(fsync, changed))
+        for staged, target in ((Path(str(old)), Path(str(new))) for old, new in moves.items()):
+            changed.add(target.parent)
+            changed |= {folder.parent for folder in target.parents if not folder.exists()}
+            _move(staged, target)
+        for folder in changed:
+            fsync(folder)
 
     def remove(self, paths: Iterable[AnyPath]) -> None:
         """Remove segment files and the folders that are empty then; garbage collection gets what resists."""

@@ -72,9 +72,10 @@ class SegmentWriter:
         self.end_ns = rows.column(0)[-1].as_py()
 
     def close(self) -> Segment:
-        """Finish the file; it may not be on the disk yet."""
+        """Finish the file; it is there to stay then."""
         self._writer.close()
         self._file.close()
+        files.settle(self.path)
         (footer,) = self._footer
         bounds = tuple(_bounds(self._columns.leaves, footer))
         _, start_ns, end_ns = bounds[0]

@@ -26,6 +26,9 @@ from mosaico_ingest.store.topic import Staging, StoreTopic
 
 __all__ = ["StoreSession"]
 
+_WAITING = 2
+"""How many threads may wait for the disk while others encode."""
+
 
 class StoreSession:
     """One writing session; `commit` or `discard` ends it."""
@@ -84,7 +87,7 @@ class StoreSession:
 
     def commit(self) -> None:
         """Finish every topic, move the segments to their places, and enter them in the catalog at once."""
-        with ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="segment") as pool:
+        with ThreadPoolExecutor((os.cpu_count() or 1) + _WAITING, thread_name_prefix="segment") as pool:
             # the largest first, so that no thread is left with it at the end
             waiting = sorted(self._staging.topics.values(), key=lambda topic: -topic.buffered_bytes)
             list(pool.map(StoreTopic.close, waiting))

@@ -14,7 +14,6 @@ from mosaico_ingest.errors import SinkError
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote.path import AnyPath
 from mosaico_ingest.sink import check_batch, topic_schema
-from mosaico_ingest.store import files
 from mosaico_ingest.store.columns import columns_of
 from mosaico_ingest.store.faults import explained
 from mosaico_ingest.store.segment import Segment, SegmentWriter, sorted_rows
@@ -141,8 +140,6 @@ class StoreTopic:
         self._writer.append(rows)
         if self._writer.written_bytes >= _SEGMENT_BYTES:
             self._finish_segment()
-            # as much as this goes to the disk while others are still read
-            files.settle(self.segments[-1].path)
 
     def _finish_segment(self) -> None:
         if self._writer is not None:
