@@ -15,6 +15,8 @@ from mosaico_ingest.sink import TopicWriter
 __all__ = ["WriteBuffer"]
 
 _INTERRUPTED_S = 20.0
+_WORTH_WAKING_BYTES = 1 << 20
+"""Batches of small topics wait for company: handing over to a thread costs more than writing one."""
 
 
 class WriteBuffer:
@@ -57,12 +59,14 @@ class WriteBuffer:
         size = batch.nbytes
         with self._changed:
             while self._error is None and self._queued_bytes and self._queued_bytes + size > self._max_bytes:
+                self._changed.notify_all()  # what is queued may have waited for company
                 self._changed.wait()
             if self._error is not None:
                 raise self._error
             self._queue.append((writer, batch, size))
             self._queued_bytes += size
-            self._changed.notify_all()
+            if self._queued_bytes >= min(_WORTH_WAKING_BYTES, self._max_bytes):
+                self._changed.notify_all()
 
     def _work(self) -> None:
         while True:

@@ -90,3 +90,22 @@ def test_an_interrupt_waits_for_a_stuck_writer_only_so_long(monkeypatch: pytest.
     assert time.monotonic() - begin < 0.45
     buffer._thread.join()
     assert writer.seen == [0]
+
+
+def test_small_batches_are_written_together() -> None:
+    writer = Writer()
+    with WriteBuffer(max_bytes=1 << 30) as buffer:
+        for value in range(5):
+            buffer.put(writer, batch(value))
+        time.sleep(0.05)
+        assert not writer.seen
+    assert writer.seen == [0, 1, 2, 3, 4]
+
+
+def test_who_waits_for_room_wakes_the_writer_first() -> None:
+    writer = Writer()
+    almost = batch(0, 100_000)  # 0.8 MB, too little to wake the writer for
+    with WriteBuffer(max_bytes=1 << 20) as buffer:
+        buffer.put(writer, almost)
+        buffer.put(writer, almost)
+    assert writer.seen == [0, 0]
