@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from os.path import normpath
 from pathlib import Path
 
@@ -63,9 +63,8 @@ def open_for(config: ROSInjectionConfig) -> Generator[tuple[Recording, TypeResol
 
 def make_plan(config: ROSInjectionConfig) -> Plan:
     """Open the recording, decide everything, write nothing."""
-    bridge = ROSBridge.for_config(config)
     with open_for(config) as (recording, resolver):
-        return resolve(config, recording, bridge=bridge, resolver=resolver)
+        return resolve(config, recording, bridge=ROSBridge.for_config(config), resolver=resolver)
 
 
 def sink_for(target: StoreTarget | ServerTarget, *, buffer_bytes: int) -> Sink:
@@ -87,11 +86,17 @@ def preflight(plan: Plan) -> Finding | None:
 
 
 def execute(
-    plan: Plan, observe: Observer, *, sink: Sink | None = None, watch: Stopwatch | None = None
+    plan: Plan,
+    observe: Observer,
+    *,
+    sink: Sink | None = None,
+    recording: Recording | None = None,
+    watch: Stopwatch | None = None,
 ) -> tuple[Report, IngestError | None]:
     """Run a plan; return what happened, and the error that ended it, if one did.
 
-    `sink` stands in for the plan's target where the caller has its own; `watch` knows when the planning began.
+    `sink` stands in for the plan's target where the caller has its own, `recording` is open still from the planning,
+    and `watch` knows when that began.
     """
     failure: IngestError | None = None
     watch = watch or Stopwatch()
@@ -116,10 +121,10 @@ def execute(
             tell(Unreadable(None, None, None, f"{path}: this part is not there"))
         for lost in _undefined(plan):
             tell(lost)
-        with open_recording(plan.files, resolve=plan.resolver) as recording:
+        with _opened(plan, recording) as source:
             destination = sink or sink_for(plan.target, buffer_bytes=plan.memory_bytes // 4)
             watch.lap(Step.PREPARE)
-            inject(entered, recording, destination, tell, watch)
+            inject(entered, source, destination, tell, watch)
     except IngestError as error:
         failure = error
     watch.lap(Step.COMMIT)
@@ -128,11 +133,17 @@ def execute(
     return collector.report(), failure
 
 
+def _opened(plan: Plan, recording: Recording | None) -> AbstractContextManager[Recording]:
+    return nullcontext(recording) if recording else open_recording(plan.files, resolve=plan.resolver)
+
+
 def run_config(config: ROSInjectionConfig, observe: Observer) -> Report:
     """Plan and run one configuration; every outcome is a report, a mistake of ours and an interrupt too."""
     watch = Stopwatch()
     try:
-        report, _ = execute(make_plan(config), observe, watch=watch)
+        with open_for(config) as (recording, resolver):
+            plan = resolve(config, recording, bridge=ROSBridge.for_config(config), resolver=resolver)
+            report, _ = execute(plan, observe, recording=recording, watch=watch)
     except IngestError as error:
         return failed_report(config, error, observe)
     except KeyboardInterrupt:
