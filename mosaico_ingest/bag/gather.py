@@ -101,8 +101,7 @@ class Gather:
     def _batches(self, channel: Channel, slab: Slab) -> Iterator[RawBatch]:
         """Cut into batches of the allowed size, as equal as can be."""
         parts = min(len(slab), max(-(-len(slab) // self._rows), -(-slab.payload_bytes // BATCH_BYTES)))
-        edges = np.linspace(0, len(slab), parts + 1).astype(np.int64).tolist()
-        for begin, end in pairwise(edges):
+        for begin, end in pairwise(len(slab) * part // parts for part in range(parts + 1)):
             rows = slab.rows(slice(begin, end))
             yield RawBatch(channel, rows.log_times, rows.data, rows.starts, rows.lengths, rows.offsets)
 

@@ -97,8 +97,10 @@ class _Builder:
         view = self._block(inst, leaf.step).numbers(number, leaf.offset, leaf.dims)
         if leaf.type == "bool":
             return array_of(kind, view.size, np.packbits(view != 0, bitorder="little"))
-        values = np.require(view, number.newbyteorder("="), ["C_CONTIGUOUS", "ALIGNED"])
-        return array_of(kind, values.size, values)
+        flags = view.flags
+        if not (flags.c_contiguous and flags.aligned and number.isnative):
+            view = view.astype(number.newbyteorder("="), order="C")
+        return array_of(kind, view.size, view)
 
     def _block(self, inst: _Instances, number: int) -> Cells:
         if number not in inst.blocks:
