@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import zstandard
 
-from mosaico_ingest.store.columns import columns_of
+from mosaico_ingest.store.columns import Columns
 from mosaico_ingest.store.segment import SegmentWriter
 from mosaico_ingest.store.store import Store
 
@@ -91,9 +91,7 @@ def main() -> None:
     write_from = time.perf_counter()
     with tempfile.TemporaryDirectory(dir=store.parent) as folder:
         for number, groups in enumerate(files):
-            writer = SegmentWriter(
-                Path(folder) / f"{number}.parquet", columns_of(groups[0].schema), groups[0]
-            )
+            writer = SegmentWriter(Path(folder) / f"{number}.parquet", Columns(groups[0].schema), groups[0])
             for group in groups:
                 writer.append(group)
             writer.close()

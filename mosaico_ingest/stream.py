@@ -19,9 +19,11 @@ from mosaico_ingest.diagnostics import RowFailure, Stage
 from mosaico_ingest.errors import AdapterError, BagError, DecodeError, IngestError, SinkError
 from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.required import RequiredFields
+from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.plan.model import TopicPlan
 from mosaico_ingest.policies import LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.quarantine.quarantine import Quarantine
+from mosaico_ingest.remembered import remembered
 from mosaico_ingest.report.events import Observer, Rejected, TopicProgress, TopicStatus
 from mosaico_ingest.report.stopwatch import Step, Stopwatch
 from mosaico_ingest.report.timeline import Timeline
@@ -80,7 +82,6 @@ class Stream:
     watch: Stopwatch = field(default_factory=Stopwatch)
     _decoders: dict[int, Decoder] = field(default_factory=dict[int, Decoder])
     _adapters: dict[int, Adapter] = field(default_factory=dict[int, Adapter])
-    _columns: _Columns | None = None
     _writer: TopicWriter | None = None
     _configuration: dict[str, Any] | None = None
     """What the adapter says of the topic, from its first message."""
@@ -115,9 +116,7 @@ class Stream:
         self._reject(batch, (lost for lost in done.lost if lost.failure.row < end), quarantined)
         kept = int(np.searchsorted(done.index, end))
         if kept:
-            if self._columns is None or self._columns.kind != done.rows.type:
-                self._columns = _Columns(done.rows.type)
-            rows = self._columns.batch(done.log_times[:kept], done.rows[:kept])
+            rows = _columns(self.plan.ontology).batch(done.log_times[:kept], done.rows[:kept])
             self._write(rows, batch, done.index, buffer)
         if fatal is not None:
             self._end(fatal, batch, end)
@@ -290,6 +289,11 @@ class Stream:
             )
 
 
+@remembered
+def _columns(ontology: OntologyType) -> _Columns:
+    return _Columns(ontology.struct)
+
+
 class _Columns:
     """The columns of a topic's batches; what their type alone decides is found once."""
 
@@ -300,5 +304,7 @@ class _Columns:
 
     def batch(self, log_times: NDArray[np.int64], rows: pa.StructArray) -> pa.RecordBatch:
         """Put the time stamps before the ontology's columns."""
+        if rows.type != self.kind:  # the destination will say what is wrong with them
+            return _Columns(rows.type).batch(log_times, rows)
         columns = self._required.fill(rows).flatten()
         return pa.RecordBatch.from_arrays([pa.array(log_times), *columns], schema=self._schema)

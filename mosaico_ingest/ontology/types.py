@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 from enum import Enum
-from functools import lru_cache
 
 import pyarrow as pa
 
 from mosaico_ingest.frozen import frozen
+from mosaico_ingest.remembered import remembered
 
 __all__ = ["OntologyType", "SerializationFormat", "fingerprint"]
 
@@ -43,7 +43,7 @@ class OntologyType:
         return fingerprint(self.struct)
 
 
-@lru_cache(maxsize=256)
+@remembered
 def fingerprint(struct: pa.StructType) -> str:
     """Return the first ten hex digits of the SHA-1 of the struct's spelling; top-level large and view types count as plain."""
     fields = [pa.field(field.name, _PLAIN.get(field.type) or field.type, field.nullable) for field in struct]

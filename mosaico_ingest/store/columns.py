@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from functools import lru_cache
 from typing import Any
 
 import pyarrow as pa
@@ -11,6 +10,10 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from mosaico_ingest.frozen import frozen
+from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.remembered import remembered
+from mosaico_ingest.sink import topic_schema
+from mosaico_ingest.store.content import column_makers
 
 __all__ = ["Columns", "Leaf", "columns_of"]
 
@@ -20,8 +23,6 @@ _SAMPLES = 16
 _PIECE_BYTES = _SAMPLE_BYTES // _SAMPLES
 _TOO_LITTLE = 1 << 12
 _WORTH_IT = 0.9
-_SCHEMAS = 256
-"""How many are remembered; the topics of one recording are those of the next."""
 
 
 @frozen
@@ -60,6 +61,7 @@ class Columns:
             for leaf in _walk(Leaf(field.name, (field.name,), field.type, repeated=False))
         )
         """In the order Parquet numbers them."""
+        self.makers = column_makers(schema)
         self._few = _options(self.leaves, {leaf.parquet_path for leaf in self.leaves})
 
     def writer_options(self, rows: pa.Table) -> dict[str, Any]:
@@ -74,10 +76,10 @@ class Columns:
         return _options(self.leaves, {leaf.parquet_path for leaf in packed})
 
 
-@lru_cache(maxsize=_SCHEMAS)
-def columns_of(schema: pa.Schema) -> Columns:
-    """Return the columns of a schema; see `Columns`."""
-    return Columns(schema)
+@remembered
+def columns_of(ontology: OntologyType) -> Columns:
+    """Return the columns of a topic; see `Columns`."""
+    return Columns(topic_schema(ontology))
 
 
 def _walk(at: Leaf) -> Iterator[Leaf]:

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 from xxhash import xxh3_128, xxh3_128_digest
 
-__all__ = ["ContentHash", "combined"]
+__all__ = ["ColumnMaker", "ContentHash", "column_makers", "combined"]
+
+
+def column_makers(schema: pa.Schema) -> tuple[ColumnMaker, ...]:
+    """Return how to make the state that each column of rows is hashed with."""
+    return tuple(_maker(field.type) for field in schema)
 
 
 class ContentHash:
@@ -21,8 +26,8 @@ class ContentHash:
     lies in memory behind a null, how rows are cut into chunks, and how they are encoded in a file do not.
     """
 
-    def __init__(self, schema: pa.Schema) -> None:
-        self._columns = [_column(field.type) for field in schema]
+    def __init__(self, makers: tuple[ColumnMaker, ...]) -> None:
+        self._columns = [make() for make in makers]
 
     def add(self, rows: pa.Table | pa.RecordBatch) -> None:
         """Take the rows that come next."""
@@ -55,6 +60,10 @@ class _Column(Protocol):
         ...
 
     def digest(self) -> bytes: ...
+
+
+ColumnMaker: TypeAlias = Callable[[], _Column]
+"""Makes the state that one column is hashed with."""
 
 
 class _Bytes:
@@ -174,12 +183,10 @@ class _Texts:
 class _Lists:
     """Lists of any length, or of one."""
 
-    def __init__(
-        self, kind: pa.ListType[Any] | pa.LargeListType[Any] | pa.FixedSizeListType[Any, Any]
-    ) -> None:
+    def __init__(self, items: ColumnMaker) -> None:
         self._nulls = _Nulls()
         self._lengths = _Bytes()
-        self._items = _column(kind.value_type)
+        self._items = items()
 
     def add(self, array: pa.Array[Any]) -> None:
         lists = self._nulls.present(array)
@@ -201,9 +208,9 @@ class _Lists:
 class _Structs:
     """Fields side by side; those of a null are null."""
 
-    def __init__(self, kind: pa.StructType) -> None:
+    def __init__(self, fields: tuple[ColumnMaker, ...]) -> None:
         self._nulls = _Nulls()
-        self._fields = [_column(field.type) for field in kind]
+        self._fields = [make() for make in fields]
 
     def add(self, array: pa.Array[Any]) -> None:
         if self._nulls.add(array) == len(array):
@@ -223,29 +230,12 @@ class _Structs:
         return self._nulls.digest() + b"".join(field.digest() for field in self._fields)
 
 
-class _Maps:
-    """Maps, as lists of their entries."""
-
-    def __init__(self, kind: pa.MapType[Any, Any]) -> None:
-        self._entries = pa.list_(pa.struct([kind.key_field, kind.item_field]))
-        self._lists = _Lists(self._entries)
-
-    def add(self, array: pa.Array[Any]) -> None:
-        self._lists.add(array.cast(self._entries))
-
-    def add_nulls(self, count: int) -> None:
-        self._lists.add_nulls(count)
-
-    def digest(self) -> bytes:
-        return self._lists.digest()
-
-
-class _Decoded:
+class _Converted:
     """Values that count as those of another type."""
 
-    def __init__(self, kind: pa.DataType) -> None:
+    def __init__(self, kind: pa.DataType, make: ColumnMaker) -> None:
         self._kind = kind
-        self._values = _column(kind)
+        self._values = make()
 
     def add(self, array: pa.Array[Any]) -> None:
         self._values.add(array.cast(self._kind))
@@ -257,30 +247,31 @@ class _Decoded:
         return self._values.digest()
 
 
-def _column(kind: pa.DataType) -> _Column:
-    make = _NESTED.get(type(kind))
-    if make is not None:
-        return make(kind)
+def _maker(kind: Any) -> ColumnMaker:  # noqa: ANN401 - any Arrow type; the stubs have no common base with children
+    """Return how to make the state of a column of a type."""
+    if isinstance(kind, pa.StructType):
+        return partial(_Structs, tuple(_maker(field.type) for field in kind))
+    if isinstance(kind, pa.ListType | pa.LargeListType | pa.FixedSizeListType):
+        return partial(_Lists, _maker(kind.value_type))
+    if isinstance(kind, pa.MapType):  # as a list of its entries
+        return _converted(pa.list_(pa.struct([kind.key_field, kind.item_field])))
     if isinstance(kind, pa.DictionaryType):
-        return _Decoded(kind.value_type)
-    return _PLAIN.get(kind, _Numbers)()
+        return _converted(kind.value_type)
+    return _PLAIN.get(kind, _Numbers)
 
 
-_NESTED: dict[type[pa.DataType], Callable[[Any], _Column]] = {
-    pa.StructType: _Structs,
-    pa.ListType: _Lists,
-    pa.LargeListType: _Lists,
-    pa.FixedSizeListType: _Lists,
-    pa.MapType: _Maps,
-}
-_PLAIN: dict[pa.DataType, Callable[[], _Column]] = {
+def _converted(kind: pa.DataType) -> ColumnMaker:
+    return partial(_Converted, kind, _maker(kind))
+
+
+_PLAIN: dict[pa.DataType, ColumnMaker] = {
     pa.string(): partial(_Texts, np.int32),
     pa.large_string(): partial(_Texts, np.int64),
     pa.binary(): partial(_Texts, np.int32),
     pa.large_binary(): partial(_Texts, np.int64),
-    pa.string_view(): partial(_Decoded, pa.large_binary()),
-    pa.binary_view(): partial(_Decoded, pa.large_binary()),
-    pa.bool_(): partial(_Decoded, pa.uint8()),
+    pa.string_view(): partial(_Converted, pa.large_binary(), partial(_Texts, np.int64)),
+    pa.binary_view(): partial(_Converted, pa.large_binary(), partial(_Texts, np.int64)),
+    pa.bool_(): partial(_Converted, pa.uint8(), _Numbers),
 }
 
 

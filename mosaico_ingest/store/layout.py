@@ -18,6 +18,7 @@ import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
+from itertools import takewhile
 from pathlib import Path
 
 from mosaico_ingest.frozen import frozen
@@ -105,7 +106,7 @@ class Layout:
         changed: set[Path] = set()
         for staged, target in ((Path(str(old)), Path(str(new))) for old, new in moves.items()):
             changed.add(target.parent)
-            changed |= {folder.parent for folder in target.parents if not folder.exists()}
+            changed.update(folder.parent for folder in takewhile(_is_missing, target.parents))
             _move(staged, target)
         for folder in changed:
             fsync(folder)
@@ -138,6 +139,10 @@ def encoded(part: str) -> str:
     if len(safe) <= _LONGEST:
         return safe
     return f"{safe[:_LONGEST]}%{hashlib.sha256(part.encode()).hexdigest()[:16]}"
+
+
+def _is_missing(folder: Path) -> bool:
+    return not folder.exists()
 
 
 def _move(staged: Path, target: Path) -> None:

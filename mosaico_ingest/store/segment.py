@@ -46,7 +46,7 @@ class SegmentWriter:
         self.path = path
         self.end_ns = -(1 << 63)
         self._columns = columns
-        self._content = ContentHash(columns.schema)
+        self._content = ContentHash(columns.makers)
         self._file = files.create(path)
         self._footer: list[pq.FileMetaData] = []
         self._writer = pq.ParquetWriter(

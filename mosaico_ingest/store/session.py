@@ -14,7 +14,6 @@ from mosaico_ingest import wire
 from mosaico_ingest.errors import IngestError, SinkError
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.policies import IfExists
-from mosaico_ingest.remote.path import AnyPath
 from mosaico_ingest.sink import StoredTopic, check_same_type
 from mosaico_ingest.store import entries, files
 from mosaico_ingest.store.content import combined
@@ -72,7 +71,8 @@ class StoreSession:
         if held is not None:
             check_same_type(held, ontology, where=name)
         with explained(name):
-            topic = StoreTopic(self._staging, path, ontology, described)
+            folder = self._layout.topic(self._claim.sequence, path)
+            topic = StoreTopic(self._staging, path, ontology, described, folder=folder)
         self._staging.topics[path] = self._given[name] = topic
         return topic
 
@@ -91,12 +91,12 @@ class StoreSession:
             # the largest first, so that no thread is left with it at the end
             waiting = sorted(self._staging.topics.values(), key=lambda topic: -topic.buffered_bytes)
             list(pool.map(StoreTopic.close, waiting))
-        topics = tuple(self._placed(topic) for topic in self._staging.topics.values())
-        moves: dict[AnyPath, AnyPath] = {
-            segment.path: self._layout.root / path
-            for topic in topics
-            for path, segment in topic.segments.items()
+        moves = {
+            segment.path: topic.folder / segment.path.name
+            for topic in self._staging.topics.values()
+            for segment in topic.segments
         }
+        topics = tuple(map(self._placed, self._staging.topics.values()))
         new = entries.NewSession(self.id, self._metadata, self.created_ns, topics, tuple(self._notes))
         try:
             with explained(self._layout.root):
@@ -132,18 +132,17 @@ class StoreSession:
         return info is not None and any(session.id == self.id for session in info.sessions)
 
     def _placed(self, topic: StoreTopic) -> entries.NewTopic:
-        folder = self._layout.topic(self._claim.sequence, topic.name)
-        segments = {self._layout.relative(folder / segment.path.name): segment for segment in topic.segments}
+        relative = self._layout.relative(topic.folder)
+        segments = {f"{relative}/{segment.path.name}": segment for segment in topic.segments}
         return entries.NewTopic(
             topic.name, topic.ontology, topic.schema, topic.metadata, topic.created_ns, segments
         )
 
     def _stored(self, name: str, topic: StoreTopic) -> StoredTopic:
-        folder = self._layout.topic(self._claim.sequence, topic.name)
         rows = stored_bytes = 0
         times: list[int] = []
         for segment in topic.segments:
-            path = folder / segment.path.name
+            path = topic.folder / segment.path.name
             with explained(path):
                 footer = files.footer(path)
                 stored_bytes += path.stat().st_size

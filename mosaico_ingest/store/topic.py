@@ -13,7 +13,7 @@ import pyarrow as pa
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote.path import AnyPath
-from mosaico_ingest.sink import check_batch, topic_schema
+from mosaico_ingest.sink import check_batch
 from mosaico_ingest.store.columns import columns_of
 from mosaico_ingest.store.faults import explained
 from mosaico_ingest.store.segment import Segment, SegmentWriter, sorted_rows
@@ -53,12 +53,16 @@ class Staging:
 class StoreTopic:
     """The writer of one topic; several threads may write, and an error leaves its batch out as a whole."""
 
-    def __init__(self, staging: Staging, name: str, ontology: OntologyType, metadata: str) -> None:
+    def __init__(
+        self, staging: Staging, name: str, ontology: OntologyType, metadata: str, *, folder: AnyPath
+    ) -> None:
         self.name = name
+        self.folder = folder
+        """Where its segments lie once they are committed."""
         self.ontology = ontology
         self.metadata = metadata
-        self.schema = topic_schema(ontology)
-        self._columns = columns_of(self.schema)
+        self._columns = columns_of(ontology)
+        self.schema = self._columns.schema
         self.created_ns = time.time_ns()
         self.buffered_bytes = 0
         self.segments: list[Segment] = []

@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mosaico_ingest.frozen import frozen
-from mosaico_ingest.store.content import ContentHash
+from mosaico_ingest.store.content import ContentHash, column_makers
 from mosaico_ingest.store.files import opened
 from mosaico_ingest.store.model import SegmentInfo, SequenceInfo, TopicInfo
 from mosaico_ingest.store.segment import time_span
@@ -37,7 +37,7 @@ def _problem(topic: TopicInfo, segment: SegmentInfo) -> str | None:
         with opened(segment.path, page_checksum_verification=True) as file:
             if not file.schema_arrow.equals(topic.schema):
                 return "its columns are not those of its topic"
-            content = ContentHash(file.schema_arrow)
+            content = ContentHash(column_makers(file.schema_arrow))
             found = (segment.path.stat().st_size, *_rows_and_span(file, content))
     except (OSError, pa.ArrowException) as error:
         return str(error).partition("\n")[0]

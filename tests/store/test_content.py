@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mosaico_ingest.store.content import ContentHash, combined
+from mosaico_ingest.store.content import ContentHash, column_makers, combined
 
 WORD = st.text(max_size=4)
 ROW = st.fixed_dictionaries(
@@ -46,7 +46,7 @@ SCHEMA = pa.schema(
 
 
 def checksum(*tables: pa.Table | pa.RecordBatch) -> str:
-    content = ContentHash(tables[0].schema)
+    content = ContentHash(column_makers(tables[0].schema))
     for table in tables:
         content.add(table)
     return content.hexdigest()

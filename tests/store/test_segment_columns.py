@@ -12,7 +12,7 @@ import pytest
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.sink import topic_schema
 from mosaico_ingest.store import Store, StoreSink
-from mosaico_ingest.store.columns import columns_of
+from mosaico_ingest.store.columns import Columns
 from mosaico_ingest.store.segment import SegmentWriter
 
 ROWS = 400
@@ -29,7 +29,7 @@ def written(path: Path, name: str, values: pa.Array) -> pq.ColumnChunkMetaData:
     times = pa.array(np.arange(len(values)))
     schema = topic_schema(OntologyType("T", pa.struct([pa.field(name, values.type)])))
     table = pa.table([times, values], schema=schema)
-    writer = SegmentWriter(path / "s.parquet", columns_of(schema), table)
+    writer = SegmentWriter(path / "s.parquet", Columns(schema), table)
     writer.append(table)
     writer.close()
     assert pq.read_table(path / "s.parquet").equals(table)

@@ -146,7 +146,7 @@ def test_what_parquet_cannot_hold_is_refused_before_a_row(sink: StoreSink) -> No
 
 def test_a_session_holds_no_more_than_its_buffer(tmp_path: Path, rows: Rows, sample: OntologyType) -> None:
     staging = Staging(tmp_path, lambda _, number: tmp_path / f"{number}.parquet", buffer_bytes=100_000)
-    topics = [StoreTopic(staging, f"/{i}", sample, "{}") for i in range(5)]
+    topics = [StoreTopic(staging, f"/{i}", sample, "{}", folder=tmp_path) for i in range(5)]
     staging.topics = {topic.name: topic for topic in topics}
     for step in range(200):
         topics[step % 5].write(rows(np.arange(100) + step * 100))

@@ -1,0 +1,33 @@
+"""This file remembers what was made of an object for as long as it is used, where comparing it would cost as much as making it.
+
+Arrow types and schemas hash by spelling themselves out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+__all__ = ["remembered"]
+
+_Given = TypeVar("_Given")
+_Made = TypeVar("_Made")
+_MOST = 256
+"""How many are remembered; the topics of one recording are those of the next."""
+
+
+def remembered(make: Callable[[_Given], _Made]) -> Callable[[_Given], _Made]:
+    """Make a function remember its results by the identity of its argument (a decorator)."""
+    known: dict[
+        int, tuple[_Given, _Made]
+    ] = {}  # holding the argument keeps its identity from being used again
+
+    def recall(given: _Given) -> _Made:
+        found = known.get(id(given))
+        if found is None:
+            while len(known) >= _MOST:
+                known.pop(next(iter(known)), None)
+            found = known[id(given)] = (given, make(given))
+        return found[1]
+
+    return recall
