@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from mosaico_ingest.cli.console import plain_table
 from mosaico_ingest.cli.render import render_findings, texts_of
 from mosaico_ingest.cli.tables import open_console, print_json
 from mosaico_ingest.executors.adapters import Explained, Known, TestResult, TopicChoice
@@ -25,7 +26,7 @@ def print_adapters(known: Sequence[Known], *, as_json: bool) -> None:
     if as_json:
         _print_json([asdict(one) for one in known])
         return
-    table = _table("adapter", "ontology", "takes", "from")
+    table = plain_table("adapter", "ontology", "takes", "from")
     for one in known:
         used = one.origin if one.default else f"{one.origin}, by override"
         style = None if one.default else "dim"
@@ -57,7 +58,7 @@ def print_explained(found: Explained, *, as_json: bool) -> None:
     if len(words.takes) > 1:
         console.print(_taken(words.takes))
     if words.columns:
-        table = _table("column", "type", "", "comes from")
+        table = plain_table("column", "type", "", "comes from")
         for column in words.columns:
             need = "required" if column.required else ""
             table.add_row(column.name, column.type, need, column.origin or Text("null", style="dim"))
@@ -71,7 +72,7 @@ def print_explained(found: Explained, *, as_json: bool) -> None:
 
 
 def _taken(takes: Mapping[str, str]) -> Table:
-    table = _table("takes", "whose payload is")
+    table = plain_table("takes", "whose payload is")
     for name, of in takes.items():
         table.add_row(name, of or "the message itself")
     return table
@@ -85,7 +86,7 @@ def print_topics(topics: Sequence[TopicChoice], *, as_json: bool) -> None:
     console = open_console()
     for recording, some in groupby(topics, key=lambda one: one.recording):
         console.print(Text(recording, style="bold"))
-        table = _table("topic", "type", "adapter", "becomes", "because")
+        table = plain_table("topic", "type", "adapter", "becomes", "because")
         for one in some:
             cells = (one.topic, one.msgtype, one.adapter or "-", one.ontology or "-", one.why)
             table.add_row(*cells, style=None if one.adapter else "dim")
@@ -138,13 +139,6 @@ def _result(result: TestResult) -> dict[str, Any]:
             for one in result.outcomes
         ],
     }
-
-
-def _table(*names: str) -> Table:
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for name in names:
-        table.add_column(name, overflow="fold")
-    return table
 
 
 def _print_json(value: object) -> None:

@@ -6,9 +6,9 @@ import time
 
 from rich.console import Console, Group, RenderableType
 from rich.progress_bar import ProgressBar
-from rich.table import Table
 from rich.text import Text
 
+from mosaico_ingest.cli.console import plain_table
 from mosaico_ingest.cli.tally import Tally, Underway
 from mosaico_ingest.report.events import Event, Noted, RunFinished, RunStatus, Unreadable
 from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text
@@ -73,7 +73,7 @@ class BatchBoard:
     def render(self) -> RenderableType:
         """Return the picture."""
         batch = self._batch
-        table = Table(box=None, pad_edge=False, header_style="dim")
+        table = plain_table()
         table.add_column("recording", overflow="ellipsis")
         for column in ("read", "of", "rejected"):
             table.add_column(column, justify="right", no_wrap=True)

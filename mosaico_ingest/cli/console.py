@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
+from rich.table import Table
 
-__all__ = ["Terminal"]
+__all__ = ["Terminal", "plain_table"]
 
 _CONTROLLING = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _WIDE = 240
@@ -31,6 +32,15 @@ class Terminal(Console):
             yield (
                 segment if segment.control else Segment(_CONTROLLING.sub(_sign, segment.text), segment.style)
             )
+
+
+def plain_table(*names: str, numbers: Collection[str] = ()) -> Table:
+    """Return a table without lines whose columns fold what is long, except those of `numbers`."""
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for name in names:
+        number = name in numbers
+        table.add_column(name, justify="right" if number else "left", overflow="fold", no_wrap=number)
+    return table
 
 
 def _sign(match: re.Match[str]) -> str:

@@ -89,17 +89,14 @@ def _instant(option: str, text: str | None, first_ns: int | None, last_ns: int |
 
 
 def _print(report: ExportReport) -> None:
-    from rich.table import Table
     from rich.text import Text
 
+    from mosaico_ingest.cli.console import plain_table
     from mosaico_ingest.cli.tables import open_console
     from mosaico_ingest.report.units import bytes_text, count_text
 
     console = open_console()
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for name in ("topic", "type", "adapter"):
-        table.add_column(name, overflow="fold")
-    table.add_column("messages", justify="right", no_wrap=True)
+    table = plain_table("topic", "type", "adapter", "messages", numbers={"messages"})
     for topic in report.topics:
         if not topic.left_out:
             table.add_row(topic.topic, topic.msgtype, topic.adapter, count_text(topic.messages))

@@ -7,9 +7,9 @@ from os.path import normpath
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
+from mosaico_ingest.cli.console import plain_table
 from mosaico_ingest.cli.tables import open_console
 from mosaico_ingest.diagnostics import Severity
 from mosaico_ingest.plan.document import (
@@ -59,10 +59,8 @@ def _print_recording(recording: RecordingPlan, folder: Path, console: Console) -
     console.print(Text(f"{decided.sequence} → {place}", style="bold"))
     console.print(_source(decided, folder), highlight=False)
     samples = {sample.target: sample for sample in recording.samples}
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for name in ("topic", "type", "messages", "becomes", "adapter", "because", "sample"):
-        count = name == "messages"
-        table.add_column(name, justify="right" if count else "left", overflow="fold", no_wrap=count)
+    names = ("topic", "type", "messages", "becomes", "adapter", "because", "sample")
+    table = plain_table(*names, numbers={"messages"})
     for topic in decided.topics:
         renamed = "" if topic.target == topic.topic else f" → {topic.target}"
         every = "" if topic.every == 1 else f" / {topic.every}"

@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from mosaico_ingest.cli.batch_progress import BatchBoard, BatchLines, print_nothing, unreadable_text
-from mosaico_ingest.cli.console import Terminal
+from mosaico_ingest.cli.console import Terminal, plain_table
 from mosaico_ingest.cli.tally import Tally
 from mosaico_ingest.report.events import (
     BatchObserver,
@@ -174,7 +174,7 @@ class _Board:
         return Group(self._table(), Text(self._tally.headline(), style="bold"), bar)
 
     def _table(self) -> Table:
-        table = Table(box=None, pad_edge=False, header_style="dim")
+        table = plain_table()
         table.add_column("topic", overflow="ellipsis")
         table.add_column("ontology", style="cyan", overflow="ellipsis")
         for column in ("read", "written", "rejected"):

@@ -23,19 +23,17 @@ def status(
     from collections import Counter
     from dataclasses import asdict
 
-    from rich.table import Table
     from rich.text import Text
 
     from mosaico_ingest import api
+    from mosaico_ingest.cli.console import plain_table
     from mosaico_ingest.cli.tables import open_console, print_json
 
     found = [one for manifest in manifests for one in api.job_status(manifest)]
     if as_json:
         print_json(json.dumps([asdict(one) for one in found], indent=2))
     else:
-        table = Table(box=None, pad_edge=False, header_style="dim")
-        for name in ("sequence", "status", "recording"):
-            table.add_column(name, overflow="fold")
+        table = plain_table("sequence", "status", "recording")
         for one in found:
             style = STYLES[one.standing.value]
             files = ", ".join(one.files)

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from mosaico_ingest.cli.console import plain_table
 from mosaico_ingest.cli.tables import open_console, print_json
 from mosaico_ingest.plan.model import LEDGER_KEY
 from mosaico_ingest.report.units import bytes_text, count_text, seconds_text, time_text
@@ -91,7 +92,7 @@ def print_topic(info: TopicInfo, reader: pa.RecordBatchReader, *, rows: int, as_
 
 def _columns(schema: pa.Schema, first: Sequence[Mapping[str, Any]]) -> Table:
     """Return a line for each column, those of structs too: its path, its type, its values in the first rows."""
-    table = Table(box=None, pad_edge=False, header_style="dim")
+    table = plain_table()
     table.add_column("column", no_wrap=True)
     table.add_column("type", style="cyan", max_width=_TYPE_WIDTH, no_wrap=True)
     for number in range(len(first)):
@@ -148,8 +149,7 @@ def _first_rows(reader: pa.RecordBatchReader, rows: int) -> list[dict[str, Any]]
 
 
 def _table(first: str, **columns: bool) -> Table:
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    table.add_column(first, overflow="fold")
+    table = plain_table(first)
     for name, right in columns.items():
         table.add_column(name, justify="right" if right else "left", no_wrap=right)
     return table

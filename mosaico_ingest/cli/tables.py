@@ -5,10 +5,9 @@ from __future__ import annotations
 import sys
 
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
-from mosaico_ingest.cli.console import Terminal
+from mosaico_ingest.cli.console import Terminal, plain_table
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.inspection import Inspection
 from mosaico_ingest.report.model import Report, RunReport, TopicReport
@@ -46,17 +45,8 @@ def print_inspection(found: Inspection, *, as_json: bool) -> None:
     messages = "? messages" if found.messages is None else counted(found.messages, "message")
     console.print(Text(f"{', '.join(found.files)}", style="bold"))
     console.print(f"{found.container}, {bytes_text(found.size_bytes)}, {messages}{span}")
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for name, right in (
-        ("topic", False),
-        ("type", False),
-        ("messages", True),
-        ("rate", True),
-        ("definition", False),
-        ("becomes", False),
-        ("adapter", False),
-    ):
-        table.add_column(name, justify="right" if right else "left", overflow="fold", no_wrap=right)
+    names = ("topic", "type", "messages", "rate", "definition", "becomes", "adapter")
+    table = plain_table(*names, numbers={"messages", "rate"})
     for topic in found.topics:
         count = "?" if topic.count is None else count_text(topic.count)
         rate = "" if topic.rate_hz is None else f"{topic.rate_hz:.1f} Hz"
@@ -91,8 +81,7 @@ def print_report(report: RunReport) -> None:
 
 def _print_batch(report: RunReport, console: Console) -> None:
     """Print a line for each recording, and the sums."""
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    table.add_column("sequence", overflow="fold")
+    table = plain_table("sequence")
     table.add_column("status", no_wrap=True)
     for column in ("topics", "read", "written", "rejected", "stored", "time"):
         table.add_column(column, justify="right", no_wrap=True)
@@ -120,8 +109,7 @@ def _print_recording(report: Report, console: Console) -> None:
     if report.status is RunStatus.FAILED and not report.totals.read:
         return  # the error says it all
     columns = COLUMNS if console.width >= ROOMY else tuple(c for c in COLUMNS if c not in {"rate", "payload"})
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    table.add_column("topic", overflow="fold")
+    table = plain_table("topic")
     table.add_column("ontology", style="cyan", overflow="fold")
     for column in columns:
         table.add_column(column, justify="right", no_wrap=True)
