@@ -202,6 +202,19 @@ def test_what_is_taken_missing_or_malformed_is_refused(client: Client, rows: Row
         client.call("topic_filter_clusterize")
 
 
+def test_a_refusal_does_not_carry_what_caused_it(client: Client) -> None:
+    client.call("sequence_create", locator="somebody_elses", user_metadata={})
+    for call in (
+        lambda: client.info("nobodys"),
+        lambda: client.call("sequence_delete", locator="nobodys"),
+        lambda: client.call("sequence_create", locator="a b", user_metadata={}),
+    ):
+        with pytest.raises(pa.ArrowException) as told:
+            call()
+        assert "direct cause" not in str(told.value)
+        assert "somebody_elses" not in str(told.value)
+
+
 def test_a_topic_is_put_once_by_its_uuid_with_a_time_column(client: Client, rows: Rows) -> None:
     client.call("sequence_create", locator="drive", user_metadata={})
     session = client.call("session_create", locator="drive")["uuid"]

@@ -43,8 +43,9 @@ def answered() -> Generator[None, None, None]:
         yield
     except fl.FlightError:
         raise
-    except Exception as err:
-        raise as_flight_error(*_told(err)) from err
+    except Exception as err:  # noqa: BLE001 - the border to clients
+        # Arrow sends the traceback along: what the cause says, of other sequences too, is not for them.
+        raise as_flight_error(*_told(err)) from None
 
 
 def _told(err: Exception) -> tuple[Condition, str]:
