@@ -97,7 +97,18 @@ def _with_command(arguments: list[str]) -> list[str]:
     first = next((argument for argument in arguments if not argument.startswith("-")), None)
     if first is None or first in known:
         return arguments
-    if first.endswith((".yaml", ".yml")) or "/" in first or Path(first).exists():
+    suffixes = (".yaml", ".yml")
+    is_value = first != arguments[0] and any(argument.endswith(suffixes) for argument in arguments)
+    if first.endswith(suffixes) or is_value:
+        return ["run", *arguments]
+    if first.endswith((".bag", ".db3", ".mcap", ".zstd")) or Path(first).is_dir():
+        from shlex import quote
+
+        bag = quote(first)
+        hint = f"`ingest bag {bag} --name NAME` ingests it, `ingest init {bag}` drafts a manifest"
+        typer.echo(f"error: {first} is no manifest — {hint}", err=True)
+        sys.exit(2)
+    if "/" in first or Path(first).exists():
         return ["run", *arguments]
     near = get_close_matches(first, known, n=1)
     hint = (

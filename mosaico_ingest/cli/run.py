@@ -87,6 +87,7 @@ def run(
     from mosaico_ingest.cli.without_pandas import forgo_pandas
     from mosaico_ingest.report.metrics import prometheus_text
     from mosaico_ingest.report.model import RunReport
+    from mosaico_ingest.report.units import counted
     from mosaico_ingest.textfile import check_file, write_whole
 
     if bool(manifests) == (plan is not None):
@@ -97,7 +98,9 @@ def run(
         configs += api.compile_plan(plan)
         used = [api.used_manifest(Path(name)) for name in sorted({c.where for c in configs if c.where})]
     if shard is not None:
-        configs = take_shard(configs, shard)
+        every, configs = len(configs), take_shard(configs, shard)
+        if not configs and not quiet and log_format is LogFormat.TEXT:
+            typer.echo(f"shard {shard} has none of {counted(every, 'recording')}", err=True)
     if metrics is not None:
         check_file(metrics)
     if address is not None and executor is not Place.RAY:

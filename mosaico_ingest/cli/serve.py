@@ -36,17 +36,16 @@ def serve(
     """Let clients of the platform list, read, query and write the store; until it is interrupted."""
     from mosaico_ingest.cli.collector import collect_as_usual
     from mosaico_ingest.cli.heap import share_heaps
-    from mosaico_ingest.cli.signals import interrupt_on_terminate
+    from mosaico_ingest.cli.keys import check_keys
+    from mosaico_ingest.cli.signals import end_on_signals, interrupt_on_terminate
     from mosaico_ingest.errors import ManifestError
     from mosaico_ingest.store.server import Keyring, Tls
     from mosaico_ingest.store.server import serve as start
 
     if (tls_cert is None) != (tls_key is None):
         raise ManifestError("--tls-cert and --tls-key go together", hint="give both, or neither")
-    if api_keys is not None and not api_keys.exists():
-        raise ManifestError(
-            "there is no such file of keys", where=str(api_keys), hint="make one: ingest keys new"
-        )
+    if api_keys is not None:
+        check_keys(api_keys)
     tls = Tls(tls_cert, tls_key) if tls_cert is not None and tls_key is not None else None
     keys = Keyring(api_keys) if api_keys is not None else None
     interrupt_on_terminate()
@@ -61,7 +60,9 @@ def serve(
         server.wait()
     except KeyboardInterrupt:
         typer.echo("stopping")
-    if not server.shutdown(grace_s=GRACE_S):
+    done = server.shutdown(grace_s=GRACE_S)
+    end_on_signals()
+    if not done:
         typer.echo("a client's call was still open; what it had not finalized is discarded", err=True)
         sys.stdout.flush()
         os._exit(0)  # the thread of that call would keep the process for as long as the client likes

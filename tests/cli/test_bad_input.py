@@ -269,3 +269,35 @@ def test_an_adapter_file_that_is_not_there_is_named_once(ingest: Ingest) -> None
     ingest("bag", str(QUICKSTART), "--name", "drive", "--topics", "/imu")
     err = ingest("export", "drive", "--to", "x.mcap", "--adapter", "no.yaml")[2]
     assert err == "error: no.yaml: the adapter file cannot be read: No such file or directory\n"
+
+
+def test_a_manifest_may_follow_the_options(ingest: Ingest, tmp_path: Path) -> None:
+    assert ingest("-q", "--jobs", "2", job(tmp_path, GOOD)) == (0, "", "")
+
+
+@pytest.mark.parametrize("name", ["my drive.mcap", "."])
+def test_a_recording_in_place_of_a_manifest_is_answered_with_what_takes_it(ingest: Ingest, name: str) -> None:
+    code, _, err = ingest(name)
+    assert code == 2
+    assert f"`ingest init {name if name == '.' else repr(name)}`" in err
+
+
+def test_a_shard_without_a_recording_says_so(ingest: Ingest, tmp_path: Path) -> None:
+    assert ingest(job(tmp_path, GOOD), "--shard", "2/2") == (0, "", "shard 2/2 has none of 1 recording\n")
+
+
+def test_keys_that_are_not_there_or_have_expired_are_said(ingest: Ingest, tmp_path: Path) -> None:
+    assert ingest("keys", "ls")[0] == 2
+    new = ("keys", "new", "--permission", "read", "--expires")
+    assert "has passed" in ingest(*new, "2020-01-01T00:00:00Z")[2]
+    assert "has no time zone" in ingest(*new, "2999-01-01")[2]
+    assert ingest(*new, "2999-01-01T00:00:00Z")[0] == 0
+    assert "expires 2999" in ingest("keys", "ls")[1]
+    ring = tmp_path / "api_keys.json"
+    ring.write_text(ring.read_text().replace("2999", "2020"))
+    assert "expired 2020" in ingest("keys", "ls")[1]
+
+
+def test_a_certificate_that_cannot_be_read_is_not_the_stores_fault(ingest: Ingest) -> None:
+    code, _, err = ingest("serve", "--tls-cert", "no.pem", "--tls-key", "no.pem")
+    assert (code, err) == (1, "error: no.pem: cannot be read: No such file or directory\n")

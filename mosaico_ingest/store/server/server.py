@@ -12,7 +12,6 @@ from typing_extensions import Self
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.path import RemotePath, as_path
-from mosaico_ingest.store.faults import explained
 from mosaico_ingest.store.server.keyring import Keyring
 from mosaico_ingest.store.server.service import Service
 from mosaico_ingest.store.store import Store
@@ -106,10 +105,16 @@ def serve(
         service = Service(store, f"{scheme}://{host}:{port}", keyring=keys, certificates=certificates)
     except (OSError, pa.ArrowException) as err:
         text = str(err).splitlines()[0]
-        raise SinkError(f"cannot listen: {text}", where=f"{host}:{port}", hint="is the port taken?") from err
+        raise SinkError(
+            f"cannot listen: {text}",
+            where=f"{host}:{port}",
+            hint="is the address this machine's, and the port free?",
+        ) from err
     return Server(service, store, host, scheme=scheme, idle_s=idle_s)
 
 
 def _read(path: Path) -> bytes:
-    with explained(path):
+    try:
         return path.read_bytes()
+    except OSError as error:
+        raise SinkError(f"cannot be read: {error.strerror}", where=str(path)) from error
