@@ -155,12 +155,22 @@ def stand_alone(source: Source, cell: Mapping[str, str]) -> Value:
     return left
 
 
+_RECORDINGS = frozenset({".bag", ".db3", ".mcap"})
+_QUICKLY = "`ingest bag RECORDING --name NAME` does without one, `ingest init RECORDING` drafts one"
+
+
 def read_text(path: Path) -> str:
     """Return the text of a file.
 
     Raises:
         ManifestError: It is not there, not readable, or not UTF-8.
     """
+    if path.is_dir() or path.suffix in _RECORDINGS:
+        what = "a folder" if path.is_dir() else "a recording"
+        finding = Finding(
+            "unreadable-file", Severity.ERROR, f"{path} is {what}, not a manifest", help=_QUICKLY
+        )
+        raise refusal((finding,), str(path))
     try:
         return read_whole(path).decode()
     except UnicodeDecodeError as err:

@@ -206,3 +206,12 @@ def test_a_file_that_is_no_text_is_one_finding(tmp_path: Path, content: bytes | 
 def test_a_directory_is_no_manifest(tmp_path: Path) -> None:
     with pytest.raises(ManifestError, match="directory"):
         load_manifest(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["drive.mcap", "drive.db3", "drive.bag"])
+def test_a_recording_given_as_a_manifest_is_told_what_takes_it(tmp_path: Path, name: str) -> None:
+    file = tmp_path / name
+    file.write_bytes(b"\x89MCAP0\r\n")
+    with pytest.raises(ManifestError, match="is a recording, not a manifest") as told:
+        load_manifest(file)
+    assert "ingest bag" in str(told.value.findings[0].help)
