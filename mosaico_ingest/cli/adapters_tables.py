@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from mosaico_ingest.cli.console import plain_table
+from mosaico_ingest.cli.console import Terminal, plain_table
 from mosaico_ingest.cli.render import render_findings, texts_of
 from mosaico_ingest.cli.tables import open_console, print_json
 from mosaico_ingest.executors.adapters import Explained, Known, TestResult, TopicChoice
@@ -98,7 +98,7 @@ def print_tests(results: Sequence[TestResult], *, as_json: bool) -> None:
     if as_json:
         _print_json([_result(one) for one in results])
         return
-    console = Console(soft_wrap=True, highlight=False)
+    console = Terminal(soft_wrap=True)
     for one in results:
         _print_result(one, console)
     tests = [outcome for one in results for outcome in one.outcomes]

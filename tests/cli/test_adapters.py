@@ -154,6 +154,14 @@ def test_a_test_that_fails_says_where_and_what_came_out(ingest: Ingest) -> None:
     assert "0 of 1 tests passed" in out
 
 
+def test_a_name_of_a_test_does_not_control_the_terminal(ingest: Ingest) -> None:
+    text = PACK.read_text().replace("voltage: 12.0", "voltage: 13.0")
+    Path("pack.yaml").write_text(text.replace("name: discharging", r'name: "\e]0;owned\a:skull:"'))
+    _, out, _ = ingest("test", "pack.yaml", "--msg-dir", MESSAGES)
+    assert "\x1b" not in out
+    assert ":skull:" in out
+
+
 def test_an_adapter_that_does_not_fit_its_type_is_shown_with_its_source(ingest: Ingest) -> None:
     Path("pack.yaml").write_text(PACK.read_text().replace("soc / 100", "charge_left / 100"))
     code, out, _ = ingest("test", "pack.yaml", "--msg-dir", f"acme_msgs={MESSAGES}")
