@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -31,8 +32,9 @@ def numbers(console: Console) -> set[str]:
     return set(text.split())
 
 
-def test_of_a_run(console: Console) -> None:
-    tables.print_report(api.run(api.compile_job(JOB)))
+def test_of_a_run(console: Console, tmp_path: Path) -> None:
+    (config,) = api.compile_job(JOB)
+    tables.print_report(api.run([replace(config, store=tmp_path / "store")]))
     assert {"1,000", "308.2", "500", "rejected", "written"} <= numbers(console)
 
 
