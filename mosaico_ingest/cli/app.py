@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -67,6 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     collect_rarely()
     # numpy's OpenBLAS starts a thread for each core, and idle ones spin: 40 ms of CPU, and nothing here multiplies matrices.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # as standard error is: a file may have any name
     try:
         asked = _with_command([argument for argument in given if argument != "--debug"])
         named = asked[:1] if asked and asked[0] in {*COMMANDS, *GROUPS} else (*COMMANDS, *GROUPS)

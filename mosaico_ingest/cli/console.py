@@ -9,8 +9,9 @@ from collections.abc import Collection, Iterable
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.table import Table
+from rich.text import Text
 
-__all__ = ["Terminal", "plain_table"]
+__all__ = ["Terminal", "plain_table", "print_line"]
 
 _CONTROLLING = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _WIDE = 240
@@ -41,6 +42,11 @@ def plain_table(*names: str, numbers: Collection[str] = ()) -> Table:
         number = name in numbers
         table.add_column(name, justify="right" if number else "left", overflow="fold", no_wrap=number)
     return table
+
+
+def print_line(line: str, *, stderr: bool = False) -> None:
+    """Print a line that may hold what a recording, a manifest or a file name says."""
+    Terminal(stderr=stderr, soft_wrap=True).print(Text(line))
 
 
 def _sign(match: re.Match[str]) -> str:

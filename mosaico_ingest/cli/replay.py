@@ -40,6 +40,7 @@ def replay(
 ) -> None:
     """Add quarantined messages to the sequences they belong to; what fails again stays in the quarantine."""
     from mosaico_ingest import api
+    from mosaico_ingest.cli.console import print_line
     from mosaico_ingest.cli.session import run_configs
     from mosaico_ingest.errors import NothingMatched
     from mosaico_ingest.executors.replay import Whereabouts, alone, replays
@@ -57,7 +58,7 @@ def replay(
             if replay.whereabouts is Whereabouts.STORED:
                 replay.kept.mark_replayed()
             if replay.whereabouts is not Whereabouts.WAITING and not quiet:
-                typer.echo(f"{replay.kept.messages.name}: {_SAYS[replay.whereabouts.name]}", err=True)
+                print_line(f"{replay.kept.messages.name}: {_SAYS[replay.whereabouts.name]}", stderr=True)
         waiting = [replay for replay in found if replay.whereabouts is Whereabouts.WAITING]
         if all(replay.whereabouts is Whereabouts.FORGOTTEN for replay in found):
             raise NothingMatched("there is nothing to replay", where=str(folder), hint=_SAYS["FORGOTTEN"])

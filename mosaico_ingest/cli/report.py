@@ -24,6 +24,7 @@ def report(
     ] = None,
 ) -> None:
     """Show a report: as tables here, as a page, as Markdown."""
+    from mosaico_ingest.cli.console import print_line
     from mosaico_ingest.cli.tables import print_report
     from mosaico_ingest.report.markdown import markdown_summary
     from mosaico_ingest.report.page import html_page
@@ -47,4 +48,4 @@ def report(
         print_report(found)
         for one in found.recordings:
             if one.error is not None:
-                typer.echo(f"error: {one.error}")
+                print_line(f"error: {one.error}")

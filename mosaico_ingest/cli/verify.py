@@ -22,6 +22,7 @@ def verify(
     import json
 
     from mosaico_ingest.cli.collector import collect_as_usual
+    from mosaico_ingest.cli.console import print_line
     from mosaico_ingest.cli.tables import print_json
     from mosaico_ingest.cli.without_pandas import forgo_pandas
     from mosaico_ingest.errors import VerificationError
@@ -46,7 +47,7 @@ def verify(
         print_json(json.dumps({"sequences": list(checked), "rows": rows, "bytes": size, "problems": bad}))
     else:
         for one in bad:
-            typer.echo(f"{one['sequence']}{one['topic']}: {one['file']}: {one['problem']}", err=True)
+            print_line(f"{one['sequence']}{one['topic']}: {one['file']}: {one['problem']}", stderr=True)
     if bad:
         raise VerificationError(
             f"{counted(len(bad), 'file')} not as written",

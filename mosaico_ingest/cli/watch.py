@@ -111,4 +111,6 @@ def _again(arrivals: Arrivals, path: Path) -> str:
 def _say(line: str) -> None:
     from datetime import datetime, timezone
 
-    typer.echo(f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ} {line}")
+    from mosaico_ingest.cli.console import print_line
+
+    print_line(f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ} {line}")

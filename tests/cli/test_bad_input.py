@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -301,3 +304,19 @@ def test_keys_that_are_not_there_or_have_expired_are_said(ingest: Ingest, tmp_pa
 def test_a_certificate_that_cannot_be_read_is_not_the_stores_fault(ingest: Ingest) -> None:
     code, _, err = ingest("serve", "--tls-cert", "no.pem", "--tls-key", "no.pem")
     assert (code, err) == (1, "error: no.pem: cannot be read: No such file or directory\n")
+
+
+def test_a_manifest_of_any_name_is_expanded_where_output_is_strict(tmp_path: Path) -> None:
+    name = os.fsdecode(b"job\xff.yaml")
+    (tmp_path / name).write_text(
+        "version: 1\nbag: {path: '{a}.mcap'}\nsequence: {name: s}\nmatrix: {a: [x, y]}\n"
+    )
+    done = subprocess.run(  # noqa: S603 - our own command
+        [sys.executable, "-m", "mosaico_ingest", "expand", name],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONIOENCODING": "utf-8:strict"},
+        capture_output=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert rb"# job\udcff.yaml: a=x" in done.stdout

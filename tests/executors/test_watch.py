@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -81,11 +82,15 @@ def test_what_failed_is_given_out_again_later_and_later(tmp_path: Path) -> None:
     assert arrivals.settled(179) == ()
 
 
+STRICT = os.environ | {"PYTHONIOENCODING": "utf-8:strict"}
+"""Standard output as it is in most languages: what is not UTF-8 cannot be written to it."""
+
+
 def watch_once(folder: Path) -> list[str]:
     command = [sys.executable, "-m", "mosaico_ingest", "watch", "in", "job.yaml", "--once"]
     pace = ["--rest", "0.2", "--every", "0.1"]
     done = subprocess.run(  # noqa: S603 - our own command
-        [*command, *pace], cwd=folder, capture_output=True, text=True, check=True, timeout=60
+        [*command, *pace], cwd=folder, capture_output=True, text=True, check=True, timeout=60, env=STRICT
     )
     return done.stdout.splitlines()
 
@@ -102,3 +107,15 @@ def test_the_command_ingests_what_is_there_and_knows_it_again(tmp_path: Path) ->
     assert "in/c.mcap: failed as c" in lines[2]
     assert "tried again in 60 s" in lines[2]
     assert Store.open(tmp_path / "store").names() == ("a",)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_a_file_of_any_name_neither_ends_the_watch_nor_controls_the_terminal(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    (tmp_path / "job.yaml").write_text(JOB)
+    for name in (b"bad\xff.mcap", b"red\x1b[31m.mcap"):
+        shutil.copy(DRIVE, tmp_path / "in" / os.fsdecode(name))
+    lines = watch_once(tmp_path)
+    assert sum(": completed as " in line for line in lines) == 2
+    assert "\x1b" not in "".join(lines)
