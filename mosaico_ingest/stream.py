@@ -226,9 +226,6 @@ class Stream:
             except SinkError as error:
                 self._refused(error, rows, batch, index)
                 return
-        self.watch.lap(Step.ADAPT)
-        buffer.put(self._writer, rows)
-        self.watch.lap(Step.WAIT)
         times = rows.column(0).to_numpy()
         first, last = int(times.min()), int(times.max())
         self.timeline.add(times)
@@ -236,7 +233,11 @@ class Stream:
         self.start_ns = first if self.start_ns is None else min(self.start_ns, first)
         self.end_ns = last if self.end_ns is None else max(self.end_ns, last)
         self.status = TopicStatus.WRITTEN
+        # Counted before they are handed over, where a run may end: what is not stored then is taken back.
         self.observe(TopicProgress(self.plan.target, written=rows.num_rows, start_ns=first, end_ns=last))
+        self.watch.lap(Step.ADAPT)
+        buffer.put(self._writer, rows)
+        self.watch.lap(Step.WAIT)
 
     def _refused(
         self, error: IngestError, rows: pa.RecordBatch, batch: RawBatch, index: NDArray[np.int64]

@@ -6,6 +6,7 @@ import sqlite3
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,9 +26,10 @@ from mosaico_ingest.executors.worker import execute, make_plan
 from mosaico_ingest.injector import _missing
 from mosaico_ingest.policies import LoaderErrorPolicy
 from mosaico_ingest.report.events import Event, Noted, RunStatus, Unreadable
-from mosaico_ingest.sink import MemorySink, StoredTopic
+from mosaico_ingest.sink import MemorySink, StoredTopic, TopicWriter
 from mosaico_ingest.store import Store
 from mosaico_ingest.store.verify import verify
+from mosaico_ingest.write_buffer import WriteBuffer
 
 from .conftest import RunJob, WriteBag, number
 
@@ -233,3 +235,22 @@ def test_a_catalog_from_before_there_were_checksums_is_read_and_added_to(
     run_job(write_job(sequence={"name": "drive", "if_exists": "append"}))
     segments = Store.open(tmp_path / "store").topic("drive", "/speed").segments
     assert [segment.checksum is None for segment in segments] == [True, False]
+
+
+@pytest.mark.parametrize("handed_over", [0, 1, 7])
+def test_the_sums_of_an_interrupted_run_hold(
+    handed_over: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put, calls = WriteBuffer.put, count()
+
+    def interrupted(buffer: WriteBuffer, writer: TopicWriter, batch: pa.RecordBatch) -> None:
+        if next(calls) == handed_over:
+            raise KeyboardInterrupt
+        put(buffer, writer, batch)
+
+    monkeypatch.setattr(WriteBuffer, "put", interrupted)
+    (report,) = api.run([ROSInjectionConfig(DRIVE, "drive", store=tmp_path / "store")]).recordings
+    assert (report.status, report.exit_code) == (RunStatus.INTERRUPTED, 130)
+    assert report.totals.read > 0
+    for topic in report.topics:
+        assert topic.read == topic.written + topic.rejected, topic.topic
