@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -106,3 +107,26 @@ def test_two_topics_of_one_name_are_both_kept_and_named(
     kept = Store.open(tmp_path / "store").sequence("two").topics
     assert [topic.rows for topic in kept] == [1, 1]
     assert first == topics[0]
+
+
+def test_two_types_on_a_topic_are_told_once_and_only_where_it_is_taken(tmp_path: Path) -> None:
+    number, text = (
+        define("std_msgs/msg/Int32", "int32 data\n"),
+        define("std_msgs/msg/String", "string data\n"),
+    )
+    made = record(
+        tmp_path / "two.mcap",
+        [
+            ("/two", number, 5, {"data": 1}),
+            ("/two", text, 6, {"data": "a"}),
+            ("/one", number, 7, {"data": 2}),
+        ],
+    )
+    config = ROSInjectionConfig(made, "two", store=tmp_path / "store")
+    both, without = (
+        RosbagInjector(one).run() for one in (config, replace(config, sequence_name="one", topics="/one"))
+    )
+    assert both is not None
+    assert [finding.partition("]")[0] for finding in both.findings] == ["warning[two-types-on-a-topic"]
+    assert without is not None
+    assert without.findings == ()

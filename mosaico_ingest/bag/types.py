@@ -179,7 +179,7 @@ class TypeResolver:
             if name in BUILTIN:
                 return BUILTIN[name]  # embedded texts never define them; loading the distros takes a while
             known = agreed_type(name, distros)
-            if known:
+            if known and known.fields:  # of one without fields nothing can be assumed wrongly
                 self._assumed.setdefault(name, who)
             return known
 

@@ -34,7 +34,9 @@ def resolve(
     """
     topics = tuple(dict.fromkeys(channel.topic for channel in recording.channels))
     selection = select(config.topics or (), topics)
-    findings = [*recording.findings, *resolver.findings, *_findings(config, selection, topics)]
+    # Two types on a topic that is taken are told by `merge`, with what becomes of them.
+    known = (finding for finding in recording.findings if finding.rule != "two-types")
+    findings = [*known, *resolver.findings, *_findings(config, selection, topics)]
     taken: list[TopicPlan] = []
     left: list[LeftOut] = []
     misfits: list[tuple[str, AdapterError]] = []

@@ -111,6 +111,11 @@ class TestWithoutADistro:
         (finding,) = resolver.findings
         assert "geometry_msgs/msg/Pose" in finding.message
 
+    def test_a_type_without_fields_leaves_no_doubt(self) -> None:
+        resolver = TypeResolver()
+        assert resolve(resolver, "std_msgs/msg/Empty", "").message.fields == ()
+        assert resolver.findings == ()
+
     def test_a_recording_without_definitions_is_from_before_iron(self) -> None:
         resolver = TypeResolver()
         assert len(resolve(resolver, "sensor_msgs/msg/Range").message.fields) == 6
