@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +14,9 @@ if TYPE_CHECKING:  # imported for real when the command runs, so that --help sta
     from mosaico_ingest.report.model import Report
 
 __all__ = ["watch"]
+
+Again = Callable[[Path], str]
+"""Gives a recording that failed another turn, and says when that is."""
 
 
 def watch(
@@ -29,7 +33,10 @@ def watch(
     every: Annotated[float, typer.Option("--every", min=0.05, help="Seconds between two looks.")] = 2.0,
     jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Recordings ingested at a time.")] = 1,
     once: Annotated[
-        bool, typer.Option("--once", help="Ingest what is there and comes to rest, then leave.")
+        bool,
+        typer.Option(
+            "--once", help="Ingest what is there and comes to rest, then leave with the exit code of a run."
+        ),
     ] = False,
     log: Annotated[
         str, typer.Option("--log", "-l", help="DEBUG, INFO, WARNING, ERROR or CRITICAL.", metavar="LEVEL")
@@ -37,12 +44,14 @@ def watch(
 ) -> None:
     """Ingest what arrives in a folder, until it is interrupted; what is in the destination already is left alone."""
     import time
+    from functools import partial
 
     from mosaico_ingest.cli.collector import collect_as_usual
     from mosaico_ingest.cli.logs import set_up_logging
     from mosaico_ingest.cli.signals import interrupt_on_terminate
     from mosaico_ingest.executors.arrivals import Arrivals
     from mosaico_ingest.manifest.load import load_manifests
+    from mosaico_ingest.report.model import gravest
 
     set_up_logging(log)
     interrupt_on_terminate()
@@ -50,11 +59,13 @@ def watch(
     arrivals = Arrivals(folder, rest)
     load_manifests(manifest)  # a mistake is said now, not with the first recording
     _say(f"watching {folder}")
+    again = _never if once else partial(_again, arrivals)
+    codes: list[int] = []
     leave_at = time.monotonic() + rest + every if once else float("inf")
     try:
         while True:
             settled = arrivals.settled(time.monotonic())
-            if settled and not _ingest(manifest, settled, arrivals, jobs):
+            if settled and not _ingest(manifest, settled, jobs, again, codes):
                 break
             if not settled and time.monotonic() > leave_at:
                 break
@@ -62,32 +73,37 @@ def watch(
     except KeyboardInterrupt:
         pass
     _say("stopped watching")
+    code = gravest(codes) if once else 0
+    if code:
+        raise typer.Exit(code)
 
 
-def _ingest(manifest: Path, settled: tuple[Path, ...], arrivals: Arrivals, jobs: int) -> bool:
-    """Ingest recordings and say a line about each; return whether to go on."""
+def _ingest(manifest: Path, settled: tuple[Path, ...], jobs: int, again: Again, codes: list[int]) -> bool:
+    """Ingest recordings, say a line about each and note its exit code; return whether to go on."""
     from mosaico_ingest.executors.processes import Processes
     from mosaico_ingest.report.events import RunStatus, ignore_batch
 
-    work = [(path, config) for path in settled for config in _configs(manifest, path, arrivals)]
+    work = [(path, config) for path in settled for config in _configs(manifest, path, again, codes)]
     # Even one recording goes to a process of its own: what kills it does not end the watch.
     reports = Processes(jobs).map([config for _, config in work], ignore_batch)
     going_on = True
     for (path, _), report in zip(work, reports, strict=False):
         going_on = going_on and report.status is not RunStatus.INTERRUPTED
+        codes.append(report.exit_code)
         failed = report.exit_code not in {0, 4}
-        _say(f"{path}: {_outcome(report)}{_again(arrivals, path) if failed and going_on else ''}")
+        _say(f"{path}: {_outcome(report)}{again(path) if failed and going_on else ''}")
     return going_on
 
 
-def _configs(manifest: Path, path: Path, arrivals: Arrivals) -> tuple[ROSInjectionConfig, ...]:
+def _configs(manifest: Path, path: Path, again: Again, codes: list[int]) -> tuple[ROSInjectionConfig, ...]:
     from mosaico_ingest import api
     from mosaico_ingest.errors import IngestError
 
     try:
         return api.compile_recording(manifest, path)
     except IngestError as error:
-        _say(f"{path}: failed: {error}{_again(arrivals, path)}")
+        codes.append(error.exit_code)
+        _say(f"{path}: failed: {error}{again(path)}")
         return ()
 
 
@@ -106,6 +122,10 @@ def _again(arrivals: Arrivals, path: Path) -> str:
     import time
 
     return f"; tried again in {arrivals.again(path, time.monotonic()):.0f} s"
+
+
+def _never(_path: Path) -> str:
+    return ""
 
 
 def _say(line: str) -> None:

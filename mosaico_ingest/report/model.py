@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import datetime
 
 from pydantic import ConfigDict, Field, computed_field
@@ -21,6 +22,7 @@ __all__ = [
     "TopicReport",
     "Totals",
     "UsedManifest",
+    "gravest",
 ]
 
 _GRAVEST_FIRST = (130, 5, 1, 2, 3, 4)
@@ -220,5 +222,9 @@ class RunReport(_Part):
     @property
     def exit_code(self) -> int:
         """That of the recordings' codes which comes first in 130, 5, 1, 2, 3, 4, 0: what another try may mend is not hidden."""
-        codes = {report.exit_code for report in self.recordings}
-        return next((code for code in _GRAVEST_FIRST if code in codes), max(codes, default=0))
+        return gravest([report.exit_code for report in self.recordings])
+
+
+def gravest(codes: Sequence[int]) -> int:
+    """Return the exit code of several recordings with these."""
+    return next((code for code in _GRAVEST_FIRST if code in codes), max(codes, default=0))
