@@ -8,6 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.flight as fl
@@ -252,6 +253,27 @@ def test_a_session_that_could_not_be_finalized_is_not_called_final(
         client.call("session_finalize", session_uuid=session)
 
 
+def test_a_topic_is_taken_while_its_session_is_being_finalized(
+    client: Client, rows: Rows, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def announced_again(*arguments: Any) -> Any:
+        with refused(Condition.EXISTS):
+            client.create_topic(other, "drive/imu")
+        with refused(Condition.PRECONDITION, "finalized"):
+            client.call("session_finalize", session_uuid=session)
+        sessions = client.info("drive")[0]["sessions"]
+        assert [each["locked"] for each in sessions] == [False, False]
+        return commit(*arguments)
+
+    commit = Catalog.commit
+    client.call("sequence_create", locator="drive", user_metadata={})
+    session, other = (client.call("session_create", locator="drive")["uuid"] for _ in range(2))
+    client.put("drive/imu", client.create_topic(session, "drive/imu"), rows([1]))
+    monkeypatch.setattr(Catalog, "commit", announced_again)
+    client.call("session_finalize", session_uuid=session)
+    assert client.rows("drive/imu") == [1]
+
+
 def test_columns_are_put_in_order_and_the_time_column_may_be_nullable(client: Client) -> None:
     client.call("sequence_create", locator="drive", user_metadata={})
     client.upload("drive", "/imu", pa.record_batch({"x": [1.5, 2.5], "timestamp_ns": [2, 1]}))
@@ -307,5 +329,5 @@ def test_a_session_nobody_speaks_of_any_more_is_discarded(tmp_path: Path, rows: 
 
 
 def test_a_port_that_is_taken_is_said_so(server: Server, tmp_path: Path) -> None:
-    with pytest.raises(SinkError, match=f"{server.port}.*port taken"):
+    with pytest.raises(SinkError, match=f"{server.port}.*the port free"):
         serve(tmp_path / "another", port=server.port)

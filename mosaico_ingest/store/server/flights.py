@@ -90,6 +90,7 @@ class Flights:
         opened = [
             bodies.SessionInfo(locator=each.locator, created_at_ns=each.session.created_ns, locked=False)
             for each in self._uploads.of_sequence(sequence.name)
+            if each.locator not in {session.locator for session in finalized}
         ]
         return bodies.SequenceInfo(
             resource_locator=sequence.name,

@@ -61,18 +61,21 @@ class OpenSession:
 
 
 class Uploads:
-    """All open sessions of a server."""
+    """All sessions of a server that are not in its store yet."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
         self._sessions: dict[str, OpenSession] = {}
+        self._committing: dict[str, OpenSession] = {}
+        """They take nothing more, and their topics are not in the store yet."""
         self._finalized: set[str] = set()
         self._lock = threading.RLock()
 
     def of_sequence(self, sequence: str) -> tuple[OpenSession, ...]:
-        """Return the open sessions of a sequence."""
+        """Return the sessions of a sequence that are open or being committed."""
         with self._lock:
-            return tuple(each for each in self._sessions.values() if each.sequence == sequence)
+            waiting = (*self._sessions.values(), *self._committing.values())
+            return tuple(each for each in waiting if each.sequence == sequence)
 
     def open(self, sequence: str) -> OpenSession:
         """Open a session of a sequence that is there."""
@@ -103,8 +106,7 @@ class Uploads:
                 raise Refusal(
                     Condition.PERMISSION, f"the session writes {opened.sequence!r}, not {sequence!r}"
                 )
-            pending = {topic.name for each in self.of_sequence(sequence) for topic in each.topics.values()}
-            if name in held | pending:
+            if name in held | self._announced(sequence):
                 raise Refusal(Condition.EXISTS, f"topic {question.locator!r} already exists")
             uuid = str(uuid4())
             opened.topics[uuid] = _Topic(name, question)
@@ -136,15 +138,16 @@ class Uploads:
                 if topic.state is not _State.DONE:
                     text = f"topic {topic.question.locator!r} {topic.state.value}"
                     raise Refusal(Condition.PRECONDITION, text)
-            del self._sessions[uuid]
-            self._finalized.add(uuid)
+            self._committing[uuid] = self._sessions.pop(uuid)
         try:
             opened.session.commit()
+            self._finalized.add(uuid)
         except BaseException:
             opened.session.discard()
-            with self._lock:
-                self._finalized.discard(uuid)  # asked again, there is no such session
             raise
+        finally:
+            with self._lock:
+                del self._committing[uuid]
 
     def discard_session(self, locator: str) -> bool:
         """Drop the open session at `locator`; return whether there is one."""
@@ -155,12 +158,12 @@ class Uploads:
     def discard_sequence(self, sequence: str) -> bool:
         """Drop the open sessions of a sequence; return whether there are any."""
         with self._lock:
-            return self._drop(self.of_sequence(sequence))
+            return self._drop(self._open(sequence))
 
     def discard_topic(self, sequence: str, name: str) -> bool:
         """Forget a topic that was announced and never uploaded; return whether there is one."""
         with self._lock:
-            for opened in self.of_sequence(sequence):
+            for opened in self._open(sequence):
                 for uuid, topic in tuple(opened.topics.items()):
                     if topic.name == name:
                         if topic.state is not _State.CREATED:
@@ -170,10 +173,9 @@ class Uploads:
         return False
 
     def has_topic(self, sequence: str, name: str) -> bool:
-        """Return whether an open session has announced the topic."""
-        return any(
-            topic.name == name for each in self.of_sequence(sequence) for topic in each.topics.values()
-        )
+        """Return whether a session has announced the topic."""
+        with self._lock:
+            return name in self._announced(sequence)
 
     def discard_idle(self, idle_s: float) -> bool:
         """Drop the open sessions whose clients have said nothing for so long; return whether there are any."""
@@ -201,13 +203,19 @@ class Uploads:
         topic.state = _State.UPLOADING
         return owners[0], topic, writer
 
+    def _open(self, sequence: str) -> tuple[OpenSession, ...]:
+        return tuple(each for each in self._sessions.values() if each.sequence == sequence)
+
+    def _announced(self, sequence: str) -> set[str]:
+        return {topic.name for each in self.of_sequence(sequence) for topic in each.topics.values()}
+
     def _hear(self, opened: OpenSession) -> None:
         opened.heard_s = time.monotonic()
         if opened.uuid not in self._sessions:
             raise Refusal(Condition.PRECONDITION, "the session has ended")
 
     def _session(self, uuid: str) -> OpenSession:
-        if uuid in self._finalized:
+        if uuid in self._committing or uuid in self._finalized:
             raise Refusal(Condition.PRECONDITION, "the session is finalized already")
         if uuid not in self._sessions:
             raise NotInStore(f"there is no open session {uuid}")
