@@ -176,6 +176,8 @@ def test_whoever_writes_a_struct_as_a_plain_mapping_is_told_how() -> None:
         ("count: int32", "count: {type: int32, fields: {a: int8}}", "mapping", "count"),
         ("count: int32", "timestamp_ns: int32", "mapping", "timestamp_ns"),
         ("    count: int32\n", "    count: {unit: m}\n", "mapping", "count"),
+        ("    count: int32\n", "    count.er: int32\n", "mapping", "count.er"),
+        ("fields:\n  volts", "schema_metadata: {a.b: soc}\nfields:\n  volts", "mapping", "a.b"),
         ("fields:\n  volts", "schema_metadata: {rate: soc +}\nfields:\n  volts", "expression", "+"),
         ("acme_msgs/msg/Pack", "acme_msgs/msg/Packet", "misfit", "ros_type"),
         ("version: 1", "version: 1\nversion: 1", "yaml-duplicate", "version"),

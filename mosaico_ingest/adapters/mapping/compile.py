@@ -18,9 +18,10 @@ from mosaico_ingest.adapters.mapping.lookup_table import compile_lookup
 from mosaico_ingest.adapters.mapping.model import Form, MappingFile, Scalar, Value
 from mosaico_ingest.adapters.mapping.typed import Const, Typed, Written
 from mosaico_ingest.bag.definition import Definition
-from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.errors import AdapterError, SinkError
 from mosaico_ingest.ontology.required import AbsentRows
 from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.wire import check_metadata
 
 __all__ = ["AdapterLookup", "Compiler"]
 
@@ -59,6 +60,11 @@ class Compiler:
         found: dict[str, Typed] = {}
         for key, value in values.items():
             path = ("schema_metadata", key)
+            try:
+                check_metadata({key: None}, where="")
+            except SinkError as refused:
+                self._analyzer.report(path, refused.what, "give it another name")
+                continue
             if isinstance(value, Form):
                 self._analyzer.report(path, "metadata is an expression or a plain value", "drop the mapping")
                 continue

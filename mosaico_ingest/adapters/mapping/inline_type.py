@@ -57,6 +57,9 @@ def _fields(fields: Mapping[str, FieldType], path: Path, report: Report) -> list
 
 
 def _field(name: str, field: FieldType, path: Path, report: Report) -> DataType | None:
+    if not name.isidentifier():  # queries and SQL spell a path with dots
+        report(path, f"a field cannot be called {name!r}", "use letters, digits and _")
+        return None
     typed = TypedField(type=field) if isinstance(field, str) else field
     if typed.fields is not None and typed.type in {None, _LIST_OF_STRUCTS}:
         struct = pa.struct(_fields(typed.fields, (*path, "fields"), report))
