@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 
 from rich.console import Console
 from rich.text import Text
@@ -20,6 +21,8 @@ ROOMY = 100
 """Columns of a terminal that has room for all of them."""
 MANY = 3
 """More recordings than that get a line each instead of a table each."""
+MOST_REASONS = 20
+"""Lines of a batch that say why messages were rejected."""
 STATUS_STYLE = {RunStatus.COMPLETED: "green", RunStatus.REJECTED: "yellow", RunStatus.SKIPPED: "dim"}
 
 
@@ -97,6 +100,12 @@ def _print_batch(report: RunReport, console: Console) -> None:
             seconds_text(one.duration_s),
         )
     console.print(table)
+    reasons = [f"{one.sequence}: {line}" for one in report.recordings for line in _rejections(one)]
+    for line in reasons[:MOST_REASONS]:
+        console.print(Text(line, style="yellow"), soft_wrap=True)
+    if len(reasons) > MOST_REASONS:
+        more = counted(len(reasons) - MOST_REASONS, "more reason")
+        console.print(Text(f"… and {more}, which --report FILE keeps", style="yellow"), soft_wrap=True)
     style = "green" if report.exit_code in {0, 4} else "red"
     console.print(Text(report.headline, style=style), soft_wrap=True)
 
@@ -119,11 +128,16 @@ def _print_recording(report: Report, console: Console) -> None:
             table.add_row(topic.target, topic.ontology, *(cells[column] for column in columns))
     console.print(table)
     _print_left_out(report, console)
-    for topic in report.topics:
-        for rejection in topic.rejections:
-            line = f"{topic.target}: {count_text(rejection.count)} rejected [{rejection.rule}]: {rejection.reason}"
-            console.print(Text(line, style="yellow"), soft_wrap=True)
+    for line in _rejections(report):
+        console.print(Text(line, style="yellow"), soft_wrap=True)
     _print_totals(report, console)
+
+
+def _rejections(report: Report) -> Iterator[str]:
+    """Yield how many messages of each topic were rejected, and why."""
+    for topic in report.topics:
+        for one in topic.rejections:
+            yield f"{topic.target}: {count_text(one.count)} rejected [{one.rule}]: {one.reason}"
 
 
 def _cells(topic: TopicReport) -> dict[str, str | Text]:

@@ -1,4 +1,4 @@
-"""A narrow terminal folds names; it cuts no number."""
+"""A narrow terminal folds names and cuts no number; a batch says why messages were rejected."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from rich.console import Console
 
 from mosaico_ingest import api
 from mosaico_ingest.cli import plan_tables, tables
+from mosaico_ingest.diagnostics import Stage
+from mosaico_ingest.report.model import Rejection
 
 JOB = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
 
@@ -46,3 +48,25 @@ def test_of_an_inspection(console: Console) -> None:
 def test_of_a_plan(console: Console) -> None:
     plan_tables.print_plan(api.plan_job(JOB), folder=JOB.parent)
     assert {"1,000", "messages"} <= numbers(console)
+
+
+def test_a_batch_says_why_messages_were_rejected_up_to_a_point(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run = api.run(api.compile_job(JOB))
+    (drive,) = run.recordings
+    why = Rejection(
+        stage=Stage.DECODE,
+        rule="truncated",
+        count=3,
+        reason="4 bytes needed",
+        first_log_time_ns=0,
+        first_offset=0,
+    )
+    imu = drive.topics[0].model_copy(update={"rejections": (why,)})
+    bad = drive.model_copy(update={"topics": (imu,)})
+    tables.print_report(run.model_copy(update={"recordings": (bad,) * 25}))
+    said = capsys.readouterr().out
+    assert said.count("quickstart_drive: /imu: 3 rejected [truncated]: 4 bytes needed\n") == 20
+    assert "… and 5 more reasons, which --report FILE keeps\n" in said
