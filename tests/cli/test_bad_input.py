@@ -296,6 +296,8 @@ def test_keys_that_are_not_there_or_have_expired_are_said(ingest: Ingest, tmp_pa
     assert "has no time zone" in ingest(*new, "2999-01-01")[2]
     assert ingest(*new, "2999-01-01T00:00:00Z")[0] == 0
     assert "expires 2999" in ingest("keys", "ls")[1]
+    assert ingest("keys", "ls", "--api-keys", ".")[2] == "error: .: cannot be read: Is a directory\n"
+    assert "api_keys.json/x: cannot be " in ingest(*new[:-1], "--api-keys", "api_keys.json/x")[2]
     ring = tmp_path / "api_keys.json"
     ring.write_text(ring.read_text().replace("2999", "2020"))
     assert "expired 2020" in ingest("keys", "ls")[1]

@@ -14,7 +14,6 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mosaico_ingest.errors import SinkError
-from mosaico_ingest.store.faults import explained
 from mosaico_ingest.wire.actions import Permission
 from mosaico_ingest.wire.keys import key_problem, new_key
 
@@ -89,8 +88,10 @@ class Keyring:
         return stored.permission
 
     def _load(self) -> _File:
-        with explained(self.path):
+        try:
             text = self.path.read_text("utf-8") if self.path.exists() else "{}"
+        except OSError as err:
+            raise SinkError(f"cannot be read: {err.strerror}", where=str(self.path)) from err
         try:
             return _File.model_validate_json(text)
         except ValidationError as err:
@@ -99,7 +100,7 @@ class Keyring:
 
     def _save(self) -> None:
         content = _File(keys=self.keys).model_dump_json(indent=2)
-        with explained(self.path):
+        try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             handle, name = tempfile.mkstemp(
                 dir=self.path.parent, prefix=self.path.name
@@ -107,6 +108,8 @@ class Keyring:
             with os.fdopen(handle, "w", encoding="utf-8") as file:
                 file.write(content)
             Path(name).replace(self.path)
+        except OSError as err:
+            raise SinkError(f"cannot be written: {err.strerror}", where=str(self.path)) from err
 
 
 def _hash(key: str) -> str:
