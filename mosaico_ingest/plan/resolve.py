@@ -34,9 +34,7 @@ def resolve(
     """
     topics = tuple(dict.fromkeys(channel.topic for channel in recording.channels))
     selection = select(config.topics or (), topics)
-    # Two types on a topic that is taken are told by `merge`, with what becomes of them.
-    known = (finding for finding in recording.findings if finding.rule != "two-types")
-    findings = [*known, *resolver.findings, *_findings(config, selection, topics)]
+    findings = [*_known(recording), *resolver.findings, *_findings(config, selection, topics)]
     taken: list[TopicPlan] = []
     left: list[LeftOut] = []
     misfits: list[tuple[str, AdapterError]] = []
@@ -83,6 +81,11 @@ def resolve(
         plan = follow_schema_changes(plan, config.on_schema_change)
     check_digest(plan, config)
     return plan
+
+
+def _known(recording: Recording) -> Iterator[Finding]:
+    """Yield what is odd about the recording; two types on a topic are told by `merge`, with what becomes of them."""
+    return (finding for finding in recording.findings if finding.rule != "two-types")
 
 
 def _window(wanted: TimeRange, recording: Recording) -> tuple[int | None, int | None]:
