@@ -51,6 +51,11 @@ AdapterReference: TypeAlias = Any
 ImageFormat: TypeAlias = Literal["raw", "png"]
 LogLevel: TypeAlias = Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"]
 CustomMessages: TypeAlias = tuple[str, Path, Stores | None]
+_LISTS = ("custom_msgs", "adapters")
+_MAPPINGS = (
+    "metadata", "adapter_override", "adapter_overrides", "topic_metadata", "serialization_formats", "images", "rename",
+    "every",
+)  # fmt: skip
 _Choice = TypeVar("_Choice", bound=Enum)
 
 
@@ -206,6 +211,7 @@ class ROSInjectionConfig:
 
     def __post_init__(self) -> None:
         """Bring every value into its one form and check it."""
+        self._fill_in()
         self._normalise_recording()
         self._normalise_policies()
         self._normalise_adapters()
@@ -243,12 +249,27 @@ class ROSInjectionConfig:
         match = first_match(policies, topic)
         return default if match is None else policies[match]
 
+    def _fill_in(self) -> None:
+        """Take None for nothing, as programs written for the official bridge do."""
+        for name in _LISTS:
+            if getattr(self, name) is None:
+                self._set(name, ())
+        for name in _MAPPINGS:
+            value = getattr(self, name)
+            if value is None:
+                self._set(name, {})
+            elif not isinstance(value, Mapping):
+                raise self._error(f"{name} is {value!r:.80}", "give a mapping")
+
     def _normalise_recording(self) -> None:
         paths = self.paths
         if not paths:
             raise self._error("file_path is empty", "name a recording")
         self._set("file_path", paths[0] if len(paths) == 1 else paths)
         self._set("ros_distro", self._distro(self.ros_distro))
+        for one in self.custom_msgs:
+            if len(one) != 3:  # noqa: PLR2004 - as the hint says
+                raise self._error(f"custom_msgs has {one!r}", "give package, path, and a distro or None")
         custom = tuple(
             (package, Path(path), self._distro(store)) for package, path, store in self.custom_msgs
         )
@@ -329,7 +350,9 @@ class ROSInjectionConfig:
 
     def _choice(self, kind: type[_Choice], value: object, name: str) -> _Choice:
         try:
-            return kind(value)
+            return kind(
+                value.value if isinstance(value, Enum) else value
+            )  # rosbags and the SDK have their own
         except ValueError as err:
             allowed = ", ".join(str(choice.value) for choice in kind)
             raise self._error(f"{name} is {value!r}", f"allowed: {allowed}") from err

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import pickle
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rosbags.typesys import Stores as RosbagsStores
 
 from mosaico_ingest.config import ROSInjectionConfig, ServerTarget, StoreTarget, TimeBound
 from mosaico_ingest.errors import IngestError, ManifestError
@@ -45,6 +47,31 @@ def test_the_reference_example_is_accepted() -> None:
     assert made.adapter_overrides == made.adapter_override == {"/camera/depth/points": MyCustomRGBDAdapter}
     assert made.target == StoreTarget(Path("mosaico"))
     assert pickle.loads(pickle.dumps(made)) == made  # noqa: S301 - our own bytes
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "metadata",
+        "topics",
+        "custom_msgs",
+        "adapter_override",
+        "adapter_overrides",
+        "topic_metadata",
+        "serialization_formats",
+    ],
+)
+def test_none_is_nothing_where_there_may_be_several(name: str) -> None:
+    assert config(**{name: None}) == config()
+
+
+def test_other_enumerations_are_taken_by_their_values() -> None:
+    class Policy(Enum):  # as the official SDK has it
+        Ignore = "ignore"
+
+    made = config(ros_distro=RosbagsStores.ROS2_HUMBLE, topics_on_error={"/gps": Policy.Ignore})
+    assert made.ros_distro is Stores.ROS2_HUMBLE
+    assert made.topic_policy("/gps") is TopicLevelErrorPolicy.Ignore
 
 
 def test_words_become_what_they_name() -> None:
@@ -111,6 +138,8 @@ def test_the_key_is_not_shown() -> None:
         ({"jobs": 0}, "jobs is 0"),
         ({"sequence_name": "a b"}, "sequence name 'a b'"),
         ({"metadata": {"a.b": 1}}, "metadata key 'a.b'"),
+        ({"metadata": [1]}, "metadata is \\[1\\]"),
+        ({"custom_msgs": [("pkg", "dir")]}, "custom_msgs has \\('pkg', 'dir'\\)"),
         ({"topic_metadata": {"/a": {"x/y": 1}}}, "metadata key 'x/y'"),
         ({"rename": {"/a": "/b c"}}, "topic name '/b c'"),
         ({"rename": {"/a/*": "/b"}}, "rename\\['/a/\\*'\\] is for every topic of a glob"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from difflib import get_close_matches
+from enum import Enum
 from pathlib import Path
 from typing import ClassVar
 
@@ -100,7 +101,9 @@ def store_of(store: Stores | str | None) -> Stores | None:
     if store is None:
         return None
     try:
-        return Stores(store)
+        return Stores(
+            store.value if isinstance(store, Enum) else store
+        )  # rosbags has an enumeration of its own
     except ValueError:
         known = [known.value for known in Stores]
         near = get_close_matches(str(store), known, n=1)
