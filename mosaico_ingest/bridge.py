@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from enum import Enum
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -80,7 +81,7 @@ class ROSBridge:
             for pattern, reference in (overrides or {}).items()
         }
         self._images = dict(images or {})
-        self._formats = {normalize_msgtype(name): value for name, value in (formats or {}).items()}
+        self._formats = {normalize_msgtype(name): _layout(value) for name, value in (formats or {}).items()}
 
     @classmethod
     def for_config(cls, config: ROSInjectionConfig) -> ROSBridge:
@@ -124,7 +125,7 @@ class ROSBridge:
                 return Resolution(spec, reason, origin)
         if msgtype in BY_TYPE:
             return Resolution(BY_TYPE[msgtype], "built-in", f"built-in for {msgtype}")
-        layout = SerializationFormat(self._formats.get(msgtype, SerializationFormat.DEFAULT.value))
+        layout = self._formats.get(msgtype, SerializationFormat.DEFAULT)
         why = f"no adapter takes {msgtype}; it keeps its ROS shape"
         return Resolution(UnmodeledSpec(serialization_format=layout), "unmodeled", why)
 
@@ -156,6 +157,14 @@ class ROSBridge:
                 hint="register one with @register_default_adapter",
             )
         return translate(found.spec, msg)
+
+
+def _layout(said: object) -> SerializationFormat:
+    try:
+        return SerializationFormat(said.value if isinstance(said, Enum) else said)  # the SDK has its own
+    except ValueError:
+        allowed = ", ".join(layout.value for layout in SerializationFormat)
+        raise AdapterError(f"there is no serialization format {said!r}", hint=f"allowed: {allowed}") from None
 
 
 def _by_type(specs: Iterable[tuple[str, AdapterSpec]]) -> dict[str, tuple[str, AdapterSpec]]:

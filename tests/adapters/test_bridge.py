@@ -89,6 +89,8 @@ def test_a_type_without_an_adapter_keeps_its_shape() -> None:
     found = bridge.resolve("/m", "visualization_msgs/msg/Marker")
     assert (found.spec.name, found.reason, found.unmodeled) == ("Unmodeled", "unmodeled", True)
     assert found.spec.serialization_format is SerializationFormat.RAGGED
+    with pytest.raises(AdapterError, match="no serialization format 'raged'"):
+        ROSBridge(formats={"visualization_msgs/Marker": "raged"})
     assert found.why == "no adapter takes visualization_msgs/msg/Marker; it keeps its ROS shape"
 
 
