@@ -39,6 +39,8 @@ def _problem(topic: TopicInfo, segment: SegmentInfo) -> str | None:
                 return "its columns are not those of its topic"
             content = ContentHash(column_makers(file.schema_arrow))
             found = (segment.path.stat().st_size, *_rows_and_span(file, content))
+    except FileNotFoundError:
+        return "is not there"
     except (OSError, pa.ArrowException) as error:
         return str(error).partition("\n")[0]
     wanted = (segment.stored_bytes, segment.rows, segment.start_ns, segment.end_ns)

@@ -147,9 +147,15 @@ def test_a_destination_that_loses_rows_fails_the_run(
     assert "found 1 rows" in str(report.error)
 
 
-@pytest.mark.parametrize("damage", ["flip", "cut", "remove"])
+@pytest.mark.parametrize(("damage", "said"), [("flip", "CRC"), ("cut", ""), ("remove", '"is not there"')])
 def test_verify_finds_what_changed_on_the_disk(
-    damage: str, write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
+    damage: str,
+    said: str,
+    write_bag: WriteBag,
+    write_job: WriteJob,
+    run_job: RunJob,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     write_bag({"/speed": [number(value) for value in range(500)]})
     run_job(write_job())
@@ -164,9 +170,11 @@ def test_verify_finds_what_changed_on_the_disk(
     segment.unlink()
     if damage != "remove":
         segment.write_bytes(data if damage == "flip" else data[:-20])
+    capsys.readouterr()
     with pytest.raises(SystemExit) as ended:
         main(arguments)
     assert ended.value.code == 5
+    assert said in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("table", [{}, {"timestamp_ns": []}, {"timestamp_ns": ["a"], "data": [1.0]}, None])
