@@ -89,9 +89,14 @@ def test_what_an_interrupt_left_is_completed_by_the_next_run(
     write_bag({"/speed": [number(value) for value in range(70_000)]})
     job = write_job(sequence=SKIP)
 
+    batches = 0
+
     def stop(_position: int, event: Event) -> None:
-        if isinstance(event, TopicProgress) and event.written:
-            raise KeyboardInterrupt
+        nonlocal batches
+        if isinstance(event, TopicProgress) and event.written > 0:
+            batches += 1
+            if batches == 2:  # counted, and not handed over
+                raise KeyboardInterrupt
 
     (stopped,) = api.run(api.compile_job(job), observe=stop).recordings
     assert stopped.status is RunStatus.INTERRUPTED
