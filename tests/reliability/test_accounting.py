@@ -151,6 +151,7 @@ def test_a_destination_that_loses_rows_fails_the_run(
 def test_verify_finds_what_changed_on_the_disk(
     damage: str,
     said: str,
+    *,
     write_bag: WriteBag,
     write_job: WriteJob,
     run_job: RunJob,
