@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
-from pydantic import BaseModel, ConfigDict, SerializeAsAny
+from pydantic import BaseModel, ConfigDict, PlainValidator, SerializeAsAny
 
 from mosaico_ingest.ontology.serializable import Serializable
 
 __all__ = ["Message"]
 
 _Model = TypeVar("_Model", bound=Serializable)
+
+
+def _ontology_object(value: object) -> object:
+    """Return the value as it is; the official SDK's own objects are as good as ours."""
+    if not isinstance(value, BaseModel) or not hasattr(value, "ontology_tag"):
+        raise ValueError(f"{type(value).__name__} is no ontology object")
+    return value
 
 
 class Message(BaseModel):
@@ -20,7 +27,7 @@ class Message(BaseModel):
 
     timestamp_ns: int
     """When it was recorded, ns since the epoch."""
-    data: SerializeAsAny[Serializable]
+    data: Annotated[SerializeAsAny[Serializable], PlainValidator(_ontology_object)]
     """The row itself."""
 
     def get_data(self, model: type[_Model]) -> _Model | None:

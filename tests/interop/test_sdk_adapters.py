@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import runpy
+import sys
 from dataclasses import fields
 from pathlib import Path
 from random import Random
@@ -50,6 +51,24 @@ class LateAdapter(SpeedAdapter):
 """
 
 
+OURS_OVER_THEIR_ONTOLOGY = """
+from mosaico_ingest import Message, ROSAdapterBase
+from theirs import SdkSpeed
+
+class OurSpeedAdapter(ROSAdapterBase[SdkSpeed]):
+    ros_msgtype = "geometry_msgs/msg/TwistStamped"
+    __mosaico_ontology_type__ = SdkSpeed
+
+    @classmethod
+    def from_dict(cls, ros_data):
+        return SdkSpeed(value=ros_data["twist"]["linear"]["x"], frame=ros_data["header"]["frame_id"])
+
+    @classmethod
+    def translate(cls, ros_msg, **kwargs) -> Message:
+        return super().translate(ros_msg, **kwargs)
+"""
+
+
 @pytest.fixture(scope="module")
 def fuzz() -> Any:
     return runpy.run_path(str(Path(__file__).parents[1] / "adapters" / "fuzz.py"))["message"]
@@ -61,6 +80,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("sdk")
     (path / "theirs.py").write_text(WRITTEN_FOR_THE_SDK)
     return path
+
+
+def test_an_adapter_of_ours_may_fill_an_ontology_class_of_theirs(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    theirs = load_adapter_reference("theirs.py:SpeedAdapter", folder)
+    assert isinstance(theirs, PythonAdapterSpec)
+    monkeypatch.setitem(sys.modules, "theirs", sys.modules[theirs.adapter.__module__])
+    (folder / "ours.py").write_text(OURS_OVER_THEIR_ONTOLOGY)
+    adapted = _adapt("ours.py:OurSpeedAdapter", folder, 2.0)
+    assert adapted.rows.to_pylist() == [{"value": 2.0, "frame": "base"}]
 
 
 def _adapt(ref: str, folder: Path, *speeds: float) -> Adapted:
