@@ -210,7 +210,9 @@ class MemorySink:
 
     def _refuse_taken(self, sequence: str, if_exists: IfExists) -> None:
         if sequence in self.sequences and if_exists in {IfExists.FAIL, IfExists.SKIP}:
-            raise SequenceExists("the sequence exists", where=sequence, hint="choose sequence.if_exists")
+            raise SequenceExists(
+                "the sequence exists", where=sequence, hint="choose another name, or set sequence.if_exists"
+            )
 
 
 def _append(old: MemorySequence, new: MemorySequence) -> None:

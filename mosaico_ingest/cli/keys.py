@@ -43,7 +43,10 @@ def new(
     until = _instant(expires) if expires else None
     key = Keyring(api_keys).add(Granted(permission.value), description=description, expires=until)
     typer.echo(key)
-    typer.echo(f"{permission.value} permission, kept as a hash in {api_keys}", err=True)
+    typer.echo(
+        f"{permission.value} permission, kept as a hash in {api_keys}; a server reads it when it starts",
+        err=True,
+    )
 
 
 @app.command("ls")

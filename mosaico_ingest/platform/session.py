@@ -209,4 +209,6 @@ def _topics_of(sequence: bodies.SequenceInfo) -> frozenset[str]:
 
 
 def _taken(sequence: str) -> SequenceExists:
-    return SequenceExists("the sequence exists", where=sequence, hint="choose sequence.if_exists")
+    return SequenceExists(
+        "the sequence exists", where=sequence, hint="choose another name, or set sequence.if_exists"
+    )
