@@ -11,6 +11,7 @@ from pathlib import Path
 from mosaico_ingest.adapters.unmodeled import UnmodeledSpec
 from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.definition import Source
+from mosaico_ingest.bag.distros import ROS2, distro_type
 from mosaico_ingest.manifest.text import plain
 from mosaico_ingest.policies import Stores
 from mosaico_ingest.report.inspection import InspectedTopic, Inspection
@@ -76,9 +77,19 @@ def _bag(found: Inspection, path: str, ros_distro: Stores | str | None) -> Itera
     yield f"  path: {plain(path)}{mark}"
     if ros_distro is not None:
         yield f"  ros_distro: {Stores(ros_distro).value}"
-    if undefined:
-        yield f"  # no definition is known of {', '.join(undefined)}; say where they are:"
-        for package in dict.fromkeys(msgtype.partition("/")[0] for msgtype in undefined):
+    yield from _definitions(undefined, ros_distro)
+
+
+def _definitions(undefined: Sequence[str], ros_distro: Stores | str | None) -> Iterator[str]:
+    """Yield what to say of types that nobody defines, or on which the distros disagree."""
+    standard = [name for name in undefined if any(distro_type(distro, name) for distro in ROS2)]
+    if standard and ros_distro is None:
+        yield f"  # {', '.join(standard)} changed between distros, and the recording does not carry it; say which:"
+        yield "  # ros_distro: ros2_humble"
+    own = [name for name in undefined if ros_distro is not None or name not in standard]
+    if own:
+        yield f"  # no definition is known of {', '.join(own)}; say where they are:"
+        for package in dict.fromkeys(msgtype.partition("/")[0] for msgtype in own):
             yield f"  # custom_msgs: [{{package: {package}, path: definitions/{package}}}]"
 
 

@@ -10,10 +10,12 @@ from mosaico_ingest.plan.draft import draft_manifest
 from mosaico_ingest.report.inspection import InspectedTopic, Inspection
 
 
-def draft(definition: str, encoding: str = "cdr") -> str:
+def draft(
+    definition: str, encoding: str = "cdr", *, msgtype: str = "own_msgs/msg/A", ros_distro: str | None = None
+) -> str:
     topic = InspectedTopic(
         topic="/a",
-        msgtype="own_msgs/msg/A",
+        msgtype=msgtype,
         encoding=encoding,
         count=1,
         rate_hz=None,
@@ -31,7 +33,7 @@ def draft(definition: str, encoding: str = "cdr") -> str:
         end_ns=0,
         topics=(topic,),
     )
-    return draft_manifest(found, Path("a.db3"), folder=Path())
+    return draft_manifest(found, Path("a.db3"), folder=Path(), ros_distro=ros_distro)
 
 
 @pytest.mark.parametrize(
@@ -49,6 +51,15 @@ def test_it_says_whose_definitions_are_used(definition: str, said: str) -> None:
 def test_it_asks_for_the_definitions_of_ros_messages_only() -> None:
     assert "custom_msgs: [{package: own_msgs" in draft("none")
     assert "custom_msgs" not in draft("none", "other")
+
+
+def test_it_asks_for_the_distro_where_distros_differ() -> None:
+    marker = "visualization_msgs/msg/Marker"
+    said = draft("none", msgtype=marker)
+    assert f"# {marker} changed between distros" in said
+    assert "# ros_distro: ros2_humble" in said
+    assert "custom_msgs" not in said
+    assert "custom_msgs" in draft("none", msgtype=marker, ros_distro="ros2_dashing")
 
 
 def test_its_head_is_for_people() -> None:
