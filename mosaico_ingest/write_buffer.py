@@ -22,6 +22,8 @@ _WORTH_WAKING_BYTES = 1 << 20
 class WriteBuffer:
     """Writes batches in order on one thread of its own; `put` waits while too many bytes are queued.
 
+    As long as little is queued there is no thread; if that is all there is, it is written on leaving.
+
     The first error of a writer stops the thread; it is raised by the next `put` or when the buffer is left.
     Leaving normally waits until everything is written; leaving by an exception too, so that rows accepted
     before an error are not lost. Leaving by Ctrl-C waits only for so long: the destination may be stuck.
@@ -39,7 +41,6 @@ class WriteBuffer:
         self._thread = threading.Thread(target=self._work, name="mosaico-ingest-write", daemon=True)
 
     def __enter__(self) -> Self:
-        self._thread.start()
         return self
 
     def __exit__(
@@ -47,8 +48,13 @@ class WriteBuffer:
     ) -> None:
         with self._changed:
             self._closed = True
-            self._changed.notify_all()
-        self._thread.join(_INTERRUPTED_S if kind is KeyboardInterrupt else None)
+            needs_thread = self._thread.ident is not None or kind is KeyboardInterrupt
+            if needs_thread:
+                self._wake()
+        if needs_thread:
+            self._thread.join(_INTERRUPTED_S if kind is KeyboardInterrupt else None)
+        else:
+            self._work()
         with self._changed:
             self._queue.clear()
         if kind is None and self._error is not None:
@@ -59,14 +65,19 @@ class WriteBuffer:
         size = batch.nbytes
         with self._changed:
             while self._error is None and self._queued_bytes and self._queued_bytes + size > self._max_bytes:
-                self._changed.notify_all()  # what is queued may have waited for company
+                self._wake()  # what is queued may have waited for company
                 self._changed.wait()
             if self._error is not None:
                 raise self._error
             self._queue.append((writer, batch, size))
             self._queued_bytes += size
             if self._queued_bytes >= min(_WORTH_WAKING_BYTES, self._max_bytes):
-                self._changed.notify_all()
+                self._wake()
+
+    def _wake(self) -> None:
+        if self._thread.ident is None:
+            self._thread.start()
+        self._changed.notify_all()
 
     def _work(self) -> None:
         while True:

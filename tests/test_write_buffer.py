@@ -109,3 +109,16 @@ def test_who_waits_for_room_wakes_the_writer_first() -> None:
         buffer.put(writer, almost)
         buffer.put(writer, almost)
     assert writer.seen == [0, 0]
+
+
+def test_little_is_written_without_a_thread() -> None:
+    writer = Writer()
+    with WriteBuffer(max_bytes=1 << 30) as buffer:
+        buffer.put(writer, batch(1))
+        assert not threads()
+    assert writer.seen == [1]
+
+
+def test_an_error_without_a_thread_reaches_whoever_leaves() -> None:
+    with pytest.raises(SinkError, match="disk full"), WriteBuffer(max_bytes=1 << 30) as buffer:
+        buffer.put(Writer(fail_on=1), batch(1))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Collection, Generator, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -28,6 +28,8 @@ from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.path import AnyPath, RemotePath
 
 __all__ = ["Recording", "open_recording"]
+
+_SMALL_BYTES = 1 << 20
 
 ROWS = 1 << 16
 MEMORY_BYTES = 64 << 20
@@ -176,7 +178,9 @@ class Recording:
         return running
 
     def _gathered(self, wants: Sequence[Want], gather: Gather) -> Generator[RawBatch, None, None]:
-        with Prefetched(self._steps(wants)) as steps:
+        blocks = self._steps(wants)
+        # a recording this small is read in less time than a thread takes to start
+        with Prefetched(blocks) if self.size_bytes > _SMALL_BYTES else closing(blocks) as steps:
             for step in steps:
                 self._note(step.part, step.holes)
                 for slab in step.slabs:
@@ -185,7 +189,7 @@ class Recording:
             yield from gather.rest()
 
     def _steps(self, wants: Sequence[Want]) -> Generator[_Step, None, None]:
-        """Load block after block; runs in the prefetching thread."""
+        """Load block after block; runs in the prefetching thread of all but small recordings."""
         sources = [
             (part.start_ns, partial(_blocks, part, want))
             for part, want in zip(self._parts, wants, strict=True)

@@ -72,10 +72,9 @@ class SegmentWriter:
         self.end_ns = rows.column(0)[-1].as_py()
 
     def close(self) -> Segment:
-        """Finish the file; it is there to stay then."""
+        """Finish the file; it may not be on the disk yet."""
         self._writer.close()
         self._file.close()
-        files.settle(self.path)
         (footer,) = self._footer
         bounds = tuple(_bounds(self._columns.leaves, footer))
         _, start_ns, end_ns = bounds[0]

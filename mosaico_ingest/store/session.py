@@ -25,6 +25,8 @@ from mosaico_ingest.store.topic import Staging, StoreTopic
 
 __all__ = ["StoreSession"]
 
+_WORTH_A_THREAD_BYTES = 1 << 18
+"""A topic that holds less is written sooner than handed over."""
 _WAITING = 2
 """How many threads may wait for the disk while others encode."""
 
@@ -87,10 +89,7 @@ class StoreSession:
 
     def commit(self) -> None:
         """Finish every topic, move the segments to their places, and enter them in the catalog at once."""
-        with ThreadPoolExecutor((os.cpu_count() or 1) + _WAITING, thread_name_prefix="segment") as pool:
-            # the largest first, so that no thread is left with it at the end
-            waiting = sorted(self._staging.topics.values(), key=lambda topic: -topic.buffered_bytes)
-            list(pool.map(StoreTopic.close, waiting))
+        self._close_topics()
         moves = {
             segment.path: topic.folder / segment.path.name
             for topic in self._staging.topics.values()
@@ -108,6 +107,19 @@ class StoreSession:
             raise
         self._leave()
         self._layout.remove(self._layout.root / path for path in replaced)
+
+    def _close_topics(self) -> None:
+        """Close small topics here, and large ones on threads beside; the disk is waited for on threads always."""
+        # the largest first, so that no thread is left with it at the end
+        waiting = sorted(self._staging.topics.values(), key=lambda topic: -topic.buffered_bytes)
+        large = [topic for topic in waiting if topic.buffered_bytes >= _WORTH_A_THREAD_BYTES]
+        with ThreadPoolExecutor((os.cpu_count() or 1) + _WAITING, thread_name_prefix="segment") as pool:
+            settling = [pool.submit(_close_and_settle, topic) for topic in large]
+            for topic in waiting[len(large) :]:
+                topic.close()
+                settling.append(pool.submit(topic.settle))
+            for each in settling:
+                each.result()
 
     def discard(self) -> None:
         """Leave no trace."""
@@ -158,3 +170,8 @@ class StoreSession:
         self._held.close()
         self._lease.release()
         self._layout.discard(self.id)
+
+
+def _close_and_settle(topic: StoreTopic) -> None:
+    topic.close()
+    topic.settle()

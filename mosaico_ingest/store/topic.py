@@ -14,6 +14,7 @@ from mosaico_ingest.errors import SinkError
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote.path import AnyPath
 from mosaico_ingest.sink import check_batch
+from mosaico_ingest.store import files
 from mosaico_ingest.store.columns import columns_of
 from mosaico_ingest.store.faults import explained
 from mosaico_ingest.store.segment import Segment, SegmentWriter, sorted_rows
@@ -68,6 +69,7 @@ class StoreTopic:
         self.segments: list[Segment] = []
         self._staging = staging
         self._batches: list[pa.RecordBatch] = []
+        self._settled = 0
         self._rows = 0
         self._most_bytes = _FIRST_GROUP_BYTES
         self._broken = False
@@ -108,6 +110,13 @@ class StoreTopic:
             self._flush()
             self._finish_segment()
 
+    def settle(self) -> None:
+        """Wait until the segments finished so far are there to stay."""
+        for segment in self.segments[self._settled :]:
+            with explained(self._staging.where):
+                files.settle(segment.path)
+            self._settled += 1
+
     def abandon(self) -> None:
         """Drop what is in memory, and close the open file."""
         with self._lock:
@@ -144,6 +153,7 @@ class StoreTopic:
         self._writer.append(rows)
         if self._writer.written_bytes >= _SEGMENT_BYTES:
             self._finish_segment()
+            self.settle()  # as much as this goes to the disk while others are still read
 
     def _finish_segment(self) -> None:
         if self._writer is not None:
