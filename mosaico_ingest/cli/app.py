@@ -71,9 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # as standard error is: a file may have any name
     try:
-        asked = _with_command([argument for argument in given if argument != "--debug"])
-        named = asked[:1] if asked and asked[0] in {*COMMANDS, *GROUPS} else (*COMMANDS, *GROUPS)
-        command_line(named)(asked, prog_name="ingest")
+        _run(_with_command([argument for argument in given if argument != "--debug"]))
     except IngestError as error:
         if debug:
             raise
@@ -92,6 +90,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         _complain(IngestError(error.strerror or str(error), where=error.filename and str(error.filename)))
         sys.exit(IngestError.exit_code)
+
+
+def _run(asked: list[str]) -> None:
+    named = asked[:1] if asked and asked[0] in {*COMMANDS, *GROUPS} else (*COMMANDS, *GROUPS)
+    try:
+        command_line(named)(asked, prog_name="ingest")
+    except SystemExit as leave:
+        if isinstance(leave.__context__, BrokenPipeError):  # typer leaves with 1 then
+            raise leave.__context__ from None
+        raise
 
 
 def _with_command(arguments: list[str]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from collections.abc import Collection, Iterable
@@ -22,10 +23,16 @@ class Terminal(Console):
     """Prints text as it is: no markup, no emoji names, and a visible sign in place of each control character."""
 
     def __init__(self, *, stderr: bool = False, soft_wrap: bool = False) -> None:
-        width = None if (sys.stderr if stderr else sys.stdout).isatty() else _WIDE
+        stream = sys.stderr if stderr else sys.stdout
+        width = None if stream is not None and stream.isatty() else _WIDE  # None where it was closed
         super().__init__(
             stderr=stderr, soft_wrap=soft_wrap, width=width, markup=False, emoji=False, highlight=False
         )
+
+    def on_broken_pipe(self) -> None:
+        """Go on in silence where the reader has gone, as in `ingest job.yaml | head`: what is done, and its exit code, count."""
+        self.quiet = True
+        os.dup2(os.open(os.devnull, os.O_WRONLY), (sys.stderr if self.stderr else sys.stdout).fileno())
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         """Render as every console does, then take the controls out of the text."""

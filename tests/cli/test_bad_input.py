@@ -322,3 +322,37 @@ def test_a_manifest_of_any_name_is_expanded_where_output_is_strict(tmp_path: Pat
     )
     assert (done.returncode, done.stderr) == (0, b"")
     assert rb"# job\udcff.yaml: a=x" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (("inspect", str(QUICKSTART)), 0),
+        (("--help",), 0),
+        (("schema", "job"), 0),
+        (("bag", "cut.mcap", "--name", "cut"), 4),
+    ],
+)
+@pytest.mark.slow
+def test_a_reader_that_leaves_early_changes_nothing(
+    arguments: tuple[str, ...], code: int, tmp_path: Path
+) -> None:
+    (tmp_path / "cut.mcap").write_bytes(QUICKSTART.read_bytes()[:300_000])
+    command = [sys.executable, "-m", "mosaico_ingest", *arguments]
+    with subprocess.Popen(  # noqa: S603 - our own command
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as running:
+        assert running.stdout is not None
+        running.stdout.close()
+        assert running.wait(60) == code
+        assert running.stderr is not None
+        assert "Traceback" not in running.stderr.read()
+
+
+@pytest.mark.slow
+def test_output_that_is_closed_is_not_missed(tmp_path: Path) -> None:
+    command = f"{sys.executable} -m mosaico_ingest inspect {QUICKSTART} >&-"
+    done = subprocess.run(  # noqa: S602 - our own command
+        command, shell=True, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60
+    )
+    assert (done.returncode, done.stderr) == (0, "")
