@@ -11,7 +11,9 @@ __all__ = ["init"]
 
 
 def init(
-    path: Annotated[Path, typer.Argument(metavar="BAG", help="A recording: a file or a rosbag2 directory.")],
+    path: Annotated[
+        str, typer.Argument(metavar="BAG", help="A recording: a file, a rosbag2 directory, or a URL.")
+    ],
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Where to write it.", metavar="JOB.yaml", show_default="print it"),
@@ -27,6 +29,7 @@ def init(
     from mosaico_ingest import api
     from mosaico_ingest.errors import NothingMatched
     from mosaico_ingest.plan.draft import draft_manifest
+    from mosaico_ingest.remote.path import as_path
     from mosaico_ingest.report.units import counted
     from mosaico_ingest.textfile import write_whole
 
@@ -34,9 +37,9 @@ def init(
         raise typer.BadParameter(f"{out} is there already; --force replaces it", param_hint="--out")
     found = api.inspect_recording(path, ros_distro=ros_distro)
     if not found.topics:
-        raise NothingMatched("the recording has no topic", where=str(path))
+        raise NothingMatched("the recording has no topic", where=path)
     folder = out.parent if out is not None else Path()
-    text = draft_manifest(found, path, folder=folder, ros_distro=ros_distro)
+    text = draft_manifest(found, as_path(path), folder=folder, ros_distro=ros_distro)
     taken = len({topic.topic for topic in found.topics if topic.problem is None})
     if out is None:
         typer.echo(text, nl=False)
@@ -47,4 +50,4 @@ def init(
     if not taken:
         first = found.topics[0]
         why = f"{first.topic}: {first.problem}"
-        raise NothingMatched("no topic can be ingested as it is", where=str(path), hint=why)
+        raise NothingMatched("no topic can be ingested as it is", where=path, hint=why)

@@ -14,6 +14,7 @@ from mosaico_ingest.bag.definition import Source
 from mosaico_ingest.bag.distros import ROS2, distro_type
 from mosaico_ingest.manifest.text import plain
 from mosaico_ingest.policies import Stores
+from mosaico_ingest.remote.path import AnyPath, RemotePath
 from mosaico_ingest.report.inspection import InspectedTopic, Inspection
 from mosaico_ingest.report.units import bytes_text, counted, seconds_text
 
@@ -27,7 +28,7 @@ _HEAD = (
 
 
 def draft_manifest(
-    found: Inspection, recording: Path, *, folder: Path, ros_distro: Stores | str | None = None
+    found: Inspection, recording: AnyPath, *, folder: Path, ros_distro: Stores | str | None = None
 ) -> str:
     """Return a manifest of `recording` to be put into `folder`; it lints clean, and runs as it stands."""
     return "\n".join(
@@ -58,9 +59,10 @@ def draft_manifest(
     )
 
 
-def draft_name(recording: Path) -> str:
+def draft_name(recording: AnyPath) -> str:
     """Return a sequence name for a recording: its file's name without what no name may have."""
-    stem = re.sub(r"\.(bag|db3|mcap)(\.\w+)?$", "", recording.resolve().name, flags=re.IGNORECASE)
+    name = recording.name if isinstance(recording, RemotePath) else recording.resolve().name
+    stem = re.sub(r"\.(bag|db3|mcap)(\.\w+)?$", "", name, flags=re.IGNORECASE)
     name = _REFUSED.sub("_", stem).strip("_-")
     return plain(name if name[:1].isalnum() else f"drive_{name}".rstrip("_"))
 
@@ -152,5 +154,5 @@ def _one_line(text: str) -> str:
     return " ".join(text.split())
 
 
-def _seen_from(folder: Path, path: Path) -> str:
-    return Path(relpath(path, folder)).as_posix()
+def _seen_from(folder: Path, path: AnyPath) -> str:
+    return path.url if isinstance(path, RemotePath) else Path(relpath(path, folder)).as_posix()

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from mosaico_ingest.plan.draft import draft_manifest
+from mosaico_ingest.remote.path import as_path
 from mosaico_ingest.report.inspection import InspectedTopic, Inspection
 
 
@@ -64,3 +65,18 @@ def test_it_asks_for_the_distro_where_distros_differ() -> None:
 
 def test_its_head_is_for_people() -> None:
     assert "# sqlite3, 2.0 kB, 1 message, 0.00 s\n" in draft("bag")
+
+
+def test_a_recording_behind_a_url_keeps_it() -> None:
+    found = Inspection(
+        files=("s3://fleet/a/my drive.mcap",),
+        container="mcap",
+        size_bytes=1,
+        messages=0,
+        start_ns=None,
+        end_ns=None,
+        topics=(),
+    )
+    text = draft_manifest(found, as_path("s3://fleet/a/my drive.mcap?region=eu"), folder=Path("jobs"))
+    assert '  path: "s3://fleet/a/my drive.mcap?region=eu"\n' in text
+    assert "  name: my_drive\n" in text
