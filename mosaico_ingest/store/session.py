@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from functools import partial
@@ -14,6 +14,7 @@ from mosaico_ingest import wire
 from mosaico_ingest.errors import IngestError, SinkError
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.policies import IfExists
+from mosaico_ingest.remote.path import RemotePath
 from mosaico_ingest.sink import StoredTopic, check_same_type
 from mosaico_ingest.store import entries, files
 from mosaico_ingest.store.content import combined
@@ -26,7 +27,9 @@ from mosaico_ingest.store.topic import Staging, StoreTopic
 __all__ = ["StoreSession"]
 
 _WORTH_A_THREAD_BYTES = 1 << 18
-"""A topic that holds less is written sooner than handed over."""
+"""A topic that holds less is written sooner than handed over, unless it goes behind a URL."""
+_FAST_S = 0.005
+_AT_ONCE = 8
 _WAITING = 2
 """How many threads may wait for the disk while others encode."""
 
@@ -109,17 +112,18 @@ class StoreSession:
         self._layout.remove(self._layout.root / path for path in replaced)
 
     def _close_topics(self) -> None:
-        """Close small topics here, and large ones on threads beside; the disk is waited for on threads always."""
+        """Close large topics on threads, and small ones here meanwhile."""
         # the largest first, so that no thread is left with it at the end
         waiting = sorted(self._staging.topics.values(), key=lambda topic: -topic.buffered_bytes)
-        large = [topic for topic in waiting if topic.buffered_bytes >= _WORTH_A_THREAD_BYTES]
+        most = 0 if isinstance(self._layout.root, RemotePath) else _WORTH_A_THREAD_BYTES
+        large = [topic for topic in waiting if topic.buffered_bytes >= most]
+        small = waiting[len(large) :]
         with ThreadPoolExecutor((os.cpu_count() or 1) + _WAITING, thread_name_prefix="segment") as pool:
-            settling = [pool.submit(_close_and_settle, topic) for topic in large]
-            for topic in waiting[len(large) :]:
+            closing_large = pool.map(_close_and_settle, large)
+            for topic in small:
                 topic.close()
-                settling.append(pool.submit(topic.settle))
-            for each in settling:
-                each.result()
+            _settle(small)
+            list(closing_large)
 
     def discard(self) -> None:
         """Leave no trace."""
@@ -175,3 +179,14 @@ class StoreSession:
 def _close_and_settle(topic: StoreTopic) -> None:
     topic.close()
     topic.settle()
+
+
+def _settle(topics: Sequence[StoreTopic]) -> None:
+    """Wait for the disk one topic after the other where it is fast, for several at once where it turns out not to be."""
+    began = time.monotonic()
+    for done, topic in enumerate(topics):
+        if time.monotonic() - began > _FAST_S:
+            with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="fsync") as pool:
+                list(pool.map(StoreTopic.settle, topics[done:]))
+            return
+        topic.settle()

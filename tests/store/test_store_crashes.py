@@ -194,14 +194,22 @@ def test_what_is_deleted_takes_its_files_along(
             gone()
 
 
+@pytest.mark.parametrize("disk_s", [0, 0.01], ids=["fast", "slow"])
 def test_what_the_catalog_names_is_on_the_disk_before_it_is_named(
-    store: Store, sink: StoreSink, rows: Rows, sample: OntologyType, monkeypatch: pytest.MonkeyPatch
+    store: Store,
+    sink: StoreSink,
+    rows: Rows,
+    sample: OntologyType,
+    monkeypatch: pytest.MonkeyPatch,
+    disk_s: float,
 ) -> None:
     """A power cut cannot be had in a test; that files, then their folders, are settled before the commit can."""
+    names = ("/a", "/b/c", "/d", "/e", "/f")
     done: list[tuple[str, Path]] = []
     settle, move, enter = layout.fsync, layout._move, Catalog.commit
 
     def fsync(path: Path) -> None:
+        time.sleep(disk_s)
         settle(path)
         done.append(("fsync", path))
 
@@ -217,10 +225,10 @@ def test_what_the_catalog_names_is_on_the_disk_before_it_is_named(
     monkeypatch.setattr(layout, "_move", moved)
     monkeypatch.setattr(Catalog, "commit", commit)
     with sink.open("drive", {}) as session:
-        for name in ("/a", "/b/c"):
+        for name in names:
             session.topic(name, sample, {}).write(rows([1, 2]))
     named = done.index(("commit", store.path / "catalog.sqlite"))
-    for name in ("/a", "/b/c"):
+    for name in names:
         (path,) = store.paths("drive", name)
         at, step = next((at, step) for at, (step, target) in enumerate(done) if target == path)
         assert done.index(("fsync", Path(step.removeprefix("from ")))) < at
