@@ -57,7 +57,7 @@ def _print_recording(recording: RecordingPlan, folder: Path, console: Console) -
     if recording.destination.kind == "store":
         place = _seen_from(folder, place)
     console.print(Text(f"{decided.sequence} → {place}", style="bold"))
-    console.print(_source(decided, folder), highlight=False)
+    console.print(_source(decided, folder), soft_wrap=True)
     samples = {sample.target: sample for sample in recording.samples}
     names = ("topic", "type", "messages", "becomes", "adapter", "because", "sample")
     table = plain_table(*names, numbers={"messages"})
@@ -78,15 +78,17 @@ def _print_recording(recording: RecordingPlan, folder: Path, console: Console) -
     for sample in recording.samples:
         _print_rejections(sample, console)
     _print_notes(recording.notes, console)
+    if recording.is_empty:
+        console.print(Text("there is no message in the topics taken", style="red"))
     console.print(_state(recording.destination, decided, place), soft_wrap=True)
 
 
 def _source(decided: Decisions, folder: Path) -> str:
     size = sum(part.size_bytes for part in decided.files)
     names = ", ".join(_seen_from(folder, part.path) for part in decided.files)
-    text = f"{names}: {decided.container} by its first bytes, {bytes_text(size)}, "
-    text += f"{time_text(decided.start_ns)} .. {time_text(decided.end_ns)} UTC"
+    text = f"{names}: {decided.container} by its first bytes, {bytes_text(size)}"
     if decided.start_ns is not None and decided.end_ns is not None:
+        text += f", {time_text(decided.start_ns)} .. {time_text(decided.end_ns)} UTC"
         text += f" ({seconds_text((decided.end_ns - decided.start_ns) / 1e9)})"
     if decided.read_from_ns is not None or decided.read_until_ns is not None:
         text += f", read from {time_text(decided.read_from_ns)} until {time_text(decided.read_until_ns)}"

@@ -47,7 +47,7 @@ def print_inspection(found: Inspection, *, as_json: bool) -> None:
         span = f", {time_text(found.start_ns)} .. {time_text(found.end_ns)} UTC ({seconds_text(found.duration_s)})"
     messages = "? messages" if found.messages is None else counted(found.messages, "message")
     console.print(Text(f"{', '.join(found.files)}", style="bold"))
-    console.print(f"{found.container}, {bytes_text(found.size_bytes)}, {messages}{span}")
+    console.print(f"{found.container}, {bytes_text(found.size_bytes)}, {messages}{span}", soft_wrap=True)
     names = ("topic", "type", "messages", "rate", "definition", "becomes", "adapter")
     table = plain_table(*names, numbers={"messages", "rate"})
     for topic in found.topics:

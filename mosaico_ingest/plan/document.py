@@ -186,6 +186,11 @@ class RecordingPlan(Part):
         """How many messages of the samples would be rejected."""
         return sum(sample.rejected for sample in self.samples)
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether the index promises no message of any topic taken."""
+        return all(topic.count == 0 for topic in self.decisions.topics)
+
 
 class PlanDocument(Part):
     """What one manifest would do; `version` changes when the form does."""
@@ -199,9 +204,11 @@ class PlanDocument(Part):
 
     @property
     def exit_code(self) -> int:
-        """1 where a destination refuses, 4 where messages of a sample would be rejected, else 0."""
+        """1 where a destination refuses, 3 where there is no message, 4 where some of a sample would be rejected, else 0."""
         if any(recording.destination.problem for recording in self.recordings):
             return 1
+        if any(recording.is_empty for recording in self.recordings):
+            return 3
         return 4 if any(recording.rejected for recording in self.recordings) else 0
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from jsonschema import Draft202012Validator
 from rosbags.rosbag1 import Writer
+from rosbags.typesys import Stores, get_typestore
 
 from mosaico_ingest.cli.app import main
 from mosaico_ingest.plan.document import PlanDocument
@@ -300,3 +301,13 @@ def test_a_plan_of_many_recordings_says_of_each_why_it_cannot_be_ingested(ingest
     assert "c.bag: the recording has no topic" in said
     Path("a.mcap").unlink()
     assert ingest("plan", "job.yaml", "--json") == (3, "error[refused] c.bag: the recording has no topic\n")
+
+
+def test_a_plan_of_topics_without_a_message_is_no_plan(ingest: Ingest) -> None:
+    with Writer("quiet.bag") as writer:
+        writer.add_connection("/imu", "sensor_msgs/msg/Imu", typestore=get_typestore(Stores.ROS1_NOETIC))
+    Path("job.yaml").write_text("bag: {path: quiet.bag}\n")
+    code, said = ingest("plan", "job.yaml")
+    assert code == 3
+    assert "there is no message in the topics taken" in said
+    assert ingest("job.yaml", "-q")[0] == 3
