@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import threading
 import time
 from collections.abc import Callable
@@ -286,6 +287,27 @@ def test_columns_are_put_in_order_and_the_time_column_may_be_nullable(client: Cl
         client.put("drive/bad", uuid, pa.record_batch({"timestamp_ns": pa.array([None], pa.int64())}))
     with refused(Condition.PRECONDITION, "broke off"):
         client.call("session_finalize", session_uuid=session)
+
+
+def test_a_signal_is_heard_that_another_thread_was_given(server: Server) -> None:
+    def heard(*_: object) -> None:
+        raise InterruptedError
+
+    def signal_in_a_thread() -> None:
+        signal.pthread_kill(threading.get_ident(), signal.SIGUSR1)
+
+    at_last = threading.Timer(30, server.shutdown)
+    before = signal.signal(signal.SIGUSR1, heard)
+    try:
+        at_last.start()
+        threading.Timer(0.2, signal_in_a_thread).start()
+        began = time.monotonic()
+        with pytest.raises(InterruptedError):
+            server.wait()
+        assert time.monotonic() - began < 15
+    finally:
+        at_last.cancel()
+        signal.signal(signal.SIGUSR1, before)
 
 
 def test_many_clients_write_and_read_at_once(server: Server, rows: Rows) -> None:

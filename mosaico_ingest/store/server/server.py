@@ -24,6 +24,7 @@ IDLE_S = 3600.0
 """How long a session may stay open without a word from its client."""
 _GRACE_S = 10.0
 _TIDY_S = 30.0
+_HEARD_WITHIN_S = 0.5
 
 
 @frozen
@@ -49,7 +50,8 @@ class Server:
 
     def wait(self) -> None:
         """Block until the server is shut down; unlike Flight's own way to wait, signals are heard."""
-        self._stopped.wait()
+        while not self._stopped.wait(_HEARD_WITHIN_S):
+            pass  # a signal that the system gave to another thread does not end a wait
 
     def shutdown(self, *, grace_s: float = _GRACE_S) -> bool:
         """Stop taking calls, wait for those under way, and discard what was never finalized.
