@@ -201,6 +201,7 @@ def test_what_the_catalog_names_is_on_the_disk_before_it_is_named(
     rows: Rows,
     sample: OntologyType,
     monkeypatch: pytest.MonkeyPatch,
+    *,
     disk_s: float,
 ) -> None:
     """A power cut cannot be had in a test; that files, then their folders, are settled before the commit can."""
