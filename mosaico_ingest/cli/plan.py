@@ -23,8 +23,7 @@ def plan(
 ) -> None:
     """Decide everything against the real recording and try a few messages of each topic; write nothing.
 
-    Exit codes: 0 the job can run, 1 it cannot or the plan has drifted, 3 nothing matches, 4 some messages
-    would be rejected.
+    Exit codes: 0 the job can run, 1 it cannot or has drifted, 3 nothing matches, 4 messages would be rejected.
     """
     from mosaico_ingest import api
     from mosaico_ingest.cli.collector import collect_as_usual

@@ -164,7 +164,9 @@ def _print_left_out(report: Report, console: Console) -> None:
 def _sizes(report: Report) -> str:
     """Compare what is stored with the source where all of it was taken, else with the messages read."""
     stored = report.totals.stored_bytes
-    partial = any(topic.status is TopicStatus.LEFT_OUT for topic in report.topics)
+    taken = [topic for topic in report.topics if topic.status is not TopicStatus.LEFT_OUT]
+    promised = sum(topic.promised or 0 for topic in taken)
+    partial = len(taken) < len(report.topics) or report.totals.read < promised
     before = report.totals.payload_bytes if partial else report.source_bytes
     what = " of messages" if partial else ""
     change = f", {stored / before:.0%}" if before else ""

@@ -15,6 +15,7 @@ from mosaico_ingest.diagnostics import Stage
 from mosaico_ingest.report.model import Rejection
 
 JOB = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
+DRIVE = JOB.parent / "quickstart" / "drive.mcap"
 
 
 @pytest.fixture
@@ -41,7 +42,7 @@ def test_of_a_run(console: Console, tmp_path: Path) -> None:
 
 
 def test_of_an_inspection(console: Console) -> None:
-    tables.print_inspection(api.inspect_recording(JOB.parent / "quickstart" / "drive.mcap"), as_json=False)
+    tables.print_inspection(api.inspect_recording(DRIVE), as_json=False)
     assert {"1,000", "100.0", "messages"} <= numbers(console)
 
 
@@ -70,3 +71,15 @@ def test_a_batch_says_why_messages_were_rejected_up_to_a_point(
     said = capsys.readouterr().out
     assert said.count("quickstart_drive: /imu: 3 rejected [truncated]: 4 bytes needed\n") == 20
     assert "… and 5 more reasons, which --report FILE keeps\n" in said
+
+
+def test_what_is_stored_of_a_part_is_held_against_that_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "job.yaml").write_text(f"bag: {{path: {DRIVE}, time: {{end: +1s}}}}\n")
+    tables.print_report(api.run(api.compile_job(tmp_path / "job.yaml")))
+    assert " of messages stored in " in capsys.readouterr().out
+    (tmp_path / "job.yaml").write_text(f"bag: {{path: {DRIVE}}}\nsequence: {{name: all}}\n")
+    tables.print_report(api.run(api.compile_job(tmp_path / "job.yaml")))
+    assert " messages written, 497.3 kB stored in " in capsys.readouterr().out
