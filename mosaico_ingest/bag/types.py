@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Any
 
@@ -89,14 +90,20 @@ class TypeResolver:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What was decided without being asked for, so far."""
+        return self.findings_about({*self._replaced, *self._assumed})
+
+    def findings_about(self, types: AbstractSet[str]) -> tuple[Finding, ...]:
+        """Return those of `findings` that are about some of these types."""
         findings = [
             Finding(
                 "unreadable-definition", Severity.WARNING, f"{root}: the job's definition is used; {problem}"
             )
             for root, problem in self._replaced.items()
+            if root in types
         ]
-        for who in dict.fromkeys(self._assumed.values()):
-            names = ", ".join(name for name, known in self._assumed.items() if known == who)
+        assumed = {name: who for name, who in self._assumed.items() if name in types}
+        for who in dict.fromkeys(assumed.values()):
+            names = ", ".join(name for name, known in assumed.items() if known == who)
             message = f"the recording does not define these types, they are read as in {who}: {names}"
             remedy = _GIVE_IT if who.startswith(_PACKAGE) else "set ros_distro to be sure"
             findings.append(Finding("assumed-definition", Severity.INFO, message, help=remedy))

@@ -34,7 +34,7 @@ def resolve(
     """
     topics = tuple(dict.fromkeys(channel.topic for channel in recording.channels))
     selection = select(config.topics or (), topics)
-    findings = [*_known(recording), *resolver.findings, *_findings(config, selection, topics)]
+    findings = [*_known(recording, resolver, selection), *_findings(config, selection, topics)]
     taken: list[TopicPlan] = []
     left: list[LeftOut] = []
     misfits: list[tuple[str, AdapterError]] = []
@@ -83,9 +83,13 @@ def resolve(
     return plan
 
 
-def _known(recording: Recording) -> Iterator[Finding]:
-    """Yield what is odd about the recording; two types on a topic are told by `merge`, with what becomes of them."""
-    return (finding for finding in recording.findings if finding.rule != "two-types")
+def _known(recording: Recording, resolver: TypeResolver, selection: Selection) -> Iterator[Finding]:
+    """Yield what is odd about the recording and the types that are taken; `merge` tells of two types on a topic."""
+    yield from (finding for finding in recording.findings if finding.rule != "two-types")
+    taken = [channel for channel in recording.channels if channel.topic in selection.selected]
+    yield from resolver.findings_about(
+        {name for channel in taken if channel.definition for name in channel.definition.types}
+    )
 
 
 def _window(wanted: TimeRange, recording: Recording) -> tuple[int | None, int | None]:

@@ -111,6 +111,14 @@ class TestWithoutADistro:
         (finding,) = resolver.findings
         assert "geometry_msgs/msg/Pose" in finding.message
 
+    def test_only_what_is_taken_is_told(self) -> None:
+        resolver = TypeResolver()
+        for name in ("geometry_msgs/msg/Point", "std_msgs/msg/String"):
+            resolve(resolver, name)
+        (finding,) = resolver.findings_about({"geometry_msgs/msg/Point"})
+        assert finding.message.endswith(": geometry_msgs/msg/Point")
+        assert resolver.findings_about(set()) == ()
+
     def test_a_type_without_fields_leaves_no_doubt(self) -> None:
         resolver = TypeResolver()
         assert resolve(resolver, "std_msgs/msg/Empty", "").message.fields == ()
