@@ -12,7 +12,7 @@ from rich.console import Console
 from mosaico_ingest import api
 from mosaico_ingest.cli import plan_tables, tables
 from mosaico_ingest.diagnostics import Stage
-from mosaico_ingest.report.model import Rejection
+from mosaico_ingest.report.model import Rejection, RunReport
 
 JOB = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
 DRIVE = JOB.parent / "quickstart" / "drive.mcap"
@@ -35,9 +35,13 @@ def numbers(console: Console) -> set[str]:
     return set(text.split())
 
 
+def run_quickstart(folder: Path) -> RunReport:
+    (config,) = api.compile_job(JOB)  # whose store is in the checkout
+    return api.run([replace(config, store=folder / "store")])
+
+
 def test_of_a_run(console: Console, tmp_path: Path) -> None:
-    (config,) = api.compile_job(JOB)
-    tables.print_report(api.run([replace(config, store=tmp_path / "store")]))
+    tables.print_report(run_quickstart(tmp_path))
     assert {"1,000", "308.2", "500", "rejected", "written"} <= numbers(console)
 
 
@@ -52,10 +56,9 @@ def test_of_a_plan(console: Console) -> None:
 
 
 def test_a_batch_says_why_messages_were_rejected_up_to_a_point(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    run = api.run(api.compile_job(JOB))
+    run = run_quickstart(tmp_path)
     (drive,) = run.recordings
     why = Rejection(
         stage=Stage.DECODE,
