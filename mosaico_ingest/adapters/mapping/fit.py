@@ -131,10 +131,9 @@ def _demand_fields(kind: Kind, target: DataType) -> None:
 
 def _special(source: DataType, target: DataType) -> Callable[[Refuse, Array], Array] | None:
     """Return the conversion of a header or time stamp."""
-    names = {field.name for field in source}
-    if target == HEADER_TYPE and names >= {"stamp", "frame_id"}:
+    if target == HEADER_TYPE and {field.name for field in source} >= {"stamp", "frame_id"}:
         return as_header
-    if target == STAMP_TYPE and names == {"sec", "nanosec"}:
+    if target == STAMP_TYPE and {field.name for field in source} == {"sec", "nanosec"}:
         return as_stamp
     return None
 
