@@ -163,7 +163,7 @@ class BagSection(_Section):
 
     path: Paths = Field(examples=["data/session_01.db3", ["part_0.mcap", "part_1.mcap"], "data/*.mcap"])
     """A file or rosbag2 directory, or the URL of one; a list: the parts of one recording; a glob: one sequence for each
-    match."""
+    match that is not hidden."""
     ros_distro: Stores | None = Field(default=None, examples=["ros2_humble"])
     """The distro whose definitions are used where the recording does not carry its own."""
     custom_msgs: tuple[CustomMessages, ...] = ()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from datetime import datetime, timezone
 from difflib import get_close_matches
 from glob import has_magic
@@ -98,14 +98,26 @@ def _matches(loaded: LoadedManifest, pattern: str, place: tuple[str | int, ...])
     return recordings
 
 
-def _glob(path: AnyPath) -> Iterable[AnyPath]:
+def _glob(path: AnyPath) -> Iterator[AnyPath]:
+    """Yield what a pattern matches; what is hidden, as copying programs leave it, only where the pattern has such a name."""
+    found: Iterator[tuple[AnyPath, str]]
     if isinstance(path, RemotePath):
         above = next(parent for parent in path.above if not has_magic(parent.key))
-        return above.glob(path.key.removeprefix(above.key))
-    fixed = next(parent for parent in path.parents if not has_magic(str(parent)))
-    # Beside other characters `**` is `*`, as behind URLs; Python before 3.13 refuses it there.
-    parts = (part if part == "**" else re.sub(r"\*+", "*", part) for part in path.relative_to(fixed).parts)
-    return fixed.glob("/".join(parts))
+        pattern = path.key.removeprefix(above.key)
+        found = ((match, match.key.removeprefix(above.key)) for match in above.glob(pattern))
+    else:
+        fixed = next(parent for parent in path.parents if not has_magic(str(parent)))
+        # Beside other characters `**` is `*`, as behind URLs; Python before 3.13 refuses it there.
+        parts = (
+            part if part == "**" else re.sub(r"\*+", "*", part) for part in path.relative_to(fixed).parts
+        )
+        pattern = "/".join(parts)
+        found = ((match, match.relative_to(fixed).as_posix()) for match in fixed.glob(pattern))
+    yield from (match for match, below in found if _is_hidden(pattern) or not _is_hidden(below))
+
+
+def _is_hidden(path: str) -> bool:
+    return any(part.startswith(".") for part in path.split("/"))
 
 
 def _is_recording(path: AnyPath) -> bool:

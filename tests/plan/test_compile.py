@@ -150,6 +150,25 @@ def test_a_recursive_glob_works(folder: Path) -> None:
     assert [config.sequence_name for config in compiled(folder, 'bag: {path: "**/*.bag"}')] == ["run_a"]
 
 
+def test_a_pattern_passes_over_what_is_hidden_unless_it_names_it(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "data" / "._run_a.bag").write_bytes(b"a copy's attributes")
+    (folder / ".trash").mkdir()
+    (folder / ".trash" / "run_d.bag").touch()
+    for pattern, names in (
+        ("data/*.bag", ["run_a"]),
+        ("**/*.bag", ["run_a"]),
+        ("data/.*.bag", ["run_a"]),
+        (".trash/*.bag", ["run_d"]),
+    ):
+        configs = compiled(folder, f'bag: {{path: "{pattern}"}}')
+        assert [config.sequence_name for config in configs] == names, pattern
+    monkeypatch.chdir(folder / "data")
+    (config,) = compiled(Path(), 'bag: {path: "*.bag"}')
+    assert config.sequence_name == "run_a"
+
+
 def test_two_stars_beside_other_characters_are_one(folder: Path) -> None:
     assert [config.sequence_name for config in compiled(folder, 'bag: {path: "data/**.bag"}')] == ["run_a"]
 
