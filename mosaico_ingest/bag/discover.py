@@ -131,8 +131,11 @@ def _listed(metadata: Metadata) -> Found:
 
 
 def _recordings(folder: AnyPath) -> list[AnyPath]:
-    """Return what is a recording, and what is only called so: a part that is empty or damaged is a loss, not nothing."""
-    files = (entry for entry in _entries(folder) if entry.is_file())
+    """Return what is a recording, and what is only called so: a part that is empty or damaged is a loss, not nothing.
+
+    Hidden files are no parts: copying programs leave them.
+    """
+    files = (entry for entry in _entries(folder) if entry.is_file() and not entry.name.startswith("."))
     return sorted((file for file in files if _is_named(file) or is_recording(file)), key=_natural)
 
 

@@ -217,3 +217,9 @@ def test_a_digit_that_is_no_decimal_is_a_letter_among_names(split: Path) -> None
     part.rename(split / "part_5\N{SUPERSCRIPT TWO}1.mcap")
     (split / "metadata.yaml").unlink()
     assert len(discover([split]).files) == 3
+
+
+def test_a_hidden_file_is_no_part(split: Path) -> None:
+    (split / "metadata.yaml").unlink()
+    (split / "._part_8.mcap").write_bytes(b"what a Mac leaves")
+    assert [file.name for file in discover([split]).files] == ["part_8.mcap", "part_9.mcap", "part_10.mcap"]
