@@ -25,7 +25,7 @@ _TYPE_WIDTH, _CELL_WIDTH = 28, 24
 
 
 def print_sequences(sequences: Sequence[SequenceInfo], *, as_json: bool) -> None:
-    """Print a line for each sequence."""
+    """Print a line for each sequence, and what ended the run of one that is not whole."""
     if as_json:
         print_json(json.dumps([_sequence_json(info) for info in sequences], indent=2))
         return
@@ -43,7 +43,11 @@ def print_sequences(sequences: Sequence[SequenceInfo], *, as_json: bool) -> None
             time_text(info.start_ns),
             _span(info),
         )
-    open_console().print(table)
+    console = open_console()
+    console.print(table)
+    for info in sequences:
+        for note in info.notes[-1:]:  # the others are in `store show`
+            console.print(Text(f"{info.name}: {note.message}", style="yellow"), soft_wrap=True)
 
 
 def print_sequence(info: SequenceInfo, *, as_json: bool) -> None:

@@ -10,9 +10,11 @@ import pytest
 from rich.console import Console
 
 from mosaico_ingest import api
-from mosaico_ingest.cli import plan_tables, tables
+from mosaico_ingest.cli import plan_tables, store_tables, tables
 from mosaico_ingest.diagnostics import Stage
+from mosaico_ingest.ontology.registry import ontology_type
 from mosaico_ingest.report.model import Rejection, RunReport
+from mosaico_ingest.store import Store, StoreSink
 
 JOB = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
 DRIVE = JOB.parent / "quickstart" / "drive.mcap"
@@ -86,3 +88,16 @@ def test_what_is_stored_of_a_part_is_held_against_that_part(
     (tmp_path / "job.yaml").write_text(f"bag: {{path: {DRIVE}}}\nsequence: {{name: all}}\n")
     tables.print_report(api.run(api.compile_job(tmp_path / "job.yaml")))
     assert " messages written, 497.3 kB stored in " in capsys.readouterr().out
+
+
+def test_the_list_says_which_sequence_is_not_whole(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sink = StoreSink(Store.open(tmp_path))
+    for name in ("whole", "torn"):
+        with sink.open(name, {}) as session:
+            session.topic("/t", ontology_type("String"), {})
+            if name == "torn":
+                session.note_error("the disk is full")
+    store_tables.print_sequences(Store.open(tmp_path).sequences(), as_json=False)
+    assert capsys.readouterr().out.splitlines()[-1:] == ["torn: the disk is full"]
