@@ -28,6 +28,7 @@ __all__ = [
     "DEFAULT_PORT",
     "DEFAULT_STORE",
     "DEFAULT_TOPIC",
+    "LEDGER_KEY",
     "AdapterReference",
     "Attempt",
     "ImageFormat",
@@ -45,6 +46,8 @@ DEFAULT_STORE = Path("mosaico")
 DEFAULT_PORT = 6726
 DEFAULT_TOPIC = "default"
 """The key of `topics_on_error` for every topic that no other key matches."""
+LEDGER_KEY = "mosaico_ingest"
+"""The key of a sequence's metadata, and of each of its sessions, that says what it was made from."""
 
 AdapterReference: TypeAlias = Any
 """An adapter: a class, an `AdapterSpec`, or how to find one: `module:Class`, `file.py:Class`, a YAML path, a name."""
@@ -222,6 +225,12 @@ class ROSInjectionConfig:
             check_metadata(self.metadata, where=self.where or "metadata")
         except SinkError as error:
             raise ManifestError(error.what, where=error.where, hint=error.hint) from error
+        if LEDGER_KEY in self.metadata:
+            raise ManifestError(
+                f"the metadata key {LEDGER_KEY!r} is where a run notes what the sequence was made from",
+                where=self.where or "metadata",
+                hint="use another key",
+            )
 
     @property
     def paths(self) -> tuple[AnyPath, ...]:

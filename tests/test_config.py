@@ -138,6 +138,7 @@ def test_the_key_is_not_shown() -> None:
         ({"jobs": 0}, "jobs is 0"),
         ({"sequence_name": "a b"}, "sequence name 'a b'"),
         ({"metadata": {"a.b": 1}}, "metadata key 'a.b'"),
+        ({"metadata": {"mosaico_ingest": 1}}, "the metadata key 'mosaico_ingest'"),
         ({"metadata": [1]}, "metadata is \\[1\\]"),
         ({"custom_msgs": [("pkg", "dir")]}, "custom_msgs has \\('pkg', 'dir'\\)"),
         ({"topic_metadata": {"/a": {"x/y": 1}}}, "metadata key 'x/y'"),

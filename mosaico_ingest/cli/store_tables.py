@@ -13,7 +13,7 @@ from rich.text import Text
 
 from mosaico_ingest.cli.console import plain_table
 from mosaico_ingest.cli.tables import open_console, print_json
-from mosaico_ingest.plan.model import LEDGER_KEY
+from mosaico_ingest.config import LEDGER_KEY
 from mosaico_ingest.report.units import bytes_text, count_text, seconds_text, time_text
 from mosaico_ingest.store import SequenceInfo, TopicInfo
 

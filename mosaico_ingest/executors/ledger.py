@@ -11,12 +11,12 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from mosaico_ingest.config import ServerTarget, StoreTarget
+from mosaico_ingest.config import LEDGER_KEY, ServerTarget, StoreTarget
 from mosaico_ingest.diagnostics import encodable
 from mosaico_ingest.errors import SequenceExists
 from mosaico_ingest.executors.content import content_digest, whole_digest
 from mosaico_ingest.plan.describe import decisions
-from mosaico_ingest.plan.model import LEDGER_KEY, Plan
+from mosaico_ingest.plan.model import Plan
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.quarantine.quarantine import kept_name
 from mosaico_ingest.remote.path import AnyPath, RemotePath
@@ -24,7 +24,6 @@ from mosaico_ingest.store.store import Store
 from mosaico_ingest.version import __version__
 
 __all__ = [
-    "LEDGER_KEY",
     "Held",
     "Ledger",
     "Source",

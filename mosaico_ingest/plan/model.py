@@ -19,10 +19,8 @@ from mosaico_ingest.policies import (
 )
 from mosaico_ingest.remote.path import AnyPath
 
-__all__ = ["DEFAULT_MEMORY_BYTES", "LEDGER_KEY", "LeftOut", "Plan", "TopicPlan"]
+__all__ = ["DEFAULT_MEMORY_BYTES", "LeftOut", "Plan", "TopicPlan"]
 
-LEDGER_KEY = "mosaico_ingest"
-"""The key of a sequence's metadata, and of each of its sessions, that says what it was made from."""
 DEFAULT_MEMORY_BYTES = 256 * 1024 * 1024
 
 

@@ -9,11 +9,11 @@ from difflib import unified_diff
 from typing import Any, cast
 
 from mosaico_ingest.adapters.metadata import ROS_METADATA_KEY
-from mosaico_ingest.config import StoreTarget
+from mosaico_ingest.config import LEDGER_KEY, StoreTarget
 from mosaico_ingest.diagnostics import Finding, Severity
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.frozen import frozen
-from mosaico_ingest.plan.model import LEDGER_KEY, Plan, TopicPlan
+from mosaico_ingest.plan.model import Plan, TopicPlan
 from mosaico_ingest.policies import OnSchemaChange
 from mosaico_ingest.store.store import Store
 from mosaico_ingest.wire import check_topic_name

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from mosaico_ingest import api
+from mosaico_ingest.config import LEDGER_KEY
 from mosaico_ingest.executors.content import content_digest
 from mosaico_ingest.executors.status import Standing
-from mosaico_ingest.plan.model import LEDGER_KEY
 from mosaico_ingest.report.events import Event, RunStatus, TopicProgress
 from mosaico_ingest.store import Store
 

@@ -1,6 +1,7 @@
-"""`metadata-key`: a metadata key the platform refuses.
+"""`metadata-key`: a metadata key the platform refuses, or one that is taken.
 
 Keys are letters, digits, blanks, `_` and single `-`, at every depth: a dot or slash would clash with the paths of queries.
+Under `mosaico_ingest` a run notes what the sequence was made from.
 
 Bad:
     bag: {path: data/run.mcap}
@@ -18,6 +19,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
+from mosaico_ingest.config import LEDGER_KEY
 from mosaico_ingest.diagnostics import Severity
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.places import keys_below, metadata_places
@@ -34,6 +36,10 @@ def check(job: Job) -> Iterator[Problem]:
                 yield Problem(
                     f"the metadata key {key!r} is refused by the platform", job.source.key_span(path), remedy
                 )
+    taken = ("sequence", "metadata", LEDGER_KEY)
+    if LEDGER_KEY in job.manifest.sequence.metadata:
+        what = f"the metadata key {LEDGER_KEY!r} is where a run notes what the sequence was made from"
+        yield Problem(what, job.source.key_span(taken), "use another key")
 
 
 _KEY = re.compile(r"[A-Za-z0-9 _-]+")
