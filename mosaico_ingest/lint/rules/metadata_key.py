@@ -8,6 +8,11 @@ Bad:
     sequence:
       metadata: {driver: {v2.1: true}}
 
+Bad:
+    bag: {path: data/run.mcap}
+    sequence:
+      metadata: {mosaico_ingest: nightly}
+
 Good:
     bag: {path: data/run.mcap}
     sequence:
