@@ -359,9 +359,8 @@ class ROSInjectionConfig:
 
     def _choice(self, kind: type[_Choice], value: object, name: str) -> _Choice:
         try:
-            return kind(
-                value.value if isinstance(value, Enum) else value
-            )  # rosbags and the SDK have their own
+            # rosbags and the SDK have enumerations of their own
+            return kind(value.value if isinstance(value, Enum) else value)
         except ValueError as err:
             allowed = ", ".join(str(choice.value) for choice in kind)
             raise self._error(f"{name} is {value!r}", f"allowed: {allowed}") from err

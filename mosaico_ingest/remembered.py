@@ -6,6 +6,7 @@ Arrow types and schemas hash by spelling themselves out.
 from __future__ import annotations
 
 from collections.abc import Callable
+from threading import Lock
 from typing import TypeVar
 
 __all__ = ["remembered"]
@@ -18,16 +19,18 @@ _MOST = 256
 
 def remembered(make: Callable[[_Given], _Made]) -> Callable[[_Given], _Made]:
     """Make a function remember its results by the identity of its argument (a decorator)."""
-    known: dict[
-        int, tuple[_Given, _Made]
-    ] = {}  # holding the argument keeps its identity from being used again
+    # What is remembered holds its argument, whose identity is not used again then.
+    known: dict[int, tuple[_Given, _Made]] = {}
+    lock = Lock()
 
     def recall(given: _Given) -> _Made:
         found = known.get(id(given))
         if found is None:
-            while len(known) >= _MOST:
-                known.pop(next(iter(known)), None)
-            found = known[id(given)] = (given, make(given))
+            found = (given, make(given))
+            with lock:
+                while len(known) >= _MOST:
+                    del known[next(iter(known))]
+                known[id(given)] = found
         return found[1]
 
     return recall

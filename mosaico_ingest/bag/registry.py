@@ -101,9 +101,8 @@ def store_of(store: Stores | str | None) -> Stores | None:
     if store is None:
         return None
     try:
-        return Stores(
-            store.value if isinstance(store, Enum) else store
-        )  # rosbags has an enumeration of its own
+        # rosbags has an enumeration of its own
+        return Stores(store.value if isinstance(store, Enum) else store)
     except ValueError:
         known = [known.value for known in Stores]
         near = get_close_matches(str(store), known, n=1)

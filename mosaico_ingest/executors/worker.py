@@ -134,7 +134,9 @@ def execute(
 
 
 def _opened(plan: Plan, recording: Recording | None) -> AbstractContextManager[Recording]:
-    return nullcontext(recording) if recording else open_recording(plan.files, resolve=plan.resolver)
+    if recording is not None:
+        return nullcontext(recording)
+    return open_recording(plan.files, resolve=plan.resolver)
 
 
 def run_config(config: ROSInjectionConfig, observe: Observer) -> Report:

@@ -201,9 +201,8 @@ class Catalog:
     ) -> Generator[sqlite3.Connection, None, None]:
         with explained(self.path), closing(self._connect(mode)) as db:
             if not lasting:
-                db.execute(
-                    "PRAGMA synchronous = NORMAL"
-                )  # a WAL stays whole, its last transactions may be missing
+                # A WAL stays whole then, and its last transactions may be missing.
+                db.execute("PRAGMA synchronous = NORMAL")
             db.execute(begin)
             try:
                 yield db
