@@ -22,6 +22,8 @@ _SAMPLE_BYTES = 1 << 18
 _SAMPLES = 16
 _PIECE_BYTES = _SAMPLE_BYTES // _SAMPLES
 _TOO_LITTLE = 1 << 12
+_TOO_LITTLE_A_COLUMN = 1 << 8
+"""To begin compressing so little takes longer than to write it."""
 _WORTH_IT = 0.9
 
 
@@ -68,9 +70,10 @@ class Columns:
         """Return what `pq.ParquetWriter` is told: by type, and for blobs by how a sample of the first rows shrinks.
 
         Splitting the bytes of floats makes them smaller and faster to write than plain or dictionary pages;
-        JPEGs and their like only cost time in a second compressor, and so do rows that fit into one block of a disk.
+        JPEGs and their like only cost time in a second compressor, and so do a few rows, which all but fit into
+        a block of a disk.
         """
-        if rows.nbytes < _TOO_LITTLE:
+        if rows.nbytes < max(_TOO_LITTLE, _TOO_LITTLE_A_COLUMN * len(self.leaves)):
             return self._few
         packed = (leaf for leaf in self.leaves if _is_blob(leaf) and not _shrinks(leaf, rows))
         return _options(self.leaves, {leaf.parquet_path for leaf in packed})

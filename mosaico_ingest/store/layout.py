@@ -66,11 +66,11 @@ class Layout:
     def topic(self, sequence: str, topic: str) -> Path:
         """Return the folder of a topic's segments."""
         parts = (sequence, *topic.strip("/").split("/"))
-        return self.segments.joinpath(*(encoded(part) for part in parts))
+        return Path(self.root, "segments", *map(encoded, parts))
 
     def staged(self, session: str, sequence: str, topic: str, number: int) -> Path:  # noqa: ARG002 - it is moved later
         """Return where a session writes a segment before it is published."""
-        return self.session(session) / f"{session}-{number:04}.parquet"
+        return Path(self.root, "staging", session, f"{session}-{number:04}.parquet")
 
     def relative(self, path: AnyPath) -> str:
         """Return how the catalog spells a segment's path."""
