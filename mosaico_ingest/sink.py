@@ -27,6 +27,7 @@ __all__ = [
     "TopicWriter",
     "check_batch",
     "check_same_type",
+    "sequence_exists",
     "topic_schema",
 ]
 
@@ -102,6 +103,16 @@ class Sink(Protocol):
 def topic_schema(ontology: OntologyType) -> pa.Schema:
     """Return the columns of a topic: the envelope, then those of its type."""
     return pa.schema([ENVELOPE, *ontology.struct])
+
+
+def sequence_exists(sequence: str) -> SequenceExists:
+    """Return the error for a name that is taken."""
+    return SequenceExists(
+        "the sequence exists",
+        where=sequence,
+        hint="choose another name, or set sequence.if_exists: skip (where the content is the same), append or replace;"
+        " `ingest bag` has --if-exists",
+    )
 
 
 def check_batch(batch: pa.RecordBatch, schema: pa.Schema, *, where: str) -> None:
@@ -210,9 +221,7 @@ class MemorySink:
 
     def _refuse_taken(self, sequence: str, if_exists: IfExists) -> None:
         if sequence in self.sequences and if_exists in {IfExists.FAIL, IfExists.SKIP}:
-            raise SequenceExists(
-                "the sequence exists", where=sequence, hint="choose another name, or set sequence.if_exists"
-            )
+            raise sequence_exists(sequence)
 
 
 def _append(old: MemorySequence, new: MemorySequence) -> None:

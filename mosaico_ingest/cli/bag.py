@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from mosaico_ingest.policies import IfExists
+
 __all__ = ["bag"]
 
 
@@ -44,6 +46,10 @@ def bag(
         str | None,
         typer.Option("--store", help="The store to write to.", metavar="DIR|URL", show_default="mosaico"),
     ] = None,
+    if_exists: Annotated[
+        IfExists,
+        typer.Option("--if-exists", help="Where the sequence is there; skip needs the same content."),
+    ] = IfExists.FAIL,
     report: Annotated[
         Path | None, typer.Option("--report", metavar="FILE", help="Write the report as JSON.")
     ] = None,
@@ -75,6 +81,7 @@ def bag(
         api_key=api_key,
         tls_cert_path=tls_cert,
         store=store,
+        if_exists=if_exists,
     )
     forgo_pandas([config])
     run_configs([config], report=report, quiet=quiet, log=log)

@@ -210,7 +210,7 @@ def _take_back(plan: Plan, run: str) -> IfExists:
     return plan.if_exists
 
 
-_HINT = "set sequence.if_exists to replace or append, or choose another name"
+_HINT = "set sequence.if_exists (or --if-exists of `ingest bag`) to replace or append, or choose another name"
 
 
 def _held_by_server(target: ServerTarget, sequence: str) -> Held | None:

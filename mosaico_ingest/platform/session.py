@@ -8,14 +8,14 @@ from typing import Any
 
 from mosaico_ingest import wire
 from mosaico_ingest.config import ServerTarget
-from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
+from mosaico_ingest.errors import SinkError, SinkUnavailable
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.platform.client import PlatformClient, Uploaded, connect
 from mosaico_ingest.platform.deadlines import in_thread
 from mosaico_ingest.platform.faults import Refused, add_hint
 from mosaico_ingest.platform.upload import Memory, Upload
 from mosaico_ingest.policies import IfExists
-from mosaico_ingest.sink import StoredTopic
+from mosaico_ingest.sink import StoredTopic, sequence_exists
 from mosaico_ingest.wire import actions, bodies
 from mosaico_ingest.wire.actions import Action
 from mosaico_ingest.wire.bodies import topic_locator
@@ -53,7 +53,7 @@ class PlatformSession:
         self._held = _topics_of(old) if old and if_exists is IfExists.APPEND else frozenset[str]()
         self._created = old is None or if_exists is not IfExists.APPEND
         if old is not None and if_exists in {IfExists.FAIL, IfExists.SKIP}:
-            raise _taken(sequence)
+            raise sequence_exists(sequence)
         self._replaced = old is not None and if_exists is IfExists.REPLACE
         if self._replaced:
             client.act(actions.SEQUENCE_DELETE, bodies.Located(locator=sequence))
@@ -149,7 +149,7 @@ class PlatformSession:
             )
         except SinkError as error:
             if isinstance(error, Refused) and error.condition is Condition.EXISTS:
-                raise _taken(self._sequence) from error
+                raise sequence_exists(self._sequence) from error
             if self._replaced:
                 add_hint(error, _OLD_IS_GONE)
             raise
@@ -206,9 +206,3 @@ class PlatformSession:
 
 def _topics_of(sequence: bodies.SequenceInfo) -> frozenset[str]:
     return frozenset(locator for session in sequence.sessions for locator in session.topics)
-
-
-def _taken(sequence: str) -> SequenceExists:
-    return SequenceExists(
-        "the sequence exists", where=sequence, hint="choose another name, or set sequence.if_exists"
-    )

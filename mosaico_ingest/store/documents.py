@@ -22,8 +22,9 @@ from pydantic import ValidationError
 from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.remote.path import AnyPath, RemotePath
+from mosaico_ingest.sink import sequence_exists
 from mosaico_ingest.store.bucket import MARKER, Bucket
-from mosaico_ingest.store.entries import Claim, NewNote, NewSession, changed, taken
+from mosaico_ingest.store.entries import Claim, NewNote, NewSession, changed
 from mosaico_ingest.store.faults import NotInStore, explained
 from mosaico_ingest.store.layout import encoded, new_session_id
 from mosaico_ingest.store.model import SequenceInfo, TopicInfo
@@ -72,7 +73,7 @@ class Documents:
         """See `Records.claim`."""
         found = self._load(sequence)
         if found is not None and if_exists in {IfExists.FAIL, IfExists.SKIP}:
-            raise taken(sequence)
+            raise sequence_exists(sequence)
         if if_exists is not IfExists.APPEND:
             self._reserve(session, sequence, is_live)
         if found is None:
@@ -102,7 +103,7 @@ class Documents:
         """See `Records.create`."""
         with self._holding(sequence):
             if self._load(sequence) is not None:
-                raise taken(sequence)
+                raise sequence_exists(sequence)
             described = json.loads(metadata)
             self._put(SequenceDocument(name=sequence, metadata=described, created_ns=time.time_ns()))
 

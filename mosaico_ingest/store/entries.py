@@ -12,7 +12,7 @@ from mosaico_ingest.errors import SequenceExists, SinkError
 from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 from mosaico_ingest.policies import IfExists
-from mosaico_ingest.sink import check_same_type
+from mosaico_ingest.sink import check_same_type, sequence_exists
 from mosaico_ingest.store.faults import NotInStore
 from mosaico_ingest.store.segment import Segment
 
@@ -28,7 +28,6 @@ __all__ = [
     "note",
     "ontology_of",
     "release",
-    "taken",
 ]
 
 
@@ -87,7 +86,7 @@ def claim(
     """Note that a session will create or replace a sequence, or refuse because it must not or another does."""
     row = db.execute("SELECT id FROM sequences WHERE name = ?", (sequence,)).fetchone()
     if row is not None and if_exists in {IfExists.FAIL, IfExists.SKIP}:
-        raise taken(sequence)
+        raise sequence_exists(sequence)
     if if_exists is not IfExists.APPEND:
         _reserve(db, session, sequence, is_live)
     if row is None:
@@ -99,7 +98,7 @@ def claim(
 def create(db: sqlite3.Connection, sequence: str, metadata: str) -> None:
     """Enter a sequence without a session."""
     if db.execute("SELECT 1 FROM sequences WHERE name = ?", (sequence,)).fetchone() is not None:
-        raise taken(sequence)
+        raise sequence_exists(sequence)
     db.execute(
         "INSERT INTO sequences (name, metadata, created_ns) VALUES (?, ?, ?)",
         (sequence, metadata, time.time_ns()),
@@ -157,7 +156,7 @@ def _check_unchanged(db: sqlite3.Connection, claimed: Claim) -> list[str]:
     now = None if row is None else row["id"]
     replaces = claimed.if_exists is IfExists.REPLACE
     if now is not None and claimed.if_exists in {IfExists.FAIL, IfExists.SKIP}:
-        raise taken(claimed.sequence)
+        raise sequence_exists(claimed.sequence)
     if claimed.sequence_id is not None and now != claimed.sequence_id:
         raise changed(claimed.sequence)
     if replaces and now is not None and _sessions(db, now) != claimed.sessions:
@@ -240,15 +239,6 @@ def ontology_of(row: sqlite3.Row) -> OntologyType:
     columns = list(pa.ipc.read_schema(pa.py_buffer(row["arrow_schema"])))[1:]
     return OntologyType(
         row["ontology_tag"], pa.struct(columns), SerializationFormat(row["serialization_format"])
-    )
-
-
-def taken(sequence: str) -> SequenceExists:
-    """Return the error for a name that is in use."""
-    return SequenceExists(
-        "the sequence exists",
-        where=sequence,
-        hint="choose another name, or set sequence.if_exists: skip (where the content is the same), append or replace",
     )
 
 

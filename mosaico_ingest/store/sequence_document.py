@@ -13,8 +13,8 @@ from pydantic import BaseModel, ConfigDict
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 from mosaico_ingest.policies import IfExists
 from mosaico_ingest.remote.path import RemotePath
-from mosaico_ingest.sink import check_same_type
-from mosaico_ingest.store.entries import Claim, NewNote, NewSession, NewTopic, changed, taken
+from mosaico_ingest.sink import check_same_type, sequence_exists
+from mosaico_ingest.store.entries import Claim, NewNote, NewSession, NewTopic, changed
 from mosaico_ingest.store.faults import NotInStore
 from mosaico_ingest.store.model import Note, SegmentInfo, SequenceInfo, SessionInfo, TopicInfo
 from mosaico_ingest.store.segment import Segment
@@ -196,7 +196,7 @@ def check_unchanged(claimed: Claim, now: SequenceDocument | None) -> None:
         SinkError: Somebody else changed it.
     """
     if now is not None and claimed.if_exists in {IfExists.FAIL, IfExists.SKIP}:
-        raise taken(claimed.sequence)
+        raise sequence_exists(claimed.sequence)
     if claimed.sequence_id is not None and (now is None or now.created_ns != claimed.sequence_id):
         raise changed(claimed.sequence)
     if claimed.if_exists is IfExists.REPLACE and now is not None and now.session_ids != claimed.sessions:

@@ -82,6 +82,21 @@ def test_a_second_run_says_that_the_name_is_taken(project: Path) -> None:
     assert "/imu" not in done.stdout, "no table of a run that read nothing"
 
 
+def test_one_recording_may_be_skipped_or_replaced_without_a_manifest(project: Path) -> None:
+    command = ("bag", "configs/quickstart/drive.mcap", "--name", "drive", "--store", "again")
+    assert ingest(*command, cwd=project).returncode == 0
+    taken = ingest(*command, cwd=project)
+    assert taken.returncode == 1
+    assert "`ingest bag` has --if-exists" in taken.stderr.replace("\n", " ")
+    for choice, says in (("skip", "skipped"), ("replace", "2,130 of 2,130 messages written")):
+        done = ingest(*command, "--if-exists", choice, cwd=project)
+        assert done.returncode == 0, done.stderr
+        assert says in done.stdout + done.stderr
+    refused = ingest(*command, "--if-exists", "maybe", cwd=project)
+    assert refused.returncode == 2
+    assert "'append'" in refused.stderr
+
+
 def test_the_report_of_a_run_that_failed_says_why(project: Path) -> None:
     assert ingest("run", "configs/quickstart.yaml", "--report", "failed.json", cwd=project).returncode == 1
     shown = ingest("report", "failed.json", cwd=project)
