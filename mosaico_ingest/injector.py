@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 
 from mosaico_ingest.bag.recording import Recording
+from mosaico_ingest.deferral import DeferredInterrupt
 from mosaico_ingest.diagnostics import Finding, Severity, Stage
 from mosaico_ingest.errors import Interrupted, NothingMatched, VerificationError
 from mosaico_ingest.plan.model import Plan
@@ -43,7 +44,10 @@ def inject(
     quarantine = _open_quarantine(plan)
     streams: tuple[Stream, ...] = ()
     try:
-        with sink.open(plan.sequence, plan.metadata, if_exists=plan.if_exists) as session:
+        with (
+            DeferredInterrupt() as interrupt,
+            sink.open(plan.sequence, plan.metadata, if_exists=plan.if_exists) as session,
+        ):
             streams = _open_streams(plan, recording, session, observe, quarantine=quarantine, watch=watch)
             try:
                 _pump(plan, recording, streams, observe, watch)
@@ -57,6 +61,8 @@ def inject(
                 session.note_error(str(failure))
             if quarantine is not None:
                 quarantine.close()
+            if not isinstance(failure, Interrupted):
+                interrupt.defer()  # all is read: a commit that is cut off would lose it
     except BaseException as error:
         reported = _as_interrupt(error)
         _account_for_discard(streams, quarantine, reported, observe)
@@ -68,10 +74,17 @@ def inject(
     wrong = missing + _close(session.stored(), streams, observe, failure=failure)
     if failure is not None:
         raise failure
+    _check_stored(wrong, interrupted=interrupt.asked)
+
+
+def _check_stored(wrong: list[str], *, interrupted: bool) -> None:
+    """Raise where the destination does not hold what was written, or an interrupt waited for it."""
     if wrong:
         raise VerificationError(
             "; ".join(wrong), hint="what is stored is incomplete; replace it, and report this as a mistake"
         )
+    if interrupted:
+        raise Interrupted("stopped; all of this recording is stored")
 
 
 def _report_quarantine(quarantine: Quarantine, if_exists: IfExists, observe: Observer) -> None:

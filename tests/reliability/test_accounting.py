@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
@@ -28,6 +29,7 @@ from mosaico_ingest.policies import LoaderErrorPolicy
 from mosaico_ingest.report.events import Event, Noted, RunStatus, Unreadable
 from mosaico_ingest.sink import MemorySink, StoredTopic, TopicWriter
 from mosaico_ingest.store import Store
+from mosaico_ingest.store.session import StoreSession
 from mosaico_ingest.store.verify import verify
 from mosaico_ingest.write_buffer import WriteBuffer
 
@@ -244,6 +246,28 @@ def test_a_catalog_from_before_there_were_checksums_is_read_and_added_to(
     run_job(write_job(sequence={"name": "drive", "if_exists": "append"}))
     segments = Store.open(tmp_path / "store").topic("drive", "/speed").segments
     assert [segment.checksum is None for segment in segments] == [True, False]
+
+
+@pytest.mark.parametrize("signals", [1, 2])
+def test_a_commit_is_finished_before_an_interrupt_is_heeded_unless_it_is_repeated(
+    signals: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commit, before = StoreSession.commit, signal.getsignal(signal.SIGINT)
+
+    def interrupted(session: StoreSession) -> None:
+        for _ in range(signals):
+            signal.raise_signal(signal.SIGINT)
+        commit(session)
+
+    monkeypatch.setattr(StoreSession, "commit", interrupted)
+    configs = [ROSInjectionConfig(DRIVE, name, store=tmp_path / "store") for name in ("drive", "next")]
+    (report,) = api.run(configs).recordings
+    assert (report.status, report.exit_code) == (RunStatus.INTERRUPTED, 130)
+    kept = report.totals.written if signals == 1 else 0
+    assert sum(sequence.rows for sequence in Store.open(tmp_path / "store").sequences()) == kept
+    assert report.totals.read == report.totals.written + report.totals.rejected
+    assert (report.totals.rejected == 0) is (signals == 1)
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 @pytest.mark.parametrize("handed_over", [0, 1, 7])
