@@ -52,13 +52,25 @@ class WriteBuffer:
             if needs_thread:
                 self._wake()
         if needs_thread:
-            self._thread.join(_INTERRUPTED_S if kind is KeyboardInterrupt else None)
+            self._join(interrupted=kind is KeyboardInterrupt)
         else:
             self._work()
-        with self._changed:
-            self._queue.clear()
         if kind is None and self._error is not None:
             raise self._error
+
+    def _join(self, *, interrupted: bool) -> None:
+        """Wait until the thread has written everything, or after an interrupt as long as is reasonable."""
+        try:
+            if not interrupted:
+                self._thread.join()
+        except KeyboardInterrupt:
+            interrupted = True
+            raise
+        finally:
+            if interrupted:
+                self._thread.join(_INTERRUPTED_S)
+            with self._changed:
+                self._queue.clear()
 
     def put(self, writer: TopicWriter, batch: pa.RecordBatch) -> None:
         """Queue a batch, waiting for room; a batch larger than the whole buffer is let in alone."""

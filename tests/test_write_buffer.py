@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import threading
 import time
 
@@ -90,6 +91,20 @@ def test_an_interrupt_waits_for_a_stuck_writer_only_so_long(monkeypatch: pytest.
     assert time.monotonic() - begin < 0.45
     buffer._thread.join()
     assert writer.seen == [0]
+
+
+def test_an_interrupt_at_the_end_leaves_nothing_that_was_taken_unwritten() -> None:
+    writer = Writer(delay_s=0.2)
+    main = threading.main_thread().ident
+    assert main is not None
+    interrupt = threading.Timer(0.1, signal.pthread_kill, (main, signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt), WriteBuffer(max_bytes=64) as buffer:
+        for value in range(3):
+            buffer.put(writer, batch(value))
+        interrupt.start()
+    interrupt.join()
+    assert writer.seen == [0, 1, 2]
+    assert not threads()
 
 
 def test_small_batches_are_written_together() -> None:
