@@ -38,7 +38,8 @@ class WriteBuffer:
         self._error: BaseException | None = None
         self.busy_s = 0.0
         """How long the thread has been writing, in seconds."""
-        self._thread = threading.Thread(target=self._work, name="mosaico-ingest-write", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="mosaico-ingest-write", daemon=True)
+        self._finished = threading.Event()
 
     def __enter__(self) -> Self:
         return self
@@ -62,13 +63,14 @@ class WriteBuffer:
         """Wait until the thread has written everything, or after an interrupt as long as is reasonable."""
         try:
             if not interrupted:
-                self._thread.join()
+                self._finished.wait()
         except KeyboardInterrupt:
             interrupted = True
             raise
         finally:
-            if interrupted:
-                self._thread.join(_INTERRUPTED_S)
+            # an interrupted `join` takes the thread for ended before Python 3.13
+            if self._finished.wait(_INTERRUPTED_S if interrupted else None):
+                self._thread.join()
             with self._changed:
                 self._queue.clear()
 
@@ -90,6 +92,12 @@ class WriteBuffer:
         if self._thread.ident is None:
             self._thread.start()
         self._changed.notify_all()
+
+    def _run(self) -> None:
+        try:
+            self._work()
+        finally:
+            self._finished.set()
 
     def _work(self) -> None:
         while True:
