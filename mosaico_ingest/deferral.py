@@ -17,7 +17,8 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 class DeferredInterrupt:
     """From `defer` until it is left, the first signal to stop is only noted; a second one goes through.
 
-    Outside the main thread, where no signal arrives, it does nothing.
+    Signals that are ignored, or end the process at once, stay as they are. Outside the main thread, where none arrives,
+    it does nothing.
     """
 
     def __init__(self) -> None:
@@ -37,7 +38,8 @@ class DeferredInterrupt:
         """Begin to put signals off."""
         if threading.current_thread() is threading.main_thread():
             for number in _SIGNALS:
-                self._before[number] = signal.signal(number, self._note)
+                if callable(signal.getsignal(number)):
+                    self._before[number] = signal.signal(number, self._note)
 
     def _note(self, _signal: int, _frame: FrameType | None) -> None:
         self.asked = True

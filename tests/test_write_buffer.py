@@ -93,6 +93,7 @@ def test_an_interrupt_waits_for_a_stuck_writer_only_so_long(monkeypatch: pytest.
     assert writer.seen == [0]
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupt_at_the_end_leaves_nothing_that_was_taken_unwritten() -> None:
     writer = Writer(delay_s=0.2)
     main = threading.main_thread().ident

@@ -248,11 +248,8 @@ def test_a_catalog_from_before_there_were_checksums_is_read_and_added_to(
     assert [segment.checksum is None for segment in segments] == [True, False]
 
 
-@pytest.mark.parametrize("signals", [1, 2])
-def test_a_commit_is_finished_before_an_interrupt_is_heeded_unless_it_is_repeated(
-    signals: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    commit, before = StoreSession.commit, signal.getsignal(signal.SIGINT)
+def interrupt_commits(monkeypatch: pytest.MonkeyPatch, *, signals: int) -> None:
+    commit = StoreSession.commit
 
     def interrupted(session: StoreSession) -> None:
         for _ in range(signals):
@@ -260,6 +257,14 @@ def test_a_commit_is_finished_before_an_interrupt_is_heeded_unless_it_is_repeate
         commit(session)
 
     monkeypatch.setattr(StoreSession, "commit", interrupted)
+
+
+@pytest.mark.usefixtures("interruptible")
+@pytest.mark.parametrize("signals", [1, 2])
+def test_a_commit_is_finished_before_an_interrupt_is_heeded_unless_it_is_repeated(
+    signals: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupt_commits(monkeypatch, signals=signals)
     configs = [ROSInjectionConfig(DRIVE, name, store=tmp_path / "store") for name in ("drive", "next")]
     (report,) = api.run(configs).recordings
     assert (report.status, report.exit_code) == (RunStatus.INTERRUPTED, 130)
@@ -267,7 +272,17 @@ def test_a_commit_is_finished_before_an_interrupt_is_heeded_unless_it_is_repeate
     assert sum(sequence.rows for sequence in Store.open(tmp_path / "store").sequences()) == kept
     assert report.totals.read == report.totals.written + report.totals.rejected
     assert (report.totals.rejected == 0) is (signals == 1)
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_an_interrupt_that_is_ignored_is_not_heeded_after_a_commit_either(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupt_commits(monkeypatch, signals=1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    (report,) = api.run([ROSInjectionConfig(DRIVE, "drive", store=tmp_path / "store")]).recordings
+    assert report.status is RunStatus.COMPLETED
 
 
 @pytest.mark.parametrize("handed_over", [0, 1, 7])
