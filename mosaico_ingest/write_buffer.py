@@ -56,7 +56,7 @@ class WriteBuffer:
             self._join(interrupted=kind is KeyboardInterrupt)
         else:
             self._work()
-        if kind is None and self._error is not None:
+        if self._error is not None and (kind is None or isinstance(self._error, KeyboardInterrupt)):
             raise self._error
 
     def _join(self, *, interrupted: bool) -> None:

@@ -138,3 +138,13 @@ def test_little_is_written_without_a_thread() -> None:
 def test_an_error_without_a_thread_reaches_whoever_leaves() -> None:
     with pytest.raises(SinkError, match="disk full"), WriteBuffer(max_bytes=1 << 30) as buffer:
         buffer.put(Writer(fail_on=1), batch(1))
+
+
+def test_an_interrupt_while_the_rest_is_written_is_not_hidden_by_an_earlier_error() -> None:
+    class Interrupted:
+        def write(self, batch: pa.RecordBatch) -> None:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), WriteBuffer(max_bytes=1 << 30) as buffer:
+        buffer.put(Interrupted(), batch(1))
+        raise SinkError("earlier")
