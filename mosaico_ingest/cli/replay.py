@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from mosaico_ingest.cli.log_format import LogOption
+
 __all__ = ["replay"]
 
 _DONE = {0, 4}
@@ -28,15 +30,7 @@ def replay(
         Path | None, typer.Option("--report", help="Write the report of this call as JSON.", metavar="FILE")
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
-    log: Annotated[
-        str | None,
-        typer.Option(
-            "--log",
-            "-l",
-            help="DEBUG, INFO, WARNING, ERROR or CRITICAL; overrides run.log_level.",
-            metavar="LEVEL",
-        ),
-    ] = None,
+    log: LogOption = None,
 ) -> None:
     """Add quarantined messages to the sequences they belong to; what fails again stays in the quarantine."""
     from mosaico_ingest import api

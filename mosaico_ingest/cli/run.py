@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mosaico_ingest.cli.log_format import LogFormat
+from mosaico_ingest.cli.log_format import LogFormat, LogOption
 
 if TYPE_CHECKING:
     from mosaico_ingest.executors.executor import Executor
@@ -66,15 +66,7 @@ def run(
         bool, typer.Option("--otel", help="Send metrics and traces where the OTEL_... variables say.")
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
-    log: Annotated[
-        str | None,
-        typer.Option(
-            "--log",
-            "-l",
-            help="DEBUG, INFO, WARNING, ERROR or CRITICAL; overrides run.log_level.",
-            metavar="LEVEL",
-        ),
-    ] = None,
+    log: LogOption = None,
     log_format: Annotated[
         LogFormat, typer.Option("--log-format", help="What is said while it runs: for people, or JSON lines.")
     ] = LogFormat.TEXT,
