@@ -63,8 +63,14 @@ def open_for(config: ROSInjectionConfig) -> Generator[tuple[Recording, TypeResol
 
 def make_plan(config: ROSInjectionConfig) -> Plan:
     """Open the recording, decide everything, write nothing."""
+    with _planned(config) as (plan, _):
+        return plan
+
+
+@contextmanager
+def _planned(config: ROSInjectionConfig) -> Generator[tuple[Plan, Recording]]:
     with open_for(config) as (recording, resolver):
-        return resolve(config, recording, bridge=ROSBridge.for_config(config), resolver=resolver)
+        yield resolve(config, recording, bridge=ROSBridge.for_config(config), resolver=resolver), recording
 
 
 def sink_for(target: StoreTarget | ServerTarget, *, buffer_bytes: int) -> Sink:
@@ -143,8 +149,7 @@ def run_config(config: ROSInjectionConfig, observe: Observer) -> Report:
     """Plan and run one configuration; every outcome is a report, a mistake of ours and an interrupt too."""
     watch = Stopwatch()
     try:
-        with open_for(config) as (recording, resolver):
-            plan = resolve(config, recording, bridge=ROSBridge.for_config(config), resolver=resolver)
+        with _planned(config) as (plan, recording):
             report, _ = execute(plan, observe, recording=recording, watch=watch)
     except IngestError as error:
         return failed_report(config, error, observe)
