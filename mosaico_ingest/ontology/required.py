@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.types as pt
 
-__all__ = ["AbsentRows", "RequiredFields", "fill_required"]
+__all__ = ["AbsentRows", "RequiredFields"]
 
 _arrays: Any = pa
 """The stubs do not know `type` beside `mask`."""
@@ -55,11 +55,6 @@ class AbsentRows:
         if rows.nbytes <= _KEPT_BYTES:
             self._kept = rows
         return rows
-
-
-def fill_required(rows: pa.StructArray) -> pa.StructArray:
-    """Do what `RequiredFields.fill` does, once."""
-    return RequiredFields(rows.type).fill(rows)
 
 
 def _filling(kind: Any) -> _Fill | None:  # noqa: ANN401 - as above

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mosaico_ingest.ontology.required import fill_required
+from mosaico_ingest.ontology.required import RequiredFields
 
 STAMP = pa.struct(
     [pa.field("sec", pa.int32(), nullable=False), pa.field("frame", pa.string(), nullable=False)]
@@ -24,6 +24,11 @@ ROW = pa.struct(
         pa.field("flags", pa.struct([pa.field("list", pa.list_(pa.int8()), nullable=False)])),
     ]
 )
+
+
+def fill_required(rows: pa.StructArray) -> pa.StructArray:
+    return RequiredFields(rows.type).fill(rows)
+
 
 stamps = st.none() | st.fixed_dictionaries({"sec": st.integers(0, 9), "frame": st.sampled_from(["", "map"])})
 rows = st.fixed_dictionaries(
