@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Mapping
 
 from mosaico_ingest.bag.recording import Recording
-from mosaico_ingest.deferral import DeferredInterrupt
 from mosaico_ingest.diagnostics import Finding, Severity, Stage
 from mosaico_ingest.errors import Interrupted, NothingMatched, VerificationError
+from mosaico_ingest.interrupts import DeferredInterrupt
 from mosaico_ingest.plan.model import Plan
 from mosaico_ingest.policies import IfExists, SessionLevelErrorPolicy
 from mosaico_ingest.quarantine.quarantine import Quarantine

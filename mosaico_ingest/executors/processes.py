@@ -16,9 +16,9 @@ from multiprocessing.reduction import ForkingPickler
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.batch import Batch
-from mosaico_ingest.executors.interrupts import counted_interrupts
 from mosaico_ingest.executors.worker_process import Registrations, do_nothing, work
 from mosaico_ingest.frozen import frozen
+from mosaico_ingest.interrupts import counted_interrupts
 from mosaico_ingest.plan.model import DEFAULT_MEMORY_BYTES
 from mosaico_ingest.report.events import BatchObserver
 from mosaico_ingest.report.model import Report

@@ -16,12 +16,12 @@ from typing import Any
 from mosaico_ingest.config import ROSInjectionConfig, StoreTarget
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.batch import Batch
-from mosaico_ingest.executors.interrupts import counted_interrupts
 from mosaico_ingest.executors.processes import ATTEMPTS
 from mosaico_ingest.executors.shipment import absolute, pack
 from mosaico_ingest.executors.worker import place
 from mosaico_ingest.executors.worker_process import Registrations
 from mosaico_ingest.frozen import frozen
+from mosaico_ingest.interrupts import counted_interrupts
 from mosaico_ingest.plan.model import DEFAULT_MEMORY_BYTES
 from mosaico_ingest.report.events import BatchObserver, RunStarted
 from mosaico_ingest.report.model import Report

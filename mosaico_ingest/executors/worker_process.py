@@ -17,9 +17,9 @@ from mosaico_ingest.bag.registry import Registered, ROSTypeRegistry
 from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.held import Hold, held_catalogs
-from mosaico_ingest.executors.interrupts import Stop
 from mosaico_ingest.executors.worker import failed_report, run_config
 from mosaico_ingest.frozen import frozen
+from mosaico_ingest.interrupts import Stop
 from mosaico_ingest.policies import Stores
 from mosaico_ingest.report.events import Event
 
