@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
+from unittest.mock import Mock
 
 import pyarrow as pa
 import pytest
@@ -141,10 +142,7 @@ def test_an_error_without_a_thread_reaches_whoever_leaves() -> None:
 
 
 def test_an_interrupt_while_the_rest_is_written_is_not_hidden_by_an_earlier_error() -> None:
-    class Interrupted:
-        def write(self, batch: pa.RecordBatch) -> None:
-            raise KeyboardInterrupt
-
+    interrupted = Mock(write=Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt), WriteBuffer(max_bytes=1 << 30) as buffer:
-        buffer.put(Interrupted(), batch(1))
+        buffer.put(interrupted, batch(1))
         raise SinkError("earlier")
