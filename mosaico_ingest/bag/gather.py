@@ -14,7 +14,7 @@ from mosaico_ingest.bag.containers.slab import in_time, pack
 
 __all__ = ["Gather", "compact"]
 
-_FIRST_BYTES, BATCH_BYTES = 1 << 20, 8 << 20
+_FIRST_BYTES, BATCH_BYTES = 2 << 20, 8 << 20
 """A channel's first batch ends at about this many bytes of payload, each other at twice as many, up to the latter.
 
 So the stages that follow begin while little has been read."""

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from types import TracebackType
 
+import pyarrow as pa
 from typing_extensions import Self
 
 from mosaico_ingest.bag.batch import Channel, Encoding, Loss, RawBatch
@@ -30,6 +31,9 @@ from mosaico_ingest.remote.path import AnyPath, RemotePath
 __all__ = ["Recording", "open_recording"]
 
 _SMALL_BYTES = 1 << 20
+"""A recording up to this is read in less time than a thread takes to start."""
+_THREADS = 3
+"""Reading ahead is the third, beside decoding and writing: with fewer processors they are in each other's way."""
 
 ROWS = 1 << 16
 MEMORY_BYTES = 64 << 20
@@ -179,8 +183,8 @@ class Recording:
 
     def _gathered(self, wants: Sequence[Want], gather: Gather) -> Generator[RawBatch, None, None]:
         blocks = self._steps(wants)
-        # a recording this small is read in less time than a thread takes to start
-        with Prefetched(blocks) if self.size_bytes > _SMALL_BYTES else closing(blocks) as steps:
+        ahead = self.size_bytes > _SMALL_BYTES and pa.cpu_count() >= _THREADS
+        with Prefetched(blocks) if ahead else closing(blocks) as steps:
             for step in steps:
                 self._note(step.part, step.holes)
                 for slab in step.slabs:
@@ -189,7 +193,7 @@ class Recording:
             yield from gather.rest()
 
     def _steps(self, wants: Sequence[Want]) -> Generator[_Step, None, None]:
-        """Load block after block; runs in the prefetching thread of all but small recordings."""
+        """Load block after block; runs in a thread of its own where that pays."""
         sources = [
             (part.start_ns, partial(_blocks, part, want))
             for part, want in zip(self._parts, wants, strict=True)

@@ -15,7 +15,9 @@ from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.path import AnyPath
 
 __all__ = [
+    "BLOCK_BYTES",
     "EARLIEST_NS",
+    "FIRST_BYTES",
     "LATEST_NS",
     "Block",
     "Hole",
@@ -30,7 +32,7 @@ __all__ = [
 
 EARLIEST_NS, LATEST_NS = -(2**63), 2**63 - 1
 """The first and last time stamps there are; the last is in the year 2262."""
-_FIRST_BYTES, BLOCK_BYTES, MOST_PIECES = 1 << 20, 8 << 20, 64
+FIRST_BYTES, BLOCK_BYTES, MOST_PIECES = 2 << 20, 16 << 20, 64
 """Up to how many bytes, at first and later on, and how many chunks are read at once.
 
 What is done once a block is done less often with larger ones; the first is small, so that the next stage begins early."""
@@ -125,7 +127,7 @@ class Block:
 def in_groups(pieces: Iterable[T], size: Callable[[T], int], *, most: int = MOST_PIECES) -> Iterator[list[T]]:
     """Yield neighbours together, up to `most`; of bytes few at first, then twice as many each time, up to `BLOCK_BYTES`."""
     group: list[T] = []
-    held_bytes, most_bytes = 0, _FIRST_BYTES
+    held_bytes, most_bytes = 0, FIRST_BYTES
     for piece in pieces:
         held_bytes += size(piece)
         if group and (held_bytes > most_bytes or len(group) == most):

@@ -16,7 +16,9 @@ import numpy as np
 
 from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.containers.part import (
+    BLOCK_BYTES,
     EARLIEST_NS,
+    FIRST_BYTES,
     LATEST_NS,
     Block,
     Hole,
@@ -35,7 +37,6 @@ from mosaico_ingest.remote.path import AnyPath
 
 __all__ = ["SqlitePart"]
 
-_PAGE_BYTES = 4 << 20
 _PAGE_ROWS = 1 << 16
 _EVENT = "_Event"
 """The type of a service's events; its definition is that of the service, under the service's name."""
@@ -245,16 +246,16 @@ def _stream(row: dict[str, Any], counts: dict[int, int] | None, definitions: dic
 
 
 def _pages(rows: Iterator[Row]) -> Iterator[list[Row]]:
-    """Yield rows in lists of a few megabytes; one is read at a time, as its size is known only then."""
+    """Yield rows in lists of the size of a block; one is read at a time, as its size is known only then."""
     page: list[Row] = []
-    size = 0
+    size, most_bytes = 0, FIRST_BYTES
     try:
         for row in rows:
             page.append(row)
             size += len(row[3]) if isinstance(row[3], bytes) else 0
-            if size >= _PAGE_BYTES or len(page) >= _PAGE_ROWS:
+            if size >= most_bytes or len(page) >= _PAGE_ROWS:
                 yield page
-                page, size = [], 0
+                page, size, most_bytes = [], 0, min(2 * most_bytes, BLOCK_BYTES)
     except BROKEN:
         if page:
             yield page
