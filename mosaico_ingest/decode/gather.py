@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from mosaico_ingest.bag.room import room
 from mosaico_ingest.decode.places import Int64s, expand
 from mosaico_ingest.frozen import frozen
 
@@ -82,7 +83,7 @@ def spans(data: Bytes, at: Int64s, sizes: Int64s) -> Bytes:
 
 
 def _copied(data: Bytes, at: Int64s, ends: Int64s, total: int) -> Bytes:
-    out = np.empty(total, np.uint8)
+    out = room(total)
     pos = 0
     for start, end in zip(at.tolist(), ends.tolist(), strict=True):
         out[pos : pos + end - start] = data[start:end]

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import bz2
 import os
-from collections.abc import Callable
-from itertools import pairwise
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import lz4.frame
+import numpy as np
 import pytest
 import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from mosaico_ingest.bag.containers.compression import (
     Packed,
@@ -31,6 +32,7 @@ PACK: dict[str, Callable[[bytes], bytes]] = {
     "bz2": bz2.compress,
 }
 DATA = os.urandom(50_000).hex().encode() + bytes(50_000)
+_BETWEEN = b"between"
 
 
 @pytest.mark.parametrize("name", PACK)
@@ -81,36 +83,53 @@ def test_a_file_of_several_frames_is_one_file(tmp_path: Path) -> None:
     assert str(inflate_file(packed, plain)).startswith("damaged zstd file")
 
 
-def _packed(name: str, data: bytes, size: int | None = None) -> Packed:
-    return Packed(memoryview(PACK[name](data)), name, len(data) if size is None else size)
+def _packed(chunks: Sequence[tuple[str, bytes, int]]) -> tuple[NDArray[np.uint8], list[Packed]]:
+    """Return bytes that hold the chunks, each after something else, and where they lie in them."""
+    data, packed = b"", list[Packed]()
+    for name, held, size in chunks:
+        begin = len(data) + len(_BETWEEN)
+        data += _BETWEEN + held
+        packed.append(Packed(begin, len(data), name, size))
+    return np.frombuffer(data, np.uint8), packed
+
+
+def _inflate_all(chunks: Sequence[tuple[str, bytes, int]]) -> tuple[list[bytes], dict[int, BagError]]:
+    found = inflate_all(*_packed(chunks))
+    held = [found.data[begin:end].tobytes() for begin, end in zip(found.begins, found.ends, strict=True)]
+    return held, found.failures
 
 
 @given(
     chunks=st.lists(st.tuples(st.sampled_from(sorted(PACK)), st.binary(max_size=3000)), max_size=6),
     more=st.integers(0, 3),
+    one=st.none() | st.sampled_from(sorted(PACK)),
 )
-def test_chunks_inflated_together_are_what_each_alone_is(chunks: list[tuple[str, bytes]], more: int) -> None:
-    packed = [_packed(name, data * (1 + more)) for name, data in chunks]
-    buffer, edges, failures = inflate_all(packed)
+def test_chunks_inflated_together_are_what_each_alone_is(
+    chunks: list[tuple[str, bytes]], more: int, one: str | None
+) -> None:
+    given = [(one or name, data * (1 + more)) for name, data in chunks]
+    found, failures = _inflate_all([(name, PACK[name](data), len(data)) for name, data in given])
     assert not failures
-    found = [buffer[begin:end].tobytes() for begin, end in pairwise(edges.tolist())]
-    assert found == [data * (1 + more) for _, data in chunks]
+    assert found == [data for _, data in given]
+
+
+def test_chunks_that_are_not_compressed_are_not_copied() -> None:
+    data, packed = _packed([("", b"one", 3), ("none", b"other", 5)])
+    assert inflate_all(data, packed).data is data
 
 
 @pytest.mark.parametrize("name", PACK)
 @pytest.mark.parametrize("size", [0, 10, len(DATA) - 1, len(DATA) + 1, 1 << 50, (1 << 64) - 1])
 def test_one_broken_chunk_costs_no_other(name: str, size: int) -> None:
-    buffer, edges, failures = inflate_all(
-        [_packed(name, b"before"), _packed(name, DATA, size), _packed(name, b"after")]
-    )
+    chunks = [(b"before", 6), (DATA, size), (b"after", 5)]
+    found, failures = _inflate_all([(name, PACK[name](data), announced) for data, announced in chunks])
     assert list(failures) == [1]
     assert "announced" in failures[1].what
-    begin, end = edges[2:].tolist()
-    assert buffer[:6].tobytes() + buffer[begin:end].tobytes() == b"beforeafter"
+    assert (found[0], found[2]) == (b"before", b"after")
 
 
 @pytest.mark.parametrize("cut", [1, 5, 1000])
 @pytest.mark.parametrize("name", ["zstd", "lz4"])
 def test_a_chunk_cut_off_among_others_is_an_error(name: str, cut: int) -> None:
-    whole = _packed(name, DATA)
-    assert list(inflate_all([whole, Packed(whole.data[:-cut], name, whole.size)])[2]) == [1]
+    whole = PACK[name](DATA)
+    assert list(_inflate_all([(name, held, len(DATA)) for held in (whole, whole[:-cut])])[1]) == [1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bz2
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import pairwise
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,10 +13,12 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
+from mosaico_ingest.bag.room import room
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.frozen import frozen
 
 __all__ = [
+    "Inflated",
     "Packed",
     "inflate",
     "inflate_all",
@@ -72,44 +74,68 @@ def inflate(data: bytes | memoryview, compression: str, size: int) -> bytes | me
 
 @frozen
 class Packed:
-    """A chunk's data as they lie in the file, and what the chunk says of them."""
+    """Where a chunk's data lie in what was read, and what the chunk says of them."""
 
-    data: memoryview
+    begin: int
+    end: int
     compression: str
     size: int
 
 
-def inflate_all(chunks: Sequence[Packed]) -> tuple[Bytes, NDArray[np.int64], dict[int, BagError]]:
-    """Return one buffer with what is in the chunks, where each begins and the last ends, and which are damaged."""
+@frozen
+class Inflated:
+    """One buffer with what is in some chunks, where in it each begins and ends, and which are damaged."""
+
+    data: Bytes
+    begins: list[int]
+    ends: list[int]
+    failures: dict[int, BagError]
+
+
+def inflate_all(data: Bytes, chunks: Sequence[Packed]) -> Inflated:
+    """Return what is in the chunks, whose data lie in `data`; chunks that are not compressed stay there."""
+    sizes = [chunk.size for chunk in chunks]
+    if all(_is_plain(chunk) and chunk.end - chunk.begin == chunk.size for chunk in chunks):
+        return Inflated(data, [chunk.begin for chunk in chunks], [chunk.end for chunk in chunks], {})
     failures: dict[int, BagError] = {}
-    total = sum(chunk.size for chunk in chunks)
-    if len(chunks) != 1 and total <= _TOGETHER_BYTES:
-        buffer = np.empty(total, np.uint8)
-        edges = np.cumsum([0, *(chunk.size for chunk in chunks)], dtype=np.int64)
-        for number, (chunk, (begin, end)) in enumerate(zip(chunks, pairwise(edges.tolist()), strict=True)):
+    if len(chunks) != 1 and sum(sizes) <= _TOGETHER_BYTES:
+        buffer = room(sum(sizes))
+        ends = list(accumulate(sizes))
+        begins = [end - size for end, size in zip(ends, sizes, strict=True)]
+        for number, chunk in enumerate(chunks):
             try:
-                _inflate_into(buffer[begin:end], chunk)
+                _inflate_into(buffer[begins[number] : ends[number]], chunk, data)
             except BagError as err:  # noqa: PERF203 - each chunk may fail for itself
                 failures[number] = err
-        return buffer, edges, failures
+        return Inflated(buffer, begins, ends, failures)
     pieces: list[Bytes] = []
     for number, chunk in enumerate(chunks):
         try:
-            pieces.append(np.frombuffer(inflate(chunk.data, chunk.compression, chunk.size), np.uint8))
+            pieces.append(_inflated(chunk, data))
         except BagError as err:  # noqa: PERF203 - as above
             failures[number] = err
             pieces.append(np.empty(0, np.uint8))
-    edges = np.cumsum([0, *map(len, pieces)], dtype=np.int64)
-    return pieces[0] if len(pieces) == 1 else np.concatenate(pieces), edges, failures
+    ends = list(accumulate(map(len, pieces)))
+    begins = [end - len(piece) for end, piece in zip(ends, pieces, strict=True)]
+    return Inflated(pieces[0] if len(pieces) == 1 else np.concatenate(pieces), begins, ends, failures)
 
 
-def _inflate_into(target: Bytes, chunk: Packed) -> None:
+def _is_plain(chunk: Packed) -> bool:
+    return not chunk.compression or chunk.compression == "none"
+
+
+def _inflated(chunk: Packed, data: Bytes) -> Bytes:
+    packed = data[chunk.begin : chunk.end].data
+    return np.frombuffer(inflate(packed, chunk.compression, chunk.size), np.uint8)
+
+
+def _inflate_into(target: Bytes, chunk: Packed, data: Bytes) -> None:
     """Fill `target` with what is in a chunk, without a copy where the library can do that."""
     if chunk.compression != "zstd" or not len(target):
-        target[:] = np.frombuffer(inflate(chunk.data, chunk.compression, chunk.size), np.uint8)
+        target[:] = _inflated(chunk, data)
         return
     try:
-        stream = zstandard.ZstdDecompressor().stream_reader(chunk.data)
+        stream = zstandard.ZstdDecompressor().stream_reader(data[chunk.begin : chunk.end].data)
         found = stream.readinto(target.data)
         more = stream.read(1)
     except _FAILURES as err:

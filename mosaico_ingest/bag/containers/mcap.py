@@ -36,7 +36,7 @@ from mosaico_ingest.bag.containers.part import (
     orphans,
 )
 from mosaico_ingest.bag.containers.slab import Bytes, by_key, keep_each, stretches
-from mosaico_ingest.bag.containers.source import Source
+from mosaico_ingest.bag.containers.source import Source, Stretches
 from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.frozen import frozen
@@ -64,7 +64,7 @@ class _Chunk:
     """A piece as it was read, and its data."""
 
     piece: Piece
-    raw: bytes
+    raw: memoryview
     records: Bytes
     """What all chunks that were read together hold."""
     begin: int
@@ -138,23 +138,26 @@ class McapPart:
     def _chunks(self, pieces: Sequence[Piece], want: Want, loaded: Loaded) -> list[_Chunk]:
         """Read and inflate; what is whole lies in one buffer, what is broken is among the holes."""
         found: list[_Chunk] = []
-        packed: list[tuple[Piece, bytes, ChunkHead]] = []
+        packed: list[tuple[Piece, memoryview, ChunkHead, Packed]] = []
+        stretches = Stretches(self._source, ((piece.offset, piece.stop) for piece in pieces))
         for piece in pieces:
-            raw = b""
+            raw = memoryview(b"")
             try:
-                raw = self._source.read(piece.offset, piece.stop - piece.offset)
+                at = stretches.read(piece.offset, piece.stop)
+                raw = stretches.data[at].data
                 head = chunk_head(raw) if piece.is_chunk else None
                 if head is None or piece.is_cut:
                     found.append(_whole(piece, raw if head is None else _cut(raw, head, piece, loaded)))
                 else:
-                    packed.append((piece, raw, head))
+                    end = at.start + min(head.end, len(raw))
+                    where = Packed(at.start + head.begin, end, head.compression, head.size)
+                    packed.append((piece, raw, head, where))
             except BagError as err:
                 loaded.holes.extend(_whole_chunk(piece, raw, want, err))
-        records, edges, failures = inflate_all([_packed(raw, head) for _, raw, head in packed])
-        for place, (piece, raw, head) in enumerate(packed):
-            begin, end = edges[place : place + 2].tolist()
-            chunk = _Chunk(piece, raw, records, begin, end)
-            broken = failures.get(place) or _wrong_checksum(chunk.data, head)
+        inflated = inflate_all(stretches.data, [where for *_, where in packed])
+        for place, (piece, raw, head, _) in enumerate(packed):
+            chunk = _Chunk(piece, raw, inflated.data, inflated.begins[place], inflated.ends[place])
+            broken = inflated.failures.get(place) or _wrong_checksum(chunk.data, head)
             if broken:
                 loaded.holes.extend(_whole_chunk(piece, raw, want, broken))
             else:
@@ -206,12 +209,8 @@ def _stream(key: int, channel: McapChannel, index: McapIndex) -> Stream:
     )
 
 
-def _whole(piece: Piece, data: bytes) -> _Chunk:
+def _whole(piece: Piece, data: memoryview) -> _Chunk:
     return _Chunk(piece, data, np.frombuffer(data, np.uint8), 0, len(data))
-
-
-def _packed(raw: bytes, head: ChunkHead) -> Packed:
-    return Packed(memoryview(raw)[head.begin : head.end], head.compression, head.size)
 
 
 def _wrong_checksum(data: Bytes, head: ChunkHead) -> BagError | None:
@@ -220,14 +219,14 @@ def _wrong_checksum(data: Bytes, head: ChunkHead) -> BagError | None:
     return BagError(f"its checksum is {found:08x}, {head.crc:08x} expected")
 
 
-def _cut(raw: bytes, head: ChunkHead, piece: Piece, loaded: Loaded) -> bytes:
-    data = inflate_some(memoryview(raw)[head.begin : head.end], head.compression, head.size)
+def _cut(raw: memoryview, head: ChunkHead, piece: Piece, loaded: Loaded) -> memoryview:
+    data = inflate_some(raw[head.begin : head.end], head.compression, head.size)
     reason = f"this chunk is cut off; {len(data)} of its {head.size} bytes could be read"
     loaded.holes.append(Hole(piece.offset, reason))
-    return data
+    return memoryview(data)
 
 
-def _whole_chunk(piece: Piece, raw: bytes, want: Want, err: BagError) -> Iterator[Hole]:
+def _whole_chunk(piece: Piece, raw: memoryview, want: Want, err: BagError) -> Iterator[Hole]:
     """Yield the loss of a chunk, by channel where its index says how many messages each had."""
     reason = f"broken chunk: {err.what}"
     if not piece.indexes:
@@ -241,7 +240,7 @@ def _whole_chunk(piece: Piece, raw: bytes, want: Want, err: BagError) -> Iterato
             yield Hole(piece.offset, reason, key=key, count=count)
 
 
-def _entries(raw: bytes, piece: Piece, key: int, offset: int) -> bytes:
+def _entries(raw: memoryview, piece: Piece, key: int, offset: int) -> memoryview:
     """Return the entries of one message index record, as they stand there.
 
     Raises:

@@ -79,7 +79,7 @@ def channel_of(fields: Fields) -> tuple[int, McapChannel]:
     return fields.u16(), McapChannel(fields.u16(), fields.text(), fields.text(), fields.texts())
 
 
-def chunk_head(data: bytes, at: int = RECORD.size) -> ChunkHead:
+def chunk_head(data: bytes | memoryview, at: int = RECORD.size) -> ChunkHead:
     """Return a chunk's fields from the bytes of its record; its data may be cut off.
 
     Raises:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
-from mosaico_ingest.bag.containers.source import FileSource
+from mosaico_ingest.bag.containers.source import FileSource, check_inside
 from mosaico_ingest.errors import BagError, Unreachable
 from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.faults import reaching
@@ -64,11 +64,12 @@ class RemoteSource:
 
     def read(self, offset: int, size: int) -> bytes:
         """Return `size` bytes from `offset` on; see `FileSource.read`."""
-        if offset < 0 or size < 0 or offset + size > self.size:
-            raise BagError(
-                f"{size} bytes expected at {offset}, the file ends at {self.size}", where=str(self.path)
-            )
+        check_inside(self, offset, size)
         return self.read_some(offset, size)
+
+    def read_into(self, target: memoryview, offset: int) -> None:
+        """Fill `target` with the bytes from `offset` on; see `FileSource.read_into`."""
+        target[:] = self.read(offset, len(target))
 
     def read_some(self, offset: int, size: int) -> bytes:
         """Return up to `size` bytes from `offset` on, fewer only where the file ends."""

@@ -24,7 +24,7 @@ from mosaico_ingest.bag.containers.ros1_records import (
     times_of,
 )
 from mosaico_ingest.bag.containers.slab import Bytes, by_key, keep, keep_each, stretches
-from mosaico_ingest.bag.containers.source import Source
+from mosaico_ingest.bag.containers.source import Source, Stretches
 from mosaico_ingest.bag.definition import Embedded
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.frozen import frozen
@@ -42,7 +42,7 @@ class _Chunk:
     """A piece as it was read: its data, and the index records behind it."""
 
     piece: Piece
-    after: bytes
+    after: memoryview
     records: Bytes
     """What all chunks that were read together hold."""
     begin: int
@@ -119,24 +119,27 @@ class Ros1Part:
     def _chunks(self, pieces: Sequence[Piece], want: Want, loaded: Loaded) -> list[_Chunk]:
         """Read and inflate; what is whole lies in one buffer, what is broken is among the holes."""
         found: list[_Chunk] = []
-        packed: list[tuple[Piece, bytes, ChunkHead]] = []
+        packed: list[tuple[Piece, memoryview, Packed]] = []
+        stretches = Stretches(self._source, ((piece.offset, piece.stop) for piece in pieces))
         for piece in pieces:
             try:
-                raw = self._source.read(piece.offset, piece.stop - piece.offset)
+                at = stretches.read(piece.offset, piece.stop)
+                raw = stretches.data[at].data
                 head = _head(raw, piece) if piece.is_chunk else None
                 if head is None or piece.is_cut:
                     found.append(_whole(piece, raw if head is None else _cut(raw, head, piece, loaded)))
                 else:
-                    packed.append((piece, raw, head))
+                    where = Packed(at.start + head.begin, at.start + head.end, head.compression, head.size)
+                    packed.append((piece, raw[head.end :], where))
             except BagError as err:  # noqa: PERF203 - each chunk may fail for itself
                 loaded.holes.extend(_broken(piece, want, err))
-        records, edges, failures = inflate_all([_packed(raw, head) for _, raw, head in packed])
-        for place, (piece, raw, head) in enumerate(packed):
-            if place in failures:
-                loaded.holes.extend(_broken(piece, want, failures[place]))
+        inflated = inflate_all(stretches.data, [where for *_, where in packed])
+        for place, (piece, after, _) in enumerate(packed):
+            if place in inflated.failures:
+                loaded.holes.extend(_broken(piece, want, inflated.failures[place]))
             else:
-                begin, end = edges[place : place + 2].tolist()
-                found.append(_Chunk(piece, raw[head.end :], records, begin, end))
+                begin, end = inflated.begins[place], inflated.ends[place]
+                found.append(_Chunk(piece, after, inflated.data, begin, end))
         return found
 
 
@@ -157,26 +160,22 @@ def _streams(index: Ros1Index, counts: dict[int, int]) -> tuple[Stream, ...]:
     )
 
 
-def _whole(piece: Piece, data: bytes) -> _Chunk:
-    return _Chunk(piece, b"", np.frombuffer(data, np.uint8), 0, len(data))
+def _whole(piece: Piece, data: memoryview) -> _Chunk:
+    return _Chunk(piece, memoryview(b""), np.frombuffer(data, np.uint8), 0, len(data))
 
 
-def _head(raw: bytes, piece: Piece) -> ChunkHead:
+def _head(raw: memoryview, piece: Piece) -> ChunkHead:
     head = chunk_head(raw)
     if head.end > len(raw) and not piece.is_cut:
         raise BagError(f"{head.end - head.begin} bytes announced, {len(raw) - head.begin} left")
     return head
 
 
-def _packed(raw: bytes, head: ChunkHead) -> Packed:
-    return Packed(memoryview(raw)[head.begin : head.end], head.compression, head.size)
-
-
-def _cut(raw: bytes, head: ChunkHead, piece: Piece, loaded: Loaded) -> bytes:
-    data = inflate_some(memoryview(raw)[head.begin : head.end], head.compression, head.size)
+def _cut(raw: memoryview, head: ChunkHead, piece: Piece, loaded: Loaded) -> memoryview:
+    data = inflate_some(raw[head.begin : head.end], head.compression, head.size)
     reason = f"this chunk is cut off; {len(data)} of its {head.size} bytes could be read"
     loaded.holes.append(Hole(piece.offset, reason))
-    return data
+    return memoryview(data)
 
 
 def _broken(piece: Piece, want: Want, err: BagError) -> Iterator[Hole]:

@@ -226,14 +226,14 @@ def index_entries(record: Record, data: bytes | memoryview) -> tuple[int, NDArra
     return number(record.header, b"conn", 4), np.frombuffer(data[record.begin : record.end], ENTRY)
 
 
-def chunk_head(raw: bytes) -> ChunkHead:
+def chunk_head(raw: bytes | memoryview) -> ChunkHead:
     """Return the fields of the chunk record that `raw` begins with; its data may be cut off.
 
     Raises:
         BagError: It is no chunk record.
     """
     size = _length(_Memory(raw), 0, len(raw) - 4)
-    header = header_of(raw[4 : 4 + size])
+    header = header_of(bytes(raw[4 : 4 + size]))
     if number(header, b"op", 1) != Op.CHUNK:
         raise BagError("no chunk record")
     begin = 4 + size + 4

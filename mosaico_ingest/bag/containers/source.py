@@ -8,10 +8,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Protocol
 
+from mosaico_ingest.bag.room import room
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.remote.path import AnyPath
 
-__all__ = ["Fields", "FileSource", "Source", "Window"]
+__all__ = ["Fields", "FileSource", "Source", "Stretches", "Window", "check_inside"]
 
 _WINDOW_BYTES = 1 << 16
 
@@ -40,6 +41,10 @@ class Source(Protocol):
 
     def read_some(self, offset: int, size: int) -> bytes:
         """Return up to `size` bytes from `offset` on, fewer only where the file ends."""
+        ...
+
+    def read_into(self, target: memoryview, offset: int) -> None:
+        """Fill `target` with the bytes from `offset` on; BagError where there are fewer."""
         ...
 
     def prefetch(self, stretches: Iterable[tuple[int, int]]) -> None:
@@ -80,17 +85,25 @@ class FileSource:
         Raises:
             BagError: The file ends before that, or the disk refuses.
         """
-        if offset < 0 or size < 0 or offset + size > self.size:
-            raise BagError(
-                f"{size} bytes expected at {offset}, the file ends at {self.size}", where=str(self.path)
-            )
+        check_inside(self, offset, size)
         data = self.read_some(offset, size)
-        if len(data) < size:
-            raise BagError(
-                f"{size} bytes expected at {offset}, {len(data)} found: the file became shorter",
-                where=str(self.path),
-            )
+        self._check_found(len(data), offset, size)
         return data
+
+    def read_into(self, target: memoryview, offset: int) -> None:
+        """Fill `target` with the bytes from `offset` on.
+
+        Raises:
+            BagError: The file ends before that, or the disk refuses.
+        """
+        check_inside(self, offset, len(target))
+        found = 0
+        try:
+            while found < len(target) and (more := os.preadv(self._fd, [target[found:]], offset + found)):
+                found += more
+        except OSError as err:
+            raise self._refused(offset, err) from err
+        self._check_found(found, offset, len(target))
 
     def read_some(self, offset: int, size: int) -> bytes:
         """Return up to `size` bytes from `offset` on, fewer only where the file ends.
@@ -103,8 +116,18 @@ class FileSource:
             while len(data) < size and (more := os.pread(self._fd, size - len(data), offset + len(data))):
                 data += more
         except OSError as err:
-            raise BagError(f"cannot be read at {offset}: {err.strerror}", where=str(self.path)) from err
+            raise self._refused(offset, err) from err
         return data
+
+    def _refused(self, offset: int, err: OSError) -> BagError:
+        return BagError(f"cannot be read at {offset}: {err.strerror}", where=str(self.path))
+
+    def _check_found(self, found: int, offset: int, size: int) -> None:
+        if found < size:
+            raise BagError(
+                f"{size} bytes expected at {offset}, {found} found: the file became shorter",
+                where=str(self.path),
+            )
 
     def prefetch(self, stretches: Iterable[tuple[int, int]]) -> None:
         """Do nothing: the system reads ahead by itself."""
@@ -120,6 +143,38 @@ class FileSource:
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
+
+
+class Stretches:
+    """Reads stretches of a file into one buffer, one behind the other."""
+
+    def __init__(self, source: Source, stretches: Iterable[tuple[int, int]]) -> None:
+        """Make room for those that lie in the file; each is its first byte and the one behind its last."""
+        inside = (stop - start for start, stop in stretches if 0 <= start <= stop <= source.size)
+        self.data = room(sum(inside))
+        """What was read, and room for the rest."""
+        self._source = source
+        self._used = 0
+
+    def read(self, start: int, stop: int) -> slice:
+        """Read one of the stretches and return where in `data` it lies.
+
+        Raises:
+            BagError: The file ends before that, or the disk refuses.
+        """
+        check_inside(self._source, start, stop - start)
+        at = slice(self._used, self._used + stop - start)
+        self._source.read_into(self.data[at].data, start)
+        self._used = at.stop
+        return at
+
+
+def check_inside(source: Source, offset: int, size: int) -> None:
+    """Raise where a stretch does not lie in the file."""
+    if offset < 0 or size < 0 or offset + size > source.size:
+        raise BagError(
+            f"{size} bytes expected at {offset}, the file ends at {source.size}", where=str(source.path)
+        )
 
 
 class Window:
@@ -148,7 +203,7 @@ class Fields:
 
     __slots__ = ("_data", "_end", "_pos")
 
-    def __init__(self, data: bytes, start: int = 0, end: int | None = None) -> None:
+    def __init__(self, data: bytes | memoryview, start: int = 0, end: int | None = None) -> None:
         self._data = data
         self._pos = start
         self._end = len(data) if end is None else end
@@ -163,7 +218,7 @@ class Fields:
         if size > self.left:
             raise BagError(f"a field of {size} bytes in a record with {self.left} left")
         self._pos += size
-        return self._data[self._pos - size : self._pos]
+        return bytes(self._data[self._pos - size : self._pos])
 
     def u16(self) -> int:
         """Return an unsigned 16-bit number."""
