@@ -14,6 +14,9 @@ from mosaico_ingest.decode.stepwise import locate_stepwise
 
 __all__ = ["locate"]
 
+_LARGE_BYTES = 64 << 10
+"""So many bytes of few messages may be long sequences, whose elements can be walked together."""
+
 
 def locate(layout: Layout, frame: Frame) -> Located:
     """Find where everything lies in the messages that fit the layout."""
@@ -25,8 +28,10 @@ def locate(layout: Layout, frame: Frame) -> Located:
         left[part.rows] = False
     rest = np.flatnonzero(left)
     if len(rest) or not parts:
-        walk = locate_stepwise if len(rest) <= FEW else locate_lockstep
-        found = walk(layout, frame.take(rest))
+        others = frame.take(rest)
+        is_small = len(rest) <= FEW and int((others.ends - others.origins).sum()) < _LARGE_BYTES
+        walk = locate_stepwise if is_small else locate_lockstep
+        found = walk(layout, others)
         parts.append(replace(found, rows=rest[found.rows]))
     return _merge(parts)
 

@@ -1,13 +1,14 @@
 """This file walks all messages at once: one cursor a message, each step taken by all of them together.
 
 Elements of a sequence are taken by index: the first of every message, then the second of those that have one.
+Where one is as long as that before it, more of that length are guessed, and taken as far as they turn out to be so.
 A message whose bytes do not fit is marked and parked at its origin, where reading on is safe; what is noted
 about it is dropped at the end.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,14 @@ __all__ = ["FEW", "locate_lockstep"]
 
 FEW = 16
 """So many messages are walked faster one at a time."""
+_MANY = 64
+"""So many elements of so few messages are worth a look whether they are alike."""
+_LOOKS = 3
+"""After so many elements a sequence of equal ones shows: the first may begin elsewhere in its words."""
+_RARE = 4
+"""Messages are guessed at where at least one of so many seems to have equal elements."""
+_AHEAD = 8
+"""How many elements are guessed at first, and how many times as many after each guess that was right."""
 
 
 def locate_lockstep(layout: Layout, frame: Frame) -> Located:
@@ -62,6 +71,71 @@ class _Cursor:
     def align(self, align: int) -> None:
         if align > 1:
             self.pos = self.pos + ((self.origin - self.pos) & (align - 1))
+
+
+@dataclass(slots=True)
+class _Elements:
+    """The elements of a loop that have been walked, part by part."""
+
+    count: Int64s
+    """How many each message has, shape (m,)."""
+    parts: list[Places]
+    taken: list[tuple[Int64s, Int64s]]
+    """Of each part, whose elements they are, and which."""
+    done: Int64s = field(init=False)
+    """How many of each message have been walked, shape (m,)."""
+
+    def __post_init__(self) -> None:
+        self.done = np.zeros_like(self.count)
+
+    def left(self, rows: Int64s) -> Int64s:
+        return self.count[rows] - self.done[rows]
+
+    def take(self, places: Places, rows: Int64s) -> None:
+        """Add the next element of each of some messages."""
+        self.note(places, rows, self.done[rows])
+        self.done[rows] += 1
+
+    def note(self, places: Places, rows: Int64s, numbers: Int64s) -> None:
+        self.parts.append(places)
+        self.taken.append((rows, numbers))
+
+    def join(self) -> Places:
+        """Return all of them, message by message."""
+        firsts = np.cumsum(self.done) - self.done
+        return join(self.parts, np.concatenate([firsts[rows] + numbers for rows, numbers in self.taken]))
+
+
+class _Guesses:
+    """What the elements so far say of those to come; shapes (m,)."""
+
+    __slots__ = ("_looks", "_right", "ahead", "alike", "size")
+
+    def __init__(self, messages: int) -> None:
+        self.size = np.zeros(messages, np.int64)
+        """The bytes of the last element."""
+        self.alike = np.zeros(messages, bool)
+        """Whether it had as many as that before it."""
+        self.ahead = np.full(messages, _AHEAD)
+        self._looks = 0
+        self._right = False
+
+    def are_worth(self, active: Int64s, walked: _Elements) -> bool:
+        """Say whether the next elements are walked together; few messages only where their elements are alike."""
+        if len(active) > FEW:
+            return True
+        promising = self._looks < _LOOKS or self._right
+        return promising and int(walked.left(active).sum()) > _MANY
+
+    def note(self, active: Int64s, size: Int64s) -> None:
+        self.alike[active] = (size == self.size[active]) & (size > 0)
+        self.size[active] = size
+        self._looks += 1
+        self._right = False
+
+    def judge(self, rows: Int64s, right: NDArray[np.bool_]) -> None:
+        self.ahead[rows] = np.where(right, self.ahead[rows] * _AHEAD, _AHEAD)
+        self._right = bool(right.any())
 
 
 class _Walk:
@@ -130,23 +204,54 @@ class _Walk:
             count = np.full(len(cursor.pos), step.count, np.int64)
         at = cursor.pos
         cursor.pos = at.copy()
-        done = np.zeros_like(count)
-        parts: list[Places] = []
-        taken: list[tuple[Int64s, Int64s]] = []
+        walked = _Elements(count, [], [])
         active = np.flatnonzero(count > 0)
-        while len(active) > FEW:
-            parts.append(self._element(step.body, cursor, active))
-            taken.append((active, done[active]))
-            done[active] += 1
-            active = active[(done[active] < count[active]) & ~self.broken[cursor.row[active]]]
+        guesses = _Guesses(len(count))
+        while guesses.are_worth(active, walked):
+            begins = cursor.pos[active]
+            walked.take(self._element(step.body, cursor, active), active)
+            guesses.note(active, cursor.pos[active] - begins)
+            active = active[(walked.done[active] < count[active]) & ~self.broken[cursor.row[active]]]
+            alike = active[guesses.alike[active]]
+            if len(alike) * _RARE >= len(active):
+                self._guess(step.body, cursor, alike, walked, guesses)
+                active = active[walked.done[active] < count[active]]
         active = active[~self.broken[cursor.row[active]]]
-        if len(active) or not parts:
-            first = done[active]
-            parts.append(self._rest(step.body, cursor, active, count, done))
-            more = done[active] - first
-            taken.append((np.repeat(active, more), expand(first, more)))
-        slots = np.concatenate([(np.cumsum(done) - done)[which] + number for which, number in taken])
-        return Place(at, done, join(parts, slots))
+        if len(active) or not walked.parts:
+            before = walked.done[active]
+            places = self._rest(step.body, cursor, active, count, walked.done)
+            more = walked.done[active] - before
+            walked.note(places, np.repeat(active, more), expand(before, more))
+        return Place(at, walked.done, walked.join())
+
+    def _guess(self, body: Body, cursor: _Cursor, rows: Int64s, walked: _Elements, guesses: _Guesses) -> None:
+        """Walk elements of some messages where they begin if each is as long as the last; take those that are."""
+        size = guesses.size[rows]
+        room = (cursor.end[rows] - cursor.pos[rows]) // size
+        width = np.minimum(np.minimum(guesses.ahead[rows], walked.left(rows)), room)
+        rows, size, width = (each[width > 0] for each in (rows, size, width))
+        if not len(rows):
+            return
+        number = expand(np.zeros_like(width), width)
+        owner, sizes = np.repeat(rows, width), np.repeat(size, width)
+        begins = cursor.pos[owner] + number * sizes
+        # None may reach into the next, so that what is walked by mistake is not more than the message.
+        ends = begins + sizes
+        frame = self._frame
+        origins = cursor.origin[owner]
+        trial = _Walk(self._layout, Frame(frame.data, frame.order, origins, ends))
+        inner = _Cursor(begins, ends.copy(), origins, np.arange(len(owner)))
+        places = trial.body(body, inner)
+        fits = (inner.pos == ends) & ~trial.broken
+        firsts = np.cumsum(width) - width
+        taken = np.minimum.reduceat(np.where(fits, np.repeat(width, width), number), firsts)
+        kept = np.flatnonzero(number < np.repeat(taken, width))
+        if len(kept) < len(owner):
+            places = tuple(place.take(kept) for place in places)
+        walked.note(places, owner[kept], walked.done[owner[kept]] + number[kept])
+        walked.done[rows] += taken
+        cursor.pos[rows] += taken * size
+        guesses.judge(rows, taken == width)
 
     def _element(self, body: Body, cursor: _Cursor, active: Int64s) -> Places:
         """Walk the next element of the active messages."""
