@@ -34,6 +34,8 @@ _SMALL_BYTES = 1 << 20
 """A recording up to this is read in less time than a thread takes to start."""
 _THREADS = 3
 """Reading ahead is the third, beside decoding and writing: with fewer processors they are in each other's way."""
+_BLOCKS = 4
+"""A block is at most this part of the memory; half of it where one is read while another is at work."""
 
 ROWS = 1 << 16
 MEMORY_BYTES = 64 << 20
@@ -173,17 +175,22 @@ class Recording:
         )
         low = EARLIEST_NS if start_ns is None else start_ns
         high = LATEST_NS + 1 if end_ns is None else end_ns
-        wants = [Want(self._table.keys(number, ids), low, high) for number in range(len(self._parts))]
+        ahead = self.size_bytes > _SMALL_BYTES and pa.cpu_count() >= _THREADS
+        block_bytes = memory_bytes // (2 * _BLOCKS if ahead else _BLOCKS)
+        wants = [
+            Want(self._table.keys(number, ids), low, high, block_bytes) for number in range(len(self._parts))
+        ]
         gather = Gather(
             {channel.id: channel for channel in self.channels}, rows=rows, memory_bytes=memory_bytes
         )
-        running = self._gathered(wants, gather)
+        running = self._gathered(wants, gather, ahead=ahead)
         self._running.add(running)
         return running
 
-    def _gathered(self, wants: Sequence[Want], gather: Gather) -> Generator[RawBatch, None, None]:
+    def _gathered(
+        self, wants: Sequence[Want], gather: Gather, *, ahead: bool
+    ) -> Generator[RawBatch, None, None]:
         blocks = self._steps(wants)
-        ahead = self.size_bytes > _SMALL_BYTES and pa.cpu_count() >= _THREADS
         with Prefetched(blocks) if ahead else closing(blocks) as steps:
             for step in steps:
                 self._note(step.part, step.holes)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import threading
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from rosbags import rosbag1, rosbag2
 
 from mosaico_ingest.bag.batch import Encoding
-from mosaico_ingest.bag.containers.source import FileSource
 from mosaico_ingest.bag.recording import open_recording
 from mosaico_ingest.errors import BagError
 
@@ -171,20 +172,31 @@ def test_other_encodings_are_named_and_can_still_be_had(tmp_path: Path, recordin
         assert len(recordings.received(recording)) == 10
 
 
-def test_no_thread_is_left_when_reading_stops_early(tmp_path: Path, recordings: Any) -> None:
-    path = recordings.mcap(tmp_path / "j.mcap", recordings.sent(big=True), chunk_messages=5)
+@pytest.mark.parametrize(("processors", "threads"), [(2, 0), (3, 1)])
+def test_reading_ahead_is_for_where_a_processor_is_left_and_leaves_no_thread(
+    tmp_path: Path, recordings: Any, monkeypatch: pytest.MonkeyPatch, processors: int, threads: int
+) -> None:
+    monkeypatch.setattr(pa, "cpu_count", lambda: processors)
+    path = recordings.mcap(
+        tmp_path / "j.mcap", recordings.sent(1000, big=True), chunk_messages=5, compression=""
+    )
     before = threading.active_count()
     recording = open_recording(path, resolve=recordings.blind)
     running = recording.batches()
     next(running)
+    assert threading.active_count() == before + threads
     recording.close()
     assert threading.active_count() == before
     recording.close()
 
 
-def test_a_file_that_shrinks_while_it_is_read_costs_only_its_end(tmp_path: Path, recordings: Any) -> None:
-    messages = recordings.sent()
-    path = recordings.mcap(tmp_path / "k.mcap", messages, chunk_messages=20)
+@pytest.mark.parametrize("processors", [2, 3])
+def test_a_file_that_shrinks_while_it_is_read_costs_only_its_end(
+    tmp_path: Path, recordings: Any, monkeypatch: pytest.MonkeyPatch, processors: int
+) -> None:
+    monkeypatch.setattr(pa, "cpu_count", lambda: processors)
+    messages = recordings.sent(1000, big=True)
+    path = recordings.mcap(tmp_path / "k.mcap", messages, chunk_messages=20, compression="")
     with open_recording(path, resolve=recordings.blind) as recording:
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
         found = recordings.received(recording)
@@ -217,12 +229,15 @@ def test_a_hundredth_of_the_time_reads_about_a_hundredth_of_the_file(
     messages = recordings.sent(4000, big=True)
     path = recordings.mcap(tmp_path / "n.mcap", messages, chunk_messages=20, compression="")
     read: list[int] = []
-    whole = FileSource.read
-    monkeypatch.setattr(FileSource, "read", lambda self, at, size: read.append(size) or whole(self, at, size))
+    pread, preadv = os.pread, os.preadv
+    monkeypatch.setattr(os, "pread", lambda fd, size, at: read.append(size) or pread(fd, size, at))
+    monkeypatch.setattr(
+        os, "preadv", lambda fd, into, at: read.extend(map(len, into)) or preadv(fd, into, at)
+    )
     with open_recording(path, resolve=recordings.blind) as recording:
         start, end = messages[2000].time_ns, messages[2040].time_ns
         assert len(recordings.received(recording, start_ns=start, end_ns=end)) == 40
-    assert sum(read) < path.stat().st_size // 30
+    assert path.stat().st_size // 200 < sum(read) < path.stat().st_size // 30
 
 
 @pytest.mark.parametrize("is_read", [True, False])

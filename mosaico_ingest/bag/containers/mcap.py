@@ -113,7 +113,7 @@ class McapPart:
             if want.overlaps(piece.start_ns, piece.end_ns) and piece.has_any(want.keys)
         ]
         self._source.prefetch((piece.offset, piece.stop) for piece in wanted)
-        for group in in_groups(wanted, lambda piece: max(piece.size, piece.stop - piece.offset)):
+        for group in in_groups(wanted, _room, want.block_bytes):
             yield Block(min(group[0].start_ns, LATEST_NS), partial(self._load, group, want))
 
     def check_unchanged(self) -> None:
@@ -190,6 +190,10 @@ class McapPart:
         if self._index.counts is None:
             unwanted = {key: len(rows) for key, rows in found if key not in want.keys}
             loaded.holes.extend(orphans(unwanted, self._index.channels))
+
+
+def _room(piece: Piece) -> int:
+    return max(piece.size, piece.stop - piece.offset)
 
 
 def _stream(key: int, channel: McapChannel, index: McapIndex) -> Stream:

@@ -15,7 +15,6 @@ from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote.path import AnyPath
 
 __all__ = [
-    "BLOCK_BYTES",
     "EARLIEST_NS",
     "FIRST_BYTES",
     "LATEST_NS",
@@ -32,8 +31,8 @@ __all__ = [
 
 EARLIEST_NS, LATEST_NS = -(2**63), 2**63 - 1
 """The first and last time stamps there are; the last is in the year 2262."""
-FIRST_BYTES, BLOCK_BYTES, MOST_PIECES = 2 << 20, 16 << 20, 64
-"""Up to how many bytes, at first and later on, and how many chunks are read at once.
+FIRST_BYTES, MOST_PIECES = 2 << 20, 64
+"""Up to how many bytes at first, and how many chunks are read at once.
 
 What is done once a block is done less often with larger ones; the first is small, so that the next stage begins early."""
 T = TypeVar("T")
@@ -124,16 +123,18 @@ class Block:
     load: Callable[[], Loaded]
 
 
-def in_groups(pieces: Iterable[T], size: Callable[[T], int], *, most: int = MOST_PIECES) -> Iterator[list[T]]:
-    """Yield neighbours together, up to `most`; of bytes few at first, then twice as many each time, up to `BLOCK_BYTES`."""
+def in_groups(
+    pieces: Iterable[T], size: Callable[[T], int], block_bytes: int, *, most: int = MOST_PIECES
+) -> Iterator[list[T]]:
+    """Yield neighbours together, up to `most`; of bytes few at first, then twice as many each time, up to `block_bytes`."""
     group: list[T] = []
-    held_bytes, most_bytes = 0, FIRST_BYTES
+    held_bytes, most_bytes = 0, min(FIRST_BYTES, block_bytes)
     for piece in pieces:
         held_bytes += size(piece)
         if group and (held_bytes > most_bytes or len(group) == most):
             yield group
             group, held_bytes = [], size(piece)
-            most_bytes = min(2 * most_bytes, BLOCK_BYTES)
+            most_bytes = min(2 * most_bytes, block_bytes)
         group.append(piece)
     if group:
         yield group
@@ -144,8 +145,10 @@ class Want:
     """Which messages to read: streams by key, and times from `start_ns` up to, not including, `end_ns`."""
 
     keys: Collection[int]
-    start_ns: int = EARLIEST_NS
-    end_ns: int = LATEST_NS + 1
+    start_ns: int
+    end_ns: int
+    block_bytes: int
+    """About how many bytes to read at once."""
 
     def overlaps(self, first_ns: int, last_ns: int) -> bool:
         """Return whether anything between the two times, both inclusive, may be wanted."""

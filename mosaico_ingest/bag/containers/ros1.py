@@ -94,7 +94,7 @@ class Ros1Part:
             if piece.is_cut or (want.overlaps(piece.start_ns, piece.end_ns) and piece.counts.keys() & keys)
         ]
         self._source.prefetch((piece.offset, piece.stop) for piece in wanted)
-        for group in in_groups(wanted, lambda piece: piece.stop - piece.offset, most=_CHUNKS):
+        for group in in_groups(wanted, _length, want.block_bytes, most=_CHUNKS):
             yield Block(group[0].start_ns, partial(self._load, group, want))
 
     def check_unchanged(self) -> None:
@@ -158,6 +158,10 @@ def _streams(index: Ros1Index, counts: dict[int, int]) -> tuple[Stream, ...]:
         )
         for key, connection in sorted(index.connections.items())
     )
+
+
+def _length(piece: Piece) -> int:
+    return piece.stop - piece.offset
 
 
 def _whole(piece: Piece, data: memoryview) -> _Chunk:

@@ -16,7 +16,6 @@ import numpy as np
 
 from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.containers.part import (
-    BLOCK_BYTES,
     EARLIEST_NS,
     FIRST_BYTES,
     LATEST_NS,
@@ -104,7 +103,7 @@ class SqlitePart:
         bounds = (max(want.start_ns, EARLIEST_NS), min(want.end_ns - 1, LATEST_NS))
         done = _Done(bounds[0], set())
         try:
-            for page in _pages(self._connection.execute(query, bounds)):
+            for page in _pages(self._connection.execute(query, bounds), want):
                 done = done.after(page)
                 yield Block(int(page[0][2]), partial(_load, page))
         except BROKEN as err:
@@ -116,7 +115,7 @@ class SqlitePart:
         wanted = (
             row for row in salvage.rows() if row[1] in want.keys and row[2] < want.end_ns and done.leaves(row)
         )
-        for page in _pages(wanted):
+        for page in _pages(wanted, want):
             yield Block(done.time_ns, partial(_load, page))
         holes = salvage.holes or [Hole(0, f"{reason}; every row could be read in another way", count=0)]
         yield Block(done.time_ns, lambda: Loaded([], holes))
@@ -245,17 +244,17 @@ def _stream(row: dict[str, Any], counts: dict[int, int] | None, definitions: dic
     )
 
 
-def _pages(rows: Iterator[Row]) -> Iterator[list[Row]]:
+def _pages(rows: Iterator[Row], want: Want) -> Iterator[list[Row]]:
     """Yield rows in lists of the size of a block; one is read at a time, as its size is known only then."""
     page: list[Row] = []
-    size, most_bytes = 0, FIRST_BYTES
+    size, most_bytes = 0, min(FIRST_BYTES, want.block_bytes)
     try:
         for row in rows:
             page.append(row)
             size += len(row[3]) if isinstance(row[3], bytes) else 0
             if size >= most_bytes or len(page) >= _PAGE_ROWS:
                 yield page
-                page, size, most_bytes = [], 0, min(2 * most_bytes, BLOCK_BYTES)
+                page, size, most_bytes = [], 0, min(2 * most_bytes, want.block_bytes)
     except BROKEN:
         if page:
             yield page
