@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import pyarrow as pa
@@ -10,12 +11,19 @@ import pyarrow.parquet as pq
 from mosaico_ingest.remote.path import AnyPath, RemotePath
 from mosaico_ingest.store import layout
 
-__all__ = ["create", "footer", "opened", "settle"]
+__all__ = ["create", "footer", "opened", "send_ahead", "settle"]
 
 
 def create(path: AnyPath) -> pa.NativeFile:
     """Open a new file for writing; behind a URL it is sent while it is written, and there once it is closed."""
     return path.open_output() if isinstance(path, RemotePath) else pa.OSFile(str(path), "wb")
+
+
+def send_ahead(file: pa.NativeFile, begin: int, end: int) -> None:
+    """Have the system begin to bring a stretch of a file to the disk, so that `settle` waits for less; on Linux it does."""
+    if isinstance(file, pa.OSFile) and hasattr(os, "posix_fadvise"):
+        # Linux writes dirty pages when it is told that they are not needed, without anyone waiting for it.
+        os.posix_fadvise(file.fileno(), begin, end - begin, os.POSIX_FADV_DONTNEED)
 
 
 def settle(path: AnyPath) -> None:

@@ -23,6 +23,8 @@ Bounds = tuple[str, Any, Any]
 
 _LONGEST_TEXT = 256
 _LARGEST_INTEGER = 1 << 63
+_SEND_BYTES = 4 << 20
+"""As much as this is not left to be brought to the disk at the end."""
 
 
 @frozen
@@ -48,6 +50,7 @@ class SegmentWriter:
         self._columns = columns
         self._content = ContentHash(columns.makers)
         self._file = files.create(path)
+        self._sent = 0
         self._footer: list[pq.FileMetaData] = []
         self._writer = pq.ParquetWriter(
             self._file,
@@ -68,6 +71,10 @@ class SegmentWriter:
     def append(self, rows: pa.Table) -> None:
         """Write one row group; the rows are sorted, and none is earlier than what is there."""
         self._writer.write_table(rows, row_group_size=max(1, rows.num_rows))
+        written = self.written_bytes
+        if written - self._sent >= _SEND_BYTES:
+            files.send_ahead(self._file, self._sent, written)
+            self._sent = written
         self._content.add(rows)
         self.end_ns = rows.column(0)[-1].as_py()
 

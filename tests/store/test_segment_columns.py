@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from mosaico_ingest.store.columns import Columns
 from mosaico_ingest.store.segment import SegmentWriter
 
 ROWS = 400
+BLOB = pa.struct([pa.field("data", pa.binary())])
 NOISE = np.random.default_rng(7).bytes(3000 * ROWS)
 
 
@@ -51,6 +53,30 @@ def test_blobs_are_compressed_only_where_they_shrink(
     chunk = written(tmp_path, "data", values)
     assert chunk.compression == codec
     assert chunk.statistics is None or not chunk.statistics.has_min_max
+
+
+@pytest.mark.parametrize("knows_how", [True, False])
+def test_a_large_segment_is_on_its_way_to_the_disk_before_it_is_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, knows_how: bool
+) -> None:
+    sent: list[tuple[int, int]] = []
+    if knows_how:
+        monkeypatch.setattr(
+            os, "posix_fadvise", lambda _fd, begin, size, _how: sent.append((begin, size)), raising=False
+        )
+        monkeypatch.setattr(os, "POSIX_FADV_DONTNEED", 4, raising=False)
+    else:
+        monkeypatch.delattr(os, "posix_fadvise", raising=False)
+    values = pa.array([NOISE] * 4)
+    table = pa.table([pa.array(np.arange(4)), values], schema=topic_schema(OntologyType("T", BLOB)))
+    writer = SegmentWriter(tmp_path / "s.parquet", Columns(table.schema), table)
+    for _ in range(4):
+        writer.append(table)
+    size = writer.close().stored_bytes
+    assert pq.read_table(tmp_path / "s.parquet").num_rows == 16
+    ends = [begin + length for begin, length in sent]
+    assert [begin for begin, _ in sent] == [0, *ends][: len(sent)]  # each from where the last ended
+    assert (size - ends[-1] < 5 << 20 and len(sent) > 1) if knows_how else not sent
 
 
 def test_floats_are_split_and_text_gets_a_dictionary(tmp_path: Path) -> None:
