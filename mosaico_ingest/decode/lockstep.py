@@ -37,7 +37,7 @@ FEW = 16
 _MANY = 64
 """So many elements of so few messages are worth a look whether they are alike."""
 _LOOKS = 3
-"""After so many elements a sequence of equal ones shows: the first may begin elsewhere in its words."""
+"""After so many elements a sequence of equal ones shows: the first may be padded otherwise."""
 _RARE = 4
 """Messages are guessed at where at least one of so many seems to have equal elements."""
 _AHEAD = 8
@@ -79,8 +79,8 @@ class _Elements:
 
     count: Int64s
     """How many each message has, shape (m,)."""
-    parts: list[Places]
-    taken: list[tuple[Int64s, Int64s]]
+    parts: list[Places] = field(default_factory=list[Places])
+    taken: list[tuple[Int64s, Int64s]] = field(default_factory=list[tuple[Int64s, Int64s]])
     """Of each part, whose elements they are, and which."""
     done: Int64s = field(init=False)
     """How many of each message have been walked, shape (m,)."""
@@ -204,7 +204,7 @@ class _Walk:
             count = np.full(len(cursor.pos), step.count, np.int64)
         at = cursor.pos
         cursor.pos = at.copy()
-        walked = _Elements(count, [], [])
+        walked = _Elements(count)
         active = np.flatnonzero(count > 0)
         guesses = _Guesses(len(count))
         while guesses.are_worth(active, walked):
@@ -235,7 +235,7 @@ class _Walk:
         number = expand(np.zeros_like(width), width)
         owner, sizes = np.repeat(rows, width), np.repeat(size, width)
         begins = cursor.pos[owner] + number * sizes
-        # None may reach into the next, so that what is walked by mistake is not more than the message.
+        # None may reach into the next: what is walked by mistake is then no more than there are bytes.
         ends = begins + sizes
         frame = self._frame
         origins = cursor.origin[owner]
