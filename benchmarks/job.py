@@ -26,9 +26,9 @@ target: {store: store}
 """
 
 
-def timed(recordings: list[Path], runs: int) -> tuple[Sample, dict[str, int]]:
+def timed(recordings: list[Path], runs: int, data: Path) -> tuple[Sample, dict[str, int]]:
     """Return what a job over the recordings takes, and how many messages each has."""
-    with tempfile.TemporaryDirectory(dir=HERE / "data") as made:
+    with tempfile.TemporaryDirectory(dir=data) as made:
         folder = Path(made)
         (folder / "recordings").mkdir()
         for recording in recordings:
@@ -54,7 +54,7 @@ def main() -> None:
     arguments = parser.parse_args()
     recordings = [BY_NAME[name].path(arguments.data) for name in SHORT]
     run([*INGEST, "--help"])  # so that no run compiles the sources
-    whole, counts = timed(recordings, arguments.runs)
+    whole, counts = timed(recordings, arguments.runs, arguments.data)
     messages = sum(counts.values())
     one = whole.wall_s / len(recordings)
     print(

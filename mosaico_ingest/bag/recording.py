@@ -35,7 +35,7 @@ _SMALL_BYTES = 1 << 20
 _THREADS = 3
 """Reading ahead is the third, beside decoding and writing: with fewer processors they are in each other's way."""
 _BLOCKS = 4
-"""A block is at most this part of the memory; half of it where one is read while another is at work."""
+"""As many blocks fit into the memory, or twice as many where one is read while another is at work."""
 
 ROWS = 1 << 16
 MEMORY_BYTES = 64 << 20

@@ -211,17 +211,14 @@ class _Walk:
             begins = cursor.pos[active]
             walked.take(self._element(step.body, cursor, active), active)
             guesses.note(active, cursor.pos[active] - begins)
-            active = active[(walked.done[active] < count[active]) & ~self.broken[cursor.row[active]]]
+            active = active[(walked.left(active) > 0) & ~self.broken[cursor.row[active]]]
             alike = active[guesses.alike[active]]
             if len(alike) * _RARE >= len(active):
                 self._guess(step.body, cursor, alike, walked, guesses)
-                active = active[walked.done[active] < count[active]]
+                active = active[walked.left(active) > 0]
         active = active[~self.broken[cursor.row[active]]]
         if len(active) or not walked.parts:
-            before = walked.done[active]
-            places = self._rest(step.body, cursor, active, count, walked.done)
-            more = walked.done[active] - before
-            walked.note(places, np.repeat(active, more), expand(before, more))
+            self._rest(step.body, cursor, active, walked)
         return Place(at, walked.done, walked.join())
 
     def _guess(self, body: Body, cursor: _Cursor, rows: Int64s, walked: _Elements, guesses: _Guesses) -> None:
@@ -261,18 +258,20 @@ class _Walk:
         cursor.end[active] = inner.end
         return places
 
-    def _rest(self, body: Body, cursor: _Cursor, active: Int64s, count: Int64s, done: Int64s) -> Places:
-        """Walk all elements that are left of the active messages, which are few; `done` counts those that fit."""
+    def _rest(self, body: Body, cursor: _Cursor, active: Int64s, walked: _Elements) -> None:
+        """Walk all elements that are left of the active messages, which are few; take those that fit."""
         stepper, notes = Stepper(self._layout, self._frame), Notes(body)
+        before = walked.done[active]
         for index in active.tolist():
-            left = int(count[index] - done[index])
+            left = int(walked.count[index] - walked.done[index])
             row, pos = int(cursor.row[index]), int(cursor.pos[index])
             fit, end = stepper.elements(row, notes, pos=pos, count=left)
-            done[index] += fit
+            walked.done[index] += fit
             cursor.pos[index] = end
             if fit < left:
-                self._drop(cursor, np.arange(len(count)) == index)
-        return notes.places()
+                self._drop(cursor, np.arange(len(walked.count)) == index)
+        more = walked.done[active] - before
+        walked.note(notes.places(), np.repeat(active, more), expand(before, more))
 
     def _count(self, cursor: _Cursor, step: Step, bound: int = 0) -> Int64s:
         """Read a length word each, and check it against the bytes left."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from typing import Any
 
 import pyarrow as pa
@@ -22,8 +23,10 @@ def create(path: AnyPath) -> pa.NativeFile:
 def send_ahead(file: pa.NativeFile, begin: int, end: int) -> None:
     """Have the system begin to bring a stretch of a file to the disk, so that `settle` waits for less; on Linux it does."""
     if isinstance(file, pa.OSFile) and hasattr(os, "posix_fadvise"):
-        # Linux writes dirty pages when it is told that they are not needed, without anyone waiting for it.
-        os.posix_fadvise(file.fileno(), begin, end - begin, os.POSIX_FADV_DONTNEED)
+        # Linux writes dirty pages when it is told that they are not needed, without anyone waiting for it. It is a
+        # hint: a file system that takes none is no reason to stop, and a disk that fails says so to `settle`.
+        with suppress(OSError):
+            os.posix_fadvise(file.fileno(), begin, end - begin, os.POSIX_FADV_DONTNEED)
 
 
 def settle(path: AnyPath) -> None:

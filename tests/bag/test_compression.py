@@ -95,7 +95,7 @@ def _packed(chunks: Sequence[tuple[str, bytes, int]]) -> tuple[NDArray[np.uint8]
 
 def _inflate_all(chunks: Sequence[tuple[str, bytes, int]]) -> tuple[list[bytes], dict[int, BagError]]:
     found = inflate_all(*_packed(chunks))
-    held = [found.data[begin:end].tobytes() for begin, end in zip(found.begins, found.ends, strict=True)]
+    held = [found.data[begin:end].tobytes() for begin, end in found.places]
     return held, found.failures
 
 

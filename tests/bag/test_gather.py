@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mosaico_ingest.bag.batch import Channel, Encoding
-from mosaico_ingest.bag.containers.part import LATEST_NS, Block, Loaded, Slab
+from mosaico_ingest.bag.containers.part import FIRST_BYTES, LATEST_NS, Block, Loaded, Slab, in_groups
 from mosaico_ingest.bag.containers.slab import by_key, in_time, pack
 from mosaico_ingest.bag.gather import Gather
 from mosaico_ingest.bag.merge import in_turn
@@ -169,3 +169,16 @@ def test_reading_ahead_stops_with_its_context() -> None:
     assert threading.active_count() == before
     assert len(made) <= 6
     assert made[-1] == 0
+
+
+def test_groups_double_up_to_a_block_and_give_what_came_before_an_error() -> None:
+    def pieces() -> Generator[int, None, None]:
+        yield from [FIRST_BYTES] * 8
+        raise ValueError("here")
+
+    found: list[int] = []
+    with pytest.raises(ValueError, match="here"):
+        found.extend(len(group) for group in in_groups(pieces(), int, 4 * FIRST_BYTES))
+    assert found == [1, 2, 4, 1]
+    assert [len(group) for group in in_groups([1] * 5, int, 0)] == [1] * 5
+    assert [len(group) for group in in_groups([1] * 5, int, FIRST_BYTES, most=2)] == [2, 2, 1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bz2
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -60,7 +60,7 @@ def inflate(data: bytes | memoryview, compression: str, size: int) -> bytes | me
     Raises:
         BagError: The compression is unknown, the data are damaged, or they hold another number of bytes.
     """
-    if not compression or compression == "none":
+    if _is_plain(compression):
         whole: bytes | memoryview = data
     else:
         try:
@@ -87,27 +87,25 @@ class Inflated:
     """One buffer with what is in some chunks, where in it each begins and ends, and which are damaged."""
 
     data: Bytes
-    begins: list[int]
-    ends: list[int]
+    places: list[tuple[int, int]]
     failures: dict[int, BagError]
 
 
 def inflate_all(data: Bytes, chunks: Sequence[Packed]) -> Inflated:
     """Return what is in the chunks, whose data lie in `data`; chunks that are not compressed stay there."""
-    sizes = [chunk.size for chunk in chunks]
-    if all(_is_plain(chunk) and chunk.end - chunk.begin == chunk.size for chunk in chunks):
-        return Inflated(data, [chunk.begin for chunk in chunks], [chunk.end for chunk in chunks], {})
+    if all(_is_plain(chunk.compression) and chunk.end - chunk.begin == chunk.size for chunk in chunks):
+        return Inflated(data, [(chunk.begin, chunk.end) for chunk in chunks], {})
     failures: dict[int, BagError] = {}
-    if len(chunks) != 1 and sum(sizes) <= _TOGETHER_BYTES:
-        buffer = room(sum(sizes))
-        ends = list(accumulate(sizes))
-        begins = [end - size for end, size in zip(ends, sizes, strict=True)]
-        for number, chunk in enumerate(chunks):
+    total = sum(chunk.size for chunk in chunks)
+    if len(chunks) != 1 and total <= _TOGETHER_BYTES:
+        buffer = room(total)
+        places = _side_by_side(chunk.size for chunk in chunks)
+        for number, (chunk, (begin, end)) in enumerate(zip(chunks, places, strict=True)):
             try:
-                _inflate_into(buffer[begins[number] : ends[number]], chunk, data)
+                _inflate_into(buffer[begin:end], chunk, data)
             except BagError as err:  # noqa: PERF203 - each chunk may fail for itself
                 failures[number] = err
-        return Inflated(buffer, begins, ends, failures)
+        return Inflated(buffer, places, failures)
     pieces: list[Bytes] = []
     for number, chunk in enumerate(chunks):
         try:
@@ -115,13 +113,16 @@ def inflate_all(data: Bytes, chunks: Sequence[Packed]) -> Inflated:
         except BagError as err:  # noqa: PERF203 - as above
             failures[number] = err
             pieces.append(np.empty(0, np.uint8))
-    ends = list(accumulate(map(len, pieces)))
-    begins = [end - len(piece) for end, piece in zip(ends, pieces, strict=True)]
-    return Inflated(pieces[0] if len(pieces) == 1 else np.concatenate(pieces), begins, ends, failures)
+    whole = pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
+    return Inflated(whole, _side_by_side(map(len, pieces)), failures)
 
 
-def _is_plain(chunk: Packed) -> bool:
-    return not chunk.compression or chunk.compression == "none"
+def _side_by_side(sizes: Iterable[int]) -> list[tuple[int, int]]:
+    return list(pairwise(accumulate(sizes, initial=0)))
+
+
+def _is_plain(compression: str) -> bool:
+    return compression in {"", "none"}
 
 
 def _inflated(chunk: Packed, data: Bytes) -> Bytes:
@@ -146,7 +147,7 @@ def _inflate_into(target: Bytes, chunk: Packed, data: Bytes) -> None:
 
 def inflate_some(data: bytes | memoryview, compression: str, size: int) -> bytes:
     """Return what can be had of a chunk that is cut off or damaged, at most `size` bytes; maybe nothing."""
-    if not compression or compression == "none":
+    if _is_plain(compression):
         return bytes(data[:size])
     found = bytearray()
     try:

@@ -113,7 +113,7 @@ class McapPart:
             if want.overlaps(piece.start_ns, piece.end_ns) and piece.has_any(want.keys)
         ]
         self._source.prefetch((piece.offset, piece.stop) for piece in wanted)
-        for group in in_groups(wanted, _room, want.block_bytes):
+        for group in in_groups(wanted, _inflated_bytes, want.block_bytes):
             yield Block(min(group[0].start_ns, LATEST_NS), partial(self._load, group, want))
 
     def check_unchanged(self) -> None:
@@ -156,7 +156,7 @@ class McapPart:
                 loaded.holes.extend(_whole_chunk(piece, raw, want, err))
         inflated = inflate_all(stretches.data, [where for *_, where in packed])
         for place, (piece, raw, head, _) in enumerate(packed):
-            chunk = _Chunk(piece, raw, inflated.data, inflated.begins[place], inflated.ends[place])
+            chunk = _Chunk(piece, raw, inflated.data, *inflated.places[place])
             broken = inflated.failures.get(place) or _wrong_checksum(chunk.data, head)
             if broken:
                 loaded.holes.extend(_whole_chunk(piece, raw, want, broken))
@@ -192,7 +192,7 @@ class McapPart:
             loaded.holes.extend(orphans(unwanted, self._index.channels))
 
 
-def _room(piece: Piece) -> int:
+def _inflated_bytes(piece: Piece) -> int:
     return max(piece.size, piece.stop - piece.offset)
 
 

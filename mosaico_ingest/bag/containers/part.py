@@ -126,16 +126,25 @@ class Block:
 def in_groups(
     pieces: Iterable[T], size: Callable[[T], int], block_bytes: int, *, most: int = MOST_PIECES
 ) -> Iterator[list[T]]:
-    """Yield neighbours together, up to `most`; of bytes few at first, then twice as many each time, up to `block_bytes`."""
+    """Yield neighbours together, up to `most`; of bytes few at first, then twice as many each time, up to `block_bytes`.
+
+    What came before an error of `pieces` is given before it is raised.
+    """
     group: list[T] = []
     held_bytes, most_bytes = 0, min(FIRST_BYTES, block_bytes)
-    for piece in pieces:
-        held_bytes += size(piece)
-        if group and (held_bytes > most_bytes or len(group) == most):
+    try:
+        for piece in pieces:
+            piece_bytes = size(piece)
+            held_bytes += piece_bytes
+            if group and (held_bytes > most_bytes or len(group) == most):
+                yield group
+                group, held_bytes = [], piece_bytes
+                most_bytes = min(2 * most_bytes, block_bytes)
+            group.append(piece)
+    except Exception:
+        if group:
             yield group
-            group, held_bytes = [], size(piece)
-            most_bytes = min(2 * most_bytes, block_bytes)
-        group.append(piece)
+        raise
     if group:
         yield group
 

@@ -69,7 +69,10 @@ class RemoteSource:
 
     def read_into(self, target: memoryview, offset: int) -> None:
         """Fill `target` with the bytes from `offset` on; see `FileSource.read_into`."""
-        target[:] = self.read(offset, len(target))
+        if self._near is not None:
+            self._near.read_into(target, offset)
+        else:
+            target[:] = self.read(offset, len(target))
 
     def read_some(self, offset: int, size: int) -> bytes:
         """Return up to `size` bytes from `offset` on, fewer only where the file ends."""

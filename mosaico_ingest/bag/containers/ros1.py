@@ -94,7 +94,7 @@ class Ros1Part:
             if piece.is_cut or (want.overlaps(piece.start_ns, piece.end_ns) and piece.counts.keys() & keys)
         ]
         self._source.prefetch((piece.offset, piece.stop) for piece in wanted)
-        for group in in_groups(wanted, _length, want.block_bytes, most=_CHUNKS):
+        for group in in_groups(wanted, _packed_bytes, want.block_bytes, most=_CHUNKS):
             yield Block(group[0].start_ns, partial(self._load, group, want))
 
     def check_unchanged(self) -> None:
@@ -138,8 +138,7 @@ class Ros1Part:
             if place in inflated.failures:
                 loaded.holes.extend(_broken(piece, want, inflated.failures[place]))
             else:
-                begin, end = inflated.begins[place], inflated.ends[place]
-                found.append(_Chunk(piece, after, inflated.data, begin, end))
+                found.append(_Chunk(piece, after, inflated.data, *inflated.places[place]))
         return found
 
 
@@ -160,7 +159,7 @@ def _streams(index: Ros1Index, counts: dict[int, int]) -> tuple[Stream, ...]:
     )
 
 
-def _length(piece: Piece) -> int:
+def _packed_bytes(piece: Piece) -> int:
     return piece.stop - piece.offset
 
 

@@ -17,7 +17,6 @@ import numpy as np
 from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.bag.containers.part import (
     EARLIEST_NS,
-    FIRST_BYTES,
     LATEST_NS,
     Block,
     Hole,
@@ -25,6 +24,7 @@ from mosaico_ingest.bag.containers.part import (
     Slab,
     Stream,
     Want,
+    in_groups,
     orphans,
 )
 from mosaico_ingest.bag.containers.slab import by_key
@@ -246,21 +246,11 @@ def _stream(row: dict[str, Any], counts: dict[int, int] | None, definitions: dic
 
 def _pages(rows: Iterator[Row], want: Want) -> Iterator[list[Row]]:
     """Yield rows in lists of the size of a block; one is read at a time, as its size is known only then."""
-    page: list[Row] = []
-    size, most_bytes = 0, min(FIRST_BYTES, want.block_bytes)
-    try:
-        for row in rows:
-            page.append(row)
-            size += len(row[3]) if isinstance(row[3], bytes) else 0
-            if size >= most_bytes or len(page) >= _PAGE_ROWS:
-                yield page
-                page, size, most_bytes = [], 0, min(2 * most_bytes, want.block_bytes)
-    except BROKEN:
-        if page:
-            yield page
-        raise
-    if page:
-        yield page
+    return in_groups(rows, _data_bytes, want.block_bytes, most=_PAGE_ROWS)
+
+
+def _data_bytes(row: Row) -> int:
+    return len(row[3]) if isinstance(row[3], bytes) else 0
 
 
 def _load(page: list[Row]) -> Loaded:
