@@ -16,7 +16,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 from measure import run
 
-from mosaico_ingest.store.store import Store
+from mosaico_ingest.destinations.store.store import Store
 
 CHUNK_BYTES = 25 << 20
 ROW = "{:<22} {:>9} {:>9} {:>8} {:>10} {:>8} {:>7}"

@@ -17,14 +17,12 @@ import numpy as np
 from rosbags.typesys import Stores as RosbagsStores
 from rosbags.typesys import get_typestore
 
-from mosaico_ingest.bag.batch import Channel, Encoding, RawBatch
-from mosaico_ingest.bag.definition import Definition
-from mosaico_ingest.bag.serialize import Serializer
-from mosaico_ingest.bag.types import TypeResolver
-from mosaico_ingest.decode.columnar import ColumnarDecoder
-from mosaico_ingest.decode.decoder import Decoded
-from mosaico_ingest.decode.rowwise import RowwiseDecoder
-from mosaico_ingest.policies import Stores
+from mosaico_ingest.decode.decoder import ColumnarDecoder, Decoded, RowwiseDecoder
+from mosaico_ingest.job.model import Stores
+from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
+from mosaico_ingest.rosbag.definitions.model import Definition
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.serialization import Serializer
 
 RNG = np.random.default_rng(7)
 Values = dict[str, Any]

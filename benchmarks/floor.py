@@ -20,9 +20,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import zstandard
 
-from mosaico_ingest.store.columns import Columns
-from mosaico_ingest.store.segment import SegmentWriter
-from mosaico_ingest.store.store import Store
+from mosaico_ingest.destinations.store.segment import Columns, SegmentWriter
+from mosaico_ingest.destinations.store.store import Store
 
 INFLATE = {
     "": bytes,

@@ -19,19 +19,21 @@ except ImportError:  # only the long run needs it
     atheris = None
 
 with atheris.instrument_imports(include=["mosaico_ingest"]) if atheris else nullcontext():
-    from mosaico_ingest.adapters.mapping.load import load_adapter
-    from mosaico_ingest.bag.batch import Channel, Encoding, RawBatch
-    from mosaico_ingest.bag.containers import mcap, ros1, rosrecord, sqlite
-    from mosaico_ingest.bag.definition import Embedded
-    from mosaico_ingest.bag.metadata import read_metadata
-    from mosaico_ingest.bag.recording import open_recording
-    from mosaico_ingest.bag.types import TypeResolver
-    from mosaico_ingest.decode.choose import decoder_for
+    from mosaico_ingest.adapters.mapping.loader import load_adapter
+    from mosaico_ingest.decode.decoder import decoder_for
     from mosaico_ingest.errors import IngestError
-    from mosaico_ingest.manifest.load import check_manifest
-    from mosaico_ingest.manifest.source import load_source
-    from mosaico_ingest.wire.actions import ACTIONS
-    from mosaico_ingest.wire.codec import JSON, Malformed
+    from mosaico_ingest.job.manifest import check_manifest
+    from mosaico_ingest.job.yaml_source import load_source
+    from mosaico_ingest.protocol.messages import ACTIONS, JSON, Malformed
+    from mosaico_ingest.rosbag import sqlite
+    from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
+    from mosaico_ingest.rosbag.definitions.model import Embedded
+    from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+    from mosaico_ingest.rosbag.discovery import read_metadata
+    from mosaico_ingest.rosbag.mcap import reader as mcap
+    from mosaico_ingest.rosbag.recording import open_recording
+    from mosaico_ingest.rosbag.ros1 import reader as ros1
+    from mosaico_ingest.rosbag.ros1 import version_1_2 as rosrecord
 
 __all__ = ["TARGETS"]
 

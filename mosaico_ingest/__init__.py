@@ -9,21 +9,21 @@ from mosaico_ingest.version import __version__
 
 if TYPE_CHECKING:
     from mosaico_ingest.adapters import ROSAdapterBase, register_default_adapter
+    from mosaico_ingest.adapters.bridge import ROSBridge
     from mosaico_ingest.api import RosbagInjector
-    from mosaico_ingest.bag.loader import ROSLoader
-    from mosaico_ingest.bag.message import ROSMessage
-    from mosaico_ingest.bag.registry import ROSTypeRegistry
-    from mosaico_ingest.bridge import ROSBridge
-    from mosaico_ingest.config import ROSInjectionConfig
-    from mosaico_ingest.ontology import Message, Serializable
-    from mosaico_ingest.policies import (
+    from mosaico_ingest.job.config import ROSInjectionConfig
+    from mosaico_ingest.job.model import (
         IfExists,
         LoaderErrorPolicy,
         SessionLevelErrorPolicy,
         Stores,
         TopicLevelErrorPolicy,
     )
-    from mosaico_ingest.wire.actions import Permission as APIKeyPermissionEnum
+    from mosaico_ingest.ontology import Message, Serializable
+    from mosaico_ingest.protocol.messages import Permission as APIKeyPermissionEnum
+    from mosaico_ingest.rosbag.blocks import ROSMessage
+    from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry
+    from mosaico_ingest.rosbag.loader import ROSLoader
 
 __all__ = [
     "APIKeyPermissionEnum",
@@ -46,20 +46,20 @@ __all__ = [
 ]
 
 _WHERE = {
-    "IfExists": "policies",
-    "LoaderErrorPolicy": "policies",
+    "IfExists": "job.model",
+    "LoaderErrorPolicy": "job.model",
     "Message": "ontology",
     "ROSAdapterBase": "adapters",
-    "ROSBridge": "bridge",
-    "ROSInjectionConfig": "config",
-    "ROSLoader": "bag.loader",
-    "ROSMessage": "bag.message",
-    "ROSTypeRegistry": "bag.registry",
+    "ROSBridge": "adapters.bridge",
+    "ROSInjectionConfig": "job.config",
+    "ROSLoader": "rosbag.loader",
+    "ROSMessage": "rosbag.blocks",
+    "ROSTypeRegistry": "rosbag.definitions.registry",
     "RosbagInjector": "api",
     "Serializable": "ontology",
-    "SessionLevelErrorPolicy": "policies",
-    "Stores": "policies",
-    "TopicLevelErrorPolicy": "policies",
+    "SessionLevelErrorPolicy": "job.model",
+    "Stores": "job.model",
+    "TopicLevelErrorPolicy": "job.model",
     "register_default_adapter": "adapters",
 }
 """A name is imported when it is asked for, so that `ingest --help` does not wait for Arrow."""
@@ -67,7 +67,7 @@ _WHERE = {
 
 def __getattr__(name: str) -> object:
     if name == "APIKeyPermissionEnum":
-        return import_module(f"{__name__}.wire.actions").Permission
+        return import_module(f"{__name__}.protocol.messages").Permission
     if name not in _WHERE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_WHERE[name]}"), name)

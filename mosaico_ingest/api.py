@@ -12,27 +12,31 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mosaico_ingest.bridge import ROSBridge
-from mosaico_ingest.config import ROSInjectionConfig
-from mosaico_ingest.diagnostics import Finding, Severity
+from mosaico_ingest.adapters.bridge import ROSBridge
 from mosaico_ingest.errors import IngestError, ManifestError
-from mosaico_ingest.executors.local import Inline
-from mosaico_ingest.executors.worker import execute, make_plan
-from mosaico_ingest.plan.model import Plan
-from mosaico_ingest.policies import IfExists
-from mosaico_ingest.remote.path import AnyPath
-from mosaico_ingest.report.events import BatchObserver, Observer, ignore_batch, ignore_events
+from mosaico_ingest.executors.in_process import Inline
+from mosaico_ingest.findings import Finding, Severity
+from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.pipeline.plan import Plan
+from mosaico_ingest.pipeline.run import execute, make_plan
+from mosaico_ingest.remote import AnyPath
+from mosaico_ingest.report.events import (
+    BatchObserver,
+    Observer,
+    ignore_batch,
+    ignore_events,
+)
 from mosaico_ingest.report.model import Report, RunReport, UsedManifest
-from mosaico_ingest.report.stopwatch import Stopwatch
+from mosaico_ingest.report.timing import Stopwatch
 from mosaico_ingest.textfile import read_whole
 from mosaico_ingest.version import __version__
 
 if TYPE_CHECKING:
-    from mosaico_ingest.executors.executor import Executor
-    from mosaico_ingest.executors.status import RecordingStatus
-    from mosaico_ingest.plan.document import PlanDocument
-    from mosaico_ingest.plan.drift import Difference
-    from mosaico_ingest.report.inspection import Inspection
+    from mosaico_ingest.executors.in_process import Executor
+    from mosaico_ingest.pipeline.plan import Difference, PlanDocument
+    from mosaico_ingest.services.inspection import Inspection
+    from mosaico_ingest.services.status import RecordingStatus
 
 __all__ = [
     "RosbagInjector",
@@ -92,8 +96,8 @@ def compile_job(manifest: Path) -> tuple[ROSInjectionConfig, ...]:
         NothingMatched: There is no such recording.
         AdapterError: An adapter it names is not there or has a mistake.
     """
-    from mosaico_ingest.manifest.load import load_manifests
-    from mosaico_ingest.plan.compile import compile_manifests
+    from mosaico_ingest.job.manifest import load_manifests
+    from mosaico_ingest.pipeline.compile import compile_manifests
 
     configs = compile_manifests(load_manifests(manifest))
     for _, alike in groupby(configs, key=lambda config: (config.adapters, config.adapter_override)):
@@ -109,8 +113,8 @@ def compile_recording(manifest: Path, recording: Path) -> tuple[ROSInjectionConf
     Raises:
         IngestError: As `compile_job`.
     """
-    from mosaico_ingest.manifest.load import load_manifests
-    from mosaico_ingest.plan.compile import compile_manifests
+    from mosaico_ingest.job.manifest import load_manifests
+    from mosaico_ingest.pipeline.compile import compile_manifests
 
     loaded = (one.for_recording(recording.resolve()) for one in load_manifests(manifest))
     return tuple(
@@ -134,7 +138,7 @@ def plan_job(
     Raises:
         IngestError: The job cannot be done; the message says why.
     """
-    from mosaico_ingest.executors.preview import plan_document
+    from mosaico_ingest.pipeline.preview import plan_document
 
     return plan_document(
         configs or compile_job(manifest), job=manifest, folder=folder or Path(), connect=connect
@@ -147,8 +151,7 @@ def plan_differences(path: Path, document: PlanDocument) -> tuple[Difference, ..
     Raises:
         ManifestError: The file is no plan.
     """
-    from mosaico_ingest.plan.document import read_plan
-    from mosaico_ingest.plan.drift import differences
+    from mosaico_ingest.pipeline.plan import differences, read_plan
 
     known = [recording.decisions for recording in read_plan(path).recordings]
     return differences(known, [recording.decisions for recording in document.recordings])
@@ -160,8 +163,8 @@ def compare_jobs(before: Path, after: Path) -> tuple[Difference, ...]:
     Raises:
         IngestError: One of them cannot be done; the message says why.
     """
-    from mosaico_ingest.executors.preview import decide
-    from mosaico_ingest.plan.drift import differences
+    from mosaico_ingest.pipeline.plan import differences
+    from mosaico_ingest.pipeline.preview import decide
 
     both = ([decide(config, folder=Path()) for config in compile_job(job)] for job in (before, after))
     return differences(*both)
@@ -174,9 +177,8 @@ def compile_plan(path: Path) -> tuple[ROSInjectionConfig, ...]:
         ManifestError: The file is no plan, or its manifest has mistakes.
         IngestError: The manifest or a recording no longer fits the plan; `findings` say how.
     """
-    from mosaico_ingest.executors.preview import decide
-    from mosaico_ingest.plan.document import read_plan
-    from mosaico_ingest.plan.drift import differences
+    from mosaico_ingest.pipeline.plan import differences, read_plan
+    from mosaico_ingest.pipeline.preview import decide
 
     planned = read_plan(path).recordings
     configs = compile_job(path.parent / read_plan(path).job)
@@ -228,7 +230,7 @@ def used_manifest(path: Path) -> UsedManifest:
     Raises:
         ManifestError: It cannot be read.
     """
-    from mosaico_ingest.manifest.used import manifest_text
+    from mosaico_ingest.job.expand import manifest_text
 
     return UsedManifest(path=str(path), text=manifest_text(path))
 
@@ -239,7 +241,7 @@ def job_status(manifest: Path) -> tuple[RecordingStatus, ...]:
     Raises:
         IngestError: The manifest cannot become a job.
     """
-    from mosaico_ingest.executors.status import standings
+    from mosaico_ingest.services.status import standings
 
     return tuple(standings(compile_job(manifest)))
 
@@ -250,7 +252,7 @@ def inspect_recording(path: AnyPath | str, *, ros_distro: str | None = None) -> 
     Raises:
         BagError: It cannot be opened.
     """
-    from mosaico_ingest.executors.inspection import inspect
+    from mosaico_ingest.services.inspection import inspect
 
     config = ROSInjectionConfig(file_path=path, sequence_name="inspected", ros_distro=ros_distro)
     return inspect(config)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from mosaico_ingest.diagnostics import Finding, one_line
+from mosaico_ingest.findings import Finding, one_line
 
 __all__ = [
     "AdapterError",

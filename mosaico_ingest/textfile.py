@@ -9,7 +9,7 @@ from pathlib import Path
 from stat import S_ISDIR, S_ISREG
 
 from mosaico_ingest.errors import ManifestError, SinkError
-from mosaico_ingest.remote.path import AnyPath
+from mosaico_ingest.remote import AnyPath
 
 __all__ = ["LONGEST", "check_file", "read_whole", "write_whole"]
 

@@ -11,7 +11,7 @@ import pytest
 from made_recordings import define, record
 
 from mosaico_ingest import RosbagInjector, ROSInjectionConfig
-from mosaico_ingest.store import Store
+from mosaico_ingest.destinations.store import Store
 
 BAR = "=" * 80
 Rows = list[dict[str, Any]]

@@ -10,9 +10,14 @@ from typing import Any
 import pytest
 from rosbags.typesys import Stores as RosbagsStores
 
-from mosaico_ingest.config import ROSInjectionConfig, ServerTarget, StoreTarget, TimeBound
 from mosaico_ingest.errors import IngestError, ManifestError
-from mosaico_ingest.policies import (
+from mosaico_ingest.job.config import (
+    ROSInjectionConfig,
+    ServerTarget,
+    StoreTarget,
+    TimeBound,
+)
+from mosaico_ingest.job.model import (
     IfExists,
     LoaderErrorPolicy,
     SessionLevelErrorPolicy,

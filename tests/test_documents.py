@@ -16,7 +16,7 @@ import pytest
 from typer.main import get_command
 
 from mosaico_ingest.cli.app import command_line
-from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.job.config import ROSInjectionConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = sorted((ROOT / "docs").glob("*.md"))

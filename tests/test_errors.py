@@ -7,8 +7,13 @@ import pickle
 import pytest
 
 from mosaico_ingest import errors
-from mosaico_ingest.diagnostics import Finding, Severity
-from mosaico_ingest.errors import IngestError, ManifestError, SinkUnavailable, Unreachable
+from mosaico_ingest.errors import (
+    IngestError,
+    ManifestError,
+    SinkUnavailable,
+    Unreachable,
+)
+from mosaico_ingest.findings import Finding, Severity
 
 KINDS = [getattr(errors, name) for name in errors.__all__]
 FINDING = Finding("unknown-key", Severity.ERROR, "unknown key")

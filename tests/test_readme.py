@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from mosaico_ingest.store import Store
+from mosaico_ingest.destinations.store import Store
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -19,9 +19,9 @@ from rosbags.typesys import Stores as RosbagsStores
 from rosbags.typesys import get_types_from_msg, get_typestore
 
 from mosaico_ingest import ROSTypeRegistry
-from mosaico_ingest.adapters import base
+from mosaico_ingest.adapters import python as base
 from mosaico_ingest.cli.app import main
-from mosaico_ingest.store import Store
+from mosaico_ingest.destinations.store import Store
 
 CUSTOM = {
     "my_custom_pkg/msg/Status": "std_msgs/Header header\nuint8 mode\nfloat32[] loads\n",

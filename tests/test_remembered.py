@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mosaico_ingest.remembered import remembered
+from mosaico_ingest.caching import remembered
 
 
 class _Given:

@@ -12,18 +12,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mosaico_ingest.adapters.adapter import Adapted, Envelope
-from mosaico_ingest.bag.batch import Channel, Encoding, RawBatch
-from mosaico_ingest.bag.serialize import Serializer
-from mosaico_ingest.bag.types import TypeResolver
-from mosaico_ingest.diagnostics import RowFailure
 from mosaico_ingest.errors import AdapterError, DecodeError, SinkError
+from mosaico_ingest.findings import RowFailure
+from mosaico_ingest.job.model import LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.plan.model import TopicPlan
-from mosaico_ingest.policies import LoaderErrorPolicy, TopicLevelErrorPolicy
+from mosaico_ingest.pipeline.plan import TopicPlan
+from mosaico_ingest.pipeline.topic import Stream
+from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.report.collect import Collector
 from mosaico_ingest.report.events import Expected, RunStarted
-from mosaico_ingest.stream import Stream
-from mosaico_ingest.write_buffer import WriteBuffer
+from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.serialization import Serializer
 
 DEFINITION = TypeResolver("ros2_humble").resolve("std_msgs/msg/Float64", None, ros_version=2)
 CHANNEL = Channel(0, "/speed", "std_msgs/msg/Float64", Encoding.CDR, None, DEFINITION)

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pytest
 
 from mosaico_ingest.errors import SinkError
-from mosaico_ingest.write_buffer import WriteBuffer
+from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 
 
 def batch(value: int, rows: int = 4) -> pa.RecordBatch:
@@ -82,7 +82,7 @@ def test_put_waits_while_the_buffer_is_full() -> None:
 
 
 def test_an_interrupt_waits_for_a_stuck_writer_only_so_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mosaico_ingest.write_buffer._INTERRUPTED_S", 0.1)
+    monkeypatch.setattr("mosaico_ingest.pipeline.write_buffer._INTERRUPTED_S", 0.1)
     writer = Writer(delay_s=0.5)
     begin = time.monotonic()
     with pytest.raises(KeyboardInterrupt), WriteBuffer(max_bytes=1000) as buffer:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mosaico_ingest.adapters.base import ROSAdapterBase, register_default_adapter
+    from mosaico_ingest.adapters.python import ROSAdapterBase, register_default_adapter
 
 __all__ = ["ROSAdapterBase", "register_default_adapter"]
 
@@ -16,14 +16,14 @@ __all__ = ["ROSAdapterBase", "register_default_adapter"]
 def __getattr__(name: str) -> Any:  # noqa: ANN401 - a class or a function
     """Import what `name` needs, and nothing before."""
     if name in __all__:
-        from mosaico_ingest.adapters import base  # noqa: PLC0415 - on demand
+        from mosaico_ingest.adapters import python  # noqa: PLC0415 - on demand
 
-        return getattr(base, name)
+        return getattr(python, name)
     if name.endswith("Adapter"):
         from mosaico_ingest.adapters.builtin import BY_NAME  # noqa: PLC0415 - on demand
 
         if name in BY_NAME:
-            from mosaico_ingest.adapters.names import adapter_class  # noqa: PLC0415 - on demand
+            from mosaico_ingest.adapters.direct import adapter_class  # noqa: PLC0415 - on demand
 
             return adapter_class(name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

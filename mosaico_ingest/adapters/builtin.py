@@ -13,9 +13,9 @@ from typing import Any
 import pyarrow as pa
 
 from mosaico_ingest.adapters.adapter import Adapter
-from mosaico_ingest.adapters.mapping.load import MappingSpec, known_adapter
-from mosaico_ingest.bag.definition import Definition
+from mosaico_ingest.adapters.mapping.loader import MappingSpec, known_adapter
 from mosaico_ingest.frozen import frozen
+from mosaico_ingest.rosbag.definitions.model import Definition
 
 __all__ = ["BUILTIN", "BY_NAME", "BY_TYPE", "CATALOG", "FILE", "Builtin", "find_builtin"]
 

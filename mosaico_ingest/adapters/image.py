@@ -9,11 +9,16 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from mosaico_ingest.adapters.adapter import Adapted, Adapter, AdapterSpec, Envelope
-from mosaico_ingest.bag.definition import Definition
+from mosaico_ingest.adapters.adapter import (
+    Adapted,
+    Adapter,
+    AdapterSpec,
+    Envelope,
+)
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.rosbag.definitions.model import Definition
 
 __all__ = ["PngImageSpec", "greyscale_pixels", "greyscale_png", "without_png"]
 

@@ -1,4 +1,4 @@
-"""This file is the `ingest` command: its subcommands in one list, and the one place an error becomes an exit code."""
+"""The `ingest` command: its subcommands, and the conversion of errors to exit codes."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from typing import Annotated
 
 import typer
 
-from mosaico_ingest.cli.collector import collect_rarely
+from mosaico_ingest.cli.process import collect_rarely
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.version import __version__
 
 __all__ = ["command_line", "main"]
 
-COMMANDS = (
-    "run", "bag", "inspect", "plan", "diff", "init", "expand", "verify", "replay", "export", "lint", "serve", "watch",
-    "status", "report", "schema",
-)  # fmt: skip
-"""Each is a function in the module of its name; in the order `--help` lists them."""
-GROUPS = ("adapters", "store", "keys")
-"""Each is the `app` of the module of its name."""
+COMMANDS = {
+    "run": "run", "bag": "run", "inspect": "report", "plan": "plan", "diff": "plan", "init": "plan", "expand": "plan",
+    "verify": "store", "replay": "run", "export": "export", "lint": "lint", "serve": "serve", "watch": "watch",
+    "status": "watch", "report": "report", "schema": "lint",
+}  # fmt: skip
+"""Each command is the function of its name in this module of `cli`; in the order `--help` lists them."""
+GROUPS = {"adapters": "adapters", "store": "store", "keys": "serve"}
+"""Each command group is the Typer application `<name>_app` in this module of `cli`."""
 
 
 def _print_version(wanted: bool) -> None:
@@ -53,10 +54,11 @@ def command_line(names: Sequence[str] = (*COMMANDS, *GROUPS)) -> typer.Typer:
         context_settings={"help_option_names": ["--help", "-h"]},
     )
     for name in names:
-        module = import_module(f"{__package__}.{name}")
         if name in GROUPS:
-            app.add_typer(module.app, name=name)
+            module = import_module(f"{__package__}.{GROUPS[name]}")
+            app.add_typer(getattr(module, f"{name}_app"), name=name)
         else:
+            module = import_module(f"{__package__}.{COMMANDS[name]}")
             app.command(name)(getattr(module, name))
     return app
 
@@ -130,7 +132,7 @@ def _with_command(arguments: list[str]) -> list[str]:
 
 
 def _complain(error: IngestError) -> None:
-    from mosaico_ingest.cli.errors import print_error
+    from mosaico_ingest.cli.console import print_error
 
     print_error(str(error), error.findings)
 

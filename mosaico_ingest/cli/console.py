@@ -1,18 +1,30 @@
-"""This file is the terminal as the commands see it: what recordings and manifests say cannot control it."""
+"""The terminal: escaped output, findings with their source lines, and errors."""
 
 from __future__ import annotations
 
 import os
 import re
 import sys
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
 
+from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-__all__ = ["Terminal", "plain_table", "print_line"]
+from mosaico_ingest.findings import Finding, Severity, Span
+
+__all__ = [
+    "Terminal",
+    "plain_table",
+    "print_error",
+    "print_line",
+    "render_findings",
+    "texts_of",
+]
 
 _CONTROLLING = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _WIDE = 240
@@ -59,3 +71,80 @@ def print_line(line: str, *, stderr: bool = False) -> None:
 def _sign(match: re.Match[str]) -> str:
     code = ord(match[0])
     return chr(0x2400 + code) if code < 0x20 else "\ufffd"  # noqa: PLR2004 - Unicode has a picture of each C0 control
+
+
+_STYLES = {Severity.ERROR: "bold red", Severity.WARNING: "bold yellow", Severity.INFO: "bold cyan"}
+_SECRET = re.compile(
+    r"((?:api_?key|password|token|secret)[\"']?\s*[:=]\s*[\"']?|(?=msco_))([^\s\"'$,}][^\s\"',}]*)",
+    re.IGNORECASE,
+)
+_UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
+_WIDTH = 160
+
+
+def render_findings(findings: Iterable[Finding], texts: Mapping[str, str]) -> Text:
+    """Return the findings with their source lines; `texts` holds what is known of the files, by name."""
+    return Text("\n\n").join(_finding(finding, texts) for finding in findings)
+
+
+def texts_of(findings: Iterable[Finding]) -> dict[str, str]:
+    """Read the files that findings point into; what cannot be read is left out."""
+    texts: dict[str, str] = {}
+    for file in {finding.span.file for finding in findings if finding.span is not None}:
+        with suppress(OSError):
+            texts[file] = Path(file).read_text(encoding="utf-8", errors="replace")
+    return texts
+
+
+def _finding(finding: Finding, texts: Mapping[str, str]) -> Text:
+    text = Text()
+    if finding.span is not None:
+        text.append(f"{finding.span}: ", style="bold")
+    text.append(f"{finding.severity.value}[{finding.rule}]", style=_STYLES[finding.severity])
+    text.append(f" {finding.message}")
+    gutter = 0
+    if finding.span is not None and finding.span.file in texts:
+        gutter = len(str(finding.span.line))
+        text.append(_excerpt(finding.span, texts[finding.span.file], _STYLES[finding.severity]))
+    if finding.help is not None:
+        text.append(f"\n{' ' * gutter} = help: ", style="bold")
+        text.append(finding.help)
+    return text
+
+
+def _excerpt(span: Span, source: str, style: str) -> Text:
+    """Return the line with its number, and carets under the span; nothing where there is no such line."""
+    lines = source.removeprefix("\ufeff").split("\n")
+    if span.line > len(lines) or not lines[span.line - 1].strip():
+        return Text()
+    line = _UNPRINTABLE.sub(" ", _SECRET.sub(_mask, lines[span.line - 1].rstrip("\r")))
+    start = min(span.column - 1, len(line))
+    end = span.end_column - 1 if span.end_line == span.line else len(line)
+    line, start, end = _crop(line, start, max(end, start + 1))
+    margin = " " * len(str(span.line))
+    text = Text(f"\n{margin} |\n{span.line} | {line}\n{margin} | ", style="")
+    text.append(" " * cell_len(line[:start]))
+    text.append("^" * max(1, cell_len(line[start:end])), style=style)
+    return text
+
+
+def _crop(line: str, start: int, end: int) -> tuple[str, int, int]:
+    """Cut a long line down to what surrounds the span."""
+    if len(line) <= _WIDTH:
+        return line, start, end
+    left = max(0, min(start - _WIDTH // 4, len(line) - _WIDTH))
+    shown = line[left : left + _WIDTH]
+    return shown, start - left, min(end - left, len(shown))
+
+
+def _mask(match: re.Match[str]) -> str:
+    return match[1] + "*" * len(match[2])
+
+
+def print_error(error: str, findings: Sequence[Finding]) -> None:
+    """Print to standard error."""
+    console = Terminal(stderr=True, soft_wrap=True)
+    if findings:
+        console.print(render_findings(findings, texts_of(findings)))
+    else:
+        console.print(Text.assemble(("error: ", "bold red"), error))

@@ -49,9 +49,9 @@ def export(
 
     Exits with 4 where a topic was left out, or would not give the same rows if the file were ingested.
     """
-    from mosaico_ingest.cli.tables import print_json
+    from mosaico_ingest.cli.report import print_json
+    from mosaico_ingest.destinations.store import Store
     from mosaico_ingest.export import export_sequence
-    from mosaico_ingest.store import Store
 
     opened = Store.open(store, create=False)
     info = opened.sequence(sequence)
@@ -75,7 +75,7 @@ def export(
 
 def _instant(option: str, text: str | None, first_ns: int | None, last_ns: int | None) -> int | None:
     """Return ns since the epoch; an offset counts from the first message, a negative one from the last."""
-    from mosaico_ingest.manifest.units import parse_instant, parse_offset
+    from mosaico_ingest.job.units import parse_instant, parse_offset
 
     if text is None:
         return None
@@ -92,7 +92,7 @@ def _print(report: ExportReport) -> None:
     from rich.text import Text
 
     from mosaico_ingest.cli.console import plain_table
-    from mosaico_ingest.cli.tables import open_console
+    from mosaico_ingest.cli.report import open_console
     from mosaico_ingest.report.units import bytes_text, count_text
 
     console = open_console()

@@ -1,18 +1,92 @@
-"""This file is `ingest lint`: judges manifests, adapters and `.msg` files, and mends what is safe to mend."""
+"""`ingest lint` and `schema`."""
 
 from __future__ import annotations
 
+import json
 import os
 import sys
+from collections.abc import Callable
+from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
     from mosaico_ingest.lint.engine import LintReport
 
-__all__ = ["lint"]
+__all__ = [
+    "lint",
+    "schema",
+]
+
+
+class Document(str, Enum):
+    """The files that have a schema."""
+
+    JOB = "job"
+    ADAPTER = "adapter"
+    PLAN = "plan"
+    REPORT = "report"
+
+
+def schema(
+    document: Annotated[
+        Document | None, typer.Argument(metavar="DOCUMENT", help="Which file's schema to print.")
+    ] = None,
+    write: Annotated[
+        Path | None,
+        typer.Option("--write", metavar="DIR", help="Write NAME.schema.json into DIR, for editors."),
+    ] = None,
+    check: Annotated[
+        Path | None,
+        typer.Option("--check", metavar="DIR", help="Fail where a file in DIR is not up to date."),
+    ] = None,
+) -> None:
+    """Print, write or check the JSON Schemas (draft 2020-12); to write or check all of them, name none."""
+    from mosaico_ingest.textfile import write_whole
+
+    wanted = [document] if document else list(Document)
+    if write is None and check is None and document is None:
+        raise typer.BadParameter("name one of " + ", ".join(one.value for one in Document))
+    stale = 0
+    for one in wanted:
+        text = _text(one)
+        if write is not None:
+            write_whole(_file(write, one), text)
+        elif check is not None:
+            stale += _is_stale(_file(check, one), text)
+        else:
+            typer.echo(text, nl=False)
+    if stale:
+        raise typer.Exit(1)
+
+
+def _text(document: Document) -> str:
+    from mosaico_ingest.adapters.mapping.model import adapter_schema
+    from mosaico_ingest.job.reference import job_schema
+    from mosaico_ingest.pipeline.plan import plan_schema
+    from mosaico_ingest.report.model import report_schema
+
+    makers: dict[Document, Callable[[], dict[str, Any]]] = {
+        Document.JOB: job_schema,
+        Document.ADAPTER: adapter_schema,
+        Document.PLAN: plan_schema,
+        Document.REPORT: report_schema,
+    }
+    return json.dumps(makers[document](), indent=2, ensure_ascii=False) + "\n"
+
+
+def _file(folder: Path, document: Document) -> Path:
+    return folder / f"{document.value}.schema.json"
+
+
+def _is_stale(path: Path, text: str) -> bool:
+    if path.exists() and path.read_text(encoding="utf-8") == text:
+        return False
+    typer.echo(f"{path} is not up to date — run `ingest schema --write {path.parent}`", err=True)
+    return True
+
 
 _TEXT = "text"
 
@@ -38,7 +112,7 @@ def lint(
 
     Exit codes: 0 clean, 1 failure, 2 usage, 3 nothing to judge, 10 infos, 11 warnings, 12 errors; SARIF: 0 for findings.
     """
-    from mosaico_ingest.cli.collector import collect_as_usual
+    from mosaico_ingest.cli.process import collect_as_usual
     from mosaico_ingest.lint.engine import STDIN, lint_paths
     from mosaico_ingest.lint.formats import FORMATS
 
@@ -64,8 +138,7 @@ def lint(
 
 
 def _print_text(report: LintReport, *, quiet: bool) -> None:
-    from mosaico_ingest.cli.console import Terminal
-    from mosaico_ingest.cli.render import render_findings, texts_of
+    from mosaico_ingest.cli.console import Terminal, render_findings, texts_of
 
     console = Terminal(soft_wrap=True)
     if report.findings:
@@ -86,10 +159,10 @@ def _summary(report: LintReport) -> str:
 
 
 def _explanation(rule: str) -> str:
+    from mosaico_ingest.job.validation import nearest
     from mosaico_ingest.lint.pages import index, page
     from mosaico_ingest.lint.rules import RULES
     from mosaico_ingest.lint.settings import NAMES
-    from mosaico_ingest.manifest.problems import nearest
 
     if rule == "all":
         return index()

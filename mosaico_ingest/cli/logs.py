@@ -1,4 +1,4 @@
-"""This file sets up what the program says while it runs: lines for people, or JSON for programs, on standard error."""
+"""Logging of a run: lines for people or JSON for programs, on standard error."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import logging
 import sys
 import time
 from datetime import datetime, timezone
-from typing import Any
+from enum import Enum
+from typing import Annotated, Any, TypeAlias, TYPE_CHECKING
 
-from mosaico_ingest.cli.log_format import LogFormat
-from mosaico_ingest.cli.tally import Tally, Underway
+import typer
+
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.report.events import (
     Event,
@@ -21,7 +22,34 @@ from mosaico_ingest.report.events import (
     Unreadable,
 )
 
-__all__ = ["JsonLines", "set_up_logging"]
+if TYPE_CHECKING:
+    from mosaico_ingest.cli.progress import Tally, Underway
+
+__all__ = [
+    "JsonLines",
+    "LogFormat",
+    "LogOption",
+    "set_up_logging",
+]
+
+LogOption: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        "--log",
+        "-l",
+        help="DEBUG, INFO, WARNING, ERROR or CRITICAL; overrides run.log_level.",
+        metavar="LEVEL",
+    ),
+]
+"""How much a command with a manifest says."""
+
+
+class LogFormat(str, Enum):
+    """How lines are written."""
+
+    TEXT = "text"
+    JSON = "json"
+
 
 PROGRESS_EVERY_S = 5.0
 

@@ -1,4 +1,4 @@
-"""This file is `ingest watch`: what arrives in a folder is ingested once it has come to rest."""
+"""`ingest watch` and `status`."""
 
 from __future__ import annotations
 
@@ -9,11 +9,53 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:  # imported for real when the command runs, so that --help starts fast
-    from mosaico_ingest.config import ROSInjectionConfig
-    from mosaico_ingest.executors.arrivals import Arrivals
+    from mosaico_ingest.job.config import ROSInjectionConfig
     from mosaico_ingest.report.model import Report
+    from mosaico_ingest.services.watch import Arrivals
 
-__all__ = ["watch"]
+__all__ = [
+    "status",
+    "watch",
+]
+
+STYLES = {"done": "green", "new": "cyan", "changed": "yellow", "failed": "red", "unreadable": "red"}
+
+
+def status(
+    manifests: Annotated[list[Path], typer.Argument(metavar="JOB.yaml", help="Job manifests.")],
+    *,
+    check: Annotated[bool, typer.Option("--check", help="Exit 1 unless every recording is done.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Say of every recording whether its sequence is there, whole and of the same content; writes nothing."""
+    import json
+    from collections import Counter
+    from dataclasses import asdict
+
+    from rich.text import Text
+
+    from mosaico_ingest import api
+    from mosaico_ingest.cli.console import plain_table
+    from mosaico_ingest.cli.report import open_console, print_json
+
+    found = [one for manifest in manifests for one in api.job_status(manifest)]
+    if as_json:
+        print_json(json.dumps([asdict(one) for one in found], indent=2))
+    else:
+        table = plain_table("sequence", "status", "recording")
+        for one in found:
+            style = STYLES[one.standing.value]
+            files = ", ".join(one.files)
+            known = one.why.startswith(files)  # an error says where it is from
+            said = one.why if known else f"{files}: {one.why}" if one.why else files
+            table.add_row(one.sequence, Text(one.standing.value, style=style), Text(said))
+        console = open_console()
+        console.print(table)
+        counts = Counter(one.standing.value for one in found)
+        console.print(", ".join(f"{count} {name}" for name, count in counts.items()), soft_wrap=True)
+    if check and any(one.standing.value != "done" for one in found):
+        raise typer.Exit(1)
+
 
 Again = Callable[[Path], str]
 """Gives a recording that failed another turn, and says when that is."""
@@ -46,12 +88,11 @@ def watch(
     import time
     from functools import partial
 
-    from mosaico_ingest.cli.collector import collect_as_usual
     from mosaico_ingest.cli.logs import set_up_logging
-    from mosaico_ingest.cli.signals import interrupt_on_terminate
-    from mosaico_ingest.executors.arrivals import Arrivals
-    from mosaico_ingest.manifest.load import load_manifests
+    from mosaico_ingest.cli.process import collect_as_usual, interrupt_on_terminate
+    from mosaico_ingest.job.manifest import load_manifests
     from mosaico_ingest.report.model import gravest
+    from mosaico_ingest.services.watch import Arrivals
 
     set_up_logging(log)
     interrupt_on_terminate()

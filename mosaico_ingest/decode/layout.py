@@ -12,10 +12,15 @@ from typing import TypeAlias
 
 import numpy as np
 
-from mosaico_ingest.bag.batch import Encoding
-from mosaico_ingest.bag.definition import Container, Definition, Field, MessageType
-from mosaico_ingest.bag.shape import NUMBERS, TEXTS
 from mosaico_ingest.frozen import frozen
+from mosaico_ingest.rosbag.blocks import Encoding
+from mosaico_ingest.rosbag.definitions.linking import NUMBERS, TEXTS
+from mosaico_ingest.rosbag.definitions.model import (
+    Container,
+    Definition,
+    Field,
+    MessageType,
+)
 
 __all__ = [
     "PADDING",

@@ -1,4 +1,4 @@
-"""This file walks all messages at once: one cursor a message, each step taken by all of them together.
+"""Locate the values of all messages in lockstep, and choose between this and the other walks.
 
 Elements of a sequence are taken by index: the first of every message, then the second of those that have one.
 Where one is as long as that before it, more of that length are guessed, and taken as far as they turn out to be so.
@@ -8,12 +8,11 @@ about it is dropped at the end.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mosaico_ingest.bag.batch import Encoding
 from mosaico_ingest.decode.layout import (
     PADDING,
     WORD,
@@ -27,10 +26,23 @@ from mosaico_ingest.decode.layout import (
     Text,
     least_bytes,
 )
-from mosaico_ingest.decode.places import Frame, Int64s, Located, Place, Places, expand, join
-from mosaico_ingest.decode.stepwise import Notes, Stepper
+from mosaico_ingest.decode.spans import (
+    Frame,
+    Int64s,
+    Located,
+    Place,
+    Places,
+    expand,
+    join,
+)
+from mosaico_ingest.decode.walk import Notes, Stepper, locate_clustered, locate_stepwise
+from mosaico_ingest.rosbag.blocks import Encoding
 
-__all__ = ["FEW", "locate_lockstep"]
+__all__ = [
+    "FEW",
+    "locate",
+    "locate_lockstep",
+]
 
 FEW = 16
 """So many messages are walked faster one at a time."""
@@ -295,3 +307,36 @@ class _Walk:
         self.broken[cursor.row[wrong]] = True
         cursor.pos = np.where(wrong, cursor.origin, cursor.pos)
         cursor.end = np.where(wrong, cursor.origin, cursor.end)
+
+
+_LARGE_BYTES = 64 << 10
+"""So many bytes of few messages may be long sequences, whose elements can be walked together."""
+
+
+def locate(layout: Layout, frame: Frame) -> Located:
+    """Find where everything lies in the messages that fit the layout."""
+    if all(isinstance(step, Block) for step in layout.body.steps):
+        return locate_lockstep(layout, frame)  # nothing in a message depends on its bytes
+    parts = locate_clustered(layout, frame)
+    left = np.ones(len(frame), bool)
+    for part in parts:
+        left[part.rows] = False
+    rest = np.flatnonzero(left)
+    if len(rest) or not parts:
+        others = frame.take(rest)
+        is_small = len(rest) <= FEW and int((others.ends - others.origins).sum()) < _LARGE_BYTES
+        walk = locate_stepwise if is_small else locate_lockstep
+        found = walk(layout, others)
+        parts.append(replace(found, rows=rest[found.rows]))
+    return _merge(parts)
+
+
+def _merge(parts: list[Located]) -> Located:
+    if len(parts) == 1:
+        return parts[0]
+    rows = np.concatenate([part.rows for part in parts])
+    order = np.argsort(rows)
+    slots = np.empty(len(rows), np.int64)
+    slots[order] = np.arange(len(rows))
+    tails = np.concatenate([part.tails for part in parts])
+    return Located(rows[order], tails[order], join([part.places for part in parts], slots))

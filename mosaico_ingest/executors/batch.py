@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
-from mosaico_ingest.config import Attempt, ROSInjectionConfig
 from mosaico_ingest.errors import IngestError
-from mosaico_ingest.executors.worker import failed_report
+from mosaico_ingest.job.config import Attempt, ROSInjectionConfig
+from mosaico_ingest.pipeline.run import failed_report
 from mosaico_ingest.report.events import BatchObserver, Event
 from mosaico_ingest.report.model import Report
 

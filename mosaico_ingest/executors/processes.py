@@ -1,29 +1,101 @@
-"""This file runs configurations in several processes, each of which does one recording after the other."""
+"""The executor that runs recordings in a pool of worker processes."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from multiprocessing.reduction import ForkingPickler
+from typing import Any
 
-from mosaico_ingest.config import ROSInjectionConfig
+import pyarrow as pa
+
+from mosaico_ingest.adapters.python import register_default_adapter, registered_adapters
+from mosaico_ingest.destinations.store.open_stores import Hold, held_catalogs
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.batch import Batch
-from mosaico_ingest.executors.worker_process import Registrations, do_nothing, work
 from mosaico_ingest.frozen import frozen
-from mosaico_ingest.interrupts import counted_interrupts
-from mosaico_ingest.plan.model import DEFAULT_MEMORY_BYTES
-from mosaico_ingest.report.events import BatchObserver
+from mosaico_ingest.interrupts import Stop, counted_interrupts
+from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.model import Stores
+from mosaico_ingest.pipeline.plan import DEFAULT_MEMORY_BYTES
+from mosaico_ingest.pipeline.run import failed_report, run_config
+from mosaico_ingest.report.events import BatchObserver, Event
 from mosaico_ingest.report.model import Report
+from mosaico_ingest.rosbag.definitions.registry import Registered, ROSTypeRegistry
 
-__all__ = ["Processes"]
+__all__ = [
+    "Processes",
+    "Registrations",
+    "do_nothing",
+    "work",
+]
+
+
+@frozen
+class Registrations:
+    """The types and adapters a program has registered, which a new process does not know of."""
+
+    types: Mapping[Stores | None, Mapping[str, Registered]]
+    adapters: tuple[type[Any], ...]
+
+    @classmethod
+    def current(cls) -> Registrations:
+        """Return those of this process."""
+        return cls(ROSTypeRegistry.snapshot(), tuple(dict.fromkeys(registered_adapters().values())))
+
+    def register(self) -> None:
+        """Register them in this process."""
+        ROSTypeRegistry.restore(self.types)
+        for adapter in self.adapters:
+            register_default_adapter(adapter)
+
+
+def do_nothing() -> None:
+    """Prepare nothing."""
+
+
+def work(pipe: Connection, registrations: Registrations, prepare: Callable[[], None], jobs: int) -> None:
+    """Ingest what comes through the pipe until its other end is closed."""
+    os.setsid()  # Ctrl-C reaches the parent only, which passes it on once
+    stop = Stop()
+    signal.signal(signal.SIGINT, stop)
+    signal.signal(signal.SIGTERM, stop)
+    pa.set_cpu_count(max(1, (os.cpu_count() or 1) // jobs))
+    prepare()
+    registrations.register()
+    with held_catalogs() as hold, suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        while not stop.asked:
+            _ingest(pipe, pipe.recv_bytes(), stop, hold)
+
+
+def _ingest(pipe: Connection, pickled: bytes, stop: Stop, hold: Hold) -> None:
+    def tell(event: Event) -> None:
+        stop.hold()  # an interrupt in the middle of a message would leave half of it in the pipe
+        pipe.send(event)
+        stop.heed()
+
+    try:
+        config: ROSInjectionConfig = pickle.loads(pickled)  # noqa: S301 - from our own parent
+    except Exception as error:  # noqa: BLE001 - the border: a class's own code runs here
+        pipe.send(IngestError(f"the job cannot be read in another process: {type(error).__name__}: {error}"))
+        return
+    try:
+        stop.heed()
+        report = run_config(config, tell)
+    except KeyboardInterrupt:
+        report = failed_report(config, Interrupted("stopped before it was begun"), tell)
+    stop.hold()
+    pipe.send(report)
+    hold(config.target)
+
 
 ATTEMPTS = 2
 """How often a recording is begun whose process died under it."""

@@ -13,19 +13,18 @@ from os.path import relpath
 from pathlib import Path
 from typing import Any
 
-from mosaico_ingest.config import ROSInjectionConfig, StoreTarget
+from mosaico_ingest.destinations.store.errors import explained
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.batch import Batch
-from mosaico_ingest.executors.processes import ATTEMPTS
+from mosaico_ingest.executors.processes import ATTEMPTS, Registrations
 from mosaico_ingest.executors.shipment import absolute, pack
-from mosaico_ingest.executors.worker import place
-from mosaico_ingest.executors.worker_process import Registrations
 from mosaico_ingest.frozen import frozen
 from mosaico_ingest.interrupts import counted_interrupts
-from mosaico_ingest.plan.model import DEFAULT_MEMORY_BYTES
+from mosaico_ingest.job.config import ROSInjectionConfig, StoreTarget
+from mosaico_ingest.pipeline.plan import DEFAULT_MEMORY_BYTES
+from mosaico_ingest.pipeline.run import place
 from mosaico_ingest.report.events import BatchObserver, RunStarted
 from mosaico_ingest.report.model import Report
-from mosaico_ingest.store.faults import explained
 
 try:
     import ray
@@ -35,7 +34,12 @@ try:
 except ModuleNotFoundError as missing:
     raise IngestError("Ray is not installed", hint="pip install 'mosaico-ingest[ray]'") from missing
 
-from mosaico_ingest.executors.ray_worker import Mailbox, Setting, ingest, machine
+from mosaico_ingest.executors.ray_worker import (
+    Mailbox,
+    Setting,
+    ingest,
+    machine,
+)
 
 __all__ = ["Ray"]
 

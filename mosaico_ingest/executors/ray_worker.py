@@ -15,12 +15,17 @@ from typing import Any, TypeAlias
 import pyarrow as pa
 import ray
 
-from mosaico_ingest.config import ROSInjectionConfig, StoreTarget
-from mosaico_ingest.errors import BagError, IngestError, Interrupted, SinkError
-from mosaico_ingest.executors.worker import failed_report, run_config
-from mosaico_ingest.executors.worker_process import Registrations
+from mosaico_ingest.errors import (
+    BagError,
+    IngestError,
+    Interrupted,
+    SinkError,
+)
+from mosaico_ingest.executors.processes import Registrations
 from mosaico_ingest.frozen import frozen
 from mosaico_ingest.interrupts import Stop
+from mosaico_ingest.job.config import ROSInjectionConfig, StoreTarget
+from mosaico_ingest.pipeline.run import failed_report, run_config
 from mosaico_ingest.report.events import Event, RunFinished, RunStarted
 from mosaico_ingest.report.model import Report
 

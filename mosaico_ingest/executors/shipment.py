@@ -11,10 +11,10 @@ from os.path import abspath
 from pathlib import Path
 
 from mosaico_ingest.adapters.builtin import BY_NAME
-from mosaico_ingest.bag.registry import definition_files
-from mosaico_ingest.config import ROSInjectionConfig, StoreTarget
 from mosaico_ingest.frozen import frozen
-from mosaico_ingest.remote.path import AnyPath
+from mosaico_ingest.job.config import ROSInjectionConfig, StoreTarget
+from mosaico_ingest.remote import AnyPath
+from mosaico_ingest.rosbag.definitions.registry import definition_files
 
 __all__ = ["absolute", "pack"]
 

@@ -5,7 +5,6 @@ Whether messages are what was stored is tried on every batch; what is lost or le
 
 from __future__ import annotations
 
-from mosaico_ingest.export.account import ExportReport, TopicExport
-from mosaico_ingest.export.export import export_sequence
+from mosaico_ingest.export.export import ExportReport, TopicExport, export_sequence
 
 __all__ = ["ExportReport", "TopicExport", "export_sequence"]

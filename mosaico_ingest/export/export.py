@@ -1,24 +1,241 @@
-"""This file writes a sequence back: it reads its topics side by side and writes their messages by time."""
+"""Export a sequence as a recording: restore the messages of each topic and write them by time."""
 
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+import re
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePath
+from typing import Any, cast
 
-from mosaico_ingest.adapters.adapter import AdapterSpec
-from mosaico_ingest.adapters.reference import adapter_spec
-from mosaico_ingest.bag.writing import RecordingWriter, open_writer
-from mosaico_ingest.bag.writing.opening import ROS_VERSIONS
-from mosaico_ingest.diagnostics import offered
+import pyarrow as pa
+from pydantic import BaseModel, ConfigDict
+
+from mosaico_ingest.adapters.adapter import ROS_METADATA_KEY, Adapter, AdapterSpec, Envelope, UnmodeledSpec
+from mosaico_ingest.adapters.bridge import ROSBridge, adapter_spec
+from mosaico_ingest.adapters.builtin import BUILTIN
+from mosaico_ingest.adapters.inverse import Inverse, Restored, invert
+from mosaico_ingest.adapters.mapping.columns import struct_of
+from mosaico_ingest.destinations.store import SequenceInfo, Store, TopicInfo
 from mosaico_ingest.errors import AdapterError, BagError, NothingMatched
-from mosaico_ingest.export.account import ExportReport, TopicExport
-from mosaico_ingest.export.origin import origin_of, version_of
-from mosaico_ingest.export.restore import Restorer, restorer_for
-from mosaico_ingest.patterns import select
-from mosaico_ingest.store import SequenceInfo, Store, TopicInfo
+from mosaico_ingest.findings import offered
+from mosaico_ingest.frozen import frozen
+from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.patterns import select
+from mosaico_ingest.rosbag.blocks import Encoding
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.serialization import Serializer
+from mosaico_ingest.rosbag.writers import ROS_VERSIONS, RecordingWriter, open_writer
 
-__all__ = ["export_sequence"]
+__all__ = [
+    "ExportReport",
+    "Message",
+    "Origin",
+    "Restorer",
+    "TopicExport",
+    "export_sequence",
+    "origin_of",
+    "restorer_for",
+    "version_of",
+]
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+
+
+class TopicExport(_Record):
+    """What became of one topic."""
+
+    topic: str
+    msgtype: str = ""
+    """`pkg/msg/Name`; empty where the topic does not say."""
+    ontology: str
+    adapter: str = ""
+    """The adapter that was undone; `Unmodeled`: the messages kept their shape."""
+    messages: int = 0
+    unknown: tuple[str, ...] = ()
+    """Fields that are not in the store; they are zero, empty or false in every message."""
+    not_undone: dict[str, str] = {}
+    """Columns that no field could be computed from, and what they were computed as."""
+    changed: dict[str, int] = {}
+    """Columns that would come out otherwise if the file were ingested, and in how many rows."""
+    left_out: str = ""
+    """Why it is not in the file; empty where it is."""
+
+    @property
+    def faithful(self) -> bool:
+        """Whether the file, ingested in the same way, gives the same rows."""
+        return not self.left_out and not self.changed
+
+
+class ExportReport(_Record):
+    """What one export did."""
+
+    sequence: str
+    path: str
+    bytes: int
+    topics: tuple[TopicExport, ...]
+
+    @property
+    def messages(self) -> int:
+        """How many messages the file holds."""
+        return sum(topic.messages for topic in self.topics)
+
+    @property
+    def faithful(self) -> bool:
+        """Whether every topic is in the file, and gives the same rows again."""
+        return all(topic.faithful for topic in self.topics)
+
+
+_TIME_1 = re.compile(r"^(?:time|duration)(?:\[\d*\])?\s", re.MULTILINE)
+_TIME_2 = re.compile(r"^builtin_interfaces/(?:Time|Duration)(?:\[[<=\d]*\])?\s", re.MULTILINE)
+
+
+@frozen
+class Origin:
+    """The messages a topic was made of."""
+
+    msgtype: str
+    text: str
+    """The flattened definition."""
+    source_file: str
+
+    @property
+    def version(self) -> int | None:
+        """The version of ROS its definition can only be of; None where it has no time in it."""
+        return 1 if _TIME_1.search(self.text) else 2 if _TIME_2.search(self.text) else None
+
+    def definition(self, version: int) -> Definition:
+        """Return the definition, as of a version of ROS.
+
+        Raises:
+            BagError: The text cannot be read.
+        """
+        embedded = Embedded(f"ros{version}msg", self.text)
+        return TypeResolver(Stores.EMPTY).resolve(self.msgtype, embedded, ros_version=version)
+
+
+def origin_of(topic: TopicInfo) -> Origin | None:
+    """Return what a topic was made of; None where it does not say."""
+    said = topic.metadata.get(ROS_METADATA_KEY)
+    if not isinstance(said, dict):
+        return None
+    values = cast("Mapping[str, Any]", said)
+    found = [values.get(key, "") for key in ("msgtype", "msgdef", "source_file")]
+    if not all(isinstance(value, str) for value in found) or not found[0]:
+        return None
+    return Origin(*found)
+
+
+def version_of(origin: Origin, others: Sequence[Origin], possible: Collection[int]) -> int:
+    """Return the version of ROS of a topic: its definition's, else that of the topics it was recorded with."""
+    known = [one.version for one in (origin, *others) if one.source_file == origin.source_file]
+    said = next((version for version in known if version is not None), None)
+    if said is None:
+        said = 1 if PurePath(origin.source_file).suffix == ".bag" else 2
+    return said if said in possible or origin.version is not None else min(possible)
+
+
+_ROWS = 1000
+"""Messages made at a time."""
+
+Message = tuple[int, bytes]
+"""Log time in ns, and payload."""
+
+
+@dataclass(slots=True)
+class Restorer:
+    """Makes the messages of one topic, and counts what they lack."""
+
+    info: TopicInfo
+    definition: Definition
+    adapter: str
+    inverse: Inverse
+    messages: int = 0
+    _unknown: dict[str, None] = field(default_factory=dict[str, None])
+    _kept_out: dict[str, str] = field(default_factory=dict[str, str])
+    _changed: Counter[str] = field(default_factory=Counter[str])
+
+    def read(self, batches: Iterator[pa.RecordBatch]) -> Iterator[Message]:
+        """Yield the topic's messages in the order of the rows.
+
+        Raises:
+            BagError: A value has no place in the message.
+        """
+        encoding = Encoding.ROS1 if self.definition.ros_version == 1 else Encoding.CDR
+        serializer = Serializer(self.definition, encoding)
+        for batch in batches:
+            for start in range(0, batch.num_rows, _ROWS):
+                part = batch.slice(start, _ROWS)
+                times: Any = part.column(0).to_numpy()
+                rows = struct_of(part.columns[1:], self.info.ontology.struct, None, part.num_rows)
+                envelope = Envelope(self.info.name, self.definition.root, times)
+                restored = self.inverse.restore(rows, envelope)
+                self._count(restored)
+                values: Any = cast("Any", restored.rows).to_pylist()  # the stubs do not know a struct's
+                yield from zip(times.tolist(), map(serializer.from_dict, values), strict=True)
+
+    def account(self) -> TopicExport:
+        """Return what became of the topic so far."""
+        return TopicExport(
+            topic=self.info.name,
+            msgtype=self.definition.root,
+            ontology=self.info.ontology.tag,
+            adapter=self.adapter,
+            messages=self.messages,
+            unknown=tuple(self._unknown),
+            not_undone=dict(self._kept_out),
+            changed=dict(self._changed),
+        )
+
+    def _count(self, restored: Restored) -> None:
+        self.messages += len(restored.rows)
+        self._unknown.update(dict.fromkeys(restored.unknown))
+        self._kept_out.update(restored.kept_out or {})
+        self._changed.update(restored.changed or {})
+
+
+def restorer_for(info: TopicInfo, definition: Definition, specs: Sequence[AdapterSpec]) -> Restorer:
+    """Return the way back for a topic, through the first adapter that makes columns like its own.
+
+    Raises:
+        AdapterError: None does, or it has no way back.
+    """
+    shape = ros_shape(definition)
+    misfits: list[str] = []
+    for spec in _candidates(info, definition, specs):
+        try:
+            adapter = spec.bind(definition, shape)
+        except AdapterError as error:
+            misfits.append(error.what)
+            continue
+        if _makes(adapter, info):
+            inverse = invert(adapter, shape, info.metadata)
+            return Restorer(info, definition, spec.name, inverse)
+    raise AdapterError(
+        f"no adapter known makes {info.ontology.tag} of {definition.root}",
+        hint=misfits[0] if misfits else "name the one that did with --adapter",
+    )
+
+
+def _candidates(
+    info: TopicInfo, definition: Definition, specs: Sequence[AdapterSpec]
+) -> Iterator[AdapterSpec]:
+    """Yield the adapters that may have made a topic: those named, the default one, the others of the catalog."""
+    yield from (spec for spec in specs if not spec.ros_types or definition.root in spec.ros_types)
+    yield ROSBridge().resolve(info.name, definition.root).spec
+    yield from (spec for spec in BUILTIN if definition.root in spec.ros_types)
+    yield UnmodeledSpec(serialization_format=info.ontology.serialization_format)
+
+
+def _makes(adapter: Adapter, info: TopicInfo) -> bool:
+    made = adapter.ontology
+    return (made.tag, made.struct) == (info.ontology.tag, info.ontology.struct)
 
 
 def export_sequence(

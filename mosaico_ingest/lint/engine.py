@@ -1,29 +1,240 @@
-"""This file judges documents: reads them, runs the rules, applies comments and settings, and sums up."""
+"""The lint engine: read documents, run the rules, apply comments and settings, and count findings."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from functools import cache, partial
+from itertools import takewhile
 from pathlib import Path
 
-from mosaico_ingest.diagnostics import Finding, Severity, Span
-from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.adapters.bridge import KnownAdapters
+from mosaico_ingest.adapters.direct import KnownTypes
+from mosaico_ingest.adapters.mapping.loader import MappingSpec, load_adapter
+from mosaico_ingest.errors import AdapterError, BagError, ManifestError
+from mosaico_ingest.findings import Edit, Finding, Severity, Span
 from mosaico_ingest.frozen import frozen
-from mosaico_ingest.lint.adapter import adapter_findings
-from mosaico_ingest.lint.document import Document, Kind, documents_in
-from mosaico_ingest.lint.fix import apply_fixes
+from mosaico_ingest.job.compose import EXTENDS_KEY as EXTENDS
+from mosaico_ingest.job.compose import bases_of, extended
+from mosaico_ingest.job.manifest import read_text
+from mosaico_ingest.job.yaml_source import load_source
 from mosaico_ingest.lint.job import Job, read_job
 from mosaico_ingest.lint.message import MessageFile, read_message
 from mosaico_ingest.lint.rules import RULES
 from mosaico_ingest.lint.settings import NAMES, Settings, settings_for
-from mosaico_ingest.lint.suppress import apply_ignores, ignores_in
-from mosaico_ingest.manifest.extends import KEY as EXTENDS
-from mosaico_ingest.manifest.extends import bases_of, extended
-from mosaico_ingest.manifest.load import read_text
-from mosaico_ingest.manifest.source import load_source
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.model import Definition
 
-__all__ = ["STDIN", "Judged", "LintReport", "lint_document", "lint_paths"]
+__all__ = [
+    "MARKER",
+    "STDIN",
+    "Document",
+    "Ignore",
+    "Judged",
+    "Kind",
+    "LintReport",
+    "adapter_findings",
+    "apply_fixes",
+    "apply_ignores",
+    "documents_in",
+    "ignores_in",
+    "kind_of",
+    "lint_document",
+    "lint_paths",
+]
+
+
+def apply_fixes(text: str, findings: Iterable[Finding]) -> tuple[str, int]:
+    """Return the text with every proposed change that does not touch another one, and how many those are."""
+    lines = text.splitlines(keepends=True)
+    edits = sorted(
+        {finding.fix for finding in findings if finding.fix is not None}, key=lambda edit: edit.span
+    )
+    made = 0
+    untouched = (len(lines) + 1, 0)
+    for edit in reversed(edits):
+        span = edit.span
+        if (span.end_line, span.end_column) <= untouched and span.line == span.end_line <= len(lines):
+            lines[span.line - 1] = _edited(lines[span.line - 1], edit)
+            untouched = (span.line, span.column)
+            made += 1
+    return "".join(lines), made
+
+
+def _edited(line: str, edit: Edit) -> str:
+    return line[: edit.span.column - 1] + edit.text + line[edit.span.end_column - 1 :]
+
+
+MARKER = "# ingest:"
+"""What every comment to the linter starts with."""
+
+_COMMENT = re.compile(r"#\s*ingest:\s*(ignore|ignore-file)\s*\[([^\]]*)\]")
+_WORD = re.compile(r"[^\s,]+")
+
+
+@dataclass(slots=True)
+class Ignore:
+    """One rule that a comment silences, on its line (alone on a line: on the next) or in the whole file."""
+
+    rule: str
+    """As written: a code or a name."""
+    span: Span
+    lines: range
+    used: bool = field(default=False)
+
+
+def ignores_in(text: str, *, file: str) -> list[Ignore]:
+    """Return what the comments of a text silence."""
+    ignores: list[Ignore] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        for comment in _COMMENT.finditer(line):
+            alone = not line[: comment.start()].strip()
+            lines = range(number + alone, number + alone + 1)
+            if comment[1] == "ignore-file":
+                lines = range(1, text.count("\n") + 2)
+            for word in _WORD.finditer(comment[2]):
+                start = comment.start(2) + word.start() + 1
+                ignores.append(
+                    Ignore(word[0], Span(file, number, start, number, start + len(word[0])), lines)
+                )
+    return ignores
+
+
+def apply_ignores(
+    findings: Iterable[Finding], ignores: Sequence[Ignore], names: dict[str, str]
+) -> list[Finding]:
+    """Return the findings that no comment silences, and one for each comment that silences nothing.
+
+    `names` maps every code and every name of a rule to its name.
+    """
+    kept = [finding for finding in findings if not _silenced(finding, ignores, names)]
+    kept += [_complaint(ignore, names) for ignore in ignores if not ignore.used]
+    return kept
+
+
+def _silenced(finding: Finding, ignores: Sequence[Ignore], names: dict[str, str]) -> bool:
+    line = finding.span.line if finding.span else 0
+    about = [item for item in ignores if names.get(item.rule) == finding.rule and line in item.lines]
+    for ignore in about:
+        ignore.used = True
+    return bool(about)
+
+
+def _complaint(ignore: Ignore, names: dict[str, str]) -> Finding:
+    if ignore.rule in names:
+        message = f"nothing here breaks {ignore.rule}"
+        return Finding("unused-ignore", Severity.WARNING, message, ignore.span, "remove it from the comment")
+    message = f"there is no rule {ignore.rule!r}"
+    return Finding("unknown-rule", Severity.WARNING, message, ignore.span, "see `ingest lint --explain all`")
+
+
+_JOB = re.compile(r"^(bag|\"bag\"|'bag'|extends) *:|^ *\{ *\"?(bag|extends)\"? *:", re.MULTILINE)
+_ADAPTER = re.compile(r"^(adapter|ros_type|variants) *:", re.MULTILINE)
+_NAMED = re.compile(r"^adapter *:", re.MULTILINE)
+_FENCE = re.compile(r"^(?P<indent> *)(?P<fence>```+|~~~+) *(?P<language>\w*)[^\n]*$")
+
+
+class Kind(str, Enum):
+    """What a text is judged as."""
+
+    JOB = "job"
+    ADAPTER = "adapter"
+    MESSAGE = "message"
+
+
+@frozen
+class Document:
+    """A text to judge."""
+
+    file: str
+    """The name to show."""
+    text: str
+    kind: Kind
+    folder: Path
+    """Where its relative paths start."""
+    path: Path | None = None
+    """The file on disk, if it is one of its own."""
+    example: bool = False
+    """Whether it is an example on a page, so that nothing beside it has to be there."""
+
+
+def kind_of(text: str, *, suffix: str = ".yaml") -> Kind | None:
+    """Return what a text looks like; None if it is neither a job nor an adapter nor a definition."""
+    if suffix == ".msg":
+        return Kind.MESSAGE
+    if _JOB.search(text):
+        return Kind.JOB
+    return Kind.ADAPTER if _ADAPTER.search(text) else None
+
+
+def documents_in(text: str, *, file: str, path: Path | None, folder: Path, named: bool) -> Iterator[Document]:
+    """Yield what a file holds: itself, or the YAML blocks of a Markdown page that are jobs or adapters.
+
+    A file that was `named` is a job unless it looks like something else.
+    """
+    suffix = Path(file).suffix.lower()
+    if suffix in {".md", ".markdown"}:
+        for block in _blocks(text):
+            kind = kind_of(block)
+            whole = kind is not Kind.ADAPTER or _NAMED.search(block) is not None
+            if kind is not None and whole and f"{MARKER} skip" not in block:
+                yield Document(file, block, kind, folder, example=True)
+        return
+    kind = kind_of(text, suffix=suffix) or (Kind.JOB if named else None)
+    if kind is not None:
+        yield Document(file, text, kind, folder, path)
+
+
+def _blocks(text: str) -> Iterator[str]:
+    """Yield the YAML blocks of a Markdown text, each below as many empty lines as there are above it."""
+    lines = iter(enumerate(text.splitlines()))
+    for number, line in lines:
+        opening = _FENCE.match(line)
+        if opening is None:
+            continue
+        inside = takewhile(partial(_is_inside, opening["fence"]), lines)
+        block = [inner for _, inner in inside]
+        if opening["language"].lower() in {"yaml", "yml"}:
+            yield "\n" * (number + 1) + "\n".join(block) + "\n"
+
+
+def _is_inside(fence: str, numbered: tuple[int, str]) -> bool:
+    return numbered[1].strip() != fence
+
+
+def adapter_findings(document: Document) -> Iterator[Finding]:
+    """Yield what is wrong with an adapter file, once for each place."""
+    try:
+        spec = load_adapter(document.text, file=document.file, adapters=KnownAdapters(document.folder))
+    except AdapterError as error:
+        start = Span(document.file, 1, 1, 1, 1)
+        yield from error.findings or [Finding("mapping", Severity.ERROR, error.what, start, error.hint)]
+        return
+    said: set[Span | None] = set()
+    for msgtype in spec.ros_types:
+        definition = _definition(spec, msgtype)
+        found = () if definition is None else spec.check(definition, ros_shape(definition))
+        for finding in found:
+            if finding.span not in said:
+                said.add(finding.span)
+                yield finding
+
+
+def _definition(spec: MappingSpec, msgtype: str) -> Definition | None:
+    """Return the definition in the file itself, or else that of a distro; None where there is none."""
+    try:
+        return _known_types().find(msgtype, spec)
+    except BagError:
+        return None
+
+
+@cache
+def _known_types() -> KnownTypes:
+    return KnownTypes()
+
 
 STDIN = "-"
 _SUFFIXES = (".yaml", ".yml", ".msg", ".md", ".markdown")

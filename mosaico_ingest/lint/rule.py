@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from textwrap import dedent
 
-from mosaico_ingest.diagnostics import Edit, Finding, Severity, Span
+from mosaico_ingest.findings import (
+    Edit,
+    Finding,
+    Severity,
+    Span,
+)
 from mosaico_ingest.frozen import frozen
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.message import MessageFile

@@ -10,13 +10,13 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from mosaico_ingest.diagnostics import Finding, Severity, Span
 from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.findings import Finding, Severity, Span
 from mosaico_ingest.frozen import frozen
+from mosaico_ingest.job.manifest import read_text
+from mosaico_ingest.job.validation import explain, nearest
+from mosaico_ingest.job.yaml_source import Source, Value, load_source
 from mosaico_ingest.lint.rules import RULES
-from mosaico_ingest.manifest.load import read_text
-from mosaico_ingest.manifest.problems import explain, nearest
-from mosaico_ingest.manifest.source import Source, Value, load_source
 
 if sys.version_info >= (3, 11):
     import tomllib

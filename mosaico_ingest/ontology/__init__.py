@@ -8,14 +8,15 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from mosaico_ingest.ontology.tags import MODULES
+from mosaico_ingest.ontology.registry import MODULES
 
 if TYPE_CHECKING:
-    from mosaico_ingest.ontology.battery import BatteryState
-    from mosaico_ingest.ontology.camera import CameraInfo
-    from mosaico_ingest.ontology.depth_camera import RGBDCamera, StereoCamera, ToFCamera
-    from mosaico_ingest.ontology.dynamics import ForceTorque, Inertia
     from mosaico_ingest.ontology.geometry import (
+        Acceleration,
+        ForceTorque,
+        FrameTransform,
+        Inertia,
+        MotionState,
         Point2d,
         Point3d,
         Polygon,
@@ -26,24 +27,27 @@ if TYPE_CHECKING:
         Vector2d,
         Vector3d,
         Vector4d,
+        Velocity,
     )
-    from mosaico_ingest.ontology.gps import GPS, GPSStatus, NMEASentence
-    from mosaico_ingest.ontology.grids import GridCells, MapMetadata, OccupancyGrid
-    from mosaico_ingest.ontology.header import Duration, Header, Time
-    from mosaico_ingest.ontology.image import CompressedImage, Image, ImageFormat
-    from mosaico_ingest.ontology.imu import IMU
-    from mosaico_ingest.ontology.joy import Joy
-    from mosaico_ingest.ontology.kinematics import Acceleration, MotionState, Velocity
-    from mosaico_ingest.ontology.laser import LaserScan, MultiEchoLaserScan
-    from mosaico_ingest.ontology.lidar import Lidar
-    from mosaico_ingest.ontology.magnetometer import Magnetometer
-    from mosaico_ingest.ontology.message import Message
-    from mosaico_ingest.ontology.point_cloud import PointCloud2, PointField, PointFieldDataType
-    from mosaico_ingest.ontology.pressure import Pressure
-    from mosaico_ingest.ontology.radar import Radar
-    from mosaico_ingest.ontology.range import Range
-    from mosaico_ingest.ontology.robot import RobotJoint
-    from mosaico_ingest.ontology.roi import ROI
+    from mosaico_ingest.ontology.header import Duration, Header, Message, Time
+    from mosaico_ingest.ontology.imaging import ROI, CameraInfo, CompressedImage, Image, ImageFormat
+    from mosaico_ingest.ontology.model import Serializable
+    from mosaico_ingest.ontology.ranging import (
+        GridCells,
+        LaserScan,
+        Lidar,
+        MapMetadata,
+        MultiEchoLaserScan,
+        OccupancyGrid,
+        PointCloud2,
+        PointField,
+        PointFieldDataType,
+        Radar,
+        Range,
+        RGBDCamera,
+        StereoCamera,
+        ToFCamera,
+    )
     from mosaico_ingest.ontology.scalars import (
         Boolean,
         Floating16,
@@ -54,16 +58,25 @@ if TYPE_CHECKING:
         Integer32,
         Integer64,
         String,
+        Unmodeled,
         Unsigned8,
         Unsigned16,
         Unsigned32,
         Unsigned64,
     )
-    from mosaico_ingest.ontology.serializable import Serializable
-    from mosaico_ingest.ontology.temperature import Temperature
-    from mosaico_ingest.ontology.transforms import FrameTransform
+    from mosaico_ingest.ontology.sensors import (
+        GPS,
+        IMU,
+        BatteryState,
+        GPSStatus,
+        Joy,
+        Magnetometer,
+        NMEASentence,
+        Pressure,
+        RobotJoint,
+        Temperature,
+    )
     from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
-    from mosaico_ingest.ontology.unmodeled import Unmodeled
 
 __all__ = [
     "GPS",
@@ -135,11 +148,11 @@ __all__ = [
 ]
 
 _OTHERS = {
-    "ImageFormat": "image",
-    "Message": "message",
+    "ImageFormat": "imaging",
+    "Message": "header",
     "OntologyType": "types",
-    "PointFieldDataType": "point_cloud",
-    "Serializable": "serializable",
+    "PointFieldDataType": "ranging",
+    "Serializable": "model",
     "SerializationFormat": "types",
 }
 

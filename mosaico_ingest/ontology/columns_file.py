@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 
-from mosaico_ingest.ontology.columns import FILE, written_fields
-from mosaico_ingest.ontology.registry import model
-from mosaico_ingest.ontology.tags import MODULES
+from mosaico_ingest.ontology.registry import FILE, MODULES, model, written_fields
 from mosaico_ingest.ontology.types import OntologyType
 
 __all__ = ["columns_file"]

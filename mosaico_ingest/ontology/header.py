@@ -1,17 +1,22 @@
-"""This file is moments, spans of time, and the header that says when and in which frame."""
+"""Time, Duration, Header and Message."""
 
 from __future__ import annotations
 
 from datetime import datetime, timedelta, timezone
-from typing import Annotated
+from typing import Annotated, TypeVar
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field, PlainValidator, SerializeAsAny
 from typing_extensions import Self
 
-from mosaico_ingest.ontology.fields import Int32, UInt32, UInt64
-from mosaico_ingest.ontology.serializable import Serializable
+from mosaico_ingest.ontology.model import Int32, Serializable, UInt32, UInt64
 
-__all__ = ["Duration", "Header", "Stamped", "Time"]
+__all__ = [
+    "Duration",
+    "Header",
+    "Message",
+    "Stamped",
+    "Time",
+]
 
 _SECOND = 1_000_000_000
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
@@ -93,3 +98,32 @@ class Stamped(BaseModel):
 
     header: Header | None = None
     """Time and frame of the values; null where the sender gave none."""
+
+
+_Model = TypeVar("_Model", bound=Serializable)
+
+
+def _ontology_object(value: object) -> object:
+    """Return the value as it is; the official SDK's own objects are as good as ours."""
+    if not isinstance(value, BaseModel) or not hasattr(value, "ontology_tag"):
+        raise ValueError(f"{type(value).__name__} is no ontology object")
+    return value
+
+
+class Message(BaseModel):
+    """The envelope around a row."""
+
+    model_config = ConfigDict(extra="forbid", defer_build=True)
+
+    timestamp_ns: int
+    """When it was recorded, ns since the epoch."""
+    data: Annotated[SerializeAsAny[Serializable], PlainValidator(_ontology_object)]
+    """The row itself."""
+
+    def get_data(self, model: type[_Model]) -> _Model | None:
+        """Return the row where it is a `model`, None otherwise."""
+        return self.data if isinstance(self.data, model) else None
+
+    def ontology_tag(self) -> str:
+        """Return the tag of the row."""
+        return self.data.ontology_tag()

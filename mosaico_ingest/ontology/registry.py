@@ -1,20 +1,119 @@
-"""This file finds a model by its tag and imports no more of the ontology than that one needs, for its columns none."""
+"""Find ontology models and their Arrow columns by tag.
+
+The file says of each tag how it is laid out and what its columns are: the name of an Arrow type, a mapping for a
+struct, a list for a list (of so many items); a name that ends in ? may be null.
+"""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from difflib import get_close_matches
+from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import pyarrow as pa
 
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.ontology.columns import builtin_type
-from mosaico_ingest.ontology.tags import DEFINED, MODULES
+from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 
 if TYPE_CHECKING:
-    from mosaico_ingest.ontology.serializable import Serializable
-    from mosaico_ingest.ontology.types import OntologyType
+    from mosaico_ingest.ontology.model import Serializable
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+if TYPE_CHECKING:
+    from mosaico_ingest.ontology.model import Serializable
 
-__all__ = ["UnknownTag", "model", "ontology_type", "tags"]
+__all__ = [
+    "DEFINED",
+    "FILE",
+    "MODULES",
+    "UnknownTag",
+    "Written",
+    "builtin_type",
+    "model",
+    "ontology_type",
+    "tags",
+    "written_fields",
+]
+
+DEFINED: dict[str, type[Serializable]] = {}
+"""Every model class by tag, from the moment it is defined; a later one of the same tag replaces it."""
+
+MODULES: Mapping[str, str] = MappingProxyType(
+    {
+        tag: module
+        for module, names in {
+            "geometry": (
+                "Acceleration ForceTorque FrameTransform Inertia MotionState Point2d Point3d Polygon Pose Quaternion "
+                "RobotPath Transform Vector2d Vector3d Vector4d Velocity"
+            ),
+            "header": "Duration Header Time",
+            "imaging": "CameraInfo CompressedImage Image ROI",
+            "ranging": (
+                "GridCells LaserScan Lidar MapMetadata MultiEchoLaserScan OccupancyGrid PointCloud2 PointField "
+                "RGBDCamera Radar Range StereoCamera ToFCamera"
+            ),
+            "scalars": (
+                "Boolean Floating16 Floating32 Floating64 Integer16 Integer32 Integer64 Integer8 "
+                "String Unmodeled Unsigned16 Unsigned32 Unsigned64 Unsigned8"
+            ),
+            "sensors": "BatteryState GPS GPSStatus IMU Joy Magnetometer NMEASentence Pressure RobotJoint Temperature",
+        }.items()
+        for tag in names.split()
+    }
+)
+"""The built-in tags, which are class names, and the module each is defined in."""
+
+FILE = Path(__file__).with_name("columns.json")
+
+Written: TypeAlias = "str | list[Any] | dict[str, Any]"
+"""An Arrow type as the file has it."""
+_arrow: Any = pa
+"""The stubs know each name of a type for itself, but not `str`."""
+
+
+@cache
+def builtin_type(tag: str) -> OntologyType:
+    """Return tag, columns and serialization format of a built-in tag; KeyError for any other."""
+    known = _known()[tag]
+    return OntologyType(tag, pa.struct(_fields(known["columns"])), SerializationFormat(known["format"]))
+
+
+@cache
+def _known() -> dict[str, dict[str, Any]]:
+    return json.loads(FILE.read_bytes())
+
+
+def _fields(columns: Mapping[str, Written]) -> list[pa.Field[Any]]:
+    return [
+        pa.field(name.removesuffix("?"), _type(kind), nullable=name.endswith("?"))
+        for name, kind in columns.items()
+    ]
+
+
+def _type(kind: Written) -> pa.DataType:
+    if isinstance(kind, str):
+        return _arrow.type_for_alias(kind)
+    if isinstance(kind, dict):
+        return pa.struct(_fields(kind))
+    return pa.list_(_type(kind[0]), *kind[1:])
+
+
+def written_fields(struct: pa.StructType) -> dict[str, Written]:
+    """Return the fields of a struct as the file has them."""
+    return {field.name + "?" * field.nullable: _written(field.type) for field in struct}
+
+
+def _written(kind: Any) -> Written:  # noqa: ANN401 - the stubs hide what a nested type is made of
+    if pa.types.is_struct(kind):
+        return written_fields(kind)
+    if pa.types.is_fixed_size_list(kind):
+        return [_written(kind.value_type), kind.list_size]
+    return [_written(kind.value_type)] if pa.types.is_list(kind) else str(kind)
 
 
 class UnknownTag(AdapterError, KeyError):  # noqa: N818 - the condition, as `NothingMatched`

@@ -1,8 +1,14 @@
-"""This file is single values without a header."""
+"""Single values without a header, and rows of any shape."""
 
 from __future__ import annotations
 
-from mosaico_ingest.ontology.fields import (
+from collections.abc import Mapping
+from typing import Any
+
+import pyarrow as pa
+from typing_extensions import Self
+
+from mosaico_ingest.ontology.model import (
     Float16,
     Float32,
     Float64,
@@ -10,12 +16,12 @@ from mosaico_ingest.ontology.fields import (
     Int16,
     Int32,
     Int64,
+    Serializable,
     UInt8,
     UInt16,
     UInt32,
     UInt64,
 )
-from mosaico_ingest.ontology.serializable import Serializable
 
 __all__ = [
     "Boolean",
@@ -27,6 +33,7 @@ __all__ = [
     "Integer32",
     "Integer64",
     "String",
+    "Unmodeled",
     "Unsigned8",
     "Unsigned16",
     "Unsigned32",
@@ -123,3 +130,23 @@ class String(Serializable):
 
     data: str
     """The value."""
+
+
+class Unmodeled(Serializable):
+    """A row kept in the shape of its message; its topic's columns are those of the message type."""
+
+    raw_data: dict[str, Any]
+    """The columns' values."""
+
+    def to_row(self) -> dict[str, Any]:
+        """Return the values of the columns."""
+        return self.raw_data
+
+    @classmethod
+    def from_row(cls, row: Mapping[str, Any]) -> Self:
+        """Return the row as it is."""
+        return cls(raw_data=dict(row))
+
+    @classmethod
+    def _columns(cls) -> pa.StructType:
+        return pa.struct([])

@@ -1,17 +1,27 @@
-"""This file is an ontology type as the pipeline carries it: a tag, a format and exact Arrow columns."""
+"""Ontology types as the pipeline carries them: tag, format, exact Arrow columns and required fields."""
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from enum import Enum
+from typing import Any, TypeAlias, cast
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.types as pt
 
+from mosaico_ingest.caching import remembered
 from mosaico_ingest.frozen import frozen
-from mosaico_ingest.remembered import remembered
 
-__all__ = ["OntologyType", "SerializationFormat", "fingerprint"]
-
+__all__ = [
+    "AbsentRows",
+    "OntologyType",
+    "RequiredFields",
+    "SerializationFormat",
+    "fingerprint",
+]
 
 _PLAIN: dict[pa.DataType, pa.DataType] = {
     pa.large_string(): pa.string(),
@@ -48,3 +58,126 @@ def fingerprint(struct: pa.StructType) -> str:
     """Return the first ten hex digits of the SHA-1 of the struct's spelling; top-level large and view types count as plain."""
     fields = [pa.field(field.name, _PLAIN.get(field.type) or field.type, field.nullable) for field in struct]
     return hashlib.sha1(str(pa.struct(fields)).encode(), usedforsecurity=False).hexdigest()[:10]
+
+
+_arrays: Any = pa
+"""The stubs do not know `type` beside `mask`."""
+_KEPT_BYTES = 1 << 20
+_Fill: TypeAlias = Callable[[Any], Any]
+"""Fills an array, or returns the array itself where there is nothing to fill."""
+
+
+class RequiredFields:
+    """Where the required fields of a struct are, found once for all batches of a topic."""
+
+    def __init__(self, kind: pa.StructType) -> None:
+        self._fill = _filling(kind)
+
+    def fill(self, rows: pa.StructArray) -> pa.StructArray:
+        """Return the same rows, where a required field that is null because its struct is null holds zero instead.
+
+        No value that can be seen changes. Parquet's writer refuses `struct<a: int32 not null>` with a null in `a`
+        although the struct itself is null there.
+        """
+        return rows if self._fill is None else cast("pa.StructArray", self._fill(rows))  # a struct stays one
+
+
+class AbsentRows:
+    """Rows of one type that are all null, with zeros where fields are required; few of them are made only once."""
+
+    def __init__(self, kind: Any) -> None:  # noqa: ANN401 - any Arrow type; the stubs have no common base with children
+        self._kind = kind
+        self._fill = _filling(kind)
+        self._kept: Any = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travel without what was made."""
+        return AbsentRows, (self._kind,)
+
+    def of(self, count: int) -> Any:  # noqa: ANN401 - an array of whatever type it is
+        """Return `count` nulls."""
+        if self._kept is not None and count <= len(self._kept):
+            return self._kept.slice(0, count)
+        rows: Any = pa.nulls(count, self._kind)
+        rows = rows if self._fill is None else self._fill(rows)
+        if rows.nbytes <= _KEPT_BYTES:
+            self._kept = rows
+        return rows
+
+
+def _filling(kind: Any) -> _Fill | None:  # noqa: ANN401 - as above
+    """Return how to fill arrays of a type, None where nothing inside is required."""
+    if pt.is_struct(kind):
+        return _filling_struct(list(kind))
+    if pt.is_fixed_size_list(kind):
+        inner = _filling(kind.value_type)
+        return None if inner is None else lambda array: _filled_fixed(array, inner)
+    if pt.is_list(kind):
+        inner = _filling(kind.value_type)
+        return None if inner is None else lambda array: _filled_list(array, inner)
+    return None
+
+
+def _filling_struct(fields: list[pa.Field[Any]]) -> _Fill | None:
+    inner = [_filling(field.type) for field in fields]
+    watched = [
+        (position, fill, field.nullable)
+        for position, (field, fill) in enumerate(zip(fields, inner, strict=True))
+        if fill is not None or not field.nullable
+    ]
+
+    def filled_struct(array: Any) -> Any:  # noqa: ANN401 - as above
+        changed: dict[int, Any] = {}
+        for position, fill, nullable in watched:
+            child = array.field(position)
+            new = child if fill is None else fill(child)
+            if not nullable and child.null_count:
+                new = _without_nulls(new)
+            if new is not child:
+                changed[position] = new
+        if not changed:
+            return array
+        children = [changed[i] if i in changed else array.field(i) for i in range(len(fields))]
+        mask = pc.is_null(array) if array.null_count else None
+        return pa.StructArray.from_arrays(children, fields=fields, mask=mask)
+
+    return filled_struct if watched else None
+
+
+def _filled_fixed(array: Any, fill: _Fill) -> Any:  # noqa: ANN401 - as above
+    size = array.type.list_size
+    values = array.values.slice(array.offset * size, len(array) * size)
+    filled = fill(values)
+    if filled is values:
+        return array
+    mask = pc.is_null(array) if array.null_count else None
+    return _arrays.FixedSizeListArray.from_arrays(filled, type=array.type, mask=mask)
+
+
+def _filled_list(array: Any, fill: _Fill) -> Any:  # noqa: ANN401 - as above
+    values = array.values
+    filled = fill(values)
+    if filled is values:
+        return array
+    # A null offset is a null list; `mask` does not go with a slice.
+    absent = np.append(array.is_null().to_numpy(zero_copy_only=False), False)
+    offsets = pa.array(array.offsets.to_numpy(), pa.int32(), mask=absent)
+    return pa.ListArray.from_arrays(offsets, filled, type=array.type)
+
+
+def _without_nulls(array: Any) -> Any:  # noqa: ANN401 - as above
+    """Return the values with whatever lies under a null."""
+    if pt.is_struct(array.type):
+        children = [array.field(position) for position in range(array.type.num_fields)]
+        return pa.StructArray.from_arrays(children, fields=list(array.type))
+    if pt.is_list(array.type):
+        return pc.if_else(pc.is_null(array), pa.scalar([], array.type), array)
+    return pc.fill_null(array, _zero(array.type))
+
+
+def _zero(kind: pa.DataType) -> pa.Scalar[Any]:
+    if pt.is_string(kind) or pt.is_large_string(kind):
+        return pa.scalar("", kind)
+    if pt.is_binary(kind) or pt.is_large_binary(kind):
+        return pa.scalar(b"", kind)
+    return pa.scalar(False if pt.is_boolean(kind) else 0, kind)

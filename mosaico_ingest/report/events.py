@@ -6,10 +6,9 @@ from collections.abc import Callable, Mapping
 from enum import Enum
 from typing import TypeAlias
 
-from mosaico_ingest.diagnostics import Finding, Stage
+from mosaico_ingest.findings import Finding, Stage
 from mosaico_ingest.frozen import frozen
-from mosaico_ingest.report.stopwatch import Step
-from mosaico_ingest.report.timeline import TimelineReport
+from mosaico_ingest.report.timing import Step, TimelineReport
 
 __all__ = [
     "BatchObserver",

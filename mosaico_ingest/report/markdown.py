@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.report.kept import replay_command
-from mosaico_ingest.report.model import Report, RunReport
-from mosaico_ingest.report.slowness import STEP_WORDS, longest_step, slowest, total_seconds
+from mosaico_ingest.report.collect import (
+    STEP_WORDS,
+    longest_step,
+    slowest,
+    total_seconds,
+)
+from mosaico_ingest.report.model import Report, RunReport, replay_command
 from mosaico_ingest.report.units import bytes_text, count_text, seconds_text
 
 __all__ = ["markdown_summary"]

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from mosaico_ingest.report.events import RunStatus
 from mosaico_ingest.report.model import RunReport
-from mosaico_ingest.report.stopwatch import Step
+from mosaico_ingest.report.timing import Step
 
 __all__ = ["prometheus_text"]
 

@@ -1,17 +1,24 @@
-"""This file is the report: what was read, written, left out and lost, per topic and in total; its JSON is versioned."""
+"""The report: what was read, written, excluded, rejected and unreadable, per topic and in total."""
 
 from __future__ import annotations
 
+import os
+import shlex
 from collections.abc import Sequence
 from datetime import datetime
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
-from pydantic import ConfigDict, Field, computed_field
+from pydantic import ConfigDict, Field, ValidationError, computed_field
 
-from mosaico_ingest.diagnostics import Stage
+from mosaico_ingest.documents import Part, schema_of
+from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.findings import Stage
 from mosaico_ingest.report.events import RunStatus, TopicStatus
-from mosaico_ingest.report.part import Part
-from mosaico_ingest.report.timeline import TimelineReport
+from mosaico_ingest.report.timing import TimelineReport
 from mosaico_ingest.report.units import count_text, counted
+from mosaico_ingest.textfile import write_whole
 
 __all__ = [
     "Loss",
@@ -22,7 +29,12 @@ __all__ = [
     "TopicReport",
     "Totals",
     "UsedManifest",
+    "folder_link",
     "gravest",
+    "read_report",
+    "replay_command",
+    "report_schema",
+    "write_report",
 ]
 
 _GRAVEST_FIRST = (130, 5, 1, 2, 3, 4)
@@ -228,3 +240,55 @@ class RunReport(_Part):
 def gravest(codes: Sequence[int]) -> int:
     """Return the exit code of several recordings with these."""
     return next((code for code in _GRAVEST_FIRST if code in codes), max(codes, default=0))
+
+
+def report_schema() -> dict[str, Any]:
+    """Return the JSON Schema (draft 2020-12) of a report file."""
+    schema = schema_of(RunReport, mode="serialization")
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+
+
+def replay_command(report: RunReport, one: Report) -> str | None:
+    """Return what to type once the manifest is mended; None where nothing was set aside."""
+    if one.quarantine is None:
+        return None
+    manifests = [used.path for used in report.manifests]
+    job = shlex.quote(manifests[0]) if len(manifests) == 1 else "JOB.yaml"
+    return f"ingest replay {shlex.quote(str(Path(one.quarantine).parent))} --manifest {job}"
+
+
+def folder_link(one: Report, page_folder: Path) -> str | None:
+    """Return the link from a page in `page_folder` to the folder with the messages set aside."""
+    if one.quarantine is None:
+        return None
+    folder = os.path.relpath(Path(one.quarantine).absolute().parent, page_folder.absolute())
+    return quote(Path(folder).as_posix().encode("utf-8", "surrogateescape")) + "/"
+
+
+def write_report(report: RunReport, path: Path) -> None:
+    """Write the report as JSON, whole or not at all.
+
+    Raises:
+        SinkError: The file cannot be written.
+    """
+    write_whole(path, report.model_dump_json(indent=2) + "\n")
+
+
+def read_report(path: Path) -> RunReport:
+    """Read a report file.
+
+    Raises:
+        ManifestError: It is not there, or no report.
+    """
+    try:
+        return RunReport.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise ManifestError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "the file"
+        raise ManifestError(
+            f"is no report: {place}: {first['msg']}",
+            where=str(path),
+            hint="`ingest run --report FILE` writes one",
+        ) from error

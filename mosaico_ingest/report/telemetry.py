@@ -16,7 +16,7 @@ from mosaico_ingest.report.events import (
     TopicClosed,
     TopicProgress,
 )
-from mosaico_ingest.report.stopwatch import Step
+from mosaico_ingest.report.timing import Step
 from mosaico_ingest.version import __version__
 
 try:

@@ -14,10 +14,10 @@ import pytest
 
 from mosaico_ingest.adapters.adapter import Adapted, AdapterSpec, Envelope
 from mosaico_ingest.adapters.builtin import BUILTIN
-from mosaico_ingest.bag.definition import Definition
-from mosaico_ingest.bag.shape import ros_shape
-from mosaico_ingest.bag.types import TypeResolver
-from mosaico_ingest.policies import Stores
+from mosaico_ingest.job.model import Stores
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.model import Definition
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 
 _OLD_TF = "geometry_msgs/TransformStamped[] transforms\n"
 _DATA = {

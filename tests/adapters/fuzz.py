@@ -5,8 +5,7 @@ from __future__ import annotations
 from random import Random
 from typing import Any
 
-from mosaico_ingest.bag.definition import Container, Definition, Field
-from mosaico_ingest.bag.names import TIME
+from mosaico_ingest.rosbag.definitions.model import TIME, Container, Definition, Field
 
 _SPECIAL_FLOATS = (0.0, 0.0, 1.0, -1.0, 0.5, float("nan"), float("inf"), float("-inf"))
 _TEXTS = ("", "", "map", "base_link", "überall", "bgr8; jpeg compressed bgr8", "png")

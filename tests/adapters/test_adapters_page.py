@@ -9,13 +9,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from mosaico_ingest.adapters import base
+from mosaico_ingest.adapters import python as base
+from mosaico_ingest.adapters.bridge import ROSBridge, load_adapter_reference
 from mosaico_ingest.adapters.builtin import BY_NAME
-from mosaico_ingest.adapters.catalog_page import with_catalog
-from mosaico_ingest.adapters.reference import load_adapter_reference
-from mosaico_ingest.bag.message import ROSMessage
-from mosaico_ingest.bridge import ROSBridge
-from mosaico_ingest.manifest.model import AdaptersSection
+from mosaico_ingest.adapters.builtin_files import with_catalog
+from mosaico_ingest.job.sections import AdaptersSection
+from mosaico_ingest.rosbag.blocks import ROSMessage
 
 PAGE = (Path(__file__).parents[2] / "docs" / "adapters.md").read_text("utf-8")
 

@@ -11,16 +11,22 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from mosaico_ingest.adapters import base
+from mosaico_ingest.adapters import python as base
 from mosaico_ingest.adapters.adapter import Adapted
-from mosaico_ingest.adapters.base import ROSAdapterBase, register_default_adapter, registered_adapters
-from mosaico_ingest.adapters.python_adapter import PythonAdapter, PythonAdapterSpec, ontology_of
-from mosaico_ingest.adapters.reference import adapter_spec, load_adapter_reference
-from mosaico_ingest.bag.definition import Definition
-from mosaico_ingest.bag.message import ROSMessage
+from mosaico_ingest.adapters.bridge import adapter_spec, load_adapter_reference
+from mosaico_ingest.adapters.python import (
+    PythonAdapter,
+    PythonAdapterSpec,
+    ROSAdapterBase,
+    ontology_of,
+    register_default_adapter,
+    registered_adapters,
+)
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.ontology.message import Message
-from mosaico_ingest.ontology.serializable import Serializable
+from mosaico_ingest.ontology.header import Message
+from mosaico_ingest.ontology.model import Serializable
+from mosaico_ingest.rosbag.blocks import ROSMessage
+from mosaico_ingest.rosbag.definitions.model import Definition
 
 
 class Speed(Serializable):

@@ -6,10 +6,10 @@ import pickle
 from dataclasses import replace
 
 from mosaico_ingest.adapters.builtin import BY_NAME
-from mosaico_ingest.adapters.mapping.load import load_adapter
-from mosaico_ingest.bag.shape import ros_shape
-from mosaico_ingest.bag.types import TypeResolver
-from mosaico_ingest.policies import Stores
+from mosaico_ingest.adapters.mapping.loader import load_adapter
+from mosaico_ingest.job.model import Stores
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 
 IMU = TypeResolver(Stores.ROS2_HUMBLE).resolve("sensor_msgs/msg/Imu", None, ros_version=2)
 SPEC = BY_NAME["IMUAdapter"].path

@@ -13,20 +13,19 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from mosaico_ingest import bridge as bridge_module
-from mosaico_ingest.adapters import base
+from mosaico_ingest.adapters import bridge as bridge_module
+from mosaico_ingest.adapters import python as base
 from mosaico_ingest.adapters.adapter import Envelope
-from mosaico_ingest.adapters.base import ROSAdapterBase, register_default_adapter
+from mosaico_ingest.adapters.bridge import ROSBridge
 from mosaico_ingest.adapters.builtin import BY_NAME
-from mosaico_ingest.adapters.python_adapter import PythonAdapterSpec
-from mosaico_ingest.bag.definition import Definition
-from mosaico_ingest.bag.message import ROSMessage
-from mosaico_ingest.bag.shape import ros_shape
-from mosaico_ingest.bridge import ROSBridge
-from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.adapters.python import PythonAdapterSpec, ROSAdapterBase, register_default_adapter
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.ontology.serializable import Serializable
+from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.ontology.model import Serializable
 from mosaico_ingest.ontology.types import SerializationFormat
+from mosaico_ingest.rosbag.blocks import ROSMessage
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.model import Definition
 
 IMU, CLOUD = "sensor_msgs/msg/Imu", "sensor_msgs/msg/PointCloud2"
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import pytest
 
 from mosaico_ingest.adapters.builtin import BUILTIN, find_builtin
-from mosaico_ingest.adapters.definitions import KnownTypes
+from mosaico_ingest.adapters.direct import KnownTypes
 from mosaico_ingest.adapters.draft import draft
-from mosaico_ingest.adapters.mapping.load import load_adapter
-from mosaico_ingest.adapters.mapping.trial import run_tests
-from mosaico_ingest.bag.definition import Definition, Embedded
-from mosaico_ingest.bag.shape import ros_shape
-from mosaico_ingest.bag.types import TypeResolver
+from mosaico_ingest.adapters.mapping.loader import load_adapter
+from mosaico_ingest.adapters.mapping.testing import run_tests
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.ontology.tags import MODULES
+from mosaico_ingest.ontology.registry import MODULES
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 
 ODD = """\
 uint64 timestamp_ns

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from mosaico_ingest.adapters.adapter import Adapted
 from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.adapters.image import PngImageSpec, greyscale_png
-from mosaico_ingest.bag.definition import Definition
+from mosaico_ingest.rosbag.definitions.model import Definition
 
 
 def _pixels(png: bytes) -> tuple[int, int, bytes]:

@@ -13,9 +13,9 @@ from made_recordings import define
 
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.inverse import Restored, invert
-from mosaico_ingest.adapters.inverse.compare import differences
-from mosaico_ingest.adapters.mapping.load import load_adapter
-from mosaico_ingest.bag.shape import ros_shape
+from mosaico_ingest.adapters.inverse.restore import differences
+from mosaico_ingest.adapters.mapping.loader import load_adapter
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
 
 DEFINITION = define(
     "acme_msgs/msg/T",

@@ -10,14 +10,19 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from mosaico_ingest.adapters.adapter import Adapted, Adapter, AdapterSpec, Envelope
-from mosaico_ingest.adapters.mapping.load import MappingAdapter, MappingSpec, load_adapter
-from mosaico_ingest.adapters.mapping.trial import message_row, run_tests
-from mosaico_ingest.bag.definition import Definition, Embedded
-from mosaico_ingest.bag.shape import ros_shape
-from mosaico_ingest.bag.types import TypeResolver
+from mosaico_ingest.adapters.adapter import (
+    Adapted,
+    Adapter,
+    AdapterSpec,
+    Envelope,
+)
+from mosaico_ingest.adapters.mapping.loader import MappingAdapter, MappingSpec, load_adapter
+from mosaico_ingest.adapters.mapping.testing import message_row, run_tests
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.ontology.registry import ontology_type
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 
 PACK = """\
 uint8 CHARGING=1

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from mosaico_ingest.adapters.mapping.load import load_adapter
-from mosaico_ingest.adapters.mapping.trial import run_tests
-from mosaico_ingest.bag.shape import ros_shape
-from mosaico_ingest.bag.types import TypeResolver
+from mosaico_ingest.adapters.mapping.loader import load_adapter
+from mosaico_ingest.adapters.mapping.testing import run_tests
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 
 TEXT = (Path(__file__).parents[2] / "docs" / "mapping.md").read_text("utf-8")
 BLOCKS = re.findall(r"```yaml\n(.*?)```", TEXT, re.DOTALL)

@@ -6,12 +6,12 @@ import textwrap
 
 import pytest
 
-from mosaico_ingest.adapters.mapping.load import load_adapter
-from mosaico_ingest.bag.definition import Definition, Embedded
-from mosaico_ingest.bag.shape import ros_shape
-from mosaico_ingest.bag.types import TypeResolver
-from mosaico_ingest.diagnostics import Finding
+from mosaico_ingest.adapters.mapping.loader import load_adapter
 from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.findings import Finding
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 
 PACK = """\
 uint8 CHARGING=1

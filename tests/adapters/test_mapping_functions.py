@@ -11,14 +11,13 @@ import pyarrow as pa
 import pytest
 
 from mosaico_ingest.adapters.adapter import Envelope
-from mosaico_ingest.adapters.mapping.check import Checker, Scope
-from mosaico_ingest.adapters.mapping.evaluate import Evaluation, RowsRefused
-from mosaico_ingest.adapters.mapping.expression import parse
+from mosaico_ingest.adapters.mapping.checker import Checker, Scope
+from mosaico_ingest.adapters.mapping.evaluator import Evaluation, RowsRefused
 from mosaico_ingest.adapters.mapping.functions import SUBJECTS, functions, operators
-from mosaico_ingest.adapters.mapping.functions.ros import HEADER_TYPE
-from mosaico_ingest.adapters.mapping.functions.time import STAMP_TYPE
-from mosaico_ingest.adapters.mapping.kinds import Kind
-from mosaico_ingest.adapters.mapping.reference import with_reference
+from mosaico_ingest.adapters.mapping.functions.reference import with_reference
+from mosaico_ingest.adapters.mapping.functions.ros import HEADER_TYPE, STAMP_TYPE
+from mosaico_ingest.adapters.mapping.parser import parse
+from mosaico_ingest.adapters.mapping.types import Kind
 from mosaico_ingest.ontology.registry import ontology_type
 
 STAMP = pa.struct([("sec", pa.int32()), ("nanosec", pa.uint32())])

@@ -13,14 +13,14 @@ from every_kind import every_kind
 
 import mosaico_ingest
 from mosaico_ingest.adapters.adapter import Envelope
-from mosaico_ingest.adapters.mapping.check import Checker, Scope
-from mosaico_ingest.adapters.mapping.evaluate import Evaluation, RowsRefused
-from mosaico_ingest.adapters.mapping.expression import ExpressionError, parse
-from mosaico_ingest.adapters.mapping.fit import convert, demand
+from mosaico_ingest.adapters.mapping.checker import Checker, Scope
+from mosaico_ingest.adapters.mapping.conversion import convert, demand
+from mosaico_ingest.adapters.mapping.evaluator import Evaluation, RowsRefused
 from mosaico_ingest.adapters.mapping.functions import functions
-from mosaico_ingest.adapters.mapping.kinds import Kind, Unfit
-from mosaico_ingest.adapters.mapping.load import load_adapter
+from mosaico_ingest.adapters.mapping.loader import load_adapter
+from mosaico_ingest.adapters.mapping.parser import ExpressionError, parse
 from mosaico_ingest.adapters.mapping.typed import Typed
+from mosaico_ingest.adapters.mapping.types import Kind, Unfit
 from mosaico_ingest.errors import AdapterError
 
 STAMP = pa.struct([("sec", pa.int32()), ("nanosec", pa.uint32())])

@@ -16,10 +16,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from mosaico_ingest.adapters.adapter import Envelope
-from mosaico_ingest.adapters.mapping.check import Checker, Scope
-from mosaico_ingest.adapters.mapping.evaluate import Evaluation, RowsRefused
-from mosaico_ingest.adapters.mapping.expression import parse
-from mosaico_ingest.adapters.mapping.kinds import Kind
+from mosaico_ingest.adapters.mapping.checker import Checker, Scope
+from mosaico_ingest.adapters.mapping.evaluator import Evaluation, RowsRefused
+from mosaico_ingest.adapters.mapping.parser import parse
 from mosaico_ingest.adapters.mapping.typed import (
     Apply,
     Cast,
@@ -33,6 +32,7 @@ from mosaico_ingest.adapters.mapping.typed import (
     Typed,
     Whole,
 )
+from mosaico_ingest.adapters.mapping.types import Kind
 
 MESSAGE = every_kind()
 

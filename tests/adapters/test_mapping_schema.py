@@ -10,8 +10,8 @@ import jsonschema
 import pytest
 
 import mosaico_ingest
-from mosaico_ingest.adapters.mapping.schema import adapter_schema
-from mosaico_ingest.manifest.source import load_source
+from mosaico_ingest.adapters.mapping.model import adapter_schema
+from mosaico_ingest.job.yaml_source import load_source
 
 CATALOG = sorted((Path(mosaico_ingest.__file__).parent / "adapters" / "catalog").glob("*.yaml"))
 VALIDATOR = jsonschema.Draft202012Validator(adapter_schema())

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from mosaico_ingest.adapters.adapter import Adapted
 from mosaico_ingest.adapters.builtin import BY_NAME
-from mosaico_ingest.bag.definition import Definition
+from mosaico_ingest.rosbag.definitions.model import Definition
 
 FORMATS = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 8: "d"}
 Unpack = Callable[..., Adapted]

@@ -9,13 +9,11 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from mosaico_ingest.adapters.adapter import Adapted
-from mosaico_ingest.adapters.metadata import ros_metadata
-from mosaico_ingest.adapters.unmodeled import UnmodeledSpec
-from mosaico_ingest.bag.definition import Definition, Embedded
-from mosaico_ingest.bag.shape import ros_shape
-from mosaico_ingest.bag.types import TypeResolver
+from mosaico_ingest.adapters.adapter import Adapted, UnmodeledSpec, ros_metadata
 from mosaico_ingest.ontology.types import SerializationFormat
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 
 
 def _defined(text: str, name: str = "pkg/msg/Thing") -> Definition:

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from mosaico_ingest.adapters.bridge import installed_adapters
 from mosaico_ingest.adapters.builtin import BUILTIN, BY_NAME
-from mosaico_ingest.adapters.definitions import KnownTypes
-from mosaico_ingest.bridge import installed_adapters
+from mosaico_ingest.adapters.direct import KnownTypes
 from mosaico_ingest.cli.app import main
-from mosaico_ingest.executors.adapters import explain_adapter
+from mosaico_ingest.services.adapters import explain_adapter
 
 Ingest = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).resolve().parents[2]

@@ -9,11 +9,16 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from mosaico_ingest.cli.batch_progress import BatchBoard, BatchLines, headline
 from mosaico_ingest.cli.logs import JsonLines
-from mosaico_ingest.cli.tally import Tally, sizes_of
-from mosaico_ingest.config import ROSInjectionConfig
-from mosaico_ingest.report.events import Expected, RunFinished, RunStarted, RunStatus, TopicProgress
+from mosaico_ingest.cli.progress import BatchBoard, BatchLines, Tally, headline, sizes_of
+from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.report.events import (
+    Expected,
+    RunFinished,
+    RunStarted,
+    RunStatus,
+    TopicProgress,
+)
 
 
 def started(name: str, promised: int = 100) -> RunStarted:
@@ -24,7 +29,7 @@ def started(name: str, promised: int = 100) -> RunStarted:
 @pytest.fixture
 def tally(monkeypatch: pytest.MonkeyPatch) -> Tally:
     """A batch of three recordings, ten seconds after it began."""
-    monkeypatch.setattr("mosaico_ingest.cli.tally.time.monotonic", lambda: 10.0)
+    monkeypatch.setattr("mosaico_ingest.cli.progress.time.monotonic", lambda: 10.0)
     return Tally([1000, 8000, 1000], began=0.0)
 
 
@@ -89,7 +94,7 @@ def test_people_see_what_is_in_work_and_programs_the_same(
 
 
 def test_a_plain_log_has_a_line_now_and_then(tally: Tally, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mosaico_ingest.cli.batch_progress.LINE_EVERY_S", 0.0)
+    monkeypatch.setattr("mosaico_ingest.cli.progress.LINE_EVERY_S", 0.0)
     console = Console(file=io.StringIO(), width=100)
     say = BatchLines(console, tally)
     say(0, started("a"))

@@ -13,8 +13,8 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from mosaico_ingest.cli.app import main
-from mosaico_ingest.plan.document import PlanDocument
-from mosaico_ingest.store import Store
+from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.pipeline.plan import PlanDocument
 
 ROOT = Path(__file__).resolve().parents[2]
 JOB = "configs/quickstart.yaml"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mosaico_ingest.cli.render import render_findings, texts_of
-from mosaico_ingest.diagnostics import Finding, Severity, Span
+from mosaico_ingest.cli.console import render_findings, texts_of
+from mosaico_ingest.findings import Finding, Severity, Span
 
 
 def drawn(text: str, span: Span, message: str = "wrong", remedy: str | None = None) -> str:

@@ -17,9 +17,9 @@ import pyarrow as pa
 import pytest
 from pyarrow import flight
 
-from mosaico_ingest.store import Store
-from mosaico_ingest.store.server import Keyring, Tls, serve
-from mosaico_ingest.wire.actions import Permission
+from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.protocol.messages import Permission
+from mosaico_ingest.serve import Keyring, Tls, serve
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDING = ROOT / "configs" / "quickstart" / "drive.mcap"

@@ -10,11 +10,13 @@ import pytest
 from rich.console import Console
 
 from mosaico_ingest import api
-from mosaico_ingest.cli import plan_tables, store_tables, tables
-from mosaico_ingest.diagnostics import Stage
+from mosaico_ingest.cli import plan as plan_tables
+from mosaico_ingest.cli import report as tables
+from mosaico_ingest.cli import store as store_tables
+from mosaico_ingest.destinations.store import Store, StoreSink
+from mosaico_ingest.findings import Stage
 from mosaico_ingest.ontology.registry import ontology_type
 from mosaico_ingest.report.model import Rejection, RunReport
-from mosaico_ingest.store import Store, StoreSink
 
 JOB = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
 DRIVE = JOB.parent / "quickstart" / "drive.mcap"

@@ -8,15 +8,13 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from mosaico_ingest.bag.batch import Channel, Encoding, RawBatch
-from mosaico_ingest.bag.definition import Definition
-from mosaico_ingest.bag.serialize import Serializer
-from mosaico_ingest.bag.shape import ros_shape
-from mosaico_ingest.bag.types import TypeResolver
-from mosaico_ingest.decode.columnar import ColumnarDecoder
-from mosaico_ingest.decode.decoder import Decoder
-from mosaico_ingest.decode.rowwise import RowwiseDecoder
-from mosaico_ingest.policies import Stores
+from mosaico_ingest.decode.decoder import ColumnarDecoder, Decoder, RowwiseDecoder
+from mosaico_ingest.job.model import Stores
+from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.model import Definition
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.serialization import Serializer
 
 MakeDecoder = Callable[[Definition, Encoding], Decoder]
 CASES = {

@@ -13,12 +13,12 @@ from typing import Any
 
 import pytest
 
-from mosaico_ingest.adapters.base import ROSAdapterBase
-from mosaico_ingest.bag.registry import ROSTypeRegistry
-from mosaico_ingest.config import ROSInjectionConfig
-from mosaico_ingest.executors.executor import Executor
-from mosaico_ingest.executors.local import Inline
+from mosaico_ingest.adapters.python import ROSAdapterBase
+from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.destinations.store.session import StoreSession
+from mosaico_ingest.executors.in_process import Executor, Inline
 from mosaico_ingest.executors.processes import Processes
+from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.ontology import IMU, Vector3d
 from mosaico_ingest.report.events import (
     Event,
@@ -29,8 +29,7 @@ from mosaico_ingest.report.events import (
     ignore_batch,
 )
 from mosaico_ingest.report.model import Report
-from mosaico_ingest.store import Store
-from mosaico_ingest.store.session import StoreSession
+from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry
 
 DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
 

@@ -9,17 +9,17 @@ import pyarrow as pa
 import pytest
 from object_store import ObjectStore
 
+from mosaico_ingest.destinations.base import topic_schema
+from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.destinations.store.catalog import NewNote, NewSession, NewTopic
+from mosaico_ingest.destinations.store.errors import NotInStore
+from mosaico_ingest.destinations.store.files import new_session_id
+from mosaico_ingest.destinations.store.protocols import Records
+from mosaico_ingest.destinations.store.segment import Segment
 from mosaico_ingest.errors import SequenceExists, SinkError
+from mosaico_ingest.job.model import IfExists
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.policies import IfExists
 from mosaico_ingest.remote import as_path
-from mosaico_ingest.sink import topic_schema
-from mosaico_ingest.store import Store
-from mosaico_ingest.store.entries import NewNote, NewSession, NewTopic
-from mosaico_ingest.store.faults import NotInStore
-from mosaico_ingest.store.layout import new_session_id
-from mosaico_ingest.store.seams import Records
-from mosaico_ingest.store.segment import Segment
 
 POINT = OntologyType("Point", pa.struct([pa.field("x", pa.float64())]))
 FLAG = OntologyType("Flag", pa.struct([pa.field("on", pa.bool_())]))

@@ -16,9 +16,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from mosaico_ingest.api import run
-from mosaico_ingest.config import ROSInjectionConfig
 from mosaico_ingest.errors import IngestError
-from mosaico_ingest.policies import LoaderErrorPolicy, TopicLevelErrorPolicy
+from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.model import LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.report.events import TopicStatus
 from mosaico_ingest.report.model import Report, TopicReport
 

@@ -11,8 +11,8 @@ from types import ModuleType
 import pyarrow as pa
 import pytest
 
+from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.report.events import TopicStatus
-from mosaico_ingest.store import Store
 
 TABLE = Path(__file__).with_name("table.tsv")
 ORDER = ("refused", "part", "whole")

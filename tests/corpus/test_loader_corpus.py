@@ -16,7 +16,7 @@ from rosbags.typesys import Stores as RosbagsStores
 from rosbags.typesys import get_typestore
 from rosbags.typesys.store import Typestore
 
-from mosaico_ingest.bag.loader import ROSLoader
+from mosaico_ingest.rosbag.loader import ROSLoader
 
 PLACEHOLDER = "structure_needs_at_least_one_member"
 _MAX_MESSAGES = 3_000

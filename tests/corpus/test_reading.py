@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from mosaico_ingest.bag.definition import Definition, Embedded
-from mosaico_ingest.bag.recording import open_recording
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
+from mosaico_ingest.rosbag.recording import open_recording
 
 MORE_THAN_KNOWN = {"Tiryoh__rosbag-analyzer-web/test_truncated.bag": 3}
 """Of this chunk, cut off with the file, three messages are whole."""

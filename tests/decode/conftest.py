@@ -9,12 +9,10 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from mosaico_ingest.bag.batch import Channel, Encoding, RawBatch
-from mosaico_ingest.bag.definition import Definition
-from mosaico_ingest.decode import columnar
-from mosaico_ingest.decode.columnar import ColumnarDecoder
-from mosaico_ingest.decode.decoder import Decoded
-from mosaico_ingest.decode.rowwise import RowwiseDecoder
+from mosaico_ingest.decode import decoder as columnar
+from mosaico_ingest.decode.decoder import ColumnarDecoder, Decoded, RowwiseDecoder
+from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
+from mosaico_ingest.rosbag.definitions.model import Definition
 
 
 def make_batch(payloads: Sequence[bytes], definition: Definition, encoding: Encoding) -> RawBatch:

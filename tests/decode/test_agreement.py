@@ -11,16 +11,21 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mosaico_ingest.bag.batch import Encoding, RawBatch
-from mosaico_ingest.bag.definition import Container, Definition, Field, MessageType, Source
-from mosaico_ingest.bag.serialize import Serializer
 from mosaico_ingest.decode import lockstep
 from mosaico_ingest.decode.decoder import Decoded
 from mosaico_ingest.decode.layout import compile_layout
-from mosaico_ingest.decode.locate import locate
-from mosaico_ingest.decode.lockstep import locate_lockstep
-from mosaico_ingest.decode.places import Frame, Located, Place
-from mosaico_ingest.decode.stepwise import locate_stepwise
+from mosaico_ingest.decode.lockstep import locate, locate_lockstep
+from mosaico_ingest.decode.spans import Frame, Located, Place
+from mosaico_ingest.decode.walk import locate_stepwise
+from mosaico_ingest.rosbag.blocks import Encoding, RawBatch
+from mosaico_ingest.rosbag.definitions.model import (
+    Container,
+    Definition,
+    Field,
+    MessageType,
+    Source,
+)
+from mosaico_ingest.rosbag.serialization import Serializer
 
 BatchOf = Callable[[Sequence[bytes], Definition, Encoding], RawBatch]
 AssertAgree = Callable[[Sequence[bytes], Definition, Encoding], Decoded]

@@ -4,12 +4,18 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from mosaico_ingest.bag.batch import Encoding, RawBatch
-from mosaico_ingest.bag.definition import Container, Definition, Field, MessageType, Source
-from mosaico_ingest.bag.serialize import Serializer
-from mosaico_ingest.decode.clustered import locate_clustered
 from mosaico_ingest.decode.layout import compile_layout
-from mosaico_ingest.decode.places import Frame, Located
+from mosaico_ingest.decode.spans import Frame, Located
+from mosaico_ingest.decode.walk import locate_clustered
+from mosaico_ingest.rosbag.blocks import Encoding, RawBatch
+from mosaico_ingest.rosbag.definitions.model import (
+    Container,
+    Definition,
+    Field,
+    MessageType,
+    Source,
+)
+from mosaico_ingest.rosbag.serialization import Serializer
 
 BatchOf = Callable[[Sequence[bytes], Definition, Encoding], RawBatch]
 

@@ -8,16 +8,20 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from mosaico_ingest.bag.batch import Channel, Encoding, RawBatch
-from mosaico_ingest.bag.definition import Container, Definition, Field, MessageType, Source
-from mosaico_ingest.bag.serialize import Serializer
-from mosaico_ingest.bag.types import TypeResolver
-from mosaico_ingest.decode import columnar
-from mosaico_ingest.decode.choose import decoder_for
-from mosaico_ingest.decode.columnar import ColumnarDecoder
-from mosaico_ingest.decode.decoder import Decoded
+from mosaico_ingest.decode import decoder as columnar
+from mosaico_ingest.decode.decoder import ColumnarDecoder, Decoded, decoder_for
 from mosaico_ingest.errors import DecodeError
-from mosaico_ingest.policies import Stores
+from mosaico_ingest.job.model import Stores
+from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
+from mosaico_ingest.rosbag.definitions.model import (
+    Container,
+    Definition,
+    Field,
+    MessageType,
+    Source,
+)
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.serialization import Serializer
 
 BatchOf = Callable[[Sequence[bytes], Definition, Encoding], RawBatch]
 AssertAgree = Callable[[Sequence[bytes], Definition, Encoding], Decoded]

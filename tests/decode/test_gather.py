@@ -5,8 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mosaico_ingest.decode import gather
-from mosaico_ingest.decode.gather import Cells, bytes_at, cells, spans
+from mosaico_ingest.decode import spans as gather
+from mosaico_ingest.decode.spans import (
+    Cells,
+    bytes_at,
+    cells,
+    spans,
+)
 
 DATA = np.random.default_rng(1).integers(0, 256, 60_000).astype(np.uint8)
 

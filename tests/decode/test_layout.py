@@ -1,8 +1,5 @@
 from __future__ import annotations
 
-from mosaico_ingest.bag.batch import Encoding
-from mosaico_ingest.bag.definition import Container, Definition, Field, MessageType, Source
-from mosaico_ingest.bag.types import TypeResolver
 from mosaico_ingest.decode.layout import (
     Block,
     Grid,
@@ -16,7 +13,16 @@ from mosaico_ingest.decode.layout import (
     Words,
     compile_layout,
 )
-from mosaico_ingest.policies import Stores
+from mosaico_ingest.job.model import Stores
+from mosaico_ingest.rosbag.blocks import Encoding
+from mosaico_ingest.rosbag.definitions.model import (
+    Container,
+    Definition,
+    Field,
+    MessageType,
+    Source,
+)
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 
 
 def layout_of(

@@ -11,16 +11,14 @@ import pytest
 from rosbags.typesys import Stores as RosbagsStores
 from rosbags.typesys import get_typestore
 
-from mosaico_ingest.bag.batch import Encoding, RawBatch
-from mosaico_ingest.bag.definition import Container, Definition, Field
-from mosaico_ingest.bag.recording import open_recording
-from mosaico_ingest.bag.serialize import Serializer
-from mosaico_ingest.bag.types import TypeResolver
-from mosaico_ingest.decode.choose import decoder_for
-from mosaico_ingest.decode.decoder import Decoded
-from mosaico_ingest.decode.rowwise import RowwiseDecoder
+from mosaico_ingest.decode.decoder import Decoded, RowwiseDecoder, decoder_for
 from mosaico_ingest.errors import DecodeError, IngestError
-from mosaico_ingest.policies import Stores
+from mosaico_ingest.job.model import Stores
+from mosaico_ingest.rosbag.blocks import Encoding, RawBatch
+from mosaico_ingest.rosbag.definitions.model import Container, Definition, Field
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.recording import open_recording
+from mosaico_ingest.rosbag.serialization import Serializer
 
 AssertAgree = Callable[[Sequence[bytes], Definition, Encoding], Decoded]
 AssertSame = Callable[[Decoded, Decoded], None]

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from mosaico_ingest.executors.content import content_digest, whole_digest
+from mosaico_ingest.pipeline.provenance import content_digest, whole_digest
 
 MIB = 1 << 20
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from mosaico_ingest.config import ROSInjectionConfig
-from mosaico_ingest.executors.held import held_catalogs
-from mosaico_ingest.executors.local import Inline
-from mosaico_ingest.store import Store
+from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.destinations.store.open_stores import held_catalogs
+from mosaico_ingest.executors.in_process import Inline
+from mosaico_ingest.job.config import ROSInjectionConfig
 
 DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
 

@@ -17,17 +17,17 @@ from typing import Any
 import pytest
 
 from mosaico_ingest.api import compile_job
+from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.report.events import Event, RunStarted
 from mosaico_ingest.report.model import RunReport
-from mosaico_ingest.store import Store
 
 pytest.importorskip("ray", reason="Ray is not installed")
 
 from ray_cluster import two_nodes
 
+from mosaico_ingest.executors.processes import Registrations
 from mosaico_ingest.executors.ray import Ray
 from mosaico_ingest.executors.ray_worker import Setting, machine, out_of_reach
-from mosaico_ingest.executors.worker_process import Registrations
 
 pytestmark = pytest.mark.slow
 

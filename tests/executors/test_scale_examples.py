@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 import yaml
 
+from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.report.model import RunReport
-from mosaico_ingest.store import Store
 
 ROOT = Path(__file__).resolve().parents[2]
 SCALE = ROOT / "configs" / "scale"

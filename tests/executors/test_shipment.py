@@ -11,8 +11,8 @@ import pytest
 from mosaico_ingest.api import compile_job
 from mosaico_ingest.cli.app import main
 from mosaico_ingest.executors.shipment import absolute, pack
-from mosaico_ingest.executors.worker import make_plan
-from mosaico_ingest.plan.describe import decisions
+from mosaico_ingest.pipeline.plan import decisions
+from mosaico_ingest.pipeline.run import make_plan
 
 QUICKSTART = Path(__file__).resolve().parents[2] / "configs" / "quickstart"
 PYTHON = """

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner, Result
 
 from mosaico_ingest.cli.app import command_line
-from mosaico_ingest.cli.shard import take_shard
+from mosaico_ingest.cli.run import take_shard
+from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.report.model import RunReport
-from mosaico_ingest.report.stopwatch import Step
-from mosaico_ingest.store import Store
+from mosaico_ingest.report.timing import Step
 
 DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
 

@@ -9,10 +9,10 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from mosaico_ingest.config import ROSInjectionConfig, TimeBound, TimeRange
-from mosaico_ingest.executors import trial
-from mosaico_ingest.executors.preview import preview
-from mosaico_ingest.plan.document import RecordingPlan, Sample
+from mosaico_ingest.job.config import ROSInjectionConfig, TimeBound, TimeRange
+from mosaico_ingest.pipeline import preview as trial
+from mosaico_ingest.pipeline.plan import RecordingPlan, Sample
+from mosaico_ingest.pipeline.preview import preview
 
 FLOAT = b"\0\1\0\0" + bytes(8)
 START_NS = 1_700_000_000 * 10**9

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from mosaico_ingest.executors.arrivals import Arrivals
-from mosaico_ingest.store import Store
+from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.services.watch import Arrivals
 
 DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
 JOB = 'bag: {path: "nothing/*.mcap"}\ntopics: [/imu]\ntarget: {store: store}\n'

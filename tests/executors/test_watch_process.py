@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from mosaico_ingest.store import Store
+from mosaico_ingest.destinations.store import Store
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]

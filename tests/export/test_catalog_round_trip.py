@@ -15,12 +15,12 @@ from random_messages import random_rows
 
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.builtin import BUILTIN, Builtin
-from mosaico_ingest.adapters.definitions import KnownTypes
+from mosaico_ingest.adapters.direct import KnownTypes
 from mosaico_ingest.adapters.inverse import invert
-from mosaico_ingest.bag.definition import Definition
-from mosaico_ingest.bag.shape import ros_shape
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.policies import Stores
+from mosaico_ingest.job.model import Stores
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.model import Definition
 
 DOCS = Path(__file__).parents[2] / "docs" / "export.md"
 MESSAGES = 60

@@ -13,11 +13,11 @@ from message_differences import differences, messages_of
 from rosbags.highlevel import AnyReader
 
 from mosaico_ingest.api import run
-from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import BagError, IngestError, NothingMatched
 from mosaico_ingest.export import export_sequence
-from mosaico_ingest.policies import LoaderErrorPolicy, TopicLevelErrorPolicy
-from mosaico_ingest.store import Store
+from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.model import LoaderErrorPolicy, TopicLevelErrorPolicy
 
 DRIVE = Path(__file__).parents[2] / "configs" / "quickstart" / "drive.mcap"
 ODD = """

@@ -18,14 +18,19 @@ import pyarrow as pa
 import pytest
 
 from mosaico_ingest.adapters.adapter import Adapted, AdapterSpec, Envelope
-from mosaico_ingest.adapters.builtin import BUILTIN, BY_NAME, BY_TYPE, Builtin
+from mosaico_ingest.adapters.builtin import (
+    BUILTIN,
+    BY_NAME,
+    BY_TYPE,
+    Builtin,
+)
 from mosaico_ingest.adapters.image import PngImageSpec
-from mosaico_ingest.adapters.python_adapter import ontology_of
-from mosaico_ingest.bag.definition import Definition
-from mosaico_ingest.bag.shape import ros_shape
-from mosaico_ingest.bag.types import TypeResolver
+from mosaico_ingest.adapters.python import ontology_of
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.policies import Stores
+from mosaico_ingest.job.model import Stores
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.model import Definition
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 
 pytestmark = pytest.mark.interop
 sdk = pytest.importorskip("mosaicolabs.bridges.ros", reason="the official SDK is not installed")

@@ -14,12 +14,11 @@ import pyarrow as pa
 import pytest
 
 from mosaico_ingest.adapters.adapter import Adapted, Envelope
-from mosaico_ingest.adapters.python_adapter import PythonAdapterSpec, ontology_of
-from mosaico_ingest.adapters.reference import load_adapter_reference
-from mosaico_ingest.bag.shape import ros_shape
-from mosaico_ingest.bag.types import TypeResolver
-from mosaico_ingest.bridge import ROSBridge
-from mosaico_ingest.policies import Stores
+from mosaico_ingest.adapters.bridge import ROSBridge, load_adapter_reference
+from mosaico_ingest.adapters.python import PythonAdapterSpec, ontology_of
+from mosaico_ingest.job.model import Stores
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 
 pytestmark = pytest.mark.interop
 sdk = pytest.importorskip("mosaicolabs.bridges.ros", reason="the official SDK is not installed")

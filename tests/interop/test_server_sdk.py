@@ -14,11 +14,11 @@ from typing import Any
 import pytest
 
 from mosaico_ingest.api import RosbagInjector
-from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.store import Store
-from mosaico_ingest.store.server import Keyring, Server, serve
-from mosaico_ingest.wire.actions import Permission
+from mosaico_ingest.protocol.messages import Permission
+from mosaico_ingest.serve import Keyring, Server, serve
 
 pytestmark = pytest.mark.interop
 sdk = pytest.importorskip("mosaicolabs", reason="the official SDK is not installed")

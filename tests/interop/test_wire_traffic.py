@@ -15,10 +15,10 @@ import pyarrow.flight as fl
 import pytest
 
 from mosaico_ingest.api import RosbagInjector
-from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.ontology.types import fingerprint
-from mosaico_ingest.store import Store
-from mosaico_ingest.store.server.service import Service
+from mosaico_ingest.serve.server import Service
 
 pytestmark = pytest.mark.interop
 pytest.importorskip("mosaicolabs", reason="the official SDK is not installed")

@@ -19,13 +19,13 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
 from mosaico_ingest import api
-from mosaico_ingest.bag.batch import Encoding
-from mosaico_ingest.bag.definition import Container, Definition, Field
-from mosaico_ingest.bag.serialize import Serializer
-from mosaico_ingest.bag.types import TypeResolver
+from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.report.model import Report, TopicReport
-from mosaico_ingest.store import Store
+from mosaico_ingest.rosbag.blocks import Encoding
+from mosaico_ingest.rosbag.definitions.model import Container, Definition, Field
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.serialization import Serializer
 
 CASES = sorted(path.parent for path in Path(__file__).parent.glob("*/job.yaml"))
 CONTAINERS = {"recording.mcap": 2, "recording.db3": 2, "recording.bag": 1}

@@ -14,10 +14,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mosaico_ingest.errors import ManifestError, NothingMatched
+from mosaico_ingest.job.manifest import load_manifest
 from mosaico_ingest.lint.engine import LintReport, lint_paths
 from mosaico_ingest.lint.settings import NAMES
-from mosaico_ingest.manifest.load import load_manifest
-from mosaico_ingest.plan.compile import compile_manifest
+from mosaico_ingest.pipeline.compile import compile_manifest
 
 GOOD = "bag: {path: data/run.mcap}\n"
 TRAP = "bag: {path: data/run.mcap}\nsequence: {metadata: {a: on}}\n"

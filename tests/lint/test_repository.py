@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from mosaico_ingest.diagnostics import Finding, Severity, Span
+from mosaico_ingest.findings import Finding, Severity, Span
 from mosaico_ingest.lint.engine import lint_paths
 
 ROOT = Path(__file__).parents[2]

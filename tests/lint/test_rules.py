@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint import rules
-from mosaico_ingest.lint.document import Document, Kind, kind_of
-from mosaico_ingest.lint.engine import lint_document
+from mosaico_ingest.lint.engine import Document, Kind, kind_of, lint_document
 from mosaico_ingest.lint.rule import Rule
 from mosaico_ingest.lint.rules import RULES
 from mosaico_ingest.lint.settings import Settings

@@ -9,10 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mosaico_ingest.ontology.columns import FILE
 from mosaico_ingest.ontology.columns_file import columns_file
-from mosaico_ingest.ontology.registry import model, ontology_type
-from mosaico_ingest.ontology.tags import MODULES
+from mosaico_ingest.ontology.registry import FILE, MODULES, model, ontology_type
 
 GOLDEN: dict[str, list[str]] = json.loads(Path(__file__).with_name("fingerprints.json").read_text())
 

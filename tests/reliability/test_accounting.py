@@ -19,19 +19,23 @@ import pytest
 from made_recordings import define, record
 
 from mosaico_ingest import api
-from mosaico_ingest.bag.batch import Loss
 from mosaico_ingest.cli.app import main
-from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.destinations.base import MemorySink, StoredTopic, TopicWriter
+from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.destinations.store.session import StoreSession
+from mosaico_ingest.destinations.store.store import verify
 from mosaico_ingest.errors import BagError, VerificationError
-from mosaico_ingest.executors.worker import execute, make_plan
-from mosaico_ingest.injector import _missing
-from mosaico_ingest.policies import LoaderErrorPolicy
-from mosaico_ingest.report.events import Event, Noted, RunStatus, Unreadable
-from mosaico_ingest.sink import MemorySink, StoredTopic, TopicWriter
-from mosaico_ingest.store import Store
-from mosaico_ingest.store.session import StoreSession
-from mosaico_ingest.store.verify import verify
-from mosaico_ingest.write_buffer import WriteBuffer
+from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.model import LoaderErrorPolicy
+from mosaico_ingest.pipeline.run import _missing, execute, make_plan
+from mosaico_ingest.pipeline.write_buffer import WriteBuffer
+from mosaico_ingest.report.events import (
+    Event,
+    Noted,
+    RunStatus,
+    Unreadable,
+)
+from mosaico_ingest.rosbag.blocks import Loss
 
 from .conftest import RunJob, WriteBag, number
 
@@ -140,7 +144,8 @@ def test_a_destination_that_loses_rows_fails_the_run(
     write_bag({"/speed": [number(1), number(2)]})
     (config,) = api.compile_job(write_job())
     monkeypatch.setattr(
-        "mosaico_ingest.sink._MemorySession.stored", lambda _self: (StoredTopic("/speed", 1, 0, 0, 8),)
+        "mosaico_ingest.destinations.base._MemorySession.stored",
+        lambda _self: (StoredTopic("/speed", 1, 0, 0, 8),),
     )
     report, failure = execute(make_plan(config), lambda _event: None, sink=MemorySink())
     assert isinstance(failure, VerificationError)

@@ -14,7 +14,7 @@ import pytest
 import zstandard
 from disks import MEBIBYTE, filled, read_only, small_disk
 
-from mosaico_ingest.store import Store
+from mosaico_ingest.destinations.store import Store
 
 from .conftest import CUT, WriteBag, number
 

@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from mosaico_ingest import api
+from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.report.events import Event, RunStatus, TopicProgress
-from mosaico_ingest.store import Store
 
 from .conftest import RunJob, WriteBag, number
 

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mosaico_ingest import api
-from mosaico_ingest.config import ROSInjectionConfig
+from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import IngestError, ManifestError
+from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.report.model import RunReport
-from mosaico_ingest.store import Store
 
 from .conftest import RunJob, WriteBag, number
 

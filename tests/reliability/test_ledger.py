@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from mosaico_ingest import api
-from mosaico_ingest.config import LEDGER_KEY
-from mosaico_ingest.executors.content import content_digest
-from mosaico_ingest.executors.status import Standing
+from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.job.config import LEDGER_KEY
+from mosaico_ingest.pipeline.provenance import content_digest
 from mosaico_ingest.report.events import Event, RunStatus, TopicProgress
-from mosaico_ingest.store import Store
+from mosaico_ingest.services.status import Standing
 
 from .conftest import CUT, RunJob, WriteBag, number
 
@@ -131,8 +131,8 @@ def test_a_long_file_that_was_changed_between_its_samples_is_noticed(
     run_job: RunJob,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("mosaico_ingest.executors.content._SAMPLES", 2)
-    monkeypatch.setattr("mosaico_ingest.executors.content._READ_BYTES", 1 << 10)
+    monkeypatch.setattr("mosaico_ingest.pipeline.provenance._SAMPLES", 2)
+    monkeypatch.setattr("mosaico_ingest.pipeline.provenance._READ_BYTES", 1 << 10)
     bag = write_bag({"/speed": [number(value) for value in range(1000)]})
     assert bag.stat().st_size > 32 << 10
     job = write_job(sequence=SKIP)
@@ -153,12 +153,12 @@ def test_a_long_file_with_the_time_it_had_is_not_read_again(
     run_job: RunJob,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("mosaico_ingest.executors.content._SAMPLES", 2)
-    monkeypatch.setattr("mosaico_ingest.executors.content._READ_BYTES", 1 << 10)
+    monkeypatch.setattr("mosaico_ingest.pipeline.provenance._SAMPLES", 2)
+    monkeypatch.setattr("mosaico_ingest.pipeline.provenance._READ_BYTES", 1 << 10)
     write_bag({"/speed": [number(value) for value in range(1000)]})
     job = write_job(sequence=SKIP)
     assert run_job(job).status is RunStatus.COMPLETED
-    monkeypatch.delattr("mosaico_ingest.executors.ledger.whole_digest")
+    monkeypatch.delattr("mosaico_ingest.pipeline.provenance.whole_digest")
     assert run_job(job).status is RunStatus.SKIPPED
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from mosaico_ingest.cli.app import main
-from mosaico_ingest.store import Store
+from mosaico_ingest.destinations.store import Store
 
 from .conftest import WriteBag, number
 

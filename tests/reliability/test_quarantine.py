@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from mosaico_ingest.bag.recording import open_recording
-from mosaico_ingest.bag.types import TypeResolver
 from mosaico_ingest.cli.app import main
+from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.report.events import RunStatus, TopicStatus
-from mosaico_ingest.store import Store
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.recording import open_recording
 
 from .conftest import CUT, START_NS, RunJob, WriteBag, number
 

@@ -13,23 +13,23 @@ import yaml
 
 from mosaico_ingest import api
 from mosaico_ingest.cli.app import main
-from mosaico_ingest.executors.replay import Whereabouts, alone, replays
-from mosaico_ingest.quarantine.kept import Kept
+from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.pipeline.quarantine import Kept
 from mosaico_ingest.report.events import RunStatus
-from mosaico_ingest.store import Store
+from mosaico_ingest.services.replay import Whereabouts, alone, replays
 
 from .conftest import CUT, RunJob, WriteBag, number
 
 WriteJob = Callable[..., Path]
 WRONG = "float64 data\nfloat64 more"
 MOMENTS = {
-    "before the commit": ("mosaico_ingest.store.session.StoreSession", "commit", "before"),
-    "segments moved, not entered": ("mosaico_ingest.store.layout.Layout", "publish", "after"),
-    "committed": ("mosaico_ingest.store.session.StoreSession", "commit", "after"),
-    "committed and checked": ("mosaico_ingest.store.session.StoreSession", "stored", "after"),
-    "before it is marked": ("mosaico_ingest.quarantine.kept.Kept", "mark_replayed", "before"),
+    "before the commit": ("mosaico_ingest.destinations.store.session.StoreSession", "commit", "before"),
+    "segments moved, not entered": ("mosaico_ingest.destinations.store.files.Layout", "publish", "after"),
+    "committed": ("mosaico_ingest.destinations.store.session.StoreSession", "commit", "after"),
+    "committed and checked": ("mosaico_ingest.destinations.store.session.StoreSession", "stored", "after"),
+    "before it is marked": ("mosaico_ingest.pipeline.quarantine.Kept", "mark_replayed", "before"),
     "messages renamed, their index not": ("pathlib.Path", "rename", "after"),
-    "marked": ("mosaico_ingest.quarantine.kept.Kept", "mark_replayed", "after"),
+    "marked": ("mosaico_ingest.pipeline.quarantine.Kept", "mark_replayed", "after"),
 }
 _KILLED = """
 import importlib, os, signal, sys

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.report.events import RunStatus
 from mosaico_ingest.report.model import Report
-from mosaico_ingest.store import Store
 
 from .conftest import RunJob, WriteBag
 

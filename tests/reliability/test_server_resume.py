@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 from mosaicod import Proxy
 
-from mosaico_ingest.store import Store
+from mosaico_ingest.destinations.store import Store
 
 from .conftest import WriteBag, number
 

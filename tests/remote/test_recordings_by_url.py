@@ -13,18 +13,16 @@ from made_recordings import define, record
 from object_store import Counts, ObjectStore, object_store
 
 from mosaico_ingest import api
-from mosaico_ingest.bag.recording import Recording, open_recording
-from mosaico_ingest.bag.registry import ROSTypeRegistry
-from mosaico_ingest.bag.types import TypeResolver
-from mosaico_ingest.config import ROSInjectionConfig
-from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import BagError, NothingMatched, Unreachable
-from mosaico_ingest.manifest.load import load_manifest
-from mosaico_ingest.plan.compile import compile_manifest
-from mosaico_ingest.plan.recordings import find_recordings
-from mosaico_ingest.policies import SessionLevelErrorPolicy
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.manifest import load_manifest
+from mosaico_ingest.job.model import SessionLevelErrorPolicy
+from mosaico_ingest.pipeline.compile import compile_manifest, find_recordings
 from mosaico_ingest.remote import AnyPath, RemotePath, as_path
-from mosaico_ingest.store import Store
+from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry, TypeResolver
+from mosaico_ingest.rosbag.recording import Recording, open_recording
 
 pytestmark = pytest.mark.slow
 

@@ -7,13 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from mosaico_ingest.config import ROSInjectionConfig, StoreTarget
 from mosaico_ingest.errors import IngestError, ManifestError, Unreachable
-from mosaico_ingest.manifest.load import load_manifest
-from mosaico_ingest.plan.compile import compile_manifest
-from mosaico_ingest.remote import RemotePath, as_path, is_url
-from mosaico_ingest.remote.faults import reaching
-from mosaico_ingest.remote.filesystem import filesystem
+from mosaico_ingest.job.config import ROSInjectionConfig, StoreTarget
+from mosaico_ingest.job.manifest import load_manifest
+from mosaico_ingest.pipeline.compile import compile_manifest
+from mosaico_ingest.remote import RemotePath, as_path, filesystem, is_url, reaching
 
 
 def test_a_url_has_the_parts_of_a_path() -> None:

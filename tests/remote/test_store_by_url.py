@@ -14,15 +14,20 @@ import pytest
 from made_recordings import define, record
 from object_store import ObjectStore, object_store
 
-from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable, Unreachable
+from mosaico_ingest.destinations.base import topic_schema
+from mosaico_ingest.destinations.store import Store, StoreSink
+from mosaico_ingest.destinations.store.session import StoreTopic
+from mosaico_ingest.destinations.store.store import verify
+from mosaico_ingest.errors import (
+    SequenceExists,
+    SinkError,
+    SinkUnavailable,
+    Unreachable,
+)
+from mosaico_ingest.job.model import IfExists
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.policies import IfExists
 from mosaico_ingest.remote import RemotePath, as_path
-from mosaico_ingest.sink import topic_schema
-from mosaico_ingest.store import Store, StoreSink
-from mosaico_ingest.store.server import serve
-from mosaico_ingest.store.topic import StoreTopic
-from mosaico_ingest.store.verify import verify
+from mosaico_ingest.serve import serve
 
 pytestmark = pytest.mark.slow
 
@@ -179,7 +184,7 @@ def test_a_killed_writer_leaves_nothing_to_be_seen(
     with pytest.raises(SequenceExists, match="another run"):
         store.catalog.claim("someone", "drive", IfExists.REPLACE, is_live=store.layout.is_live)
     assert store.collect_garbage().sessions == 0, "it may still live"
-    monkeypatch.setattr("mosaico_ingest.store.bucket._SILENT_S", -2.0)
+    monkeypatch.setattr("mosaico_ingest.destinations.store.files._SILENT_S", -2.0)
     collected = store.collect_garbage()
     assert collected.sessions == 1
     assert collected.files == len(left) - 4 * len(before)
@@ -240,7 +245,7 @@ def test_what_an_ended_session_leaves_is_removed_by_it_or_later(
     monkeypatch.undo()
     folders = {key.partition("/")[0] for key in keys(url)}
     assert sorted(folders & {"segments", "sessions"}) == left
-    monkeypatch.setattr("mosaico_ingest.store.bucket._SILENT_S", -2.0)
+    monkeypatch.setattr("mosaico_ingest.destinations.store.files._SILENT_S", -2.0)
     store.collect_garbage()
     assert sorted({key.partition("/")[0] for key in keys(url)} - {"clock"}) == ["store.json"]
 
@@ -270,7 +275,7 @@ def test_a_writer_nobody_heard_of_for_long_does_not_commit(url: str, monkeypatch
     sink = StoreSink(Store.open(url))
     with pytest.raises(SinkUnavailable, match="could not be told"), sink.open("s", {}) as session:
         session.topic("/t", POINT, {}).write(POINTS)
-        monkeypatch.setattr("mosaico_ingest.store.bucket._SILENT_S", -1.0)
+        monkeypatch.setattr("mosaico_ingest.destinations.store.files._SILENT_S", -1.0)
     assert [key for key in keys(url) if key.startswith(("segments/", "catalog/"))] == []
 
 

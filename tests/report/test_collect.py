@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mosaico_ingest.diagnostics import Finding, Severity, Stage
 from mosaico_ingest.errors import SinkError
+from mosaico_ingest.findings import Finding, Severity, Stage
 from mosaico_ingest.report.collect import Collector
 from mosaico_ingest.report.events import (
     Expected,
@@ -23,8 +23,7 @@ from mosaico_ingest.report.events import (
     TopicStatus,
     Unreadable,
 )
-from mosaico_ingest.report.model import Report, RunReport
-from mosaico_ingest.report.write import write_report
+from mosaico_ingest.report.model import Report, RunReport, write_report
 
 IMU = Expected("/imu", "/sensors/imu", "sensor_msgs/msg/Imu", "IMUAdapter", "IMU", "built-in", 10)
 LEFT = Expected("/debug", "/debug", "std_msgs/msg/String", "", "", "left out", None, left_out=True)

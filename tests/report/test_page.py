@@ -13,8 +13,9 @@ import pytest
 from typer.testing import CliRunner
 
 from mosaico_ingest.cli.app import command_line
-from mosaico_ingest.diagnostics import Stage
+from mosaico_ingest.findings import Stage
 from mosaico_ingest.report.events import RunStatus, TopicStatus
+from mosaico_ingest.report.html import gaps, html_page
 from mosaico_ingest.report.markdown import markdown_summary
 from mosaico_ingest.report.model import (
     Loss,
@@ -25,9 +26,7 @@ from mosaico_ingest.report.model import (
     TopicReport,
     UsedManifest,
 )
-from mosaico_ingest.report.page import html_page
-from mosaico_ingest.report.sparkline import gaps
-from mosaico_ingest.report.timeline import TimelineReport
+from mosaico_ingest.report.timing import TimelineReport
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 VOID = {"meta", "input", "path"}

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mosaico_ingest.report.timeline import MOST_STRETCHES, Timeline
+from mosaico_ingest.report.timing import MOST_STRETCHES, Timeline
 
 BATCHES = st.lists(st.lists(st.integers(-(10**18), 2 * 10**18), max_size=20), max_size=6)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mosaico_ingest.diagnostics import a_few
+from mosaico_ingest.findings import a_few
 from mosaico_ingest.report.units import counted
 
 

@@ -10,10 +10,10 @@ import pyarrow as pa
 import pytest
 from flight_calls import Client
 
+from mosaico_ingest.destinations.base import topic_schema
+from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.sink import topic_schema
-from mosaico_ingest.store import Store, StoreSink
-from mosaico_ingest.store.server import Server, serve
+from mosaico_ingest.serve import Server, serve
 
 SAMPLE = OntologyType("Sample", pa.struct([pa.field("value", pa.float64()), pa.field("source", pa.int32())]))
 

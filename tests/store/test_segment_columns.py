@@ -10,11 +10,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from mosaico_ingest.destinations.base import topic_schema
+from mosaico_ingest.destinations.store import Store, StoreSink
+from mosaico_ingest.destinations.store.segment import Columns, SegmentWriter
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.sink import topic_schema
-from mosaico_ingest.store import Store, StoreSink
-from mosaico_ingest.store.columns import Columns
-from mosaico_ingest.store.segment import SegmentWriter
 
 ROWS = 400
 BLOB = pa.struct([pa.field("data", pa.binary())])

@@ -13,9 +13,9 @@ import pytest
 from flight_calls import Client, refused
 
 from mosaico_ingest.errors import SinkError
-from mosaico_ingest.store.server import Keyring, Tls, serve
-from mosaico_ingest.wire.actions import ACTIONS, Permission
-from mosaico_ingest.wire.conditions import Condition
+from mosaico_ingest.protocol.errors import Condition
+from mosaico_ingest.protocol.messages import ACTIONS, Permission
+from mosaico_ingest.serve import Keyring, Tls, serve
 
 Rows = Callable[..., pa.RecordBatch]
 

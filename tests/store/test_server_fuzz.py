@@ -13,11 +13,11 @@ from flight_calls import Client
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.store import Store, StoreSink
-from mosaico_ingest.store.server import serve
-from mosaico_ingest.wire.actions import ACTIONS
-from mosaico_ingest.wire.conditions import Condition, condition_of
+from mosaico_ingest.protocol.errors import Condition, condition_of
+from mosaico_ingest.protocol.messages import ACTIONS
+from mosaico_ingest.serve import serve
 
 Rows = Callable[..., pa.RecordBatch]
 

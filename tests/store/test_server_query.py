@@ -14,13 +14,12 @@ from flight_calls import Client, refused
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.store import Store, StoreSink
-from mosaico_ingest.store.server import Server
-from mosaico_ingest.store.server.filters import Glob
-from mosaico_ingest.store.server.query import run
-from mosaico_ingest.wire.bodies import Query
-from mosaico_ingest.wire.conditions import Condition
+from mosaico_ingest.protocol.errors import Condition
+from mosaico_ingest.protocol.messages import Query
+from mosaico_ingest.serve import Server
+from mosaico_ingest.serve.query import Glob, run
 
 Rows = Callable[..., pa.RecordBatch]
 
@@ -202,7 +201,7 @@ def test_segments_the_bounds_rule_out_are_not_opened(filled: Store, monkeypatch:
     def opened(*_: object, **__: object) -> None:
         pytest.fail("a segment was opened")
 
-    monkeypatch.setattr("mosaico_ingest.store.server.query.ds.dataset", opened)
+    monkeypatch.setattr("mosaico_ingest.serve.query.ds.dataset", opened)
     assert found(filled, ontology={"Pose.at.x": {"$gt": 5000}}) == {}
     assert found(filled, ontology={"Pose.timestamp_ns": {"$lt": 0}}) == {}
 

@@ -14,11 +14,12 @@ from typing import Any
 import pyarrow as pa
 import pytest
 
+from mosaico_ingest.destinations.store import Store, StoreSink
+from mosaico_ingest.destinations.store import files as layout
+from mosaico_ingest.destinations.store.catalog import Catalog
 from mosaico_ingest.errors import SequenceExists, SinkError
+from mosaico_ingest.job.model import IfExists
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.policies import IfExists
-from mosaico_ingest.store import Store, StoreSink, layout
-from mosaico_ingest.store.catalog import Catalog
 
 WRITER = Path(__file__).with_name("writer_process.py")
 Rows = Callable[..., pa.RecordBatch]

@@ -20,13 +20,13 @@ import pyarrow as pa
 import pytest
 from disks import MEBIBYTE, read_only, small_disk
 
+from mosaico_ingest.destinations.store import Store, StoreSink
+from mosaico_ingest.destinations.store.catalog import FORMAT, Catalog
+from mosaico_ingest.destinations.store.errors import explained
+from mosaico_ingest.destinations.store.files import Lease, is_live
+from mosaico_ingest.destinations.store.segment import SegmentWriter
 from mosaico_ingest.errors import SinkError, SinkUnavailable
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.store import Store, StoreSink
-from mosaico_ingest.store.catalog import FORMAT, Catalog
-from mosaico_ingest.store.faults import explained
-from mosaico_ingest.store.lease import Lease, is_live
-from mosaico_ingest.store.segment import SegmentWriter
 
 Rows = Callable[..., pa.RecordBatch]
 
@@ -231,7 +231,7 @@ from mosaico_ingest.errors import SinkError
 sys.path.insert(0, sys.argv[2])
 from writer_process import main
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-from mosaico_ingest.store import Store
+from mosaico_ingest.destinations.store import Store
 Store.open(sys.argv[1])
 resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))
 try:

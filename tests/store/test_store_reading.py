@@ -12,12 +12,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from mosaico_ingest.destinations.store import Store, StoreSink
+from mosaico_ingest.destinations.store.session import Staging, StoreTopic
+from mosaico_ingest.destinations.store.store import Window, scan
 from mosaico_ingest.errors import SinkError
+from mosaico_ingest.job.model import IfExists
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.policies import IfExists
-from mosaico_ingest.store import Store, StoreSink
-from mosaico_ingest.store.scan import Window, scan
-from mosaico_ingest.store.topic import Staging, StoreTopic
 
 Rows = Callable[..., pa.RecordBatch]
 

@@ -7,10 +7,10 @@ import sys
 import numpy as np
 import pyarrow as pa
 
+from mosaico_ingest.destinations.base import topic_schema
+from mosaico_ingest.destinations.store import Store, StoreSink
+from mosaico_ingest.job.model import IfExists
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.policies import IfExists
-from mosaico_ingest.sink import topic_schema
-from mosaico_ingest.store import Store, StoreSink
 
 SAMPLE = OntologyType("Sample", pa.struct([pa.field("value", pa.float64()), pa.field("source", pa.int32())]))
 TOPICS = 4

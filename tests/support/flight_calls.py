@@ -8,9 +8,9 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.flight as fl
 
-from mosaico_ingest.store.server import Server
-from mosaico_ingest.wire.actions import API_KEY_HEADER
-from mosaico_ingest.wire.conditions import Condition, condition_of, text_of
+from mosaico_ingest.protocol.errors import Condition, condition_of, text_of
+from mosaico_ingest.protocol.messages import API_KEY_HEADER
+from mosaico_ingest.serve import Server
 
 __all__ = ["Client", "descriptor_of", "refused"]
 

@@ -6,12 +6,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from mosaico_ingest.bag.batch import Encoding
-from mosaico_ingest.bag.definition import Definition, Embedded
-from mosaico_ingest.bag.serialize import Serializer
-from mosaico_ingest.bag.types import TypeResolver
-from mosaico_ingest.bag.writing import open_writer
-from mosaico_ingest.policies import Stores
+from mosaico_ingest.job.model import Stores
+from mosaico_ingest.rosbag.blocks import Encoding
+from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.serialization import Serializer
+from mosaico_ingest.rosbag.writers import open_writer
 
 Message = tuple[str, Definition, int, dict[str, Any]]
 

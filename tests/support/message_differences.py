@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from mosaico_ingest.bag.loader import ROSLoader
+from mosaico_ingest.rosbag.loader import ROSLoader
 
 
 def messages_of(path: Path, **options: Any) -> dict[str, list[tuple[int, dict[str, Any]]]]:

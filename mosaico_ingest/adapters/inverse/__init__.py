@@ -6,6 +6,6 @@ checked: the messages are adapted once more, and rows that differ are counted.
 
 from __future__ import annotations
 
-from mosaico_ingest.adapters.inverse.inverse import Inverse, Restored, invert
+from mosaico_ingest.adapters.inverse.restore import Inverse, Restored, invert
 
 __all__ = ["Inverse", "Restored", "invert"]

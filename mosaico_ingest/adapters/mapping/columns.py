@@ -1,30 +1,46 @@
-"""This file is a column while it is computed: flat values, and the lists they are the elements of."""
+"""Intermediate columns of an expression: flat values plus the lists that contain them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute
+import pyarrow.types
 from numpy.typing import NDArray
 
-from mosaico_ingest.adapters.mapping.arrow import Array, DataType, Scalar, arrays, pc, pt
-
 __all__ = [
+    "Array",
     "Axis",
     "Column",
+    "DataType",
     "Mask",
+    "Scalar",
+    "arrays",
     "field_of",
     "fixed_list",
     "null_where",
     "nulls",
     "one_type",
     "open_list",
+    "pc",
+    "pt",
     "repeat",
     "struct_of",
     "true_where",
     "var_list",
 ]
+
+Array: TypeAlias = Any
+"""A `pyarrow.Array` of whatever type the checker found."""
+Scalar: TypeAlias = Any
+DataType: TypeAlias = Any
+pc: Any = pyarrow.compute
+pt: Any = pyarrow.types
+arrays: Any = pa
+"""pyarrow itself, for the constructors whose stubs are narrower than they are."""
 
 Mask = NDArray[np.bool_]
 

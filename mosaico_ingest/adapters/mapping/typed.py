@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import field
 from typing import TYPE_CHECKING, TypeAlias
 
-from mosaico_ingest.adapters.mapping.arrow import DataType
-from mosaico_ingest.adapters.mapping.expression import LiteralValue, Node
+from mosaico_ingest.adapters.mapping.columns import DataType
 from mosaico_ingest.adapters.mapping.functions.registry import Function
-from mosaico_ingest.adapters.mapping.kinds import Kind
+from mosaico_ingest.adapters.mapping.parser import LiteralValue, Node
+from mosaico_ingest.adapters.mapping.types import Kind
 from mosaico_ingest.frozen import frozen
 
 if TYPE_CHECKING:
-    from mosaico_ingest.manifest.source import Path
+    from mosaico_ingest.job.yaml_source import KeyPath
 
 __all__ = [
     "Apply",
@@ -130,7 +130,7 @@ class ChoiceOf:
 class Written:
     """An expression as written and as understood; `typed` is None where there is no message to type it by."""
 
-    path: Path
+    path: KeyPath
     """Where in the file."""
     text: str
     node: Node

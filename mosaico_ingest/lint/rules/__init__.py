@@ -91,9 +91,7 @@ from mosaico_ingest.lint.rules import (
     yaml_tab,
     yaml_tag,
 )
-from mosaico_ingest.lint.rules import (
-    type as type_,
-)
+from mosaico_ingest.lint.rules import type as type_
 
 __all__ = ["RULES"]
 

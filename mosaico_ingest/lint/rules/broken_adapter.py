@@ -19,11 +19,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from mosaico_ingest.diagnostics import Severity
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.references import adapter_references, find_module, python_reference, read_classes
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.job.validation import nearest
+from mosaico_ingest.lint.job import (
+    Job,
+    adapter_references,
+    find_module,
+    python_reference,
+    read_classes,
+)
 from mosaico_ingest.lint.rule import Problem, Rule
-from mosaico_ingest.manifest.problems import nearest
 
 
 def check(job: Job) -> Iterator[Problem]:

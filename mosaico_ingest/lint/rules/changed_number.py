@@ -20,9 +20,8 @@ import re
 from collections.abc import Iterator
 from decimal import Decimal
 
-from mosaico_ingest.diagnostics import Edit, Severity
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.places import metadata_places, values_below
+from mosaico_ingest.findings import Edit, Severity
+from mosaico_ingest.lint.job import Job, metadata_places, values_below
 from mosaico_ingest.lint.rule import Problem, Rule
 
 

@@ -17,10 +17,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.job.units import parse_instant, parse_offset
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.rule import Problem, Rule
-from mosaico_ingest.manifest.units import parse_instant, parse_offset
 
 
 def check(job: Job) -> Iterator[Problem]:

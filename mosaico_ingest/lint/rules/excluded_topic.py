@@ -19,12 +19,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.diagnostics import Severity
-from mosaico_ingest.lint.globs import is_glob
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.places import keyed_patterns
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.job.patterns import select
+from mosaico_ingest.lint.job import Job, is_glob, keyed_patterns
 from mosaico_ingest.lint.rule import Problem, Rule
-from mosaico_ingest.patterns import select
 
 
 def check(job: Job) -> Iterator[Problem]:

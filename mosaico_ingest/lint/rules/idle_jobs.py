@@ -16,11 +16,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.diagnostics import Severity
-from mosaico_ingest.lint.globs import is_glob
-from mosaico_ingest.lint.job import Job
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.lint.job import Job, is_glob
 from mosaico_ingest.lint.rule import Problem, Rule
-from mosaico_ingest.remote.path import without_options
+from mosaico_ingest.remote import without_options
 
 
 def check(job: Job) -> Iterator[Problem]:

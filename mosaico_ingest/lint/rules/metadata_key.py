@@ -24,10 +24,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from mosaico_ingest.config import LEDGER_KEY
-from mosaico_ingest.diagnostics import Severity
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.places import keys_below, metadata_places
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.job.config import LEDGER_KEY
+from mosaico_ingest.lint.job import Job, keys_below, metadata_places
 from mosaico_ingest.lint.rule import Problem, Rule
 
 

@@ -18,9 +18,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from mosaico_ingest.diagnostics import Severity
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.places import metadata_places, values_below
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.lint.job import Job, metadata_places, values_below
 from mosaico_ingest.lint.rule import Problem, Rule
 
 

@@ -18,9 +18,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.diagnostics import Severity
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.references import adapter_references, find_module, is_mapping_file, python_reference
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.lint.job import (
+    Job,
+    adapter_references,
+    find_module,
+    is_mapping_file,
+    python_reference,
+)
 from mosaico_ingest.lint.rule import Problem, Rule
 
 

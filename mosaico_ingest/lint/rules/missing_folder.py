@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.rule import Problem, Rule
 

@@ -21,10 +21,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.bag.registry import definition_files
-from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.rosbag.definitions.registry import definition_files
 
 
 def check(job: Job) -> Iterator[Problem]:

@@ -14,9 +14,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from mosaico_ingest.diagnostics import Severity
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.places import recording_paths
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.lint.job import Job, recording_paths
 from mosaico_ingest.lint.rule import Problem, Rule
 
 

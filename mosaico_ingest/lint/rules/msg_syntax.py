@@ -15,11 +15,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.bag.msgtext import parse_msg
-from mosaico_ingest.diagnostics import Severity
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.message import MessageFile
 from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.rosbag.definitions.parser import parse_msg
 
 
 def check(message: MessageFile) -> Iterator[Problem]:

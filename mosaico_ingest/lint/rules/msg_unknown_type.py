@@ -15,11 +15,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.bag.msgtext import PRIMITIVES
-from mosaico_ingest.diagnostics import Severity
-from mosaico_ingest.lint.definitions import is_known
-from mosaico_ingest.lint.message import MessageFile
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.lint.message import MessageFile, is_known
 from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.rosbag.definitions.parser import PRIMITIVES
 
 
 def check(message: MessageFile) -> Iterator[Problem]:

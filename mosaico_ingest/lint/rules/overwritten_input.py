@@ -18,9 +18,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from os.path import normpath
 
-from mosaico_ingest.diagnostics import Severity
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.places import recording_paths
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.lint.job import Job, recording_paths
 from mosaico_ingest.lint.rule import Problem, Rule
 
 

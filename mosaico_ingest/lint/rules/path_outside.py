@@ -15,9 +15,8 @@ from collections.abc import Iterator
 from os.path import normpath
 from pathlib import Path
 
-from mosaico_ingest.diagnostics import Severity
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.places import all_paths
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.lint.job import Job, all_paths
 from mosaico_ingest.lint.rule import Problem, Rule
 
 

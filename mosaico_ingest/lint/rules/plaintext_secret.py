@@ -20,9 +20,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from mosaico_ingest.diagnostics import Severity
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.places import values_below
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.lint.job import Job, values_below
 from mosaico_ingest.lint.rule import Problem, Rule
 
 

@@ -17,11 +17,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.diagnostics import Severity
 from mosaico_ingest.errors import SinkError
+from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.rule import Problem, Rule
-from mosaico_ingest.wire import check_topic_name
+from mosaico_ingest.protocol import check_topic_name
 
 
 def check(job: Job) -> Iterator[Problem]:

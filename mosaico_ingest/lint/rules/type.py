@@ -23,7 +23,7 @@ Good:
 
 from __future__ import annotations
 
-from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.rule import Rule
 
 RULE = Rule("ING408", __name__, Severity.ERROR, __doc__)

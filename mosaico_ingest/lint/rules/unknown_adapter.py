@@ -23,16 +23,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from mosaico_ingest.adapters.adapter import UnmodeledSpec
+from mosaico_ingest.adapters.bridge import installed_adapters, what_was_meant
 from mosaico_ingest.adapters.builtin import BY_NAME
-from mosaico_ingest.adapters.reference import what_was_meant
-from mosaico_ingest.adapters.unmodeled import UnmodeledSpec
-from mosaico_ingest.bridge import installed_adapters
-from mosaico_ingest.diagnostics import Severity
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.references import adapter_references, is_mapping_file, loaded_names, python_reference
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.job.validation import nearest
+from mosaico_ingest.lint.job import (
+    Job,
+    adapter_references,
+    is_mapping_file,
+    loaded_names,
+    python_reference,
+)
 from mosaico_ingest.lint.rule import Problem, Rule
-from mosaico_ingest.manifest.problems import nearest
 
 _UNMODELED = UnmodeledSpec().name
 

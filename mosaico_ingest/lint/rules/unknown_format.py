@@ -14,12 +14,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from mosaico_ingest.bag.containers.magics import RECORDING_NAME
-from mosaico_ingest.diagnostics import Severity
-from mosaico_ingest.lint.globs import is_glob
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.places import recording_paths
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.lint.job import Job, is_glob, recording_paths
 from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.rosbag.formats import RECORDING_NAME
 
 
 def check(job: Job) -> Iterator[Problem]:

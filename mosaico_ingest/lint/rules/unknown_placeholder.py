@@ -15,11 +15,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.job.compose import PLACEHOLDERS, placeholders_in
+from mosaico_ingest.job.validation import nearest
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.rule import Problem, Rule
-from mosaico_ingest.manifest.placeholders import PLACEHOLDERS, placeholders_in
-from mosaico_ingest.manifest.problems import nearest
 
 
 def check(job: Job) -> Iterator[Problem]:

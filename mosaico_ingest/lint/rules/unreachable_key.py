@@ -20,10 +20,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.diagnostics import Severity
-from mosaico_ingest.lint.globs import covers, is_glob
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.places import keyed_patterns
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.lint.job import Job, covers, is_glob, keyed_patterns
 from mosaico_ingest.lint.rule import Problem, Rule
 
 

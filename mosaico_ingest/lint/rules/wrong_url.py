@@ -14,12 +14,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.diagnostics import Severity
 from mosaico_ingest.errors import IngestError
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.places import all_paths
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.lint.job import Job, all_paths
 from mosaico_ingest.lint.rule import Problem, Rule
-from mosaico_ingest.remote.path import as_path, is_url
+from mosaico_ingest.remote import as_path, is_url
 
 _MAY_BE_URLS = {("bag", "path"), ("target", "store")}
 

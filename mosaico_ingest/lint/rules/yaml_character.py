@@ -5,7 +5,7 @@ Control characters get into files by way of terminals and broken editors; one ca
 
 from __future__ import annotations
 
-from mosaico_ingest.diagnostics import Severity
+from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.rule import Rule
 
 RULE = Rule("ING014", __name__, Severity.ERROR, __doc__)

@@ -6,9 +6,7 @@ from mosaico_ingest.adapters.mapping.functions import (
     numeric,
     operators,
     ros,
-    rotation,
     text,
-    time,
 )
 from mosaico_ingest.adapters.mapping.functions.registry import (
     ANY,
@@ -45,5 +43,5 @@ __all__ = [
     "lookup",
 ]
 
-SUBJECTS = (operators, numeric, lists, text, time, rotation, ros, clouds)
+SUBJECTS = (operators, numeric, lists, text, ros, clouds)
 """Where the functions come from, in the order of the documentation."""

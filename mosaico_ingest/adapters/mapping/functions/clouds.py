@@ -1,4 +1,4 @@
-"""This file is the fields of point clouds, of all points of all messages at once."""
+"""Fields of point clouds, for all points of all messages."""
 
 from __future__ import annotations
 
@@ -9,9 +9,22 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mosaico_ingest.adapters.mapping.arrow import Array, DataType, arrays, pt
-from mosaico_ingest.adapters.mapping.columns import field_of, nulls, open_list, var_list
-from mosaico_ingest.adapters.mapping.functions.registry import TEXT_LITERAL, Refuse, function, struct_with
+from mosaico_ingest.adapters.mapping.columns import (
+    Array,
+    DataType,
+    arrays,
+    field_of,
+    nulls,
+    open_list,
+    pt,
+    var_list,
+)
+from mosaico_ingest.adapters.mapping.functions.registry import (
+    TEXT_LITERAL,
+    Refuse,
+    function,
+    struct_with,
+)
 
 __all__: list[str] = []
 

@@ -1,4 +1,4 @@
-"""This file is the functions over the elements of a list."""
+"""Functions over the elements of a list."""
 
 from __future__ import annotations
 
@@ -7,11 +7,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mosaico_ingest.adapters.mapping.arrow import Array, arrays, pc, pt
-from mosaico_ingest.adapters.mapping.columns import Axis, open_list
+from mosaico_ingest.adapters.mapping.columns import (
+    Array,
+    Axis,
+    arrays,
+    open_list,
+    pc,
+    pt,
+)
 from mosaico_ingest.adapters.mapping.functions.operators import computed, whole
-from mosaico_ingest.adapters.mapping.functions.registry import Refuse, Take, function, list_of
-from mosaico_ingest.adapters.mapping.kinds import INT64, Kind, int_bounds, is_number, kind_of
+from mosaico_ingest.adapters.mapping.functions.registry import (
+    Refuse,
+    Take,
+    function,
+    list_of,
+)
+from mosaico_ingest.adapters.mapping.types import (
+    INT64,
+    Kind,
+    int_bounds,
+    is_number,
+    kind_of,
+)
 
 __all__ = ["BOOLEANS", "NUMBERS"]
 

@@ -1,4 +1,4 @@
-"""This file is the functions of numbers, of null and of NaN."""
+"""Functions of numbers, null and NaN."""
 
 from __future__ import annotations
 
@@ -7,11 +7,30 @@ from typing import Any
 
 import numpy as np
 
-from mosaico_ingest.adapters.mapping.arrow import Array, arrays, pc, pt
-from mosaico_ingest.adapters.mapping.columns import one_type, open_list, true_where, var_list
-from mosaico_ingest.adapters.mapping.functions.operators import comparable, computed, numbers, whole
-from mosaico_ingest.adapters.mapping.functions.registry import ANY, FLOAT, NUMBER, Refuse, function
-from mosaico_ingest.adapters.mapping.kinds import Kind, Unfit, join
+from mosaico_ingest.adapters.mapping.columns import (
+    Array,
+    arrays,
+    one_type,
+    open_list,
+    pc,
+    pt,
+    true_where,
+    var_list,
+)
+from mosaico_ingest.adapters.mapping.functions.operators import (
+    comparable,
+    computed,
+    numbers,
+    whole,
+)
+from mosaico_ingest.adapters.mapping.functions.registry import (
+    ANY,
+    FLOAT,
+    NUMBER,
+    Refuse,
+    function,
+)
+from mosaico_ingest.adapters.mapping.types import Kind, Unfit, join
 
 __all__: list[str] = []
 
@@ -25,7 +44,7 @@ def _extreme(*kinds: Kind) -> Kind:
     return Kind(arrays.int64(), bounds=joined.bounds) if joined.bounds is not None else joined
 
 
-def _same(kind: Kind, *_: Kind) -> Kind:
+def _element_kind(kind: Kind, *_: Kind) -> Kind:
     return kind.element
 
 
@@ -53,7 +72,7 @@ def null_if(x: Array, value: Array) -> Array:
     return pc.if_else(same, arrays.scalar(None, x.type), x)
 
 
-@function(NUMBER, gives=_same)
+@function(NUMBER, gives=_element_kind)
 def nan_to_null(x: Array) -> Array:
     """Null where x is NaN."""
     return pc.if_else(pc.is_nan(x), arrays.scalar(None, x.type), x) if pt.is_floating(x.type) else x

@@ -1,4 +1,4 @@
-"""This file is the operators: arithmetic, comparison, logic."""
+"""Operators: arithmetic, comparison, logic."""
 
 from __future__ import annotations
 
@@ -8,8 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from mosaico_ingest.adapters.mapping.arrow import Array, arrays, pc, pt
-from mosaico_ingest.adapters.mapping.columns import true_where
+from mosaico_ingest.adapters.mapping.columns import (
+    Array,
+    arrays,
+    pc,
+    pt,
+    true_where,
+)
 from mosaico_ingest.adapters.mapping.functions.registry import (
     ANY,
     BOOLEAN,
@@ -19,7 +24,14 @@ from mosaico_ingest.adapters.mapping.functions.registry import (
     function,
     nullified,
 )
-from mosaico_ingest.adapters.mapping.kinds import INT64, Kind, Unfit, is_number, spell, widest_float
+from mosaico_ingest.adapters.mapping.types import (
+    INT64,
+    Kind,
+    Unfit,
+    is_number,
+    spell,
+    widest_float,
+)
 
 __all__ = ["comparable", "computed", "whole"]
 
@@ -250,11 +262,11 @@ def negative(refuse: Refuse, x: Array) -> Array:
     return _checked(refuse, "-", pc.subtract_checked, zero, x) if pt.is_integer(x.type) else pc.negate(x)
 
 
-def _same(kind: Kind) -> Kind:
+def _same_kind(kind: Kind) -> Kind:
     return kind
 
 
-@function(NUMBER, gives=_same)
+@function(NUMBER, gives=_same_kind)
 def positive(x: Array) -> Array:
     """+x."""
     return x

@@ -9,9 +9,22 @@ from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
-from mosaico_ingest.adapters.mapping.arrow import Array, DataType, arrays, pc, pt
-from mosaico_ingest.adapters.mapping.columns import Mask
-from mosaico_ingest.adapters.mapping.kinds import Kind, Unfit, is_list, is_number, kind_of, spell
+from mosaico_ingest.adapters.mapping.columns import (
+    Array,
+    DataType,
+    Mask,
+    arrays,
+    pc,
+    pt,
+)
+from mosaico_ingest.adapters.mapping.types import (
+    Kind,
+    Unfit,
+    is_list,
+    is_number,
+    kind_of,
+    spell,
+)
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.frozen import frozen
 

@@ -1,29 +1,186 @@
-"""This file is the conventions of ROS messages: headers, covariances, image formats."""
+"""Functions for ROS conventions: headers, covariances, image formats, time stamps and rotations."""
 
 from __future__ import annotations
 
 import re
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mosaico_ingest.adapters.mapping.arrow import Array, DataType, arrays, pc, pt
 from mosaico_ingest.adapters.mapping.columns import (
+    Array,
     Axis,
+    DataType,
     Mask,
+    arrays,
     field_of,
     fixed_list,
     nulls,
     open_list,
+    pc,
+    pt,
     true_where,
     var_list,
 )
 from mosaico_ingest.adapters.mapping.functions.lists import NUMBERS
-from mosaico_ingest.adapters.mapping.functions.operators import computed
-from mosaico_ingest.adapters.mapping.functions.registry import FLOAT, TEXT, Refuse, function, struct_with
-from mosaico_ingest.adapters.mapping.functions.time import STAMP, STAMP_TYPE, as_stamp, stamp_parts
-from mosaico_ingest.adapters.mapping.kinds import Kind
+from mosaico_ingest.adapters.mapping.functions.operators import computed, numbers, whole
+from mosaico_ingest.adapters.mapping.functions.registry import (
+    FLOAT,
+    INTEGER,
+    TEXT,
+    Refuse,
+    function,
+    nullified,
+    struct_with,
+)
+from mosaico_ingest.adapters.mapping.types import Kind, is_number
 
-__all__ = ["HEADER", "HEADER_TYPE", "as_header"]
+__all__ = [
+    "HEADER",
+    "HEADER_TYPE",
+    "QUATERNION_TYPE",
+    "STAMP",
+    "STAMP_TYPE",
+    "as_header",
+    "as_stamp",
+    "stamp_parts",
+]
+
+SECOND_NS = 1_000_000_000
+STAMP_TYPE: DataType = arrays.struct(
+    [
+        arrays.field("seconds", arrays.int32(), nullable=False),
+        arrays.field("nanoseconds", arrays.uint32(), nullable=False),
+    ]
+)
+"""The ontology's time: what `Time` and `Duration` are, and a header's `timestamp`."""
+STAMP = struct_with(
+    "a time or duration",
+    {"sec": pt.is_integer, "nanosec": pt.is_integer},
+    {"seconds": pt.is_integer, "nanoseconds": pt.is_integer},
+)
+_INT32 = (-(2**31), 2**31 - 1)
+
+
+def stamp_parts(t: Array) -> tuple[Array, Array]:
+    """Return the seconds and the nanoseconds, in ROS's or the ontology's spelling."""
+    names = ("sec", "nanosec") if t.type.get_field_index("sec") >= 0 else ("seconds", "nanoseconds")
+    return field_of(t, names[0]), field_of(t, names[1])
+
+
+def as_stamp(refuse: Refuse, t: Array) -> Array:
+    """Return `{sec, nanosec}` as the ontology's time; the fields are shared where their types agree."""
+    sec, nanosec = stamp_parts(t)
+    over = true_where(pc.greater_equal(nanosec, SECOND_NS))
+    if over.any():
+        refuse(over, "nanosec", lambda i: f"nanosec is {nanosec[i]}; it must be below 1e9")
+        nanosec = nullified(nanosec, over)
+    children = [pc.cast(sec, arrays.int32()), pc.cast(nanosec, arrays.uint32())]
+    absent = nulls(t)
+    mask = None if absent is None else arrays.array(absent)
+    return arrays.StructArray.from_arrays(children, fields=list(STAMP_TYPE), mask=mask)
+
+
+@function(STAMP, gives=STAMP_TYPE)
+def ros_time(refuse: Refuse, t: Array) -> Array:
+    """`{sec, nanosec}` as `{seconds, nanoseconds}`; nanosec of 1e9 or more rejects the row."""
+    return as_stamp(refuse, t)
+
+
+@function(STAMP, gives=arrays.float64())
+def seconds(t: Array) -> Array:
+    """A time or duration in s."""
+    sec, nanosec = stamp_parts(t)
+    fraction = pc.multiply(pc.cast(nanosec, arrays.float64()), 1e-9)
+    return pc.add(pc.cast(sec, arrays.float64()), fraction)
+
+
+def _whole(_: Kind) -> Kind:
+    return whole()
+
+
+@function(STAMP, gives=_whole)
+def nanoseconds(t: Array) -> Array:
+    """A time or duration in ns."""
+    sec, nanosec = (pc.cast(part, arrays.int64()) for part in stamp_parts(t))
+    return pc.add(pc.multiply(sec, SECOND_NS), nanosec)
+
+
+@function(INTEGER, gives=STAMP_TYPE)
+def time_from_ns(refuse: Refuse, n: Array) -> Array:
+    """Nanoseconds since the epoch as `{seconds, nanoseconds}`; more seconds than 32 bits hold reject the row."""
+    (n,) = numbers(refuse, n)
+    absent = nulls(n)
+    total = np.asarray(pc.fill_null(n, 0))
+    sec, nanosec = np.divmod(total, SECOND_NS)
+    over = (sec < _INT32[0]) | (sec > _INT32[1])
+    if over.any():
+        refuse(over, "overflow", lambda i: f"{total[i]} ns are more seconds than 32 bits hold")
+    children = [
+        arrays.array(np.where(over, 0, sec).astype(np.int32)),
+        arrays.array(nanosec.astype(np.uint32)),
+    ]
+    mask = None if absent is None else arrays.array(absent)
+    return arrays.StructArray.from_arrays(children, fields=list(STAMP_TYPE), mask=mask)
+
+
+_AXES = ("x", "y", "z", "w")
+QUATERNION_TYPE: DataType = arrays.struct([(axis, arrays.float64()) for axis in _AXES])
+_QUATERNION = struct_with("a quaternion {x, y, z, w}", dict.fromkeys(_AXES, is_number))
+
+
+def _halves(*angles: Array) -> tuple[NDArray[np.bool_], list[NDArray[np.float64]]]:
+    """Return half the angles, broadcast, with NaN for null; and where one of them is null."""
+    plain = [np.asarray(pc.fill_null(angle, np.nan), np.float64) for angle in angles]
+    absent = np.zeros(np.broadcast_shapes(*(p.shape for p in plain)), bool)
+    for angle in angles:
+        absent |= np.asarray(pc.is_null(angle), bool)
+    return absent, [np.broadcast_to(p, absent.shape) / 2 for p in plain]
+
+
+def _sin_cos(half: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    with np.errstate(invalid="ignore"):  # of an infinite angle both are NaN
+        return np.sin(half), np.cos(half)
+
+
+def _quaternions(parts: tuple[NDArray[np.float64], ...], absent: NDArray[np.bool_]) -> Array:
+    children = [arrays.array(np.ascontiguousarray(part)) for part in parts]
+    mask = arrays.array(absent) if absent.any() else None
+    return arrays.StructArray.from_arrays(children, fields=list(QUATERNION_TYPE), mask=mask)
+
+
+@function(FLOAT, FLOAT, FLOAT, gives=QUATERNION_TYPE)
+def quaternion_from_rpy(roll: Array, pitch: Array, yaw: Array) -> Array:
+    """Rotation about the fixed axes x, then y, then z."""
+    absent, (r, p, y) = _halves(roll, pitch, yaw)
+    (sr, cr), (sp, cp), (sy, cy) = (_sin_cos(half) for half in (r, p, y))
+    return _quaternions(
+        (
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ),
+        absent,
+    )
+
+
+@function(FLOAT, gives=QUATERNION_TYPE)
+def quaternion_from_yaw(yaw: Array) -> Array:
+    """Rotation in the plane, about z."""
+    absent, (y,) = _halves(yaw)
+    zero = np.zeros(len(y))
+    return _quaternions((zero, zero, *_sin_cos(y)), absent)
+
+
+@function(_QUATERNION, gives=arrays.float64())
+def yaw(q: Array) -> Array:
+    """Heading of a quaternion: its angle about z."""
+    x, y, z, w = (pc.cast(field_of(q, axis), arrays.float64()) for axis in _AXES)
+    sine = pc.multiply(pc.add(pc.multiply(w, z), pc.multiply(x, y)), 2.0)
+    cosine = pc.subtract(1.0, pc.multiply(pc.add(pc.multiply(y, y), pc.multiply(z, z)), 2.0))
+    return pc.atan2(sine, cosine)
+
 
 HEADER_TYPE: DataType = arrays.struct(
     [("timestamp", STAMP_TYPE), ("frame_id", arrays.string()), ("sample_counter", arrays.uint64())]

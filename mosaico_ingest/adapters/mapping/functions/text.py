@@ -1,4 +1,4 @@
-"""This file is the functions of text and bytes."""
+"""Functions of text and bytes."""
 
 from __future__ import annotations
 
@@ -7,8 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from mosaico_ingest.adapters.mapping.arrow import Array, arrays, pc, pt
-from mosaico_ingest.adapters.mapping.columns import nulls, open_list
+from mosaico_ingest.adapters.mapping.columns import (
+    Array,
+    arrays,
+    nulls,
+    open_list,
+    pc,
+    pt,
+)
 from mosaico_ingest.adapters.mapping.functions.registry import (
     TEXT,
     TEXT_LITERAL,
@@ -19,7 +25,7 @@ from mosaico_ingest.adapters.mapping.functions.registry import (
     list_of,
     nullified,
 )
-from mosaico_ingest.adapters.mapping.kinds import Kind, is_number
+from mosaico_ingest.adapters.mapping.types import Kind, is_number
 
 __all__: list[str] = []
 

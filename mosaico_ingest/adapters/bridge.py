@@ -1,0 +1,400 @@
+"""Resolve adapter references and choose the adapter of each topic."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import re
+import sys
+import traceback
+from collections.abc import Generator, Iterable, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from difflib import get_close_matches
+from enum import Enum
+from functools import cache
+from hashlib import sha1
+from importlib.metadata import entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Literal, cast
+
+from mosaico_ingest.adapters.adapter import AdapterSpec, UnmodeledSpec
+from mosaico_ingest.adapters.builtin import BY_NAME, BY_TYPE
+from mosaico_ingest.adapters.image import PngImageSpec
+from mosaico_ingest.adapters.mapping.loader import load_adapter
+from mosaico_ingest.adapters.python import PythonAdapterSpec, is_adapter_class, registered_adapters
+from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.frozen import frozen
+from mosaico_ingest.job.config import AdapterReference, ImageFormat, ROSInjectionConfig
+from mosaico_ingest.job.patterns import first_match
+from mosaico_ingest.ontology.types import SerializationFormat
+from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
+from mosaico_ingest.textfile import read_whole
+
+if TYPE_CHECKING:
+    from mosaico_ingest.ontology.header import Message
+    from mosaico_ingest.rosbag.blocks import ROSMessage
+
+__all__ = [
+    "ENTRY_POINTS",
+    "KnownAdapters",
+    "ROSBridge",
+    "Reason",
+    "Resolution",
+    "adapter_spec",
+    "installed_adapters",
+    "load_adapter_reference",
+    "what_was_meant",
+]
+
+_MAPPING_SUFFIXES = frozenset({".yaml", ".yml"})
+
+
+def adapter_spec(adapter: object, base_dir: Path) -> AdapterSpec:
+    """Return the spec an adapter is given by: a spec itself, a class, or a reference as text or path.
+
+    Raises:
+        AdapterError: It stands for none.
+    """
+    if isinstance(adapter, (str, Path)):
+        return load_adapter_reference(str(adapter), base_dir)
+    if isinstance(adapter, type):
+        if "__adapter_spec__" in vars(adapter):  # a built-in's own class, not one that extends it
+            return vars(adapter)["__adapter_spec__"]
+        if is_adapter_class(adapter):
+            return PythonAdapterSpec(adapter)
+    elif hasattr(adapter, "bind") and hasattr(adapter, "ros_types"):
+        return cast("AdapterSpec", adapter)  # it has what the protocol asks for
+    raise AdapterError(
+        f"{_spell(adapter)} is no adapter", hint="give a subclass of ROSAdapterBase, or a reference to one"
+    )
+
+
+def load_adapter_reference(ref: str, base_dir: Path) -> AdapterSpec:
+    """Find `LidarAdapter`, `adapters/pack.yaml`, `pkg.module:Class` or `path/to/file.py:Class`.
+
+    Paths start at `base_dir`; a module is looked for where Python looks, then there.
+
+    Raises:
+        AdapterError: There is none, or its file has a mistake: names the file and the line.
+    """
+    if ref in BY_NAME:
+        return BY_NAME[ref]
+    if ref == UnmodeledSpec().name:
+        return UnmodeledSpec()
+    if Path(ref).suffix in _MAPPING_SUFFIXES:
+        return _load_mapping(base_dir / ref)
+    place, colon, qualname = ref.rpartition(":")
+    if not colon or not place or not qualname:
+        raise AdapterError(f"no adapter is called {ref!r}", hint=what_was_meant(ref, BY_NAME))
+    module = _load_file(base_dir / place) if place.endswith(".py") else _load_module(place, base_dir)
+    found = _attribute(module, qualname, ref)
+    spec = adapter_spec(found, base_dir)
+    if isinstance(spec, PythonAdapterSpec):
+        return PythonAdapterSpec(spec.adapter, origin=(load_adapter_reference, (ref, base_dir)))
+    return spec
+
+
+def what_was_meant(ref: str, known: Iterable[str] = ()) -> str:
+    """Return what to write instead of a name that no adapter has."""
+    if ref.endswith(".py"):
+        return f"name the class in it: {ref}:Class"
+    if near := get_close_matches(ref, list(known), n=1, cutoff=0.6):
+        return f"did you mean {near[0]}?"
+    return "see `ingest adapters list`, or write a YAML path, module:Class or file.py:Class"
+
+
+@frozen
+class KnownAdapters:
+    """Finds the adapters a mapping may use: the built-in ones, and those of the files beside it."""
+
+    folder: Path
+
+    def __call__(self, name: str) -> AdapterSpec | None:
+        """Return the adapter of that name, None where there is none."""
+        if name in BY_NAME:
+            return BY_NAME[name]
+        said = re.compile(rf"^adapter:\s*['\"]?{re.escape(name)}['\"]?\s*(#|$)", re.MULTILINE)
+        files = sorted(path for path in self.folder.iterdir() if path.suffix in _MAPPING_SUFFIXES)
+        found = next((path for path in files if said.search(_text_of(path))), None)
+        return None if found is None else _load_mapping(found)
+
+
+def _text_of(path: Path) -> str:
+    """Return what a file beside a mapping says; nothing where it cannot be read."""
+    try:
+        return read_whole(path).decode("utf-8", "replace")
+    except OSError:
+        return ""
+
+
+def _load_mapping(path: Path) -> AdapterSpec:
+    return load_adapter(path, adapters=KnownAdapters(path.parent))
+
+
+def _attribute(module: ModuleType, qualname: str, ref: str) -> object:
+    found: object = module
+    for name in qualname.split("."):
+        if not hasattr(found, name):
+            classes = [name for name, value in vars(module).items() if is_adapter_class(value)]
+            near = get_close_matches(qualname, classes, n=1)
+            known = near or [name for name in classes if name != "ROSAdapterBase"]
+            raise AdapterError(
+                f"{ref.rpartition(':')[0]} has no {qualname}",
+                hint=f"did you mean {near[0]}?" if near else f"its adapters are {', '.join(known) or 'none'}",
+            )
+        found = getattr(found, name)
+    return found
+
+
+def _load_module(name: str, base_dir: Path) -> ModuleType:
+    with _also_searched(base_dir):
+        try:
+            return importlib.import_module(name)
+        except Exception as error:
+            if isinstance(error, ModuleNotFoundError) and name.startswith(error.name or "?"):
+                raise AdapterError(
+                    f"there is no module {error.name}",
+                    hint=f"install it, put it into {base_dir}, or write path/to/file.py:Class",
+                ) from error
+            raise _broken(name, error) from error
+
+
+def _load_file(path: Path) -> ModuleType:
+    path = path.resolve()
+    name = f"mosaico_ingest_adapters_{path.stem}_{sha1(str(path).encode(), usedforsecurity=False).hexdigest()[:8]}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, path)
+    if not path.is_file() or spec is None or spec.loader is None:
+        raise AdapterError(f"there is no file {path}", hint="the path starts at the folder of the manifest")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        with _also_searched(path.parent):
+            spec.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[name]
+        raise _broken(str(path), error) from error
+    return module
+
+
+@contextmanager
+def _also_searched(folder: Path) -> Generator[None]:
+    """Let imports find modules in `folder`, after everything that is installed."""
+    entry = str(folder.resolve())
+    if entry in sys.path:  # and there it stays
+        yield
+        return
+    sys.path.append(entry)
+    try:
+        yield
+    finally:
+        sys.path.remove(entry)
+
+
+def _broken(name: str, error: Exception) -> AdapterError:
+    """Say where an import failed: in the deepest line that is the user's own, if one is."""
+    if isinstance(error, SyntaxError) and error.filename:
+        place = f"{error.filename}:{error.lineno}"
+    else:
+        frames = [
+            frame
+            for frame in traceback.extract_tb(error.__traceback__)
+            if "importlib" not in frame.filename and frame.filename != __file__
+        ]
+        own = [frame for frame in frames if "site-packages" not in frame.filename] or frames
+        place = f"{own[-1].filename}:{own[-1].lineno}" if own else name
+    text = " ".join(str(error).split())
+    return AdapterError(f"importing {name} failed: {type(error).__name__}: {text}", where=place)
+
+
+def _spell(candidate: object) -> str:
+    return (
+        candidate.__qualname__
+        if isinstance(candidate, type)
+        else f"{type(candidate).__name__} {candidate!r:.60}"
+    )
+
+
+ENTRY_POINTS = "mosaico_ingest.adapters"
+"""The group under which an installed package names its adapters: a class, a spec, or a list of them."""
+
+Reason = Literal["override", "loaded", "registered", "entry point", "built-in", "unmodeled"]
+
+
+@frozen
+class Resolution:
+    """The adapter of a topic and which rule chose it; the first of the reasons that applies does."""
+
+    spec: AdapterSpec
+    reason: Reason
+    why: str
+
+    @property
+    def unmodeled(self) -> bool:
+        """Whether no adapter takes the type."""
+        return self.reason == "unmodeled"
+
+
+class ROSBridge:
+    """Every adapter a run knows: its overrides by topic, its own by type, those installed, the built-in ones."""
+
+    def __init__(
+        self,
+        *,
+        overrides: Mapping[str, AdapterReference] | None = None,
+        loaded: Iterable[AdapterReference] = (),
+        base_dir: Path | None = None,
+        images: Mapping[str, ImageFormat] | None = None,
+        formats: Mapping[str, str] | None = None,
+    ) -> None:
+        """Find every adapter that is named; `base_dir` is where relative paths start.
+
+        `overrides` and `images` are by topic name or glob, `formats` (of types without an adapter) by type.
+
+        Raises:
+            AdapterError: One is not there, has a mistake, or two are loaded for one type.
+        """
+        folder = base_dir or Path()
+        own = [(str(reference), adapter_spec(reference, folder)) for reference in loaded]
+        self._loaded = _by_type((f"loaded from {origin}", spec) for origin, spec in own)
+        self._installed = _by_type(installed_adapters())
+        names = {spec.name: spec for _, spec in (*installed_adapters(), *own)}
+        self._overrides = {
+            pattern: names.get(reference) or adapter_spec(reference, folder)
+            if isinstance(reference, str)
+            else adapter_spec(reference, folder)
+            for pattern, reference in (overrides or {}).items()
+        }
+        self._images = dict(images or {})
+        self._formats = {normalize_msgtype(name): _layout(value) for name, value in (formats or {}).items()}
+
+    @classmethod
+    def for_config(cls, config: ROSInjectionConfig) -> ROSBridge:
+        """Make the bridge of a job.
+
+        Raises:
+            AdapterError: As when it is made by hand.
+        """
+        return cls(
+            overrides=config.adapter_override,
+            loaded=config.adapters,
+            base_dir=config.code_dir or config.base_dir,
+            images=config.images,
+            formats=config.serialization_formats,
+        )
+
+    def resolve(self, topic: str, msgtype: str) -> Resolution:
+        """Choose the adapter of a topic.
+
+        Raises:
+            AdapterError: The topic's override does not take the type.
+        """
+        found = self._resolve(topic, normalize_msgtype(msgtype))
+        pattern = first_match(self._images, topic)
+        if pattern is None or self._images[pattern] == "raw":
+            return found
+        return replace(found, spec=PngImageSpec(found.spec))
+
+    def _resolve(self, topic: str, msgtype: str) -> Resolution:
+        pattern = first_match(self._overrides, topic)
+        if pattern is not None:
+            return self._override(pattern, topic, msgtype)
+        sources: tuple[tuple[Reason, Mapping[str, tuple[str, AdapterSpec]]], ...] = (
+            ("loaded", self._loaded),
+            ("registered", _registered()),
+            ("entry point", self._installed),
+        )
+        for reason, by_type in sources:
+            if msgtype in by_type:
+                origin, spec = by_type[msgtype]
+                return Resolution(spec, reason, origin)
+        if msgtype in BY_TYPE:
+            return Resolution(BY_TYPE[msgtype], "built-in", f"built-in for {msgtype}")
+        layout = self._formats.get(msgtype, SerializationFormat.DEFAULT)
+        why = f"no adapter takes {msgtype}; it keeps its ROS shape"
+        return Resolution(UnmodeledSpec(serialization_format=layout), "unmodeled", why)
+
+    def _override(self, pattern: str, topic: str, msgtype: str) -> Resolution:
+        spec = self._overrides[pattern]
+        if spec.ros_types and msgtype not in spec.ros_types:
+            raise AdapterError(
+                f"the override {pattern!r} names {spec.name}, which takes {', '.join(spec.ros_types)}; "
+                f"the topic carries {msgtype}",
+                where=topic,
+                hint="name an adapter that takes this type, or leave the topic out of the override",
+            )
+        return Resolution(spec, "override", f"override {pattern!r}")
+
+    @classmethod
+    def from_ros_message(cls, msg: ROSMessage) -> Message:
+        """Translate one message with the adapter its type gets without a job.
+
+        Raises:
+            AdapterError: No adapter takes the type, or the message does not fit.
+        """
+        from mosaico_ingest.adapters.direct import translate  # noqa: PLC0415 - a run has no single messages
+
+        found = cls().resolve(msg.topic, msg.msg_type)
+        if found.unmodeled:
+            raise AdapterError(
+                f"no adapter takes {msg.msg_type}",
+                where=msg.topic,
+                hint="register one with @register_default_adapter",
+            )
+        return translate(found.spec, msg)
+
+
+def _layout(said: object) -> SerializationFormat:
+    try:
+        return SerializationFormat(said.value if isinstance(said, Enum) else said)  # the SDK has its own
+    except ValueError:
+        allowed = ", ".join(layout.value for layout in SerializationFormat)
+        raise AdapterError(f"there is no serialization format {said!r}", hint=f"allowed: {allowed}") from None
+
+
+def _by_type(specs: Iterable[tuple[str, AdapterSpec]]) -> dict[str, tuple[str, AdapterSpec]]:
+    """Arrange default adapters by message type; two for one type are a mistake."""
+    by_type: dict[str, tuple[str, AdapterSpec]] = {}
+    for origin, spec in specs:
+        for msgtype in spec.ros_types if spec.default else ():
+            if msgtype in by_type and by_type[msgtype][1] != spec:
+                other_origin, other = by_type[msgtype]
+                raise AdapterError(
+                    f"{other.name} ({other_origin}) and {spec.name} ({origin}) both take {msgtype}",
+                    hint="drop one, or give it `default: false` and name it in an override",
+                )
+            by_type[msgtype] = (origin, spec)
+    return by_type
+
+
+def _registered() -> dict[str, tuple[str, AdapterSpec]]:
+    return {
+        msgtype: (f"registered by {adapter.__module__}", PythonAdapterSpec(adapter))
+        for msgtype, adapter in registered_adapters().items()
+    }
+
+
+@cache
+def installed_adapters() -> tuple[tuple[str, AdapterSpec], ...]:
+    """Return what installed packages offer, with where it comes from.
+
+    Raises:
+        AdapterError: One of them cannot be imported or is no adapter; names the package.
+    """
+    found: list[tuple[str, AdapterSpec]] = []
+    for entry in entry_points(group=ENTRY_POINTS):
+        package = entry.dist.name if entry.dist else "an installed package"
+        try:
+            offered = entry.load()
+            offers = offered if isinstance(offered, (list, tuple)) else (offered,)
+            specs = [adapter_spec(one, Path()) for one in offers]
+        except Exception as error:
+            raise AdapterError(
+                f"entry point {entry.name} of {package} cannot be used: {type(error).__name__}: {error}",
+                hint=f"repair or remove {package}",
+            ) from error
+        found += [(f"entry point {entry.name} of {package}", spec) for spec in specs]
+    return tuple(found)

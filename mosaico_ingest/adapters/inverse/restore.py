@@ -1,0 +1,191 @@
+"""Restore messages from stored rows, and verify them by adapting them again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Protocol
+
+import numpy as np
+import pyarrow as pa
+
+from mosaico_ingest.adapters.adapter import Adapter, Envelope, UnmodeledAdapter
+from mosaico_ingest.adapters.image import without_png
+from mosaico_ingest.adapters.inverse.messages import Parts, Place
+from mosaico_ingest.adapters.inverse.undo import Undo
+from mosaico_ingest.adapters.mapping.columns import (
+    Array,
+    DataType,
+    Mask,
+    arrays,
+    field_of,
+    fixed_list,
+    nulls,
+    open_list,
+    pc,
+    pt,
+    struct_of,
+    var_list,
+)
+from mosaico_ingest.adapters.mapping.loader import MappingAdapter
+from mosaico_ingest.adapters.mapping.typed import FieldOf, Typed, Whole
+from mosaico_ingest.adapters.mapping.types import is_list
+from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.frozen import frozen
+
+__all__ = [
+    "Inverse",
+    "Restored",
+    "differences",
+    "invert",
+]
+
+
+def differences(left: Array, right: Array) -> Mapping[str, Mask]:
+    """Return where the fields of two columns of one struct differ, without those that never do."""
+    both = ((f.name, ~_same(field_of(left, f.name), field_of(right, f.name))) for f in left.type)
+    return {name: wrong for name, wrong in both if wrong.any()}
+
+
+def _same(left: Array, right: Array) -> Mask:
+    absent = np.asarray(left.is_null()), np.asarray(right.is_null())
+    equal = absent[0] == absent[1]
+    present = np.flatnonzero(~absent[0] & ~absent[1])
+    if len(present) < len(left):
+        at = arrays.array(present)
+        left, right = left.take(at), right.take(at)
+    equal[present] = _same_values(left, right)
+    return equal
+
+
+def _same_values(left: Array, right: Array) -> Mask:
+    """Compare where neither is null."""
+    if pt.is_struct(left.type):
+        equal = np.ones(len(left), bool)
+        for field in left.type:
+            equal &= _same(field_of(left, field.name), field_of(right, field.name))
+        return equal
+    if is_list(left.type):
+        return _same_lists(left, right)
+    equal = np.asarray(pc.equal(left, right))
+    if pt.is_floating(left.type):
+        equal |= np.asarray(pc.and_(pc.is_nan(left), pc.is_nan(right)))
+    return equal
+
+
+def _same_lists(left: Array, right: Array) -> Mask:
+    lengths = [open_list(side)[1].lengths for side in (left, right)]
+    equal = lengths[0] == lengths[1]
+    rows = np.flatnonzero(equal)
+    if len(rows) < len(left):
+        at = arrays.array(rows)
+        left, right = left.take(at), right.take(at)
+    values, axis = open_list(left)
+    wrong = axis.parents[~_same(values, open_list(right)[0])]
+    equal[rows[wrong]] = False
+    return equal
+
+
+_IMAGE = "Image"
+"""The one type whose rows `topic_settings` may have packed."""
+
+
+@frozen
+class Restored:
+    """A batch of messages, and how far they are what was stored."""
+
+    rows: pa.StructArray
+    """In the ROS shape, without nulls."""
+    unknown: tuple[str, ...] = ()
+    """Fields of the message that are not in the rows; they are zero, empty or false."""
+    kept_out: Mapping[str, str] | None = None
+    """Columns that no field could be computed from, and what they were computed as."""
+    changed: Mapping[str, int] | None = None
+    """Columns that would come out otherwise if the messages were ingested again, and in how many rows."""
+
+
+class Inverse(Protocol):
+    """Takes rows of one topic back."""
+
+    def restore(self, rows: pa.StructArray, envelope: Envelope) -> Restored:
+        """Return one message a row."""
+        ...
+
+
+def invert(adapter: Adapter, shape: pa.StructType, metadata: Mapping[str, Any]) -> Inverse:
+    """Return the way back through a bound adapter; `metadata` is the topic's.
+
+    Raises:
+        AdapterError: The adapter is a class, of which nobody knows what it does.
+    """
+    if isinstance(adapter, UnmodeledAdapter):
+        return _Kept(shape)
+    if isinstance(adapter, MappingAdapter):
+        return _Mapped(adapter, shape, _said(adapter.metadata, metadata))
+    raise AdapterError("an adapter written in Python has no way back")
+
+
+@frozen
+class _Kept:
+    """Of messages that kept their shape: exact."""
+
+    shape: pa.StructType
+
+    def restore(self, rows: pa.StructArray, envelope: Envelope) -> Restored:  # noqa: ARG002 - the seam's signature
+        columns = [
+            _in_shape(values, field.type) for values, field in zip(rows.flatten(), self.shape, strict=True)
+        ]
+        return Restored(struct_of(columns, self.shape, None, len(rows)))
+
+
+@frozen
+class _Mapped:
+    """Of messages that went through a mapping."""
+
+    adapter: MappingAdapter
+    shape: pa.StructType
+    said: Mapping[Place, str]
+
+    def restore(self, rows: pa.StructArray, envelope: Envelope) -> Restored:
+        if self.adapter.ontology.tag == _IMAGE:
+            rows = without_png(rows)
+        parts = Parts(self.shape, len(rows))
+        undo = Undo(parts, self.said)
+        undo.record(self.adapter.record, rows)
+        messages = parts.build()
+        changed = self._changed(rows, messages, replace(envelope, msgtype=self.adapter.msgtype))
+        return Restored(messages, tuple(parts.unknown), undo.kept_out, changed)
+
+    def _changed(self, rows: Array, messages: Array, envelope: Envelope) -> Mapping[str, int]:
+        again = self.adapter.adapt(messages, envelope)
+        given = rows if len(again.index) == len(rows) else rows.take(arrays.array(again.index))
+        changed = {name: int(wrong.sum()) for name, wrong in differences(given, again.rows).items()}
+        return changed | ({"(refused)": len(again.failures)} if again.failures else {})
+
+
+def _said(values: Mapping[str, Typed], metadata: Mapping[str, Any]) -> Mapping[Place, str]:
+    """Return what the metadata keeps of fields of the first message."""
+    found: dict[Place, str] = {}
+    for key, typed in values.items():
+        if isinstance(typed, FieldOf) and isinstance(typed.of, Whole) and isinstance(metadata.get(key), str):
+            found[(typed.name,)] = metadata[key]
+    return found
+
+
+def _in_shape(values: Array, kind: DataType) -> Array:
+    """Return values in the message's own type: empty messages lose the member that storage gave them."""
+    if values.type == kind and not values.null_count:
+        return values
+    if pt.is_struct(kind):
+        there = [field.name for field in values.type]
+        children = [_in_shape(field_of(values, f.name), f.type) for f in kind if f.name in there]
+        return struct_of(children, kind, None, len(values))
+    if is_list(kind):
+        elements, axis = open_list(values)
+        elements = _in_shape(elements, kind.value_type)
+        if pt.is_fixed_size_list(kind):
+            return fixed_list(elements, kind.list_size, None, len(values), kind)
+        return var_list(elements, axis.offsets, None, kind)
+    if nulls(values) is not None:
+        raise AdapterError(f"null where a {kind} is needed; the topic was not written by an ingestion")
+    return values.cast(kind)

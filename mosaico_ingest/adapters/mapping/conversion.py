@@ -1,0 +1,298 @@
+"""This file decides what fits an ontology column, before anything runs and for every value when it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mosaico_ingest.adapters.mapping.columns import (
+    Array,
+    Axis,
+    DataType,
+    Mask,
+    arrays,
+    fixed_list,
+    nulls,
+    open_list,
+    pc,
+    pt,
+    struct_of,
+    var_list,
+)
+from mosaico_ingest.adapters.mapping.functions.registry import Refuse, nullified
+from mosaico_ingest.adapters.mapping.functions.ros import HEADER_TYPE, STAMP_TYPE, as_header, as_stamp
+from mosaico_ingest.adapters.mapping.types import (
+    Kind,
+    Unfit,
+    float_of,
+    int_bounds,
+    is_list,
+    is_number,
+    kind_of,
+    spell,
+    within,
+)
+
+__all__ = ["convert", "demand", "peel", "refuse_nulls", "to_number"]
+
+
+def peel(target: DataType, axes: tuple[int | None, ...]) -> DataType:
+    """Return what an element must be, for a target that holds the lists around it.
+
+    Raises:
+        Unfit: The target has fewer lists, or lists of another length.
+    """
+    for size in axes:
+        if not is_list(target):
+            raise Unfit(
+                f"a list for {spell(target)}",
+                hint="a[0] is one element, len sum mean least greatest are one value",
+            )
+        if size is not None and pt.is_fixed_size_list(target) and target.list_size != size:
+            raise Unfit(f"a list of {size} for one of {target.list_size}")
+        target = target.value_type
+    return target
+
+
+def demand(kind: Kind, target: DataType) -> None:
+    """Check that every value of a kind fits a column.
+
+    Raises:
+        Unfit: Some value may not.
+    """
+    _demand(kind.element, peel(target, kind.axes))
+
+
+def _demand(kind: Kind, target: DataType) -> None:
+    source = kind.type
+    if source == target or pt.is_null(source):
+        return
+    if is_list(source) and is_list(target):
+        if pt.is_fixed_size_list(source) and pt.is_fixed_size_list(target):
+            peel(target, (source.list_size,))
+        _demand(kind_of(source.value_type, msgtype=kind.msgtype), target.value_type)
+    elif pt.is_struct(source) and pt.is_struct(target):
+        _demand_fields(kind, target)
+    elif not (is_number(source) and is_number(target) and _surely(kind, target)):
+        raise Unfit(_misfit(kind, target), hint=_remedy(source, target))
+
+
+def _surely(kind: Kind, target: DataType) -> bool:
+    if pt.is_integer(target):
+        return kind.bounds is not None and within(kind.bounds, int_bounds(target))
+    return float_of(kind).bit_width <= target.bit_width
+
+
+def _misfit(kind: Kind, target: DataType) -> str:
+    if not (is_number(kind.type) and is_number(target)):
+        return f"{spell(kind)} for {spell(target)}"
+    if kind.bounds is None or kind.bounds == int_bounds(kind.type):
+        return f"{spell(kind)} may not fit {spell(target)}"
+    low, high = kind.bounds
+    if low == high:
+        return f"{low} does not fit {spell(target)}"
+    return f"{spell(kind)} from {low} to {high} may not fit {spell(target)}"
+
+
+def _remedy(source: DataType, target: DataType) -> str | None:
+    """Return what to write instead."""
+    computes = is_number(source) or pt.is_boolean(source)
+    if computes and (is_number(target) or pt.is_boolean(target)):
+        whole = "round(x) first, then " if pt.is_floating(source) and pt.is_integer(target) else ""
+        return f"{whole}cast(…) if you know that it does; a row where it does not is then rejected"
+    if pt.is_string(target):
+        return "text(…) spells a number" if computes else None
+    if is_number(target) and pt.is_string(source):
+        return "cast(number(…)) reads it"
+    if pt.is_binary(target) and is_list(source):
+        return "bytes(…) if it is a list of uint8"
+    if is_list(target) and not is_list(source):
+        return "[x] is a list of one" if computes else None
+    return "name one of its fields" if pt.is_struct(source) else None
+
+
+def _demand_fields(kind: Kind, target: DataType) -> None:
+    if _special(kind.type, target) is not None:
+        return
+    there = {field.name for field in target}
+    extra = [field.name for field in kind.type if field.name not in there]
+    if extra:
+        raise Unfit(
+            f"{spell(kind)} has {', '.join(extra)}, which {spell(target)} has not",
+            hint="name what goes where: {of: …, fields: {…}}, or another adapter: {use: …, of: …}",
+        )
+    for field in target:
+        position = kind.type.get_field_index(field.name)
+        if position >= 0:
+            _demand(kind_of(kind.type.field(position).type), field.type)
+        elif not field.nullable:
+            raise Unfit(f"{spell(kind)} has no {field.name}, which {spell(target)} requires")
+
+
+def _special(source: DataType, target: DataType) -> Callable[[Refuse, Array], Array] | None:
+    """Return the conversion of a header or time stamp."""
+    if target == HEADER_TYPE and {field.name for field in source} >= {"stamp", "frame_id"}:
+        return as_header
+    if target == STAMP_TYPE and {field.name for field in source} == {"sec", "nanosec"}:
+        return as_stamp
+    return None
+
+
+def convert(array: Array, target: DataType, refuse: Refuse) -> Array:
+    """Return the column in exactly the target's type; what fits as it is, is not copied."""
+    if array.type == target:
+        return array
+    if pt.is_null(array.type):
+        return arrays.nulls(len(array), target)
+    if is_list(target):
+        return _convert_list(array, target, refuse)
+    if pt.is_struct(target):
+        return _convert_struct(array, target, refuse)
+    return to_number(array, target, refuse)
+
+
+def _convert_list(array: Array, target: DataType, refuse: Refuse) -> Array:
+    elements, axis = open_list(array)
+    if pt.is_fixed_size_list(target) and axis.size is None:
+        size = target.list_size
+        wrong = axis.lengths != size
+        if axis.null is not None:
+            wrong &= ~axis.null
+        if wrong.any():
+            refuse(wrong, "length", lambda i: f"the list has {axis.lengths[i]} elements, not {size}")
+        elements, axis = _stretched(elements, axis, size)
+    values = convert(elements, target.value_type, _of_elements(axis, refuse))
+    if pt.is_fixed_size_list(target):
+        return fixed_list(values, target.list_size, axis.null, len(array), target)
+    return var_list(values, axis.offsets, axis.null, target)
+
+
+def _stretched(elements: Array, axis: Axis, size: int) -> tuple[Array, Axis]:
+    """Return the elements with `size` of them for every row, also where the list is null."""
+    fits = axis.lengths == size
+    offsets = np.arange(len(fits) + 1, dtype=np.int64) * size
+    if fits.all():
+        return elements, Axis(offsets, axis.null, size)
+    positions = (axis.offsets[:-1, None] + np.arange(size)).ravel()
+    absent = np.repeat(~fits, size)
+    taken = elements.take(arrays.array(np.where(absent, 0, positions), mask=absent))
+    return taken, Axis(offsets, ~fits, size)
+
+
+def _of_elements(axis: Axis, refuse: Refuse) -> Refuse:
+    """Return a way to reject rows by the elements of their lists."""
+
+    def refuse_elements(bad: Mask, rule: str, says: Callable[[int], str]) -> None:
+        rows, first = np.unique(axis.parents[bad], return_index=True)
+        positions = dict(zip(rows.tolist(), np.flatnonzero(bad)[first].tolist(), strict=True))
+        mask = np.zeros(len(axis.lengths), bool)
+        mask[rows] = True
+        refuse(
+            mask,
+            rule,
+            lambda row: f"element {positions[row] - int(axis.offsets[row])}: {says(positions[row])}",
+        )
+
+    return refuse_elements
+
+
+def _convert_struct(array: Array, target: DataType, refuse: Refuse) -> Array:
+    conversion = _special(array.type, target)
+    if conversion is not None:
+        return conversion(refuse, array)
+    absent = nulls(array)
+    children: list[Array] = []
+    for field in target:
+        position = array.type.get_field_index(field.name)
+        child = arrays.nulls(len(array), field.type) if position < 0 else array.field(position)
+        child = convert(child, field.type, _named(field.name, refuse))
+        children.append(child if field.nullable else refuse_nulls(child, absent, _named(field.name, refuse)))
+    return struct_of(children, target, absent, len(array))
+
+
+def _named(name: str, refuse: Refuse) -> Refuse:
+    def refuse_named(bad: Mask, rule: str, says: Callable[[int], str]) -> None:
+        refuse(bad, rule, lambda i: f"{name}: {says(i)}")
+
+    return refuse_named
+
+
+def refuse_nulls(array: Array, parent_null: Mask | None, refuse: Refuse) -> Array:
+    """Reject rows without a required value, unless what it belongs to is null as well."""
+    absent = nulls(array)
+    if absent is None:
+        return array
+    bad = absent if parent_null is None else absent & ~parent_null
+    if bad.any():
+        refuse(bad, "null", lambda _: "null, where the ontology requires a value")
+    return _filled(array, absent)
+
+
+def _filled(array: Array, absent: Mask) -> Array:
+    """Return the array with some value where there is none; the struct around it is null there."""
+    present = np.flatnonzero(~absent)
+    if not len(present):
+        return _zeros(array.type, len(array))
+    positions = np.where(absent, present[0], np.arange(len(array)))
+    return array.take(arrays.array(positions))
+
+
+def _zeros(type_: DataType, length: int) -> Array:
+    """Return an array of one value, whatever it is, that is nowhere null."""
+    if pt.is_struct(type_):
+        return struct_of([_zeros(field.type, length) for field in type_], type_, None, length)
+    if pt.is_fixed_size_list(type_):
+        return fixed_list(
+            _zeros(type_.value_type, length * type_.list_size), type_.list_size, None, length, type_
+        )
+    if pt.is_list(type_):
+        return var_list(_zeros(type_.value_type, 0), np.zeros(length + 1, np.int64), None, type_)
+    plain = "" if pt.is_string(type_) else b"" if pt.is_binary(type_) else 0
+    return (
+        arrays.array([plain] * length, type_) if type_ != arrays.bool_() else arrays.array([False] * length)
+    )
+
+
+def to_number(array: Array, target: DataType, refuse: Refuse) -> Array:
+    """Return numbers in another type; a value outside it rejects its row."""
+    if array.type == target:
+        return array
+    bad = _outside(array, target)
+    if bad is not None and bad.any():
+        refuse(bad, "out-of-range", lambda i: f"{array[i].as_py()} does not fit {spell(target)}")
+        array = nullified(array, bad)
+    return pc.cast(array, target, safe=False)
+
+
+def _outside(array: Array, target: DataType) -> Mask | None:
+    """Return which numbers do not fit; None where none can be."""
+    if pt.is_boolean(array.type) or pt.is_null(array.type) or target == arrays.float64():
+        return None
+    values = np.asarray(pc.fill_null(array, 0))
+    if pt.is_boolean(target):
+        return (values != 0) & (values != 1)
+    bounds = int_bounds(target)
+    if bounds is None:
+        return _too_large(values, target)
+    if values.dtype.kind == "f":
+        # the next float above: 2 ** 63 - 1 itself is no float64
+        return ~(
+            (values >= float(bounds[0])) & (values < float(bounds[1] + 1)) & (values == np.trunc(values))
+        )
+    own = int_bounds(array.type)
+    if own is not None and within(own, bounds):
+        return None
+    low, high = max(bounds[0], own[0] if own else 0), min(bounds[1], own[1] if own else 0)
+    return (values < values.dtype.type(low)) | (values > values.dtype.type(high))
+
+
+def _too_large(values: NDArray[Any], target: DataType) -> Mask | None:
+    """Return which floats become infinite in a narrower type."""
+    if values.dtype.kind != "f" or values.dtype.itemsize * 8 <= target.bit_width:
+        return None
+    with np.errstate(over="ignore"):
+        narrow = values.astype(np.float32 if target.bit_width == 32 else np.float16)  # noqa: PLR2004 - bits
+    return np.isinf(narrow) & ~np.isinf(values)

@@ -1,0 +1,57 @@
+"""This file makes the language's list of functions from their docstrings, for `docs/mapping.md`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from mosaico_ingest.adapters.mapping.functions import SUBJECTS, functions, operators
+
+__all__ = ["function_reference", "with_reference"]
+
+_BEGIN, _END = "<!-- functions: made from their docstrings -->\n", "<!-- end of functions -->\n"
+_SPECIAL = (
+    (
+        "cast(x)",
+        "x as the type of what it fills; a value outside it, a fraction for an integer, rejects the row",
+    ),
+    ("cast(x, 'type')", "the same as bool, int8 … int64, uint8 … uint64, float16, float32 or float64"),
+    (
+        "either(a, b, …)",
+        "the first that names only fields the message's type has: `either(d, D)`, `either(seq, null)`",
+    ),
+    ("if_else(c, a, b)", "`a if c else b`"),
+)
+
+
+def function_reference() -> str:
+    """Return the tables of all functions as Markdown, by subject."""
+    return "\n".join(_tables())
+
+
+def with_reference(text: str) -> str:
+    """Return a document with what stands between its two marks made anew."""
+    before, rest = text.split(_BEGIN)
+    after = rest.split(_END)[1]
+    return f"{before}{_BEGIN}\n{function_reference()}\n{_END}{after}"
+
+
+def _tables() -> Iterator[str]:
+    yield _table("Types and branches", _SPECIAL)
+    for subject in SUBJECTS:
+        if subject is operators:
+            continue
+        rows = [(f.signature, f.summary) for f in functions() if f.apply.__module__ == subject.__name__]
+        title = (subject.__doc__ or "").rstrip(".")
+        yield _table(title[:1].upper() + title[1:], rows)
+
+
+def _table(title: str, rows: list[tuple[str, str]] | tuple[tuple[str, str], ...]) -> str:
+    body = "".join(f"| `{signature}` | {summary.rstrip('.')} |\n" for signature, summary in rows)
+    return f"**{title}**\n\n| function | gives |\n|---|---|\n{body}"
+
+
+if __name__ == "__main__":
+    path = Path(sys.argv[1])
+    path.write_text(with_reference(path.read_text("utf-8")), "utf-8")

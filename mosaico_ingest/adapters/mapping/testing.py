@@ -1,0 +1,199 @@
+"""This file runs the tests an adapter file carries: what is given goes through the adapter, what is expected is compared."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+import pyarrow as pa
+from pydantic import ValidationError
+
+from mosaico_ingest.adapters.adapter import Envelope
+from mosaico_ingest.adapters.mapping.columns import Array, DataType, pt
+from mosaico_ingest.adapters.mapping.functions.registry import nearest
+from mosaico_ingest.adapters.mapping.loader import MappingSpec
+from mosaico_ingest.adapters.mapping.model import Case, Recorded
+from mosaico_ingest.errors import BagError, IngestError
+from mosaico_ingest.frozen import frozen
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, Resolver, normalize_msgtype
+
+__all__ = ["Outcome", "ReadRecorded", "message_row", "run_tests"]
+
+ReadRecorded: TypeAlias = Callable[[Recorded], "tuple[Definition, pa.StructArray]"]
+"""Reads one recorded message: its definition, and itself as one row in the ROS shape."""
+
+_RELATIVE, _ABSOLUTE = 1e-6, 1e-9
+"""How far numbers may differ: float32 columns keep about seven digits."""
+
+
+@frozen
+class Outcome:
+    """The result of one test."""
+
+    name: str
+    problems: tuple[str, ...]
+    """What differs, a line each; none: it passed."""
+    line: int
+    """Where the test stands in the file."""
+
+    @property
+    def passed(self) -> bool:
+        """Whether everything expected came out."""
+        return not self.problems
+
+
+def run_tests(
+    spec: MappingSpec, resolver: Resolver, *, recorded: ReadRecorded | None = None
+) -> tuple[Outcome, ...]:
+    """Run all tests of an adapter file; never raises for what is in it."""
+    outcomes: list[Outcome] = []
+    for position, case in enumerate(spec.model.tests):
+        try:
+            problems = _run(spec, case, resolver, recorded)
+        except IngestError as error:
+            problems = [str(error)]
+        outcomes.append(Outcome(case.name, tuple(problems), spec.source.span(("tests", position)).line))
+    return tuple(outcomes)
+
+
+def message_row(given: Mapping[str, Any], shape: DataType) -> tuple[dict[str, Any], list[str]]:
+    """Return a message with defaults for what is not given, and what is wrong with what is."""
+    problems: list[str] = []
+    return _filled(given, shape, "", problems), problems
+
+
+def _run(spec: MappingSpec, case: Case, resolver: Resolver, recorded: ReadRecorded | None) -> list[str]:
+    if case.expect is None and case.rejects is None:
+        return ["nothing is expected: give expect or rejects"]
+    if {"bag", "topic"} <= case.given.keys():
+        if recorded is None:
+            return ["recorded messages cannot be read here"]
+        try:
+            definition, rows = recorded(Recorded.model_validate(case.given))
+        except ValidationError as error:
+            return [f"given: {detail['loc'][-1]}: {detail['msg']}" for detail in error.errors()]
+    else:
+        definition = _definition(spec, case, resolver)
+        shape = ros_shape(definition)
+        row, problems = message_row(case.given, shape)
+        if problems:
+            return problems
+        try:
+            rows = pa.array([row], shape)
+        except (pa.ArrowException, OverflowError, TypeError, ValueError) as error:
+            return [f"given does not fit {definition.root}: {error}"]
+    return _compare(spec, case, definition, rows)
+
+
+def _definition(spec: MappingSpec, case: Case, resolver: Resolver) -> Definition:
+    msgtype = normalize_msgtype(case.ros_type) if case.ros_type else spec.ros_types[0]
+    text = spec.own_text(msgtype)
+    embedded = Embedded("ros2msg", text) if text else None
+    try:
+        return resolver.resolve(msgtype, embedded, ros_version=2)
+    except BagError as unknown:
+        try:
+            return resolver.resolve(msgtype, None, ros_version=1)  # a type that only ROS 1 had
+        except BagError:
+            hint = "give its .msg text under `definition`"
+            raise BagError(unknown.what, where=unknown.where, hint=hint) from unknown
+
+
+def _compare(spec: MappingSpec, case: Case, definition: Definition, rows: Array) -> list[str]:
+    adapter = spec.bind(definition, rows.type)
+    adapted = adapter.adapt(rows, Envelope("", definition.root, np.zeros(len(rows), np.int64)))
+    if adapted.failures:
+        reason = adapted.failures[0].reason
+        if case.rejects is None:
+            return [f"the row is rejected: {reason}"]
+        return [] if case.rejects in reason else [f"rejected, but not for {case.rejects!r}: {reason}"]
+    if case.rejects is not None:
+        return [f"the row is accepted; it should be rejected for {case.rejects!r}"]
+    problems: list[str] = []
+    _differences(case.expect, adapted.rows[0].as_py(), adapted.rows.type, "", problems)
+    return problems
+
+
+def _filled(given: Mapping[str, Any], shape: DataType, path: str, problems: list[str]) -> dict[str, Any]:
+    names = [field.name for field in shape]
+    for name in given:
+        if name not in names:
+            near = nearest(str(name), names) or f"there are {', '.join(names)}"
+            problems.append(f"given: there is no field {path}{name}; {near}")
+    return {
+        field.name: _value(given.get(field.name), field.type, f"{path}{field.name}", problems)
+        for field in shape
+    }
+
+
+def _value(given: Any, type_: DataType, path: str, problems: list[str]) -> Any:  # noqa: ANN401 - values of a message
+    if pt.is_struct(type_):
+        if given is not None and not isinstance(given, Mapping):
+            problems.append(f"given: {path} is a mapping, not {given!r}")
+            given = None
+        return _filled(given or {}, type_, f"{path}.", problems)
+    if pt.is_fixed_size_list(type_) or pt.is_list(type_):
+        default = [None] * type_.list_size if pt.is_fixed_size_list(type_) else []
+        items = default if given is None else given
+        if not isinstance(items, list):
+            problems.append(f"given: {path} is a list, not {given!r}")
+            return default
+        return [_value(item, type_.value_type, f"{path}[{i}]", problems) for i, item in enumerate(items)]
+    if pt.is_binary(type_):
+        return _bytes(given)
+    if given is None:
+        return "" if pt.is_string(type_) else False if pt.is_boolean(type_) else 0
+    return given
+
+
+def _bytes(given: Any) -> Any:  # noqa: ANN401 - text, a list of numbers, or bytes
+    if isinstance(given, str):
+        return given.encode()
+    return bytes(given or ()) if given is None or isinstance(given, list) else given
+
+
+def _differences(expected: Any, got: Any, type_: DataType, path: str, problems: list[str]) -> None:  # noqa: ANN401 - values of a record
+    where = path.lstrip(".") or "the record"
+    if isinstance(expected, Mapping) and pt.is_struct(type_):
+        names = [field.name for field in type_]
+        for name, value in expected.items():
+            if name not in names:
+                near = nearest(str(name), names) or f"there are {', '.join(names)}"
+                problems.append(
+                    f"expect: there is no field {path.lstrip('.')}.{name}; {near}".replace(" .", " ")
+                )
+            elif got is None:
+                if value is not None:
+                    problems.append(f"{where}.{name}: expected {value!r}, but {where} is null")
+            else:
+                _differences(
+                    value,
+                    got[name],
+                    type_.field(type_.get_field_index(name)).type,
+                    f"{path}.{name}",
+                    problems,
+                )
+        return
+    if isinstance(expected, Sequence) and not isinstance(expected, str) and isinstance(got, list):
+        if len(expected) != len(got):
+            problems.append(f"{where}: expected {len(expected)} elements, got {len(got)}")
+        for position, (one, other) in enumerate(zip(expected, got, strict=False)):
+            _differences(one, other, type_.value_type, f"{path}[{position}]", problems)
+        return
+    if not _same(expected, got):
+        problems.append(f"{where}: expected {expected!r}, got {got!r}")
+
+
+def _same(expected: Any, got: Any) -> bool:  # noqa: ANN401 - values of a record
+    if isinstance(got, bytes):
+        return _bytes(expected) == got
+    if isinstance(expected, bool) or isinstance(got, bool) or expected is None or got is None:
+        return expected is got
+    if isinstance(expected, (int, float)) and isinstance(got, (int, float)):
+        if math.isnan(expected) or math.isnan(got):
+            return math.isnan(expected) and math.isnan(got)
+        return math.isclose(expected, got, rel_tol=_RELATIVE, abs_tol=_ABSOLUTE)
+    return bool(expected == got)

@@ -1,0 +1,177 @@
+"""The types of expressions: what is known about a value before an expression is evaluated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pyarrow as pa
+
+from mosaico_ingest.adapters.mapping.columns import DataType, arrays, pt
+from mosaico_ingest.frozen import frozen
+
+__all__ = [
+    "INT64",
+    "Kind",
+    "Unfit",
+    "float_of",
+    "int_bounds",
+    "is_list",
+    "is_number",
+    "join",
+    "kind_of",
+    "listed",
+    "narrowest_int",
+    "spell",
+    "widest_float",
+    "within",
+]
+
+Bounds = tuple[int, int]
+INT64 = (-(2**63), 2**63 - 1)
+_FLOATS = (pa.float16(), pa.float32(), pa.float64())
+_EXACT_INTEGERS = (2**11, 2**24, 2**53)
+"""How far the integers are exact in each of the floats."""
+
+
+class Unfit(Exception):  # noqa: N818 - a condition of two types, turned into a finding by the checker
+    """Types do not go together; `argument` is the position of the one to blame."""
+
+    def __init__(self, message: str, *, argument: int | None = None, hint: str | None = None) -> None:
+        super().__init__(message)
+        self.argument = argument
+        self.hint = hint
+
+
+@frozen
+class Kind:
+    """The static type of an expression; of a computed float, `type` is the widest float field in it."""
+
+    type: DataType
+    axes: tuple[int | None, ...] = ()
+    """The lists that `[]` opened, outermost first; a number where the length is fixed."""
+    bounds: Bounds | None = None
+    """What an integer can be."""
+    msgtype: str | None = None
+    """Where the type is a message, or lists of it: which."""
+
+    @property
+    def element(self) -> Kind:
+        """The kind of one element, without the lists that were opened."""
+        return replace(self, axes=())
+
+    def folded(self) -> Kind:
+        """Close the innermost list that was opened."""
+        inner = kind_of(listed(self.type, self.axes[-1]), msgtype=self.msgtype)
+        return replace(inner, axes=self.axes[:-1])
+
+    def closed(self) -> Kind:
+        """Close all lists: the kind of the whole column."""
+        kind = self
+        while kind.axes:
+            kind = kind.folded()
+        return kind
+
+
+def kind_of(type_: DataType, *, msgtype: str | None = None) -> Kind:
+    """Return the kind of a column of a type."""
+    return Kind(type_, bounds=int_bounds(type_), msgtype=msgtype)
+
+
+def listed(type_: DataType, size: int | None) -> DataType:
+    """Return the list type around a type."""
+    return arrays.list_(type_) if size is None else arrays.list_(type_, size)
+
+
+def int_bounds(type_: DataType) -> Bounds | None:
+    """Return the smallest and largest value of an integer type."""
+    if not pt.is_integer(type_):
+        return None
+    bits = type_.bit_width
+    return (0, 2**bits - 1) if pt.is_unsigned_integer(type_) else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+
+
+def is_list(type_: DataType) -> bool:
+    """Return whether it is a list, of fixed length or not."""
+    return pt.is_list(type_) or pt.is_fixed_size_list(type_)
+
+
+def is_number(type_: DataType) -> bool:
+    """Return whether one can compute with it; bool is no number."""
+    return pt.is_integer(type_) or pt.is_floating(type_)
+
+
+def float_of(kind: Kind) -> DataType:
+    """Return the narrowest float that holds every value of a number."""
+    if kind.bounds is None:
+        return kind.type
+    reach = max(abs(kind.bounds[0]), abs(kind.bounds[1]))
+    fitting = (float_ for float_, exact in zip(_FLOATS, _EXACT_INTEGERS, strict=True) if reach <= exact)
+    return next(fitting, _FLOATS[-1])
+
+
+def widest_float(*types: DataType) -> DataType:
+    """Return the widest of the floats among `types`; float16 where there is none."""
+    return max((t for t in types if pt.is_floating(t)), key=lambda t: t.bit_width, default=_FLOATS[0])
+
+
+def join(kinds: list[Kind]) -> Kind:
+    """Return the kind of a value that is one of several, lists around it ignored.
+
+    Raises:
+        Unfit: They have nothing in common.
+    """
+    first = next((kind for kind in kinds if not pt.is_null(kind.type)), kinds[0])
+    known = [kind for kind in kinds if not pt.is_null(kind.type)] or [first]
+    if all(is_number(kind.type) for kind in known):
+        return _join_numbers(known)
+    for position, kind in enumerate(kinds):
+        if not pt.is_null(kind.type) and kind.type != first.type:
+            raise Unfit(f"{spell(first)} and {spell(kind)} have no common type", argument=position)
+    return first.element
+
+
+def _join_numbers(kinds: list[Kind]) -> Kind:
+    bounds = [kind.bounds for kind in kinds if kind.bounds is not None]
+    if len(bounds) < len(kinds):
+        return Kind(widest_float(*(float_of(kind) for kind in kinds)))
+    low, high = min(low for low, _ in bounds), max(high for _, high in bounds)
+    if high > INT64[1] and low < 0:
+        raise Unfit("uint64 and what may be negative have no common type", hint="cast one of them")
+    same = all(kind.type == kinds[0].type for kind in kinds)
+    common = arrays.int64() if high <= INT64[1] else arrays.uint64()
+    return Kind(kinds[0].type if same else common, bounds=(low, high))
+
+
+def spell(kind: Kind | DataType) -> str:
+    """Return a type in the words of the language, without the depths of a struct."""
+    if isinstance(kind, pa.DataType):
+        return _spell_type(kind)
+    closed = kind.closed()
+    if closed.msgtype is not None:
+        depth, type_ = 0, closed.type
+        while pt.is_list(type_) or pt.is_fixed_size_list(type_):
+            depth, type_ = depth + 1, type_.value_type
+        return f"{closed.msgtype}{'[]' * depth}"
+    return _spell_type(closed.type)
+
+
+def _spell_type(type_: DataType) -> str:
+    if pt.is_fixed_size_list(type_):
+        return f"list[{_spell_type(type_.value_type)}, {type_.list_size}]"
+    if pt.is_list(type_):
+        return f"list[{_spell_type(type_.value_type)}]"
+    if pt.is_struct(type_):
+        return "{" + ", ".join(field.name for field in type_) + "}"
+    return {"double": "float64", "float": "float32", "halffloat": "float16"}.get(str(type_), str(type_))
+
+
+def narrowest_int(bounds: Bounds) -> DataType:
+    """Return the narrowest integer type for all values within bounds; signed before unsigned."""
+    names = [f"{sign}int{bits}" for bits in (8, 16, 32, 64) for sign in ("", "u")]
+    types: list[DataType] = [getattr(arrays, name)() for name in names]
+    return next((t for t in types if within(bounds, int_bounds(t))), arrays.int64())
+
+
+def within(bounds: Bounds, outer: Bounds | None) -> bool:
+    """Return whether all of `bounds` lies in `outer`."""
+    return outer is not None and outer[0] <= bounds[0] and bounds[1] <= outer[1]

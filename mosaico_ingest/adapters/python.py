@@ -1,0 +1,372 @@
+"""Adapters written in Python: the base class, the registry of defaults, and their execution."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from inspect import signature
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
+
+import numpy as np
+import pyarrow as pa
+
+from mosaico_ingest.adapters.adapter import Adapted, Envelope
+from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.findings import RowFailure
+from mosaico_ingest.frozen import frozen
+from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
+from mosaico_ingest.rosbag.blocks import ROSMessage
+from mosaico_ingest.rosbag.definitions.model import Definition, normalize_msgtype
+
+if TYPE_CHECKING:
+    from mosaico_ingest.ontology.header import Message
+    from mosaico_ingest.ontology.model import Serializable
+
+__all__ = [
+    "PythonAdapterSpec",
+    "ROSAdapterBase",
+    "is_adapter_class",
+    "ontology_of",
+    "register_default_adapter",
+    "registered_adapters",
+    "ros_types_of",
+]
+
+T = TypeVar("T", bound="Serializable")
+A = TypeVar("A", bound=type[Any])
+
+_registered: dict[str, type[Any]] = {}
+
+
+class ROSAdapterBase(Generic[T]):
+    """Turns messages of `ros_msgtype` into objects of `__mosaico_ontology_type__`.
+
+    An adapter fills in `from_dict`. One that also has a classmethod
+    `from_batch(rows: pa.StructArray) -> pa.StructArray` is given whole batches of columns instead: as many rows of
+    the ontology's columns come back, a null row is a rejected one.
+    """
+
+    ros_msgtype: str | tuple[str, ...]
+    """The message types it takes, as `sensor_msgs/msg/Imu`."""
+    __mosaico_ontology_type__: type[Any]
+    """The class `from_dict` returns an object of."""
+
+    @classmethod
+    def from_dict(cls, ros_data: dict[str, Any]) -> T:
+        """Return the object for one message, a dict of its fields; any exception rejects the message."""
+        raise NotImplementedError(f"{cls.__name__} defines neither from_dict nor from_batch")
+
+    @classmethod
+    def translate(cls, ros_msg: ROSMessage, **kwargs: Any) -> Message:  # noqa: ANN401 - passed on to from_dict
+        """Return the object with its time; to be overridden where the topic or the time of a message matter."""
+        from mosaico_ingest.ontology.header import Message  # noqa: PLC0415 - the models are slow to import
+
+        convert: Callable[..., T] = cls.from_dict  # one that is overridden may take more
+        return Message(timestamp_ns=ros_msg.bag_timestamp_ns, data=convert(ros_msg.data, **kwargs))
+
+    @classmethod
+    def schema_metadata(
+        cls,
+        ros_data: dict[str, Any],  # noqa: ARG003 - for those who override it
+        **kwargs: Any,  # noqa: ANN401, ARG003 - the same
+    ) -> dict[str, Any] | None:
+        """Return topic metadata read from the topic's first message; none by default."""
+        return None
+
+
+def register_default_adapter(adapter: A) -> A:
+    """Make an adapter class the default for its types, before the built-in ones (a class decorator).
+
+    Raises:
+        AdapterError: Another class is already registered for one of the types.
+    """
+    for msgtype in ros_types_of(adapter):
+        other = _registered.get(msgtype)
+        if other is not None and _path(other) != _path(adapter):
+            raise AdapterError(
+                f"{_path(adapter)} and {_path(other)} both register as the default for {msgtype}",
+                hint="register one, and name the other in adapter_override for its topics",
+            )
+        _registered[msgtype] = adapter
+    return adapter
+
+
+def registered_adapters() -> dict[str, type[Any]]:
+    """Return the adapter classes registered as defaults, by message type."""
+    return dict(_registered)
+
+
+def ros_types_of(adapter: type[Any]) -> tuple[str, ...]:
+    """Return the message types an adapter class names.
+
+    Raises:
+        AdapterError: It names none.
+    """
+    declared: object = getattr(adapter, "ros_msgtype", None)
+    names = (declared,) if isinstance(declared, str) else declared
+    if not isinstance(names, (tuple, list)) or not names or not all(isinstance(name, str) for name in names):
+        raise AdapterError(
+            f"{_path(adapter)} has no ros_msgtype",
+            hint='set it to a type such as "my_pkg/msg/MyType", or to a tuple of them',
+        )
+    return tuple(normalize_msgtype(str(name)) for name in names)
+
+
+def _path(adapter: type[Any]) -> str:
+    return f"{adapter.__module__}.{adapter.__qualname__}"
+
+
+_BASE = "ROSAdapterBase"
+"""What the base class of adapters is called, here and in the official SDK."""
+_SDK_FIRST = "typestore"
+"""The first parameter of `schema_metadata` in newer SDKs: what it returns is known here already."""
+_ROWS_AS_DICTS = 256
+"""How many messages are Python objects at a time; an image topic must not be in memory twice as a whole."""
+
+
+@frozen
+class PythonAdapterSpec:
+    """An adapter class: a subclass of `ROSAdapterBase`, ours or the official SDK's."""
+
+    adapter: type[Any]
+    default: bool = True
+    origin: tuple[Callable[..., Any], tuple[Any, ...]] | None = field(default=None, compare=False)
+    """How another process gets the same spec, where importing the class by its name does not do."""
+
+    @property
+    def name(self) -> str:
+        """The class's name."""
+        return self.adapter.__name__
+
+    @property
+    def ros_types(self) -> tuple[str, ...]:
+        """What `ros_msgtype` says."""
+        return ros_types_of(self.adapter)
+
+    def bind(self, definition: Definition, shape: pa.StructType) -> PythonAdapter:  # noqa: ARG002 - a dict has no shape
+        """Find the columns of the adapter's ontology class."""
+        model = getattr(self.adapter, "__mosaico_ontology_type__", None)
+        if not isinstance(model, type):
+            raise AdapterError(
+                f"{self.name} has no __mosaico_ontology_type__", hint="set it to the class from_dict returns"
+            )
+        return PythonAdapter(self.adapter, ontology_of(model))
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        """Pickle by reference."""
+        return self.origin or (PythonAdapterSpec, (self.adapter, self.default))
+
+
+@frozen
+class PythonAdapter:
+    """Calls an adapter class for rows; whatever it raises rejects the row it was raised for."""
+
+    adapter: type[Any]
+    ontology: OntologyType
+
+    def adapt(self, rows: pa.StructArray, envelope: Envelope) -> Adapted:
+        """Adapt by columns where the class can, else message by message."""
+        if hasattr(self.adapter, "from_batch"):
+            return self._by_columns(rows)
+        return self._by_messages(rows, envelope)
+
+    def topic_metadata(self, first_row: pa.StructScalar | None) -> dict[str, Any]:
+        """Return what `schema_metadata` reads from the first message; the newer SDK's is given no message.
+
+        Raises:
+            AdapterError: It raised something.
+        """
+        method = getattr(self.adapter, "schema_metadata", None)
+        if first_row is None or method is None or _SDK_FIRST in signature(method).parameters:
+            return {}
+        try:
+            return dict(method(first_row.as_py()) or {})
+        except Exception as error:
+            raise AdapterError(f"{self.adapter.__name__}.schema_metadata: {_say(error)}") from error
+
+    def _by_columns(self, rows: pa.StructArray) -> Adapted:
+        results = list(self._columns(rows, first=0))
+        failures = tuple(item for item in results if isinstance(item, RowFailure))
+        parts = [item for item in results if not isinstance(item, RowFailure)]
+        index = [start + np.flatnonzero(part.is_valid()).astype(np.int64) for start, part in parts]
+        rejected = [
+            RowFailure(int(row), "adapter", f"{self.adapter.__name__}.from_batch returned null for the row")
+            for start, part in parts
+            for row in start + np.flatnonzero(part.is_null())
+        ]
+        good = [part.drop_null() for _, part in parts]
+        return Adapted(
+            _joined(good, self.ontology.struct),
+            np.concatenate(index) if index else np.empty(0, np.int64),
+            tuple(sorted((*failures, *rejected), key=lambda failure: failure.row)),
+        )
+
+    def _columns(
+        self, rows: pa.StructArray, *, first: int
+    ) -> Iterator[RowFailure | tuple[int, pa.StructArray]]:
+        """Yield adapted stretches and failed rows in order; a stretch that raises is halved until a row is found."""
+        try:
+            result = self.adapter.from_batch(rows)
+        except Exception as error:  # noqa: BLE001 - the border to a user's code
+            if len(rows) > 1:
+                half = len(rows) // 2
+                yield from self._columns(rows.slice(0, half), first=first)
+                yield from self._columns(rows.slice(half), first=first + half)
+            else:
+                yield self._failure(first, error)
+            return
+        yield first, self._checked(result, len(rows))
+
+    def _checked(self, result: object, count: int) -> pa.StructArray:
+        wanted = self.ontology.struct
+        if isinstance(result, pa.RecordBatch):
+            result = result.to_struct_array()
+        if not isinstance(result, pa.StructArray) or result.type != wanted or len(result) != count:
+            found = (
+                f"{len(result)} rows of {result.type}"
+                if isinstance(result, pa.Array)
+                else type(result).__name__
+            )
+            raise AdapterError(
+                f"{self.adapter.__name__}.from_batch returned {found}, expected {count} rows of {self.ontology.tag}",
+                hint=f"return a StructArray of type {wanted}",
+            )
+        return result
+
+    def _by_messages(self, rows: pa.StructArray, envelope: Envelope) -> Adapted:
+        convert = self._translate if _overrides(self.adapter, "translate") else self._from_dict
+        parts: list[_Part] = []
+        for start in range(0, len(rows), _ROWS_AS_DICTS):
+            part = _Part()
+            for row, ros_data in enumerate(_as_dicts(rows.slice(start, _ROWS_AS_DICTS)), start):
+                try:
+                    part.add(row, *convert(ros_data, envelope, row))
+                except Exception as error:  # noqa: BLE001, PERF203 - the border to a user's code, a row at a time
+                    part.failures.append(self._failure(row, error))
+            parts.append(part)
+        arrays = [self._columns_of(part) for part in parts]
+        index = np.array([row for part in parts for row in part.index], np.int64)
+        times = np.array([time for part in parts for time in part.times], np.int64)
+        changed = not np.array_equal(times, envelope.log_times[index])
+        return Adapted(
+            _joined(arrays, self.ontology.struct),
+            index,
+            tuple(failure for part in parts for failure in part.failures),
+            log_times=times if changed else None,
+        )
+
+    def _from_dict(
+        self, ros_data: dict[str, Any], envelope: Envelope, row: int
+    ) -> tuple[int, dict[str, Any]]:
+        return int(envelope.log_times[row]), self._row_of(self.adapter.from_dict(ros_data))
+
+    def _translate(
+        self, ros_data: dict[str, Any], envelope: Envelope, row: int
+    ) -> tuple[int, dict[str, Any]]:
+        message = _message_class(self.adapter)(
+            bag_timestamp_ns=int(envelope.log_times[row]),
+            topic=envelope.topic,
+            msg_type=envelope.msgtype,
+            data=ros_data,
+        )
+        translated = self.adapter.translate(message)
+        return int(translated.timestamp_ns), self._row_of(translated.data)
+
+    def _row_of(self, value: object) -> dict[str, Any]:
+        wanted = self.adapter.__mosaico_ontology_type__
+        if not isinstance(value, wanted):
+            raise TypeError(f"returned {type(value).__name__}, expected {wanted.__name__}")
+        own: Any = value
+        return own.to_row() if hasattr(own, "to_row") else own.model_dump()  # the SDK's are plain pydantic
+
+    def _columns_of(self, part: _Part) -> pa.StructArray:
+        """Make columns of the rows; where one does not fit them, move it to the failures."""
+        struct = self.ontology.struct
+        try:
+            return _struct_array(part.rows, struct)
+        except _MISFITS:
+            for at in reversed(range(len(part.rows))):
+                try:
+                    _struct_array(part.rows[at : at + 1], struct)
+                except _MISFITS as error:  # noqa: PERF203 - finds the rows once something is known to be wrong
+                    part.failures.append(self._failure(part.index[at], error))
+                    part.drop(at)
+            part.failures.sort(key=lambda failure: failure.row)
+            return _struct_array(part.rows, struct)
+
+    def _failure(self, row: int, error: Exception) -> RowFailure:
+        return RowFailure(row, "adapter", f"{self.adapter.__name__}: {_say(error)}")
+
+
+_MISFITS = (pa.ArrowException, OverflowError, TypeError, ValueError)
+
+
+@dataclass(slots=True)
+class _Part:
+    """The rows of one stretch while they are Python objects."""
+
+    index: list[int] = field(default_factory=list[int])
+    times: list[int] = field(default_factory=list[int])
+    rows: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
+    failures: list[RowFailure] = field(default_factory=list[RowFailure])
+
+    def add(self, row: int, time: int, values: dict[str, Any]) -> None:
+        self.index.append(row)
+        self.times.append(time)
+        self.rows.append(values)
+
+    def drop(self, at: int) -> None:
+        del self.index[at], self.times[at], self.rows[at]
+
+
+def is_adapter_class(candidate: object) -> bool:
+    """Whether `candidate` has what an adapter class needs, whichever base it comes from."""
+    return isinstance(candidate, type) and any(base.__name__ == _BASE for base in candidate.__mro__[1:])
+
+
+def ontology_of(model: type[Any]) -> OntologyType:
+    """Return tag, format and columns of an ontology class, ours or the SDK's.
+
+    Raises:
+        AdapterError: It is neither.
+    """
+    if hasattr(model, "ontology_type"):
+        return model.ontology_type()
+    struct = getattr(model, "__msco_pyarrow_struct__", None)
+    if not isinstance(struct, pa.StructType):
+        raise AdapterError(f"{model.__name__} is no ontology class", hint="subclass Serializable")
+    layout = getattr(model, "__serialization_format__", SerializationFormat.DEFAULT)
+    return OntologyType(model.ontology_tag(), struct, SerializationFormat(layout.value))
+
+
+def _message_class(adapter: type[Any]) -> Callable[..., Any]:
+    """Return the message class of the base the adapter was written for: ours, or the SDK's beside its base."""
+    base = next(base for base in adapter.__mro__ if base.__name__ == _BASE)
+    return getattr(sys.modules[base.__module__], "ROSMessage", ROSMessage)
+
+
+def _say(error: Exception) -> str:
+    """Return an exception in one line."""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def _overrides(adapter: type[Any], method: str) -> bool:
+    """Whether the class, and not only the base of all adapters, defines `method`."""
+    owner = next((base for base in adapter.__mro__ if method in vars(base)), None)
+    return owner is not None and owner.__name__ != _BASE
+
+
+def _as_dicts(rows: Any) -> list[dict[str, Any]]:  # noqa: ANN401 - the stubs have no to_pylist for structs
+    return rows.to_pylist()
+
+
+def _struct_array(rows: Sequence[dict[str, Any]], struct: pa.StructType) -> pa.StructArray:
+    return cast("pa.StructArray", pa.array(rows, type=struct))  # the class follows from the type
+
+
+def _joined(parts: Sequence[pa.StructArray], struct: pa.StructType) -> pa.StructArray:
+    if len(parts) == 1:
+        return parts[0]
+    return cast("pa.StructArray", pa.concat_arrays(parts) if parts else pa.array([], struct))

@@ -1,0 +1,1 @@
+"""Where sequences go: batches in, committed sequences out. Knows no recordings and no messages."""

@@ -1,0 +1,696 @@
+"""The SQLite catalog of a store: schema, queries, sessions and removal.
+
+A connection lives only for one task, so threads and forked processes share nothing, and a catalog that
+was deleted is noticed instead of being written to after its end.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+import time
+from collections import defaultdict
+from collections.abc import Callable, Collection, Generator, Mapping
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from mosaico_ingest.destinations.base import check_same_type, sequence_exists
+from mosaico_ingest.destinations.store.errors import NotInStore, explained
+from mosaico_ingest.destinations.store.model import (
+    Note,
+    SegmentInfo,
+    SequenceInfo,
+    SessionInfo,
+    TopicInfo,
+)
+from mosaico_ingest.destinations.store.segment import Segment
+from mosaico_ingest.errors import SequenceExists, SinkError
+from mosaico_ingest.frozen import frozen
+from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
+from mosaico_ingest.remote import AnyPath
+
+__all__ = [
+    "FORMAT",
+    "Catalog",
+    "Claim",
+    "NewNote",
+    "NewSession",
+    "NewTopic",
+    "bounds",
+    "changed",
+    "claim",
+    "commit",
+    "create",
+    "delete_notes",
+    "delete_sequence",
+    "delete_session",
+    "delete_topic",
+    "find_sequence",
+    "forget",
+    "names",
+    "note",
+    "ontology_of",
+    "release",
+]
+
+
+def names(db: sqlite3.Connection) -> list[str]:
+    """Return the names of all sequences, sorted."""
+    return [row["name"] for row in db.execute("SELECT name FROM sequences ORDER BY name")]
+
+
+def find_sequence(db: sqlite3.Connection, name: str, root: Path) -> SequenceInfo | None:
+    """Return all that is known of a sequence, None where it does not exist."""
+    row = db.execute("SELECT * FROM sequences WHERE name = ?", (name,)).fetchone()
+    if row is None:
+        return None
+    return SequenceInfo(
+        name=name,
+        metadata=json.loads(row["metadata"]),
+        created_ns=row["created_ns"],
+        sessions=_session_infos(db, row["id"]),
+        topics=_topics(db, row["id"], name, root),
+        notes=_notes(db, row["id"]),
+    )
+
+
+def bounds(
+    db: sqlite3.Connection, topic: TopicInfo, columns: Collection[str], root: Path
+) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
+    """Return the known bounds of the columns asked for, by the path of the segment."""
+    found: dict[AnyPath, dict[str, tuple[Any, Any]]] = defaultdict(dict)
+    rows = db.execute(
+        "SELECT path, column_path, low, high FROM bounds JOIN segments ON segments.id = segment_id"
+        " JOIN topics ON topics.id = topic_id JOIN sequences ON sequences.id = sequence_id"
+        " WHERE sequences.name = ? AND topics.name = ?",
+        (topic.sequence, topic.name),
+    )
+    for row in rows:
+        if row["column_path"] in columns:
+            found[root / row["path"]][row["column_path"]] = (row["low"], row["high"])
+    return found
+
+
+def _session_infos(db: sqlite3.Connection, sequence_id: int) -> tuple[SessionInfo, ...]:
+    rows = db.execute("SELECT * FROM sessions WHERE sequence_id = ? ORDER BY id", (sequence_id,))
+    return tuple(
+        SessionInfo(row["id"], json.loads(row["metadata"]), row["created_ns"], row["completed_ns"])
+        for row in rows
+    )
+
+
+def _topics(db: sqlite3.Connection, sequence_id: int, name: str, root: Path) -> tuple[TopicInfo, ...]:
+    segments = _segments(db, sequence_id, root)
+    rows = db.execute("SELECT * FROM topics WHERE sequence_id = ? ORDER BY name", (sequence_id,))
+    return tuple(
+        TopicInfo(
+            sequence=name,
+            name=row["name"],
+            session=row["session_id"],
+            ontology=ontology_of(row),
+            schema=pa.ipc.read_schema(pa.py_buffer(row["arrow_schema"])),
+            metadata=json.loads(row["metadata"]),
+            created_ns=row["created_ns"],
+            segments=tuple(segments[row["id"]]),
+        )
+        for row in rows
+    )
+
+
+def _segments(db: sqlite3.Connection, sequence_id: int, root: Path) -> dict[int, list[SegmentInfo]]:
+    found: dict[int, list[SegmentInfo]] = defaultdict(list)
+    rows = db.execute(
+        "SELECT segments.* FROM segments JOIN topics ON topics.id = topic_id WHERE sequence_id = ?"
+        " ORDER BY start_ns, segments.session_id, path",
+        (sequence_id,),
+    )
+    for row in rows:
+        found[row["topic_id"]].append(
+            SegmentInfo(
+                path=root / row["path"],
+                session=row["session_id"],
+                rows=row["rows"],
+                stored_bytes=row["bytes"],
+                start_ns=row["start_ns"],
+                end_ns=row["end_ns"],
+                checksum=row["checksum"] if "checksum" in row.keys() else None,  # noqa: SIM118 - `in` would look among its values
+            )
+        )
+    return found
+
+
+def _notes(db: sqlite3.Connection, sequence_id: int) -> tuple[Note, ...]:
+    rows = db.execute("SELECT * FROM notes WHERE sequence_id = ? ORDER BY id", (sequence_id,))
+    return tuple(Note(row["topic"], row["message"], row["created_ns"]) for row in rows)
+
+
+def delete_sequence(db: sqlite3.Connection, name: str) -> list[str]:
+    """Remove a sequence and return the paths of its segments."""
+    owner = _sequence_id(db, name)
+    paths = _paths(db, "topic_id IN (SELECT id FROM topics WHERE sequence_id = ?)", owner)
+    db.execute("DELETE FROM sequences WHERE id = ?", (owner,))
+    return paths
+
+
+def delete_topic(db: sqlite3.Connection, sequence_name: str, name: str) -> list[str]:
+    """Remove a topic and return the paths of its segments."""
+    owner = _sequence_id(db, sequence_name)
+    row = db.execute("SELECT id FROM topics WHERE sequence_id = ? AND name = ?", (owner, name)).fetchone()
+    if row is None:
+        raise NotInStore(f"there is no topic {name!r}", where=sequence_name)
+    paths = _paths(db, "topic_id = ?", row["id"])
+    db.execute("DELETE FROM topics WHERE id = ?", (row["id"],))
+    db.execute("DELETE FROM notes WHERE sequence_id = ? AND topic = ?", (owner, name))
+    return paths
+
+
+def delete_session(db: sqlite3.Connection, sequence_name: str, session_id: str) -> list[str]:
+    """Remove a session, with the topics only it wrote to, and return the paths of its segments."""
+    owner = _sequence_id(db, sequence_name)
+    paths = _paths(db, "session_id = ?", session_id)
+    if not db.execute("DELETE FROM sessions WHERE id = ? AND sequence_id = ?", (session_id, owner)).rowcount:
+        raise NotInStore(f"there is no session {session_id!r}", where=sequence_name)
+    db.execute(
+        "DELETE FROM topics WHERE session_id = ? AND id NOT IN (SELECT topic_id FROM segments)", (session_id,)
+    )
+    return paths
+
+
+def delete_notes(db: sqlite3.Connection, sequence_name: str, topic_name: str | None) -> None:
+    """Remove the notes of a sequence, or those of one of its topics."""
+    owner = _sequence_id(db, sequence_name)
+    db.execute("DELETE FROM notes WHERE sequence_id = ? AND topic IS ?", (owner, topic_name))
+
+
+def forget(db: sqlite3.Connection, live: Collection[str]) -> set[str]:
+    """Remove the reservations of sessions that are not live and return the paths of all segments."""
+    for row in db.execute("SELECT session_id FROM reservations").fetchall():
+        if row["session_id"] not in live:
+            db.execute("DELETE FROM reservations WHERE session_id = ?", (row["session_id"],))
+    return set(_paths(db, "?", 1))
+
+
+def _sequence_id(db: sqlite3.Connection, name: str) -> int:
+    row = db.execute("SELECT id FROM sequences WHERE name = ?", (name,)).fetchone()
+    if row is None:
+        raise NotInStore(f"there is no sequence {name!r}")
+    return int(row["id"])
+
+
+def _paths(db: sqlite3.Connection, condition: str, value: int | str) -> list[str]:
+    rows = db.execute(f"SELECT path FROM segments WHERE {condition}", (value,))  # noqa: S608 - the conditions are the constants above
+    return [row["path"] for row in rows]
+
+
+@frozen
+class Claim:
+    """The sequence as it was when the session began; the commit insists on finding it so."""
+
+    sequence: str
+    if_exists: IfExists
+    sequence_id: int | None
+    sessions: tuple[str, ...]
+    types: Mapping[str, OntologyType]
+    """What its topics hold, for a session that appends to them."""
+
+
+@frozen
+class NewTopic:
+    """A topic of the session, and its segments under the paths the catalog will know them by."""
+
+    name: str
+    ontology: OntologyType
+    schema: pa.Schema
+    metadata: str
+    created_ns: int
+    segments: Mapping[str, Segment]
+
+
+@frozen
+class NewNote:
+    """An error to attach."""
+
+    topic: str | None
+    message: str
+    created_ns: int
+
+
+@frozen
+class NewSession:
+    """All a session wrote."""
+
+    id: str
+    metadata: str
+    created_ns: int
+    topics: tuple[NewTopic, ...]
+    notes: tuple[NewNote, ...]
+
+
+def claim(
+    db: sqlite3.Connection,
+    session: str,
+    sequence: str,
+    if_exists: IfExists,
+    *,
+    is_live: Callable[[str], bool],
+) -> Claim:
+    """Note that a session will create or replace a sequence, or refuse because it must not or another does."""
+    row = db.execute("SELECT id FROM sequences WHERE name = ?", (sequence,)).fetchone()
+    if row is not None and if_exists in {IfExists.FAIL, IfExists.SKIP}:
+        raise sequence_exists(sequence)
+    if if_exists is not IfExists.APPEND:
+        _reserve(db, session, sequence, is_live)
+    if row is None:
+        return Claim(sequence, if_exists, None, (), {})
+    types = _types(db, row["id"]) if if_exists is IfExists.APPEND else {}
+    return Claim(sequence, if_exists, row["id"], _session_ids(db, row["id"]), types)
+
+
+def create(db: sqlite3.Connection, sequence: str, metadata: str) -> None:
+    """Enter a sequence without a session."""
+    if db.execute("SELECT 1 FROM sequences WHERE name = ?", (sequence,)).fetchone() is not None:
+        raise sequence_exists(sequence)
+    db.execute(
+        "INSERT INTO sequences (name, metadata, created_ns) VALUES (?, ?, ?)",
+        (sequence, metadata, time.time_ns()),
+    )
+
+
+def note(db: sqlite3.Connection, sequence: str, new: NewNote) -> None:
+    """Attach a note to a sequence that is there."""
+    entered = db.execute(
+        "INSERT INTO notes (sequence_id, topic, message, created_ns)"
+        " SELECT id, ?, ?, ? FROM sequences WHERE name = ?",
+        (new.topic, new.message, new.created_ns, sequence),
+    )
+    if not entered.rowcount:
+        raise NotInStore(f"there is no sequence {sequence!r}")
+
+
+def release(db: sqlite3.Connection, session: str) -> None:
+    """Give the name back."""
+    db.execute("DELETE FROM reservations WHERE session_id = ?", (session,))
+
+
+def commit(db: sqlite3.Connection, claimed: Claim, new: NewSession) -> list[str]:
+    """Enter a session and return the paths of the segments it replaces."""
+    replaced = _check_unchanged(db, claimed)
+    sequence_id = _sequence(db, claimed, new)
+    db.execute(
+        "INSERT INTO sessions VALUES (?, ?, ?, ?, ?)",
+        (new.id, sequence_id, new.metadata, new.created_ns, time.time_ns()),
+    )
+    held = _types(db, sequence_id)
+    for topic in new.topics:
+        if topic.name in held:
+            check_same_type(held[topic.name], topic.ontology, where=topic.name)
+        _enter_segments(db, _topic(db, sequence_id, new.id, topic), new.id, topic.segments)
+    db.executemany(
+        "INSERT INTO notes (sequence_id, topic, message, created_ns) VALUES (?, ?, ?, ?)",
+        [(sequence_id, note.topic, note.message, note.created_ns) for note in new.notes],
+    )
+    release(db, new.id)
+    return replaced
+
+
+def _reserve(db: sqlite3.Connection, session: str, sequence: str, is_live: Callable[[str], bool]) -> None:
+    for other in db.execute("SELECT session_id FROM reservations WHERE sequence = ?", (sequence,)).fetchall():
+        if is_live(other["session_id"]):
+            raise SequenceExists("another run is writing this sequence", where=sequence, hint="wait for it")
+        release(db, other["session_id"])
+    db.execute("INSERT INTO reservations VALUES (?, ?)", (session, sequence))
+
+
+def _check_unchanged(db: sqlite3.Connection, claimed: Claim) -> list[str]:
+    """Return the segments to be replaced, or refuse because somebody else changed the sequence meanwhile."""
+    row = db.execute("SELECT id FROM sequences WHERE name = ?", (claimed.sequence,)).fetchone()
+    now = None if row is None else row["id"]
+    replaces = claimed.if_exists is IfExists.REPLACE
+    if now is not None and claimed.if_exists in {IfExists.FAIL, IfExists.SKIP}:
+        raise sequence_exists(claimed.sequence)
+    if claimed.sequence_id is not None and now != claimed.sequence_id:
+        raise changed(claimed.sequence)
+    if replaces and now is not None and _session_ids(db, now) != claimed.sessions:
+        raise changed(claimed.sequence)
+    if not replaces or now is None:
+        return []
+    paths = db.execute(
+        "SELECT path FROM segments JOIN topics ON topics.id = topic_id WHERE sequence_id = ?", (now,)
+    ).fetchall()
+    db.execute("DELETE FROM sequences WHERE id = ?", (now,))
+    return [path["path"] for path in paths]
+
+
+def _sequence(db: sqlite3.Connection, claimed: Claim, new: NewSession) -> int:
+    db.execute(
+        "INSERT INTO sequences (name, metadata, created_ns) VALUES (?, ?, ?) ON CONFLICT (name) DO NOTHING",
+        (claimed.sequence, new.metadata, new.created_ns),
+    )
+    row = db.execute("SELECT id FROM sequences WHERE name = ?", (claimed.sequence,)).fetchone()
+    return int(row["id"])
+
+
+def _topic(db: sqlite3.Connection, sequence_id: int, session: str, topic: NewTopic) -> int:
+    db.execute(
+        "INSERT INTO topics (sequence_id, session_id, name, ontology_tag, serialization_format, fingerprint,"
+        " arrow_schema, metadata, created_ns) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
+        " ON CONFLICT (sequence_id, name) DO NOTHING",
+        (
+            sequence_id,
+            session,
+            topic.name,
+            topic.ontology.tag,
+            topic.ontology.serialization_format.value,
+            topic.ontology.fingerprint,
+            topic.schema.serialize().to_pybytes(),
+            topic.metadata,
+            topic.created_ns,
+        ),
+    )
+    row = db.execute("SELECT id FROM topics WHERE sequence_id = ? AND name = ?", (sequence_id, topic.name))
+    return int(row.fetchone()["id"])
+
+
+def _enter_segments(
+    db: sqlite3.Connection, topic_id: int, session: str, segments: Mapping[str, Segment]
+) -> None:
+    for path, segment in segments.items():
+        cursor = db.execute(
+            "INSERT INTO segments (topic_id, session_id, path, rows, bytes, start_ns, end_ns, checksum)"
+            " VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+            (
+                topic_id,
+                session,
+                path,
+                segment.rows,
+                segment.stored_bytes,
+                segment.start_ns,
+                segment.end_ns,
+                segment.checksum,
+            ),
+        )
+        db.executemany(
+            "INSERT INTO bounds VALUES (?, ?, ?, ?)",
+            [(cursor.lastrowid, *bounds) for bounds in segment.bounds],
+        )
+
+
+def _session_ids(db: sqlite3.Connection, sequence_id: int) -> tuple[str, ...]:
+    rows = db.execute("SELECT id FROM sessions WHERE sequence_id = ? ORDER BY id", (sequence_id,))
+    return tuple(row["id"] for row in rows)
+
+
+def _types(db: sqlite3.Connection, sequence_id: int) -> dict[str, OntologyType]:
+    rows = db.execute("SELECT * FROM topics WHERE sequence_id = ?", (sequence_id,))
+    return {row["name"]: ontology_of(row) for row in rows}
+
+
+def ontology_of(row: sqlite3.Row) -> OntologyType:
+    """Return the type a row of `topics` describes."""
+    columns = list(pa.ipc.read_schema(pa.py_buffer(row["arrow_schema"])))[1:]
+    return OntologyType(
+        row["ontology_tag"], pa.struct(columns), SerializationFormat(row["serialization_format"])
+    )
+
+
+def changed(sequence: str) -> SinkError:
+    """Return the error for a sequence that is not what it was when the session began."""
+    return SinkError("another run changed the sequence meanwhile", where=sequence, hint="run again")
+
+
+FORMAT = 1
+"""Counts up when a catalog can no longer be read by what was released before."""
+
+_APPLICATION = 0x6D6F7361  # "mosa", which `file catalog.sqlite` shows
+_BUSY_S = 30.0
+
+_TABLES = """
+CREATE TABLE sequences (
+    id INTEGER PRIMARY KEY AUTOINCREMENT,
+    name TEXT NOT NULL UNIQUE,
+    metadata TEXT NOT NULL,
+    created_ns INTEGER NOT NULL
+);
+CREATE TABLE sessions (
+    id TEXT PRIMARY KEY,
+    sequence_id INTEGER NOT NULL REFERENCES sequences ON DELETE CASCADE,
+    metadata TEXT NOT NULL,
+    created_ns INTEGER NOT NULL,
+    completed_ns INTEGER NOT NULL
+);
+CREATE INDEX sessions_of_sequence ON sessions (sequence_id);
+CREATE TABLE topics (
+    id INTEGER PRIMARY KEY,
+    sequence_id INTEGER NOT NULL REFERENCES sequences ON DELETE CASCADE,
+    session_id TEXT NOT NULL,
+    name TEXT NOT NULL,
+    ontology_tag TEXT NOT NULL,
+    serialization_format TEXT NOT NULL,
+    fingerprint TEXT NOT NULL,
+    arrow_schema BLOB NOT NULL,
+    metadata TEXT NOT NULL,
+    created_ns INTEGER NOT NULL,
+    UNIQUE (sequence_id, name)
+);
+CREATE TABLE segments (
+    id INTEGER PRIMARY KEY,
+    topic_id INTEGER NOT NULL REFERENCES topics ON DELETE CASCADE,
+    session_id TEXT NOT NULL REFERENCES sessions ON DELETE CASCADE,
+    path TEXT NOT NULL UNIQUE,
+    rows INTEGER NOT NULL,
+    bytes INTEGER NOT NULL,
+    start_ns INTEGER NOT NULL,
+    end_ns INTEGER NOT NULL,
+    checksum TEXT
+);
+CREATE INDEX segments_of_topic ON segments (topic_id, start_ns);
+CREATE INDEX segments_of_session ON segments (session_id);
+CREATE TABLE bounds (
+    segment_id INTEGER NOT NULL REFERENCES segments ON DELETE CASCADE,
+    column_path TEXT NOT NULL,
+    low,
+    high,
+    PRIMARY KEY (segment_id, column_path)
+) WITHOUT ROWID;
+CREATE TABLE notes (
+    id INTEGER PRIMARY KEY,
+    sequence_id INTEGER NOT NULL REFERENCES sequences ON DELETE CASCADE,
+    topic TEXT,
+    message TEXT NOT NULL,
+    created_ns INTEGER NOT NULL
+);
+CREATE INDEX notes_of_sequence ON notes (sequence_id);
+CREATE TABLE reservations (
+    session_id TEXT PRIMARY KEY,
+    sequence TEXT NOT NULL
+);
+"""
+
+
+class Catalog:
+    """The `Records` in the SQLite file at `path`; `create` makes it where it is not there."""
+
+    def __init__(self, path: Path, *, create: bool) -> None:
+        self.path = path
+        self.root = path.parent
+        with explained(path):
+            if create:
+                path.parent.mkdir(parents=True, exist_ok=True)
+            elif not path.is_file():
+                raise SinkError("there is no store here", where=str(path.parent), hint="check the path")
+            self._prepare(create=create)
+
+    @contextmanager
+    def read(self) -> Generator[sqlite3.Connection, None, None]:
+        """Give a connection that sees one state of the catalog throughout."""
+        with self._task("BEGIN", mode="ro") as db:
+            yield db
+
+    @contextmanager
+    def write(self, *, lasting: bool = True) -> Generator[sqlite3.Connection, None, None]:
+        """Give a connection inside a transaction: all of it happens, or nothing; a power cut may undo what need not last."""
+        with self._task("BEGIN IMMEDIATE", mode="rw", lasting=lasting) as db:
+            yield db
+
+    def keep_open(self) -> sqlite3.Connection:
+        """Give an idle connection: closing the last one costs a checkpoint, closing another while it is open does not."""
+        with explained(self.path):
+            return self._connect("rw")
+
+    def claim(
+        self, session: str, sequence: str, if_exists: IfExists, *, is_live: Callable[[str], bool]
+    ) -> Claim:
+        """See `Records.claim`; a claim means nothing once its writer is dead, as it is after a power cut."""
+        with self.write(lasting=False) as db:
+            return claim(db, session, sequence, if_exists, is_live=is_live)
+
+    def commit(self, claimed: Claim, new: NewSession) -> list[str]:
+        """See `Records.commit`."""
+        with self.write() as db:
+            return commit(db, claimed, new)
+
+    def release(self, session: str, sequence: str) -> None:  # noqa: ARG002 - the session says it all
+        """See `Records.release`."""
+        with self.write(lasting=False) as db:
+            release(db, session)
+
+    def create(self, sequence: str, metadata: str) -> None:
+        """See `Records.create`."""
+        with self.write() as db:
+            create(db, sequence, metadata)
+
+    def note(self, sequence: str, new: NewNote) -> None:
+        """See `Records.note`."""
+        with self.write() as db:
+            note(db, sequence, new)
+
+    def names(self) -> list[str]:
+        """See `Records.names`."""
+        with self.read() as db:
+            return names(db)
+
+    def sequence(self, name: str) -> SequenceInfo | None:
+        """See `Records.sequence`."""
+        with self.read() as db:
+            return find_sequence(db, name, self.root)
+
+    def sequences(self) -> tuple[SequenceInfo, ...]:
+        """See `Records.sequences`."""
+        with self.read() as db:
+            found = (find_sequence(db, name, self.root) for name in names(db))
+            return tuple(info for info in found if info is not None)
+
+    def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
+        """See `Records.bounds`."""
+        with self.read() as db:
+            return bounds(db, topic, columns, self.root)
+
+    def delete_sequence(self, sequence: str) -> list[str]:
+        """See `Records.delete_sequence`."""
+        with self.write() as db:
+            return delete_sequence(db, sequence)
+
+    def delete_topic(self, sequence: str, topic: str) -> list[str]:
+        """See `Records.delete_topic`."""
+        with self.write() as db:
+            return delete_topic(db, sequence, topic)
+
+    def delete_session(self, sequence: str, session: str) -> list[str]:
+        """See `Records.delete_session`."""
+        with self.write() as db:
+            return delete_session(db, sequence, session)
+
+    def delete_notes(self, sequence: str, topic: str | None) -> None:
+        """See `Records.delete_notes`."""
+        with self.write() as db:
+            delete_notes(db, sequence, topic)
+
+    def forget(self, live: Collection[str]) -> set[str]:
+        """See `Records.forget`."""
+        with self.write() as db:
+            return forget(db, live)
+
+    @contextmanager
+    def _task(
+        self, begin: str, *, mode: str, lasting: bool = True
+    ) -> Generator[sqlite3.Connection, None, None]:
+        with explained(self.path), closing(self._connect(mode)) as db:
+            if not lasting:
+                # A WAL stays whole then, and its last transactions may be missing.
+                db.execute("PRAGMA synchronous = NORMAL")
+            db.execute(begin)
+            try:
+                yield db
+            except BaseException:
+                db.rollback()
+                raise
+            db.commit()
+
+    def _connect(self, mode: str) -> sqlite3.Connection:
+        try:
+            return self._opened(f"mode={mode}")
+        except sqlite3.OperationalError:
+            if mode != "ro" or not self.path.is_file() or os.access(self.path.parent, os.W_OK):
+                raise
+            return self._opened("immutable=1")  # a read-only medium has no room for the files of the WAL
+
+    def _opened(self, query: str) -> sqlite3.Connection:
+        uri = f"{self.path.absolute().as_uri()}?{query}"
+        db = sqlite3.connect(uri, uri=True, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
+        try:
+            db.row_factory = sqlite3.Row
+            db.execute("PRAGMA foreign_keys = ON")
+            db.execute("PRAGMA synchronous = FULL")
+            db.execute("SELECT count(*) FROM sqlite_master")
+        except sqlite3.Error:
+            db.close()
+            raise
+        return db
+
+    def _prepare(self, *, create: bool) -> None:
+        with closing(self._connect("rwc" if create else "ro")) as db:
+            if create and self._format(db) == 0:
+                _use_wal(db)
+                db.execute("BEGIN IMMEDIATE")
+                if self._format(db) == 0:  # no other process was faster
+                    for statement in _TABLES.split(";"):
+                        db.execute(statement)
+                    db.execute(f"PRAGMA application_id = {_APPLICATION}")
+                    db.execute(f"PRAGMA user_version = {FORMAT}")
+                db.execute("COMMIT")
+            found = self._format(db)
+            if create and found == FORMAT:  # a newer one is not ours to change
+                _complete(db)
+        if found > FORMAT:
+            raise SinkError(
+                f"the store has format {found}, this version knows up to {FORMAT}",
+                where=str(self.path.parent),
+                hint="upgrade mosaico-ingest",
+            )
+        if found == 0:
+            raise SinkError("there is no store here", where=str(self.path.parent), hint="check the path")
+
+    def _format(self, db: sqlite3.Connection) -> int:
+        version, application = (db.execute(f"PRAGMA {name}").fetchone()[0] for name in _STAMPS)
+        tables = db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
+        if application != _APPLICATION and (application or version or tables):
+            raise SinkError("the file is no catalog of a store", where=str(self.path), hint="check the path")
+        return int(version)
+
+
+_STAMPS = ("user_version", "application_id")
+
+
+def _complete(db: sqlite3.Connection) -> None:
+    """Add what catalogs of the same format once did without."""
+    if not _has_checksums(db):
+        db.execute("BEGIN IMMEDIATE")
+        if not _has_checksums(db):  # no other process was faster
+            db.execute("ALTER TABLE segments ADD COLUMN checksum TEXT")
+        db.execute("COMMIT")
+
+
+def _has_checksums(db: sqlite3.Connection) -> bool:
+    columns = db.execute("SELECT name FROM pragma_table_info('segments')").fetchall()
+    return not columns or ("checksum",) in map(tuple, columns)
+
+
+def _use_wal(db: sqlite3.Connection) -> None:
+    deadline = time.monotonic() + _BUSY_S
+    while not _switched_to_wal(db) and time.monotonic() < deadline:
+        time.sleep(0.01)
+
+
+def _switched_to_wal(db: sqlite3.Connection) -> bool:
+    try:
+        db.execute("PRAGMA journal_mode = WAL")
+    except sqlite3.OperationalError as err:  # this pragma does not wait for others by itself
+        if "locked" not in str(err):
+            raise
+        return False
+    return True

@@ -1,0 +1,538 @@
+"""The catalog of a store behind a URL: one JSON document per sequence.
+
+Such a store has no transactions, but two things to build on: an object is written whole or not at all, and a listing
+shows what was written before it. So a writer first puts its claim on a sequence, then lists the claims: of two writers
+at least one sees the other, and gives way. Who holds the claim reads the document, changes it, and writes it.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import time
+from base64 import b64decode, b64encode
+from collections.abc import Callable, Collection, Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from io import BytesIO
+from typing import Any
+from urllib.parse import unquote
+
+import pyarrow as pa
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from mosaico_ingest.destinations.base import check_same_type, sequence_exists
+from mosaico_ingest.destinations.store.catalog import (
+    Claim,
+    NewNote,
+    NewSession,
+    NewTopic,
+    changed,
+)
+from mosaico_ingest.destinations.store.errors import NotInStore, explained
+from mosaico_ingest.destinations.store.files import MARKER, Bucket, encoded, new_session_id
+from mosaico_ingest.destinations.store.model import (
+    Note,
+    SegmentInfo,
+    SequenceInfo,
+    SessionInfo,
+    TopicInfo,
+)
+from mosaico_ingest.destinations.store.segment import Segment
+from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
+from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
+from mosaico_ingest.remote import AnyPath, RemotePath
+
+__all__ = [
+    "FORMAT",
+    "Documents",
+    "SequenceDocument",
+    "check_unchanged",
+]
+
+FORMAT = 1
+"""Counts up when a document can no longer be read by what was released before."""
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+
+class SegmentEntry(_Part):
+    """One Parquet file."""
+
+    path: str
+    session: str
+    rows: int
+    bytes: int
+    start_ns: int
+    end_ns: int
+    checksum: str | None = None
+    bounds: tuple[tuple[str, Any, Any], ...] = ()
+    """Of each column that has an order: its path, its smallest and its largest value."""
+
+
+class TopicEntry(_Part):
+    """One topic and its segments."""
+
+    name: str
+    session: str
+    ontology_tag: str
+    serialization_format: SerializationFormat
+    arrow_schema: str
+    """An Arrow IPC schema message, in Base64."""
+    metadata: dict[str, Any]
+    created_ns: int
+    segments: tuple[SegmentEntry, ...]
+
+    @property
+    def columns(self) -> pa.Schema:
+        """Its columns."""
+        return pa.ipc.read_schema(pa.py_buffer(b64decode(self.arrow_schema)))
+
+    @property
+    def ontology(self) -> OntologyType:
+        """Its type."""
+        return OntologyType(self.ontology_tag, pa.struct(list(self.columns)[1:]), self.serialization_format)
+
+
+class SessionEntry(_Part):
+    """One session that was committed."""
+
+    id: str
+    metadata: dict[str, Any]
+    created_ns: int
+    completed_ns: int
+
+
+class NoteEntry(_Part):
+    """One error that was attached."""
+
+    topic: str | None
+    message: str
+    created_ns: int
+
+
+class SequenceDocument(_Part):
+    """One sequence."""
+
+    format: int = FORMAT
+    name: str
+    metadata: dict[str, Any]
+    created_ns: int
+    sessions: tuple[SessionEntry, ...] = ()
+    topics: tuple[TopicEntry, ...] = ()
+    notes: tuple[NoteEntry, ...] = ()
+
+    @property
+    def session_ids(self) -> tuple[str, ...]:
+        """Its sessions, sorted."""
+        return tuple(sorted(session.id for session in self.sessions))
+
+    @property
+    def types(self) -> dict[str, OntologyType]:
+        """What its topics hold."""
+        return {topic.name: topic.ontology for topic in self.topics}
+
+    @property
+    def paths(self) -> list[str]:
+        """The paths of all its segments."""
+        return [segment.path for topic in self.topics for segment in topic.segments]
+
+    def info(self, root: RemotePath) -> SequenceInfo:
+        """Return it as the catalog's callers know it."""
+        return SequenceInfo(
+            name=self.name,
+            metadata=self.metadata,
+            created_ns=self.created_ns,
+            sessions=tuple(
+                SessionInfo(one.id, one.metadata, one.created_ns, one.completed_ns)
+                for one in sorted(self.sessions, key=lambda one: one.id)
+            ),
+            topics=tuple(
+                self._topic(topic, root) for topic in sorted(self.topics, key=lambda topic: topic.name)
+            ),
+            notes=tuple(Note(one.topic, one.message, one.created_ns) for one in self.notes),
+        )
+
+    def with_session(self, new: NewSession, *, completed_ns: int) -> SequenceDocument:
+        """Return the sequence with all that a session wrote."""
+        entry = SessionEntry(
+            id=new.id,
+            metadata=json.loads(new.metadata),
+            created_ns=new.created_ns,
+            completed_ns=completed_ns,
+        )
+        topics = {topic.name: topic for topic in self.topics}
+        for topic in new.topics:
+            topics[topic.name] = _joined(topics.get(topic.name), new.id, topic)
+        return self.model_copy(
+            update={
+                "sessions": (*self.sessions, entry),
+                "topics": tuple(topics.values()),
+                "notes": (*self.notes, *map(_note, new.notes)),
+            }
+        )
+
+    def with_note(self, new: NewNote) -> SequenceDocument:
+        """Return the sequence with one more note."""
+        return self.model_copy(update={"notes": (*self.notes, _note(new))})
+
+    def without_notes(self, topic: str | None) -> SequenceDocument:
+        """Return the sequence without its own notes, or without those of a topic."""
+        return self.model_copy(update={"notes": tuple(one for one in self.notes if one.topic != topic)})
+
+    def without_topic(self, name: str) -> SequenceDocument:
+        """Return the sequence without a topic; NotInStore where it has none of that name."""
+        rest = tuple(topic for topic in self.topics if topic.name != name)
+        if len(rest) == len(self.topics):
+            raise NotInStore(f"there is no topic {name!r}", where=self.name)
+        return self.without_notes(name).model_copy(update={"topics": rest})
+
+    def without_session(self, session: str) -> SequenceDocument:
+        """Return the sequence without what a session added; NotInStore where it has none of that name."""
+        rest = tuple(one for one in self.sessions if one.id != session)
+        if len(rest) == len(self.sessions):
+            raise NotInStore(f"there is no session {session!r}", where=self.name)
+        topics = (
+            topic.model_copy(
+                update={"segments": tuple(one for one in topic.segments if one.session != session)}
+            )
+            for topic in self.topics
+        )
+        kept = tuple(topic for topic in topics if topic.segments or topic.session != session)
+        return self.model_copy(update={"sessions": rest, "topics": kept})
+
+    def _topic(self, topic: TopicEntry, root: RemotePath) -> TopicInfo:
+        segments = sorted(topic.segments, key=lambda one: (one.start_ns, one.session, one.path))
+        return TopicInfo(
+            sequence=self.name,
+            name=topic.name,
+            session=topic.session,
+            ontology=topic.ontology,
+            schema=topic.columns,
+            metadata=topic.metadata,
+            created_ns=topic.created_ns,
+            segments=tuple(_segment(one, root) for one in segments),
+        )
+
+
+def check_unchanged(claimed: Claim, now: SequenceDocument | None) -> None:
+    """Refuse a commit because the sequence is there by now, or is not what it was when the session began.
+
+    Raises:
+        SequenceExists: It is there, and must not be.
+        SinkError: Somebody else changed it.
+    """
+    if now is not None and claimed.if_exists in {IfExists.FAIL, IfExists.SKIP}:
+        raise sequence_exists(claimed.sequence)
+    if claimed.sequence_id is not None and (now is None or now.created_ns != claimed.sequence_id):
+        raise changed(claimed.sequence)
+    if claimed.if_exists is IfExists.REPLACE and now is not None and now.session_ids != claimed.sessions:
+        raise changed(claimed.sequence)
+
+
+def _joined(held: TopicEntry | None, session: str, new: NewTopic) -> TopicEntry:
+    added = tuple(_entries(session, new))
+    if held is not None:
+        check_same_type(held.ontology, new.ontology, where=new.name)
+        return held.model_copy(update={"segments": (*held.segments, *added)})
+    return TopicEntry(
+        name=new.name,
+        session=session,
+        ontology_tag=new.ontology.tag,
+        serialization_format=new.ontology.serialization_format,
+        arrow_schema=b64encode(new.schema.serialize().to_pybytes()).decode(),
+        metadata=json.loads(new.metadata),
+        created_ns=new.created_ns,
+        segments=added,
+    )
+
+
+def _entries(session: str, new: NewTopic) -> Iterator[SegmentEntry]:
+    for path, segment in new.segments.items():
+        yield _entry(session, path, segment)
+
+
+def _entry(session: str, path: str, segment: Segment) -> SegmentEntry:
+    return SegmentEntry(
+        path=path,
+        session=session,
+        rows=segment.rows,
+        bytes=segment.stored_bytes,
+        start_ns=segment.start_ns,
+        end_ns=segment.end_ns,
+        checksum=segment.checksum,
+        bounds=segment.bounds,
+    )
+
+
+def _segment(entry: SegmentEntry, root: RemotePath) -> SegmentInfo:
+    return SegmentInfo(
+        path=root / entry.path,
+        session=entry.session,
+        rows=entry.rows,
+        stored_bytes=entry.bytes,
+        start_ns=entry.start_ns,
+        end_ns=entry.end_ns,
+        checksum=entry.checksum,
+    )
+
+
+def _note(new: NewNote) -> NoteEntry:
+    return NoteEntry(topic=new.topic, message=new.message, created_ns=new.created_ns)
+
+
+_SUFFIX = ".json"
+_AT_ONCE = 16
+_LONGEST_NAME = 200
+"""Longer ones are not spelled out in the names of objects."""
+_TRIES, _PAUSE_S = 8, 0.25
+
+
+class Documents:
+    """The `Records` of the store in `bucket`; `create` makes it where there is none."""
+
+    def __init__(self, bucket: Bucket, *, create: bool) -> None:
+        self._bucket = bucket
+        self._root = bucket.root
+        marker = self._root / MARKER
+        with explained(self._root):
+            try:
+                found = _number(marker.read_bytes())
+            except FileNotFoundError:
+                if not create:
+                    raise SinkError(
+                        "there is no store here", where=str(self._root), hint="check the URL"
+                    ) from None
+                marker.write_bytes(json.dumps({"format": FORMAT}).encode())
+                found = FORMAT
+        if found > FORMAT:
+            raise SinkError(
+                f"the store has format {found}, this version knows up to {FORMAT}",
+                where=str(self._root),
+                hint="upgrade mosaico-ingest",
+            )
+
+    def keep_open(self) -> BytesIO:
+        """See `Records.keep_open`; there is nothing to keep."""
+        return BytesIO()
+
+    def claim(
+        self, session: str, sequence: str, if_exists: IfExists, *, is_live: Callable[[str], bool]
+    ) -> Claim:
+        """See `Records.claim`."""
+        found = self._load(sequence)
+        if found is not None and if_exists in {IfExists.FAIL, IfExists.SKIP}:
+            raise sequence_exists(sequence)
+        if if_exists is not IfExists.APPEND:
+            self._reserve(session, sequence, is_live)
+        if found is None:
+            return Claim(sequence, if_exists, None, (), {})
+        types = found.types if if_exists is IfExists.APPEND else {}
+        return Claim(sequence, if_exists, found.created_ns, found.session_ids, types)
+
+    def commit(self, claimed: Claim, new: NewSession) -> list[str]:
+        """See `Records.commit`."""
+        if claimed.if_exists is IfExists.APPEND:
+            with self._holding(claimed.sequence, session=new.id):
+                return self._enter(claimed, new)
+        with explained(self._root):
+            if not self._claim(new.id, claimed.sequence).exists():
+                raise changed(claimed.sequence)
+        replaced = self._enter(claimed, new)
+        with suppress(SinkError):  # what is written counts; a claim without its session is no obstacle
+            self.release(new.id, claimed.sequence)
+        return replaced
+
+    def release(self, session: str, sequence: str) -> None:
+        """See `Records.release`."""
+        with explained(self._root), suppress(FileNotFoundError):
+            self._claim(session, sequence).unlink()
+
+    def create(self, sequence: str, metadata: str) -> None:
+        """See `Records.create`."""
+        with self._holding(sequence):
+            if self._load(sequence) is not None:
+                raise sequence_exists(sequence)
+            described = json.loads(metadata)
+            self._put(SequenceDocument(name=sequence, metadata=described, created_ns=time.time_ns()))
+
+    def note(self, sequence: str, new: NewNote) -> None:
+        """See `Records.note`."""
+        with self._holding(sequence):
+            self._put(self._known(sequence).with_note(new))
+
+    def names(self) -> list[str]:
+        """See `Records.names`."""
+        return sorted(self._name(path) for path in self._paths())
+
+    def sequence(self, name: str) -> SequenceInfo | None:
+        """See `Records.sequence`."""
+        found = self._load(name)
+        return None if found is None else found.info(self._root)
+
+    def sequences(self) -> tuple[SequenceInfo, ...]:
+        """See `Records.sequences`; each sequence is as it was when it was asked for."""
+        return tuple(one.info(self._root) for one in self._all())
+
+    def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
+        """See `Records.bounds`."""
+        found = self._load(topic.sequence)
+        segments = [
+            segment
+            for one in (found.topics if found else ())
+            if one.name == topic.name
+            for segment in one.segments
+        ]
+        return {
+            self._root / segment.path: {
+                name: (low, high) for name, low, high in segment.bounds if name in columns
+            }
+            for segment in segments
+        }
+
+    def delete_sequence(self, sequence: str) -> list[str]:
+        """See `Records.delete_sequence`."""
+        with self._holding(sequence):
+            found = self._known(sequence)
+            with explained(self._root):
+                self._document(sequence).unlink()
+        return found.paths
+
+    def delete_topic(self, sequence: str, topic: str) -> list[str]:
+        """See `Records.delete_topic`."""
+        return self._change(sequence, lambda found: found.without_topic(topic))
+
+    def delete_session(self, sequence: str, session: str) -> list[str]:
+        """See `Records.delete_session`."""
+        return self._change(sequence, lambda found: found.without_session(session))
+
+    def delete_notes(self, sequence: str, topic: str | None) -> None:
+        """See `Records.delete_notes`."""
+        self._change(sequence, lambda found: found.without_notes(topic))
+
+    def forget(self, live: Collection[str]) -> set[str]:
+        """See `Records.forget`."""
+        with explained(self._root):
+            for claim in (self._root / "claims").listing(recursive=True):
+                if claim.is_file() and claim.name not in live:
+                    with suppress(FileNotFoundError):
+                        claim.unlink()
+        return {path for one in self._all() for path in one.paths}
+
+    def _enter(self, claimed: Claim, new: NewSession) -> list[str]:
+        """Write the document with the session, in which moment it becomes visible; return what it replaces."""
+        now = self._load(claimed.sequence)
+        check_unchanged(claimed, now)
+        replaces = claimed.if_exists is IfExists.REPLACE
+        base = now if now and not replaces else None
+        base = base or SequenceDocument(
+            name=claimed.sequence, metadata=json.loads(new.metadata), created_ns=new.created_ns
+        )
+        self._put(base.with_session(new, completed_ns=time.time_ns()))
+        return now.paths if now and replaces else []
+
+    def _change(self, sequence: str, change: Callable[[SequenceDocument], SequenceDocument]) -> list[str]:
+        """Replace a document by what `change` makes of it; return the segments it names no longer."""
+        with self._holding(sequence):
+            found = self._known(sequence)
+            left = change(found)
+            self._put(left)
+        return sorted(set(found.paths) - set(left.paths))
+
+    def _known(self, sequence: str) -> SequenceDocument:
+        found = self._load(sequence)
+        if found is None:
+            raise NotInStore(f"there is no sequence {sequence!r}")
+        return found
+
+    @contextmanager
+    def _holding(self, sequence: str, *, session: str | None = None) -> Generator[None, None, None]:
+        """Hold the claim on a sequence for a moment, waiting for others who do the same."""
+        holder = session or new_session_id()
+        if session is None:
+            self._bucket.begin(holder).release()
+        try:
+            self._wait_for(holder, sequence)
+            try:
+                yield
+            finally:
+                self.release(holder, sequence)
+        finally:
+            if session is None:
+                self._bucket.discard(holder)
+
+    def _wait_for(self, holder: str, sequence: str) -> None:
+        for tries_left in reversed(range(_TRIES)):
+            try:
+                self._reserve(holder, sequence, self._bucket.is_live)
+            except SequenceExists as err:  # noqa: PERF203 - each try may find another holder
+                if not tries_left:
+                    raise SinkUnavailable(err.what, where=err.where, hint=err.hint) from err
+                time.sleep(_PAUSE_S * (0.5 + random.random()))  # noqa: S311 - so that two do not meet again
+            else:
+                return
+
+    def _reserve(self, session: str, sequence: str, is_live: Callable[[str], bool]) -> None:
+        """Claim a sequence, then look who else does; see the head of this file."""
+        own = self._claim(session, sequence)
+        with explained(self._root):
+            own.write_bytes(b"")
+            others = [one for one in own.parent.iterdir() if one.is_file() and one.name != session]
+            for other in others:
+                if is_live(other.name):
+                    own.unlink()
+                    raise SequenceExists(
+                        "another run is writing this sequence", where=sequence, hint="wait for it"
+                    )
+                with suppress(FileNotFoundError):
+                    other.unlink()
+
+    def _document(self, sequence: str) -> RemotePath:
+        return self._root / f"catalog/{encoded(sequence)}{_SUFFIX}"
+
+    def _claim(self, session: str, sequence: str) -> RemotePath:
+        return self._root / f"claims/{encoded(sequence)}/{session}"
+
+    def _paths(self) -> list[RemotePath]:
+        with explained(self._root):
+            below = (self._root / "catalog").iterdir()
+            return [path for path in below if path.is_file() and path.suffix == _SUFFIX]
+
+    def _name(self, path: RemotePath) -> str:
+        name = path.name.removesuffix(_SUFFIX)
+        return self._read(path).name if len(name) > _LONGEST_NAME else unquote(name)
+
+    def _all(self) -> list[SequenceDocument]:
+        with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="catalog") as pool:
+            return sorted(pool.map(self._read, self._paths()), key=lambda one: one.name)
+
+    def _load(self, sequence: str) -> SequenceDocument | None:
+        try:
+            return self._read(self._document(sequence))
+        except NotInStore:
+            return None
+
+    def _read(self, path: RemotePath) -> SequenceDocument:
+        with explained(path):
+            try:
+                return SequenceDocument.model_validate(json.loads(path.read_bytes()))
+            except FileNotFoundError as err:
+                raise NotInStore("it is not in the catalog", where=str(path)) from err
+            except (ValueError, ValidationError) as err:
+                problem = str(err).splitlines()[0]
+                raise SinkError(f"the document cannot be read: {problem}", where=str(path)) from err
+
+    def _put(self, document: SequenceDocument) -> None:
+        content = json.dumps(document.model_dump(mode="python"), default=str).encode()
+        with explained(self._root):
+            self._document(document.name).write_bytes(content)
+
+
+def _number(marker: bytes) -> int:
+    try:
+        return int(json.loads(marker)["format"])
+    except (ValueError, KeyError, TypeError) as err:
+        raise SinkError(f"{MARKER} does not say what format the store has", hint="check the URL") from err

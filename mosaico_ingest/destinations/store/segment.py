@@ -1,0 +1,301 @@
+"""Parquet segments: column encodings and the writer of one segment."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from mosaico_ingest.caching import remembered
+from mosaico_ingest.destinations.base import topic_schema
+from mosaico_ingest.destinations.store import files
+from mosaico_ingest.destinations.store.checksum import ContentHash, column_makers
+from mosaico_ingest.frozen import frozen
+from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.remote import AnyPath
+
+__all__ = [
+    "Bounds",
+    "Columns",
+    "Leaf",
+    "Segment",
+    "SegmentWriter",
+    "columns_of",
+    "sorted_rows",
+    "time_span",
+]
+
+_LEVEL = 1
+_SAMPLE_BYTES = 1 << 18
+_SAMPLES = 16
+_PIECE_BYTES = _SAMPLE_BYTES // _SAMPLES
+_TOO_LITTLE = 1 << 12
+_TOO_LITTLE_A_COLUMN = 1 << 8
+"""To begin compressing so little takes longer than to write it."""
+_WORTH_IT = 0.9
+
+
+@frozen
+class Leaf:
+    """One Parquet column: a value without children."""
+
+    parquet_path: str
+    """As Parquet spells it, as `transforms.list.item.x`."""
+    steps: tuple[str, ...]
+    """The names of the fields on the way, as `("transforms", "x")`."""
+    type: pa.DataType
+    repeated: bool
+    """Whether it lies inside a list."""
+
+    @property
+    def path(self) -> str:
+        """The way as users write it, as `transforms.x`."""
+        return ".".join(self.steps)
+
+
+class Columns:
+    """The Parquet columns of one schema, and how each is written.
+
+    Raises:
+        pa.ArrowInvalid: Parquet has no room for them; said before there is a file or a row.
+    """
+
+    def __init__(self, schema: pa.Schema) -> None:
+        if len(set(schema.names)) != len(schema.names):
+            raise pa.ArrowInvalid(f"a column name is used twice: {schema.names}")
+        pq.ParquetWriter(pa.BufferOutputStream(), schema, use_compliant_nested_type=False).close()
+        self.schema = schema
+        self.leaves = tuple(
+            leaf
+            for field in schema
+            for leaf in _walk(Leaf(field.name, (field.name,), field.type, repeated=False))
+        )
+        """In the order Parquet numbers them."""
+        self.makers = column_makers(schema)
+        self._few = _options(self.leaves, {leaf.parquet_path for leaf in self.leaves})
+
+    def writer_options(self, rows: pa.Table) -> dict[str, Any]:
+        """Return what `pq.ParquetWriter` is told: by type, and for blobs by how a sample of the first rows shrinks.
+
+        Splitting the bytes of floats makes them smaller and faster to write than plain or dictionary pages;
+        JPEGs and their like only cost time in a second compressor, and so do a few rows, which all but fit into
+        a block of a disk.
+        """
+        if rows.nbytes < max(_TOO_LITTLE, _TOO_LITTLE_A_COLUMN * len(self.leaves)):
+            return self._few
+        packed = (leaf for leaf in self.leaves if _is_blob(leaf) and not _shrinks(leaf, rows))
+        return _options(self.leaves, {leaf.parquet_path for leaf in packed})
+
+
+@remembered
+def columns_of(ontology: OntologyType) -> Columns:
+    """Return the columns of a topic; see `Columns`."""
+    return Columns(topic_schema(ontology))
+
+
+def _walk(at: Leaf) -> Iterator[Leaf]:
+    kind = at.type
+    if isinstance(kind, pa.StructType):
+        for child in kind:
+            path = f"{at.parquet_path}.{child.name}"
+            yield from _walk(Leaf(path, (*at.steps, child.name), child.type, at.repeated))
+    elif isinstance(kind, pa.ListType | pa.LargeListType | pa.FixedSizeListType):
+        path = f"{at.parquet_path}.list.{kind.value_field.name}"
+        yield from _walk(Leaf(path, at.steps, kind.value_type, repeated=True))
+    elif isinstance(kind, pa.MapType):
+        for child in (kind.key_field, kind.item_field):
+            path = f"{at.parquet_path}.key_value.{child.name}"
+            yield from _walk(Leaf(path, (*at.steps, child.name), child.type, repeated=True))
+    else:
+        yield at
+
+
+def _options(columns: tuple[Leaf, ...], packed: Collection[str]) -> dict[str, Any]:
+    """Return the writer's options; `packed` are the paths of columns that no codec makes smaller."""
+    zstd = [leaf.parquet_path for leaf in columns if leaf.parquet_path not in packed]
+    encodings = {leaf.parquet_path: "BYTE_STREAM_SPLIT" for leaf in columns if _splits(leaf.type)}
+    encodings[columns[0].parquet_path] = "DELTA_BINARY_PACKED"
+    return {
+        "compression": dict.fromkeys(zstd, "zstd") | dict.fromkeys(packed, "none"),
+        "compression_level": dict.fromkeys(zstd, _LEVEL),
+        "use_dictionary": [leaf.parquet_path for leaf in columns if _is_text(leaf.type)],
+        "column_encoding": encodings,
+        "write_statistics": [leaf.parquet_path for leaf in columns if not _is_blob(leaf)],
+    }
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    return pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind)
+
+
+def _is_blob(leaf: Leaf) -> bool:
+    return _is_binary(leaf.type) or (leaf.repeated and leaf.type in {pa.uint8(), pa.int8()})
+
+
+def _is_binary(kind: pa.DataType) -> bool:
+    return pa.types.is_binary(kind) or pa.types.is_large_binary(kind) or pa.types.is_binary_view(kind)
+
+
+def _splits(kind: pa.DataType) -> bool:
+    return pa.types.is_float32(kind) or pa.types.is_float64(kind)
+
+
+def _shrinks(leaf: Leaf, rows: pa.Table) -> bool:
+    sample = b"".join(_samples(leaf, rows))
+    if len(sample) < _TOO_LITTLE:
+        return True
+    packed = pa.Codec("zstd", compression_level=_LEVEL).compress(sample)
+    return len(packed) < _WORTH_IT * len(sample)
+
+
+def _samples(leaf: Leaf, rows: pa.Table) -> Iterator[bytes]:
+    """Yield bytes from the middle of a few values, where no header flatters the result."""
+    for chunk in rows.column(leaf.steps[0]).chunks[:_SAMPLES]:
+        values: pa.Array[Any] = chunk
+        for step in leaf.steps[1:]:
+            values = pc.struct_field(_values(values), step)
+        values = _values(values)
+        if _is_binary(values.type):
+            for blob in values.slice(len(values) // 2, _SAMPLES).drop_null():
+                data = blob.as_buffer()
+                yield data.slice(data.size // 2, min(data.size // 2, _PIECE_BYTES)).to_pybytes()
+        else:
+            yield values.drop_null().slice(len(values) // 2, _PIECE_BYTES).to_numpy().tobytes()
+
+
+def _values(array: pa.Array[Any]) -> pa.Array[Any]:
+    while isinstance(array, pa.ListArray | pa.LargeListArray | pa.FixedSizeListArray):
+        array = array.flatten()
+    return array
+
+
+Bounds = tuple[str, Any, Any]
+"""A column's path, its smallest and its largest value."""
+
+_LONGEST_TEXT = 256
+_LARGEST_INTEGER = 1 << 63
+_SEND_BYTES = 4 << 20
+"""As much as this is not left to be brought to the disk at the end."""
+
+
+@frozen
+class Segment:
+    """A finished segment."""
+
+    path: AnyPath
+    rows: int
+    stored_bytes: int
+    start_ns: int
+    end_ns: int
+    checksum: str
+    """Of the values of its rows; see `ContentHash`."""
+    bounds: tuple[Bounds, ...]
+
+
+class SegmentWriter:
+    """Writes row groups to `path`; the columns' codecs are chosen from the first rows."""
+
+    def __init__(self, path: AnyPath, columns: Columns, first_rows: pa.Table) -> None:
+        self.path = path
+        self.end_ns = -(1 << 63)
+        self._columns = columns
+        self._content = ContentHash(columns.makers)
+        self._file = files.create(path)
+        self._sent = 0
+        self._footer: list[pq.FileMetaData] = []
+        self._writer = pq.ParquetWriter(
+            self._file,
+            columns.schema,
+            use_compliant_nested_type=False,  # a list item's name is part of the type readers look for
+            sorting_columns=[pq.SortingColumn(0)],
+            write_batch_size=4096,
+            write_page_checksum=True,
+            metadata_collector=self._footer,
+            **columns.writer_options(first_rows),
+        )
+
+    @property
+    def written_bytes(self) -> int:
+        """How much is in the file by now."""
+        return self._file.tell()
+
+    def append(self, rows: pa.Table) -> None:
+        """Write one row group; the rows are sorted, and none is earlier than what is there."""
+        self._writer.write_table(rows, row_group_size=max(1, rows.num_rows))
+        written = self.written_bytes
+        if written - self._sent >= _SEND_BYTES:
+            files.send_ahead(self._file, self._sent, written)
+            self._sent = written
+        self._content.add(rows)
+        self.end_ns = rows.column(0)[-1].as_py()
+
+    def close(self) -> Segment:
+        """Finish the file; it may not be on the disk yet."""
+        self._writer.close()
+        self._file.close()
+        (footer,) = self._footer
+        bounds = tuple(_bounds(self._columns.leaves, footer))
+        _, start_ns, end_ns = bounds[0]
+        return Segment(
+            self.path,
+            footer.num_rows,
+            self.path.stat().st_size,
+            start_ns,
+            end_ns,
+            self._content.hexdigest(),
+            bounds,
+        )
+
+    def abandon(self) -> None:
+        """Close the file without caring for its content."""
+        # a RuntimeError says that there is no footer to collect
+        with suppress(OSError, pa.ArrowException, RuntimeError):
+            self._writer.close()
+        with suppress(OSError, pa.ArrowException):
+            self._file.close()
+
+
+def sorted_rows(batches: Iterable[pa.RecordBatch], schema: pa.Schema) -> pa.Table:
+    """Return the rows by time stamp; rows that are in order already are not copied, equal ones keep theirs."""
+    table = pa.Table.from_batches(batches, schema)
+    times = table.column(0).to_numpy()
+    if (times[1:] >= times[:-1]).all():
+        return table
+    return table.take(np.argsort(times, kind="stable"))
+
+
+def time_span(footer: pq.FileMetaData, group: int) -> tuple[int, int]:
+    """Return the first and the last time stamp of a row group that this file wrote."""
+    times = footer.row_group(group).column(0).statistics
+    if times is None or not times.has_min_max:
+        raise pa.ArrowInvalid("a row group has no statistics of timestamp_ns")
+    low: Any = times.min
+    high: Any = times.max
+    return low, high
+
+
+def _bounds(columns: tuple[Leaf, ...], footer: pq.FileMetaData) -> Iterable[Bounds]:
+    """Yield what the footer says of each column; columns without an order, or with longer values, are left out."""
+    groups = [footer.row_group(i) for i in range(footer.num_row_groups)]
+    for number, leaf in enumerate(columns):
+        statistics = [group.column(number).statistics for group in groups]
+        known = [each for each in statistics if each is not None and each.has_min_max]
+        if len(known) == len(groups):
+            lows: list[Any] = [each.min for each in known]
+            highs: list[Any] = [each.max for each in known]
+            low, high = min(lows), max(highs)
+            if _fits(low) and _fits(high):
+                yield leaf.path, low, high
+
+
+def _fits(value: object) -> bool:
+    if isinstance(value, str):
+        return len(value) <= _LONGEST_TEXT
+    if isinstance(value, int):
+        return -_LARGEST_INTEGER <= value < _LARGEST_INTEGER
+    return isinstance(value, float)

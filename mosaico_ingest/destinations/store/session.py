@@ -1,0 +1,379 @@
+"""A writing session of the store: topics, staged segments and one atomic commit."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import threading
+import time
+from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing, contextmanager
+from functools import partial
+from typing import Any
+
+import pyarrow as pa
+
+from mosaico_ingest import protocol
+from mosaico_ingest.destinations.base import Session, StoredTopic, check_batch, check_same_type
+from mosaico_ingest.destinations.store import catalog, files
+from mosaico_ingest.destinations.store.checksum import combined
+from mosaico_ingest.destinations.store.errors import explained
+from mosaico_ingest.destinations.store.files import new_session_id
+from mosaico_ingest.destinations.store.protocols import Files, Records
+from mosaico_ingest.destinations.store.segment import (
+    Segment,
+    SegmentWriter,
+    columns_of,
+    sorted_rows,
+    time_span,
+)
+from mosaico_ingest.destinations.store.store import Store
+from mosaico_ingest.errors import IngestError, SinkError
+from mosaico_ingest.frozen import frozen
+from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.remote import AnyPath, RemotePath
+
+__all__ = [
+    "Staging",
+    "StoreSession",
+    "StoreSink",
+    "StoreTopic",
+]
+
+_FIRST_GROUP_BYTES, _GROUP_BYTES = 4 << 20, 32 << 20
+"""The first row group, and the largest; between them each is twice the one before, so that writing begins early."""
+_GROUP_ROWS = 1 << 20
+_BIG_GROUP_BYTES = 8 << 20
+_BIG_ROW_BYTES = 16 << 10
+"""Rows larger than this on average gain nothing from larger groups: they are written while others are still read."""
+_SEGMENT_BYTES = 512 << 20
+
+
+class Staging:
+    """The topics of a session, where their segments are staged, and the memory they share."""
+
+    def __init__(self, where: AnyPath, staged: Callable[[str, int], AnyPath], *, buffer_bytes: int) -> None:
+        self.where = where
+        self._staged = staged
+        self.topics: dict[str, StoreTopic] = {}
+        self._buffer_bytes = buffer_bytes
+        self._numbers = itertools.count()
+
+    def next_path(self, topic: str) -> AnyPath:
+        """Return a path no other segment of the session has."""
+        return self._staged(topic, next(self._numbers))
+
+    def relieve(self) -> None:
+        """Write out the topic that holds most where all of them hold too much."""
+        topics = tuple(self.topics.values())
+        if sum(topic.buffered_bytes for topic in topics) > self._buffer_bytes:
+            max(topics, key=lambda topic: topic.buffered_bytes).flush()
+
+
+class StoreTopic:
+    """The writer of one topic; several threads may write, and an error leaves its batch out as a whole."""
+
+    def __init__(
+        self, staging: Staging, name: str, ontology: OntologyType, metadata: str, *, folder: AnyPath
+    ) -> None:
+        self.name = name
+        self.folder = folder
+        """Where its segments lie once they are committed."""
+        self.ontology = ontology
+        self.metadata = metadata
+        self._columns = columns_of(ontology)
+        self.schema = self._columns.schema
+        self.created_ns = time.time_ns()
+        self.buffered_bytes = 0
+        self.segments: list[Segment] = []
+        self._staging = staging
+        self._batches: list[pa.RecordBatch] = []
+        self._settled = 0
+        self._rows = 0
+        self._most_bytes = _FIRST_GROUP_BYTES
+        self._broken = False
+        self._writer: SegmentWriter | None = None
+        self._lock = threading.Lock()
+
+    def write(self, batch: pa.RecordBatch) -> None:
+        """Append rows; see `TopicWriter.write`."""
+        check_batch(batch, self.schema, where=self.name)
+        if not batch.num_rows:
+            return
+        with self._lock:
+            self._refuse_if_broken()
+            self._batches.append(batch)
+            self._rows += batch.num_rows
+            self.buffered_bytes += batch.nbytes
+            full = self._is_full()
+        if full:
+            self.flush()
+        else:
+            self._staging.relieve()
+
+    def _is_full(self) -> bool:
+        big = self.buffered_bytes >= _BIG_ROW_BYTES * self._rows
+        return (
+            self.buffered_bytes >= (_BIG_GROUP_BYTES if big else self._most_bytes)
+            or self._rows >= _GROUP_ROWS
+        )
+
+    def flush(self) -> None:
+        """Write what is in memory as one row group."""
+        with self._writing():
+            self._flush()
+
+    def close(self) -> None:
+        """Write what is in memory and finish the last segment."""
+        with self._writing():
+            self._flush()
+            self._finish_segment()
+
+    def settle(self) -> None:
+        """Wait until the segments finished so far are there to stay."""
+        for segment in self.segments[self._settled :]:
+            with explained(self._staging.where):
+                files.settle(segment.path)
+            self._settled += 1
+
+    def abandon(self) -> None:
+        """Drop what is in memory, and close the open file."""
+        with self._lock:
+            self._batches.clear()
+            if self._writer is not None:
+                self._writer.abandon()
+                self._writer = None
+
+    @contextmanager
+    def _writing(self) -> Generator[None, None, None]:
+        """Hold the lock; a failure inside leaves an unfinished file, so the topic can no longer be committed."""
+        with self._lock, explained(self._staging.where):
+            self._refuse_if_broken()
+            self._broken = True
+            yield
+            self._broken = False
+
+    def _refuse_if_broken(self) -> None:
+        if self._broken:
+            raise SinkError("an earlier write of the topic failed", where=self.name)
+
+    def _flush(self) -> None:
+        batches, self._batches = self._batches, []
+        self._rows = self.buffered_bytes = 0
+        if batches:
+            self._most_bytes = min(2 * self._most_bytes, _GROUP_BYTES)
+            self._write_group(sorted_rows(batches, self.schema))
+
+    def _write_group(self, rows: pa.Table) -> None:
+        if self._writer is not None and rows.column(0)[0].as_py() < self._writer.end_ns:
+            self._finish_segment()  # a segment is sorted from its first row to its last
+        if self._writer is None:
+            self._writer = SegmentWriter(self._staging.next_path(self.name), self._columns, rows)
+        self._writer.append(rows)
+        if self._writer.written_bytes >= _SEGMENT_BYTES:
+            self._finish_segment()
+            self.settle()  # as much as this goes to the disk while others are still read
+
+    def _finish_segment(self) -> None:
+        if self._writer is not None:
+            self.segments.append(self._writer.close())
+            self._writer = None
+
+
+_WORTH_A_THREAD_BYTES = 1 << 18
+"""A topic that holds less is written sooner than handed over, unless it goes behind a URL."""
+_FAST_S = 0.005
+_AT_ONCE = 8
+_WAITING = 2
+"""How many threads may wait for the disk while others encode."""
+
+
+class StoreSession:
+    """One writing session; `commit` or `discard` ends it."""
+
+    def __init__(
+        self,
+        layout: Files,
+        catalog: Records,
+        sequence: str,
+        metadata: str,
+        *,
+        if_exists: IfExists,
+        buffer_bytes: int,
+    ) -> None:
+        self.id = new_session_id()
+        self.created_ns = time.time_ns()
+        self._layout = layout
+        self._catalog = catalog
+        self._metadata = metadata
+        self._given: dict[str, StoreTopic] = {}
+        self._notes: list[catalog.NewNote] = []
+        self._staging = Staging(
+            layout.root, partial(layout.staged, self.id, sequence), buffer_bytes=buffer_bytes
+        )
+        self._lease = layout.begin(self.id)
+        self._held = ExitStack()
+        try:
+            self._held.enter_context(closing(catalog.keep_open()))
+            self._claim = catalog.claim(self.id, sequence, if_exists, is_live=layout.is_live)
+        except BaseException:
+            self._leave()
+            raise
+
+    def topic(self, name: str, ontology: OntologyType, metadata: Mapping[str, Any]) -> StoreTopic:
+        """Open a topic; see `Session.topic`."""
+        path = protocol.check_topic_name(name)
+        described = protocol.check_metadata(metadata, where=name)
+        if path in self._staging.topics:
+            raise SinkError("the topic is open already", where=name)
+        held = self._claim.types.get(path)
+        if held is not None:
+            check_same_type(held, ontology, where=name)
+        with explained(name):
+            folder = self._layout.topic(self._claim.sequence, path)
+            topic = StoreTopic(self._staging, path, ontology, described, folder=folder)
+        self._staging.topics[path] = self._given[name] = topic
+        return topic
+
+    def note_error(self, message: str, *, topic: str | None = None) -> None:
+        """Attach an error; see `Session.note_error`."""
+        path = None if topic is None else protocol.check_topic_name(topic)
+        self._notes.append(catalog.NewNote(path, message, time.time_ns()))
+
+    def stored(self) -> tuple[StoredTopic, ...]:
+        """Return what the footers of the committed files say; see `Session.stored`."""
+        return tuple(self._stored(name, topic) for name, topic in self._given.items())
+
+    def commit(self) -> None:
+        """Finish every topic, move the segments to their places, and enter them in the catalog at once."""
+        self._close_topics()
+        moves = {
+            segment.path: topic.folder / segment.path.name
+            for topic in self._staging.topics.values()
+            for segment in topic.segments
+        }
+        topics = tuple(map(self._placed, self._staging.topics.values()))
+        new = catalog.NewSession(self.id, self._metadata, self.created_ns, topics, tuple(self._notes))
+        try:
+            with explained(self._layout.root):
+                self._layout.publish(moves)
+            replaced = self._catalog.commit(self._claim, new)
+        except BaseException:
+            if not self._may_be_entered():
+                self._layout.remove(moves.values())
+            raise
+        self._leave()
+        self._layout.remove(self._layout.root / path for path in replaced)
+
+    def _close_topics(self) -> None:
+        """Close large topics on threads, and small ones here meanwhile."""
+        # the largest first, so that no thread is left with it at the end
+        waiting = sorted(self._staging.topics.values(), key=lambda topic: -topic.buffered_bytes)
+        most = 0 if isinstance(self._layout.root, RemotePath) else _WORTH_A_THREAD_BYTES
+        large = [topic for topic in waiting if topic.buffered_bytes >= most]
+        small = waiting[len(large) :]
+        with ThreadPoolExecutor((os.cpu_count() or 1) + _WAITING, thread_name_prefix="segment") as pool:
+            closing_large = pool.map(_close_and_settle, large)
+            for topic in small:
+                topic.close()
+            _settle(small)
+            list(closing_large)
+
+    def discard(self) -> None:
+        """Leave no trace."""
+        with ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="segment") as pool:
+            list(pool.map(StoreTopic.abandon, self._staging.topics.values()))
+        try:
+            self._catalog.release(self.id, self._claim.sequence)
+        except SinkError:
+            return  # the error that ended the session matters more, and the name is free without its lock
+        finally:
+            self._leave()
+
+    def _may_be_entered(self) -> bool:
+        """Say whether the catalog has the session although its commit failed, as its answer may be lost.
+
+        Where it cannot be read it may have: files that nobody needs go with the garbage, lost ones do not come back.
+        """
+        try:
+            info = self._catalog.sequence(self._claim.sequence)
+        except IngestError:
+            return True
+        return info is not None and any(session.id == self.id for session in info.sessions)
+
+    def _placed(self, topic: StoreTopic) -> catalog.NewTopic:
+        relative = self._layout.relative(topic.folder)
+        segments = {f"{relative}/{segment.path.name}": segment for segment in topic.segments}
+        return catalog.NewTopic(
+            topic.name, topic.ontology, topic.schema, topic.metadata, topic.created_ns, segments
+        )
+
+    def _stored(self, name: str, topic: StoreTopic) -> StoredTopic:
+        rows = stored_bytes = 0
+        times: list[int] = []
+        for segment in topic.segments:
+            path = topic.folder / segment.path.name
+            with explained(path):
+                footer = files.footer(path)
+                stored_bytes += path.stat().st_size
+                rows += footer.num_rows
+                for group in range(footer.num_row_groups):
+                    times += time_span(footer, group)
+        checksum = combined(s.checksum for s in sorted(topic.segments, key=lambda s: (s.start_ns, s.path)))
+        return StoredTopic(
+            name, rows, min(times, default=None), max(times, default=None), stored_bytes, checksum
+        )
+
+    def _leave(self) -> None:
+        self._held.close()
+        self._lease.release()
+        self._layout.discard(self.id)
+
+
+def _close_and_settle(topic: StoreTopic) -> None:
+    topic.close()
+    topic.settle()
+
+
+def _settle(topics: Sequence[StoreTopic]) -> None:
+    """Wait for the disk one topic after the other where it is fast, for several at once where it turns out not to be."""
+    began = time.monotonic()
+    for done, topic in enumerate(topics):
+        if time.monotonic() - began > _FAST_S:
+            with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="fsync") as pool:
+                list(pool.map(StoreTopic.settle, topics[done:]))
+            return
+        topic.settle()
+
+
+_BUFFER_BYTES = 96 << 20
+
+
+@frozen
+class StoreSink:
+    """Writes sequences into a store; one session holds at most about `buffer_bytes` in memory."""
+
+    store: Store
+    buffer_bytes: int = _BUFFER_BYTES
+
+    @contextmanager
+    def open(
+        self, sequence: str, metadata: Mapping[str, Any], *, if_exists: IfExists = IfExists.FAIL
+    ) -> Generator[Session, None, None]:
+        """Open a session; see `Sink.open`."""
+        session = StoreSession(
+            self.store.layout,
+            self.store.catalog,
+            protocol.check_sequence_name(sequence),
+            protocol.check_metadata(metadata, where=sequence),
+            if_exists=if_exists,
+            buffer_bytes=self.buffer_bytes,
+        )
+        try:
+            yield session
+            session.commit()
+        except BaseException:
+            session.discard()
+            raise

@@ -1,0 +1,350 @@
+"""The embedded store: open, query, read in time order, verify, delete, collect garbage."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from mosaico_ingest import protocol
+from mosaico_ingest.destinations.store.catalog import Catalog, NewNote
+from mosaico_ingest.destinations.store.checksum import ContentHash, column_makers
+from mosaico_ingest.destinations.store.errors import NotInStore, explained
+from mosaico_ingest.destinations.store.files import Layout, opened
+from mosaico_ingest.destinations.store.model import Collected, SegmentInfo, SequenceInfo, TopicInfo
+from mosaico_ingest.destinations.store.protocols import Files, Records
+from mosaico_ingest.destinations.store.segment import sorted_rows, time_span
+from mosaico_ingest.errors import SinkError
+from mosaico_ingest.findings import offered
+from mosaico_ingest.frozen import frozen
+from mosaico_ingest.remote import AnyPath, RemotePath, as_path
+
+__all__ = [
+    "Checked",
+    "Store",
+    "Window",
+    "count",
+    "scan",
+    "verify",
+]
+
+
+@frozen
+class Checked:
+    """One segment that was read to its end, and what is wrong with it."""
+
+    topic: str
+    segment: SegmentInfo
+    problem: str | None
+
+
+def verify(info: SequenceInfo) -> Iterator[Checked]:
+    """Read every segment of a sequence; a damaged page, a missing file and rows the catalog does not know are problems."""
+    for topic in info.topics:
+        for segment in topic.segments:
+            yield Checked(topic.name, segment, _problem(topic, segment))
+
+
+def _problem(topic: TopicInfo, segment: SegmentInfo) -> str | None:
+    try:
+        with opened(segment.path, page_checksum_verification=True) as file:
+            if not file.schema_arrow.equals(topic.schema):
+                return "its columns are not those of its topic"
+            content = ContentHash(column_makers(file.schema_arrow))
+            found = (segment.path.stat().st_size, *_rows_and_span(file, content))
+    except FileNotFoundError:
+        return "is not there"
+    except (OSError, pa.ArrowException) as error:
+        return str(error).partition("\n")[0]
+    wanted = (segment.stored_bytes, segment.rows, segment.start_ns, segment.end_ns)
+    if found != wanted:
+        form = "{} bytes, {} rows in [{}, {}]"
+        return f"the catalog says {form.format(*wanted)}, the file has {form.format(*found)}"
+    if segment.checksum not in {None, content.hexdigest()}:
+        return f"its rows have the checksum {content.hexdigest()}, those that were written {segment.checksum}"
+    return None
+
+
+def _rows_and_span(file: pq.ParquetFile, content: ContentHash) -> tuple[int, int, int]:
+    """Return how many rows the file really gives, after adding them to `content`, and the span its row groups state."""
+    rows = 0
+    for batch in file.iter_batches(batch_size=1 << 12):
+        content.add(batch)
+        rows += batch.num_rows
+    spans = [time_span(file.metadata, group) for group in range(file.num_row_groups)]
+    return rows, min((low for low, _ in spans), default=0), max((high for _, high in spans), default=0)
+
+
+_BATCH_ROWS = 1 << 16
+
+
+@frozen
+class Window:
+    """A span of time, its start in, its end out; None is open."""
+
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+    def overlaps(self, start_ns: int, end_ns: int) -> bool:
+        """Return whether rows from `start_ns` to `end_ns`, both in, may be inside."""
+        early = self.start_ns is not None and end_ns < self.start_ns
+        late = self.end_ns is not None and start_ns >= self.end_ns
+        return not early and not late
+
+    def covers(self, start_ns: int, end_ns: int) -> bool:
+        """Return whether rows from `start_ns` to `end_ns`, both in, are all inside."""
+        early = self.start_ns is not None and start_ns < self.start_ns
+        late = self.end_ns is not None and end_ns >= self.end_ns
+        return not early and not late
+
+    def cut(self, batch: pa.RecordBatch) -> pa.RecordBatch:
+        """Return the rows inside; the batch is sorted and is not copied."""
+        times = batch.column(0).to_numpy()
+        start = 0 if self.start_ns is None else int(np.searchsorted(times, self.start_ns))
+        end = len(times) if self.end_ns is None else int(np.searchsorted(times, self.end_ns))
+        return batch.slice(start, max(0, end - start))
+
+
+def scan(segments: Sequence[SegmentInfo], schema: pa.Schema, window: Window) -> Iterator[pa.RecordBatch]:
+    """Yield the rows of the columns in `schema`, whose first is `timestamp_ns`, sorted by it."""
+    wanted = [segment for segment in segments if window.overlaps(segment.start_ns, segment.end_ns)]
+    for together in _overlapping(wanted):
+        streams = [_read(segment, schema, window) for segment in together]
+        yield from streams[0] if len(streams) == 1 else _merge(streams, schema)
+
+
+def count(
+    segments: Sequence[SegmentInfo], schema: pa.Schema, window: Window
+) -> tuple[int, int | None, int | None]:
+    """Return how many rows are inside, and the first and the last of their time stamps."""
+    times = pa.schema([schema.field(0)])
+    rows, stamps = 0, list[int]()
+    for segment in segments:
+        if window.covers(segment.start_ns, segment.end_ns):
+            rows += segment.rows
+            stamps += [segment.start_ns, segment.end_ns]
+            continue
+        for batch in scan([segment], times, window):
+            rows += batch.num_rows
+            stamps += [batch.column(0)[0].as_py(), batch.column(0)[-1].as_py()]
+    return rows, min(stamps, default=None), max(stamps, default=None)
+
+
+def _overlapping(segments: Iterable[SegmentInfo]) -> Iterator[list[SegmentInfo]]:
+    """Yield groups of segments, in time order, that have no time in common with another group."""
+    group: list[SegmentInfo] = []
+    end_ns = 0
+    for segment in sorted(segments, key=lambda each: each.start_ns):
+        if group and segment.start_ns >= end_ns:
+            yield group
+            group = []
+        end_ns = max(end_ns, segment.end_ns) if group else segment.end_ns
+        group.append(segment)
+    if group:
+        yield group
+
+
+def _read(segment: SegmentInfo, schema: pa.Schema, window: Window) -> Iterator[pa.RecordBatch]:
+    with explained(str(segment.path)), opened(segment.path) as file:
+        for group in range(file.num_row_groups):
+            if not window.overlaps(*time_span(file.metadata, group)):
+                continue
+            for batch in file.iter_batches(_BATCH_ROWS, row_groups=[group], columns=schema.names):
+                inside = window.cut(batch)
+                if inside.num_rows:
+                    yield pa.RecordBatch.from_arrays(inside.columns, schema=schema)
+
+
+def _merge(streams: Sequence[Iterator[pa.RecordBatch]], schema: pa.Schema) -> Iterator[pa.RecordBatch]:
+    """Yield the rows of sorted streams in order; one batch of each is in memory at a time."""
+    heads = [next(stream, None) for stream in streams]
+    while live := [head for head in heads if head is not None]:
+        horizon = min(head.column(0)[-1].as_py() for head in live)
+        ready: list[pa.RecordBatch] = []
+        for i, head in enumerate(heads):
+            if head is None:
+                continue
+            split = int(np.searchsorted(head.column(0).to_numpy(), horizon, side="right"))
+            ready.append(head.slice(0, split))
+            heads[i] = head.slice(split) if split < head.num_rows else next(streams[i], None)
+        yield from sorted_rows(ready, schema).combine_chunks().to_batches(_BATCH_ROWS)
+
+
+_GRACE_S = 10.0
+
+
+@frozen
+class Store:
+    """A folder of Parquet segments and the catalog that says what they are; made by `Store.open`."""
+
+    layout: Files
+    catalog: Records
+
+    @classmethod
+    def open(cls, path: str | AnyPath, *, create: bool = True) -> Store:
+        """Open the store in the folder or behind the URL `path`; it is made where there is none, unless `create` is off.
+
+        Raises:
+            SinkError: There is no store, it cannot be written, or a newer version made it.
+        """
+        place = as_path(path)
+        if isinstance(place, RemotePath):
+            from mosaico_ingest.destinations.store.files import Bucket  # noqa: PLC0415 - only stores behind URLs need it
+            from mosaico_ingest.destinations.store.object_catalog import Documents  # noqa: PLC0415 - the same
+
+            bucket = Bucket(place)
+            return cls(bucket, Documents(bucket, create=create))
+        layout = Layout(place)
+        return cls(layout, Catalog(layout.catalog, create=create))
+
+    @classmethod
+    def find(cls, path: AnyPath) -> Store | None:
+        """Open the store in a folder or behind a URL; None where there is none."""
+        if isinstance(path, RemotePath):
+            from mosaico_ingest.destinations.store.files import Bucket  # noqa: PLC0415 - only stores behind URLs need it
+
+            is_there = Bucket(path).is_there()
+        else:
+            is_there = Layout(path).catalog.is_file()
+        return cls.open(path, create=False) if is_there else None
+
+    @property
+    def path(self) -> AnyPath:
+        """The folder."""
+        return self.layout.root
+
+    def sequences(self) -> tuple[SequenceInfo, ...]:
+        """Return every sequence, by name."""
+        return self.catalog.sequences()
+
+    def names(self) -> tuple[str, ...]:
+        """Return the names of all sequences, sorted."""
+        return tuple(self.catalog.names())
+
+    def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
+        """Return the smallest and largest value of columns, as `pose.x`, by segment, where they are known."""
+        return self.catalog.bounds(topic, columns)
+
+    def find_sequence(self, name: str) -> SequenceInfo | None:
+        """Return one sequence, None where there is none of that name."""
+        return self.catalog.sequence(name)
+
+    def sequence(self, name: str) -> SequenceInfo:
+        """Return one sequence.
+
+        Raises:
+            SinkError: There is none of that name; the error lists those there are.
+        """
+        info = self.catalog.sequence(name)
+        if info is None:
+            known = self.catalog.names()
+            raise NotInStore(
+                f"there is no sequence {name!r}", where=str(self.path), hint=offered(known, [name])
+            )
+        return info
+
+    def topic(self, sequence: str, topic: str) -> TopicInfo:
+        """Return one topic; its leading slash may be left out.
+
+        Raises:
+            SinkError: There is none of that name; the error lists those there are.
+        """
+        topics = {info.name: info for info in self.sequence(sequence).topics}
+        name = f"/{topic.removeprefix('/')}"
+        if name not in topics:
+            raise NotInStore(f"there is no topic {name!r}", where=sequence, hint=offered(topics, [name]))
+        return topics[name]
+
+    def create_sequence(self, sequence: str, metadata: Mapping[str, Any]) -> None:
+        """Enter a sequence that sessions will be added to; a `StoreSink` does it with its first session.
+
+        Raises:
+            SequenceExists: There is one of that name.
+            SinkError: The name or the metadata is refused.
+        """
+        described = protocol.check_metadata(metadata, where=sequence)
+        self.catalog.create(protocol.check_sequence_name(sequence), described)
+
+    def add_note(self, sequence: str, message: str, *, topic: str | None = None) -> None:
+        """Attach an error to a sequence, or to one of its topics."""
+        self.catalog.note(sequence, NewNote(topic, message, time.time_ns()))
+
+    def delete_notes(self, sequence: str, *, topic: str | None = None) -> None:
+        """Remove the notes of a sequence itself, or those of one topic."""
+        self.catalog.delete_notes(sequence, topic)
+
+    def paths(self, sequence: str, topic: str) -> tuple[AnyPath, ...]:
+        """Return the Parquet files of a topic, each sorted by `timestamp_ns`."""
+        return tuple(segment.path for segment in self.topic(sequence, topic).segments)
+
+    def scan(
+        self,
+        sequence: str,
+        topic: str,
+        *,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        columns: Sequence[str] | None = None,
+    ) -> pa.RecordBatchReader:
+        """Read a topic's rows sorted by `timestamp_ns`, from `start_ns` up to but without `end_ns`.
+
+        `columns` names top-level columns; `timestamp_ns` always comes, and comes first.
+        """
+        info = self.topic(sequence, topic)
+        schema = info.schema
+        if columns is not None:
+            schema = _chosen(schema, columns, where=f"{sequence}{info.name}")
+        return pa.RecordBatchReader.from_batches(
+            schema, scan(info.segments, schema, Window(start_ns, end_ns))
+        )
+
+    def delete_sequence(self, sequence: str) -> None:
+        """Remove a sequence with all it holds; SinkError where there is none."""
+        self._remove(self.catalog.delete_sequence(sequence))
+
+    def delete_topic(self, sequence: str, topic: str) -> None:
+        """Remove one topic; SinkError where there is none."""
+        self._remove(self.catalog.delete_topic(sequence, f"/{topic.removeprefix('/')}"))
+
+    def delete_session(self, sequence: str, session: str) -> None:
+        """Remove what one session added; SinkError where there is none."""
+        self._remove(self.catalog.delete_session(sequence, session))
+
+    def collect_garbage(self, *, grace_s: float = _GRACE_S) -> Collected:
+        """Remove what crashed writers and interrupted deletions left; live sessions are not touched.
+
+        A staging folder younger than `grace_s` may belong to a session that is about to take its lock.
+        """
+        with explained(self.path):
+            files = list(self.layout.segment_files())
+            sessions = self.layout.open_sessions()
+            live = {session for session in sessions if self.layout.in_use(session, grace_s)}
+            known = self.catalog.forget(live)
+            orphans = [file for file in files if self._is_orphan(file, known, live)]
+            dead = sorted(set(sessions) - live)
+            staged = [file for session in dead for file in self.layout.staged_files(session)]
+            stored_bytes = sum(file.stat().st_size for file in (*orphans, *staged))
+            self.layout.remove(orphans)
+            for session in dead:
+                self.layout.discard(session)
+        return Collected(len(dead), len(orphans) + len(staged), stored_bytes)
+
+    def _remove(self, paths: Iterable[str]) -> None:
+        self.layout.remove(self.path / path for path in paths)
+
+    def _is_orphan(self, file: AnyPath, known: set[str], live: set[str]) -> bool:
+        return self.layout.relative(file) not in known and file.name.partition("-")[0] not in live
+
+
+def _chosen(schema: pa.Schema, columns: Sequence[str], *, where: str) -> pa.Schema:
+    unknown = [name for name in columns if name not in schema.names]
+    if unknown:
+        raise SinkError(
+            f"there is no column {unknown[0]!r}", where=where, hint=offered(schema.names, unknown[:1])
+        )
+    wanted = dict.fromkeys([schema.names[0], *columns])
+    return pa.schema([schema.field(name) for name in wanted])

@@ -1,0 +1,83 @@
+"""The base of JSON documents (reports, plans, inspections), and JSON Schemas of models.
+
+Pydantic's `use_attribute_docstrings` gives the same, but reads the source of every class whenever it is imported.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from itertools import pairwise
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic_core.core_schema import ModelSchema
+
+from mosaico_ingest.findings import encodable
+
+__all__ = [
+    "Part",
+    "schema_of",
+]
+
+
+def schema_of(
+    model: type[BaseModel], *, mode: Literal["validation", "serialization"] = "validation"
+) -> dict[str, Any]:
+    """Return the JSON Schema of `model`; fields are named as files name them."""
+    return model.model_json_schema(mode=mode, schema_generator=_WithDocstrings)
+
+
+class _WithDocstrings(GenerateJsonSchema):
+    def model_schema(self, schema: ModelSchema) -> JsonSchemaValue:
+        """Add to the members of one model what stands under its fields."""
+        written, model = super().model_schema(schema), schema["cls"]
+        model.model_rebuild()  # one that names a later class knows its aliases only then
+        members = written.get("properties", {})
+        for owner in reversed(model.__mro__):
+            if not issubclass(owner, BaseModel) or owner is BaseModel:
+                continue
+            for name, text in _docstrings(owner).items():
+                field = model.model_fields.get(name)
+                member = members.get((field and field.alias) or name)
+                if member is not None:
+                    member.setdefault("description", text)
+        return written
+
+
+def _docstrings(owner: type) -> dict[str, str]:
+    """Return the string under each annotated name of a class body."""
+    tree = ast.parse(inspect.cleandoc("\n" + inspect.getsource(owner)))
+    body = tree.body[0].body if isinstance(tree.body[0], ast.ClassDef) else []
+    return {
+        above.target.id: inspect.cleandoc(below.value.value)
+        for above, below in pairwise(body)
+        if isinstance(above, ast.AnnAssign) and isinstance(above.target, ast.Name)
+        if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+        if isinstance(below.value.value, str)
+    }
+
+
+class Part(BaseModel):
+    """A model whose texts can be encoded, whatever the names of files hold."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _spell_texts(cls, values: Any) -> Any:  # noqa: ANN401 - whatever stands for a part
+        """Look at all fields at once: a validator for each made every part slow to build."""
+        return (
+            {name: _encodable(value) for name, value in values.items()}
+            if isinstance(values, dict)
+            else values
+        )
+
+
+def _encodable(value: Any) -> Any:  # noqa: ANN401 - every field of every part
+    if type(value) is str:
+        return encodable(value)
+    if isinstance(value, tuple):
+        return tuple(encodable(item) if type(item) is str else item for item in value)
+    return value

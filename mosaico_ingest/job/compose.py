@@ -1,0 +1,357 @@
+"""Composition of manifests: environment variables, placeholders, `extends` and `matrix`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import count, product
+from os.path import normpath, relpath
+from pathlib import Path as File
+
+from mosaico_ingest.findings import Finding, Severity, Span
+from mosaico_ingest.frozen import frozen
+from mosaico_ingest.job.yaml_source import (
+    KeyPath,
+    Scalar,
+    Source,
+    Value,
+    load_source,
+)
+from mosaico_ingest.remote import is_url
+from mosaico_ingest.textfile import read_whole
+
+__all__ = [
+    "EXTENDS_KEY",
+    "MATRIX_KEY",
+    "MAX_FILES",
+    "MAX_JOBS",
+    "PLACEHOLDERS",
+    "Filled",
+    "Placeholder",
+    "bases_of",
+    "combinations",
+    "extended",
+    "fill_in",
+    "fill_in_cell",
+    "placeholders_in",
+    "variables",
+]
+
+PLACEHOLDERS = ("stem", "name", "parent", "date", "index")
+
+_WIDTH = re.compile(r"0?[0-9]")
+_BRACED = re.compile(r"\{([^{}]*)\}")
+
+
+@frozen
+class Placeholder:
+    """`{index:03}` at `start:end` of a name."""
+
+    start: int
+    end: int
+    name: str
+    width: str
+
+    @property
+    def known(self) -> bool:
+        """Whether something can stand for it; only `index` has a width."""
+        return self.name in PLACEHOLDERS and (
+            not self.width or (self.name == "index" and _WIDTH.fullmatch(self.width) is not None)
+        )
+
+
+def placeholders_in(template: str) -> Iterator[Placeholder]:
+    """Yield what stands in braces."""
+    for match in _BRACED.finditer(template):
+        name, _, width = match[1].partition(":")
+        yield Placeholder(match.start(), match.end(), name, width)
+
+
+MATRIX_KEY = "matrix"
+MAX_JOBS = 1000
+"""How many jobs one manifest may expand to."""
+
+
+def combinations(document: Value) -> list[dict[str, str]]:
+    """Return the variables of each job a document stands for; a single one without any where it has no matrix.
+
+    A mapping of lists is every combination of their values, a list is its items. What the model refuses counts as
+    not there, and beyond `MAX_JOBS` there is none.
+    """
+    matrix = document.get(MATRIX_KEY) if isinstance(document, dict) else None
+    if isinstance(matrix, list):
+        cells = [variables(item) for item in matrix[:MAX_JOBS]]
+    elif isinstance(matrix, dict):
+        axes = {str(name): values for name, values in matrix.items() if isinstance(values, list) and values}
+        count = 1
+        for values in axes.values():
+            count *= len(values)
+        chosen = product(*axes.values()) if axes and count <= MAX_JOBS else ()
+        cells = [variables(dict(zip(axes, values, strict=True))) for values in chosen]
+    else:
+        cells = []
+    return cells or [{}]
+
+
+def variables(mapping: Value) -> dict[str, str]:
+    """Return the variables a mapping gives values to; what is no text or number counts as not there."""
+    if not isinstance(mapping, dict):
+        return {}
+    return {str(name): str(value) for name, value in mapping.items() if isinstance(value, str | int)}
+
+
+_REFERENCE = re.compile(r"\$(?:(\$)|\{([^{}]*)\}|(?=\{))")
+_WITHOUT = {("extends",), ("defaults",), ("matrix",)}
+"""Sections in which there are no variables."""
+_INSIDE = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)(?::([-?])(.*))?", re.DOTALL)
+
+
+@dataclass(slots=True)
+class Filled:
+    """The document with its variables filled in."""
+
+    value: Value
+    findings: list[Finding] = field(default_factory=list[Finding])
+    changed: set[KeyPath] = field(default_factory=set[KeyPath])
+    """Where a variable was; what stands there now may be a secret."""
+    unknown: set[KeyPath] = field(default_factory=set[KeyPath])
+    """Where it could not be filled in; the text stands there as written."""
+
+
+def fill_in(source: Source, env: Mapping[str, str] | None, cell: Mapping[str, str] | None = None) -> Filled:
+    """Fill in the variables of every text; without `env` only those with a default, and none is missed.
+
+    The values of `cell` come first (without it, those of the first job of the document's matrix), then those of the
+    environment, then the document's own `defaults`.
+    """
+    known = _Variables(
+        combinations(source.value)[0] if cell is None else cell, env, variables(source.at(("defaults",)))
+    )
+    return _filled(source, known)
+
+
+def fill_in_cell(source: Source, cell: Mapping[str, str]) -> Filled:
+    """Fill in the variables of a matrix and leave every other one as it is written."""
+    return _filled(source, _Variables(cell, None, {}, alone=True))
+
+
+def _filled(source: Source, known: _Variables) -> Filled:
+    filled = Filled(None)
+    filled.value = _value(source.value, (), source, known, filled)
+    return filled
+
+
+@frozen
+class _Variables:
+    """The values of variables; of several sources the first that has one wins."""
+
+    cell: Mapping[str, str]
+    env: Mapping[str, str] | None
+    """None: not looked at, and nothing is missed."""
+    defaults: Mapping[str, str]
+    alone: bool = False
+    """Whether nothing but the cell counts, and all else stays to be filled in later."""
+
+    def get(self, name: str) -> str | None:
+        if name in self.cell:
+            return self.cell[name]
+        return (self.env or {}).get(name) or self.defaults.get(name)
+
+
+def _value(value: Value, path: KeyPath, source: Source, known: _Variables, out: Filled) -> Value:
+    if path in _WITHOUT:
+        return value
+    if isinstance(value, dict):
+        return {key: _value(inner, (*path, key), source, known, out) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_value(inner, (*path, index), source, known, out) for index, inner in enumerate(value)]
+    if isinstance(value, str) and "$" in value:
+        return _text(value, path, source, known, out)
+    return value
+
+
+def _text(text: str, path: KeyPath, source: Source, known: _Variables, out: Filled) -> str:
+    def replace(match: re.Match[str]) -> str:
+        if match[1]:
+            return "$$" if known.alone else "$"
+        if known.alone and (match[2] or "").partition(":")[0] not in known.cell:
+            return match[0]
+        out.changed.add(path)
+        inside = _INSIDE.fullmatch(match[2] or "")
+        if inside is None:
+            report(
+                "variable-syntax",
+                f"{'${' if match[0] == '$' else match[0]} is no variable",
+                "write ${NAME}, or $$ for a dollar",
+                match,
+            )
+            return match[0]
+        name, operator, rest = inside.groups()
+        value = known.get(name)
+        if value is not None:
+            return value.replace("$", "$$") if known.alone else value
+        if operator == "-":
+            return rest
+        out.unknown.add(path)
+        if known.env is not None:
+            why = f": {rest}" if operator == "?" and rest else ""
+            report("unset-variable", f"{name} is not set{why}", f"set {name} in the environment", match)
+        return match[0]
+
+    def report(rule: str, message: str, remedy: str, match: re.Match[str]) -> None:
+        span = source.inner_span(path, match.start(), max(match.end(), match.start() + 1))
+        out.findings.append(Finding(rule, Severity.ERROR, message, span, remedy))
+
+    return _REFERENCE.sub(replace, text)
+
+
+EXTENDS_KEY = "extends"
+MAX_FILES = 100
+"""How many files one document may extend, each counted as often as it is named."""
+_PATHS: tuple[KeyPath, ...] = (
+    ("bag", "path"),
+    ("bag", "path", None),
+    ("bag", "custom_msgs", None, "path"),
+    ("sequence", "metadata_file"),
+    ("target", "store"),
+    ("target", "tls_cert"),
+    ("quarantine", "path"),
+    ("run", "report"),
+)
+"""Where a manifest has paths; None stands for every key and position."""
+_ADAPTERS: tuple[KeyPath, ...] = (("adapters", "load", None), ("adapters", "override", None))
+"""Where it may have them: an adapter is named by a file, or otherwise."""
+
+
+def extended(source: Source, *, folder: File) -> Source:
+    """Return a document with everything of the files it extends that it does not say itself.
+
+    Mappings are joined key by key, the document's own keys first; anything else it says stands for itself, and an
+    empty value takes a key away. Paths of another file are rewritten to start in `folder`, the document's own.
+    What is wrong with the other files is among the findings.
+    """
+    return _extended(source, folder, (), count(1))
+
+
+def bases_of(source: Source, *, folder: File) -> Iterator[tuple[File, Span]]:
+    """Yield the files a document names to be extended, and where it does; later ones count more."""
+    named = source.at((EXTENDS_KEY,))
+    for position, name in enumerate(named if isinstance(named, list) else [named]):
+        if isinstance(name, str) and name:
+            place = (EXTENDS_KEY, position) if isinstance(named, list) else (EXTENDS_KEY,)
+            yield File(normpath(folder / File(name).expanduser())), source.span(place)
+
+
+def _extended(source: Source, folder: File, chain: tuple[File, ...], read: Iterator[int]) -> Source:
+    if not isinstance(source.value, dict):
+        return source
+    for path, span in reversed(list(bases_of(source, folder=folder))):
+        base = _base(path, span, chain, read)
+        if isinstance(base, Finding):
+            source = replace(source, findings=(*source.findings, base))
+        else:
+            source = _joined(source, _moved(base, relpath(path.parent, folder)))
+    return source
+
+
+def _base(path: File, span: Span, chain: tuple[File, ...], read: Iterator[int]) -> Source | Finding:
+    """Read a file to extend, with all it extends itself; a finding at `span` where that cannot be done."""
+    here = path.resolve()
+    if here in chain:
+        names = " → ".join(file.name for file in (*chain[chain.index(here) :], here))
+        return _finding(f"files extend one another: {names}", span, "take one of them out")
+    if next(read) > MAX_FILES:
+        return _finding(f"{path} is one of more than {MAX_FILES} files", span, "extend fewer files")
+    try:
+        text = read_whole(path).decode()
+    except (OSError, UnicodeDecodeError) as error:
+        why = (error.strerror or str(error)).lower() if isinstance(error, OSError) else "it is not UTF-8"
+        return _finding(f"{path} cannot be extended: {why}", span, "name a manifest, or a part of one")
+    source = load_source(text, file=str(path))
+    if not isinstance(source.value, dict) and not source.findings:
+        return _finding(f"{path} cannot be extended: it holds no mapping", span, "name a part of a manifest")
+    return _extended(source, path.parent, (*chain, here), read)
+
+
+def _finding(message: str, span: Span, remedy: str) -> Finding:
+    return Finding("missing-base", Severity.ERROR, message, span, remedy)
+
+
+@dataclass(slots=True)
+class _Join:
+    """Joins two values, and records which paths came from the base and which the document removed."""
+
+    taken: set[KeyPath] = field(default_factory=set[KeyPath])
+    dropped: set[KeyPath] = field(default_factory=set[KeyPath])
+
+    def value(self, own: Value, base: Value, path: KeyPath) -> Value:
+        if not (isinstance(own, dict) and isinstance(base, dict)):
+            return own
+        joined: dict[Scalar, Value] = {}
+        for key, value in own.items():
+            if value is None and key in base:
+                self.dropped.add((*path, key))
+            else:
+                joined[key] = self.value(value, base[key], (*path, key)) if key in base else value
+        for key in base:
+            if key not in own and (*path, key) != (EXTENDS_KEY,):
+                self.taken.add((*path, key))
+                joined[key] = base[key]
+        return joined
+
+    def places(self, own: dict[KeyPath, Span], base: dict[KeyPath, Span]) -> dict[KeyPath, Span]:
+        kept = {path: span for path, span in own.items() if not _below(path, self.dropped)}
+        return {**kept, **{path: span for path, span in base.items() if _below(path, self.taken)}}
+
+
+def _below(path: KeyPath, roots: set[KeyPath]) -> bool:
+    return any(path[:length] in roots for length in range(1, len(path) + 1))
+
+
+def _joined(own: Source, base: Source) -> Source:
+    join = _Join()
+    value = join.value(own.value, base.value, ())
+    return Source(
+        own.file,
+        own.text,
+        value,
+        (*own.findings, *base.findings),
+        join.places(own.spans, base.spans),
+        join.places(own.key_spans, base.key_spans),
+        {**base.others, base.file: base.text, **own.others},
+    )
+
+
+def _moved(source: Source, way: str) -> Source:
+    """Return a document whose relative paths start elsewhere; `way` leads from there to where they started."""
+    return replace(source, value=_moved_value(source.value, (), way)) if way != "." else source
+
+
+def _moved_value(value: Value, path: KeyPath, way: str) -> Value:
+    if isinstance(value, dict):
+        return {key: _moved_value(inner, (*path, key), way) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_moved_value(inner, (*path, i), way) for i, inner in enumerate(value)]
+    if isinstance(value, str) and _is_path(value, path) and _is_relative(value):
+        return File(normpath(File(way, value))).as_posix()
+    return value
+
+
+def _is_path(text: str, path: KeyPath) -> bool:
+    return _among(path, _PATHS) or (
+        _among(path, _ADAPTERS) and (text.endswith((".yaml", ".yml")) or ".py:" in text)
+    )
+
+
+def _among(path: KeyPath, patterns: tuple[KeyPath, ...]) -> bool:
+    return any(
+        len(path) == len(pattern)
+        and all(wanted in (None, part) for wanted, part in zip(pattern, path, strict=True))
+        for pattern in patterns
+    )
+
+
+def _is_relative(text: str) -> bool:
+    """Say whether a path starts at the manifest's folder; one that starts with a variable is left as it is."""
+    return text != "" and not text.startswith(("/", "~", "${")) and not is_url(text)

@@ -1,0 +1,193 @@
+"""Write composed manifests as YAML, without secrets."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path as File
+from typing import TypeAlias
+
+from mosaico_ingest.findings import Finding
+from mosaico_ingest.frozen import frozen
+from mosaico_ingest.job.compose import EXTENDS_KEY, combinations
+from mosaico_ingest.job.manifest import (
+    check_manifest,
+    read_manifest,
+    refusal,
+    stand_alone,
+)
+from mosaico_ingest.job.yaml_source import KeyPath, Scalar, Source, Value, resolve_plain
+
+__all__ = [
+    "MASK",
+    "Expanded",
+    "Remark",
+    "expand_manifest",
+    "manifest_text",
+    "plain",
+    "to_yaml",
+]
+
+Remark: TypeAlias = Callable[[KeyPath], "str | None"]
+"""What to say beside the value at a path; None: nothing."""
+
+_PLAIN = re.compile(r"[A-Za-z0-9_./~+-]([A-Za-z0-9_./~+:-]*[A-Za-z0-9_./~+-])?")
+_UNPRINTABLE = re.compile(r"[\x7f-\x9f\u2028\u2029\ufeff\ud800-\udfff\ufffe\uffff]")
+_WIDTH = 100
+
+
+def plain(value: Scalar) -> str:
+    """Return a scalar, quoted where it would not be read as the same value by everybody."""
+    if not isinstance(value, str):
+        return _number(value) if isinstance(value, float) else json.dumps(value)
+    if _PLAIN.fullmatch(value) and resolve_plain(value) == (value, None) and value[0] not in "-~":
+        return value
+    quoted = json.dumps(value, ensure_ascii=False)
+    return _UNPRINTABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", quoted)
+
+
+def to_yaml(value: Value, remark: Remark = lambda _: None) -> str:
+    """Return a document in block style; lists of single values that are short stay on a line."""
+    if isinstance(value, dict | list) and value:
+        return "".join(f"{line}\n" for line in _lines(value, (), remark))
+    return f"{_flow(value)}\n"
+
+
+def _lines(value: Value, path: KeyPath, remark: Remark) -> Iterator[str]:
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from _entry(f"{plain(key)}:", inner, (*path, key), remark)
+    elif isinstance(value, list):
+        for position, inner in enumerate(value):
+            yield from _item(inner, (*path, position), remark)
+
+
+def _entry(head: str, value: Value, path: KeyPath, remark: Remark) -> Iterator[str]:
+    if _is_short(value):
+        said = remark(path)
+        yield f"{head} {_flow(value)}" + (f"  # {said}" if said else "")
+    else:
+        yield head
+        yield from (f"  {line}" for line in _lines(value, path, remark))
+
+
+def _item(value: Value, path: KeyPath, remark: Remark) -> Iterator[str]:
+    if _is_short(value):
+        yield from _entry("-", value, path, remark)
+    else:
+        lines = _lines(value, path, remark)
+        yield f"- {next(lines)}"
+        yield from (f"  {line}" for line in lines)
+
+
+def _is_short(value: Value) -> bool:
+    if isinstance(value, dict):
+        return not value
+    if isinstance(value, list):
+        single = not any(isinstance(item, list | dict) for item in value)
+        return single and len(_flow(value)) <= _WIDTH
+    return True
+
+
+def _flow(value: Value) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(_flow(item) for item in value)}]"
+    return "{}" if isinstance(value, dict) else plain(value)
+
+
+def _number(value: float) -> str:
+    if value != value:  # noqa: PLR0124 - not a number
+        return ".nan"
+    mantissa, exponent, power = repr(value).partition("e")
+    if exponent and "." not in mantissa:
+        mantissa += ".0"  # without it, it is a text to some readers
+    return {float("inf"): ".inf", float("-inf"): "-.inf"}.get(value, f"{mantissa}{exponent}{power}")
+
+
+@frozen
+class Expanded:
+    """One job, as a document that extends nothing and has no matrix."""
+
+    source: Source
+    cell: Mapping[str, str]
+    """The values of the matrix that make it this job."""
+    value: Value
+
+    def remark(self, path: KeyPath) -> str | None:
+        """Return the place of a value that another file says, None where it is the manifest's own."""
+        span = self.source.span(path)
+        return None if span.file == self.source.file else f"{span.file}:{span.line}"
+
+
+def expand_manifest(path: File) -> tuple[Expanded, ...]:
+    """Return every job of a manifest; no variable of the environment is filled in.
+
+    Raises:
+        ManifestError: The manifest has mistakes; `findings` has one entry for each.
+    """
+    source = read_manifest(path)
+    cells = combinations(source.value)
+    findings: dict[Finding, None] = {}
+    for cell in cells:
+        findings.update(dict.fromkeys(check_manifest(source, env=None, cell=cell)[1]))
+    if findings:
+        raise refusal(tuple(findings), str(path))
+    return tuple(Expanded(source, cell, stand_alone(source, cell)) for cell in cells)
+
+
+MASK = "***"
+_SECRET = re.compile(r"api_?key|password|token|secret", re.IGNORECASE)
+_IN_TEXT = re.compile(
+    r"(?<=://)[^/@\s]+(?=@)|msco_\w+|(?<=[?&])([^=&\s]*(?:key|password|token|secret)[^=&\s]*=)[^&\s]+",
+    re.IGNORECASE,
+)
+"""Keys of our own form, and what a URL says before an `@` and in its query."""
+_VARIABLE = re.compile(r"\$\{(\w+)(?:[^{}]*)\}")
+
+
+def manifest_text(path: File) -> str:
+    """Return a manifest that has what it extends; variables stay, and a comment says what is another file's.
+
+    Raises:
+        ManifestError: It cannot be read.
+    """
+    source = read_manifest(path)
+    value = source.value
+    if isinstance(value, dict):
+        value = {key: inner for key, inner in value.items() if key != EXTENDS_KEY}
+    hidden = frozenset(name for text in _secrets(value) for name in _VARIABLE.findall(text))
+
+    def remark(place: KeyPath) -> str | None:
+        span = source.span(place)
+        return None if span.file == source.file else f"{span.file}:{span.line}"
+
+    return to_yaml(_masked(value, hidden), remark)
+
+
+def _secrets(value: Value) -> Iterator[str]:
+    """Yield the texts of a document whose keys say that they are secret."""
+    if isinstance(value, list):
+        for inner in value:
+            yield from _secrets(inner)
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            if isinstance(inner, str) and _SECRET.search(str(key)):
+                yield inner
+            else:
+                yield from _secrets(inner)
+
+
+def _masked(value: Value, hidden: frozenset[str], *, secret: bool = False) -> Value:
+    """Mask texts below a key that says so, whatever a variable of such a text defaults to, and what looks like a key."""
+    if isinstance(value, list):
+        return [_masked(inner, hidden, secret=secret) for inner in value]
+    if isinstance(value, dict):
+        return {
+            key: _masked(inner, hidden, secret=secret or key in hidden or bool(_SECRET.search(str(key))))
+            for key, inner in value.items()
+        }
+    if secret and value is not None:
+        names = _VARIABLE.findall(value) if isinstance(value, str) else []
+        return "".join(f"${{{name}}}" for name in names) or MASK
+    return _IN_TEXT.sub(lambda found: (found[1] or "") + MASK, value) if isinstance(value, str) else value

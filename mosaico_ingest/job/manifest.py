@@ -1,0 +1,268 @@
+"""Load a job manifest: YAML text, environment variables and model; report all findings together."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import field, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from mosaico_ingest.errors import IngestError, ManifestError
+from mosaico_ingest.findings import Finding, Severity, Span
+from mosaico_ingest.frozen import frozen
+from mosaico_ingest.job.compose import Filled, combinations, extended, fill_in, fill_in_cell
+from mosaico_ingest.job.reference import job_schema
+from mosaico_ingest.job.sections import Manifest
+from mosaico_ingest.job.validation import explain
+from mosaico_ingest.job.yaml_source import (
+    KeyPath,
+    Source,
+    Value,
+    load_source,
+    member,
+    resolve_plain,
+)
+from mosaico_ingest.remote import AnyPath, as_path, is_url
+from mosaico_ingest.textfile import read_whole
+
+__all__ = [
+    "LoadedManifest",
+    "check_manifest",
+    "load_manifest",
+    "load_manifests",
+    "read_manifest",
+    "read_text",
+    "refusal",
+    "stand_alone",
+]
+
+
+@frozen
+class LoadedManifest:
+    """A manifest that holds together, with the place of everything in it."""
+
+    manifest: Manifest
+    source: Source
+    path: Path
+    cell: Mapping[str, str] = field(default_factory=dict[str, str])
+    """The values of its matrix that make it this job and no other."""
+
+    def where(self, *place: str | int) -> str:
+        """Return `file:line:column` of the value at a path, for the errors of later stages."""
+        return str(self.source.span(place))
+
+    def for_recording(self, path: Path) -> LoadedManifest:
+        """Return the same manifest for another recording."""
+        bag = self.manifest.bag.model_copy(update={"path": str(path)})
+        return replace(self, manifest=self.manifest.model_copy(update={"bag": bag}))
+
+    def resolve(self, path: str) -> Path:
+        """Return a path of the manifest as seen from here: relative ones start in the manifest's folder.
+
+        Raises:
+            ManifestError: It is a URL.
+        """
+        if is_url(path):
+            raise ManifestError(f"{path}: only recordings and stores may be URLs", where=str(self.path))
+        return self.path.parent / Path(path).expanduser()
+
+    def locate(self, path: str, *place: str | int) -> AnyPath:
+        """Return what may also lie behind a URL, as seen from here.
+
+        Raises:
+            ManifestError: It is a URL that is not understood; `place` is where the manifest says it.
+        """
+        if not is_url(path):
+            return self.resolve(path)
+        try:
+            return as_path(path)
+        except IngestError as err:
+            raise ManifestError(f"{err.where}: {err.what}", where=self.where(*place), hint=err.hint) from err
+
+
+def load_manifest(path: Path | str, *, env: Mapping[str, str] | None = os.environ) -> LoadedManifest:
+    """Load a job manifest, of a matrix the first job; see `load_manifests`."""
+    return load_manifests(path, env=env)[0]
+
+
+def load_manifests(
+    path: Path | str, *, env: Mapping[str, str] | None = os.environ
+) -> tuple[LoadedManifest, ...]:
+    """Load every job of a manifest with what it extends; `env=None` judges it without looking at the environment.
+
+    Raises:
+        ManifestError: The file cannot become a job; `findings` has one entry for each mistake.
+    """
+    file = Path(path)
+    source = read_manifest(file)
+    jobs: list[LoadedManifest] = []
+    findings: dict[Finding, None] = {}
+    for cell in combinations(source.value):
+        manifest, mistakes = check_manifest(source, env=env, cell=cell)
+        findings.update(dict.fromkeys(mistakes))
+        if manifest is not None:
+            jobs.append(LoadedManifest(manifest, source, file, cell))
+    if findings or not jobs:
+        raise refusal(tuple(findings), str(path))
+    return tuple(jobs)
+
+
+def read_manifest(path: Path) -> Source:
+    """Read a manifest's text and that of what it extends, joined; what is wrong with them is in the findings.
+
+    Raises:
+        ManifestError: The file cannot be read.
+    """
+    return extended(load_source(read_text(path), file=str(path)), folder=path.parent)
+
+
+def check_manifest(
+    source: Source, *, env: Mapping[str, str] | None, cell: Mapping[str, str] | None = None
+) -> tuple[Manifest | None, tuple[Finding, ...]]:
+    """Return the model, None if there are mistakes, and the findings in the order of the text.
+
+    `cell` has the values of one combination of its matrix; without it they are those of the first.
+    """
+    if not isinstance(source.value, dict):
+        return None, source.findings or (_not_a_job(source),)
+    filled = fill_in(source, env, cell)
+    findings = [*source.findings, *filled.findings]
+    filled.value = _with_text_keys(filled.value, (), source, findings)
+    manifest, mistakes = _validate(source, filled)
+    known = {finding.span for finding in findings}
+    if any(finding.rule == "missing-base" for finding in findings):
+        mistakes = [finding for finding in mistakes if finding.rule != "missing-key"]
+    findings += [finding for finding in mistakes if finding.span not in known]  # one word for one place
+    ordered = tuple(sorted(findings, key=lambda finding: finding.span or Span("", 0, 0, 0, 0)))
+    return (None if ordered else manifest), ordered
+
+
+def stand_alone(source: Source, cell: Mapping[str, str]) -> Value:
+    """Return one job of a manifest as a document of its own: nothing to extend, no matrix, its variables filled in.
+
+    Those of the environment stay, and with them the defaults they may need.
+    """
+    filled = fill_in_cell(source, cell)
+    _validate(source, filled)  # finds the texts that have to be numbers
+    if not isinstance(filled.value, dict):
+        return filled.value
+    defaults = filled.value.get("defaults")
+    left = {key: value for key, value in filled.value.items() if key not in {"extends", "defaults", "matrix"}}
+    if isinstance(defaults, dict) and (unfilled := {k: v for k, v in defaults.items() if k not in cell}):
+        return {"defaults": unfilled, **left}
+    return left
+
+
+_RECORDINGS = frozenset({".bag", ".db3", ".mcap"})
+_QUICKLY = "`ingest bag RECORDING --name NAME` does without one, `ingest init RECORDING` drafts one"
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file.
+
+    Raises:
+        ManifestError: It is not there, not readable, or not UTF-8.
+    """
+    if path.is_dir() or path.suffix in _RECORDINGS:
+        what = "a folder" if path.is_dir() else "a recording"
+        finding = Finding(
+            "unreadable-file", Severity.ERROR, f"{path} is {what}, not a manifest", help=_QUICKLY
+        )
+        raise refusal((finding,), str(path))
+    try:
+        return read_whole(path).decode()
+    except UnicodeDecodeError as err:
+        message = f"not UTF-8 text: byte {err.start} is 0x{err.object[err.start]:02x}"
+        finding = Finding(
+            "not-utf8", Severity.ERROR, message, Span(str(path), 1, 1, 1, 1), "save it as UTF-8"
+        )
+        raise refusal((finding,), str(path)) from err
+    except OSError as err:
+        message = f"cannot be read: {(err.strerror or str(err)).lower()}"
+        finding = Finding("unreadable-file", Severity.ERROR, message, Span(str(path), 1, 1, 1, 1))
+        raise refusal((finding,), str(path)) from err
+
+
+def refusal(findings: tuple[Finding, ...], where: str) -> ManifestError:
+    """Return the error that says why a manifest cannot become a job."""
+    if not findings:
+        return ManifestError(
+            "there is no job without its variables", where=where, hint="set them in the environment"
+        )
+    first = findings[0]
+    if len(findings) == 1:
+        return ManifestError(
+            first.message, where=str(first.span or where), hint=first.help, findings=findings
+        )
+    return ManifestError(
+        f"{len(findings)} mistakes; the first: {first.message}", where=where, findings=findings
+    )
+
+
+def _not_a_job(source: Source) -> Finding:
+    span = source.span(())
+    if source.value is None:
+        return Finding(
+            "empty-manifest", Severity.ERROR, "there is nothing in it", span, "start with bag: {path: …}"
+        )
+    return Finding("not-a-mapping", Severity.ERROR, "a job is a mapping", span, "start with bag: {path: …}")
+
+
+def _with_text_keys(value: Value, path: KeyPath, source: Source, findings: list[Finding]) -> Value:
+    """Report keys that are not text, and leave them out."""
+    if isinstance(value, list):
+        return [_with_text_keys(item, (*path, i), source, findings) for i, item in enumerate(value)]
+    if not isinstance(value, dict):
+        return value
+    for key in value:
+        if not isinstance(key, str):
+            span = source.key_span((*path, key))
+            message = f"the key {json.dumps(key)} is not text"
+            findings.append(Finding("yaml-key", Severity.ERROR, message, span, "quote it"))
+    return {
+        key: _with_text_keys(inner, (*path, key), source, findings)
+        for key, inner in value.items()
+        if isinstance(key, str)
+    }
+
+
+def _validate(source: Source, filled: Filled) -> tuple[Manifest | None, list[Finding]]:
+    """Validate; a filled-in text may have to be a number, and what an unknown variable would be is not judged."""
+    manifest, mistakes = _attempt(source, filled.value)
+    retry = [place for place, _ in mistakes if place in filled.changed]
+    if retry:
+        for place in dict.fromkeys(retry):
+            _reread(filled, place)
+        manifest, mistakes = _attempt(source, filled.value)
+    return manifest, [finding for place, finding in mistakes if place not in filled.unknown]
+
+
+def _attempt(source: Source, value: Value) -> tuple[Manifest | None, list[tuple[KeyPath, Finding]]]:
+    try:
+        # As JSON, so that strict means: no text for a number, and lists and names for what they are.
+        return Manifest.model_validate_json(json.dumps(value), strict=True), []
+    except ValidationError as error:
+        return None, explain(error, source=source, schema=_schema())
+
+
+def _reread(filled: Filled, place: KeyPath) -> None:
+    """Read a filled-in text as YAML would read it unquoted; take it out if its value is not known."""
+    parent = filled.value
+    for part in place[:-1]:
+        parent = member(parent, part)
+    if isinstance(parent, dict):
+        value = parent[place[-1]]
+        if place in filled.unknown:
+            del parent[place[-1]]
+        elif isinstance(value, str):
+            parent[place[-1]] = resolve_plain(value)[0]
+
+
+@cache
+def _schema() -> dict[str, Any]:
+    return job_schema()

@@ -1,0 +1,174 @@
+"""The JSON Schema of job manifests and docs/manifest.md, derived from the model."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+from mosaico_ingest.documents import schema_of
+from mosaico_ingest.job.compose import EXTENDS_KEY as EXTENDS
+from mosaico_ingest.job.sections import Manifest
+
+__all__ = [
+    "DIALECT",
+    "job_schema",
+    "manifest_reference",
+    "tidy",
+]
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+_VARIABLE = {"type": "string", "pattern": r"\$\{[^{}]+\}", "description": "A variable of the environment."}
+
+
+def job_schema() -> dict[str, Any]:
+    """Return the schema (draft 2020-12) that editors complete and check manifests with."""
+    schema = tidy(schema_of(Manifest))
+    definitions: dict[str, Any] = schema.pop("$defs")
+    for model in [schema, *definitions.values()]:
+        model["properties"] = {
+            key: _or_variable(node, definitions) for key, node in _properties(model).items()
+        }
+        if not model["properties"]:
+            del model["properties"]
+    definitions["Variable"] = _VARIABLE
+    required = schema.pop("required")
+    schema["anyOf"] = [{"required": required}, {"required": [EXTENDS]}]  # what is extended may say the rest
+    return {"$schema": DIALECT, "title": "mosaico-ingest job", **schema, "$defs": definitions}
+
+
+def _properties(model: dict[str, Any]) -> dict[str, Any]:
+    return model.get("properties", {})
+
+
+def _or_variable(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:
+    """Allow `${VAR}` where the value is a number or one of a few words; in a text it is allowed anyway."""
+    target = definitions[node["$ref"].rsplit("/", 1)[-1]] if "$ref" in node else node
+    if "enum" not in target and target.get("type") not in ("integer", "boolean"):
+        return node
+    about = {key: value for key, value in node.items() if key in {"default", "description", "examples"}}
+    return {
+        **about,
+        "anyOf": [{k: v for k, v in node.items() if k not in about}, {"$ref": "#/$defs/Variable"}],
+    }
+
+
+def tidy(node: dict[str, Any]) -> dict[str, Any]:
+    """Leave out titles, which repeat the keys, nulls for keys left out, and the defaults of whole sections."""
+    branches = [branch for branch in node.get("anyOf", ()) if branch != {"type": "null"}]
+    if len(branches) == 1:
+        node = {**{key: value for key, value in node.items() if key != "anyOf"}, **branches[0]}
+    noise = {"title", "default"} if "$ref" in node and isinstance(node.get("default"), dict) else {"title"}
+    kept = {
+        key: value for key, value in node.items() if key not in noise and (key, value) != ("default", None)
+    }
+    return {key: _tidy_member(key, value) for key, value in kept.items()}
+
+
+def _tidy_member(key: str, value: object) -> object:
+    if key in {"default", "examples"}:
+        return value
+    if key == "description":
+        return " ".join(str(value).split())
+    if key in {"properties", "$defs"}:
+        members = cast("dict[str, dict[str, Any]]", value)  # names, not keywords
+        return {name: tidy(member) for name, member in members.items()}
+    if isinstance(value, dict):
+        return tidy(cast("dict[str, Any]", value))
+    if isinstance(value, list):
+        return [tidy(cast("dict[str, Any]", item)) if isinstance(item, dict) else item for item in value]
+    return value
+
+
+_HEAD = """\
+<!-- made from the model of the manifest -->
+
+# The job manifest, key by key
+
+Only `bag.path` must be there. Relative paths start at the manifest's folder. `${VAR}`, `${VAR:-default}` and `${VAR:?why}` stand
+for variables of the environment wherever a value is a text or one of a few words, `$$` is a dollar. An unknown key is an error;
+`ingest lint job.yaml` says everything that is wrong at once, each thing with its place.
+"""
+
+
+def manifest_reference() -> str:
+    """Return the page: a section for each part of the manifest, a row for each key."""
+    schema = job_schema()
+    sections = [_section("The manifest", schema, schema)]
+    for path, model in _models(schema["properties"], (), schema):
+        sections.append(_section(f"`{'.'.join(path)}`", model, schema))
+    return _HEAD + "".join(sections)
+
+
+def _models(
+    properties: dict[str, Any], path: tuple[str, ...], schema: dict[str, Any]
+) -> Iterator[tuple[tuple[str, ...], dict[str, Any]]]:
+    """Yield every mapping with keys of its own below these properties, in their order."""
+    for key, node in properties.items():
+        name, inner = key, _resolved(node, schema)
+        if "items" in inner:
+            name, inner = f"{key}[]", _resolved(inner["items"], schema)
+        elif isinstance(inner.get("additionalProperties"), dict):
+            name, inner = f"{key}.*", _resolved(inner["additionalProperties"], schema)
+        if "properties" in inner:
+            yield (*path, name), inner
+            yield from _models(inner["properties"], (*path, name), schema)
+
+
+def _section(title: str, model: dict[str, Any], schema: dict[str, Any]) -> str:
+    required = model.get("required", [])
+    rows = "".join(_row(key, node, key in required, schema) for key, node in model["properties"].items())
+    head = f"\n## {title}\n\n{model['description']}\n\n| key | is | default | |\n|---|---|---|---|\n"
+    return head + rows
+
+
+def _row(key: str, node: dict[str, Any], required: bool, schema: dict[str, Any]) -> str:  # noqa: FBT001 - a row's cell
+    described = node.get("description") or _resolved(node, schema).get("description", "")
+    examples = node.get("examples", [])
+    example = f" As {' or '.join(_code(example) for example in examples)}." if examples else ""
+    cells = (f"`{key}`", _kind(node, schema), _default(node, required), f"{described}{example}")
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
+
+
+def _default(node: dict[str, Any], required: bool) -> str:  # noqa: FBT001 - as above
+    if required:
+        return "must be there"
+    default = node.get("default")
+    return "" if default in (None, [], {}) or isinstance(default, dict) else _code(default)
+
+
+def _kind(node: dict[str, Any], schema: dict[str, Any]) -> str:
+    """Say what a value is, in a word or the words that are allowed."""
+    branches = cast("list[dict[str, Any]]", node.get("anyOf") or node.get("oneOf") or [])
+    if branches:
+        kinds = (_kind(branch, schema) for branch in branches if branch.get("$ref") != "#/$defs/Variable")
+        return " or ".join(dict.fromkeys(kinds))
+    node = _resolved(node, schema)
+    if "enum" in node:
+        return " ".join(_code(word) for word in node["enum"])
+    if node.get("type") == "array":
+        return f"list of {_kind(node['items'], schema)}"
+    if isinstance(node.get("additionalProperties"), dict):
+        inner = _kind(node["additionalProperties"], schema)
+        return f"name → {inner}"
+    kinds = node.get("type", "")
+    return " or ".join(
+        _WORDS.get(kind, "anything") for kind in ([kinds] if isinstance(kinds, str) else kinds)
+    )
+
+
+_WORDS = {"string": "text", "integer": "number", "boolean": "true or false", "object": "mapping"}
+
+
+def _resolved(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
+    return schema["$defs"][node["$ref"].rsplit("/", 1)[-1]] if "$ref" in node else node
+
+
+def _code(value: object) -> str:
+    return f"`{value if isinstance(value, str) else json.dumps(value)}`"
+
+
+if __name__ == "__main__":
+    Path(sys.argv[1]).write_text(manifest_reference(), encoding="utf-8")

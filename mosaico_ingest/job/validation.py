@@ -1,0 +1,327 @@
+"""This file turns what pydantic says of a document into findings a person would have written."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from difflib import get_close_matches
+from typing import Any
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+from mosaico_ingest.findings import (
+    Edit,
+    Finding,
+    Severity,
+    Span,
+)
+from mosaico_ingest.frozen import frozen
+from mosaico_ingest.job.yaml_source import (
+    KeyPath,
+    Source,
+    Value,
+    member,
+)
+
+__all__ = ["explain", "keys_at", "nearest", "place_of"]
+
+_EXPECTED = {
+    "string_type": "text",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "bool_type": "true or false",
+    "tuple_type": "a list",
+    "list_type": "a list",
+    "dict_type": "a mapping",
+    "model_type": "a mapping",
+    "model_attributes_type": "a mapping",
+}
+_BRACED = re.compile(r"\{\w+\}")
+_PLAIN = re.compile(r"[^\s\"'\\#&*!|>@`%\[\],]+")
+
+
+@frozen
+class _Problem:
+    error: ErrorDetails
+    path: KeyPath
+    value: Value
+    source: Source
+    schema: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        """The value's name for a person."""
+        return _name(self.path) or "the document"
+
+    @property
+    def span(self) -> Span:
+        """The value's place."""
+        return self.source.span(self.path)
+
+    @property
+    def secret(self) -> bool:
+        """Whether the value must not be shown."""
+        return _node_at(self.schema, self.path).get("writeOnly", False)
+
+    def finding(
+        self, rule: str, message: str, remedy: str | None, span: Span | None = None, fix: Edit | None = None
+    ) -> Finding:
+        return Finding(rule, Severity.ERROR, message, span or self.span, remedy, fix)
+
+
+def explain(
+    error: ValidationError, *, source: Source, schema: dict[str, Any]
+) -> list[tuple[KeyPath, Finding]]:
+    """Return one finding for each mistake, with the path of the value; values are quoted as written, so never a secret.
+
+    `schema` is the JSON Schema of the model that refused the document.
+    """
+    problems = [_problem(details, source, schema) for details in error.errors(include_url=False)]
+    meant = {(*problem.path[:-1], _suggestion(problem)) for problem in problems}
+    return [
+        (problem.path, _describe(problem))
+        for problem in problems
+        if problem.error["type"] != "missing" or (*problem.path, problem.error["loc"][-1]) not in meant
+        if problem.error["type"] != "too_short" or not _any_below(problem.path, problems)
+    ]
+
+
+def _any_below(path: KeyPath, problems: Iterable[_Problem]) -> bool:
+    """Say whether something inside a value is wrong: a list is then short only of what was refused."""
+    return any(problem.path[: len(path)] == path and problem.path != path for problem in problems)
+
+
+def place_of(location: KeyPath, value: Value) -> KeyPath:
+    """Follow an error's location through the document; what is not there (a union's branch) is no part of the path."""
+    path: KeyPath = ()
+    for part in location:
+        with suppress(LookupError):
+            value = member(value, part)
+            path = (*path, part)
+    return path
+
+
+def nearest(word: str, known: Iterable[str]) -> str | None:
+    """Return the known word that `word` was probably meant to be: same letters, a missing prefix, or a slip."""
+    words = list(known)
+    plain = {_plain(candidate): candidate for candidate in words}
+    if _plain(word) in plain:
+        return plain[_plain(word)]
+    tails = [candidate for candidate in words if _plain(candidate).endswith(f"_{_plain(word)}")]
+    if len(tails) == 1:
+        return tails[0]
+    close = get_close_matches(_plain(word), plain, n=1, cutoff=0.6)
+    return plain[close[0]] if close else None
+
+
+def keys_at(schema: dict[str, Any], path: KeyPath) -> list[str]:
+    """Return the keys that a JSON Schema allows in the mapping at `path`; none where any key is."""
+    return list(_resolved(_node_at(schema, path), schema).get("properties", {}))
+
+
+def _node_at(schema: dict[str, Any], path: KeyPath) -> dict[str, Any]:
+    node = schema
+    for part in path:
+        node = _descend(_resolved(node, schema), part)
+    return node
+
+
+def _name(path: KeyPath) -> str:
+    """Return a path as a person would say it: `bag.custom_msgs[0].path`."""
+    return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path).lstrip(".")
+
+
+def _plain(word: str) -> str:
+    return re.sub(r"[-\s]+", "_", word.strip().lower())
+
+
+def _problem(details: ErrorDetails, source: Source, schema: dict[str, Any]) -> _Problem:
+    path = place_of(details["loc"], source.value)
+    return _Problem(details, path, source.at(path), source, schema)
+
+
+def _descend(node: dict[str, Any], part: object) -> dict[str, Any]:
+    if isinstance(part, int):
+        return node.get("items", {})
+    inner = node.get("properties", {}).get(part)
+    extra = node.get("additionalProperties")
+    return inner or (extra if isinstance(extra, dict) else {})
+
+
+def _resolved(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
+    """Follow references, and of alternatives take the one that is a mapping or a list."""
+    while "$ref" in node:
+        node = schema["$defs"][node["$ref"].rsplit("/", 1)[-1]]
+    for branch in node.get("anyOf", node.get("oneOf", ())):
+        resolved = _resolved(branch, schema)
+        if resolved.get("type") in {"object", "array"}:
+            return resolved
+    return node
+
+
+def _describe(problem: _Problem) -> Finding:
+    kind = problem.error["type"]
+    describe = _DESCRIBERS.get(kind)
+    if describe is not None:
+        return describe(problem)
+    if kind in _EXPECTED:
+        return _wrong_type(problem, _EXPECTED[kind])
+    message = problem.error["msg"].removeprefix("Value error, ")
+    return problem.finding("wrong-value", f"{problem.name}: {message}", _example(problem))
+
+
+def _suggestion(problem: _Problem) -> str | None:
+    """Return the key that an unknown one was probably meant to be."""
+    if problem.error["type"] != "extra_forbidden":
+        return None
+    return nearest(str(problem.path[-1]), keys_at(problem.schema, problem.path[:-1]))
+
+
+def _unknown_key(problem: _Problem) -> Finding:
+    parent, word = problem.path[:-1], str(problem.path[-1])
+    allowed = keys_at(problem.schema, parent)
+    span = problem.source.key_span(problem.path)
+    section = f"in {_name(parent)}" if parent else "at the top level"
+    close = _suggestion(problem)
+    if close:
+        remedy = f"did you mean {close!r}? "
+    elif {"value", "fields"} <= set(allowed):  # a mapping's value
+        remedy = f"a struct is written {{fields: {{{word}: …}}}}; "
+    else:
+        remedy = _elsewhere(word, problem.schema)
+    fix = (
+        Edit(span, close)
+        if close and _plain(close).replace("_", "") == _plain(word).replace("_", "")
+        else None
+    )
+    message = f"unknown key {word!r} {section}"
+    return problem.finding("unknown-key", message, f"{remedy}allowed: {', '.join(allowed)}", span, fix)
+
+
+def _elsewhere(word: str, schema: dict[str, Any]) -> str:
+    """Say which section has the key that is not allowed here."""
+    for section in keys_at(schema, ()):
+        if word in keys_at(schema, (section,)):
+            return f"it belongs into {section!r}; "
+    return ""
+
+
+def _missing_key(problem: _Problem) -> Finding:
+    key = problem.error["loc"][-1]
+    span = problem.source.key_span(problem.path)
+    if not problem.path:
+        span = Span(span.file, span.line, span.column, span.line, span.column + 1)
+    return problem.finding("missing-key", f"{problem.name} needs the key {key!r}", f"add {key}:", span)
+
+
+def _wrong_type(problem: _Problem, expected: str) -> Finding:
+    value, name = problem.value, problem.name
+    if value is None:
+        span = problem.source.key_span(problem.path)
+        return problem.finding("empty-value", f"{name} is empty", "give it a value, or remove the key", span)
+    if problem.secret:
+        return problem.finding("wrong-type", f"{name} must be {expected}", "quote it")
+    message = f"{name} must be {expected}, not {_kind(value)}"
+    written = _written(problem)
+    remedy = fix = None
+    node = _node_at(problem.schema, problem.path)
+    if expected == "text" and not _fits(written, node, problem.schema):
+        remedy = _example(problem)
+    elif expected == "text" and (_PLAIN.fullmatch(written) or _BRACED.fullmatch(written)):
+        remedy, fix = f'quote it: "{written}"', Edit(problem.span, f'"{written}"')
+    elif expected == "a list" and isinstance(value, str):
+        remedy = f'write ["{value}"]'
+    elif expected == "a whole number" and isinstance(value, str) and value.strip().isdigit():
+        remedy, fix = f"write {value.strip()} without quotes", Edit(problem.span, value.strip())
+    elif expected == "a mapping":
+        keys = keys_at(problem.schema, problem.path)
+        remedy = f"its keys are {', '.join(keys)}" if keys else "write key: value pairs"
+    return problem.finding("wrong-type", message, remedy or _example(problem) or f"write {expected}", fix=fix)
+
+
+def _example(problem: _Problem) -> str | None:
+    """Say how the value may be written, in the words of the model's examples."""
+    examples = _node_at(problem.schema, problem.path).get("examples", ())
+    shown = [str(example) for example in examples if isinstance(example, str | int | float)]
+    return f"write it as {' or '.join(shown)}" if shown else None
+
+
+def _fits(text: str, node: dict[str, Any], schema: dict[str, Any]) -> bool:
+    """Say whether a text could be what the schema wants, as far as it says by a pattern."""
+    branches = [_resolved(branch, schema) for branch in node.get("anyOf", [node])]
+    patterns = [branch["pattern"] for branch in branches if "pattern" in branch]
+    return not patterns or any(re.search(pattern, text) for pattern in patterns)
+
+
+def _written(problem: _Problem) -> str:
+    span = problem.span
+    if span.line != span.end_line:
+        return ""
+    return problem.source.line(span)[span.column - 1 : span.end_column - 1]
+
+
+def _kind(value: Value) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int | float):
+        return f"the number {value}"
+    if isinstance(value, str):
+        return f"the text {value!r}"
+    return "a list" if isinstance(value, list) else "a mapping"
+
+
+def _not_a_choice(problem: _Problem) -> Finding:
+    allowed = problem.error.get("ctx", {}).get("expected", "")
+    if problem.value is None:
+        return _wrong_type(problem, "text")
+    shown = repr(problem.value) if isinstance(problem.value, str) else _kind(problem.value)
+    words = re.findall(r"'([^']*)'", allowed)
+    close = nearest(problem.value, words) if isinstance(problem.value, str) else None
+    remedy = f"did you mean {close!r}? " if close else ""
+    choices = ", ".join(words) or allowed
+    exact = (
+        close is not None and isinstance(problem.value, str) and _plain(close).endswith(_plain(problem.value))
+    )
+    fix = Edit(problem.span, close) if close and exact else None
+    return problem.finding(
+        "wrong-value", f"{problem.name} cannot be {shown}", f"{remedy}allowed: {choices}", fix=fix
+    )
+
+
+def _out_of_range(problem: _Problem) -> Finding:
+    bounds = problem.error.get("ctx", {})
+    if problem.path == ("version",) and "le" in bounds:
+        message = f"version {problem.value} is newer than this tool, which reads {bounds['le']}"
+        return problem.finding("newer-version", message, "upgrade mosaico-ingest")
+    words = {"ge": "at least", "le": "at most", "gt": "more than", "lt": "less than"}
+    limit = next(f"{words[key]} {bounds[key]}" for key in words if key in bounds)
+    return problem.finding("wrong-value", f"{problem.name} is {problem.value}", f"it must be {limit}")
+
+
+def _empty(problem: _Problem) -> Finding:
+    return problem.finding("empty-value", f"{problem.name} is empty", "give it a value, or remove the key")
+
+
+def _contradiction(problem: _Problem) -> Finding:
+    """A section refuses two keys together; the error says which of them to point at."""
+    key = problem.error.get("ctx", {}).get("key", "")
+    span = problem.source.key_span((*problem.path, key))
+    return problem.finding("contradiction", problem.error["msg"], "keep one of the two", span)
+
+
+_DESCRIBERS: dict[str, Callable[[_Problem], Finding]] = {
+    "extra_forbidden": _unknown_key,
+    "missing": _missing_key,
+    "enum": _not_a_choice,
+    "literal_error": _not_a_choice,
+    "greater_than_equal": _out_of_range,
+    "greater_than": _out_of_range,
+    "less_than_equal": _out_of_range,
+    "less_than": _out_of_range,
+    "string_too_short": _empty,
+    "too_short": _empty,
+    "contradiction": _contradiction,
+}

@@ -1,0 +1,188 @@
+"""Findings as JSON, SARIF 2.1.0, GitHub annotations and JUnit."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from typing import Any
+from urllib.parse import quote
+from xml.sax.saxutils import escape, quoteattr
+
+from mosaico_ingest.findings import (
+    Edit,
+    Finding,
+    Severity,
+    Span,
+)
+from mosaico_ingest.lint.engine import Judged, LintReport
+from mosaico_ingest.lint.rule import Rule
+from mosaico_ingest.lint.rules import RULES
+from mosaico_ingest.version import __version__
+
+__all__ = ["FORMATS"]
+
+
+def _render_json(report: LintReport) -> str:
+    """Return `{version, files, findings}`; lines and columns start at 1, ends are one past the last character."""
+    document = {
+        "version": 1,
+        "files": [{"file": judged.file, "fixed": judged.fixed} for judged in report.files],
+        "findings": [_finding(finding) for finding in report.findings],
+    }
+    return json.dumps(document, indent=2, ensure_ascii=False) + "\n"
+
+
+def _finding(finding: Finding) -> dict[str, Any]:
+    span = finding.span
+    place = {}
+    if span is not None:
+        place = {
+            "file": span.file,
+            "line": span.line,
+            "column": span.column,
+            "end_line": span.end_line,
+            "end_column": span.end_column,
+        }
+    return {
+        "rule": finding.rule,
+        "severity": finding.severity.value,
+        "message": finding.message,
+        "help": finding.help,
+        **place,
+        "fix": None if finding.fix is None else {"text": finding.fix.text},
+    }
+
+
+_COMMANDS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.INFO: "notice"}
+_ESCAPES = (("%", "%25"), ("\r", "%0D"), ("\n", "%0A"))
+
+
+def _render_github(report: LintReport) -> str:
+    """Return a line for each finding."""
+    return "".join(f"{_line(finding)}\n" for finding in report.findings)
+
+
+def _line(finding: Finding) -> str:
+    place = ""
+    if finding.span is not None:
+        span = finding.span
+        ends = f",endLine={span.end_line}"
+        ends += f",endColumn={span.end_column}" if span.line == span.end_line else ""
+        place = f"file={_property(span.file)},line={span.line},col={span.column}{ends},"
+    text = f"{finding.message} — {finding.help}" if finding.help else finding.message
+    return f"::{_COMMANDS[finding.severity]} {place}title={_property(finding.rule)}::{_escaped(text)}"
+
+
+def _escaped(text: str) -> str:
+    for character, code in _ESCAPES:
+        text = text.replace(character, code)
+    return text
+
+
+def _property(text: str) -> str:
+    return _escaped(text).replace(":", "%3A").replace(",", "%2C")
+
+
+_NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def _render_junit(report: LintReport) -> str:
+    """Return the document; a file without findings is one case that passed."""
+    suites = "".join(_suite(judged) for judged in report.files)
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n<testsuites>\n{suites}</testsuites>\n'
+
+
+def _suite(judged: Judged) -> str:
+    cases = "".join(_case(finding, judged.file) for finding in judged.findings)
+    count = len(judged.findings)
+    cases = cases or f"    <testcase name={_attribute(judged.file)}/>\n"
+    name = _attribute(judged.file)
+    return f'  <testsuite name={name} tests="{max(count, 1)}" failures="{count}">\n{cases}  </testsuite>\n'
+
+
+def _case(finding: Finding, file: str) -> str:
+    place = file if finding.span is None else f"{finding.span.line}:{finding.span.column}"
+    message = _attribute(finding.message)
+    failure = f"<failure type={_attribute(finding.severity.value)} message={message}>{_text(str(finding))}</failure>"
+    return f"    <testcase name={_attribute(f'{place} {finding.rule}')} classname={_attribute(file)}>{failure}</testcase>\n"
+
+
+def _attribute(text: str) -> str:
+    return quoteattr(_NOT_XML.sub("\ufffd", text))
+
+
+def _text(text: str) -> str:
+    return escape(_NOT_XML.sub("\ufffd", text))
+
+
+_SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
+_LEVELS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.INFO: "note"}
+
+
+def _render_sarif(report: LintReport) -> str:
+    """Return one run, with the rules that were broken and a fix where there is one."""
+    broken = {finding.rule for finding in report.findings}
+    driver = {
+        "name": "mosaico-ingest",
+        "semanticVersion": __version__,
+        "rules": [_rule(rule) for rule in RULES if rule.name in broken],
+    }
+    run = {
+        "tool": {"driver": driver},
+        "columnKind": "unicodeCodePoints",
+        "results": [_result(finding) for finding in report.findings],
+    }
+    return json.dumps({"$schema": _SCHEMA, "version": "2.1.0", "runs": [run]}, indent=2) + "\n"
+
+
+def _rule(rule: Rule) -> dict[str, Any]:
+    return {
+        "id": rule.name,
+        "name": rule.code,
+        "shortDescription": {"text": rule.title},
+        "help": {"text": rule.page or rule.title},
+        "defaultConfiguration": {"level": _LEVELS[rule.severity]},
+    }
+
+
+def _result(finding: Finding) -> dict[str, Any]:
+    text = f"{finding.message}: {finding.help}" if finding.help else finding.message
+    result: dict[str, Any] = {
+        "ruleId": finding.rule,
+        "level": _LEVELS[finding.severity],
+        "message": {"text": text},
+    }
+    if finding.span is not None:
+        result["locations"] = [{"physicalLocation": _location(finding.span)}]
+    if finding.fix is not None:
+        result["fixes"] = [_fix(finding.fix)]
+    return result
+
+
+def _location(span: Span) -> dict[str, Any]:
+    return {"artifactLocation": {"uri": quote(span.file)}, "region": _region(span)}
+
+
+def _region(span: Span) -> dict[str, int]:
+    return {
+        "startLine": span.line,
+        "startColumn": span.column,
+        "endLine": span.end_line,
+        "endColumn": span.end_column,
+    }
+
+
+def _fix(edit: Edit) -> dict[str, Any]:
+    replacement = {"deletedRegion": _region(edit.span), "insertedContent": {"text": edit.text}}
+    change = {"artifactLocation": {"uri": quote(edit.span.file)}, "replacements": [replacement]}
+    return {"description": {"text": f"write {edit.text}"}, "artifactChanges": [change]}
+
+
+FORMATS: dict[str, Callable[[LintReport], str]] = {
+    "json": _render_json,
+    "sarif": _render_sarif,
+    "github": _render_github,
+    "junit": _render_junit,
+}
+"""Each format by the name `--format` takes."""

@@ -1,0 +1,285 @@
+"""The base of ontology models: annotated fields, and the Arrow columns derived from them.
+
+```
+class Sonar(Serializable):
+    beams: list[Float32]                            # list<item: float> not null
+    gain: Float32 | None = None                     # float
+    rotation: Annotated[list[Float64], FixedSize(9)]  # fixed_size_list<item: double>[9] not null
+    payload: Annotated[bytes, pa.large_binary()]    # any Arrow type, taken as it is
+```
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Iterable, Mapping, Sequence
+from enum import Enum
+from functools import cache
+from typing import Annotated, Any, ClassVar, Literal, Union, cast, get_args, get_origin
+
+import pyarrow as pa
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError
+from pydantic_core import CoreSchema, core_schema
+from typing_extensions import Self
+
+from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.frozen import frozen
+from mosaico_ingest.ontology.registry import DEFINED, MODULES
+from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
+
+__all__ = [
+    "FixedSize",
+    "Float16",
+    "Float32",
+    "Float64",
+    "Int8",
+    "Int16",
+    "Int32",
+    "Int64",
+    "Nullable",
+    "Serializable",
+    "UInt8",
+    "UInt16",
+    "UInt32",
+    "UInt64",
+    "struct_of",
+]
+
+Int8 = Annotated[int, Field(ge=-(2**7), lt=2**7), pa.int8()]
+Int16 = Annotated[int, Field(ge=-(2**15), lt=2**15), pa.int16()]
+Int32 = Annotated[int, Field(ge=-(2**31), lt=2**31), pa.int32()]
+Int64 = Annotated[int, Field(ge=-(2**63), lt=2**63), pa.int64()]
+UInt8 = Annotated[int, Field(ge=0, lt=2**8), pa.uint8()]
+UInt16 = Annotated[int, Field(ge=0, lt=2**16), pa.uint16()]
+UInt32 = Annotated[int, Field(ge=0, lt=2**32), pa.uint32()]
+UInt64 = Annotated[int, Field(ge=0, lt=2**64), pa.uint64()]
+Float16 = Annotated[float, pa.float16()]
+Float32 = Annotated[float, pa.float32()]
+Float64 = Annotated[float, pa.float64()]
+
+
+@frozen
+class Nullable:
+    """Marks a column that may hold nulls although the model wants a value."""
+
+
+@frozen
+class FixedSize:
+    """Marks a list of exactly `length` values."""
+
+    length: int
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401 - pydantic's signature
+        """Check the length after the items."""
+        return core_schema.no_info_after_validator_function(self.check, handler(source))
+
+    def check(self, values: list[Any]) -> list[Any]:
+        """Return `values`, or raise ValueError where they are not `length`."""
+        if len(values) != self.length:
+            raise ValueError(f"expected {self.length} values, found {len(values)}")
+        return values
+
+
+_PLAIN: dict[type, pa.DataType] = {
+    bool: pa.bool_(),  # before int, which it is a subclass of
+    int: pa.int64(),
+    float: pa.float64(),
+    str: pa.string(),
+    bytes: pa.binary(),
+}
+
+
+@cache
+def struct_of(model: type[BaseModel]) -> pa.StructType:
+    """Return the columns of `model`, in the order of its fields.
+
+    Raises:
+        AdapterError: A field's annotation has no Arrow type.
+    """
+    return _struct(model, ())
+
+
+@frozen
+class _Column:
+    """An annotation taken apart: the bare type and what was said about it."""
+
+    bare: Any
+    nullable: bool
+    exact: pa.DataType | None
+    size: int
+
+
+def _struct(model: type[BaseModel], outer: tuple[type[BaseModel], ...]) -> pa.StructType:
+    if model in outer:
+        raise AdapterError(
+            "contains itself, which columns cannot", where=model.__name__, hint="refer to it by a key"
+        )
+    inside = (*outer, model)
+    fields: list[pa.Field[Any]] = []
+    for name, field in model.model_fields.items():
+        column = _take_apart(field.annotation, field.metadata)
+        data_type = _arrow(column, f"{model.__name__}.{name}", inside)
+        fields.append(pa.field(name, data_type, nullable=column.nullable))
+    return pa.struct(fields)
+
+
+def _take_apart(annotation: Any, metadata: Iterable[object] = ()) -> _Column:  # noqa: ANN401 - any annotation
+    marks = list(metadata)
+    nullable = False
+    while True:
+        origin = get_origin(annotation)
+        if origin is Annotated:
+            annotation, *more = get_args(annotation)
+            marks += more
+        elif origin in (Union, types.UnionType) and type(None) in get_args(annotation):
+            rest = tuple(arg for arg in get_args(annotation) if arg is not type(None))
+            annotation, nullable = Union[rest], True  # noqa: UP007 - a tuple cannot be spelled with |
+        else:
+            break
+    exact = next((mark for mark in marks if isinstance(mark, pa.DataType)), None)
+    size = next((mark.length for mark in marks if isinstance(mark, FixedSize)), -1)
+    nullable = nullable or any(mark is Nullable or isinstance(mark, Nullable) for mark in marks)
+    return _Column(annotation, nullable, exact, size)
+
+
+def _arrow(column: _Column, where: str, outer: tuple[type[BaseModel], ...]) -> pa.DataType:
+    if column.exact is not None:
+        return column.exact
+    bare = column.bare
+    if get_origin(bare) in (list, tuple, Sequence):
+        return _list(column, where, outer)
+    if get_origin(bare) is Literal:
+        kinds = {type(value) for value in get_args(bare)}
+        bare = kinds.pop() if len(kinds) == 1 else bare
+    if isinstance(bare, type):
+        if issubclass(bare, BaseModel):
+            return _struct(bare, outer)
+        plain = next((arrow for kind, arrow in _PLAIN.items() if issubclass(bare, kind)), None)
+        if plain is not None and (bare in _PLAIN or issubclass(bare, Enum)):
+            return plain
+    raise AdapterError(
+        f"the annotation {_spell(bare)} has no column type",
+        where=where,
+        hint="use bool, int, float, str, bytes, a list, a nested model, or Annotated[…, <an Arrow type>]",
+    )
+
+
+def _list(column: _Column, where: str, outer: tuple[type[BaseModel], ...]) -> pa.DataType:
+    items = [arg for arg in get_args(column.bare) if arg is not ...]
+    if len(items) != 1:
+        raise AdapterError(
+            f"the annotation {_spell(column.bare)} mixes item types", where=where, hint="use a nested model"
+        )
+    item = pa.field("item", _arrow(_take_apart(items[0]), f"{where}[]", outer))
+    return pa.list_(item, column.size)
+
+
+def _spell(annotation: object) -> str:
+    return annotation.__name__ if isinstance(annotation, type) else str(annotation)
+
+
+_MISFITS = (pa.ArrowException, OverflowError, TypeError, ValueError)
+
+
+class Serializable(BaseModel):
+    """A row of one topic. Subclass it with annotated fields; its columns are derived from them.
+
+    `int` becomes int64, `float` double, `bytes` binary, `list[X]` a list, `X | None` a nullable column, a nested
+    model a struct; `ontology.fields` names the exact types.
+    """
+
+    model_config = ConfigDict(extra="forbid", validate_assignment=True, defer_build=True)
+
+    __ontology_tag__: ClassVar[str]
+    """The name the platform stores; the class's own name where nothing is said."""
+    __serialization_format__: ClassVar[SerializationFormat] = SerializationFormat.DEFAULT
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:  # noqa: ANN401 - pydantic's signature
+        """Make the class known by its tag.
+
+        Raises:
+            AdapterError: The tag is a built-in's, whose readers expect the built-in's columns.
+        """
+        super().__pydantic_init_subclass__(**kwargs)
+        tag = cls.__dict__.get("__ontology_tag__", cls.__name__)
+        if tag in MODULES and cls.__module__ != f"{__package__}.{MODULES[tag]}":
+            raise AdapterError(
+                f"the tag {tag!r} is a built-in's",
+                where=f"{cls.__module__}.{cls.__qualname__}",
+                hint="rename the class or set __ontology_tag__",
+            )
+        cls.__ontology_tag__ = tag
+        DEFINED[tag] = cls
+
+    @classmethod
+    def ontology_tag(cls) -> str:
+        """Return the tag, as `IMU`."""
+        return cls.__ontology_tag__
+
+    @classmethod
+    def ontology_type(cls) -> OntologyType:
+        """Return tag, columns and serialization format.
+
+        Raises:
+            AdapterError: A field's annotation has no Arrow type.
+        """
+        return OntologyType(cls.__ontology_tag__, cls._columns(), cls.__serialization_format__)
+
+    @classmethod
+    def to_batch(cls, models: Iterable[Self]) -> pa.StructArray:
+        """Return one row a model.
+
+        Raises:
+            AdapterError: A value does not fit its column; names the row.
+        """
+        rows, columns = [model.to_row() for model in models], cls._columns()
+        try:
+            return _array(rows, columns)
+        except _MISFITS as error:
+            reasons = ((at, _misfit(row, columns)) for at, row in enumerate(rows))
+            at, reason = next(((at, reason) for at, reason in reasons if reason), (0, str(error)))
+            raise AdapterError(f"row {at}: {reason}", where=cls.__ontology_tag__) from error
+
+    @classmethod
+    def from_row(cls, row: Mapping[str, Any]) -> Self:
+        """Return the model of one row as Arrow gives it; a struct of nulls alone counts as null.
+
+        Raises:
+            AdapterError: The values break the model's rules; names the field and the value.
+        """
+        try:
+            return cls.model_validate({name: _without_empty(value) for name, value in row.items()})
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            place = ".".join((cls.__ontology_tag__, *map(str, first["loc"])))
+            raise AdapterError(f"{first['msg']}, found {first['input']!r:.80}", where=place) from error
+
+    def to_row(self) -> dict[str, Any]:
+        """Return the values of the columns."""
+        return self.model_dump()
+
+    @classmethod
+    def _columns(cls) -> pa.StructType:
+        return struct_of(cls)
+
+
+def _array(rows: list[dict[str, Any]], columns: pa.StructType) -> pa.StructArray:
+    return cast("pa.StructArray", pa.array(rows, type=columns))  # the class follows from the type
+
+
+def _misfit(row: dict[str, Any], columns: pa.StructType) -> str | None:
+    """Return why `row` does not fit, None where it does."""
+    try:
+        _array([row], columns)
+    except _MISFITS as reason:
+        return str(reason)
+    return None
+
+
+def _without_empty(value: Any) -> Any:  # noqa: ANN401 - any cell
+    """Return `value` with every struct of nothing but nulls replaced by None."""
+    if not isinstance(value, dict):
+        return value
+    cells = {name: _without_empty(cell) for name, cell in value.items()}
+    return cells if any(cell is not None for cell in cells.values()) else None

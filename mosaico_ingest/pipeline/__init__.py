@@ -1,0 +1,1 @@
+"""The run of one recording: plan, read, decode, adapt, write, verify, report."""

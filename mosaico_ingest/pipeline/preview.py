@@ -1,0 +1,367 @@
+"""Preview a run: the plan, the state of the destination, and a sample of messages."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from os.path import relpath
+from pathlib import Path
+
+from mosaico_ingest.adapters.bridge import ROSBridge
+from mosaico_ingest.destinations.base import MemorySink, Session, StoredTopic, check_same_type
+from mosaico_ingest.destinations.store.store import Store
+from mosaico_ingest.errors import IngestError, SinkError, Unreachable
+from mosaico_ingest.findings import Finding, Severity
+from mosaico_ingest.frozen import frozen
+from mosaico_ingest.job.config import ROSInjectionConfig, ServerTarget
+from mosaico_ingest.job.model import IfExists, LoaderErrorPolicy, TopicLevelErrorPolicy
+from mosaico_ingest.job.patterns import first_match
+from mosaico_ingest.pipeline.plan import (
+    Decisions,
+    DestinationState,
+    Plan,
+    PlanDocument,
+    RecordingPlan,
+    Sample,
+    SampleRejection,
+    TopicPlan,
+    decisions,
+    notes,
+)
+from mosaico_ingest.pipeline.planning import resolve
+from mosaico_ingest.pipeline.run import open_for, preflight
+from mosaico_ingest.pipeline.topic import Stream
+from mosaico_ingest.pipeline.write_buffer import WriteBuffer
+from mosaico_ingest.protocol import check_topic_name
+from mosaico_ingest.remote import RemotePath
+from mosaico_ingest.report.events import Event, Rejected
+from mosaico_ingest.rosbag.blocks import RawBatch
+from mosaico_ingest.rosbag.recording import Recording
+from mosaico_ingest.version import __version__
+
+__all__ = [
+    "ask_destination",
+    "decide",
+    "plan_document",
+    "preview",
+    "space_finding",
+    "try_messages",
+]
+
+
+def ask_destination(plan: Plan, samples: Iterable[Sample], *, connect: bool) -> DestinationState:
+    """Return what the destination says; a server is asked only with `connect`."""
+    estimated = _estimate(plan, {sample.target: sample for sample in samples})
+    if isinstance(plan.target, ServerTarget):
+        return _server(plan, plan.target, estimated, connect=connect)
+    folder = plan.target.path
+    base = None if isinstance(folder, RemotePath) else _base(folder)
+    store = None
+    try:
+        store = Store.find(folder)
+        taken = store is not None and _taken(plan, store)
+        problem = (base and _refusal_of_folder(base)) or _refusal_of_name(plan, taken=taken)
+    except (SinkError, Unreachable) as error:
+        taken, problem = None, str(error)
+    return DestinationState(
+        kind="store",
+        exists=store is not None,
+        taken=taken,
+        problem=problem,
+        free_bytes=None if base is None else shutil.disk_usage(base).free,
+        estimated_bytes=estimated,
+    )
+
+
+def space_finding(state: DestinationState) -> Finding | None:
+    """Return a warning where the rows may not fit the disk."""
+    if state.free_bytes is None or state.estimated_bytes is None or state.estimated_bytes <= state.free_bytes:
+        return None
+    return Finding(
+        "disk-space",
+        Severity.WARNING,
+        f"the rows take {state.estimated_bytes} bytes before compression, and {state.free_bytes} are free",
+        help="make room, or name another store in target.store",
+    )
+
+
+def _taken(plan: Plan, store: Store) -> bool:
+    """Say whether the name is taken.
+
+    Raises:
+        SinkError: Rows of the plan cannot join what is there.
+    """
+    info = store.find_sequence(plan.sequence)
+    if info is None:
+        return False
+    if plan.if_exists is IfExists.APPEND:
+        held = {topic.name: topic.ontology for topic in info.topics}
+        for topic in plan.topics:
+            name = check_topic_name(topic.target)
+            if name in held:
+                check_same_type(held[name], topic.ontology, where=topic.target)
+    return True
+
+
+def _base(folder: Path) -> Path:
+    """Return the folder itself, or what is there of the way to it."""
+    return next(path for path in (folder, *folder.absolute().parents) if path.exists())
+
+
+def _refusal_of_folder(base: Path) -> str | None:
+    if not base.is_dir():
+        return f"{base} is no folder"
+    return None if os.access(base, os.W_OK | os.X_OK) else f"{base} cannot be written"
+
+
+def _refusal_of_name(plan: Plan, *, taken: bool) -> str | None:
+    if taken and plan.if_exists is IfExists.FAIL:
+        return f"there is a sequence {plan.sequence!r}, and sequence.if_exists is fail"
+    return None
+
+
+def _server(plan: Plan, target: ServerTarget, estimated: int | None, *, connect: bool) -> DestinationState:
+    taken: bool | None = None
+    exists: bool | None = None
+    problem: str | None = None
+    if connect:
+        try:
+            taken, exists = _found(plan, target), True
+            problem = _refusal_of_name(plan, taken=taken)
+        except SinkError as error:
+            exists, problem = False, str(error)
+    return DestinationState(
+        kind="server",
+        exists=exists,
+        taken=taken,
+        problem=problem,
+        free_bytes=None,
+        estimated_bytes=estimated,
+    )
+
+
+def _found(plan: Plan, target: ServerTarget) -> bool:
+    from mosaico_ingest.destinations.server.client import connect  # noqa: PLC0415 - Flight is slow to import and rarely needed
+
+    with connect(target) as client:
+        return client.find(plan.sequence) is not None
+
+
+def _estimate(plan: Plan, samples: dict[str, Sample]) -> int | None:
+    """Return what all rows take uncompressed, None where the index or the sample does not say."""
+    sizes = [_topic_bytes(topic, samples[topic.target]) for topic in plan.topics if topic.count != 0]
+    if any(size is None for size in sizes):
+        return None
+    return round(sum(size or 0 for size in sizes) * _share(plan))
+
+
+def _topic_bytes(topic: TopicPlan, sample: Sample) -> int | None:
+    if topic.count is None or sample.row_bytes is None:
+        return None
+    return -(-topic.count // topic.every) * sample.row_bytes
+
+
+def _share(plan: Plan) -> float:
+    """Return how much of the recording's time is read, from 0 to 1."""
+    if plan.start_ns is None or plan.end_ns is None or plan.end_ns <= plan.start_ns:
+        return 1.0
+    start = max(plan.start_ns, plan.read_from_ns if plan.read_from_ns is not None else plan.start_ns)
+    end = min(plan.end_ns, plan.read_until_ns if plan.read_until_ns is not None else plan.end_ns)
+    return max(0.0, (end - start) / (plan.end_ns - plan.start_ns))
+
+
+MESSAGES = 16
+"""How many messages of each topic are enough."""
+_MEMORY_BYTES = 32 << 20
+_LOOK_BYTES = 64 << 20
+"""How much is read in search of them; what the index knows of is looked up after that."""
+_LOOK_S = 5.0
+
+
+def try_messages(plan: Plan, recording: Recording) -> tuple[Sample, ...]:
+    """Decode and adapt the first messages of every topic of the plan; nothing is written."""
+    with MemorySink().open(plan.sequence, plan.metadata) as session:
+        trials = tuple(_trial(topic, recording, session) for topic in plan.topics)
+        by_channel = {channel: trial for trial in trials for channel in trial.stream.plan.channels}
+        with WriteBuffer(max_bytes=_MEMORY_BYTES) as buffer:
+            for batch in _first(plan, recording, by_channel):
+                by_channel[batch.channel.id].stream.feed(batch, buffer)
+    stored = {topic.topic: topic for topic in session.stored()}
+    return tuple(trial.sample(stored.get(trial.stream.plan.target)) for trial in trials)
+
+
+@dataclass(slots=True)
+class _Tally:
+    """An observer that keeps the rejections, by their rules."""
+
+    rejections: dict[str, Rejected] = field(default_factory=dict[str, Rejected])
+
+    def __call__(self, event: Event) -> None:
+        if isinstance(event, Rejected):
+            known = self.rejections.get(event.rule)
+            self.rejections[event.rule] = (
+                event if known is None else replace(known, count=known.count + event.count)
+            )
+
+
+@frozen
+class _Trial:
+    stream: Stream
+    tally: _Tally
+
+    def sample(self, stored: StoredTopic | None) -> Sample:
+        rejections = tuple(
+            SampleRejection(stage=lost.stage, rule=lost.rule, count=lost.count, reason=lost.reason)
+            for lost in self.tally.rejections.values()
+        )
+        return Sample(
+            target=self.stream.plan.target,
+            read=self.stream.seen,
+            rejected=sum(lost.count for lost in rejections),
+            row_bytes=-(-stored.stored_bytes // stored.rows) if stored and stored.rows else None,
+            rejections=rejections,
+        )
+
+
+def _trial(topic: TopicPlan, recording: Recording, session: Session) -> _Trial:
+    """Open a topic's stream so that a lost message costs nothing but itself."""
+    tally = _Tally()
+    patient = replace(topic, on_error=TopicLevelErrorPolicy.Ignore)
+    stream = Stream(patient, LoaderErrorPolicy.IGNORE, session, tally)
+    channels = {channel.id: channel for channel in recording.channels}
+    for channel in topic.channels:
+        stream.bind(channels[channel])
+    return _Trial(stream, tally)
+
+
+def _first(plan: Plan, recording: Recording, trials: dict[int, _Trial]) -> Iterator[RawBatch]:
+    """Yield batches until every topic has enough; then, of those that had none, what the index knows of."""
+    yield from _look(plan, recording, trials, enough=MESSAGES)
+    absent = {
+        channel: trial
+        for channel, trial in trials.items()
+        if not trial.stream.seen and trial.stream.plan.count
+    }
+    if absent:
+        yield from _look(plan, recording, absent, enough=1)
+
+
+def _look(plan: Plan, recording: Recording, trials: dict[int, _Trial], *, enough: int) -> Iterator[RawBatch]:
+    left_bytes, until = _LOOK_BYTES, time.monotonic() + _LOOK_S
+    batches = recording.batches(
+        tuple(trials),
+        start_ns=plan.read_from_ns,
+        end_ns=plan.read_until_ns,
+        rows=MESSAGES,
+        memory_bytes=_MEMORY_BYTES,
+    )
+    for batch in batches:
+        left_bytes -= int(batch.lengths.sum())
+        if trials[batch.channel.id].stream.seen < enough:
+            yield batch
+        if all(trial.stream.seen >= enough for trial in trials.values()):
+            return
+        if left_bytes < 0 or time.monotonic() > until:
+            return
+
+
+def plan_document(
+    configs: Sequence[ROSInjectionConfig], *, job: Path, folder: Path, connect: bool
+) -> PlanDocument:
+    """Return what a manifest's configurations would do, as a document for `folder`.
+
+    Raises:
+        IngestError: One of them cannot be done; of several that cannot, `findings` says why of each.
+    """
+    tried = [_tried(config, connect=connect) for config in configs]
+    planned = tuple(one for one in tried if isinstance(one, RecordingPlan))
+    refused = [one for one in tried if isinstance(one, IngestError)]
+    if refused:
+        raise refused[0] if len(tried) == 1 else _all_of(refused, len(tried))
+    return PlanDocument(
+        tool=f"mosaico-ingest {__version__}",
+        job=Path(relpath(job, folder)).as_posix(),
+        recordings=planned,
+    )
+
+
+def _tried(config: ROSInjectionConfig, *, connect: bool) -> RecordingPlan | IngestError:
+    try:
+        return preview(config, connect=connect)
+    except IngestError as error:
+        return error
+
+
+def _all_of(refused: Sequence[IngestError], count: int) -> IngestError:
+    """Return one error for all of them, with the exit code that is the least."""
+    findings = [
+        finding
+        for error in refused
+        for finding in error.findings or (Finding("refused", Severity.ERROR, str(error)),)
+    ]
+    one = min(refused, key=lambda error: error.exit_code)
+    one.what, one.where, one.hint = f"{len(refused)} of {count} recordings cannot be ingested", None, None
+    one.findings = tuple(dict.fromkeys(findings))
+    return one
+
+
+def preview(config: ROSInjectionConfig, *, connect: bool) -> RecordingPlan:
+    """Open the recording, decide everything, try a few messages, ask the destination (a server only with `connect`).
+
+    Raises:
+        IngestError: The job cannot be done; the message says why.
+    """
+    bridge = ROSBridge.for_config(config)
+    with open_for(config) as (recording, resolver):
+        plan = resolve(config, recording, bridge=bridge, resolver=resolver)
+        samples = try_messages(plan, recording)
+        losses = tuple(_losses(recording))
+    decided = decisions(plan, folder=config.base_dir)
+    state = ask_destination(plan, samples, connect=connect)
+    warning = preflight(plan) if connect and state.exists else None
+    found = (finding for finding in (space_finding(state), warning) if finding is not None)
+    return RecordingPlan(
+        digest=decided.digest,
+        decisions=decided,
+        destination=state,
+        samples=samples,
+        notes=notes((*plan.findings, *losses, *_chosen(config, plan), *_left_out(plan), *found)),
+    )
+
+
+def decide(config: ROSInjectionConfig, *, folder: Path) -> Decisions:
+    """Open the recording and decide everything; paths are seen from `folder`.
+
+    Raises:
+        IngestError: The job cannot be done; the message says why.
+    """
+    bridge = ROSBridge.for_config(config)
+    with open_for(config) as (recording, resolver):
+        return decisions(resolve(config, recording, bridge=bridge, resolver=resolver), folder=folder)
+
+
+def _losses(recording: Recording) -> Iterator[Finding]:
+    for loss in recording.losses:
+        where = f"{Path(loss.file).name} at {loss.offset}" if loss.file else "the recording"
+        yield Finding("unreadable", Severity.WARNING, f"{where}: {loss.reason}")
+
+
+def _chosen(config: ROSInjectionConfig, plan: Plan) -> Iterator[Finding]:
+    """Yield a note for each topic whose adapter the manifest names, with the line that does."""
+    for topic in plan.topics:
+        glob = first_match(config.adapter_override, topic.topic)
+        if glob is not None:
+            place = config.places.get(("adapters", "override", glob))
+            yield Finding(
+                "override", Severity.INFO, f"{topic.topic}: {topic.adapter.name} by {glob!r}", place
+            )
+
+
+def _left_out(plan: Plan) -> Iterator[Finding]:
+    """Yield a note for each topic that is not read, with the line of the manifest that says so."""
+    for topic in plan.left_out:
+        severity = Severity.WARNING if topic.lost else Severity.INFO
+        yield Finding("left-out", severity, f"{topic.topic}: {topic.why}", topic.span)

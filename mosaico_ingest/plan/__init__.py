@@ -1,1 +1,0 @@
-"""Every decision about a job, made against the real recording; writes nothing."""

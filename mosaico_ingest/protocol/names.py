@@ -1,0 +1,114 @@
+"""Rules for names of sequences and topics, metadata keys and API keys."""
+
+from __future__ import annotations
+
+import json
+import re
+import secrets
+import string
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+from mosaico_ingest.errors import SinkError
+
+__all__ = [
+    "check_metadata",
+    "check_sequence_name",
+    "check_topic_name",
+    "key_problem",
+    "new_key",
+]
+
+_FORBIDDEN = re.compile(r"[^\x21-\x7e]|[!\"'*£$%&.:]")
+_MAX_DEPTH = 64
+_KEY = re.compile(r"[A-Za-z0-9 _-]+")
+_NAMES = "ASCII without blanks and without ! \" ' * $ % & . :"
+
+
+def check_sequence_name(name: str) -> str:
+    """Return the name of a sequence, or raise SinkError with the first character that is not allowed."""
+    if not name:
+        raise SinkError("a sequence needs a name", hint="set sequence.name")
+    _refuse(name, _FORBIDDEN.search(name), kind="sequence", allowed=f"{_NAMES} /")
+    _refuse(name, re.search("/", name), kind="sequence", allowed=f"{_NAMES} /")
+    return name
+
+
+def check_topic_name(name: str) -> str:
+    """Return the name of a topic with its leading slash, or raise SinkError with what is not allowed."""
+    _refuse(name, _FORBIDDEN.search(name), kind="topic", allowed=_NAMES)
+    path = name.removeprefix("/")
+    if not all(path.split("/")):
+        raise SinkError(f"topic name {name!r} has an empty part", hint="rename it in topic_settings")
+    return f"/{path}"
+
+
+def _refuse(name: str, bad: re.Match[str] | None, *, kind: str, allowed: str) -> None:
+    if bad is not None:
+        hint = "set sequence.name" if kind == "sequence" else "rename it in topic_settings"
+        raise SinkError(
+            f"{kind} name {name!r} has {bad.group()!r}; allowed is {allowed}",
+            hint=hint,
+        )
+
+
+def check_metadata(metadata: Mapping[str, Any], *, where: str) -> str:
+    """Return the metadata as JSON, or raise SinkError with the path of the key or value that is refused."""
+    if _is_deeper(metadata, _MAX_DEPTH):
+        raise SinkError(f"metadata is nested deeper than {_MAX_DEPTH} levels", where=where, hint="flatten it")
+    for path, key in _keys(metadata, ""):
+        if not _KEY.fullmatch(key) or "--" in key:
+            raise SinkError(
+                f"metadata key {path!r} is refused; allowed are letters, digits, blanks, _ and single -",
+                where=where,
+            )
+    try:
+        text = json.dumps(metadata, allow_nan=False)
+        json.dumps(metadata, ensure_ascii=False).encode()  # half a surrogate pair is no text to most readers
+    except (TypeError, ValueError) as err:
+        raise SinkError(f"metadata is not JSON: {err}", where=where) from err
+    return text
+
+
+def _is_deeper(value: object, levels: int) -> bool:
+    if not isinstance(value, Mapping | list | tuple):
+        return False
+    inner = value.values() if isinstance(value, Mapping) else value
+    return levels == 0 or any(_is_deeper(child, levels - 1) for child in inner)
+
+
+def _keys(value: object, path: str) -> list[tuple[str, str]]:
+    if isinstance(value, Mapping):
+        found: list[tuple[str, str]] = []
+        for key, child in value.items():
+            inner = f"{path}.{key}" if path else str(key)
+            found += [(inner, str(key)), *_keys(child, inner)]
+        return found
+    if isinstance(value, list | tuple):
+        return [pair for i, child in enumerate(value) for pair in _keys(child, f"{path}[{i}]")]
+    return []
+
+
+_ALPHABET = string.ascii_lowercase + string.digits
+_FORM = re.compile(r"msco_([a-z0-9]{32})_([0-9a-f]{8})")
+
+
+def new_key() -> str:
+    """Return a new random key."""
+    secret = "".join(secrets.choice(_ALPHABET) for _ in range(32))
+    return f"msco_{secret}_{_checksum(secret)}"
+
+
+def key_problem(key: str) -> str | None:
+    """Return why this can be no key, without repeating it; None where it can."""
+    form = _FORM.fullmatch(key)
+    if form is None:
+        return "it is not msco_<32 letters or digits>_<8 hex digits>"
+    if form.group(2) != _checksum(form.group(1)):
+        return "its checksum does not fit, so a character is wrong"
+    return None
+
+
+def _checksum(secret: str) -> str:
+    return f"{zlib.crc32(secret.encode()):08x}"

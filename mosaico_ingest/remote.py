@@ -1,0 +1,405 @@
+"""Paths behind URLs: a subset of `pathlib.Path` over pyarrow file systems, and their errors."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from datetime import timedelta
+from fnmatch import fnmatchcase
+from functools import lru_cache
+from pathlib import Path
+from stat import S_IFDIR, S_IFREG
+from typing import TYPE_CHECKING, Any, TypeAlias
+from urllib.parse import parse_qs, unquote, urlsplit
+
+from mosaico_ingest.errors import IngestError, Unreachable
+from mosaico_ingest.frozen import frozen
+
+if TYPE_CHECKING:
+    from pyarrow.fs import FileSystem
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from pyarrow.fs import FileInfo, FileSystem
+
+__all__ = [
+    "SCHEMES",
+    "AnyPath",
+    "RemotePath",
+    "RemoteStat",
+    "as_path",
+    "explained",
+    "filesystem",
+    "is_transient",
+    "is_url",
+    "reaching",
+    "without_options",
+]
+
+_REFUSED = re.compile(
+    r"ACCESS_DENIED|INVALID_ACCESS_KEY|INVALID_SIGNATURE|INVALID_CLIENT_TOKEN|SIGNATURE_DOES_NOT_MATCH"
+    r"|MISSING_AUTHENTICATION|EXPIRED_TOKEN|HTTP status 40[13]|PERMISSION_DENIED|UNAUTHENTICATED|PermissionDenied"
+)
+_TRANSIENT = re.compile(
+    r"NETWORK_CONNECTION|SLOW_DOWN|THROTTLING|SERVICE_UNAVAILABLE|INTERNAL_FAILURE|REQUEST_TIMEOUT|REQUEST_EXPIRED"
+    r"|HTTP status 5\d\d|curlCode|\bUNAVAILABLE\b|DEADLINE_EXCEEDED|Retry policy exhausted|[Tt]imed out"
+)
+_NO_BUCKET = re.compile(r"NO_SUCH_BUCKET|[Bb]ucket .*(does not exist|not found)")
+_SDK = re.compile(r"^.*?AWS Error |\s*\(Request ID: [^)]*\)")
+
+
+@contextmanager
+def reaching(where: str) -> Generator[None, None, None]:
+    """Raise our own error for what goes wrong on the way to `where`; a missing object stays a FileNotFoundError.
+
+    Raises:
+        Unreachable: Nobody answers, or not in time; the client has tried several times.
+        IngestError: Access is refused, or something else is wrong with the request.
+    """
+    try:
+        yield
+    except FileNotFoundError:
+        raise
+    except OSError as err:
+        raise explained(err, where) from err
+
+
+def explained(err: OSError, where: str) -> IngestError:
+    """Return the error of ours for one of a file system, about `where`."""
+    said = _SDK.sub("", str(err).strip().splitlines()[0] if str(err).strip() else type(err).__name__)
+    if is_transient(err):
+        return Unreachable(f"does not answer: {said}", where=where, hint="check the address and the network")
+    if _REFUSED.search(str(err)):
+        hint = "check the credentials: the environment, the client's configuration, or the machine's role"
+        return IngestError(f"access is refused: {said}", where=where, hint=hint)
+    if _NO_BUCKET.search(str(err)):
+        return IngestError(
+            "there is no such bucket", where=where, hint="check the URL; buckets are not made here"
+        )
+    return IngestError(said, where=where)
+
+
+def is_transient(err: OSError) -> bool:
+    """Say whether trying again later may help."""
+    return isinstance(err, ConnectionError | TimeoutError) or _TRANSIENT.search(str(err)) is not None
+
+
+_ATTEMPTS = 5
+"""How often a request is made, with a pause that doubles, before its failure is believed."""
+_CONNECT_S, _REQUEST_S = 5.0, 30.0
+_RETRY_S = 30.0
+
+
+def filesystem(root: str, options: str) -> FileSystem:
+    """Return the file system of `s3://bucket`, one for each process and set of options.
+
+    Raises:
+        IngestError: The scheme or an option is not known.
+        Unreachable: The bucket's region could not be asked for.
+    """
+    return _made(root, options, os.getpid())  # a connection must not cross a fork
+
+
+@lru_cache(maxsize=64)
+def _made(root: str, options: str, _process: int) -> FileSystem:
+    scheme, _, bucket = root.partition("://")
+    make, known = SCHEMES[scheme]
+    given = {name: values[-1] for name, values in parse_qs(options, keep_blank_values=True).items()}
+    for name in given:
+        if name not in known:
+            raise IngestError(
+                f"the option {name!r} is not known",
+                where=f"{root}?{options}",
+                hint=f"known are {', '.join(known)}",
+            )
+    return make(bucket, given)
+
+
+def _s3(bucket: str, given: dict[str, str]) -> FileSystem:
+    from pyarrow import fs  # noqa: PLC0415 - slow to import, and only jobs with URLs need it
+
+    region = given.get("region")
+    if region is None and "endpoint_override" not in given:
+        with reaching(f"s3://{bucket}"):
+            region = fs.resolve_s3_region(bucket)
+    return fs.S3FileSystem(
+        region=region,
+        scheme=given.get("scheme", "https"),
+        endpoint_override=given.get("endpoint_override"),
+        anonymous=given.get("anonymous") == "true",
+        connect_timeout=_CONNECT_S,
+        request_timeout=_REQUEST_S,
+        retry_strategy=fs.AwsStandardS3RetryStrategy(max_attempts=_ATTEMPTS),
+        allow_delayed_open=True,  # pyright: ignore[reportCallIssue] - the stubs are older; small objects are sent with one request
+    )
+
+
+def _gs(_bucket: str, given: dict[str, str]) -> FileSystem:
+    from pyarrow import fs  # noqa: PLC0415 - slow to import, and only jobs with URLs need it
+
+    return fs.GcsFileSystem(
+        anonymous=given.get("anonymous") == "true",
+        scheme=given.get("scheme", "https"),
+        endpoint_override=given.get("endpoint_override"),
+        retry_time_limit=timedelta(seconds=_RETRY_S),
+    )
+
+
+_Make = Callable[[str, dict[str, str]], "FileSystem"]
+SCHEMES: dict[str, tuple[_Make, tuple[str, ...]]] = {
+    "s3": (_s3, ("endpoint_override", "scheme", "region", "anonymous")),
+    "gs": (_gs, ("endpoint_override", "scheme", "anonymous")),
+}
+"""What is understood, with the options each may have behind `?`."""
+
+_URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/(?=[^/])|([A-Za-z][A-Za-z0-9+.-]+)://")
+"""With one slash too: that is what is left of a URL that went through `Path`."""
+
+
+@frozen
+class RemoteStat:
+    """What is known of an object without reading it; named as in `os.stat_result`."""
+
+    st_mode: int
+    st_size: int
+    st_mtime_ns: int
+
+    @property
+    def st_mtime(self) -> float:
+        """When it was written, in seconds since the epoch."""
+        return self.st_mtime_ns / 1e9
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class RemotePath:
+    """`s3://bucket/a/b?region=…`, as root, key and options; what a listing said of it is kept with it."""
+
+    root: str
+    key: str
+    options: str = field(default="", repr=False)
+    listed: RemoteStat | None = field(default=None, compare=False, repr=False)
+
+    def __str__(self) -> str:
+        """Return the URL without its options."""
+        return f"{self.root}/{self.key}".rstrip("/")
+
+    def __truediv__(self, name: str) -> RemotePath:
+        """Return what lies below."""
+        return replace(self, key="/".join(part for part in (self.key, name.strip("/")) if part), listed=None)
+
+    @property
+    def url(self) -> str:
+        """The URL with its options, from which `as_path` makes the same path."""
+        return f"{self}?{self.options}" if self.options else str(self)
+
+    @property
+    def name(self) -> str:
+        """The last part."""
+        return self.key.rpartition("/")[2] or self.root.rpartition("/")[2]
+
+    @property
+    def suffix(self) -> str:
+        """What follows the last dot of the name, with it."""
+        return Path(self.name).suffix
+
+    @property
+    def parent(self) -> RemotePath:
+        """The folder it lies in; a bucket is its own."""
+        return replace(self, key=self.key.rpartition("/")[0], listed=None)
+
+    @property
+    def filesystem(self) -> FileSystem:
+        """What serves it."""
+        return filesystem(self.root, self.options)
+
+    @property
+    def place(self) -> str:
+        """How its file system spells it."""
+        return f"{self.root.partition('://')[2]}/{self.key}".rstrip("/")
+
+    @property
+    def above(self) -> Iterator[RemotePath]:
+        """The folders it lies in, up to the bucket."""
+        path = self
+        while path.key:
+            path = path.parent
+            yield path
+
+    def resolve(self) -> RemotePath:
+        """Return the path itself: there are no links."""
+        return self
+
+    def exists(self) -> bool:
+        """Say whether there is such an object, or one below it."""
+        return self._look() is not None
+
+    def is_file(self) -> bool:
+        """Say whether it is an object."""
+        found = self._look()
+        return found is not None and found.st_mode & S_IFREG == S_IFREG
+
+    def is_dir(self) -> bool:
+        """Say whether there are objects below it."""
+        found = self._look()
+        return found is not None and found.st_mode & S_IFREG != S_IFREG
+
+    def stat(self) -> RemoteStat:
+        """Return what the listing said that it came from, or what its file system says now.
+
+        Raises:
+            FileNotFoundError: There is none.
+        """
+        found = self._look()
+        if found is None:
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self))
+        return found
+
+    def now(self) -> RemotePath:
+        """Return the path without what a listing said of it, so that its file system is asked again."""
+        return replace(self, listed=None)
+
+    def iterdir(self) -> Iterator[RemotePath]:
+        """Yield what lies in this folder, nothing where it is not there."""
+        return self.listing(recursive=False)
+
+    def listing(self, *, recursive: bool) -> Iterator[RemotePath]:
+        """Yield what lies below, in the order of the names."""
+        from pyarrow.fs import FileSelector  # noqa: PLC0415 - slow to import, and only jobs with URLs need it
+
+        selector = FileSelector(self.place, allow_not_found=True, recursive=recursive)
+        with reaching(str(self)):
+            found = self.filesystem.get_file_info(selector)
+        bucket = self.root.partition("://")[2]
+        for info in sorted(found, key=lambda one: one.path):
+            yield replace(self, key=info.path.removeprefix(f"{bucket}/"), listed=_stat(info))
+
+    def glob(self, pattern: str) -> Iterator[RemotePath]:
+        """Yield what matches, as `Path.glob`: `*` within a part of the name, `**` across parts."""
+        first, _, rest = pattern.strip("/").partition("/")
+        if first == "**":
+            folders = [self, *(one for one in self.listing(recursive=True) if one.is_dir())]
+            seen = (match for folder in folders for match in folder.glob(rest or "*"))
+            yield from dict.fromkeys(seen)
+            return
+        for entry in self.iterdir():
+            if fnmatchcase(entry.name, first):
+                if not rest:
+                    yield entry
+                elif entry.is_dir():
+                    yield from entry.glob(rest)
+
+    def open(self, mode: str = "rb") -> Any:  # noqa: ANN401 - a file of pyarrow's, whose stubs have no common class
+        """Open for reading from the start to the end (`rb`).
+
+        Raises:
+            FileNotFoundError: There is none.
+        """
+        if mode != "rb":
+            raise ValueError(f"a file behind a URL is opened with 'rb', not {mode!r}")
+        with reaching(str(self)):
+            return self.filesystem.open_input_stream(self.place, compression=None)
+
+    def open_input(self) -> pa.NativeFile:
+        """Open for reading by position."""
+        with reaching(str(self)):
+            return self.filesystem.open_input_file(self.place)
+
+    def open_output(self) -> pa.NativeFile:
+        """Open for writing; what is written is there once the file is closed."""
+        with reaching(str(self)):
+            return self.filesystem.open_output_stream(self.place, compression=None)
+
+    def version(self, file: pa.NativeFile | None = None) -> str:
+        """Return what changes when the object does: its size, and its tag or else the time it was written.
+
+        Raises:
+            FileNotFoundError: There is none.
+        """
+        with reaching(str(self)):
+            opened = file or self.open_input()
+            said = {str(name).lower(): bytes(value).decode() for name, value in opened.metadata().items()}
+            tag = next((said[name] for name in ("etag", "generation") if said.get(name)), None)
+            return f"{opened.size()} {tag or self.now().stat().st_mtime_ns}"
+
+    def read_bytes(self) -> bytes:
+        """Return the whole content."""
+        with reaching(str(self)), self.open() as file:
+            return bytes(file.read())
+
+    def write_bytes(self, content: bytes) -> None:
+        """Write the whole content, at once."""
+        with reaching(str(self)), self.open_output() as file:
+            file.write(content)
+
+    def unlink(self) -> None:
+        """Remove the object.
+
+        Raises:
+            FileNotFoundError: There is none.
+        """
+        with reaching(str(self)):
+            self.filesystem.delete_file(self.place)
+
+    def _look(self) -> RemoteStat | None:
+        if self.listed is not None:
+            return self.listed
+        with reaching(str(self)):
+            return _stat(self.filesystem.get_file_info(self.place))
+
+
+AnyPath: TypeAlias = "Path | RemotePath"
+
+
+def is_url(text: str) -> bool:
+    """Say whether a text is a URL, and no path of a disk."""
+    return _URL.match(text) is not None
+
+
+def without_options(text: str) -> str:
+    """Return a URL without what stands behind `?`; a path as it is."""
+    return text.partition("?")[0] if is_url(text) else text
+
+
+def as_path(given: str | Path | RemotePath) -> AnyPath:
+    """Return what a text stands for: a path, or what lies behind a URL; `file://` is a path.
+
+    Raises:
+        IngestError: The URL's scheme is not known, it has no bucket, or it carries a password.
+    """
+    if isinstance(given, RemotePath) or not is_url(str(given)):
+        return Path(given) if isinstance(given, str) else given
+    text = str(given)
+    if "://" not in text:  # it went through `Path`
+        text = text.replace(":/", ":///" if text.startswith("file:") else "://", 1)
+    try:
+        url = urlsplit(text, allow_fragments=False)  # an object's name may have a #
+    except ValueError as error:
+        raise IngestError(f"the URL cannot be read: {error}", where=str(given)) from error
+    if url.scheme == "file":
+        return Path(unquote(url.path))
+    if url.scheme not in SCHEMES:
+        known = ", ".join(f"{scheme}://" for scheme in (*SCHEMES, "file"))
+        raise IngestError(
+            f"the scheme {url.scheme}:// is not known", where=str(given), hint=f"known are {known}"
+        )
+    if not url.netloc:
+        raise IngestError("the URL names no bucket", where=str(given))
+    if "@" in url.netloc:
+        raise IngestError(
+            "a URL is no place for a password",
+            where=f"{url.scheme}://…@{url.netloc.rpartition('@')[2]}",
+            hint="credentials are taken from the environment, the client's configuration or the machine's role",
+        )
+    return RemotePath(f"{url.scheme}://{url.netloc}", url.path.strip("/"), url.query)
+
+
+def _stat(info: FileInfo) -> RemoteStat | None:
+    from pyarrow.fs import FileType  # noqa: PLC0415 - slow to import, and only jobs with URLs need it
+
+    if info.type == FileType.NotFound:
+        return None
+    mode = S_IFREG if info.type == FileType.File else S_IFDIR
+    return RemoteStat(mode, info.size or 0, info.mtime_ns or 0)

@@ -1,0 +1,1 @@
+"""Message definitions: parser, registry, distros, hashes."""

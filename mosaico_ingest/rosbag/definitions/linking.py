@@ -1,0 +1,157 @@
+"""Link a definition with the definitions it refers to, and derive its Arrow shape."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+
+from mosaico_ingest.errors import BagError, DecodeError
+from mosaico_ingest.rosbag.definitions.model import (
+    HEADER,
+    Container,
+    Definition,
+    Field,
+    MessageType,
+    normalize_msgtype,
+)
+from mosaico_ingest.rosbag.definitions.parser import BYTES, PRIMITIVES
+
+__all__ = [
+    "NUMBERS",
+    "TEXTS",
+    "link",
+    "ros_shape",
+]
+
+_MAX_DEPTH = 64
+_MAX_LEAVES = 20_000
+
+
+def link(
+    root: MessageType, find: Callable[[str], MessageType | None], *, ros_version: int, hint: str
+) -> dict[str, MessageType]:
+    """Return `root` and all it needs by full name, their fields' types spelled in full; `hint` says how to add one.
+
+    Raises:
+        BagError: A type is not known, is no ROS type, contains itself, or is too large to be one.
+    """
+    linked = dict[str, MessageType]()
+    waiting = [root]
+    while waiting:
+        message = waiting.pop()
+        fields = list[Field]()
+        for field in message.fields:
+            if not field.is_message and field.type not in PRIMITIVES:
+                raise BagError(f"{field.name} is of type {field.type}, which is not read", where=message.name)
+            needed = _needed(field, message.name, find, ros_version, hint) if field.is_message else None
+            if needed and needed.name not in linked:
+                waiting.append(needed)
+            fields.append(replace(field, type=needed.name) if needed else field)
+        linked[message.name] = replace(message, fields=tuple(fields))
+    _leaves(root.name, linked, {}, depth=0)
+    return linked
+
+
+def _needed(
+    field: Field, owner: str, find: Callable[[str], MessageType | None], ros_version: int, hint: str
+) -> MessageType:
+    names = _spellings(field.type, owner, ros_version)
+    found = next((known for name in names if (known := find(name))), None)
+    if found is None:
+        raise BagError(
+            f"the definition of {names[-1]} is not known", where=f"{owner}.{field.name}", hint=hint
+        )
+    return found
+
+
+def _spellings(name: str, owner: str, ros_version: int) -> list[str]:
+    """Return the full names that `name` may stand for in the text of `owner`, the likeliest first."""
+    namespace = owner.rpartition("/")[0]
+    if "/" in name:
+        package, _, short = name.rpartition("/")
+        same_kind = f"{package}/{namespace.rpartition('/')[2]}/{short}"
+        return list(dict.fromkeys((name, same_kind, normalize_msgtype(name))))
+    if name == "Header" and ros_version == 1:
+        return [HEADER]
+    local = f"{namespace}/{name}" if namespace else name
+    package = namespace.partition("/")[0]
+    names = [local, f"{package}/msg/{name}"] if package else [local]
+    return [*dict.fromkeys(names), HEADER] if name == "Header" else list(dict.fromkeys(names))
+
+
+def _leaves(name: str, types: Mapping[str, MessageType], known: dict[str, int], *, depth: int) -> int:
+    """Count the columns of a type, to stop a few lines of text from becoming millions of them."""
+    if depth > _MAX_DEPTH or known.get(name) == 0:
+        reason = "contains itself" if known.get(name) == 0 else f"is nested more than {_MAX_DEPTH} deep"
+        raise BagError(f"{name} {reason}", where=name)
+    if name not in known:
+        known[name] = 0
+        count = 1
+        for field in types[name].fields:
+            each = _leaves(field.type, types, known, depth=depth + 1) if field.is_message else 1
+            count += each * (field.size if field.container is Container.ARRAY and field.is_message else 1)
+        if count > _MAX_LEAVES:
+            raise BagError(f"{count} fields are more than a message can have", where=name)
+        known[name] = count
+    return known[name]
+
+
+NUMBERS = {
+    "bool": "?",
+    "byte": "u1",
+    "char": "u1",
+    "uint8": "u1",
+    "int8": "i1",
+    "uint16": "u2",
+    "int16": "i2",
+    "uint32": "u4",
+    "int32": "i4",
+    "uint64": "u8",
+    "int64": "i8",
+    "float32": "f4",
+    "float64": "f8",
+}
+"""The numpy type of every primitive but the texts, in the bytes and in the column."""
+
+TEXTS = frozenset({"string", "wstring"})
+
+
+def ros_shape(definition: Definition) -> pa.StructType:
+    """Return the Arrow type of a message's rows; every field is nullable, constants are not columns.
+
+    Raises:
+        DecodeError: A type contains itself, or a primitive is unknown.
+    """
+    return _struct(definition, definition.message, ())
+
+
+def _struct(definition: Definition, message: MessageType, within: tuple[str, ...]) -> pa.StructType:
+    if message.name in within:
+        raise DecodeError(f"type {message.name} contains itself", rule="definition", where=definition.root)
+    within = (*within, message.name)
+    return pa.struct([pa.field(field.name, _field(definition, field, within)) for field in message.fields])
+
+
+def _field(definition: Definition, field: Field, within: tuple[str, ...]) -> pa.DataType:
+    if field.container is Container.SEQUENCE and field.type in BYTES:
+        return pa.binary()
+    item = _item(definition, field, within)
+    if field.container is Container.SCALAR:
+        return item
+    child = pa.field(field.name if pa.types.is_struct(item) else "item", item)
+    return pa.list_(child, field.size) if field.container is Container.ARRAY else pa.list_(child)
+
+
+def _item(definition: Definition, field: Field, within: tuple[str, ...]) -> pa.DataType:
+    if field.is_message:
+        return _struct(definition, definition.types[field.type], within)
+    if field.type in TEXTS:
+        return pa.string()
+    if field.type not in NUMBERS:
+        raise DecodeError(
+            f"field {field.name} has the unknown type {field.type}", rule="definition", where=definition.root
+        )
+    return pa.from_numpy_dtype(np.dtype(NUMBERS[field.type]))

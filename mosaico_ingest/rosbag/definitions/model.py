@@ -1,0 +1,147 @@
+"""Message definitions as data, and the names of message types."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import Enum
+from typing import Protocol
+
+from mosaico_ingest.frozen import frozen
+
+__all__ = [
+    "DURATION",
+    "HEADER",
+    "TIME",
+    "Constant",
+    "Container",
+    "Definition",
+    "Embedded",
+    "Field",
+    "MessageType",
+    "Resolver",
+    "Source",
+    "normalize_msgtype",
+    "short_msgtype",
+]
+
+TIME = "builtin_interfaces/msg/Time"
+DURATION = "builtin_interfaces/msg/Duration"
+HEADER = "std_msgs/msg/Header"
+
+_KINDS = frozenset({"msg", "srv", "action"})
+_RENAMED = {
+    "roslib/msg/Header": HEADER,
+    "roslib/msg/Log": "rosgraph_msgs/msg/Log",
+    "roslib/msg/Clock": "rosgraph_msgs/msg/Clock",
+}
+
+
+def normalize_msgtype(name: str) -> str:
+    """Return `pkg/msg/Name` for `pkg/Name`, for DDS's `pkg::msg::dds_::Name_`, and for names ROS has given up.
+
+    Service and action parts keep their kind (`pkg/srv/Name_Request`), a name without a package stays as it is.
+    """
+    parts = [part for part in name.strip().replace("::", "/").split("/") if part]
+    if "dds_" in parts:
+        parts = [part for part in parts if part != "dds_"]
+        parts[-1] = parts[-1].removesuffix("_")
+    if len(parts) > 1 and parts[-2] not in _KINDS:
+        parts.insert(-1, "msg")
+    full = "/".join(parts)
+    return _RENAMED.get(full, full)
+
+
+def short_msgtype(name: str) -> str:
+    """Return the name as definition texts spell it: `pkg/Name` for `pkg/msg/Name`, any other unchanged."""
+    return name.replace("/msg/", "/", 1)
+
+
+class Container(str, Enum):
+    """How many values a field holds."""
+
+    SCALAR = "scalar"
+    ARRAY = "array"
+    """A fixed number of them, without a length word."""
+    SEQUENCE = "sequence"
+    """Any number up to the bound, behind a length word."""
+
+
+class Source(str, Enum):
+    """Where a definition was found, in the order of preference."""
+
+    BAG = "bag"
+    CUSTOM = "custom"
+    DISTRO = "distro"
+    PACKAGE = "package"
+    """A public package that no distro's core has."""
+
+
+@frozen
+class Field:
+    """One field: `type` is a primitive (`float64`, `string`, `wstring`, …) or a full message type name."""
+
+    name: str
+    type: str
+    is_message: bool = False
+    container: Container = Container.SCALAR
+    size: int = 0
+    """The length of an array, the bound of a sequence (0: unbounded)."""
+    string_bound: int = 0
+    """What `string<=N` says (0: unbounded); the bytes do not depend on it."""
+
+
+@frozen
+class Constant:
+    """A named value of a message type, as `uint8 STATUS_FIX=0`."""
+
+    name: str
+    type: str
+    value: str | bool | int | float
+
+
+@frozen
+class MessageType:
+    """A message type's own fields and constants; `name` is `pkg/msg/Name`, also for ROS 1."""
+
+    name: str
+    fields: tuple[Field, ...]
+    constants: tuple[Constant, ...] = ()
+
+
+@frozen
+class Definition:
+    """A message type with every type it needs, and where it came from."""
+
+    root: str
+    types: Mapping[str, MessageType]
+    source: Source
+    text: str
+    """The flattened `.msg` text: nested types follow 80 `=` and `MSG: pkg/Name`."""
+    ros_version: int
+    """1 or 2: the form of `time` and of the header."""
+
+    @property
+    def message(self) -> MessageType:
+        """The type this definition is about."""
+        return self.types[self.root]
+
+
+@frozen
+class Embedded:
+    """The definition text a recording carries for a type, as it stands there."""
+
+    encoding: str
+    """`ros1msg`, `ros2msg`, `ros2idl`, or what else the recording calls it."""
+    text: str
+
+
+class Resolver(Protocol):
+    """Finds the definition of a type: embedded first, then the caller's own, then the distro's and known packages'."""
+
+    def resolve(self, msgtype: str, embedded: Embedded | None, *, ros_version: int) -> Definition:
+        """Return the definition of `msgtype`, any spelling of the name.
+
+        Raises:
+            BagError: None is known, or the one in the recording cannot be read; the text says which.
+        """
+        ...

@@ -1,0 +1,345 @@
+"""Parse `.msg` and IDL text, and write definitions as `.msg` text."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import lru_cache
+
+from rosbags.interfaces import Nodetype
+from rosbags.interfaces.typing import FieldDesc, Typesdict
+from rosbags.typesys import TypesysError, get_types_from_idl
+
+from mosaico_ingest.errors import BagError
+from mosaico_ingest.frozen import frozen
+from mosaico_ingest.rosbag.definitions.model import (
+    DURATION,
+    TIME,
+    Constant,
+    Container,
+    Field,
+    MessageType,
+    normalize_msgtype,
+    short_msgtype,
+)
+
+__all__ = [
+    "BYTES",
+    "PRIMITIVES",
+    "SEPARATOR",
+    "Section",
+    "flatten",
+    "message_type",
+    "parse_msg",
+    "read_idl",
+    "read_types",
+    "sections",
+    "spell",
+]
+
+SEPARATOR = "=" * 80
+
+PRIMITIVES = frozenset(
+    {
+        "bool", "byte", "char", "int8", "uint8", "int16", "uint16", "int32", "uint32",
+        "int64", "uint64", "float32", "float64", "string", "wstring",
+    }
+)  # fmt: skip
+"""The types that are not messages; `time` and `duration` are read as messages of two fields."""
+
+BYTES = frozenset({"byte", "char", "uint8"})
+"""The primitives whose sequences are one binary value, `bytes` in Python."""
+
+_SEPARATOR_LINE = re.compile(r"^={10,}[ \t\r]*(?:\n|\Z)", re.MULTILINE)
+_HEAD = re.compile(r"\s*(?P<kind>MSG|IDL):[ \t]*(?P<name>\S+)[ \t\r]*(?:\n|\Z)")
+_LINE = re.compile(
+    r"(?P<type>[A-Za-z]\w*(?:/\w+)*)(?:<=(?P<bound>\d+))?(?P<array>\[(?:<=)?\d*\])?\s+(?P<name>[A-Za-z_]\w*)"
+    r"(?:\s*=(?P<value>.*)|\s*(?:#.*)?|\s+(?P<default>[-+.\w'\"\[].*))"
+)
+_ANNOTATION = re.compile(r"@(?P<name>\w+)(?:\([^)]*\))?\s*")
+_QUOTED = re.compile(r"""(?:'((?:\\.|[^'\\])*)'|"((?:\\.|[^"\\])*)")\s*(?:#.*)?""")
+_MAX_SIZE = 2**31 - 1
+_BUILTIN = {"time": TIME, "duration": DURATION}
+
+
+@frozen
+class Section:
+    """The text of one type among several; the first may have no name of its own."""
+
+    kind: str
+    """`MSG`, `IDL`, or empty where there is no head."""
+    name: str
+    text: str
+    line: int
+    """How many lines of the whole come before it."""
+
+
+def sections(text: str) -> Iterator[Section]:
+    """Split a text at its `===` lines; empty text is one section, an empty part before a separator none."""
+    separators = list(_SEPARATOR_LINE.finditer(text))
+    starts = [0, *(separator.end() for separator in separators)]
+    ends = [*(separator.start() for separator in separators), len(text)]
+    for start, end in zip(starts, ends, strict=True):
+        head = _HEAD.match(text, start, end)
+        body = head.end() if head else start
+        if head or text[start:end].strip() or not separators:
+            kind, name = (head["kind"], head["name"]) if head else ("", "")
+            yield Section(kind, name, text[body:end], text.count("\n", 0, body))
+
+
+def parse_msg(text: str, name: str, *, where: str | None = None, line: int = 0) -> MessageType:
+    """Return the one type that `text` defines; types its fields refer to keep the spelling of the text.
+
+    `where` names the source and `line` the lines before the text in it, for messages.
+
+    Raises:
+        BagError: A line is no field, no constant and no comment.
+    """
+    fields, constants = list[Field](), list[Constant]()
+    for number, raw in enumerate(text.lstrip("\ufeff").split("\n"), start=line + 1):
+        content = raw.strip(" \t\r\0\f")
+        if not content or content.startswith("#"):
+            continue
+        try:
+            item = _item(content)
+        except ValueError as error:
+            place = f"{where or name}:{number}"
+            hint = "a line is `type name`, `type NAME=value` or a `#` comment"
+            raise BagError(f"cannot read {content!r}: {error}", where=place, hint=hint) from None
+        if isinstance(item, Field):
+            fields.append(item)
+        elif item:
+            constants.append(item)
+    _refuse_twins(fields, where or name)
+    return MessageType(name, tuple(fields), tuple(constants))
+
+
+def _item(content: str) -> Field | Constant | None:
+    while annotation := _ANNOTATION.match(content):
+        if annotation["name"] == "optional":
+            raise ValueError("optional fields have no place in plain CDR")
+        content = content[annotation.end() :]
+    if not content or content.startswith("#"):
+        return None
+    match = _LINE.fullmatch(content)
+    if not match:
+        raise ValueError("not a field or constant")
+    kind = match["type"]
+    if match["bound"] and kind not in {"string", "wstring"}:
+        raise ValueError(f"{kind} cannot be bounded")
+    if match["default"] and kind not in PRIMITIVES:
+        raise ValueError(f"a default for {kind}")
+    if match["value"] is not None:
+        return Constant(match["name"], kind, _value(kind, match["value"].strip()))
+    container, size = _container(match["array"])
+    return Field(
+        match["name"],
+        _BUILTIN.get(kind, kind),
+        is_message=kind not in PRIMITIVES,
+        container=container,
+        size=size,
+        string_bound=int(match["bound"] or 0),
+    )
+
+
+def _container(array: str | None) -> tuple[Container, int]:
+    if array is None:
+        return Container.SCALAR, 0
+    bounded = array.startswith("[<=")
+    digits = array.strip("[<=]")
+    size = int(digits or 0)
+    if size > _MAX_SIZE or (bounded and not digits):
+        raise ValueError(f"{array} is no size")
+    return (Container.SEQUENCE if bounded or not digits else Container.ARRAY), size
+
+
+def _value(kind: str, text: str) -> str | bool | int | float:
+    """Return a constant's value; a string's runs to the end of the line unless it is quoted."""
+    if kind not in PRIMITIVES:
+        raise ValueError(f"a constant of type {kind}")
+    quoted = _QUOTED.fullmatch(text)
+    if quoted:
+        return quoted[1] if quoted[1] is not None else quoted[2]
+    if kind in {"string", "wstring"}:
+        return text
+    plain = text.partition("#")[0].strip()
+    if kind == "bool" and plain.lower() in {"true", "false"}:
+        return plain.lower() == "true"
+    if kind == "bool":
+        return bool(_integer(plain))
+    return float(plain) if kind.startswith("float") else _integer(plain)
+
+
+def _integer(text: str) -> int:
+    digits = text.lstrip("+-")
+    octal = len(digits) > 1 and digits.startswith("0") and digits.isdecimal()
+    return int(text, 8 if octal else 0)
+
+
+def _refuse_twins(fields: list[Field], where: str) -> None:
+    counts = Counter(field.name for field in fields)
+    twin = next((name for name, count in counts.items() if count > 1), None)
+    if twin:
+        raise BagError(f"the field {twin!r} is defined twice", where=where)
+
+
+def flatten(root: str, types: Mapping[str, MessageType], *, ros_version: int) -> str:
+    """Return the text of `root`, then of each type it needs, after a separator, in the order they are met."""
+    order = dict[str, None]()
+    _collect(types[root], types, order, hidden=_hidden(ros_version))
+    order.pop(root, None)
+    texts = [_own_text(types[root], ros_version)]
+    texts += [f"{SEPARATOR}\nMSG: {short_msgtype(n)}\n{_own_text(types[n], ros_version)}" for n in order]
+    return "".join(texts)
+
+
+def _hidden(ros_version: int) -> Mapping[str, str]:
+    return {TIME: "time", DURATION: "duration"} if ros_version == 1 else {}
+
+
+def _collect(
+    message: MessageType,
+    types: Mapping[str, MessageType],
+    order: dict[str, None],
+    *,
+    hidden: Mapping[str, str],
+) -> None:
+    for field in message.fields:
+        if field.is_message and field.type not in order and field.type not in hidden:
+            order[field.type] = None
+            _collect(types[field.type], types, order, hidden=hidden)
+
+
+def _own_text(message: MessageType, ros_version: int) -> str:
+    hidden = _hidden(ros_version)
+    fields = (
+        replace(field, type=hidden.get(field.type) or short_msgtype(field.type)) for field in message.fields
+    )
+    return spell(replace(message, fields=tuple(fields)))
+
+
+def spell(message: MessageType) -> str:
+    """Return the text of one type, its fields' types spelled as they are."""
+    lines = [f"{constant.type} {constant.name}={constant.value}" for constant in message.constants]
+    for field in message.fields:
+        bound = f"<={field.string_bound}" if field.string_bound else ""
+        lines.append(f"{field.type}{bound}{_brackets(field)} {field.name}")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _brackets(field: Field) -> str:
+    if field.container is Container.SCALAR:
+        return ""
+    if field.container is Container.ARRAY:
+        return f"[{field.size}]"
+    return f"[<={field.size}]" if field.size else "[]"
+
+
+_NOT_CODE = re.compile(r"//[^\n]*|/\*.*?\*/|\"(?:\\.|[^\"\\])*\"", re.DOTALL)
+_PLACEHOLDER = "structure_needs_at_least_one_member"
+_CONTAINERS = {Nodetype.ARRAY: Container.ARRAY, Nodetype.SEQUENCE: Container.SEQUENCE}
+_IDL_ERRORS = (
+    TypesysError,
+    AssertionError,
+    LookupError,
+    TypeError,
+    ValueError,
+    ArithmeticError,
+    RecursionError,
+)
+"""What rosbags' IDL parser raises on text that is not IDL."""
+
+
+def read_idl(text: str, *, where: str) -> list[MessageType]:
+    """Return every type that `text` defines; `where` names its place in messages.
+
+    Raises:
+        BagError: It cannot be read.
+    """
+    if "<<" in _NOT_CODE.sub("", text):
+        # No ROS message shifts, and one line of it could ask for all memory there is.
+        raise BagError("shifts in IDL constants are not read", where=where)
+    try:
+        types = get_types_from_idl(text)
+    except _IDL_ERRORS as error:
+        reason = " ".join(str(error).split())[-200:]
+        raise BagError(f"cannot read the IDL: {reason}", where=where) from None
+    return [message_type(name, types) for name in types]
+
+
+def message_type(name: str, types: Typesdict) -> MessageType:
+    """Return one of rosbags' types in our form."""
+    constants, fields = types[name]
+    return MessageType(
+        name,
+        tuple(_field(field, desc) for field, desc in fields if field != _PLACEHOLDER),
+        tuple(Constant(constant, kind, value) for constant, kind, value in constants),
+    )
+
+
+def _field(name: str, desc: FieldDesc) -> Field:
+    if desc[0] == Nodetype.BASE:
+        return Field(name, desc[1][0], string_bound=desc[1][1])
+    if desc[0] == Nodetype.NAME:
+        return Field(name, desc[1], is_message=True)
+    element, size = desc[1]
+    plain = _field(name, element)
+    return Field(
+        name,
+        plain.type,
+        plain.is_message,
+        _CONTAINERS[Nodetype(desc[0])],
+        size,
+        string_bound=plain.string_bound,
+    )
+
+
+_MODULE = re.compile(r"^\s*module\s+\w+\s*\{", re.MULTILINE)
+_DASHES = re.compile(r"^---[ \t\r]*$", re.MULTILINE)
+_SERVICE_PARTS = re.compile(r"(.+/srv/.+)_(?:Event|Request|Response)")
+_EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
+
+
+@lru_cache(maxsize=4096)
+def read_types(text: str, root: str, *, where: str | None = None) -> Mapping[str, MessageType]:
+    """Return every type that `text` defines by full name; `root` names the part that has no name of its own.
+
+    Field types keep the spelling of the text.
+
+    Raises:
+        BagError: A part cannot be read; names `where` (or the type) and the line.
+    """
+    types, parts = dict[str, MessageType](), list(sections(text))
+    for part in parts:
+        for message in _read_section(part, root, where):
+            types.setdefault(message.name, message)
+    if all(part.kind == "MSG" for part in parts) and not text.partition(SEPARATOR)[0].strip():
+        types.setdefault(root, MessageType(root, ()))  # nothing before the other parts: it has no fields
+    return types
+
+
+def _read_section(section: Section, root: str, where: str | None) -> list[MessageType]:
+    if section.kind == "IDL" or (not section.kind and _MODULE.search(section.text)):
+        return read_idl(section.text, where=f"{where or root}:{section.line + 1}")
+    name = normalize_msgtype(section.name) if section.name else root
+    service, dashes = _SERVICE_PARTS.fullmatch(name), _DASHES.search(section.text)
+    if service and dashes:
+        return _read_service(service[1], section, dashes, where or root)
+    return [parse_msg(section.text, name, where=where or root, line=section.line)]
+
+
+def _read_service(name: str, section: Section, dashes: re.Match[str], where: str) -> list[MessageType]:
+    """Return request, response and event of a service; recorders keep the `.srv` text for its events."""
+    request, response = section.text[: dashes.start()], section.text[dashes.end() :]
+    later = section.line + section.text.count("\n", 0, dashes.end())
+    parts = [
+        Field(part, f"{name}_{part.title()}", is_message=True, container=Container.SEQUENCE, size=1)
+        for part in ("request", "response")
+    ]
+    return [
+        parse_msg(request, parts[0].type, where=where, line=section.line),
+        parse_msg(response, parts[1].type, where=where, line=later),
+        MessageType(f"{name}_Event", (Field("info", _EVENT_INFO, is_message=True), *parts)),
+    ]

@@ -1,0 +1,380 @@
+"""Find the definition of a message type: recording, custom registration, distro."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Set as AbstractSet
+from difflib import get_close_matches
+from enum import Enum
+from pathlib import Path
+from typing import Any, ClassVar
+
+from mosaico_ingest.errors import BagError
+from mosaico_ingest.findings import Finding, Severity
+from mosaico_ingest.frozen import frozen
+from mosaico_ingest.job.model import Stores
+from mosaico_ingest.rosbag.definitions.distros import (
+    BEFORE_IRON,
+    BUILTIN,
+    ROS1,
+    ROS2,
+    agreed_type,
+    distro_type,
+    package_type,
+    ros_version,
+)
+from mosaico_ingest.rosbag.definitions.linking import link
+from mosaico_ingest.rosbag.definitions.model import (
+    Definition,
+    Embedded,
+    MessageType,
+    Source,
+    normalize_msgtype,
+)
+from mosaico_ingest.rosbag.definitions.parser import flatten, read_types
+from mosaico_ingest.textfile import read_whole
+
+__all__ = [
+    "CustomMessages",
+    "ROSTypeRegistry",
+    "Registered",
+    "TypeResolver",
+    "definition_files",
+    "directory_types",
+    "register_source",
+    "store_of",
+]
+
+_SUFFIXES = (".msg", ".idl")
+
+
+@frozen
+class Registered:
+    """A definition text somebody gave: the type it is for, and every type it defines."""
+
+    msgtype: str
+    text: str
+    types: Mapping[str, MessageType]
+
+
+class ROSTypeRegistry:
+    """Message types valid in this process, for all distros or for one; nothing of it needs an instance."""
+
+    _scopes: ClassVar[dict[Stores | None, dict[str, Registered]]] = {}
+
+    @classmethod
+    def register(cls, msg_type: str, source: Path | str, store: Stores | str | None = None) -> None:
+        """Announce one type: `source` is its text, or the path of a `.msg` or `.idl` file; the last one wins.
+
+        Raises:
+            BagError: The file or its text cannot be read; names the file and the line.
+        """
+        entry = register_source(msg_type, source)
+        cls._scopes.setdefault(store_of(store), {})[entry.msgtype] = entry
+
+    @classmethod
+    def register_directory(
+        cls, package_name: str, dir_path: Path | str, store: Stores | str | None = None
+    ) -> None:
+        """Announce every `.msg` and `.idl` file of a directory as `<package_name>/msg/<file name>`.
+
+        Raises:
+            BagError: There is no such directory, it has none of them, or one cannot be read; then none is announced.
+        """
+        entries = {entry.msgtype: entry for entry in directory_types(package_name, Path(dir_path))}
+        cls._scopes.setdefault(store_of(store), {}).update(entries)
+
+    @classmethod
+    def get_types(cls, store: Stores | str | None = None) -> dict[str, str]:
+        """Return the text of every announced type: those of all distros, overlaid by those of `store`."""
+        return {name: entry.text for name, entry in cls.entries(store).items()}
+
+    @classmethod
+    def entries(cls, store: Stores | str | None = None) -> dict[str, Registered]:
+        """Return what `get_types` returns, read."""
+        scope = store_of(store)
+        return {**cls._scopes.get(None, {}), **(cls._scopes.get(scope, {}) if scope else {})}
+
+    @classmethod
+    def snapshot(cls) -> dict[Stores | None, dict[str, Registered]]:
+        """Return everything announced so far, to be restored in another process."""
+        return {scope: dict(entries) for scope, entries in cls._scopes.items()}
+
+    @classmethod
+    def restore(cls, snapshot: Mapping[Stores | None, Mapping[str, Registered]]) -> None:
+        """Announce what a snapshot holds, and nothing else."""
+        cls._scopes.clear()
+        cls._scopes.update({scope: dict(entries) for scope, entries in snapshot.items()})
+
+    @classmethod
+    def reset(cls) -> None:
+        """Forget every announced type."""
+        cls._scopes.clear()
+
+
+def store_of(store: Stores | str | None) -> Stores | None:
+    """Return the distro a name stands for.
+
+    Raises:
+        BagError: There is no such distro; names the nearest.
+    """
+    if store is None:
+        return None
+    try:
+        # rosbags has an enumeration of its own
+        return Stores(store.value if isinstance(store, Enum) else store)
+    except ValueError:
+        known = [known.value for known in Stores]
+        near = get_close_matches(str(store), known, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+        raise BagError(f"unknown distro {store!r}", hint=hint) from None
+
+
+def register_source(msg_type: str, source: Path | str) -> Registered:
+    """Read one definition, from a file or as text.
+
+    Raises:
+        BagError: The file or its text cannot be read.
+    """
+    name = normalize_msgtype(msg_type)
+    if name.count("/") != 2:  # noqa: PLR2004 - pkg/msg/Name
+        raise BagError(f"{msg_type!r} is no message type", hint="write it as pkg/msg/Name")
+    text, where = (source, f"definition of {name}") if _is_text(source) else _read(Path(source))
+    types = dict(read_types(str(text), name, where=where))
+    if name not in types:
+        raise BagError(f"the text does not define {name}", where=where, hint=f"it defines {', '.join(types)}")
+    return Registered(name, str(text), types)
+
+
+def _is_text(source: Path | str) -> bool:
+    """Say whether a source is a definition; one line that ends like a definition's file name is a path."""
+    if isinstance(source, Path) or not source.endswith(_SUFFIXES) or "\n" in source:
+        return isinstance(source, str)
+    return len(source.split()) > 1 and not Path(source).is_file()
+
+
+def _read(path: Path) -> tuple[str, str]:
+    try:
+        return read_whole(path).decode("utf-8-sig"), str(path)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
+        raise BagError(f"cannot read the definition: {reason}", where=str(path)) from error
+
+
+def directory_types(package: str, path: Path) -> Iterator[Registered]:
+    """Read the definitions of a package: those in a directory, in its `msg` folder, or the one a file holds.
+
+    Raises:
+        BagError: There are none, or one cannot be read.
+    """
+    files = definition_files(path)
+    if not files:
+        there = "has no .msg or .idl file" if path.is_dir() else "does not exist"
+        raise BagError(
+            f"{path} {there}",
+            where=f"messages of {package}",
+            hint="give a directory of .msg files or one file",
+        )
+    for file in files:
+        yield register_source(f"{package.removesuffix('/msg')}/msg/{file.stem}", file)
+
+
+def definition_files(path: Path) -> list[Path]:
+    """Return the definition files of a directory, of its `msg` folder, or the one file itself."""
+    if path.is_file():
+        return [path]
+    for folder in (path, path / "msg"):
+        if folder.is_dir():
+            files = sorted(file for file in folder.iterdir() if file.suffix in _SUFFIXES)
+            if files:
+                return files
+    return []
+
+
+CustomMessages = tuple[str, Path, Stores | str | None]
+"""A package, the directory of its `.msg` files (or one file), and the distro it is for (None: all)."""
+
+_PACKAGE = "the public package "
+_GIVE_IT = "if yours have other fields, give them with custom_msgs"
+_UNSAID = frozenset({"unknown", ""})
+_LANGUAGES = frozenset({"ros1msg", "ros2msg", "ros2idl", "omgidl", "idl", "msg"}) | _UNSAID
+
+
+@frozen
+class _Place:
+    """One place where types are looked for."""
+
+    label: str
+    source: Source
+    find: Callable[[str], MessageType | None]
+
+
+class TypeResolver:
+    """Finds definitions: in the recording, then the run's own, then announced ones, then the distro's, then known packages'.
+
+    Each nested type is looked for on its own in the same order. Without a distro a standard type is taken where all
+    distros of the ROS version agree on it, with a finding. What the registry holds is copied when a resolver is made.
+    """
+
+    def __init__(
+        self,
+        distro: Stores | str | None = None,
+        custom: Iterable[CustomMessages] = (),
+        *,
+        types: Mapping[str, Path | str] | None = None,
+        registry: type[ROSTypeRegistry] = ROSTypeRegistry,
+    ) -> None:
+        """Read the run's own definitions: `custom` by package, `types` one by one, as text or file.
+
+        Raises:
+            BagError: One of them cannot be read.
+        """
+        store = store_of(distro)
+        self.distro = None if store is Stores.EMPTY else store
+        self._other_distros = dict[str, str]()
+        own = list[Registered]()
+        for package, path, only in custom:
+            entries = list(directory_types(package, Path(path)))
+            scope = store_of(only)
+            if scope and self.distro and scope is not self.distro:
+                self._other_distros |= {entry.msgtype: scope.value for entry in entries}
+            else:
+                own += entries
+        own += [register_source(name, source) for name, source in (types or {}).items()]
+        self._custom = _by_name(own)
+        self._registered = _by_name(registry.entries(self.distro).values())
+        self._resolved = dict[tuple[str, Embedded | None, int], Definition]()
+        self._assumed = dict[str, str]()
+        self._replaced = dict[str, str]()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_resolved": {}}
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What was decided without being asked for, so far."""
+        return self.findings_about({*self._replaced, *self._assumed})
+
+    def findings_about(self, types: AbstractSet[str]) -> tuple[Finding, ...]:
+        """Return those of `findings` that are about some of these types."""
+        findings = [
+            Finding(
+                "unreadable-definition", Severity.WARNING, f"{root}: the job's definition is used; {problem}"
+            )
+            for root, problem in self._replaced.items()
+            if root in types
+        ]
+        assumed = {name: who for name, who in self._assumed.items() if name in types}
+        for who in dict.fromkeys(assumed.values()):
+            names = ", ".join(name for name, known in assumed.items() if known == who)
+            message = f"the recording does not define these types, they are read as in {who}: {names}"
+            remedy = _GIVE_IT if who.startswith(_PACKAGE) else "set ros_distro to be sure"
+            findings.append(Finding("assumed-definition", Severity.INFO, message, help=remedy))
+        return tuple(findings)
+
+    def resolve(self, msgtype: str, embedded: Embedded | None, *, ros_version: int) -> Definition:
+        """Return the definition of `msgtype`, any spelling of the name.
+
+        Raises:
+            BagError: It or a type it needs is not known, or the text in the recording cannot be read.
+        """
+        key = (msgtype, embedded, ros_version)
+        if key not in self._resolved:
+            self._resolved[key] = self._resolve(normalize_msgtype(msgtype), embedded, ros_version)
+        return self._resolved[key]
+
+    def _resolve(self, root: str, embedded: Embedded | None, version: int) -> Definition:
+        places = self._places(root, embedded, version)
+        found = next(((known, place.source) for place in places if (known := place.find(root))), None)
+        hint = self._hint(places, version)
+        if not found:
+            elsewhere = self._other_distros.get(root)
+            limited = f"; custom_msgs has it for {elsewhere} only" if elsewhere else ""
+            raise BagError(f"the definition of {root} is not known{limited}", hint=hint)
+        message, source = found
+
+        def find(name: str) -> MessageType | None:
+            known = (place.find(name) for place in places)
+            return next((message for message in known if message), BUILTIN.get(name))
+
+        types = link(message, find, ros_version=version, hint=hint)
+        return Definition(root, types, source, flatten(root, types, ros_version=version), version)
+
+    def _places(self, root: str, embedded: Embedded | None, version: int) -> list[_Place]:
+        places = [
+            _Place("the recording", Source.BAG, self._embedded(root, embedded).get),
+            _Place("custom_msgs", Source.CUSTOM, self._custom.get),
+            _Place("the type registry", Source.CUSTOM, self._registered.get),
+        ]
+        distro = self.distro
+        if distro is None:
+            places += self._agreements(embedded, version)
+        elif ros_version(distro) == version:
+            places.append(_Place(distro.value, Source.DISTRO, lambda name: distro_type(distro, name)))
+        if version == 2:  # noqa: PLR2004 - a ROS 1 recording always has its definitions
+            places.append(_Place("the packages this tool knows", Source.PACKAGE, self._package))
+        if embedded and embedded.encoding not in _UNSAID and _is_empty(embedded.text):
+            # A text without fields is such a type, unless a distro knows the type: recorders that lack a definition
+            # write an empty one, or a comment.
+            known = any(distro_type(distro, root) for distro in (ROS1 if version == 1 else ROS2))
+            empty = {} if known else {root: MessageType(root, ())}
+            places.append(_Place("the recording's empty text", Source.BAG, empty.get))
+        return places
+
+    def _embedded(self, root: str, embedded: Embedded | None) -> Mapping[str, MessageType]:
+        if embedded is None or _is_empty(embedded.text):
+            return {}
+        if embedded.encoding.lower() not in _LANGUAGES:
+            raise BagError(f"a schema in {embedded.encoding!r} is no ROS definition", where=root)
+        try:
+            return read_types(embedded.text, root)
+        except BagError as error:
+            if root not in self._custom and root not in self._registered:
+                problem = f"the definition in the recording cannot be read: {error.what}"
+                raise BagError(problem, where=error.where, hint="give the type with custom_msgs") from error
+            self._replaced[root] = error.what
+            return {}
+
+    def _agreements(self, embedded: Embedded | None, version: int) -> list[_Place]:
+        """Return what can be known without a distro: a recording that holds no definition at all is an old one."""
+        places = [self._agreement(f"all ROS {version} distros", ROS1 if version == 1 else ROS2)]
+        if embedded is None and version != 1:
+            places.append(
+                self._agreement("all distros until Humble, the last to record no definitions", BEFORE_IRON)
+            )
+        return places
+
+    def _agreement(self, who: str, distros: tuple[Stores, ...]) -> _Place:
+        def find(name: str) -> MessageType | None:
+            if name in BUILTIN:
+                return BUILTIN[name]  # embedded texts never define them; loading the distros takes a while
+            known = agreed_type(name, distros)
+            if known and known.fields:  # of one without fields nothing can be assumed wrongly
+                self._assumed.setdefault(name, who)
+            return known
+
+        return _Place(f"what {who.partition(',')[0]} agree on", Source.DISTRO, find)
+
+    def _package(self, name: str) -> MessageType | None:
+        known = package_type(name)
+        if known:
+            self._assumed.setdefault(name, f"{_PACKAGE}{name.partition('/')[0]}")
+        return known
+
+    def _hint(self, places: list[_Place], version: int) -> str:
+        searched = f"searched: {', '.join(place.label for place in places)}"
+        if self.distro and ros_version(self.distro) != version:
+            return f"{searched}; the recording is ROS {version}, ros_distro is {self.distro.value}; set the right one"
+        remedy = "give it with custom_msgs" if self.distro else "set ros_distro, or give it with custom_msgs"
+        return f"{searched}; {remedy}"
+
+
+def _is_empty(text: str) -> bool:
+    return all(not line.strip() or line.lstrip().startswith("#") for line in text.split("\n"))
+
+
+def _by_name(entries: Iterable[Registered]) -> dict[str, MessageType]:
+    """Return all types by name; one given under its own name wins over the same inside another's text."""
+    chosen = list(entries)
+    types = {name: message for entry in reversed(chosen) for name, message in entry.types.items()}
+    return types | {entry.msgtype: entry.types[entry.msgtype] for entry in chosen}

@@ -1,0 +1,340 @@
+"""Writers of recordings: MCAP, ROS 1 bags and rosbag2 SQLite files."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import struct
+import tempfile
+import zlib
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import zstandard
+from rosbags.interfaces import Connection
+from rosbags.rosbag1 import Writer as Rosbag1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Rosbag2
+
+from mosaico_ingest.errors import BagError
+from mosaico_ingest.rosbag.definitions.hashes import md5sum, rihs01
+from mosaico_ingest.rosbag.definitions.model import Definition, short_msgtype
+from mosaico_ingest.rosbag.formats import MCAP
+from mosaico_ingest.rosbag.mcap.records import (
+    RECORD,
+    Op,
+    record_bytes,
+    text_bytes,
+    texts_bytes,
+)
+from mosaico_ingest.version import __version__
+
+__all__ = [
+    "ROS_VERSIONS",
+    "McapWriter",
+    "RecordingWriter",
+    "Ros1Writer",
+    "SqliteWriter",
+    "open_writer",
+]
+
+
+class RecordingWriter(Protocol):
+    """Takes messages by log time; those of ROS 1 definitions in ROS 1's encoding, others as little-endian CDR."""
+
+    def channel(self, topic: str, definition: Definition) -> int:
+        """Open a channel and return its number.
+
+        Raises:
+            BagError: The container cannot hold it.
+        """
+        ...
+
+    def write(self, channel: int, log_ns: int, payload: bytes) -> None:
+        """Append a message."""
+        ...
+
+    def finish(self) -> None:
+        """Write what comes last."""
+        ...
+
+    def abandon(self) -> None:
+        """Close the file, which stays unfinished."""
+        ...
+
+
+_CHUNK_BYTES = 4 << 20
+_MESSAGE = struct.Struct("<HIQQ")
+_MAX_CHANNELS = 65535
+
+
+@dataclass(slots=True)
+class _Chunk:
+    """What is gathered for one chunk."""
+
+    data: bytearray = field(default_factory=bytearray)
+    index: dict[int, bytearray] = field(default_factory=dict[int, bytearray])
+    """By channel: time and offset of each message."""
+    start_ns: int = 0
+    end_ns: int = 0
+
+
+class McapWriter:
+    """Writes one MCAP file; satisfies `RecordingWriter`."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("wb")
+        self._schemas: dict[tuple[str, int, str], int] = {}
+        self._records: list[bytes] = []
+        """Schemas and channels; they stand before the first chunk that may need them, and in the summary."""
+        self._versions: list[int] = []
+        self._counts: dict[int, int] = {}
+        self._pending: list[bytes] = []
+        self._chunk = _Chunk()
+        self._chunk_indexes: list[bytes] = []
+        self._start_ns: int | None = None
+        self._end_ns = 0
+        self._file.write(MCAP)
+        self._began = False
+
+    def channel(self, topic: str, definition: Definition) -> int:
+        """Open a channel; two definitions of one type are two schemas."""
+        if len(self._versions) == _MAX_CHANNELS:
+            raise BagError(f"MCAP has room for {_MAX_CHANNELS} channels", where=topic)
+        number, version = len(self._versions) + 1, definition.ros_version
+        self._versions.append(version)
+        encoding = "ros1" if version == 1 else "cdr"
+        content = struct.pack("<HH", number, self._schema(definition))
+        self._add(Op.CHANNEL, content + text_bytes(topic) + text_bytes(encoding) + texts_bytes({}))
+        self._counts[number] = 0
+        return number
+
+    def write(self, channel: int, log_ns: int, payload: bytes) -> None:
+        """Append a message; it was published when it was recorded, as far as is known."""
+        self._begin()
+        chunk = self._chunk
+        if not chunk.data:
+            chunk.start_ns = chunk.end_ns = log_ns
+        chunk.start_ns, chunk.end_ns = min(chunk.start_ns, log_ns), max(chunk.end_ns, log_ns)
+        chunk.index.setdefault(channel, bytearray()).extend(struct.pack("<QQ", log_ns, len(chunk.data)))
+        chunk.data += RECORD.pack(Op.MESSAGE, _MESSAGE.size + len(payload))
+        chunk.data += _MESSAGE.pack(channel, self._counts[channel] & 0xFFFFFFFF, log_ns, log_ns)
+        chunk.data += payload
+        self._counts[channel] += 1
+        self._start_ns = log_ns if self._start_ns is None else min(self._start_ns, log_ns)
+        self._end_ns = max(self._end_ns, log_ns)
+        if len(chunk.data) >= _CHUNK_BYTES:
+            self._flush()
+
+    def finish(self) -> None:
+        """Write the last chunk and the summary."""
+        self._begin()
+        self._flush()
+        self._put(Op.DATA_END, struct.pack("<I", 0))
+        start = self._file.tell()
+        groups = [
+            (Op.SCHEMA, [record for record in self._records if record[0] == Op.SCHEMA]),
+            (Op.CHANNEL, [record for record in self._records if record[0] == Op.CHANNEL]),
+            (Op.STATISTICS, [record_bytes(Op.STATISTICS, self._statistics())]),
+            (Op.CHUNK_INDEX, self._chunk_indexes),
+        ]
+        summary, offsets = b"", b""
+        for op, records in groups:
+            group = b"".join(records)
+            if group:
+                place = struct.pack("<BQQ", op, start + len(summary), len(group))
+                offsets += record_bytes(Op.SUMMARY_OFFSET, place)
+                summary += group
+        footer = RECORD.pack(Op.FOOTER, 20) + struct.pack("<QQ", start, start + len(summary))
+        checked = summary + offsets + footer
+        self._file.write(checked + struct.pack("<I", zlib.crc32(checked)) + MCAP)
+        self._file.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is."""
+        self._file.close()
+
+    def _begin(self) -> None:
+        """Write the header, once it is known which versions of ROS there are, and what was opened since."""
+        if not self._began:
+            versions = set(self._versions)
+            profile = f"ros{versions.pop()}" if len(versions) == 1 else ""
+            self._put(Op.HEADER, text_bytes(profile) + text_bytes(f"mosaico-ingest {__version__}"))
+            self._began = True
+        for record in self._pending:
+            self._file.write(record)
+        self._pending.clear()
+
+    def _schema(self, definition: Definition) -> int:
+        version = definition.ros_version
+        key = (definition.root, version, definition.text)
+        if key not in self._schemas:
+            number = self._schemas[key] = len(self._schemas) + 1
+            name = short_msgtype(definition.root) if version == 1 else definition.root
+            data = definition.text.encode()
+            content = struct.pack("<H", number) + text_bytes(name) + text_bytes(f"ros{version}msg")
+            self._add(Op.SCHEMA, content + struct.pack("<I", len(data)) + data)
+        return self._schemas[key]
+
+    def _add(self, op: int, content: bytes) -> None:
+        record = record_bytes(op, content)
+        self._records.append(record)
+        self._pending.append(record)
+
+    def _put(self, op: int, content: bytes) -> int:
+        """Write a record and return where it begins."""
+        at = self._file.tell()
+        self._file.write(record_bytes(op, content))
+        return at
+
+    def _flush(self) -> None:
+        chunk, self._chunk = self._chunk, _Chunk()
+        if not chunk.data:
+            return
+        data = bytes(chunk.data)
+        packed = zstandard.compress(data, 3)
+        span = struct.pack("<QQ", chunk.start_ns, chunk.end_ns)
+        head = span + struct.pack("<QI", len(data), zlib.crc32(data)) + text_bytes("zstd")
+        at = self._put(Op.CHUNK, head + struct.pack("<Q", len(packed)) + packed)
+        length = self._file.tell() - at
+        places = b""
+        for channel, entries in chunk.index.items():
+            where = self._put(Op.MESSAGE_INDEX, struct.pack("<HI", channel, len(entries)) + entries)
+            places += struct.pack("<HQ", channel, where)
+        content = span + struct.pack("<QQ", at, length) + struct.pack("<I", len(places)) + places
+        content += struct.pack("<Q", self._file.tell() - at - length) + text_bytes("zstd")
+        content += struct.pack("<QQ", len(packed), len(data))
+        self._chunk_indexes.append(record_bytes(Op.CHUNK_INDEX, content))
+
+    def _statistics(self) -> bytes:
+        counts = b"".join(struct.pack("<HQ", channel, count) for channel, count in self._counts.items())
+        return (
+            struct.pack("<QHI", sum(self._counts.values()), len(self._schemas), len(self._versions))
+            + struct.pack("<II", 0, 0)
+            + struct.pack("<I", len(self._chunk_indexes))
+            + struct.pack("<QQ", self._start_ns or 0, self._end_ns)
+            + struct.pack("<I", len(counts))
+            + counts
+        )
+
+
+class SqliteWriter:
+    """Writes one `.db3` file; satisfies `RecordingWriter`."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        folder = path.with_name(f"{path.stem}.folder") / path.stem
+        folder.parent.mkdir()
+        self._bag = Rosbag2(folder, version=9, storage_plugin=StoragePlugin.SQLITE3)
+        self._bag.open()
+        self._connections: list[Connection] = []
+        self._texts: dict[str, str] = {}
+
+    def channel(self, topic: str, definition: Definition) -> int:
+        """Open a channel; a `.db3` file holds one definition of a type, and none of ROS 1."""
+        if definition.ros_version == 1:
+            raise BagError(f"{definition.root} is of ROS 1", where=topic, hint="write .mcap or .bag")
+        if self._texts.setdefault(definition.root, definition.text) != definition.text:
+            what = f"there is another definition of {definition.root}, and .db3 holds one"
+            raise BagError(what, where=topic, hint="write .mcap")
+        try:
+            digest = rihs01(definition)
+        except BagError as error:
+            raise BagError(f"{error.what}, as .db3 wants it", where=topic, hint="write .mcap") from error
+        opened = self._bag.add_connection(topic, definition.root, msgdef=definition.text, rihs01=digest)
+        self._connections.append(opened)
+        return len(self._connections) - 1
+
+    def write(self, channel: int, log_ns: int, payload: bytes) -> None:
+        """Append a message."""
+        self._bag.write(self._connections[channel], log_ns, payload)
+
+    def finish(self) -> None:
+        """Close the database and take it out of its folder."""
+        self._bag.close()
+        next(self._bag.path.glob("*.db3")).replace(self._path)
+
+    def abandon(self) -> None:
+        """Close the database as it is."""
+        self._bag.abort()
+
+
+class Ros1Writer:
+    """Writes one ROS 1 bag; satisfies `RecordingWriter`."""
+
+    def __init__(self, path: Path) -> None:
+        self._bag = Rosbag1(path)
+        self._bag.set_compression(Rosbag1.CompressionFormat.LZ4)
+        self._bag.open()
+        self._connections: list[Connection] = []
+
+    def channel(self, topic: str, definition: Definition) -> int:
+        """Open a channel; a bag holds no definitions of ROS 2."""
+        if definition.ros_version != 1:
+            raise BagError(f"{definition.root} is of ROS 2", where=topic, hint="write .mcap or .db3")
+        try:
+            digest = md5sum(definition)
+        except BagError as error:
+            raise BagError(error.what, where=topic) from error
+        opened = self._bag.add_connection(topic, definition.root, msgdef=definition.text, md5sum=digest)
+        self._connections.append(opened)
+        return len(self._connections) - 1
+
+    def write(self, channel: int, log_ns: int, payload: bytes) -> None:
+        """Append a message."""
+        self._bag.write(self._connections[channel], log_ns, payload)
+
+    def finish(self) -> None:
+        """Write the index."""
+        self._bag.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is."""
+        self._bag.abort()
+
+
+ROS_VERSIONS = {".mcap": (1, 2), ".db3": (2,), ".bag": (1,)}
+"""By suffix: the versions of ROS whose messages the container holds."""
+
+_WRITERS: dict[str, Callable[[Path], RecordingWriter]] = {
+    ".mcap": McapWriter,
+    ".db3": SqliteWriter,
+    ".bag": Ros1Writer,
+}
+
+
+@contextmanager
+def open_writer(path: Path, *, replace: bool = False) -> Generator[RecordingWriter]:
+    """Open a writer for `.mcap`, `.db3` or `.bag`; an exception leaves no file behind.
+
+    Raises:
+        BagError: The name says no container, the file is there already, or it cannot be written.
+    """
+    make = _WRITERS.get(path.suffix)
+    if make is None:
+        raise BagError("no container has this suffix", where=str(path), hint="write .mcap, .db3 or .bag")
+    if path.exists() and not replace:
+        raise BagError("is there already", where=str(path), hint="choose another name, or give --force")
+    if path.is_dir():
+        raise BagError("is a folder", where=str(path), hint="choose another name")
+    try:
+        folder = Path(tempfile.mkdtemp(prefix=f".{path.stem}-", dir=path.parent))
+    except OSError as error:
+        raise BagError(f"cannot be written: {error.strerror}", where=str(path)) from error
+    try:
+        part = folder / path.name
+        writer = make(part)
+        try:
+            yield writer
+            writer.finish()
+        except BaseException:
+            writer.abandon()
+            raise
+        part.replace(path)
+    except (OSError, sqlite3.Error) as error:
+        raise BagError(f"cannot be written: {error}", where=str(path)) from error
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)

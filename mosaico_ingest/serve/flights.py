@@ -1,0 +1,211 @@
+"""Flight information: sequences and topics, their endpoints, tickets and rows; fields for clients before 0.7."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.flight as fl
+
+from mosaico_ingest import protocol
+from mosaico_ingest.destinations.store.model import SequenceInfo, SessionInfo, TopicInfo
+from mosaico_ingest.destinations.store.store import Store, Window, count, scan
+from mosaico_ingest.protocol import messages
+from mosaico_ingest.protocol.errors import Condition
+from mosaico_ingest.protocol.messages import JSON, Body, Interval
+from mosaico_ingest.serve.errors import Refusal, checked
+from mosaico_ingest.serve.uploads import Uploads
+
+__all__ = [
+    "Extent",
+    "Flights",
+    "OlderTopicInfo",
+    "sequence_schema",
+    "split_locator",
+    "topic_schema",
+]
+
+
+class Extent(Body):
+    """How much a topic holds, under the older names."""
+
+    chunks_number: int
+    total_bytes: int
+    timestamp: Interval | None
+
+
+class OlderTopicInfo(messages.TopicInfo):
+    """A topic's application metadata, for clients of either time."""
+
+    info: Extent
+
+
+def sequence_schema(sequence: SequenceInfo) -> pa.Schema:
+    """Return no columns, and what is said of the sequence."""
+    return _with(pa.schema([]), {"context": "sequence", "user_metadata": sequence.metadata})
+
+
+def topic_schema(topic: TopicInfo) -> pa.Schema:
+    """Return the topic's columns, and what is said of it."""
+    properties = {
+        "ontology_tag": topic.ontology.tag,
+        "serialization_format": topic.ontology.serialization_format.value,
+    }
+    return _with(
+        topic.schema, {"context": "topic", "properties": properties, "user_metadata": topic.metadata}
+    )
+
+
+def _with(schema: pa.Schema, said: Mapping[str, Any]) -> pa.Schema:
+    spelled = {
+        f"mosaico:{key}": value if isinstance(value, str) else json.dumps(value)
+        for key, value in said.items()
+    }
+    return schema.with_metadata(spelled)
+
+
+_MESSAGE_BYTES = 16 << 20
+
+
+def split_locator(locator: str) -> tuple[str, str | None]:
+    """Return the sequence and, with its leading slash, the topic, or refuse a locator of something else."""
+    sequence, slash, path = locator.partition("/")
+    with checked():
+        protocol.check_sequence_name(sequence)
+        return sequence, protocol.check_topic_name(path) if slash else None
+
+
+class Flights:
+    """Answers from the store, and from the sessions that are open."""
+
+    def __init__(self, store: Store, uploads: Uploads) -> None:
+        self._store = store
+        self._uploads = uploads
+
+    def listed(self) -> Iterator[fl.FlightInfo]:
+        """Yield every sequence by its name."""
+        for name in self._store.names():
+            yield fl.FlightInfo(pa.schema([]), fl.FlightDescriptor.for_path(name), [], -1, -1)
+
+    def info(self, descriptor: fl.FlightDescriptor) -> fl.FlightInfo:
+        """Return a sequence with an endpoint for each topic, or one topic with its endpoint."""
+        question = _question(descriptor)
+        name, topic = split_locator(question.resource_locator)
+        if topic is not None:
+            info = self._store.topic(name, topic)
+            ended = {each.id: each for each in self._store.sequence(name).sessions}
+            endpoint = _endpoint(info, ended, question)
+            return fl.FlightInfo(topic_schema(info), descriptor, [endpoint], -1, -1)
+        sequence = self._store.sequence(name)
+        ended = {each.id: each for each in sequence.sessions}
+        endpoints = [_endpoint(each, ended, question) for each in sequence.topics]
+        metadata = JSON.encode(self._described(sequence))
+        schema = sequence_schema(sequence)
+        return fl.FlightInfo(schema, descriptor, endpoints, -1, -1, app_metadata=metadata)
+
+    def schema(self, descriptor: fl.FlightDescriptor) -> pa.Schema:
+        """Return the columns of a topic."""
+        return self._topic(_question(descriptor)).schema
+
+    def rows(self, ticket: fl.Ticket) -> tuple[pa.Schema, Iterator[pa.RecordBatch]]:
+        """Return a topic's columns and its rows in time order, in messages of a moderate size."""
+        question = JSON.decode(messages.GetInfo, ticket.ticket)
+        topic = self._topic(question)
+        rows = scan(topic.segments, topic.schema, _window(question))
+        return topic_schema(topic), _messages(rows)
+
+    def _topic(self, question: messages.GetInfo) -> TopicInfo:
+        sequence, topic = split_locator(question.resource_locator)
+        if topic is None:
+            raise Refusal(Condition.INVALID, f"{question.resource_locator!r} is no topic")
+        return self._store.topic(sequence, topic)
+
+    def _described(self, sequence: SequenceInfo) -> messages.SequenceInfo:
+        finalized = [
+            messages.SessionInfo(
+                locator=messages.session_locator(sequence.name, session.id),
+                created_at_ns=session.created_ns,
+                locked=True,
+                completed_at_ns=session.completed_ns,
+                topics=[_locator(topic) for topic in sequence.topics if topic.session == session.id],
+            )
+            for session in sequence.sessions
+        ]
+        opened = [
+            messages.SessionInfo(locator=each.locator, created_at_ns=each.session.created_ns, locked=False)
+            for each in self._uploads.of_sequence(sequence.name)
+            if each.locator not in {session.locator for session in finalized}
+        ]
+        return messages.SequenceInfo(
+            resource_locator=sequence.name,
+            created_at_ns=sequence.created_ns,
+            user_metadata=dict(sequence.metadata),
+            sessions=finalized + opened,
+        )
+
+
+def _question(descriptor: fl.FlightDescriptor) -> messages.GetInfo:
+    if descriptor.descriptor_type is not fl.DescriptorType.CMD:
+        raise Refusal(Condition.INVALID, "only descriptors with a command are understood")
+    question = JSON.decode(messages.GetInfo, descriptor.command or b"")
+    _window(question)
+    return question
+
+
+def _window(question: messages.GetInfo) -> Window:
+    start, end = question.timestamp_ns_start, question.timestamp_ns_end
+    if start is not None and end is not None and start >= end:
+        raise Refusal(Condition.INVALID, f"the time range from {start} to {end} is empty")
+    return Window(start, end)
+
+
+def _locator(topic: TopicInfo) -> str:
+    return messages.topic_locator(topic.sequence, topic.name)
+
+
+def _endpoint(
+    topic: TopicInfo, ended: Mapping[str, SessionInfo], question: messages.GetInfo
+) -> fl.FlightEndpoint:
+    window = _window(question)
+    ticket = question.model_copy(update={"resource_locator": _locator(topic)})
+    session = ended.get(topic.session)
+    interval = _interval(topic.start_ns, topic.end_ns)
+    described = OlderTopicInfo(
+        resource_locator=_locator(topic),
+        ontology_tag=topic.ontology.tag,
+        serialization_format=topic.ontology.serialization_format,
+        user_metadata=dict(topic.metadata),
+        created_at_ns=topic.created_ns,
+        completed_at_ns=session.completed_ns if session else None,
+        locked=True,
+        data_info=messages.DataInfo(
+            interval=interval,
+            total_row_count=topic.rows,
+            total_bytes=topic.stored_bytes,
+            total_chunks_count=len(topic.segments),
+        ),
+        info=Extent(chunks_number=len(topic.segments), total_bytes=topic.stored_bytes, timestamp=interval),
+        time_window_info=None if window == Window() else _inside(topic, window),
+    )
+    return fl.FlightEndpoint(JSON.encode(ticket), [], None, JSON.encode(described))
+
+
+def _inside(topic: TopicInfo, window: Window) -> messages.TimeWindow:
+    rows, start_ns, end_ns = count(topic.segments, topic.schema, window)
+    return messages.TimeWindow(interval=_interval(start_ns, end_ns), row_count=rows)
+
+
+def _interval(start_ns: int | None, end_ns: int | None) -> messages.Interval | None:
+    if start_ns is None or end_ns is None:
+        return None
+    return messages.Interval(start_ns=start_ns, end_ns=end_ns)
+
+
+def _messages(batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
+    """Cut batches so that one message stays well below what a client takes, if rows allow."""
+    for batch in batches:
+        rows = max(1, batch.num_rows * _MESSAGE_BYTES // max(1, batch.nbytes))
+        for start in range(0, batch.num_rows, rows):
+            yield batch.slice(start, rows)

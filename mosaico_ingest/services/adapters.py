@@ -1,0 +1,376 @@
+"""List, explain, test and draft adapters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from difflib import get_close_matches
+from fnmatch import fnmatchcase
+from os.path import relpath
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from mosaico_ingest.adapters.adapter import AdapterSpec
+from mosaico_ingest.adapters.bridge import ROSBridge, installed_adapters, load_adapter_reference
+from mosaico_ingest.adapters.builtin import BUILTIN, BY_NAME, Builtin
+from mosaico_ingest.adapters.direct import KnownTypes, mapping_of
+from mosaico_ingest.adapters.draft import Example, draft
+from mosaico_ingest.adapters.explain import Description, describe, unread_fields
+from mosaico_ingest.adapters.mapping.model import Recorded
+from mosaico_ingest.adapters.mapping.testing import Outcome, run_tests
+from mosaico_ingest.decode.decoder import decoder_for
+from mosaico_ingest.errors import AdapterError, BagError, DecodeError, NothingMatched
+from mosaico_ingest.findings import Finding
+from mosaico_ingest.frozen import frozen
+from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.manifest import load_manifest
+from mosaico_ingest.pipeline.compile import compile_manifest
+from mosaico_ingest.pipeline.run import make_plan
+from mosaico_ingest.rosbag.blocks import Channel, RawBatch
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.model import (
+    Definition,
+    Resolver,
+    Source,
+    normalize_msgtype,
+    short_msgtype,
+)
+from mosaico_ingest.rosbag.definitions.registry import CustomMessages
+from mosaico_ingest.rosbag.recording import Recording, open_recording
+
+__all__ = [
+    "Explained",
+    "Known",
+    "TestResult",
+    "TopicChoice",
+    "definition_in",
+    "draft_adapter",
+    "explain_adapter",
+    "explain_topics",
+    "find_adapter",
+    "known_adapters",
+    "message_in",
+    "run_adapter_tests",
+    "source_text",
+]
+
+_ROWS = 64
+
+
+def definition_in(path: Path, msgtype: str, *, resolve: Resolver) -> Definition:
+    """Return a type's definition as a recording has it.
+
+    Raises:
+        BagError: The recording cannot be opened, or its definition of the type is not known.
+        NothingMatched: No topic has that type.
+    """
+    with open_recording(path, resolve=resolve) as recording:
+        return _definition(_channels(recording, msgtype=msgtype)[0])
+
+
+def message_in(
+    path: Path, topic: str, index: int = 0, *, resolve: Resolver
+) -> tuple[Definition, pa.StructArray]:
+    """Return the definition of a topic's message, and the message as the only row in its ROS shape.
+
+    Raises:
+        BagError: The recording cannot be opened, has fewer messages, or the message cannot be decoded.
+        NothingMatched: There is no such topic.
+    """
+    with open_recording(path, resolve=resolve) as recording:
+        channels = _channels(recording, topic=topic)
+        before = 0
+        for batch in recording.batches([channel.id for channel in channels], rows=_ROWS):
+            if index < before + len(batch):
+                return _definition(batch.channel), _row(batch, index - before)
+            before += len(batch)
+    raise BagError(
+        f"{topic} has {before} messages, there is none at index {index}",
+        where=str(path),
+        hint="the first is at index 0",
+    )
+
+
+def _channels(recording: Recording, *, topic: str | None = None, msgtype: str | None = None) -> list[Channel]:
+    found = [
+        one for one in recording.channels if topic in {None, one.topic} and msgtype in {None, one.msgtype}
+    ]
+    if found:
+        return found
+    wanted = topic or msgtype or ""
+    known = sorted({one.topic if topic else one.msgtype for one in recording.channels})
+    near = get_close_matches(wanted, known, n=1)
+    raise NothingMatched(
+        f"no topic {'is called' if topic else 'has the type'} {wanted}",
+        where=str(recording.files[0]),
+        hint=f"did you mean {near[0]}?" if near else f"there are {', '.join(known) or 'none'}",
+    )
+
+
+def _definition(channel: Channel) -> Definition:
+    if channel.definition is None:
+        raise BagError(channel.problem or f"no definition of {channel.msgtype} is known", where=channel.topic)
+    return channel.definition
+
+
+def _row(batch: RawBatch, row: int) -> pa.StructArray:
+    one = np.array([row])
+    alone = replace(
+        batch,
+        log_times=batch.log_times[one],
+        starts=batch.starts[one],
+        lengths=batch.lengths[one],
+        offsets=batch.offsets[one],
+    )
+    decoded = decoder_for(batch.channel).decode(alone)
+    if decoded.failures:
+        failure = decoded.failures[0]
+        raise DecodeError(failure.reason, rule=failure.rule, where=batch.channel.topic)
+    return decoded.rows
+
+
+@frozen
+class Known:
+    """An adapter that can be named."""
+
+    name: str
+    origin: str
+    """`built-in`, or the entry point it comes from."""
+    default: bool
+    ontology: str
+    ros_types: tuple[str, ...]
+    summary: str
+
+
+@frozen
+class Explained:
+    """An adapter in words, and what is known of the type it was explained for."""
+
+    description: Description
+    msgtype: str
+    why: str
+    """Which rule gives the type this adapter; empty where the adapter was asked for."""
+    unread: tuple[str, ...]
+    """Fields of the message that no expression names."""
+    others: tuple[str, ...]
+    """Adapters that take the type where they are named for a topic."""
+
+
+@frozen
+class TopicChoice:
+    """Which adapter a topic gets, and why."""
+
+    recording: str
+    topic: str
+    msgtype: str
+    adapter: str
+    """Empty for a topic that is left out."""
+    ontology: str
+    why: str
+
+
+@frozen
+class TestResult:
+    """What testing one adapter file showed."""
+
+    name: str
+    file: str
+    findings: tuple[Finding, ...]
+    """Where it does not fit a message type it takes."""
+    unknown: tuple[str, ...]
+    """Types it takes whose definition is not known here, so that it could not be held against them."""
+    outcomes: tuple[Outcome, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether it fits, and every test came out as it says."""
+        return not self.findings and all(outcome.passed for outcome in self.outcomes)
+
+
+def find_adapter(reference: str) -> AdapterSpec:
+    """Return an adapter by its name, file, or `module:Class`.
+
+    Raises:
+        AdapterError: There is none, or its file has a mistake.
+    """
+    installed = {spec.name: spec for _, spec in installed_adapters()}
+    return installed.get(reference) or load_adapter_reference(reference, Path())
+
+
+def known_adapters(takes: str | None = None) -> tuple[Known, ...]:
+    """Return the installed and the built-in adapters, those for some message types if `takes` (a glob) is given.
+
+    Raises:
+        AdapterError: An installed package offers something that is no adapter.
+    """
+    every = [*installed_adapters(), *(("built-in", builtin) for builtin in BUILTIN)]
+    return tuple(_known(origin, spec) for origin, spec in every if takes is None or _takes(spec, takes))
+
+
+def _known(origin: str, spec: AdapterSpec) -> Known:
+    words = describe(spec)
+    return Known(spec.name, origin, spec.default, words.ontology, spec.ros_types, words.summary)
+
+
+def _takes(spec: AdapterSpec, glob: str) -> bool:
+    """Whether a glob matches one of an adapter's types, in any of the spellings people use."""
+    spellings = ((name, short_msgtype(name), name.rpartition("/")[2]) for name in spec.ros_types)
+    return any(fnmatchcase(spelling, glob) for names in spellings for spelling in names)
+
+
+def source_text(spec: AdapterSpec) -> str:
+    """Return an adapter's file as it is written.
+
+    Raises:
+        AdapterError: It is written in Python.
+    """
+    mapping = mapping_of(spec)
+    if mapping is None:
+        raise AdapterError(
+            f"{spec.name} is written in Python, not in YAML",
+            hint=f"try `ingest adapters explain {spec.name}`",
+        )
+    return mapping.source.text
+
+
+def explain_adapter(given: str, types: KnownTypes) -> Explained:
+    """Explain an adapter, or the one that a message type gets without a job.
+
+    Raises:
+        AdapterError: There is no such adapter, or a type without one.
+    """
+    if _is_type(given):
+        msgtype = normalize_msgtype(given)
+        found = ROSBridge().resolve("", msgtype)
+        spec, why = found.spec, found.why
+    else:
+        spec, why = find_adapter(given), ""
+        msgtype = spec.ros_types[0] if spec.ros_types else ""
+    others = tuple(
+        known.name
+        for known in known_adapters(msgtype)
+        if known.name != spec.name and msgtype in known.ros_types
+    )
+    return Explained(describe(spec, msgtype), msgtype, why, _unread(spec, msgtype, types), others)
+
+
+def _is_type(given: str) -> bool:
+    return given not in BY_NAME and "/" in given and ":" not in given and not Path(given).suffix
+
+
+def _unread(spec: AdapterSpec, msgtype: str, types: KnownTypes) -> tuple[str, ...]:
+    if not msgtype:
+        return ()
+    try:
+        definition = types.find(msgtype, spec)
+    except BagError:
+        return ()
+    shape = ros_shape(definition)
+    return unread_fields(spec.bind(definition, shape), shape)
+
+
+def explain_topics(
+    *, job: Path | None, bag: Path | None, distro: str | None = None, custom: Sequence[CustomMessages] = ()
+) -> tuple[TopicChoice, ...]:
+    """Return which adapter each topic of a job's recordings, or of one recording, gets, and why.
+
+    Raises:
+        IngestError: The job cannot be done; the message says why.
+    """
+    if job is not None:
+        configs = compile_manifest(load_manifest(job))
+    else:
+        configs = (
+            ROSInjectionConfig(
+                file_path=bag or Path(), sequence_name="explained", ros_distro=distro, custom_msgs=custom
+            ),
+        )
+    return tuple(choice for config in configs for choice in _choices(config))
+
+
+def _choices(config: ROSInjectionConfig) -> Iterator[TopicChoice]:
+    plan = make_plan(config)
+    name = ", ".join(path.name for path in plan.files)
+    chosen = [
+        TopicChoice(name, one.topic, one.msgtype, one.adapter.name, one.ontology.tag, one.why)
+        for one in plan.topics
+    ]
+    chosen += [TopicChoice(name, one.topic, one.msgtype, "", "", one.why) for one in plan.left_out]
+    yield from sorted(chosen, key=lambda one: one.topic)
+
+
+def run_adapter_tests(spec: AdapterSpec, types: KnownTypes) -> TestResult:
+    """Hold an adapter file against the types it takes, and run its tests; recordings are read from its folder.
+
+    Raises:
+        AdapterError: It is written in Python.
+    """
+    mapping = mapping_of(spec)
+    if mapping is None:
+        raise AdapterError(
+            f"{spec.name} is written in Python; only an adapter file carries tests",
+            hint="test it with pytest",
+        )
+    folder = Path(mapping.source.file).parent
+
+    def recorded(place: Recorded) -> tuple[Definition, pa.StructArray]:
+        return message_in(folder / place.bag, place.topic, place.index, resolve=types)
+
+    findings: dict[Finding, None] = {}
+    unknown: list[str] = []
+    for msgtype in mapping.ros_types:
+        try:
+            definition = types.find(msgtype, spec)
+        except BagError:  # noqa: PERF203 - each type may be unknown for itself
+            unknown.append(msgtype)
+        else:
+            findings |= dict.fromkeys(mapping.check(definition, ros_shape(definition)))
+    outcomes = () if findings else run_tests(mapping, types, recorded=recorded)
+    file = str(spec.path) if isinstance(spec, Builtin) else mapping.source.file
+    return TestResult(spec.name, file, tuple(findings), tuple(unknown), outcomes)
+
+
+def draft_adapter(
+    msgtype: str,
+    types: KnownTypes,
+    *,
+    bag: Path | None = None,
+    record: str | None = None,
+    ontology: str | None = None,
+    folder: Path = Path(),
+) -> str:
+    """Return a first draft of an adapter file that is going to lie in `folder`.
+
+    The type's definition is the recording's if `bag` is given; `record` names a topic whose first message is tested.
+
+    Raises:
+        BagError: The definition is not known, or the recording cannot be read.
+        NothingMatched: The recording has no such type or topic.
+        AdapterError: The type has no fields, the topic has another type, or there is no such ontology.
+    """
+    name = normalize_msgtype(msgtype)
+    if bag is None:
+        definition = types.find(name)
+        return draft(definition, ontology=ontology, embed=definition.source is not Source.DISTRO)
+    if record is None:
+        definition, example = definition_in(bag, name, resolve=types), None
+    else:
+        definition, row = message_in(bag, record, resolve=types)
+        place = {"bag": relpath(bag, folder), "topic": record, "index": 0}
+        example = Example(row, place)
+        if definition.root != name:
+            raise AdapterError(
+                f"it carries {definition.root}, not {name}", where=record, hint="name another topic"
+            )
+    return draft(definition, ontology=ontology, embed=not _in_distros(definition), example=example)
+
+
+def _in_distros(definition: Definition) -> bool:
+    """Whether a distro has the very same type, so that a file need not hold it."""
+    try:
+        known = KnownTypes().find(definition.root)
+    except BagError:
+        return False
+    return replace(known.message, constants=()) == replace(definition.message, constants=())

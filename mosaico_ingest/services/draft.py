@@ -1,0 +1,158 @@
+"""This file drafts the manifest of a recording: what is in it, what becomes of it, and what one may want to change."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from glob import escape
+from os.path import relpath
+from pathlib import Path
+
+from mosaico_ingest.adapters.adapter import UnmodeledSpec
+from mosaico_ingest.job.expand import plain
+from mosaico_ingest.job.model import Stores
+from mosaico_ingest.remote import AnyPath, RemotePath
+from mosaico_ingest.report.units import bytes_text, counted, seconds_text
+from mosaico_ingest.rosbag.blocks import Encoding
+from mosaico_ingest.rosbag.definitions.distros import ROS2, distro_type
+from mosaico_ingest.rosbag.definitions.model import Source
+from mosaico_ingest.services.inspection import InspectedTopic, Inspection
+
+__all__ = ["draft_manifest", "draft_name"]
+
+_REFUSED = re.compile(r"[^A-Za-z0-9_-]+")
+_HEAD = (
+    "# yaml-language-server: $schema=job.schema.json",
+    "# `ingest schema job --write .` writes that schema, for completion and hover in an editor.",
+)
+
+
+def draft_manifest(
+    found: Inspection, recording: AnyPath, *, folder: Path, ros_distro: Stores | str | None = None
+) -> str:
+    """Return a manifest of `recording` to be put into `folder`; it lints clean, and runs as it stands."""
+    return "\n".join(
+        (
+            *_HEAD,
+            "version: 1",
+            "",
+            *_bag(found, _seen_from(folder, recording), ros_distro),
+            "",
+            "sequence:",
+            f"  name: {draft_name(recording)}",
+            "  # metadata: {vehicle: demo-01}",
+            "  # if_exists: replace                # fail, skip, append or replace",
+            "",
+            *_topics(found),
+            "",
+            *_adapters(found),
+            "",
+            "on_error:",
+            "  message: log_warn                   # bytes that do not fit their type: ignore, log_warn, raise",
+            "  topic: raise                        # rows that do not fit theirs: raise, ignore, finalize",
+            "  session: report                     # what an early end leaves behind: report, delete",
+            "",
+            "target: {store: mosaico}",
+            '# target: {host: mosaico.example.org, api_key: "${MOSAICO_API_KEY}", tls: true}',
+            "",
+        )
+    )
+
+
+def draft_name(recording: AnyPath) -> str:
+    """Return a sequence name for a recording: its file's name without what no name may have."""
+    name = recording.name if isinstance(recording, RemotePath) else recording.resolve().name
+    stem = re.sub(r"\.(bag|db3|mcap)(\.\w+)?$", "", name, flags=re.IGNORECASE)
+    name = _REFUSED.sub("_", stem).strip("_-")
+    return plain(name if name[:1].isalnum() else f"drive_{name}".rstrip("_"))
+
+
+def _bag(found: Inspection, path: str, ros_distro: Stores | str | None) -> Iterator[str]:
+    span = "" if found.duration_s is None else f", {seconds_text(found.duration_s)}"
+    messages = "" if found.messages is None else f", {counted(found.messages, 'message')}"
+    ours = [topic for topic in found.topics if topic.encoding != Encoding.OTHER.value]
+    undefined = sorted({topic.msgtype for topic in ours if topic.definition == "none"})
+    yield f"# {found.container}, {bytes_text(found.size_bytes)}{messages}{span}"
+    yield "bag:"
+    silenced = path.lower().endswith(".db3") and ros_distro is None and not undefined
+    mark = f"  # ingest: ignore[distro-missing] ({_known_from(ours)})" if silenced else ""
+    yield f"  path: {plain(path)}{mark}"
+    if ros_distro is not None:
+        yield f"  ros_distro: {Stores(ros_distro).value}"
+    yield from _definitions(undefined, ros_distro)
+
+
+def _definitions(undefined: Sequence[str], ros_distro: Stores | str | None) -> Iterator[str]:
+    """Yield what to say of types that nobody defines, or on which the distros disagree."""
+    standard = [name for name in undefined if any(distro_type(distro, name) for distro in ROS2)]
+    if standard and ros_distro is None:
+        yield f"  # {', '.join(standard)} changed between distros, and the recording does not carry it; say which:"
+        yield "  # ros_distro: ros2_humble"
+    own = [name for name in undefined if ros_distro is not None or name not in standard]
+    if own:
+        yield f"  # no definition is known of {', '.join(own)}; say where they are:"
+        for package in dict.fromkeys(msgtype.partition("/")[0] for msgtype in own):
+            yield f"  # custom_msgs: [{{package: {package}, path: definitions/{package}}}]"
+
+
+def _known_from(topics: Sequence[InspectedTopic]) -> str:
+    assumed = sorted({topic.definition for topic in topics} - {Source.BAG.value})
+    places = {Source.DISTRO.value: "as in all distros", Source.PACKAGE.value: "as in public packages"}
+    how = " or ".join(places[source] for source in assumed)
+    return f"it carries no definitions; they are read {how}" if assumed else "it carries its definitions"
+
+
+def _topics(found: Inspection) -> Iterator[str]:
+    """Yield the topics as a list in which each can be taken out by a #; those that cannot be ingested are."""
+    topics = _merged(found.topics)
+    good = [topic for topic in topics if topic.problem is None]
+    width = min(44, max((len(_quoted(topic.topic)) for topic in topics), default=0))
+    yield "# Put a # before what is not wanted. Globs work too, the last that matches decides, ! leaves out;"
+    yield '# what begins with * or ! must be quoted: ["/cam*", "!/cam/debug*"].'
+    if any(not topic.topic.startswith("/") for topic in good):
+        yield "# ingest: ignore-file[relative-topic] (these names are as the recording has them)"
+    yield "topics:" if good else "# topics:"
+    for topic in good:
+        yield f"  - {_quoted(topic.topic):{width}}  # {_about(topic)}"
+    for topic in topics:
+        if topic.problem is not None:
+            yield f"  # - {_quoted(topic.topic):{width}}  # {topic.msgtype}: {_one_line(topic.problem)}"
+
+
+def _adapters(found: Inspection) -> Iterator[str]:
+    kept = [topic for topic in _merged(found.topics) if topic.adapter == UnmodeledSpec().name]
+    if kept:
+        yield f"# No adapter takes {', '.join(sorted({topic.msgtype for topic in kept}))}: the ROS shape is kept."
+    yield "adapters:"
+    yield "  unmodeled: keep                     # a type without an adapter: keep, skip, fail"
+    yield "  # load: [adapters/mine.yaml]        # adapters of your own, for every topic of their types"
+    some = kept[0].topic if kept else found.topics[0].topic if found.topics else "/topic"
+    yield f"  # override: {{{plain(some)}: MyAdapter}}"
+
+
+def _merged(topics: Sequence[InspectedTopic]) -> list[InspectedTopic]:
+    """Return one entry for each topic, of several channels one that can be ingested."""
+    best: dict[str, InspectedTopic] = {}
+    for topic in topics:
+        known = best.get(topic.topic)
+        if known is None or (known.problem is not None and topic.problem is None):
+            best[topic.topic] = topic
+    return list(best.values())
+
+
+def _about(topic: InspectedTopic) -> str:
+    count = "?" if topic.count is None else str(topic.count)
+    rate = "" if topic.rate_hz is None else f" at {topic.rate_hz:.1f} Hz"
+    return f"{count} x {topic.msgtype}{rate}, {topic.ontology} by {topic.adapter}"
+
+
+def _quoted(topic: str) -> str:
+    return plain(escape(topic))
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def _seen_from(folder: Path, path: AnyPath) -> str:
+    return path.url if isinstance(path, RemotePath) else Path(relpath(path, folder)).as_posix()

@@ -1,0 +1,108 @@
+"""Inspect a recording: its index, its definitions, and the adapters its topics would get."""
+
+from __future__ import annotations
+
+from mosaico_ingest.adapters.bridge import ROSBridge
+from mosaico_ingest.documents import Part
+from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.patterns import select
+from mosaico_ingest.pipeline.plan import LeftOut
+from mosaico_ingest.pipeline.planning import decide
+from mosaico_ingest.pipeline.run import open_for
+from mosaico_ingest.rosbag.blocks import Channel
+
+__all__ = [
+    "InspectedTopic",
+    "Inspection",
+    "inspect",
+]
+
+
+class InspectedTopic(Part):
+    """One topic of the recording and what it would become."""
+
+    topic: str
+    msgtype: str
+    encoding: str
+    count: int | None
+    """How many messages the index promises."""
+    rate_hz: float | None
+    """Messages a second over the recording's span."""
+    definition: str
+    """Where the definition was found: bag, custom, distro, package or none."""
+    adapter: str
+    """The adapter it would get."""
+    ontology: str | None
+    """The ontology tag it would have; None where it cannot be ingested."""
+    problem: str | None = None
+    """Why it cannot be ingested."""
+
+
+class Inspection(Part):
+    """A recording as its index describes it."""
+
+    files: tuple[str, ...]
+    container: str
+    size_bytes: int
+    messages: int | None
+    start_ns: int | None
+    end_ns: int | None
+    topics: tuple[InspectedTopic, ...]
+    findings: tuple[str, ...] = ()
+
+    @property
+    def duration_s(self) -> float | None:
+        """Seconds from the first message to the last."""
+        if self.start_ns is None or self.end_ns is None:
+            return None
+        return (self.end_ns - self.start_ns) / 1e9
+
+
+def inspect(config: ROSInjectionConfig) -> Inspection:
+    """Open the recording and describe it.
+
+    Raises:
+        BagError: It cannot be opened.
+    """
+    bridge = ROSBridge.for_config(config)
+    with open_for(config) as (recording, _):
+        duration_ns = None
+        if recording.start_ns is not None and recording.end_ns is not None:
+            duration_ns = recording.end_ns - recording.start_ns
+        topics = [_topic(config, channel, bridge, duration_ns) for channel in recording.channels]
+        return Inspection(
+            files=tuple(str(path) for path in recording.files),
+            container=recording.container,
+            size_bytes=recording.size_bytes,
+            messages=recording.message_count,
+            start_ns=recording.start_ns,
+            end_ns=recording.end_ns,
+            topics=tuple(sorted(topics, key=lambda topic: topic.topic)),
+            findings=tuple(str(finding) for finding in recording.findings),
+        )
+
+
+def _topic(
+    config: ROSInjectionConfig, channel: Channel, bridge: ROSBridge, duration_ns: int | None
+) -> InspectedTopic:
+    try:
+        outcome = decide(config, channel, select((), [channel.topic]), bridge, "")
+    except AdapterError as error:
+        outcome = LeftOut(channel.topic, channel.msgtype, channel.count, str(error))
+    rate = None
+    if channel.count and channel.count > 1 and duration_ns:
+        rate = (channel.count - 1) / (duration_ns / 1e9)
+    source = channel.definition.source.value if channel.definition else "none"
+    left = isinstance(outcome, LeftOut)
+    return InspectedTopic(
+        topic=channel.topic,
+        msgtype=channel.msgtype,
+        encoding=channel.encoding.value,
+        count=channel.count,
+        rate_hz=rate,
+        definition=source,
+        adapter="" if left else outcome.adapter.name,
+        ontology=None if left else outcome.ontology.tag,
+        problem=outcome.why if left else None,
+    )

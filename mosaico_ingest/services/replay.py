@@ -1,0 +1,132 @@
+"""This file says what becomes of the messages in a quarantine, and makes the configurations that ingest them."""
+
+from __future__ import annotations
+
+import sqlite3
+import sys
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from enum import Enum
+from pathlib import Path
+
+from mosaico_ingest.destinations.store.files import Lease
+from mosaico_ingest.errors import ManifestError, NothingMatched, SinkUnavailable
+from mosaico_ingest.findings import a_few, encodable
+from mosaico_ingest.frozen import frozen
+from mosaico_ingest.job.config import (
+    QuarantineSettings,
+    ROSInjectionConfig,
+    StoreTarget,
+    TimeRange,
+)
+from mosaico_ingest.job.model import IfExists, SessionLevelErrorPolicy, TopicLevelErrorPolicy
+from mosaico_ingest.pipeline.provenance import content_digest, held
+from mosaico_ingest.pipeline.quarantine import Kept, find_kept
+
+__all__ = ["Replay", "Whereabouts", "alone", "replays"]
+
+_LOCK = ".replay.lock"
+
+
+class Whereabouts(Enum):
+    """What the destination knows of kept messages."""
+
+    WAITING = "waiting"
+    """The run that kept them is part of the sequence, they are not."""
+    STORED = "stored"
+    """A replay has brought them in, and was stopped before it could say so here."""
+    FORGOTTEN = "forgotten"
+    """The run that kept them is not part of the sequence: it was stopped, or what it made was replaced or removed."""
+
+
+@frozen
+class Replay:
+    """Kept messages, what the destination knows of them, and the configuration that brings them in."""
+
+    kept: Kept
+    whereabouts: Whereabouts
+    config: ROSInjectionConfig
+
+
+@contextmanager
+def alone(folder: Path) -> Generator[None, None, None]:
+    """Hold a quarantine's lock, so that no two replays bring the same messages in.
+
+    Raises:
+        NothingMatched: There is no such folder.
+        SinkUnavailable: Another replay holds it.
+    """
+    if not folder.is_dir():
+        raise NothingMatched("there is no such folder", where=str(folder), hint="name a quarantine's folder")
+    lock = folder / _LOCK
+    try:
+        lease = Lease(lock)
+    except sqlite3.OperationalError as error:
+        busy = "locked" in str(error)
+        what = "another replay is at work here" if busy else f"cannot be written: {error}"
+        raise SinkUnavailable(what, where=str(folder), hint="wait for it" if busy else None) from error
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            lock.unlink()
+        lease.release()
+
+
+def replays(folder: Path, configs: Sequence[ROSInjectionConfig]) -> tuple[Replay, ...]:
+    """Return what lies in a quarantine, each with the configuration of its sequence.
+
+    Raises:
+        NothingMatched: It is empty.
+        ManifestError: None of the configurations is for a sequence that has messages there.
+        BagError: A file there cannot be read.
+    """
+    known = {config.sequence_name: config for config in configs}
+    return tuple(_replay(kept, known) for kept in find_kept(folder))
+
+
+def _replay(kept: Kept, known: dict[str, ROSInjectionConfig]) -> Replay:
+    if kept.sequence not in known:
+        raise ManifestError(
+            f"{kept.messages.name} belongs to the sequence {kept.sequence!r}, which the manifest does not make",
+            where=next((config.where for config in known.values()), None),
+            hint=f"it makes {a_few(known)}",
+        )
+    config = known[kept.sequence]
+    return Replay(kept, _whereabouts(kept, config), _configuration(kept, config))
+
+
+def _whereabouts(kept: Kept, config: ROSInjectionConfig) -> Whereabouts:
+    """Ask the ledgers of the sequence; a server keeps that of its first session only, and adds to no topic twice."""
+    found = held(config.target, kept.sequence)
+    if found is None:
+        return Whereabouts.FORGOTTEN
+    name = encodable(kept.messages.name)
+    made_from = {(source.name, source.content) for known in found.ledgers for source in known.sources}
+    if (name, content_digest(kept.messages)) in made_from:
+        return Whereabouts.STORED
+    ledgers = found.ledgers if isinstance(config.target, StoreTarget) else ()
+    if ledgers and all(known.quarantine != name for known in ledgers):
+        return Whereabouts.FORGOTTEN
+    return Whereabouts.WAITING
+
+
+def _configuration(kept: Kept, config: ROSInjectionConfig) -> ROSInjectionConfig:
+    """Return the configuration of a sequence for messages kept of it: all of them, added to what is there, or none.
+
+    What fails again is kept again, however much: the copy that is there is put away.
+    """
+    folder = config.quarantine.path if config.quarantine else kept.messages.parent
+    return replace(
+        config,
+        file_path=kept.messages,
+        if_exists=IfExists.APPEND,
+        on_error=SessionLevelErrorPolicy.Delete,
+        topics_on_error=TopicLevelErrorPolicy.Raise,
+        topics=(),
+        every={},
+        time_range=TimeRange(),
+        quarantine=QuarantineSettings(folder, systematic=sys.maxsize),
+        plan_digest=None,
+    )

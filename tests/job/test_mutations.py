@@ -1,0 +1,164 @@
+"""Every key misspelt, every value of the wrong type: one finding, at the right place, with the right remedy."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+
+import jsonschema
+import pytest
+import yaml
+
+from mosaico_ingest.job.manifest import check_manifest
+from mosaico_ingest.job.reference import job_schema
+from mosaico_ingest.job.yaml_source import (
+    KeyPath,
+    Source,
+    Value,
+    load_source,
+)
+
+GOOD = """\
+version: 1
+bag:
+  path: data/session_01.db3
+  ros_distro: ros2_humble
+  custom_msgs:
+  - package: my_custom_pkg
+    path: definitions/my_pkg
+    store: ros2_humble
+  time:
+    start: +10s
+    end: 2026-03-01T12:00:00Z
+sequence:
+  name: run_01
+  metadata_file: metadata.json
+  if_exists: append
+topics:
+- /cam*
+topic_settings:
+  /imu:
+    rename: /sensors/imu
+    every: 3
+    image: png
+adapters:
+  load:
+  - adapters/battery_pack.yaml
+  override:
+    /lidar: LidarAdapter
+  unmodeled: keep
+on_error:
+  session: report
+  topic: raise
+  message: log_warn
+target:
+  host: mosaico.example.org
+  port: 6726
+  api_key: key
+  tls_cert: certs/ca.pem
+  tls: true
+run:
+  jobs: 2
+  memory: 512MiB
+  report: report.json
+  log_level: INFO
+"""
+FREE = {("topic_settings", "/imu"), ("adapters", "override", "/lidar")}
+WRONG = [("7", 7), ("1.5", 1.5), ("[a]", ["a"]), ("{a: b}", {"a": "b"}), ("true", True), ("'zzz'", "zzz")]
+SCHEMA = jsonschema.Draft202012Validator(job_schema())
+
+
+def walk(value: Value, path: KeyPath = ()) -> Iterator[KeyPath]:
+    if path:
+        yield path
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, inner in items:
+        yield from walk(inner, (*path, key))
+
+
+SOURCE = load_source(GOOD, file="j")
+PATHS = list(walk(SOURCE.value))
+KEYS = [path for path in PATHS if isinstance(path[-1], str) and path not in FREE]
+LEAVES = [path for path in PATHS if not isinstance(SOURCE.at(path), dict | list)]
+
+
+def name(path: KeyPath) -> str:
+    return ".".join(str(part) for part in path)
+
+
+def replaced(start: tuple[int, int], end: tuple[int, int], new: str) -> str:
+    lines = GOOD.splitlines(keepends=True)
+    assert start[0] == end[0]
+    line = lines[start[0] - 1]
+    lines[start[0] - 1] = line[: start[1] - 1] + new + line[end[1] - 1 :]
+    return "".join(lines)
+
+
+def findings_of(text: str) -> list[tuple[str, int, int, str]]:
+    _, findings = check_manifest(load_source(text, file="j"), env={})
+    return [(f.rule, f.span.line, f.span.column, f.help or "") for f in findings if f.span is not None]
+
+
+def test_the_manifest_that_is_mutated_is_good() -> None:
+    assert findings_of(GOOD) == []
+    SCHEMA.validate(SOURCE.value)
+
+
+@pytest.mark.parametrize("path", KEYS, ids=name)
+@pytest.mark.parametrize("slip", ["double", "drop", "upper"])
+def test_a_misspelt_key_is_pointed_at_and_the_right_one_named(path: KeyPath, slip: str) -> None:
+    key = str(path[-1])
+    wrong = {"double": key + key[-1], "drop": key[:-1], "upper": key.upper()}[slip]
+    span = SOURCE.key_span(path)
+    found = findings_of(replaced((span.line, span.column), (span.end_line, span.end_column), wrong))
+    assert [(rule, line, column) for rule, line, column, _ in found] == [
+        ("unknown-key", span.line, span.column)
+    ]
+    assert f"did you mean '{key}'" in found[0][3]
+
+
+def cases() -> Iterator[tuple[KeyPath, str]]:
+    for path in LEAVES:
+        for written, value in WRONG:
+            if schema_refuses(path, value):
+                yield path, written
+
+
+def schema_refuses(path: KeyPath, value: object) -> bool:
+    document = yaml.safe_load(yaml.safe_dump(SOURCE.value))
+    parent = document
+    for part in path[:-1]:
+        parent = parent[part]
+    parent[path[-1]] = value
+    return not SCHEMA.is_valid(document)
+
+
+@pytest.mark.parametrize(
+    ("path", "written"), list(cases()), ids=lambda part: name(part) if isinstance(part, tuple) else part
+)
+def test_a_value_that_is_wrong_is_pointed_at_once(path: KeyPath, written: str) -> None:
+    span = SOURCE.span(path)
+    text = replaced((span.line, span.column), (span.end_line, span.end_column), written)
+    found = findings_of(text)
+    assert len(found) == 1
+    rule, line, column, remedy = found[0]
+    assert rule in {"wrong-type", "wrong-value", "newer-version", "unknown-key"}
+    assert line == span.line
+    assert column >= span.column
+    assert remedy
+
+
+@pytest.mark.parametrize("path", LEAVES, ids=name)
+@pytest.mark.parametrize("written", [written for written, _ in WRONG])
+def test_the_schema_and_the_tool_agree(path: KeyPath, written: str) -> None:
+    span = SOURCE.span(path)
+    text = replaced((span.line, span.column), (span.end_line, span.end_column), written)
+    source = load_source(text, file="j")
+    refused = bool(findings_of(text))
+    assert refused == (not SCHEMA.is_valid(source.value)) or is_about_one_another(source)
+
+
+def is_about_one_another(source: Source) -> bool:
+    """What JSON Schema is not asked to say: a text's inner language beyond its pattern."""
+    return bool(re.search("zzz", json.dumps(source.value)))

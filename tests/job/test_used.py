@@ -1,0 +1,38 @@
+"""A report shows the manifest with what it extends; whatever it says, no secret gets into it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from mosaico_ingest.job.expand import MASK, manifest_text
+
+SECRETS = (
+    "target: {host: h, api_key: hunter2}",
+    'target: {host: h, api_key: "${K:-hunter2}"}',
+    'defaults: {K: hunter2}\ntarget: {host: h, api_key: "${K}"}',
+    "matrix: {api_key: [hunter2]}",
+    "sequence: {metadata: {Token: {of: [hunter2]}}}",
+    "sequence: {metadata: {note: we use msco_hunter2_1}}",
+    "bag: {path: 's3://me:hunter2@bucket/a.mcap'}",
+    "bag: {path: 's3://bucket/a.mcap?secret_key=hunter2&region=x'}",
+    "target:\n  host: h\n  api_key: >-\n    hunter2",
+)
+
+
+@pytest.mark.parametrize("text", SECRETS)
+def test_no_secret_gets_into_the_text(text: str, tmp_path: Path) -> None:
+    (tmp_path / "job.yaml").write_text(text)
+    shown = manifest_text(tmp_path / "job.yaml")
+    assert "hunter2" not in shown
+    assert MASK in shown or "${K}" in shown
+
+
+def test_what_another_file_says_is_there_with_its_place(tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text("run: {jobs: 2}\n")
+    (tmp_path / "job.yaml").write_text('extends: base.yaml\nbag: {path: "${DIR}/*.mcap"}\n')
+    shown = manifest_text(tmp_path / "job.yaml")
+    assert yaml.safe_load(shown) == {"bag": {"path": "${DIR}/*.mcap"}, "run": {"jobs": 2}}
+    assert f"jobs: 2  # {tmp_path / 'base.yaml'}:1" in shown

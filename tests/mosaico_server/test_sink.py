@@ -1,0 +1,503 @@
+from __future__ import annotations
+
+import logging
+import os
+import pickle
+import signal
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.flight as fl
+import pytest
+from mosaicod import Mosaicod, Proxy, exists, make_key, precondition, running
+
+from mosaico_ingest.destinations.base import topic_schema
+from mosaico_ingest.destinations.server.client import connect
+from mosaico_ingest.destinations.server.errors import Address
+from mosaico_ingest.destinations.server.sink import PlatformSink, delete_finding
+from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
+from mosaico_ingest.job.config import ServerTarget
+from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.ontology import Integer64
+from mosaico_ingest.ontology.types import OntologyType
+
+NUMBER = Integer64.ontology_type()
+BLOB = OntologyType("Blob", pa.struct([pa.field("data", pa.binary(), nullable=False)]))
+META = {"car": 7}
+
+
+def numbers(*times: int) -> pa.RecordBatch:
+    return pa.record_batch([pa.array(times, pa.int64())] * 2, topic_schema(NUMBER))
+
+
+def blobs(*sizes: int) -> pa.RecordBatch:
+    times = pa.array(range(len(sizes)), pa.int64())
+    return pa.record_batch(
+        [times, pa.array([b"x" * size for size in sizes], pa.binary())], topic_schema(BLOB)
+    )
+
+
+@pytest.fixture
+def server() -> Iterator[Mosaicod]:
+    with running(Mosaicod()) as server:
+        yield server
+
+
+def target(server: Any, **options: Any) -> ServerTarget:
+    return ServerTarget("127.0.0.1", server.port, **options)
+
+
+def write(server: Mosaicod, *times: int, if_exists: IfExists = IfExists.FAIL, topic: str = "/n") -> None:
+    with PlatformSink(target(server)).open("seq", META, if_exists=if_exists) as session:
+        session.topic(topic, NUMBER, {"unit": "m"}).write(numbers(*times))
+
+
+def test_the_calls_are_those_of_the_protocol_in_its_order(server: Mosaicod) -> None:
+    write(server, 1, 2)
+    assert server.calls == [
+        "info",
+        "get_flight_info",
+        "sequence_create",
+        "session_create",
+        "topic_create",
+        "do_put",
+        "session_finalize",
+    ]
+    session_uuid = next(iter(server.sessions))
+    assert server.bodies[1:4] == [
+        ("sequence_create", {"locator": "seq", "user_metadata": META}),
+        ("session_create", {"locator": "seq"}),
+        (
+            "topic_create",
+            {
+                "session_uuid": session_uuid,
+                "locator": "seq/n",
+                "serialization_format": "default",
+                "ontology_tag": "Integer64",
+                "user_metadata": {"unit": "m"},
+            },
+        ),
+    ]
+    assert server.topics["seq/n"].schema == topic_schema(NUMBER)
+    assert server.topics["seq/n"].table().to_batches() == [numbers(1, 2)]
+
+
+def test_the_server_is_asked_what_it_holds(server: Mosaicod) -> None:
+    with PlatformSink(target(server)).open("seq", {}) as session:
+        session.topic("/n", NUMBER, {}).write(numbers(3, 1, 2))
+        session.topic("/empty", NUMBER, {})
+    held, empty = session.stored()
+    assert (held.topic, held.rows, held.start_ns, held.end_ns) == ("/n", 3, 1, 3)
+    assert (empty.rows, empty.start_ns, empty.stored_bytes) == (0, None, 0)
+    assert server.topics["seq/empty"].state == "final"
+
+
+def test_small_batches_travel_together_and_large_ones_in_parts() -> None:
+    with running(Mosaicod(message_bytes=100_000)) as server:
+        with PlatformSink(target(server)).open("seq", {}) as session:
+            few = session.topic("/few", NUMBER, {})
+            many = session.topic("/many", BLOB, {})
+            for at in range(100):
+                few.write(numbers(at))
+            many.write(blobs(*[30_000] * 7))
+        assert [chunk.num_rows for chunk in server.topics["seq/few"].chunks] == [100]
+        assert [chunk.num_rows for chunk in server.topics["seq/many"].chunks] == [2, 2, 2, 1]
+
+
+def test_a_row_no_message_can_hold_is_refused_and_the_topic_goes_on() -> None:
+    with running(Mosaicod(message_bytes=100_000)) as server:
+        with PlatformSink(target(server)).open("seq", {}) as session:
+            writer = session.topic("/b", BLOB, {})
+            with pytest.raises(SinkError, match=r"/b: the row of 1 ns has 9.* bytes, the server takes 90000"):
+                writer.write(blobs(5, 95_000))
+            writer.write(blobs(6))
+        assert server.topics["seq/b"].table().column("data").to_pylist() == [b"x" * 6]
+
+
+def test_what_waits_in_memory_is_bounded_over_all_topics(server: Mosaicod) -> None:
+    with PlatformSink(target(server), buffer_bytes=10_000).open("seq", {}) as session:
+        writers = [session.topic(f"/t{n}", BLOB, {}) for n in range(4)]
+        for _ in range(10):
+            for writer in writers:
+                writer.write(blobs(1000))
+                assert sum(w.waiting_bytes for w in writers) <= 10_000  # type: ignore[attr-defined]  # the class is known
+    assert all(len(topic.chunks) > 1 for topic in server.topics.values())
+
+
+def test_topics_can_be_written_from_several_threads(server: Mosaicod) -> None:
+    with PlatformSink(target(server), buffer_bytes=20_000).open("seq", {}) as session:
+        writers = [session.topic(f"/t{n}", NUMBER, {}) for n in range(6)]
+        threads = [
+            threading.Thread(target=lambda w=w: [w.write(numbers(at)) for at in range(300)]) for w in writers
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert [topic.rows for topic in session.stored()] == [300] * 6
+
+
+def test_an_exception_leaves_no_trace(server: Mosaicod) -> None:
+    with pytest.raises(ZeroDivisionError), PlatformSink(target(server)).open("seq", {}) as session:
+        session.topic("/n", NUMBER, {}).write(numbers(1))
+        raise ZeroDivisionError
+    assert (server.sequences, server.sessions, server.topics) == ({}, {}, {})
+    write(server, 1)
+
+
+def test_an_exception_in_an_added_session_keeps_the_sequence(server: Mosaicod) -> None:
+    write(server, 1)
+    sink = PlatformSink(target(server))
+    with pytest.raises(ZeroDivisionError), sink.open("seq", {}, if_exists=IfExists.APPEND) as session:
+        session.topic("/m", NUMBER, {}).write(numbers(1))
+        raise ZeroDivisionError
+    assert list(server.topics) == ["seq/n"]
+
+
+def test_a_session_without_topics_is_never_begun(server: Mosaicod) -> None:
+    with PlatformSink(target(server)).open("seq", META) as session:
+        pass
+    assert server.sequences == {"seq": META}
+    assert "session_create" not in server.calls
+    assert session.stored() == ()
+
+
+def test_append_adds_new_topics_and_refuses_known_ones(server: Mosaicod) -> None:
+    write(server, 1)
+    write(server, 2, if_exists=IfExists.APPEND, topic="/m")
+    assert set(server.topics) == {"seq/n", "seq/m"}
+    with pytest.raises(SinkError, match="/n: the sequence has this topic, and a server adds no rows to one"):
+        write(server, 3, if_exists=IfExists.APPEND)
+    assert server.topics["seq/n"].table().num_rows == 1
+
+
+def test_replace_deletes_the_old_sequence(server: Mosaicod) -> None:
+    write(server, 1)
+    write(server, 2, 3, if_exists=IfExists.REPLACE, topic="/m")
+    assert set(server.topics) == {"seq/m"}
+    sink = PlatformSink(target(server))
+    with (
+        pytest.raises(SinkError, match="enough — the old sequence is deleted"),
+        sink.open("seq", {}, if_exists=IfExists.REPLACE),
+    ):
+        raise SinkError("enough")
+
+
+def test_a_replacement_that_cannot_begin_says_that_the_old_is_gone(server: Mosaicod) -> None:
+    write(server, 1)
+    server.faults.refuse["sequence_create"] = [pa.ArrowInvalid("odd name")]
+    with pytest.raises(SinkError, match="sequence_create is refused: odd name — the old sequence is deleted"):
+        write(server, 2, if_exists=IfExists.REPLACE)
+
+
+def test_a_name_taken_meanwhile_is_taken(server: Mosaicod) -> None:
+    server.faults.refuse["sequence_create"] = [exists("sequence seq")]
+    with pytest.raises(SequenceExists, match="seq: the sequence exists"):
+        write(server, 1)
+
+
+def test_names_and_metadata_are_checked_before_the_first_byte() -> None:
+    nowhere = PlatformSink(ServerTarget("127.0.0.1", 1))
+    with pytest.raises(SinkError, match="sequence name"), nowhere.open("a b", {}):
+        pytest.fail("opened")
+    with pytest.raises(SinkError, match="metadata key"), nowhere.open("seq", {"a.b": 1}):
+        pytest.fail("opened")
+
+
+def test_errors_go_to_their_topic_or_to_the_sequence(server: Mosaicod) -> None:
+    with PlatformSink(target(server)).open("seq", {}) as session:
+        session.topic("/n", NUMBER, {})
+        session.note_error("stopped")
+        session.note_error("one row lost", topic="/n")
+        session.note_error("never opened", topic="/x")
+    assert server.notes == {"seq": ["stopped", "/x: never opened"], "seq/n": ["one row lost"]}
+
+
+def test_an_older_server_is_spoken_to_and_counted_by_reading(server: Mosaicod) -> None:
+    server.faults.version = "0.6.1"
+    with connect(target(server)) as client:
+        assert client.version == "0.6.1"
+        assert client.message_bytes == 50 << 20
+    with PlatformSink(target(server)).open("seq", {}) as session:
+        session.topic("/n", NUMBER, {}).write(numbers(3, 1))
+    (held,) = session.stored()
+    assert (held.rows, held.start_ns, held.end_ns) == (2, 1, 3)
+
+
+class TestFaults:
+    def test_a_refused_topic_leaves_the_others(self, server: Mosaicod) -> None:
+        server.faults.refuse["topic_create"] = [pa.ArrowInvalid("bad schema")]
+        with PlatformSink(target(server)).open("seq", {}) as session:
+            with pytest.raises(SinkError, match="topic_create is refused: bad schema"):
+                session.topic("/bad", NUMBER, {})
+            session.topic("/good", NUMBER, {}).write(numbers(1))
+        assert list(server.topics) == ["seq/good"]
+
+    def test_a_broken_upload_loses_its_topic_and_leaves_the_others(self, server: Mosaicod) -> None:
+        def refuse(topic: str, _: int) -> None:
+            if topic == "seq/bad":
+                raise pa.ArrowInvalid("no such column")
+
+        server.faults.before_batch = refuse
+        with PlatformSink(target(server), buffer_bytes=0).open("seq", {}) as session:
+            good, bad = session.topic("/good", NUMBER, {}), session.topic("/bad", NUMBER, {})
+            good.write(numbers(1))
+            with pytest.raises(SinkError, match="the upload of /bad is refused: no such column"):
+                for at in range(200):
+                    bad.write(numbers(at))
+                    time.sleep(0.01)
+            good.write(numbers(2))
+            with pytest.raises(SinkError, match="no such column"):
+                bad.write(numbers(3))
+        assert [(topic.topic, topic.rows) for topic in session.stored()] == [("/good", 2), ("/bad", 0)]
+
+    def test_a_session_whose_only_topic_broke_is_taken_back(self, server: Mosaicod) -> None:
+        server.faults.refuse["do_put"] = [pa.ArrowInvalid("no room")]
+        with PlatformSink(target(server), buffer_bytes=0).open("seq", META) as session:
+            writer = session.topic("/n", NUMBER, {})
+            with pytest.raises(SinkError, match="the upload of /n is refused: no room"):
+                for at in range(200):
+                    writer.write(numbers(at))
+                    time.sleep(0.01)
+        assert (server.sequences, server.sessions, server.topics) == ({"seq": META}, {}, {})
+        assert [topic.rows for topic in session.stored()] == [0]
+
+    def test_a_refusal_at_the_end_discards_everything(self, server: Mosaicod) -> None:
+        def refuse(topic: str, _: int) -> None:
+            raise pa.ArrowInvalid(f"{topic} is odd")
+
+        server.faults.before_batch = refuse
+        with pytest.raises(SinkError, match="the upload of /n is refused: seq/n is odd"):
+            write(server, 1)
+        assert (server.sequences, server.topics) == ({}, {})
+
+    def test_a_refused_finalize_discards_everything(self, server: Mosaicod) -> None:
+        server.faults.refuse["session_finalize"] = [precondition("not now")]
+        with pytest.raises(SinkError, match="session_finalize is refused: failed precondition: not now"):
+            write(server, 1)
+        assert (server.sequences, server.topics) == ({}, {})
+
+    @pytest.mark.parametrize("action", ["sequence_create", "session_finalize"])
+    def test_a_lost_answer_is_looked_up_before_asking_again(self, server: Mosaicod, action: str) -> None:
+        server.faults.lose_answer[action] = 1
+        write(server, 1, 2)
+        assert server.topics["seq/n"].state == "final"
+        assert server.calls.count(action) == 1
+
+    @pytest.mark.parametrize("action", ["sequence_create", "session_finalize"])
+    def test_an_action_that_did_not_happen_is_asked_again(self, server: Mosaicod, action: str) -> None:
+        server.faults.refuse[action] = [fl.FlightUnavailableError("away")]
+        write(server, 1, 2)
+        assert server.topics["seq/n"].state == "final"
+
+    def test_a_handshake_is_repeated_while_the_server_starts(self, server: Mosaicod) -> None:
+        server.faults.refuse["info"] = [fl.FlightUnavailableError("starting")] * 2
+        write(server, 1)
+        assert server.calls.count("info") == 3
+
+    def test_a_slow_server_is_given_up(self, server: Mosaicod) -> None:
+        server.faults.answer_after_s = 0.5
+        begin = time.monotonic()
+        with (
+            pytest.raises(SinkUnavailable, match="no answer to info in time"),
+            connect(target(server), answer_s=0.1),
+        ):
+            pytest.fail("connected")
+        assert time.monotonic() - begin < 2
+
+    def test_a_line_cut_in_the_middle_is_one_error_that_may_be_tried_again(
+        self, server: Mosaicod, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("mosaico_ingest.destinations.server.client._DELAYS_S", (0.01,))
+        proxy = Proxy(server.port)
+        sink = PlatformSink(target(proxy), buffer_bytes=0)
+        with (
+            pytest.raises(SinkUnavailable, match="nothing listens there") as caught,
+            sink.open("seq", {}) as session,
+        ):
+            writer = session.topic("/n", NUMBER, {})
+            writer.write(numbers(1))
+            proxy.cut()
+            for at in range(2, 200):
+                writer.write(numbers(at))
+                time.sleep(0.01)
+        assert caught.value.retryable
+        assert "an unfinished session of seq may stay on the server" in str(caught.value)
+
+    def test_a_line_mended_in_time_goes_on(self, server: Mosaicod) -> None:
+        proxy = Proxy(server.port)
+        proxy.cut()
+        threading.Timer(0.5, proxy.mend).start()
+        with connect(target(proxy)) as client:
+            assert client.find("seq") is None
+        proxy.cut()
+
+
+class TestKeys:
+    def test_the_key_is_sent_and_let_in(self, server: Mosaicod) -> None:
+        server.keys[make_key("w")] = "write"
+        with PlatformSink(target(server, api_key=make_key("w"))).open("seq", {}) as session:
+            session.topic("/n", NUMBER, {}).write(numbers(1))
+        assert session.stored()[0].rows == 1
+
+    @pytest.mark.parametrize(
+        ("key", "reason"),
+        [
+            (None, "the server wants an API key"),
+            (make_key("other"), r"the API key is refused \(.*\) — ask for a new one"),
+            (make_key("w")[:-1] + "?", "the API key is refused: it is not msco_"),
+            (
+                make_key("r"),
+                "the API key may not do sequence_create .* — use a key with the permission write",
+            ),
+        ],
+    )
+    def test_a_key_that_is_not_let_in_is_one_error_at_once(
+        self, server: Mosaicod, key: str | None, reason: str
+    ) -> None:
+        server.keys.update({make_key("w"): "write", make_key("r"): "read"})
+        with (
+            pytest.raises(SinkError, match=reason) as caught,
+            PlatformSink(target(server, api_key=key)).open("s", {}),
+        ):
+            pytest.fail("opened")
+        assert len(server.calls) <= 3
+        assert not caught.value.retryable
+        if key:
+            assert key not in str(caught.value)
+            assert key not in repr(caught.value.__cause__)
+
+    def test_a_key_is_in_no_repr_and_no_pickle_of_an_error(self, server: Mosaicod) -> None:
+        server.keys[make_key("w")] = "write"
+        key = make_key("wrong")
+        sink = PlatformSink(target(server, api_key=key))
+        with pytest.raises(SinkError) as caught, sink.open("s", {}):
+            pytest.fail("opened")
+        assert key not in repr(sink)
+        assert key.encode() not in pickle.dumps(caught.value)
+
+    @pytest.mark.parametrize("key", ["msco_ü", "msco_\n", "a b"])
+    def test_a_key_that_cannot_be_sent_is_refused_here(self, key: str) -> None:
+        sink = PlatformSink(ServerTarget("127.0.0.1", 1, api_key=key))
+        with (
+            pytest.raises(SinkError, match="the API key has characters no key has") as caught,
+            sink.open("s", {}),
+        ):
+            pytest.fail("opened")
+        assert key not in str(caught.value)
+
+    @pytest.mark.parametrize(
+        ("permission", "warned"), [("write", True), ("delete", False), ("manage", False)]
+    )
+    def test_a_key_that_may_not_delete_is_known_beforehand(
+        self, server: Mosaicod, permission: str, *, warned: bool
+    ) -> None:
+        server.keys[make_key("k")] = permission
+        found = delete_finding(target(server, api_key=make_key("k")), "seq")
+        assert (found is not None) is warned
+        assert server.calls == ["info", "session_delete"]
+
+    def test_a_key_nobody_knows_is_no_warning_but_an_error(self, server: Mosaicod) -> None:
+        server.keys[make_key("k")] = "write"
+        with pytest.raises(SinkError, match="the API key is refused"):
+            delete_finding(target(server, api_key=make_key("other")), "seq")
+
+    def test_a_session_that_may_not_be_deleted_is_told(self, server: Mosaicod) -> None:
+        server.keys[make_key("w")] = "write"
+        sink = PlatformSink(target(server, api_key=make_key("w")))
+        with (
+            pytest.raises(
+                SinkError, match=r"an unfinished session of seq stays on the server .*session_delete"
+            ),
+            sink.open("seq", {}) as session,
+        ):
+            session.topic("/n", NUMBER, {})
+            raise SinkError("enough")
+
+
+def test_a_sequence_that_exists_is_refused(server: Mosaicod) -> None:
+    write(server, 1)
+    for choice in (IfExists.FAIL, IfExists.SKIP):
+        with pytest.raises(SequenceExists, match="seq: the sequence exists"):
+            write(server, 2, if_exists=choice)
+
+
+def test_another_flight_server_is_told_apart() -> None:
+    with (
+        fl.FlightServerBase("grpc://127.0.0.1:0") as other,
+        pytest.raises(SinkError, match="a Flight server answers, but it is no Mosaico server"),
+        connect(ServerTarget("127.0.0.1", other.port)),
+    ):
+        pytest.fail("connected")
+
+
+class Babbling(Mosaicod):
+    """Answers the handshake in another language."""
+
+    def do_action(self, context: fl.ServerCallContext, action: fl.Action) -> Iterator[bytes]:  # noqa: ARG002 - Flight's signature
+        yield b"\x0a\x05hello"
+
+
+def test_an_answer_in_another_language_is_told() -> None:
+    with (
+        running(Babbling()) as server,
+        pytest.raises(SinkError, match="the answer to info is not understood: Invalid JSON"),
+        connect(target(server)),
+    ):
+        pytest.fail("connected")
+
+
+def test_an_address_is_spelled_as_a_url() -> None:
+    assert str(Address("::1", 6726, tls=True, key="secret")) == "grpc+tls://[::1]:6726"
+    assert "secret" not in repr(Address("::1", 6726, tls=True, key="secret"))
+
+
+def test_nothing_is_logged(server: Mosaicod, caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+    with caplog.at_level(logging.DEBUG):
+        write(server, 1)
+    assert not caplog.records
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_server_that_never_takes_an_upload_ends_it(
+    server: Mosaicod, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is stuck costs its limit once, and the rest is cleared away."""
+    monkeypatch.setattr("mosaico_ingest.destinations.server.upload._UPLOAD_S", 0.3)
+    monkeypatch.setattr("mosaico_ingest.destinations.server.upload._LOCK_S", 0.2)
+    going_on = threading.Event()
+    server.faults.before_batch = lambda _topic, _number: going_on.wait(20) and None
+    begin = time.monotonic()
+    with (
+        pytest.raises(SinkUnavailable, match="no answer to the upload of /n in time"),
+        PlatformSink(target(server)).open("seq", META) as session,
+    ):
+        for topic in ("/n", "/m"):
+            session.topic(topic, NUMBER, {}).write(numbers(1))
+    assert time.monotonic() - begin < 4
+    assert not server.sequences
+    going_on.set()
+
+
+def test_an_interrupt_is_heard_while_the_server_does_not_answer() -> None:
+    # A shell's background job is started deaf to Ctrl-C, and so is what it starts.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        _interrupt_a_handshake()
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _interrupt_a_handshake() -> None:
+    begin = time.monotonic()
+    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        silent_target = ServerTarget("127.0.0.1", silent.getsockname()[1])
+        with pytest.raises(KeyboardInterrupt), connect(silent_target):
+            pytest.fail("connected")
+    assert time.monotonic() - begin < 2.5

@@ -1,0 +1,226 @@
+"""A manifest compiles to a configuration for each recording, field by field."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from mosaico_ingest.errors import IngestError, ManifestError, NothingMatched
+from mosaico_ingest.job.config import (
+    Limit,
+    QuarantineSettings,
+    ROSInjectionConfig,
+    ServerTarget,
+    StoreTarget,
+    TimeBound,
+    TimeRange,
+)
+from mosaico_ingest.job.manifest import load_manifest
+from mosaico_ingest.job.model import (
+    IfExists,
+    LoaderErrorPolicy,
+    OnSchemaChange,
+    SessionLevelErrorPolicy,
+    Stores,
+    TopicLevelErrorPolicy,
+    Unmodeled,
+)
+from mosaico_ingest.pipeline.compile import compile_manifest
+
+
+def compiled(folder: Path, text: str) -> tuple[ROSInjectionConfig, ...]:
+    file = folder / "job.yaml"
+    file.write_text(text)
+    return compile_manifest(load_manifest(file, env={"KEY": "k"}))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    data = tmp_path / "data"
+    (data / "run_c").mkdir(parents=True)
+    (data / "run_c" / "metadata.yaml").touch()
+    for name in ("run_a.bag", "run 1.2.mcap", "notes.txt"):
+        (data / name).touch()
+        os.utime(data / name, (86_400, 86_400))
+    (tmp_path / "msgs").mkdir()
+    (tmp_path / "metadata.json").write_text('{"weather": "rain", "driver": "Ada"}')
+    return tmp_path
+
+
+def test_every_key_arrives(folder: Path) -> None:
+    (config,) = compiled(
+        folder,
+        """
+bag:
+  path: [data/run_a.bag, "data/run 1.2.mcap"]
+  ros_distro: ros2_humble
+  custom_msgs: [{package: p, path: msgs, store: ros1_noetic}]
+  time: {start: +10s, end: 2026-03-01T12:00:00Z}
+sequence: {name: "x_{stem}", family: f, metadata: {weather: sunny}, metadata_file: metadata.json, if_exists: append}
+topics: [/cam*]
+topic_settings: {/imu: {rename: /sensors/imu, metadata: {mount: roof}}, "/camera/*": {every: 3, image: png}}
+adapters:
+  load: [a.yaml]
+  override: {/lidar: LidarAdapter}
+  unmodeled: skip
+  serialization_formats: {p/msg/Scan: ragged}
+on_error: {session: delete, topic: {default: finalize, /gps: ignore}, message: raise}
+on_schema_change: new_topic
+quarantine: {path: q, max: 0.1%, max_run: 100, systematic: 7}
+target: {host: h, port: 1, api_key: "${KEY}", tls_cert: ca.pem, tls: true}
+run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
+""",
+    )
+    assert config == ROSInjectionConfig(
+        file_path=(folder / "data/run_a.bag", folder / "data/run 1.2.mcap"),
+        sequence_name="x_run_a",
+        metadata={"weather": "sunny", "driver": "Ada"},
+        host="h",
+        port=1,
+        mosaico_api_key="k",
+        tls_cert_path=folder / "ca.pem",
+        enable_tls=True,
+        ros_distro=Stores.ROS2_HUMBLE,
+        custom_msgs=(("p", folder / "msgs", Stores.ROS1_NOETIC),),
+        time_range=TimeRange(TimeBound(10**10, relative=True), TimeBound(1772366400 * 10**9)),
+        if_exists=IfExists.APPEND,
+        topics=("/cam*",),
+        topic_metadata={"/imu": {"mount": "roof"}},
+        rename={"/imu": "/sensors/imu"},
+        every={"/camera/*": 3},
+        images={"/camera/*": "png"},
+        adapters=("a.yaml",),
+        adapter_override={"/lidar": "LidarAdapter"},
+        base_dir=folder,
+        serialization_formats={"p/msg/Scan": "ragged"},
+        unmodeled=Unmodeled.SKIP,
+        on_error=SessionLevelErrorPolicy.Delete,
+        topics_on_error={"default": TopicLevelErrorPolicy.Finalize, "/gps": TopicLevelErrorPolicy.Ignore},
+        messages_on_error=LoaderErrorPolicy.RAISE,
+        family="f",
+        on_schema_change=OnSchemaChange.NEW_TOPIC,
+        quarantine=QuarantineSettings(folder / "q", Limit(share=0.001), Limit(100), 7),
+        log_level="DEBUG",
+        report_path=folder / "r.json",
+        memory_bytes=2**20,
+        jobs=2,
+    )
+    assert config.where == str(folder / "job.yaml")
+    default = ROSInjectionConfig("a", "b")
+    unsaid = {f.name for f in fields(config) if getattr(config, f.name) == getattr(default, f.name)}
+    assert unsaid == {
+        "update_if_exists",
+        "dry_run",
+        "registry",
+        "store",
+        "plan_digest",
+        "attempt",
+        "code_dir",
+    }  # if_exists, a command, Python's, the host, a plan, an executor's two
+
+
+def test_the_smallest_manifest_is_a_job(folder: Path) -> None:
+    (config,) = compiled(folder, "bag: {path: data/run_a.bag}")
+    assert config == ROSInjectionConfig(
+        file_path=folder / "data/run_a.bag", sequence_name="run_a", base_dir=folder, family="{stem}"
+    )
+    assert config.target == StoreTarget(Path("mosaico"))
+
+
+def test_a_store_lies_where_the_manifest_says_seen_from_the_manifest(folder: Path) -> None:
+    (config,) = compiled(folder, "bag: {path: data/run_a.bag}\ntarget: {store: ./s}")
+    assert config.target == StoreTarget(folder / "s")
+    (config,) = compiled(folder, "bag: {path: data/run_a.bag}\ntarget: {host: h}")
+    assert config.target == ServerTarget("h", 6726)
+
+
+def test_a_glob_is_one_sequence_for_each_recording(folder: Path) -> None:
+    configs = compiled(folder, 'bag: {path: "data/*"}\nsequence: {name: "{parent}_{stem}_{index:02}"}')
+    assert [(config.paths[0].name, config.sequence_name) for config in configs] == [
+        ("run 1.2.mcap", "data_run_1_2_01"),
+        ("run_a.bag", "data_run_a_02"),
+        ("run_c", "data_run_c_03"),
+    ]
+
+
+def test_a_recursive_glob_works(folder: Path) -> None:
+    assert [config.sequence_name for config in compiled(folder, 'bag: {path: "**/*.bag"}')] == ["run_a"]
+
+
+def test_a_pattern_passes_over_what_is_hidden_unless_it_names_it(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "data" / "._run_a.bag").write_bytes(b"a copy's attributes")
+    (folder / ".trash").mkdir()
+    (folder / ".trash" / "run_d.bag").touch()
+    for pattern, names in (
+        ("data/*.bag", ["run_a"]),
+        ("**/*.bag", ["run_a"]),
+        ("data/.*.bag", ["run_a"]),
+        (".trash/*.bag", ["run_d"]),
+    ):
+        configs = compiled(folder, f'bag: {{path: "{pattern}"}}')
+        assert [config.sequence_name for config in configs] == names, pattern
+    monkeypatch.chdir(folder / "data")
+    (config,) = compiled(Path(), 'bag: {path: "*.bag"}')
+    assert config.sequence_name == "run_a"
+
+
+def test_two_stars_beside_other_characters_are_one(folder: Path) -> None:
+    assert [config.sequence_name for config in compiled(folder, 'bag: {path: "data/**.bag"}')] == ["run_a"]
+
+
+def test_placeholders_stand_for_parts_of_the_path(folder: Path) -> None:
+    (config,) = compiled(folder, 'bag: {path: data/run_a.bag}\nsequence: {name: "{name}_{date}_{index}"}')
+    assert config.sequence_name == "run_a_bag_1970-01-02_1"
+    (config,) = compiled(folder, "bag: {path: data/run_c/metadata.yaml}")
+    assert config.sequence_name == "run_c"
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "message"),
+    [
+        ("bag: {path: data/run_b.bag}", NothingMatched, r"job.yaml:1:13: no such file .*run_a.bag"),
+        ("bag: {path: [data/run_a.bag, data/x]}", NothingMatched, r"job.yaml:1:30: no such file"),
+        ("bag: {path: nowhere/x.bag}", NothingMatched, r"no such file"),
+        ('bag: {path: "data/*.db3"}', NothingMatched, r"no recording matches .* has run 1.2.mcap, run_a.bag"),
+        ('bag: {path: "data/*.txt"}', NothingMatched, r"no recording matches .*it matches 1 other files"),
+        ('bag: {path: "data/*"}\nsequence: {name: x}', ManifestError, r"job.yaml:2:18: 3 recordings .* 'x'"),
+        (
+            "bag: {path: data/run_a.bag}\nsequence: {name: '{day}'}",
+            ManifestError,
+            r"unknown placeholder \{day\}",
+        ),
+        (
+            "bag: {path: data/run_a.bag}\nsequence: {name: 'a b'}",
+            IngestError,
+            r"job.yaml:2:18: sequence name 'a b'",
+        ),
+        (
+            "bag: {path: data/run_a.bag}\nsequence: {metadata_file: x.json}",
+            ManifestError,
+            r"2:27: .*cannot be read",
+        ),
+        ("bag: {path: data/run_a.bag}\nsequence: {metadata_file: job.yaml}", ManifestError, r"is not JSON"),
+        (
+            "bag: {path: data/run_a.bag, custom_msgs: [{package: p, path: nope}]}",
+            ManifestError,
+            r"job.yaml:1:62: no such file or directory: .*nope",
+        ),
+    ],
+)
+def test_what_is_not_there_is_said_with_its_place(
+    folder: Path, text: str, kind: type[IngestError], message: str
+) -> None:
+    with pytest.raises(kind, match=message) as caught:
+        compiled(folder, text)
+    assert "\n" not in str(caught.value)
+
+
+def test_metadata_that_is_no_object_is_refused(folder: Path) -> None:
+    (folder / "metadata.json").write_text("[1]")
+    with pytest.raises(ManifestError, match="no JSON object"):
+        compiled(folder, "bag: {path: data/run_a.bag}\nsequence: {metadata_file: metadata.json}")

@@ -1,0 +1,82 @@
+"""A drafted manifest says of a recording only what is true."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mosaico_ingest.remote import as_path
+from mosaico_ingest.services.draft import draft_manifest
+from mosaico_ingest.services.inspection import InspectedTopic, Inspection
+
+
+def draft(
+    definition: str, encoding: str = "cdr", *, msgtype: str = "own_msgs/msg/A", ros_distro: str | None = None
+) -> str:
+    topic = InspectedTopic(
+        topic="/a",
+        msgtype=msgtype,
+        encoding=encoding,
+        count=1,
+        rate_hz=None,
+        definition=definition,
+        adapter="Unmodeled",
+        ontology="A",
+        problem="is not known" if definition == "none" else None,
+    )
+    found = Inspection(
+        files=("a.db3",),
+        container="sqlite3",
+        size_bytes=2_000,
+        messages=1,
+        start_ns=0,
+        end_ns=0,
+        topics=(topic,),
+    )
+    return draft_manifest(found, Path("a.db3"), folder=Path(), ros_distro=ros_distro)
+
+
+@pytest.mark.parametrize(
+    ("definition", "said"),
+    [
+        ("bag", "(it carries its definitions)"),
+        ("distro", "(it carries no definitions; they are read as in all distros)"),
+        ("package", "(it carries no definitions; they are read as in public packages)"),
+    ],
+)
+def test_it_says_whose_definitions_are_used(definition: str, said: str) -> None:
+    assert said in draft(definition)
+
+
+def test_it_asks_for_the_definitions_of_ros_messages_only() -> None:
+    assert "custom_msgs: [{package: own_msgs" in draft("none")
+    assert "custom_msgs" not in draft("none", "other")
+
+
+def test_it_asks_for_the_distro_where_distros_differ() -> None:
+    marker = "visualization_msgs/msg/Marker"
+    said = draft("none", msgtype=marker)
+    assert f"# {marker} changed between distros" in said
+    assert "# ros_distro: ros2_humble" in said
+    assert "custom_msgs" not in said
+    assert "custom_msgs" in draft("none", msgtype=marker, ros_distro="ros2_dashing")
+
+
+def test_its_head_is_for_people() -> None:
+    assert "# sqlite3, 2.0 kB, 1 message, 0.00 s\n" in draft("bag")
+
+
+def test_a_recording_behind_a_url_keeps_it() -> None:
+    found = Inspection(
+        files=("s3://fleet/a/my drive.mcap",),
+        container="mcap",
+        size_bytes=1,
+        messages=0,
+        start_ns=None,
+        end_ns=None,
+        topics=(),
+    )
+    text = draft_manifest(found, as_path("s3://fleet/a/my drive.mcap?region=eu"), folder=Path("jobs"))
+    assert '  path: "s3://fleet/a/my drive.mcap?region=eu"\n' in text
+    assert "  name: my_drive\n" in text

@@ -1,0 +1,117 @@
+"""Two plans differ in what is said, and in nothing else."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mosaico_ingest.pipeline.plan import Decisions, differences
+
+TOPIC: dict[str, Any] = {
+    "topic": "/a",
+    "target": "/a",
+    "msgtype": "p/msg/A",
+    "definitions": ("bag 00",),
+    "adapter": "A",
+    "adapter_digest": None,
+    "why": "built-in",
+    "ontology": "O",
+    "fingerprint": "f",
+    "serialization_format": "default",
+    "count": 3,
+    "every": 1,
+    "on_error": "raise",
+    "metadata": {},
+}
+
+
+def plan(**changes: Any) -> Decisions:
+    return Decisions.model_validate(
+        {
+            "sequence": "s",
+            "metadata": {},
+            "files": [{"path": "x.bag", "size_bytes": 1}],
+            "container": "ros1",
+            "start_ns": 0,
+            "end_ns": None,
+            "read_from_ns": None,
+            "read_until_ns": None,
+            "destination": "store",
+            "if_exists": "fail",
+            "on_error": "report",
+            "on_message_error": "log_warn",
+            "topics": [TOPIC],
+            "left_out": [],
+            **changes,
+        }
+    )
+
+
+def said(old: Decisions, new: Decisions) -> list[str]:
+    return [str(one) for one in differences([old], [new])]
+
+
+def test_a_plan_does_not_differ_from_itself() -> None:
+    assert differences([plan()], [plan()]) == ()
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"end_ns": 5}, "s: end_ns: none → 5"),
+        ({"metadata": {"a": {"b": 1}}}, 's: + metadata a: {"b": 1}'),
+        ({"files": [{"path": "x.bag", "size_bytes": 2}]}, "s: file x.bag size_bytes: 1 → 2"),
+        ({"topics": [{**TOPIC, "count": None}]}, "s: topic /a count: 3 → none"),
+        ({"topics": []}, "s: - topic /a: p/msg/A by A to O"),
+        ({"topics": [{**TOPIC, "definitions": ("bag 01",)}]}, 's: topic /a definitions: ["bag 00"] → ["bag 01"]'),
+        ({"left_out": [{"topic": "/b", "msgtype": "B", "count": 0, "why": "no"}]}, "s: + left out /b: no"),
+        ({"sequence": "t"}, "s: sequence: s → t"),
+    ],
+)  # fmt: skip
+def test_each_difference_is_a_line(changes: dict[str, Any], line: str) -> None:
+    assert said(plan(), plan(**changes)) == [line]
+
+
+def test_recordings_are_told_by_their_names_then_by_their_files() -> None:
+    def at(name: str, file: str) -> Decisions:
+        return plan(sequence=name, files=[{"path": file, "size_bytes": 1}])
+
+    lines = [
+        str(one)
+        for one in differences(
+            [at("a", "1"), at("b", "2"), at("c", "3")], [at("a", "1"), at("z", "3"), at("y", "9")]
+        )
+    ]
+    assert lines == [
+        "b: - recording: 2, 1 topics",
+        "c: sequence: c → z",
+        "y: + recording: 9, 1 topics",
+    ]
+
+
+CHANGES = st.fixed_dictionaries(
+    {},
+    optional={
+        "metadata": st.dictionaries(st.sampled_from("ab"), st.none() | st.integers() | st.just({"c": None})),
+        "end_ns": st.none() | st.integers(0, 2),
+        "topics": st.lists(
+            st.builds(lambda name, every: {**TOPIC, "target": name, "every": every}, st.sampled_from("ab"), st.integers(1, 2)),
+            unique_by=lambda topic: topic["target"],
+            max_size=2,
+        ),
+    },
+)  # fmt: skip
+
+
+@given(CHANGES, CHANGES)
+def test_plans_differ_exactly_where_their_digests_do(one: dict[str, Any], other: dict[str, Any]) -> None:
+    old, new = plan(**one), plan(**other)
+    unordered = old.model_copy(
+        update={"topics": tuple(sorted(old.topics, key=str)), "metadata": dict(sorted(old.metadata.items()))}
+    ) == new.model_copy(
+        update={"topics": tuple(sorted(new.topics, key=str)), "metadata": dict(sorted(new.metadata.items()))}
+    )
+    assert (differences([old], [new]) == ()) is unordered

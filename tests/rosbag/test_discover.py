@@ -1,0 +1,225 @@
+"""A path stands for the files it should: by content, by directory, by metadata.yaml, and never silently for less."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+import zstandard
+
+from mosaico_ingest.errors import BagError
+from mosaico_ingest.rosbag.discovery import discover
+from mosaico_ingest.rosbag.recording import open_recording
+
+BOMB = "\n".join(
+    [
+        "a: &a0 [x]",
+        *(f"b{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 30)),
+        "rosbag2_bagfile_information: {relative_file_paths: [*a29]}",
+    ]
+)
+
+
+@pytest.fixture
+def split(tmp_path: Path, recordings: Any) -> Path:
+    """A recording in three parts, with its metadata."""
+    folder = tmp_path / "split"
+    folder.mkdir()
+    messages = recordings.sent(90)
+    names = [f"part_{number}.mcap" for number in (8, 9, 10)]
+    for number, name in enumerate(names):
+        recordings.mcap(folder / name, messages[30 * number : 30 * number + 30])
+    topics = sorted({(message.topic, message.msgtype) for message in messages})
+    info = {
+        "version": 5,
+        "relative_file_paths": names,
+        "message_count": 90,
+        "topics_with_message_count": [
+            {
+                "topic_metadata": {"name": topic, "type": msgtype, "serialization_format": "cdr"},
+                "message_count": sum(message.topic == topic for message in messages),
+            }
+            for topic, msgtype in topics
+        ],
+    }
+    write_metadata(folder, info)
+    return folder
+
+
+def write_metadata(folder: Path, info: dict[str, Any]) -> None:
+    (folder / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": info}))
+
+
+def read_info(folder: Path) -> dict[str, Any]:
+    return yaml.safe_load((folder / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+
+
+def rules(path: Path, recordings: Any) -> list[str]:
+    with open_recording(path, resolve=recordings.blind) as recording:
+        return [finding.rule for finding in recording.findings]
+
+
+def test_a_directory_and_its_metadata_are_the_same_recording(split: Path, recordings: Any) -> None:
+    names = [f"part_{number}.mcap" for number in (8, 9, 10)]
+    assert [file.name for file in discover([split]).files] == names
+    assert [file.name for file in discover([split / "metadata.yaml"]).files] == names
+    (split / "metadata.yaml").unlink()
+    assert [file.name for file in discover([split]).files] == names
+    with open_recording(split, resolve=recordings.blind) as recording:
+        assert recordings.received(recording) == sorted(recordings.sent(90))
+        assert recording.findings == ()
+
+
+def test_a_part_that_is_missing_is_a_finding_and_a_loss(split: Path, recordings: Any) -> None:
+    (split / "part_9.mcap").unlink()
+    with open_recording(split, resolve=recordings.blind) as recording:
+        assert len(recordings.received(recording)) == 60
+        assert "missing-part" in [finding.rule for finding in recording.findings]
+        assert any("part_9.mcap" in finding.message for finding in recording.findings)
+        assert [(Path(loss.file).name, loss.count) for loss in recording.losses] == [("part_9.mcap", None)]
+
+
+def test_one_part_alone_says_that_there_are_others(split: Path, recordings: Any) -> None:
+    assert rules(split / "part_9.mcap", recordings) == ["part-of-recording"]
+
+
+def test_the_storage_decides_and_metadata_that_differ_are_findings(split: Path, recordings: Any) -> None:
+    info = read_info(split)
+    for entry in info["topics_with_message_count"]:
+        entry["topic_metadata"] |= {"type": "std_msgs/msg/Bool"}
+        entry["message_count"] += 1
+    info["topics_with_message_count"].pop()
+    write_metadata(split, info)
+    with open_recording(split, resolve=recordings.blind) as recording:
+        assert len(recordings.received(recording)) == 90
+        messages = [finding.message for finding in recording.findings if finding.rule == "metadata-differs"]
+    assert sum("std_msgs/msg/Bool in the metadata" in message for message in messages) == 3
+    assert sum("is not in the metadata" in message for message in messages) == 1
+    assert sum("messages in the metadata" in message for message in messages) == 3
+
+
+@pytest.mark.parametrize(
+    "content", ["{", "[]", "rosbag2_bagfile_information: 3", "a: &a [*a]", "[" * 9000, BOMB]
+)
+def test_metadata_that_cannot_be_read_are_a_finding(split: Path, recordings: Any, content: str) -> None:
+    (split / "metadata.yaml").write_text(content)
+    with open_recording(split, resolve=recordings.blind) as recording:
+        assert len(recordings.received(recording)) == 90
+        assert [finding.rule for finding in recording.findings] == ["metadata-unreadable"]
+
+
+def test_old_metadata_and_listed_names_with_folder_and_suffix_are_understood(
+    tmp_path: Path, split: Path, recordings: Any
+) -> None:
+    old = tmp_path / "old"
+    old.mkdir()
+    content = (split / "part_8.mcap").read_bytes()
+    (old / "part_8.mcap.zstd").write_bytes(zstandard.compress(content))
+    topic = {"topic_and_type": {"name": "/imu", "type": "sensor_msgs/Imu"}, "message_count": 0}
+    write_metadata(
+        old, {"version": 1, "relative_file_paths": ["old/part_8.mcap"], "topics_with_message_count": [topic]}
+    )
+    assert [file.name for file in discover([old]).files] == ["part_8.mcap.zstd"]
+    with open_recording(old, resolve=recordings.blind) as recording:
+        assert len(recordings.received(recording)) == 30
+        assert not any("sensor_msgs/Imu" in finding.message for finding in recording.findings)
+
+
+def test_content_decides_and_not_the_name(tmp_path: Path, recordings: Any) -> None:
+    messages = recordings.sent(20)
+    made = recordings.rosbag2(tmp_path / "x.bag", messages, storage="sqlite3")
+    with open_recording(made, resolve=recordings.blind) as recording:
+        assert recording.container == "sqlite3"
+    shutil.copy(next(made.glob("*.db3")), tmp_path / "y.mcap")
+    with open_recording(tmp_path / "y.mcap", resolve=recordings.blind) as recording:
+        assert recording.container == "sqlite3"
+        assert recordings.received(recording) == sorted(messages)
+
+
+def test_what_is_no_recording_is_one_line_that_says_what_was_found(tmp_path: Path, recordings: Any) -> None:
+    files = {
+        "empty.bag": b"",
+        "text.mcap": b"hello, world, this is text",
+        "old.bag": b"#ROSRECORD V1.1\n....",
+        "header.bag": b"#ROSBAG V2.0\n",
+        "twice.zstd": zstandard.compress(zstandard.compress(b"MCAP")),
+        "other.db3": b"SQLite format 3\x00" + b"\0" * 100,
+    }
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    found: dict[str, str] = {}
+    for name in files:
+        with pytest.raises(BagError) as caught:
+            open_recording(tmp_path / name, resolve=recordings.blind)
+        found[name] = str(caught.value)
+        assert str(tmp_path / name) in found[name]
+        assert "\n" not in found[name]
+    assert "the file is empty" in found["empty.bag"]
+    assert "68 65 6c 6c 6f" in found["text.mcap"]
+    assert "'#ROSRECORD V1.1'" in found["old.bag"]
+    assert "28 b5 2f fd" in found["twice.zstd"]
+
+
+def test_a_directory_without_recording_says_what_it_holds(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("hello")
+    with pytest.raises(BagError, match=r"without a recording; it holds notes\.txt"):
+        discover([tmp_path])
+    with pytest.raises(BagError, match="does not exist"):
+        discover([tmp_path / "nowhere"])
+    with pytest.raises(BagError, match="no path given"):
+        discover([])
+
+
+def test_metadata_that_list_nothing_that_is_there_fall_back_on_what_is(split: Path, recordings: Any) -> None:
+    info = read_info(split)
+    write_metadata(split, info | {"relative_file_paths": ["gone.mcap"]})
+    assert len(discover([split]).files) == 3
+    assert rules(split, recordings) == ["missing-part"]
+    with open_recording(split, resolve=recordings.blind) as recording:
+        assert recording.losses == ()
+    for file in split.glob("*.mcap"):
+        file.unlink()
+    with pytest.raises(BagError, match=r"none of the files it lists is there: gone\.mcap"):
+        discover([split])
+
+
+def test_a_part_that_cannot_be_opened_is_a_loss_and_a_finding(split: Path, recordings: Any) -> None:
+    (split / "part_10.mcap").write_bytes(b"")
+    with open_recording(split, resolve=recordings.blind) as recording:
+        assert len(recordings.received(recording)) == 60
+        assert "damaged" in [finding.rule for finding in recording.findings]
+        assert [loss.reason for loss in recording.losses] == ["this part cannot be opened: the file is empty"]
+    for file in split.glob("*.mcap"):
+        file.write_bytes(b"")
+    with pytest.raises(BagError, match="the file is empty; nor can any of the 2 other parts be opened"):
+        open_recording(split, resolve=recordings.blind)
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89MC", b"anything"])
+def test_a_damaged_part_counts_without_metadata_too(split: Path, recordings: Any, content: bytes) -> None:
+    (split / "metadata.yaml").unlink()
+    (split / "part_9.mcap").write_bytes(content)
+    (split / "notes.txt").write_bytes(b"not mine")
+    with open_recording(split, resolve=recordings.blind) as recording:
+        assert len(recordings.received(recording)) == 60
+        assert {Path(loss.file).name for loss in recording.losses} == {"part_9.mcap"}
+    for number in (8, 10):
+        (split / f"part_{number}.mcap").write_bytes(content)
+    with pytest.raises(BagError, match=r"part_8\.mcap"):
+        open_recording(split, resolve=recordings.blind)
+
+
+def test_a_digit_that_is_no_decimal_is_a_letter_among_names(split: Path) -> None:
+    part = split / "part_10.mcap"
+    part.rename(split / "part_5\N{SUPERSCRIPT TWO}1.mcap")
+    (split / "metadata.yaml").unlink()
+    assert len(discover([split]).files) == 3
+
+
+def test_a_hidden_file_is_no_part(split: Path) -> None:
+    (split / "metadata.yaml").unlink()
+    (split / "._part_8.mcap").write_bytes(b"what a Mac leaves")
+    assert [file.name for file in discover([split]).files] == ["part_8.mcap", "part_9.mcap", "part_10.mcap"]

@@ -1,0 +1,27 @@
+from __future__ import annotations
+
+import pytest
+from rosbags.typesys import Stores as RosbagsStores
+from rosbags.typesys import get_typestore
+
+from mosaico_ingest.job.model import Stores
+from mosaico_ingest.rosbag.definitions.distros import FILE, distro_type
+from mosaico_ingest.rosbag.definitions.distros_file import distros_file
+from mosaico_ingest.rosbag.definitions.parser import message_type
+
+
+@pytest.mark.parametrize("distro", Stores)
+def test_every_type_of_a_distro_is_the_one_that_rosbags_has(distro: Stores) -> None:
+    types = get_typestore(RosbagsStores(distro.value)).fielddefs
+    for name in types if distro is not Stores.EMPTY else ():
+        assert distro_type(distro, name) == message_type(name, types)
+
+
+def test_a_type_that_a_distro_lacks_is_not_there_though_another_has_it() -> None:
+    assert distro_type(Stores.ROS1_NOETIC, "rcl_interfaces/msg/Log") is None
+    assert distro_type(Stores.EMPTY, "std_msgs/msg/Header") is None
+    assert distro_type(Stores.LATEST, "Header") is None
+
+
+def test_the_file_of_types_is_up_to_date() -> None:
+    assert FILE.read_text(encoding="utf-8") == distros_file(), "run ./dev docs"

@@ -1,0 +1,193 @@
+"""A recording message by message."""
+
+from __future__ import annotations
+
+import logging
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores as RosbagsStores
+from rosbags.typesys import get_typestore
+
+from mosaico_ingest.errors import BagError, DecodeError, NothingMatched
+from mosaico_ingest.job.model import LoaderErrorPolicy, Stores
+from mosaico_ingest.rosbag.blocks import Encoding, ROSHeader, ROSMessage
+from mosaico_ingest.rosbag.definitions.model import Embedded
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.loader import ROSLoader
+from mosaico_ingest.rosbag.recording import open_recording, windows
+from mosaico_ingest.rosbag.serialization import Deserializer, Serializer
+
+IMU, STRING, POINT = "sensor_msgs/msg/Imu", "std_msgs/msg/String", "geometry_msgs/msg/PointStamped"
+ORIGIN = {"x": 0.0, "y": 0.0, "z": 0.0}
+SECOND = 1_000_000_000
+
+
+def payload(msgtype: str, values: dict[str, object], text: str | None = None) -> bytes:
+    embedded = None if text is None else Embedded("ros2msg", text)
+    known = TypeResolver(Stores.ROS2_HUMBLE).resolve(msgtype, embedded, ros_version=2)
+    return Serializer(known, Encoding.CDR).from_dict(values)
+
+
+def point(second: int) -> bytes:
+    header = {"stamp": {"sec": second, "nanosec": 5}, "frame_id": "map"}
+    return payload(POINT, {"header": header, "point": {**ORIGIN, "x": float(second)}})
+
+
+@pytest.fixture(params=[StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def bag(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    """Twenty seconds: a point every second, a text every two, one text broken, one type of our own."""
+    path = tmp_path / "bag"
+    store = get_typestore(RosbagsStores.ROS2_HUMBLE)
+    own = "uint8[] blob\nint32 from\n"
+    with Writer(path, version=9, storage_plugin=request.param) as writer:
+        points = writer.add_connection("/point", POINT, typestore=store)
+        texts = writer.add_connection("/text", STRING, typestore=store)
+        mine = writer.add_connection("/mine", "mine/msg/Own", msgdef=own, rihs01="RIHS01_00")
+        for second in range(20):
+            if second % 2 == 0:
+                body = payload(STRING, {"data": f"at {second}"})
+                writer.write(texts, second * SECOND, body[:-2] if second == 8 else body)
+            writer.write(points, second * SECOND + 1, point(second))
+        writer.write(mine, 3 * SECOND, payload("mine/msg/Own", {"blob": b"abc", "from": 7}, own))
+    return path
+
+
+def test_messages_come_in_the_order_they_were_recorded(bag: Path) -> None:
+    with ROSLoader(bag) as loader:
+        messages = list(loader)
+    times = [message.timestamp_ns for message in messages]
+    assert times == sorted(times)
+    assert len(messages) == 20 + 9 + 1
+    assert loader.rejected == {"/text": 1}
+
+
+def test_a_message_is_its_fields_by_name(bag: Path) -> None:
+    with ROSLoader(bag, topics="/mine") as loader:
+        (message,) = loader
+    assert message == ROSMessage(3 * SECOND, "/mine", "mine/msg/Own", {"blob": b"abc", "from": 7})
+    assert message.header is None
+
+
+def test_the_header_is_read_where_there_is_one(bag: Path) -> None:
+    with ROSLoader(bag, topics=["/point"]) as loader:
+        message = next(iter(loader))
+    assert message.header == ROSHeader(stamp_ns=5, frame_id="map")
+    assert ROSMessage(0, "/t", "a/msg/B", {"header": 5}).header is None
+    ros1 = {"header": {"seq": 4, "stamp": {"sec": 1, "nanosec": 2}, "frame_id": "f"}}
+    assert ROSMessage(0, "/t", "a/msg/B", ros1).header == ROSHeader(SECOND + 2, "f", 4)
+
+
+@pytest.mark.parametrize("max_bytes", [1, 50, 200])
+def test_stretches_too_large_to_hold_are_halved(bag: Path, max_bytes: int) -> None:
+    with open_recording(bag, resolve=TypeResolver()) as recording:
+        ids = [channel.id for channel in recording.channels]
+        stretches = [batches for batches in windows(recording, ids, max_bytes=max_bytes) if batches]
+        times = [[int(t) for batch in batches for t in batch.log_times] for batches in stretches]
+        assert len(stretches) > 5
+        assert sum(map(len, times)) == 31
+        assert all(max(earlier) < min(later) for earlier, later in pairwise(times))
+
+
+def test_a_loader_can_be_iterated_again(bag: Path) -> None:
+    with ROSLoader(bag) as loader:
+        assert list(loader) == list(loader)
+        assert loader.rejected == {"/text": 1}
+
+
+def test_it_says_what_it_holds(bag: Path) -> None:
+    with ROSLoader(bag, topics=["!/mine"]) as loader:
+        assert loader.topics == ["/point", "/text"]
+        assert loader.msg_types == [POINT, STRING]
+        assert (loader.msg_count(), loader.msg_count("/text")) == (30, 10)
+        assert loader.duration == 19 * SECOND + 1
+        with pytest.raises(NothingMatched, match="'/mine' is not selected"):
+            loader.msg_count("/mine")
+
+
+def test_patterns_that_select_nothing_name_the_nearest_topics(bag: Path) -> None:
+    with pytest.raises(NothingMatched, match=r"no topic matches /pint .* nearest: /point"):
+        ROSLoader(bag, topics=["/pint"])
+
+
+class TestPolicies:
+    def test_raise_ends_at_the_first_broken_message(self, bag: Path) -> None:
+        with ROSLoader(bag, error_policy=LoaderErrorPolicy.RAISE) as loader:
+            with pytest.raises(DecodeError, match=r"^/text at 8000000000 ns: data: ") as caught:
+                list(loader)
+            assert caught.value.rule == "string-length"
+
+    def test_raise_says_what_the_bytes_would_fit(self, bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(Deserializer, "_remedy", lambda *_: "they would fit the definition of ros2_iron")
+        loader = ROSLoader(bag, error_policy=LoaderErrorPolicy.RAISE)
+        with loader, pytest.raises(DecodeError, match="they would fit the definition of ros2_iron"):
+            list(loader)
+
+    def test_log_warn_says_so_and_goes_on(self, bag: Path, caplog: pytest.LogCaptureFixture) -> None:
+        with caplog.at_level(logging.WARNING, "mosaico_ingest.rosbag"), ROSLoader(bag) as loader:
+            list(loader)
+        assert "/text: 1 messages could not be read" in caplog.messages
+
+    def test_ignore_only_counts(self, bag: Path, caplog: pytest.LogCaptureFixture) -> None:
+        with ROSLoader(bag, error_policy="ignore") as loader:
+            list(loader)
+        assert (caplog.messages, loader.rejected["/text"]) == ([], 1)
+
+
+class TestDefinitions:
+    @pytest.fixture
+    def old_bag(self, tmp_path: Path) -> Path:
+        """A database without definitions, as before ROS 2 Iron."""
+        path = tmp_path / "old"
+        store = get_typestore(RosbagsStores.ROS2_HUMBLE)
+        with Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+            texts = writer.add_connection("/text", STRING, typestore=store)
+            mine = writer.add_connection("/mine", "mine/msg/Own", msgdef="int8 x", rihs01="RIHS01_00")
+            writer.write(texts, 1, payload(STRING, {"data": "a"}))
+            writer.write(mine, 2, payload("mine/msg/Own", {"x": 5}, "int8 x"))
+        database = next(path.glob("*.db3"))
+        import sqlite3  # noqa: PLC0415 - only here
+
+        with sqlite3.connect(database) as connection:
+            connection.execute("DELETE FROM message_definitions")
+        connection.close()
+        return path
+
+    def test_an_unknown_type_costs_its_topic_only(self, old_bag: Path) -> None:
+        with ROSLoader(old_bag, error_policy="ignore") as loader:
+            assert [message.topic for message in loader] == ["/text"]
+            assert loader.rejected == {"/mine": 1}
+            assert any(finding.rule == "assumed-definition" for finding in loader.findings)
+
+    def test_under_raise_it_is_an_error_that_says_what_is_missing(self, old_bag: Path) -> None:
+        with (
+            ROSLoader(old_bag, error_policy="raise") as loader,
+            pytest.raises(BagError, match=r"^/mine: .*mine/msg/Own.*searched"),
+        ):
+            list(loader)
+
+    def test_custom_types_are_used(self, old_bag: Path) -> None:
+        with ROSLoader(
+            old_bag, ["/mine"], Stores.ROS2_HUMBLE, custom_types={"mine/msg/Own": "int8 x"}
+        ) as loader:
+            assert [message.data for message in loader] == [{"x": 5}]
+
+
+def test_ros_1_is_read_the_same_way(tmp_path: Path) -> None:
+    path = tmp_path / "one.bag"
+    store = get_typestore(RosbagsStores.ROS1_NOETIC)
+    known = TypeResolver(Stores.ROS1_NOETIC).resolve("std_msgs/Header", None, ros_version=1)
+    values = {"seq": 3, "stamp": {"sec": 1, "nanosec": 2}, "frame_id": "f"}
+    with Writer1(path) as writer:
+        connection = writer.add_connection("/header", "std_msgs/msg/Header", typestore=store)
+        writer.write(connection, 5, Serializer(known, Encoding.ROS1).from_dict(values))
+    with ROSLoader(str(path)) as loader:
+        assert list(loader) == [ROSMessage(5, "/header", "std_msgs/msg/Header", values)]
+
+
+def test_what_is_no_recording_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(BagError):
+        ROSLoader(tmp_path / "missing.mcap")

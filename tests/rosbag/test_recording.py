@@ -1,0 +1,264 @@
+"""A recording gives back what was recorded, whatever the container, the compression and the selection."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from rosbags import rosbag1, rosbag2
+
+from mosaico_ingest.errors import BagError
+from mosaico_ingest.rosbag.blocks import Encoding
+from mosaico_ingest.rosbag.recording import open_recording
+
+MCAP_FORMS = {
+    "zstd": {},
+    "lz4": {"compression": "lz4"},
+    "plain": {"compression": ""},
+    "no message index": {"indexed": False},
+    "no summary": {"summary": False},
+    "no summary, no index": {"summary": False, "indexed": False},
+    "no chunks": {"chunked": False},
+    "no chunks, no summary": {"chunked": False, "summary": False},
+}
+
+
+@pytest.mark.parametrize("form", MCAP_FORMS)
+@pytest.mark.parametrize("big", [False, True], ids=["small", "big"])
+def test_an_mcap_of_any_form_gives_every_message_back(
+    tmp_path: Path, recordings: Any, form: str, *, big: bool
+) -> None:
+    messages = recordings.sent(big=big)
+    path = recordings.mcap(tmp_path / "a.mcap", messages, **MCAP_FORMS[form])
+    with open_recording(path, resolve=recordings.blind) as recording:
+        assert recording.container == "mcap"
+        assert recordings.received(recording) == sorted(messages)
+        assert recording.losses == ()
+        assert recording.message_count in {300, None}
+        assert (recording.start_ns, recording.end_ns) == (messages[0].time_ns, messages[-1].time_ns)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("compression", ["none", "file", "message", "storage"])
+def test_a_rosbag2_directory_reads_as_rosbags_reads_it(
+    tmp_path: Path, recordings: Any, storage: str, compression: str
+) -> None:
+    if storage == "sqlite3" and compression == "storage":
+        pytest.skip("SQLite has no compression of its own")
+    path = recordings.rosbag2(
+        tmp_path / "b", recordings.sent(big=True), storage=storage, compression=compression
+    )
+    with rosbag2.Reader(path) as reader:
+        expected = sorted(
+            recordings.Sent(connection.topic, connection.msgtype, time, bytes(data))
+            for connection, time, data in reader.messages()
+        )
+    with open_recording(path, resolve=recordings.blind) as recording:
+        assert recording.container == storage
+        assert recordings.received(recording) == expected
+        assert recording.message_count == len(expected)
+        assert recording.losses == ()
+        assert not [finding for finding in recording.findings if finding.rule != "container-note"]
+
+
+@pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])
+def test_a_ros1_bag_reads_as_rosbags_reads_it(tmp_path: Path, recordings: Any, compression: str) -> None:
+    path = recordings.ros1(tmp_path / "c.bag", recordings.sent(big=True, cdr=False), compression=compression)
+    with rosbag1.Reader(path) as reader:
+        expected = sorted(
+            recordings.Sent(connection.topic, connection.msgtype, time, bytes(data))
+            for connection, time, data in reader.messages()
+        )
+    with open_recording(path, resolve=recordings.blind) as recording:
+        assert recording.container == "ros1"
+        assert recordings.received(recording) == expected
+        assert recording.losses == ()
+        assert {channel.encoding for channel in recording.channels} == {Encoding.ROS1}
+        assert sum(channel.count or 0 for channel in recording.channels) == len(expected)
+
+
+@pytest.mark.parametrize("kind", ["mcap", "sqlite3", "ros1"])
+def test_channels_and_times_can_be_selected(tmp_path: Path, recordings: Any, kind: str) -> None:
+    messages = recordings.sent()
+    path = tmp_path / "d"
+    if kind == "ros1":
+        recordings.ros1(path, messages)
+    else:
+        recordings.rosbag2(path, messages, storage=kind)
+    start, end = messages[60].time_ns, messages[200].time_ns
+    with open_recording(path, resolve=recordings.blind) as recording:
+        ids = [channel.id for channel in recording.channels if channel.topic in {"/imu", "/chatter"}]
+        found = recordings.received(recording, channel_ids=ids, start_ns=start, end_ns=end)
+        assert recordings.received(recording, channel_ids=[]) == []
+    wanted = [m for m in messages if m.topic in {"/imu", "/chatter"} and start <= m.time_ns < end]
+    assert found == sorted(wanted)
+
+
+def test_parts_are_one_sequence_in_time(tmp_path: Path, recordings: Any) -> None:
+    messages = recordings.sent()
+    paths = [recordings.mcap(tmp_path / f"p_{n}.mcap", messages[n::3]) for n in range(3)]
+    with open_recording(paths, resolve=recordings.blind) as recording:
+        assert recordings.received(recording) == sorted(messages)
+        assert recording.files == tuple(paths)
+        assert len(recording.channels) == 4
+        assert recording.message_count == len(messages)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_memory_bounds_what_is_held_and_nothing_is_lost(
+    tmp_path: Path, recordings: Any, storage: str
+) -> None:
+    messages = recordings.sent(big=True)
+    recordings.rosbag2(tmp_path / "e", messages, storage=storage)
+    with open_recording(tmp_path / "e", resolve=recordings.blind) as recording:
+        batches = list(recording.batches(rows=20, memory_bytes=1 << 20))
+    assert max(len(batch) for batch in batches) <= 20
+    assert sum(len(batch) for batch in batches) == len(messages)
+
+
+def test_chunks_that_overlap_in_time_come_out_in_time_order(tmp_path: Path, recordings: Any) -> None:
+    messages = recordings.sent()
+    shuffled = [message for n in range(7) for message in messages[n::7]]
+    path = recordings.mcap(tmp_path / "f.mcap", shuffled, chunk_messages=17)
+    with open_recording(path, resolve=recordings.blind) as recording:
+        assert recordings.received(recording) == sorted(messages)
+        assert recordings.received(recording, rows=5) == sorted(messages)
+
+
+def test_small_messages_are_coalesced_and_large_ones_are_not_copied(tmp_path: Path, recordings: Any) -> None:
+    messages = recordings.sent(2000, big=True)
+    path = recordings.mcap(tmp_path / "g.mcap", messages, chunk_messages=100)
+    with open_recording(path, resolve=recordings.blind) as recording:
+        batches = list(recording.batches())
+    small = [batch for batch in batches if batch.channel.topic == "/imu"]
+    assert len(small) == 1
+    assert len(small[0].data) == int(small[0].lengths.sum())
+    image = next(batch for batch in batches if batch.channel.topic == "/image")
+    assert len(image.data) > int(image.lengths.sum())
+
+
+def test_a_topic_of_two_types_is_two_channels_and_a_finding(tmp_path: Path, recordings: Any) -> None:
+    one = [
+        recordings.Sent("/t", "std_msgs/msg/String", recordings.START_NS + n, b"\0\1\0\0") for n in range(3)
+    ]
+    two = [message._replace(msgtype="std_msgs/msg/Empty") for message in one]
+    paths = [recordings.mcap(tmp_path / "1.mcap", one), recordings.mcap(tmp_path / "2.mcap", two)]
+    with open_recording(paths, resolve=recordings.easy) as recording:
+        assert [channel.msgtype for channel in recording.channels] == [
+            "std_msgs/msg/String",
+            "std_msgs/msg/Empty",
+        ]
+        assert [finding.rule for finding in recording.findings] == ["two-types"]
+
+
+def test_a_channel_without_definition_says_why(tmp_path: Path, recordings: Any) -> None:
+    path = recordings.mcap(tmp_path / "h.mcap", recordings.sent(10))
+    with open_recording(path, resolve=recordings.blind) as recording:
+        assert all(channel.definition is None for channel in recording.channels)
+        assert all("is not known" in str(channel.problem) for channel in recording.channels)
+
+
+def test_other_encodings_are_named_and_can_still_be_had(tmp_path: Path, recordings: Any) -> None:
+    path = recordings.mcap(tmp_path / "i.mcap", recordings.sent(10), encoding="protobuf")
+    with open_recording(path, resolve=recordings.easy) as recording:
+        assert {channel.encoding for channel in recording.channels} == {Encoding.OTHER}
+        assert {finding.rule for finding in recording.findings} == {"skipped-encoding"}
+        assert len(recordings.received(recording)) == 10
+
+
+@pytest.mark.parametrize(("processors", "threads"), [(2, 0), (3, 1)])
+def test_reading_ahead_is_for_where_a_processor_is_left_and_leaves_no_thread(
+    tmp_path: Path, recordings: Any, monkeypatch: pytest.MonkeyPatch, processors: int, threads: int
+) -> None:
+    monkeypatch.setattr(pa, "cpu_count", lambda: processors)
+    path = recordings.mcap(
+        tmp_path / "j.mcap", recordings.sent(1000, big=True), chunk_messages=5, compression=""
+    )
+    before = threading.active_count()
+    recording = open_recording(path, resolve=recordings.blind)
+    running = recording.batches()
+    next(running)
+    assert threading.active_count() == before + threads
+    recording.close()
+    assert threading.active_count() == before
+    recording.close()
+
+
+@pytest.mark.parametrize("processors", [2, 3])
+def test_a_file_that_shrinks_while_it_is_read_costs_only_its_end(
+    tmp_path: Path, recordings: Any, monkeypatch: pytest.MonkeyPatch, processors: int
+) -> None:
+    monkeypatch.setattr(pa, "cpu_count", lambda: processors)
+    messages = recordings.sent(1000, big=True)
+    path = recordings.mcap(tmp_path / "k.mcap", messages, chunk_messages=20, compression="")
+    with open_recording(path, resolve=recordings.blind) as recording:
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+        found = recordings.received(recording)
+        assert found
+        assert set(found) < set(messages)
+        assert any("shorter" in loss.reason for loss in recording.losses)
+
+
+def test_parts_of_different_formats_are_refused(tmp_path: Path, recordings: Any) -> None:
+    paths = [
+        recordings.mcap(tmp_path / "l.mcap", recordings.sent(5)),
+        recordings.ros1(tmp_path / "l.bag", recordings.sent(5, cdr=False)),
+    ]
+    with pytest.raises(BagError, match="different formats: mcap, ros1"):
+        open_recording(paths, resolve=recordings.blind)
+
+
+def test_offsets_say_where_a_message_lies(tmp_path: Path, recordings: Any) -> None:
+    path = recordings.mcap(tmp_path / "m.mcap", recordings.sent(), chunked=False)
+    content = path.read_bytes()
+    with open_recording(path, resolve=recordings.blind) as recording:
+        for batch in recording.batches():
+            assert all(content[offset] == 5 for offset in batch.offsets.tolist())
+            assert batch.offsets.dtype == np.int64
+
+
+def test_a_hundredth_of_the_time_reads_about_a_hundredth_of_the_file(
+    tmp_path: Path, recordings: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    messages = recordings.sent(4000, big=True)
+    path = recordings.mcap(tmp_path / "n.mcap", messages, chunk_messages=20, compression="")
+    read: list[int] = []
+    pread, preadv = os.pread, os.preadv
+    monkeypatch.setattr(os, "pread", lambda fd, size, at: read.append(size) or pread(fd, size, at))
+    monkeypatch.setattr(
+        os, "preadv", lambda fd, into, at: read.extend(map(len, into)) or preadv(fd, into, at)
+    )
+    with open_recording(path, resolve=recordings.blind) as recording:
+        start, end = messages[2000].time_ns, messages[2040].time_ns
+        assert len(recordings.received(recording, start_ns=start, end_ns=end)) == 40
+    assert path.stat().st_size // 200 < sum(read) < path.stat().st_size // 30
+
+
+@pytest.mark.parametrize("is_read", [True, False])
+def test_what_was_decompressed_to_read_it_is_removed(
+    tmp_path: Path, recordings: Any, monkeypatch: pytest.MonkeyPatch, *, is_read: bool
+) -> None:
+    folder = recordings.rosbag2(tmp_path / "o", recordings.sent(20), storage="sqlite3", compression="file")
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    recording = open_recording(folder, resolve=recordings.blind)
+    assert list((tmp_path / "temporary").iterdir())
+    if is_read:
+        recordings.received(recording)
+    recording.close()
+    assert not list((tmp_path / "temporary").iterdir())
+
+
+def test_a_topic_that_keeps_its_last_message_is_latched(tmp_path: Path, recordings: Any) -> None:
+    folder = recordings.rosbag2(tmp_path / "p", recordings.sent(20), storage="sqlite3")
+    with sqlite3.connect(next(folder.glob("*.db3"))) as writer:
+        writer.execute("UPDATE topics SET offered_qos_profiles = '- durability: 1' WHERE name = '/imu'")
+    writer.close()
+    with open_recording(folder, resolve=recordings.blind) as recording:
+        assert {channel.topic for channel in recording.channels if channel.latched} == {"/imu"}

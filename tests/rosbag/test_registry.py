@@ -1,0 +1,87 @@
+"""Types a program announces for all its recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from mosaico_ingest.errors import BagError
+from mosaico_ingest.job.model import Stores
+from mosaico_ingest.rosbag.definitions.model import Source
+from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry, TypeResolver
+
+
+@pytest.fixture(autouse=True)
+def _forget() -> Iterator[None]:
+    ROSTypeRegistry.reset()
+    yield
+    ROSTypeRegistry.reset()
+
+
+def test_a_text_a_path_and_a_name_of_a_file_are_sources(tmp_path: Path) -> None:
+    file = tmp_path / "my messages" / "Heartbeat.msg"
+    file.parent.mkdir()
+    file.write_text("int8 from_file\n")
+    ROSTypeRegistry.register("a/msg/Text", "int8 from_text")
+    ROSTypeRegistry.register("a/Path", file)
+    ROSTypeRegistry.register("a/msg/Name", str(file))
+    assert ROSTypeRegistry.get_types() == {
+        "a/msg/Text": "int8 from_text",
+        "a/msg/Path": "int8 from_file\n",
+        "a/msg/Name": "int8 from_file\n",
+    }
+
+
+def test_a_distro_and_its_name_are_one_key_and_overlay_what_holds_for_all() -> None:
+    ROSTypeRegistry.register("a/msg/B", "int8 for_all")
+    ROSTypeRegistry.register("a/msg/B", "int8 for_humble", store="ros2_humble")
+    assert ROSTypeRegistry.get_types(Stores.ROS2_HUMBLE) == {"a/msg/B": "int8 for_humble"}
+    assert ROSTypeRegistry.get_types("ros2_jazzy") == {"a/msg/B": "int8 for_all"}
+    assert ROSTypeRegistry.get_types() == {"a/msg/B": "int8 for_all"}
+
+
+def test_announced_types_are_found_and_come_after_the_jobs_own() -> None:
+    ROSTypeRegistry.register("a/msg/B", "int8 announced")
+    found = TypeResolver().resolve("a/msg/B", None, ros_version=2)
+    assert (found.message.fields[0].name, found.source) == ("announced", Source.CUSTOM)
+    own = TypeResolver(types={"a/msg/B": "int8 own"}).resolve("a/msg/B", None, ros_version=2)
+    assert own.message.fields[0].name == "own"
+
+
+def test_a_directory_is_a_package(tmp_path: Path) -> None:
+    (tmp_path / "One.msg").write_text("Two two\n")
+    (tmp_path / "Two.msg").write_text("int8 x\n")
+    (tmp_path / "README").write_text("not a message")
+    ROSTypeRegistry.register_directory("pkg", tmp_path, store=Stores.ROS2_HUMBLE)
+    assert sorted(ROSTypeRegistry.get_types("ros2_humble")) == ["pkg/msg/One", "pkg/msg/Two"]
+    found = TypeResolver("ros2_humble").resolve("pkg/msg/One", None, ros_version=2)
+    assert found.message.fields[0].type == "pkg/msg/Two"
+
+
+def test_a_mistake_names_file_and_line_and_announces_nothing(tmp_path: Path) -> None:
+    (tmp_path / "Bad.msg").write_text("int8 good\nfloat64[ bad\n")
+    (tmp_path / "Good.msg").write_text("int8 good\n")
+    with pytest.raises(BagError, match=r"Bad\.msg:2: cannot read 'float64\[ bad'"):
+        ROSTypeRegistry.register_directory("pkg", tmp_path)
+    assert ROSTypeRegistry.get_types() == {}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("pkg/msg/X", "missing.msg"), "cannot read the definition: No such file"),
+        (("pkg/msg/X", Path("missing.msg")), "cannot read the definition: No such file"),
+        (("X", "int8 x"), "write it as pkg/msg/Name"),
+        (("pkg/msg/X", "int8 x", "ros2_humbel"), r"did you mean ros2_humble\?"),
+    ],
+)
+def test_other_mistakes_are_one_line(arguments: tuple[str, ...], message: str) -> None:
+    with pytest.raises(BagError, match=message):
+        ROSTypeRegistry.register(*arguments)
+
+
+def test_a_missing_directory_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match="does not exist"):
+        ROSTypeRegistry.register_directory("pkg", tmp_path / "nowhere")

@@ -1,0 +1,16 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.recording import open_recording
+
+DAMAGED = Path(__file__).parent / "data" / "damaged_rowids.db3"
+"""Found by fuzzing: a page that gives other rows than the index says, so that reading seems to go on but does not."""
+
+
+def test_salvage_comes_to_an_end_where_a_damaged_page_gives_rows_out_of_order() -> None:
+    with open_recording(DAMAGED, resolve=TypeResolver()) as recording:
+        read = sum(len(batch) for batch in recording.batches())
+        assert read < 1000
+        assert len(recording.findings) < 100

@@ -1,0 +1,235 @@
+"""Where a definition comes from."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import pytest
+from rosbags.typesys import Stores as RosbagsStores
+from rosbags.typesys import get_typestore
+
+from mosaico_ingest.errors import BagError
+from mosaico_ingest.job.model import Stores
+from mosaico_ingest.rosbag.definitions.distros import ros_version
+from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, Source, normalize_msgtype
+from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry, TypeResolver
+
+BAR = "=" * 80
+
+
+def embedded(text: str, encoding: str = "ros2msg") -> Embedded:
+    return Embedded(encoding, text)
+
+
+def resolve(resolver: TypeResolver, name: str, text: str | None = None, version: int = 2) -> Definition:
+    return resolver.resolve(name, None if text is None else embedded(text), ros_version=version)
+
+
+class TestNames:
+    @pytest.mark.parametrize(
+        ("name", "expected"),
+        [
+            ("std_msgs/String", "std_msgs/msg/String"),
+            ("std_msgs/msg/String", "std_msgs/msg/String"),
+            ("std_msgs::msg::dds_::String_", "std_msgs/msg/String"),
+            ("roslib/Header", "std_msgs/msg/Header"),
+            ("example_interfaces/srv/AddTwoInts_Event", "example_interfaces/srv/AddTwoInts_Event"),
+            ("Vec3", "Vec3"),
+        ],
+    )
+    def test_one_type_has_one_name(self, name: str, expected: str) -> None:
+        assert normalize_msgtype(name) == expected
+
+
+class TestOrder:
+    def test_the_recording_comes_before_all_else(self) -> None:
+        resolver = TypeResolver(Stores.ROS2_HUMBLE, types={"std_msgs/msg/String": "int8 custom"})
+        found = resolve(resolver, "std_msgs/String", "int8 embedded")
+        assert (found.message.fields[0].name, found.source) == ("embedded", Source.BAG)
+
+    def test_the_jobs_own_types_come_before_the_distro(self) -> None:
+        resolver = TypeResolver(Stores.ROS2_HUMBLE, types={"std_msgs/msg/String": "int8 custom"})
+        found = resolve(resolver, "std_msgs/msg/String")
+        assert (found.message.fields[0].name, found.source) == ("custom", Source.CUSTOM)
+
+    def test_each_missing_nested_type_is_looked_for_on_its_own(self) -> None:
+        resolver = TypeResolver(Stores.ROS2_HUMBLE, types={"mine/msg/Part": "float32 size"})
+        found = resolve(
+            resolver,
+            "mine/msg/Whole",
+            "mine/Part part\nPart[] parts\ngeometry_msgs/Point where\nHeader header",
+        )
+        assert set(found.types) == {
+            "mine/msg/Whole", "mine/msg/Part", "geometry_msgs/msg/Point", "std_msgs/msg/Header",
+            "builtin_interfaces/msg/Time",
+        }  # fmt: skip
+
+    def test_two_connections_of_one_type_keep_their_own_definitions(self) -> None:
+        resolver = TypeResolver()
+        first, second = resolve(resolver, "a/msg/B", "int8 x"), resolve(resolver, "a/msg/B", "int16 x")
+        assert (first.message.fields[0].type, second.message.fields[0].type) == ("int8", "int16")
+
+    def test_a_package_may_have_a_header_of_its_own_in_ros_2_only(self) -> None:
+        text = f"Header header\n{BAR}\nMSG: own/Header\nint8 x\n"
+        assert resolve(TypeResolver(), "own/msg/T", text).message.fields[0].type == "own/msg/Header"
+        ros1 = TypeResolver().resolve("own/T", Embedded("ros1msg", text), ros_version=1)
+        assert [f.name for f in ros1.types["std_msgs/msg/Header"].fields] == ["seq", "stamp", "frame_id"]
+
+    def test_service_events_find_their_parts(self) -> None:
+        text = (
+            f"service_msgs/ServiceEventInfo info\nexample_interfaces/AddTwoInts_Request[<=1] request\n{BAR}\n"
+            f"MSG: service_msgs/ServiceEventInfo\nuint8 event_type\n{BAR}\nMSG: example_interfaces/srv/AddTwoInts_Request\nint64 a\n"
+        )
+        found = resolve(TypeResolver(), "example_interfaces/srv/AddTwoInts_Event", text)
+        assert found.message.fields[1].type == "example_interfaces/srv/AddTwoInts_Request"
+
+    def test_a_service_event_recorded_with_its_srv_text_is_assembled(self) -> None:
+        text = f"int64 a\nThing thing\n---\nint64 sum\n{BAR}\nMSG: mine/Thing\nint8 x\n"
+        found = resolve(TypeResolver(), "mine/srv/Add_Event", text)
+        assert [(f.name, f.type, f.size) for f in found.message.fields] == [
+            ("info", "service_msgs/msg/ServiceEventInfo", 0),
+            ("request", "mine/srv/Add_Request", 1),
+            ("response", "mine/srv/Add_Response", 1),
+        ]
+        assert [f.type for f in found.types["mine/srv/Add_Request"].fields] == ["int64", "mine/msg/Thing"]
+
+    def test_an_empty_text_is_a_type_without_fields_unless_the_type_is_known(self) -> None:
+        assert resolve(TypeResolver(), "mine/msg/Signal", "").message.fields == ()
+        for text in ("", "# a placeholder\n"):
+            assert resolve(TypeResolver(), "std_msgs/msg/String", text).message.fields[0].name == "data"
+        with pytest.raises(BagError, match="mine/msg/Signal is not known"):
+            TypeResolver().resolve("mine/msg/Signal", Embedded("unknown", ""), ros_version=2)
+
+
+class TestWithoutADistro:
+    def test_what_all_distros_agree_on_is_used_with_a_finding(self) -> None:
+        resolver = TypeResolver()
+        assert resolve(resolver, "geometry_msgs/msg/Pose").source is Source.DISTRO
+        (finding,) = resolver.findings
+        assert "geometry_msgs/msg/Pose" in finding.message
+
+    def test_only_what_is_taken_is_told(self) -> None:
+        resolver = TypeResolver()
+        for name in ("geometry_msgs/msg/Point", "std_msgs/msg/String"):
+            resolve(resolver, name)
+        (finding,) = resolver.findings_about({"geometry_msgs/msg/Point"})
+        assert finding.message.endswith(": geometry_msgs/msg/Point")
+        assert resolver.findings_about(set()) == ()
+
+    def test_a_type_without_fields_leaves_no_doubt(self) -> None:
+        resolver = TypeResolver()
+        assert resolve(resolver, "std_msgs/msg/Empty", "").message.fields == ()
+        assert resolver.findings == ()
+
+    def test_a_recording_without_definitions_is_from_before_iron(self) -> None:
+        resolver = TypeResolver()
+        assert len(resolve(resolver, "sensor_msgs/msg/Range").message.fields) == 6
+        assert any("until Humble" in finding.message for finding in resolver.findings)
+        with pytest.raises(BagError, match="not known"):
+            resolve(resolver, "sensor_msgs/msg/Range", "")
+
+    def test_what_they_do_not_agree_on_is_not_guessed(self) -> None:
+        with pytest.raises(BagError, match=r"not known.*searched.*set ros_distro"):
+            resolve(TypeResolver(), "rcl_interfaces/msg/ParameterDescriptor")
+
+    def test_an_unknown_type_says_where_was_looked_and_what_to_do(self) -> None:
+        with pytest.raises(
+            BagError, match=r"mine/msg/X is not known .* searched: the recording.*custom_msgs"
+        ):
+            resolve(TypeResolver(), "mine/msg/X")
+
+    def test_an_unknown_part_is_named_with_the_field_that_needs_it(self) -> None:
+        with pytest.raises(
+            BagError, match=r"^mine/msg/X\.part: the definition of mine/msg/Part is not known"
+        ):
+            resolve(TypeResolver(), "mine/msg/X", "Part part")
+
+    def test_a_distro_of_the_other_ros_is_named(self) -> None:
+        with pytest.raises(BagError, match="the recording is ROS 2, ros_distro is ros1_noetic"):
+            resolve(TypeResolver(Stores.ROS1_NOETIC), "std_msgs/msg/Header")
+
+
+class TestRefusals:
+    def test_an_unreadable_text_is_its_types_problem_only(self) -> None:
+        resolver = TypeResolver()
+        with pytest.raises(BagError, match="cannot be read"):
+            resolve(resolver, "mine/msg/X", "no field here!")
+        assert resolve(resolver, "mine/msg/Y", "int8 x").message.fields
+
+    def test_the_job_can_replace_an_unreadable_text(self) -> None:
+        resolver = TypeResolver(types={"mine/msg/X": "int8 good"})
+        assert resolve(resolver, "mine/msg/X", "no field here!").source is Source.CUSTOM
+        assert resolver.findings[0].rule == "unreadable-definition"
+
+    @pytest.mark.parametrize(
+        "text",
+        [
+            "X x",
+            f"Y y\n{BAR}\nMSG: mine/Y\nX x",
+            "".join(f"T{i + 1} a\nT{i + 1} b\n{BAR}\nMSG: mine/T{i + 1}\n" for i in range(30)) + "int8 x",
+            "".join(f"T{i + 1} a\n{BAR}\nMSG: mine/T{i + 1}\n" for i in range(90)) + "int8 x",
+            f"Y[1000000] y\n{BAR}\nMSG: mine/Y\nint8 x",
+        ],
+        ids=["itself", "in a circle", "exponential", "deep", "wide"],
+    )
+    def test_a_type_no_message_could_have_is_refused(self, text: str) -> None:
+        with pytest.raises(BagError):
+            resolve(TypeResolver(), "mine/msg/X", text)
+
+    def test_other_schema_languages_are_named(self) -> None:
+        with pytest.raises(BagError, match="'protobuf' is no ROS definition"):
+            TypeResolver().resolve("X", Embedded("protobuf", "syntax"), ros_version=2)
+
+
+class TestCustomMessages:
+    @pytest.fixture
+    def folder(self, tmp_path: Path) -> Path:
+        (tmp_path / "Part.msg").write_text("float32 size\n")
+        return tmp_path
+
+    def test_a_folder_a_file_and_a_package_are_all_fine(self, folder: Path) -> None:
+        (folder / "msg").mkdir()
+        (folder / "package").mkdir()
+        (folder / "package" / "msg").mkdir()
+        (folder / "package" / "msg" / "Part.msg").write_text("float32 size\n")
+        for path in (folder, folder / "Part.msg", folder / "package"):
+            assert (
+                resolve(TypeResolver(custom=[("mine", path, None)]), "mine/msg/Part").source is Source.CUSTOM
+            )
+
+    def test_they_stay_inside_their_run(self, folder: Path) -> None:
+        TypeResolver(custom=[("mine", folder, None)])
+        with pytest.raises(BagError):
+            resolve(TypeResolver(), "mine/msg/Part")
+
+    def test_those_of_another_distro_are_not_used_but_mentioned(self, folder: Path) -> None:
+        resolver = TypeResolver("ros2_jazzy", [("mine", folder, "ros2_humble")])
+        with pytest.raises(BagError, match="custom_msgs has it for ros2_humble only"):
+            resolve(resolver, "mine/msg/Part")
+
+    def test_a_folder_without_definitions_is_an_error(self, tmp_path: Path) -> None:
+        with pytest.raises(BagError, match=r"has no \.msg or \.idl file"):
+            TypeResolver(custom=[("mine", tmp_path, None)])
+
+    def test_a_resolver_goes_to_other_processes_with_what_it_knows(self, folder: Path) -> None:
+        ROSTypeRegistry.register("mine/msg/Other", "int8 x")
+        try:
+            resolver = TypeResolver(custom=[("mine", folder, None)])
+        finally:
+            ROSTypeRegistry.reset()
+        twin = pickle.loads(pickle.dumps(resolver))  # noqa: S301 - what was just dumped
+        assert resolve(twin, "mine/msg/Part") == resolve(resolver, "mine/msg/Part")
+        assert resolve(twin, "mine/msg/Other").source is Source.CUSTOM
+
+
+@pytest.mark.parametrize("distro", [Stores.ROS1_NOETIC, Stores.ROS2_FOXY, Stores.ROS2_HUMBLE, Stores.LATEST])
+def test_the_text_of_every_standard_type_is_that_of_rosbags_and_reads_back(distro: Stores) -> None:
+    version = ros_version(distro)
+    assert version
+    store, resolver = get_typestore(RosbagsStores(distro.value)), TypeResolver(distro)
+    for name in store.fielddefs:
+        found = resolver.resolve(name, None, ros_version=version)
+        assert found.text == store.generate_msgdef(name, ros_version=version)[0], name
+        again = resolver.resolve(name, Embedded("ros2msg", found.text), ros_version=version)
+        assert {**again.types} == {**found.types}, name
