@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from enum import Enum
 
-from mosaico_ingest.frozen import frozen
+from msgspec import Struct
 
 __all__ = [
     "Edit",
@@ -84,16 +84,14 @@ class Span:
         return f"{self.file}:{self.line}:{self.column}"
 
 
-@frozen
-class Edit:
+class Edit(Struct, frozen=True):
     """A change that mends a finding: the text of `span` becomes `text`."""
 
     span: Span
     text: str
 
 
-@frozen
-class Finding:
+class Finding(Struct, frozen=True):
     """One thing to know: which rule, where, what, and the remedy."""
 
     rule: str
@@ -123,8 +121,7 @@ class Stage(str, Enum):
     WRITE = "write"
 
 
-@frozen
-class RowFailure:
+class RowFailure(Struct, frozen=True):
     """One row that could not go on: its position in the batch that was given, the rule it broke, and why."""
 
     row: int

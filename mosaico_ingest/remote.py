@@ -16,8 +16,9 @@ from stat import S_IFDIR, S_IFREG
 from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import parse_qs, unquote, urlsplit
 
+from msgspec import Struct
+
 from mosaico_ingest.errors import IngestError, Unreachable
-from mosaico_ingest.frozen import frozen
 
 if TYPE_CHECKING:
     from pyarrow.fs import FileSystem
@@ -159,8 +160,7 @@ _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/(?=[^/])|([A-Za-z][A-Za-z0-9+.-]+
 """With one slash too: that is what is left of a URL that went through `Path`."""
 
 
-@frozen
-class RemoteStat:
+class RemoteStat(Struct, frozen=True):
     """What is known of an object without reading it; named as in `os.stat_result`."""
 
     st_mode: int

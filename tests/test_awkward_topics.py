@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from made_recordings import define, record
 
@@ -134,7 +135,7 @@ def test_two_types_on_a_topic_are_told_once_and_only_where_it_is_taken(tmp_path:
 
 def test_what_is_assumed_of_topics_that_are_not_taken_is_not_told(tmp_path: Path) -> None:
     number = define("std_msgs/msg/Int32", "int32 data\n")
-    undefined = replace(define("std_msgs/msg/String", "string data\n"), text="")
+    undefined = msgspec.structs.replace(define("std_msgs/msg/String", "string data\n"), text="")
     made = record(
         tmp_path / "two.mcap", [("/one", number, 5, {"data": 1}), ("/other", undefined, 6, {"data": ""})]
     )

@@ -7,10 +7,10 @@ from typing import Any, Protocol, cast
 
 import numpy as np
 import pyarrow as pa
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from mosaico_ingest.findings import RowFailure
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 from mosaico_ingest.rosbag.definitions.model import Definition
 
@@ -51,8 +51,7 @@ def _json_value(value: object) -> object:
     return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
 
 
-@frozen
-class Envelope:
+class Envelope(Struct, frozen=True):
     """What is known of the rows beside their content."""
 
     topic: str
@@ -61,8 +60,7 @@ class Envelope:
     """ns since the epoch, shape (n,)."""
 
 
-@frozen
-class Adapted:
+class Adapted(Struct, frozen=True):
     """The rows that fit, which of the given rows they were, and the ones that did not."""
 
     rows: pa.StructArray
@@ -127,8 +125,7 @@ _ONE_MEMBER = pa.struct([("structure_needs_at_least_one_member", pa.uint8())])
 """What a nested message without fields becomes, as ROS 2 itself spells it: Parquet has no struct without fields."""
 
 
-@frozen
-class UnmodeledSpec:
+class UnmodeledSpec(Struct, frozen=True):
     """Keeps a message as it is; fits every type, and is nobody's default."""
 
     name: str = "Unmodeled"
@@ -145,8 +142,7 @@ class UnmodeledSpec:
         return UnmodeledAdapter(OntologyType(tag, struct, self.serialization_format), renamed)
 
 
-@frozen
-class UnmodeledAdapter:
+class UnmodeledAdapter(Struct, frozen=True):
     """Hands the rows on without copying; at most fields get another name, or a member where they have none."""
 
     ontology: OntologyType

@@ -9,7 +9,6 @@ import sys
 import traceback
 from collections.abc import Generator, Iterable, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from difflib import get_close_matches
 from enum import Enum
 from functools import cache
@@ -19,13 +18,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Literal, cast
 
+from msgspec import Struct
+from msgspec.structs import replace
+
 from mosaico_ingest.adapters.adapter import AdapterSpec, UnmodeledSpec
 from mosaico_ingest.adapters.builtin import BY_NAME, BY_TYPE
 from mosaico_ingest.adapters.image import PngImageSpec
 from mosaico_ingest.adapters.mapping.loader import load_adapter
 from mosaico_ingest.adapters.python import PythonAdapterSpec, is_adapter_class, registered_adapters
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.config import AdapterReference, ImageFormat, ROSInjectionConfig
 from mosaico_ingest.job.patterns import first_match
 from mosaico_ingest.ontology.types import SerializationFormat
@@ -105,8 +106,7 @@ def what_was_meant(ref: str, known: Iterable[str] = ()) -> str:
     return "see `ingest adapters list`, or write a YAML path, module:Class or file.py:Class"
 
 
-@frozen
-class KnownAdapters:
+class KnownAdapters(Struct, frozen=True):
     """Finds the adapters a mapping may use: the built-in ones, and those of the files beside it."""
 
     folder: Path
@@ -224,8 +224,7 @@ ENTRY_POINTS = "mosaico_ingest.adapters"
 Reason = Literal["override", "loaded", "registered", "entry point", "built-in", "unmodeled"]
 
 
-@frozen
-class Resolution:
+class Resolution(Struct, frozen=True):
     """The adapter of a topic and which rule chose it; the first of the reasons that applies does."""
 
     spec: AdapterSpec

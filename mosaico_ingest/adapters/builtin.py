@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+from msgspec import Struct
 
 from mosaico_ingest.adapters.adapter import Adapter
 from mosaico_ingest.adapters.mapping.loader import MappingSpec, known_adapter
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.rosbag.definitions.model import Definition
 
 __all__ = ["BUILTIN", "BY_NAME", "BY_TYPE", "CATALOG", "FILE", "Builtin", "find_builtin"]
@@ -23,8 +23,7 @@ CATALOG = Path(__file__).parent / "catalog"
 FILE = CATALOG.with_suffix(".json")
 
 
-@frozen
-class Builtin:
+class Builtin(Struct, frozen=True):
     """An adapter of the catalog; its file is read when it is first bound."""
 
     name: str

@@ -11,6 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
+from msgspec import Struct
 
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.builtin import BY_TYPE, find_builtin
@@ -25,7 +26,6 @@ from mosaico_ingest.adapters.mapping.types import (
     spell,
 )
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.yaml_source import resolve_plain
 from mosaico_ingest.ontology.registry import ontology_type, tags
 from mosaico_ingest.rosbag.definitions.linking import TEXTS, ros_shape
@@ -81,8 +81,7 @@ _TELLING = 4
 """From how many letters on a column's name is looked for inside longer ones."""
 
 
-@frozen
-class Guess:
+class Guess(Struct, frozen=True):
     """What may fill a column."""
 
     name: str
@@ -93,8 +92,7 @@ class Guess:
     fields: tuple[Guess, ...] = ()
 
 
-@frozen
-class _Candidate:
+class _Candidate(Struct, frozen=True):
     """A field of the message, however deep, but not inside a list."""
 
     path: tuple[str, ...]
@@ -278,8 +276,7 @@ _LONG = 1500
 """How many characters of a message a test spells out; a longer one is named by its place in the recording."""
 
 
-@frozen
-class Example:
+class Example(Struct, frozen=True):
     """A recorded message for the draft's test."""
 
     row: pa.StructArray

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, TypeAlias
 
 import pyarrow as pa
+from msgspec import Struct
 
 from mosaico_ingest.adapters.adapter import Adapter, AdapterSpec
 from mosaico_ingest.adapters.direct import mapping_of
@@ -34,7 +35,6 @@ from mosaico_ingest.adapters.mapping.typed import (
 )
 from mosaico_ingest.adapters.mapping.types import is_list, spell
 from mosaico_ingest.adapters.python import PythonAdapterSpec, ontology_of
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
 
@@ -146,8 +146,7 @@ def _place(typed: Typed, at: _Place) -> _Place:
             return ("",)  # no field is called so
 
 
-@frozen
-class ColumnOrigin:
+class ColumnOrigin(Struct, frozen=True):
     """One column of the records, or a field of one, and where its values come from."""
 
     name: str
@@ -158,8 +157,7 @@ class ColumnOrigin:
     """An expression, or a form in one line; None: it is null."""
 
 
-@frozen
-class Description:
+class Description(Struct, frozen=True):
     """An adapter in words."""
 
     name: str

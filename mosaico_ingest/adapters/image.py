@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from msgspec import Struct
 
 from mosaico_ingest.adapters.adapter import (
     Adapted,
@@ -16,7 +17,6 @@ from mosaico_ingest.adapters.adapter import (
     Envelope,
 )
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.rosbag.definitions.model import Definition
 
@@ -81,8 +81,7 @@ def _chunk(kind: bytes, body: bytes) -> bytes:
     return b"".join((struct.pack(">I", len(body)), kind, body, struct.pack(">I", checksum)))
 
 
-@frozen
-class PngImageSpec:
+class PngImageSpec(Struct, frozen=True):
     """An image adapter whose raw rows are stored as PNG; of other ontologies it changes nothing."""
 
     inner: AdapterSpec
@@ -108,8 +107,7 @@ class PngImageSpec:
         return _PngImages(adapter) if adapter.ontology.tag == "Image" else adapter
 
 
-@frozen
-class _PngImages:
+class _PngImages(Struct, frozen=True):
     inner: Adapter
 
     @property

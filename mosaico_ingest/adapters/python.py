@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 import numpy as np
 import pyarrow as pa
+from msgspec import Struct
 
 from mosaico_ingest.adapters.adapter import Adapted, Envelope
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.findings import RowFailure
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 from mosaico_ingest.rosbag.blocks import ROSMessage
 from mosaico_ingest.rosbag.definitions.model import Definition, normalize_msgtype
@@ -125,7 +125,7 @@ _ROWS_AS_DICTS = 256
 """How many messages are Python objects at a time; an image topic must not be in memory twice as a whole."""
 
 
-@frozen
+@dataclass(frozen=True, slots=True)
 class PythonAdapterSpec:
     """An adapter class: a subclass of `ROSAdapterBase`, ours or the official SDK's."""
 
@@ -158,8 +158,7 @@ class PythonAdapterSpec:
         return self.origin or (PythonAdapterSpec, (self.adapter, self.default))
 
 
-@frozen
-class PythonAdapter:
+class PythonAdapter(Struct, frozen=True):
     """Calls an adapter class for rows; whatever it raises rejects the row it was raised for."""
 
     adapter: type[Any]

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from msgspec import to_builtins
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -19,14 +19,14 @@ from mosaico_ingest.cli.report import open_console, print_json
 from mosaico_ingest.report.units import counted
 
 if TYPE_CHECKING:
+    from mosaico_ingest.adapters.adapter import AdapterSpec
+    from mosaico_ingest.adapters.direct import KnownTypes
     from mosaico_ingest.services.adapters import (
         Explained,
         Known,
         TestResult,
         TopicChoice,
     )
-    from mosaico_ingest.adapters.adapter import AdapterSpec
-    from mosaico_ingest.adapters.direct import KnownTypes
 
 __all__ = [
     "adapters_app",
@@ -40,7 +40,7 @@ __all__ = [
 def print_adapters(known: Sequence[Known], *, as_json: bool) -> None:
     """Print adapters; those that have to be asked for are dim."""
     if as_json:
-        _print_json([asdict(one) for one in known])
+        _print_json([to_builtins(one) for one in known])
         return
     table = plain_table("adapter", "ontology", "takes", "from")
     for one in known:
@@ -60,7 +60,7 @@ def _short(names: Sequence[str]) -> str:
 def print_explained(found: Explained, *, as_json: bool) -> None:
     """Print where every column comes from, and what is left out."""
     if as_json:
-        _print_json(asdict(found))
+        _print_json(to_builtins(found))
         return
     console, words = open_console(), found.description
     becomes = words.ontology or "its own shape"
@@ -97,7 +97,7 @@ def _taken(takes: Mapping[str, str]) -> Table:
 def print_topics(topics: Sequence[TopicChoice], *, as_json: bool) -> None:
     """Print which adapter each topic gets, and why."""
     if as_json:
-        _print_json([asdict(one) for one in topics])
+        _print_json([to_builtins(one) for one in topics])
         return
     console = open_console()
     for recording, some in groupby(topics, key=lambda one: one.recording):

@@ -8,7 +8,7 @@ import sys
 import time
 from datetime import datetime, timezone
 from enum import Enum
-from typing import Annotated, Any, TypeAlias, TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 

@@ -23,6 +23,7 @@ from mosaico_ingest.report.units import (
 )
 
 if TYPE_CHECKING:
+    from mosaico_ingest.job.expand import Expanded
     from mosaico_ingest.pipeline.plan import (
         Decisions,
         DestinationState,
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
         RecordingPlan,
         Sample,
     )
-    from mosaico_ingest.job.expand import Expanded
 
 __all__ = [
     "diff",
@@ -169,14 +169,15 @@ def diff(
     Exit codes: 0 the plans are the same, 1 they differ.
     """
     import json
-    from dataclasses import asdict
+
+    from msgspec import to_builtins
 
     from mosaico_ingest import api
     from mosaico_ingest.cli.report import print_json
 
     found = api.compare_jobs(before, after)
     if as_json:
-        print_json(json.dumps([asdict(one) for one in found], indent=2, ensure_ascii=False))
+        print_json(json.dumps([to_builtins(one) for one in found], indent=2, ensure_ascii=False))
     else:
         print_differences(found)
     if found:

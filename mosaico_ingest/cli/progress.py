@@ -7,6 +7,7 @@ from collections.abc import Generator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -35,11 +36,10 @@ from mosaico_ingest.report.units import (
     counted,
     seconds_text,
 )
-from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from mosaico_ingest.remote import AnyPath
     from mosaico_ingest.job.config import ROSInjectionConfig
+    from mosaico_ingest.remote import AnyPath
 
 __all__ = [
     "BatchBoard",

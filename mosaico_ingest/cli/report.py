@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -22,8 +22,8 @@ from mosaico_ingest.report.units import (
 )
 
 if TYPE_CHECKING:
-    from mosaico_ingest.services.inspection import Inspection
     from mosaico_ingest.report.model import Report, RunReport, TopicReport
+    from mosaico_ingest.services.inspection import Inspection
 
 __all__ = [
     "inspect",

@@ -29,9 +29,9 @@ from mosaico_ingest.report.model import RunReport, UsedManifest, write_report
 from mosaico_ingest.textfile import check_file
 
 if TYPE_CHECKING:
+    from mosaico_ingest.executors.in_process import Executor
     from mosaico_ingest.findings import Finding
     from mosaico_ingest.job.config import ROSInjectionConfig
-    from mosaico_ingest.executors.in_process import Executor
 
 __all__ = [
     "bag",

@@ -30,8 +30,8 @@ def status(
     """Say of every recording whether its sequence is there, whole and of the same content; writes nothing."""
     import json
     from collections import Counter
-    from dataclasses import asdict
 
+    from msgspec import to_builtins
     from rich.text import Text
 
     from mosaico_ingest import api
@@ -40,7 +40,7 @@ def status(
 
     found = [one for manifest in manifests for one in api.job_status(manifest)]
     if as_json:
-        print_json(json.dumps([asdict(one) for one in found], indent=2))
+        print_json(json.dumps([to_builtins(one) for one in found], indent=2))
     else:
         table = plain_table("sequence", "status", "recording")
         for one in found:

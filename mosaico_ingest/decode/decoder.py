@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any, Protocol, cast
 
 import numpy as np
 import pyarrow as pa
+from msgspec import Struct
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from mosaico_ingest.decode.columns import build_columns
@@ -17,7 +18,6 @@ from mosaico_ingest.decode.lockstep import locate
 from mosaico_ingest.decode.spans import Frame, Int64s, array_of, bytes_at
 from mosaico_ingest.errors import DecodeError
 from mosaico_ingest.findings import RowFailure
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
@@ -32,8 +32,7 @@ __all__ = [
 ]
 
 
-@frozen
-class Decoded:
+class Decoded(Struct, frozen=True):
     """The rows that could be decoded, which messages they were, and the ones that could not."""
 
     rows: pa.StructArray
@@ -219,8 +218,7 @@ def decoder_for(channel: Channel) -> Decoder:
     return _decoder(_Known(channel.definition), channel.encoding)
 
 
-@frozen
-class _Known:
+class _Known(Struct, frozen=True):
     """A definition, told from others by what a decoder needs to know of it."""
 
     definition: Definition

@@ -7,12 +7,13 @@ steps of their own. The *columns* are the tree of the Arrow type, its leaves poi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.rosbag.blocks import Encoding
 from mosaico_ingest.rosbag.definitions.linking import NUMBERS, TEXTS
 from mosaico_ingest.rosbag.definitions.model import (
@@ -51,16 +52,14 @@ _MAX_ALIGN = 8
 _UNITS = {"string": 1, "wstring": 4}
 
 
-@frozen
-class Block:
+class Block(Struct, frozen=True):
     """`size` bytes that start at a multiple of `align`."""
 
     align: int
     size: int
 
 
-@frozen
-class Text:
+class Text(Struct, frozen=True):
     """A length word and that many units of text."""
 
     unit: int
@@ -69,8 +68,7 @@ class Text:
     """Whether a NUL ends the text and is counted, as in a CDR `string`."""
 
 
-@frozen
-class Run:
+class Run(Struct, frozen=True):
     """A length word and that many cells, one every `stride` bytes."""
 
     cell: Block
@@ -79,8 +77,7 @@ class Run:
     """The most elements there may be; 0: any number."""
 
 
-@frozen
-class Loop:
+class Loop(Struct, frozen=True):
     """Elements that have to be walked one after the other."""
 
     body: Body
@@ -92,8 +89,7 @@ class Loop:
 Step: TypeAlias = Block | Text | Run | Loop
 
 
-@frozen
-class Body:
+class Body(Struct, frozen=True):
     """The steps of one message or element."""
 
     steps: tuple[Step, ...]
@@ -101,8 +97,7 @@ class Body:
     """Bytes an instance has at least, alignment apart."""
 
 
-@frozen
-class Leaf:
+class Leaf(Struct, frozen=True):
     """A number in a block; `dims` are (count, stride) of the fixed arrays around it within the block."""
 
     step: int
@@ -111,24 +106,21 @@ class Leaf:
     dims: tuple[tuple[int, int], ...] = ()
 
 
-@frozen
-class Words:
+class Words(Struct, frozen=True):
     """A text."""
 
     step: int
     text: Text
 
 
-@frozen
-class Grid:
+class Grid(Struct, frozen=True):
     """A fixed array within a block."""
 
     count: int
     item: Column
 
 
-@frozen
-class Items:
+class Items(Struct, frozen=True):
     """The elements of a run or a loop; the leaves of `item` point into the cell or the body."""
 
     step: int
@@ -136,8 +128,7 @@ class Items:
     item: Column
 
 
-@frozen
-class Record:
+class Record(Struct, frozen=True):
     """A struct."""
 
     children: tuple[Column, ...]
@@ -146,8 +137,7 @@ class Record:
 Column: TypeAlias = Leaf | Words | Grid | Items | Record
 
 
-@frozen
-class Layout:
+class Layout(Struct, frozen=True):
     """How the messages of one definition are walked, and the columns they become."""
 
     encoding: Encoding
@@ -196,8 +186,7 @@ class _Draft:
         return Body(tuple(self.steps), sum(_least(step) for step in self.steps))
 
 
-@frozen
-class _Compiler:
+class _Compiler(Struct, frozen=True):
     definition: Definition
     aligned: bool
 

@@ -7,9 +7,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
+from msgspec import Struct
 from numpy.typing import NDArray
 
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.rosbag.compression import room
 
 __all__ = [
@@ -32,8 +32,7 @@ __all__ = [
 Int64s: TypeAlias = NDArray[np.int64]
 
 
-@frozen
-class Frame:
+class Frame(Struct, frozen=True):
     """n messages of one byte order in a buffer; alignment counts from `origins`, shapes (n,)."""
 
     data: NDArray[np.uint8]
@@ -56,8 +55,7 @@ class Frame:
         return np.ndarray((count,), f"{self.order}u4", self.data.data, 0, (1,))
 
 
-@frozen
-class Place:
+class Place(Struct, frozen=True):
     """Where one step lies in each of m instances of its body, in the order of the messages."""
 
     at: Int64s
@@ -92,8 +90,7 @@ Places: TypeAlias = tuple[Place, ...]
 """One for each step of a body."""
 
 
-@frozen
-class Located:
+class Located(Struct, frozen=True):
     """The n messages that fit the layout, and where their steps lie."""
 
     rows: Int64s
@@ -137,8 +134,7 @@ _FAR = 1 << 28
 """Bytes from the first to the last value from which on taking, which reserves half as many, could be refused."""
 
 
-@frozen
-class Cells:
+class Cells(Struct, frozen=True):
     """`count` pieces of one size: the first begins at `begin` in `data`, each other `stride` bytes further."""
 
     data: Bytes

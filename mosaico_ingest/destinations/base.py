@@ -9,10 +9,10 @@ from typing import Any, Protocol
 
 import pyarrow as pa
 import pyarrow.compute as pc
+from msgspec import Struct
 
 from mosaico_ingest import protocol
 from mosaico_ingest.errors import SequenceExists, SinkError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.model import IfExists
 from mosaico_ingest.ontology.types import OntologyType
 
@@ -35,8 +35,7 @@ ENVELOPE = pa.field("timestamp_ns", pa.int64(), nullable=False)
 """The first column of every batch: when the message was recorded, ns since the epoch."""
 
 
-@frozen
-class StoredTopic:
+class StoredTopic(Struct, frozen=True):
     """What the destination says it holds of one topic of this session after the commit."""
 
     topic: str

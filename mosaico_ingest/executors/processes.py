@@ -16,12 +16,12 @@ from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 import pyarrow as pa
+from msgspec import Struct
 
 from mosaico_ingest.adapters.python import register_default_adapter, registered_adapters
 from mosaico_ingest.destinations.store.open_stores import Hold, held_catalogs
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.batch import Batch
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.interrupts import Stop, counted_interrupts
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.model import Stores
@@ -39,8 +39,7 @@ __all__ = [
 ]
 
 
-@frozen
-class Registrations:
+class Registrations(Struct, frozen=True):
     """The types and adapters a program has registered, which a new process does not know of."""
 
     types: Mapping[Stores | None, Mapping[str, Registered]]
@@ -105,8 +104,7 @@ _POLL_S = 0.2
 _LEAST_BYTES = 32 << 20
 
 
-@frozen
-class Processes:
+class Processes(Struct, frozen=True):
     """The executor for one machine: at most `jobs` recordings at a time, each in a process of its own.
 
     A process that dies takes only its recording with it, which is begun anew up to `attempts` times. The jobs' memory

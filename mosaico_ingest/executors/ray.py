@@ -13,12 +13,13 @@ from os.path import relpath
 from pathlib import Path
 from typing import Any
 
+from msgspec import Struct
+
 from mosaico_ingest.destinations.store.errors import explained
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.batch import Batch
 from mosaico_ingest.executors.processes import ATTEMPTS, Registrations
 from mosaico_ingest.executors.shipment import absolute, pack
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.interrupts import counted_interrupts
 from mosaico_ingest.job.config import ROSInjectionConfig, StoreTarget
 from mosaico_ingest.pipeline.plan import DEFAULT_MEMORY_BYTES
@@ -60,8 +61,7 @@ _PACKAGE = str(Path(__file__).parents[1])
 _NODE_ERRORS = (ray_errors.NodeDiedError, ray_errors.ObjectLostError)
 
 
-@frozen
-class Ray:
+class Ray(Struct, frozen=True):
     """The executor for a cluster: connects to the one at `address`, or starts Ray on this machine.
 
     A worker that dies takes only its recording with it, which is begun anew up to `attempts` times; one whose node went

@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 
 import pyarrow as pa
 import ray
+from msgspec import Struct
 
 from mosaico_ingest.errors import (
     BagError,
@@ -22,7 +23,6 @@ from mosaico_ingest.errors import (
     SinkError,
 )
 from mosaico_ingest.executors.processes import Registrations
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.interrupts import Stop
 from mosaico_ingest.job.config import ROSInjectionConfig, StoreTarget
 from mosaico_ingest.pipeline.run import failed_report, run_config
@@ -37,8 +37,7 @@ Notice: TypeAlias = tuple[int, int, Event | logging.LogRecord]
 _SEND_EVERY_S = 0.2
 
 
-@frozen
-class Setting:
+class Setting(Struct, frozen=True):
     """What all tasks of a run have in common."""
 
     registrations: Registrations

@@ -10,8 +10,9 @@ from dataclasses import replace
 from os.path import abspath
 from pathlib import Path
 
+from msgspec import Struct
+
 from mosaico_ingest.adapters.builtin import BY_NAME
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.config import ROSInjectionConfig, StoreTarget
 from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.rosbag.definitions.registry import definition_files
@@ -50,8 +51,7 @@ def pack(configs: Iterable[ROSInjectionConfig], folder: Path) -> list[ROSInjecti
     return [box.add(config) for config in configs]
 
 
-@frozen
-class _Box:
+class _Box(Struct, frozen=True):
     folder: Path
 
     def add(self, config: ROSInjectionConfig) -> ROSInjectionConfig:

@@ -11,6 +11,7 @@ from pathlib import Path, PurePath
 from typing import Any, cast
 
 import pyarrow as pa
+from msgspec import Struct
 from pydantic import BaseModel, ConfigDict
 
 from mosaico_ingest.adapters.adapter import ROS_METADATA_KEY, Adapter, AdapterSpec, Envelope, UnmodeledSpec
@@ -21,7 +22,6 @@ from mosaico_ingest.adapters.mapping.columns import struct_of
 from mosaico_ingest.destinations.store import SequenceInfo, Store, TopicInfo
 from mosaico_ingest.errors import AdapterError, BagError, NothingMatched
 from mosaico_ingest.findings import offered
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.model import Stores
 from mosaico_ingest.job.patterns import select
 from mosaico_ingest.rosbag.blocks import Encoding
@@ -96,8 +96,7 @@ _TIME_1 = re.compile(r"^(?:time|duration)(?:\[\d*\])?\s", re.MULTILINE)
 _TIME_2 = re.compile(r"^builtin_interfaces/(?:Time|Duration)(?:\[[<=\d]*\])?\s", re.MULTILINE)
 
 
-@frozen
-class Origin:
+class Origin(Struct, frozen=True):
     """The messages a topic was made of."""
 
     msgtype: str

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import count, product
 from os.path import normpath, relpath
 from pathlib import Path as File
 
+from msgspec import Struct
+from msgspec.structs import replace
+
 from mosaico_ingest.findings import Finding, Severity, Span
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.yaml_source import (
     KeyPath,
     Scalar,
@@ -44,8 +46,7 @@ _WIDTH = re.compile(r"0?[0-9]")
 _BRACED = re.compile(r"\{([^{}]*)\}")
 
 
-@frozen
-class Placeholder:
+class Placeholder(Struct, frozen=True):
     """`{index:03}` at `start:end` of a name."""
 
     start: int
@@ -142,8 +143,7 @@ def _filled(source: Source, known: _Variables) -> Filled:
     return filled
 
 
-@frozen
-class _Variables:
+class _Variables(Struct, frozen=True):
     """The values of variables; of several sources the first that has one wins."""
 
     cell: Mapping[str, str]

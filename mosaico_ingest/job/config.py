@@ -8,9 +8,10 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, TypeVar, get_args
 
+from msgspec import Struct
+
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.findings import Span
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.model import (
     IfExists,
     LoaderErrorPolicy,
@@ -62,8 +63,7 @@ _MAPPINGS = (
 _Choice = TypeVar("_Choice", bound=Enum)
 
 
-@frozen
-class TimeBound:
+class TimeBound(Struct, frozen=True):
     """A moment: ns since the epoch, or ns from the recording's first message (negative: back from its last)."""
 
     ns: int
@@ -76,24 +76,21 @@ class TimeBound:
         return (end_ns if self.ns < 0 else start_ns) + self.ns
 
 
-@frozen
-class TimeRange:
+class TimeRange(Struct, frozen=True):
     """Part of a recording: `start` is in, `end` is out; None is its own start or end."""
 
     start: TimeBound | None = None
     end: TimeBound | None = None
 
 
-@frozen
-class Limit:
+class Limit(Struct, frozen=True):
     """At most so many messages, or at most this share of them, from 0 to 1; one of the two is None."""
 
     count: int | None = None
     share: float | None = None
 
 
-@frozen
-class QuarantineSettings:
+class QuarantineSettings(Struct, frozen=True):
     """Where rejected messages are kept and how many: of one topic, and of all together (None: all of them)."""
 
     path: Path = Path("quarantine")
@@ -103,14 +100,13 @@ class QuarantineSettings:
     """So many failures from the very start of a topic end it."""
 
 
-@frozen
-class StoreTarget:
+class StoreTarget(Struct, frozen=True):
     """The embedded store in a directory, or behind a URL."""
 
     path: AnyPath
 
 
-@frozen
+@dataclass(frozen=True, slots=True)
 class ServerTarget:
     """A Mosaico server."""
 
@@ -121,8 +117,7 @@ class ServerTarget:
     tls: bool = False
 
 
-@frozen
-class Attempt:
+class Attempt(Struct, frozen=True):
     """Which try of which run this is: a later one takes back what an earlier one committed before it died."""
 
     run: str

@@ -8,8 +8,9 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path as File
 from typing import TypeAlias
 
+from msgspec import Struct
+
 from mosaico_ingest.findings import Finding
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.compose import EXTENDS_KEY, combinations
 from mosaico_ingest.job.manifest import (
     check_manifest,
@@ -105,8 +106,7 @@ def _number(value: float) -> str:
     return {float("inf"): ".inf", float("-inf"): "-.inf"}.get(value, f"{mantissa}{exponent}{power}")
 
 
-@frozen
-class Expanded:
+class Expanded(Struct, frozen=True):
     """One job, as a document that extends nothing and has no matrix."""
 
     source: Source

@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from msgspec import Struct, field
+from msgspec.structs import replace
 from pydantic import ValidationError
 
 from mosaico_ingest.errors import IngestError, ManifestError
 from mosaico_ingest.findings import Finding, Severity, Span
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.compose import Filled, combinations, extended, fill_in, fill_in_cell
 from mosaico_ingest.job.reference import job_schema
 from mosaico_ingest.job.sections import Manifest
@@ -42,8 +42,7 @@ __all__ = [
 ]
 
 
-@frozen
-class LoadedManifest:
+class LoadedManifest(Struct, frozen=True):
     """A manifest that holds together, with the place of everything in it."""
 
     manifest: Manifest

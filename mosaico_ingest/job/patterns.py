@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 
-from mosaico_ingest.frozen import frozen
+from msgspec import Struct
 
 __all__ = ["Selection", "first_match", "select"]
 
 
-@frozen
-class Selection:
+class Selection(Struct, frozen=True):
     """The topics that are in, and for every topic the position of the pattern that decided (None: the default)."""
 
     selected: tuple[str, ...]

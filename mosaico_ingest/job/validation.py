@@ -8,6 +8,7 @@ from contextlib import suppress
 from difflib import get_close_matches
 from typing import Any
 
+from msgspec import Struct
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
@@ -17,7 +18,6 @@ from mosaico_ingest.findings import (
     Severity,
     Span,
 )
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.yaml_source import (
     KeyPath,
     Source,
@@ -43,8 +43,7 @@ _BRACED = re.compile(r"\{\w+\}")
 _PLAIN = re.compile(r"[^\s\"'\\#&*!|>@`%\[\],]+")
 
 
-@frozen
-class _Problem:
+class _Problem(Struct, frozen=True):
     error: ErrorDetails
     path: KeyPath
     value: Value

@@ -7,7 +7,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
+import msgspec
 import yaml
+from msgspec import Struct
 
 from mosaico_ingest.findings import (
     Edit,
@@ -15,7 +17,6 @@ from mosaico_ingest.findings import (
     Severity,
     Span,
 )
-from mosaico_ingest.frozen import frozen
 
 __all__ = [
     "MAX_CHARACTERS",
@@ -56,8 +57,7 @@ _OTHER_NUMBER = re.compile(
 )
 
 
-@frozen
-class Trap:
+class Trap(Struct, frozen=True):
     """A scalar that YAML readers understand differently."""
 
     rule: str
@@ -411,8 +411,7 @@ _REMEDIES = (
 _UNPRINTABLE = re.compile(r"[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
-@frozen
-class Source:
+class Source(Struct, frozen=True):
     """A YAML document: its value, the place of everything in it, and what is wrong with its writing.
 
     Paths are tuples of keys and list positions; `()` is the whole document.
@@ -423,9 +422,9 @@ class Source:
     value: Value
     """Plain values, also where there are findings, so that a second look can find the rest."""
     findings: tuple[Finding, ...] = ()
-    spans: dict[KeyPath, Span] = field(default_factory=dict[KeyPath, Span])
-    key_spans: dict[KeyPath, Span] = field(default_factory=dict[KeyPath, Span])
-    others: dict[str, str] = field(default_factory=dict[str, str])
+    spans: dict[KeyPath, Span] = msgspec.field(default_factory=dict[KeyPath, Span])
+    key_spans: dict[KeyPath, Span] = msgspec.field(default_factory=dict[KeyPath, Span])
+    others: dict[str, str] = msgspec.field(default_factory=dict[str, str])
     """The texts of the other files that places are in, by their names."""
 
     def span(self, path: KeyPath) -> Span:

@@ -5,18 +5,20 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum
 from functools import cache, partial
 from itertools import takewhile
 from pathlib import Path
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from mosaico_ingest.adapters.bridge import KnownAdapters
 from mosaico_ingest.adapters.direct import KnownTypes
 from mosaico_ingest.adapters.mapping.loader import MappingSpec, load_adapter
 from mosaico_ingest.errors import AdapterError, BagError, ManifestError
 from mosaico_ingest.findings import Edit, Finding, Severity, Span
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.compose import EXTENDS_KEY as EXTENDS
 from mosaico_ingest.job.compose import bases_of, extended
 from mosaico_ingest.job.manifest import read_text
@@ -145,8 +147,7 @@ class Kind(str, Enum):
     MESSAGE = "message"
 
 
-@frozen
-class Document:
+class Document(Struct, frozen=True):
     """A text to judge."""
 
     file: str
@@ -244,8 +245,7 @@ _OF_WHOLE = frozenset({"missing-key", "unset-variable"})
 _EXIT_CODES = {Severity.INFO: 10, Severity.WARNING: 11, Severity.ERROR: 12}
 
 
-@frozen
-class Judged:
+class Judged(Struct, frozen=True):
     """A file with what was found in it."""
 
     file: str
@@ -257,8 +257,7 @@ class Judged:
     """The files it extends."""
 
 
-@frozen
-class LintReport:
+class LintReport(Struct, frozen=True):
     """Every file that was judged, in the order of their paths."""
 
     files: tuple[Judged, ...]

@@ -12,11 +12,11 @@ from functools import reduce
 from importlib.machinery import PathFinder
 from pathlib import Path
 
+from msgspec import Struct
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from mosaico_ingest.findings import Finding, Span
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.compose import fill_in
 from mosaico_ingest.job.manifest import check_manifest
 from mosaico_ingest.job.sections import Manifest
@@ -148,8 +148,7 @@ def keys_below(value: Value, path: KeyPath) -> Iterator[KeyPath]:
             yield from keys_below(inner, (*path, i))
 
 
-@frozen
-class PythonReference:
+class PythonReference(Struct, frozen=True):
     """`module:Class` or `file.py:Class`."""
 
     module: str
@@ -241,8 +240,7 @@ _MISSING = "missing"
 """Stands for a text that must be there and is not, so that the rest can be judged."""
 
 
-@frozen
-class Job:
+class Job(Struct, frozen=True):
     """A manifest; what the model refuses is left out of it, and reported by itself."""
 
     manifest: Manifest

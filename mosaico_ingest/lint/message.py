@@ -7,8 +7,9 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+from msgspec import Struct
+
 from mosaico_ingest.findings import Span
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.model import Stores
 from mosaico_ingest.rosbag.definitions.distros import distro_type
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
@@ -51,8 +52,7 @@ _DECLARATION = re.compile(
 )
 
 
-@frozen
-class Declaration:
+class Declaration(Struct, frozen=True):
     """One line: a field or a constant."""
 
     type: str
@@ -63,8 +63,7 @@ class Declaration:
     name_span: Span
 
 
-@frozen
-class MessageFile:
+class MessageFile(Struct, frozen=True):
     """A definition text."""
 
     file: str

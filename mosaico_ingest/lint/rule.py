@@ -5,21 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from textwrap import dedent
 
+from msgspec import Struct
+
 from mosaico_ingest.findings import (
     Edit,
     Finding,
     Severity,
     Span,
 )
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.message import MessageFile
 
 __all__ = ["Problem", "Rule"]
 
 
-@frozen
-class Problem:
+class Problem(Struct, frozen=True):
     """What a rule found; the engine adds the rule's name and severity."""
 
     message: str
@@ -28,8 +28,7 @@ class Problem:
     fix: Edit | None = None
 
 
-@frozen
-class Rule:
+class Rule(Struct, frozen=True):
     """A rule; without a check of its own it names what is found while the text is read."""
 
     code: str

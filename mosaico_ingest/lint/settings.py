@@ -8,11 +8,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
+from msgspec import Struct
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import Finding, Severity, Span
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.manifest import read_text
 from mosaico_ingest.job.validation import explain, nearest
 from mosaico_ingest.job.yaml_source import Source, Value, load_source
@@ -44,8 +44,7 @@ class _File(BaseModel):
     lint: _Lint = _Lint()
 
 
-@frozen
-class Settings:
+class Settings(Struct, frozen=True):
     """How much each rule matters here, and which files are left alone."""
 
     severities: tuple[tuple[str, Severity | None], ...] = ()

@@ -18,12 +18,12 @@ from functools import cache
 from typing import Annotated, Any, ClassVar, Literal, Union, cast, get_args, get_origin
 
 import pyarrow as pa
+from msgspec import Struct
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError
 from pydantic_core import CoreSchema, core_schema
 from typing_extensions import Self
 
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.registry import DEFINED, MODULES
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 
@@ -58,13 +58,11 @@ Float32 = Annotated[float, pa.float32()]
 Float64 = Annotated[float, pa.float64()]
 
 
-@frozen
-class Nullable:
+class Nullable(Struct, frozen=True):
     """Marks a column that may hold nulls although the model wants a value."""
 
 
-@frozen
-class FixedSize:
+class FixedSize(Struct, frozen=True):
     """Marks a list of exactly `length` values."""
 
     length: int
@@ -99,8 +97,7 @@ def struct_of(model: type[BaseModel]) -> pa.StructType:
     return _struct(model, ())
 
 
-@frozen
-class _Column:
+class _Column(Struct, frozen=True):
     """An annotation taken apart: the bare type and what was said about it."""
 
     bare: Any

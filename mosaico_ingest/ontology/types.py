@@ -11,9 +11,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.types as pt
+from msgspec import Struct
 
 from mosaico_ingest.caching import remembered
-from mosaico_ingest.frozen import frozen
 
 __all__ = [
     "AbsentRows",
@@ -39,8 +39,7 @@ class SerializationFormat(str, Enum):
     IMAGE = "image"
 
 
-@frozen
-class OntologyType:
+class OntologyType(Struct, frozen=True):
     """What a topic's rows are; `struct` has every column but `timestamp_ns`."""
 
     tag: str

@@ -12,8 +12,9 @@ from glob import has_magic
 from pathlib import Path
 from typing import Any, cast
 
+from msgspec import Struct
+
 from mosaico_ingest.errors import ManifestError, NothingMatched
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.compose import PLACEHOLDERS, Placeholder, placeholders_in
 from mosaico_ingest.job.config import (
     Limit,
@@ -45,8 +46,7 @@ __all__ = [
 _REFUSED = re.compile(r"[^A-Za-z0-9_-]+")
 
 
-@frozen
-class Recording:
+class Recording(Struct, frozen=True):
     """One recording: its parts, and its position (from 1) among those of the job."""
 
     paths: tuple[AnyPath, ...]

@@ -9,6 +9,7 @@ from os.path import relpath
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
+from msgspec import Struct
 from pydantic import Field, JsonValue, ValidationError
 
 from mosaico_ingest.adapters.adapter import ROS_METADATA_KEY, AdapterSpec
@@ -17,7 +18,6 @@ from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.documents import Part, schema_of
 from mosaico_ingest.errors import IngestError, ManifestError
 from mosaico_ingest.findings import Finding, Severity, Span, Stage
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.config import (
     Attempt,
     Limit,
@@ -66,8 +66,7 @@ __all__ = [
 DEFAULT_MEMORY_BYTES = 256 * 1024 * 1024
 
 
-@frozen
-class TopicPlan:
+class TopicPlan(Struct, frozen=True):
     """One stream: the channels it is made of, what it becomes, and why."""
 
     topic: str
@@ -90,8 +89,7 @@ class TopicPlan:
     """Where each of its definitions was found, and the digest of its text, as `bag 1f0c9a22b7e4d8a3`."""
 
 
-@frozen
-class LeftOut:
+class LeftOut(Struct, frozen=True):
     """A topic of the recording that will not be read, and why."""
 
     topic: str
@@ -104,8 +102,7 @@ class LeftOut:
     """Nobody asked for that: its messages cannot be read for want of their definition."""
 
 
-@frozen
-class Plan:
+class Plan(Struct, frozen=True):
     """What will be done with one recording."""
 
     files: tuple[AnyPath, ...]
@@ -461,8 +458,7 @@ _NAMES = {"topics": ("topic", "target"), "left_out": ("left out", "topic"), "fil
 """How an item of a list is called, and the key that tells it from the others."""
 
 
-@frozen
-class Difference:
+class Difference(Struct, frozen=True):
     """One thing that is not the same; what is not there on one side is None."""
 
     sequence: str

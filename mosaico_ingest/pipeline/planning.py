@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
 from difflib import get_close_matches, unified_diff
 from typing import Any, TypeVar, cast
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from mosaico_ingest.adapters.adapter import ROS_METADATA_KEY, ros_metadata
 from mosaico_ingest.adapters.bridge import ROSBridge
@@ -19,7 +21,6 @@ from mosaico_ingest.findings import (
     encodable,
     offered,
 )
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.config import (
     DEFAULT_TOPIC,
     LEDGER_KEY,
@@ -173,8 +174,7 @@ def _not_selected(config: ROSInjectionConfig, channel: Channel, selection: Selec
     return _left_out(channel, why, config.places.get(("topics", position)))
 
 
-@frozen
-class _Known:
+class _Known(Struct, frozen=True):
     """A definition that a sequence of the family has for a topic."""
 
     sequence: str

@@ -6,16 +6,18 @@ import os
 import shutil
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from os.path import relpath
 from pathlib import Path
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from mosaico_ingest.adapters.bridge import ROSBridge
 from mosaico_ingest.destinations.base import MemorySink, Session, StoredTopic, check_same_type
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import IngestError, SinkError, Unreachable
 from mosaico_ingest.findings import Finding, Severity
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.config import ROSInjectionConfig, ServerTarget
 from mosaico_ingest.job.model import IfExists, LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.job.patterns import first_match
@@ -207,8 +209,7 @@ class _Tally:
             )
 
 
-@frozen
-class _Trial:
+class _Trial(Struct, frozen=True):
     stream: Stream
     tally: _Tally
 

@@ -16,11 +16,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, TextIO
 
+from msgspec import Struct
 from typing_extensions import Self
 
 from mosaico_ingest.errors import BagError, NothingMatched, SinkError
 from mosaico_ingest.findings import RowFailure, Stage
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.config import Limit, QuarantineSettings
 from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
 from mosaico_ingest.rosbag.definitions.model import Definition, Source, short_msgtype
@@ -145,8 +145,7 @@ def _schema_name(channel: Channel, known: Definition | None) -> str:
     return short_msgtype(name) if channel.encoding is Encoding.ROS1 else name
 
 
-@frozen
-class Kept:
+class Kept(Struct, frozen=True):
     """The messages one run kept, and the sequence they belong to."""
 
     messages: Path

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from msgspec import Struct
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from mosaico_ingest.adapters.adapter import Adapted, Adapter, Envelope
@@ -22,7 +24,6 @@ from mosaico_ingest.errors import (
     SinkError,
 )
 from mosaico_ingest.findings import RowFailure, Stage
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.model import LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.ontology.types import OntologyType, RequiredFields
 from mosaico_ingest.pipeline.plan import TopicPlan
@@ -41,16 +42,14 @@ from mosaico_ingest.rosbag.definitions.linking import ros_shape
 __all__ = ["Stream"]
 
 
-@frozen
-class _Lost:
+class _Lost(Struct, frozen=True):
     """A message that did not go through, at its position in the raw batch."""
 
     stage: Stage
     failure: RowFailure
 
 
-@frozen
-class _Translated:
+class _Translated(Struct, frozen=True):
     """What became of a raw batch: rows, where they were in it, what was lost, what was sampled away."""
 
     rows: pa.StructArray

@@ -7,6 +7,7 @@ from enum import Enum
 from types import MappingProxyType
 from typing import Any, Generic, Protocol, TypeVar
 
+from msgspec import Struct
 from pydantic import (
     BaseModel,
     ConfigDict,
@@ -16,7 +17,6 @@ from pydantic import (
     model_serializer,
 )
 
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import SerializationFormat
 
 __all__ = [
@@ -427,8 +427,7 @@ class Permission(str, Enum):
         return order.index(self) >= order.index(needed)
 
 
-@frozen
-class Action(Generic[Question, Answer]):
+class Action(Struct, Generic[Question, Answer], frozen=True):
     """A call: what is asked, what is answered (`Empty`: nothing)."""
 
     name: str

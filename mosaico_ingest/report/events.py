@@ -6,8 +6,9 @@ from collections.abc import Callable, Mapping
 from enum import Enum
 from typing import TypeAlias
 
+from msgspec import Struct
+
 from mosaico_ingest.findings import Finding, Stage
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.report.timing import Step, TimelineReport
 
 __all__ = [
@@ -57,8 +58,7 @@ class TopicStatus(str, Enum):
     """Not selected, or nothing here can read it."""
 
 
-@frozen
-class Expected:
+class Expected(Struct, frozen=True):
     """A topic of the plan, as the display and the report need it."""
 
     topic: str
@@ -72,8 +72,7 @@ class Expected:
     left_out: bool = False
 
 
-@frozen
-class RunStarted:
+class RunStarted(Struct, frozen=True):
     """The plan stands and the work begins."""
 
     sequence: str
@@ -83,8 +82,7 @@ class RunStarted:
     topics: tuple[Expected, ...]
 
 
-@frozen
-class TopicProgress:
+class TopicProgress(Struct, frozen=True):
     """More messages of one stream went through; every number is an increment."""
 
     target: str
@@ -97,8 +95,7 @@ class TopicProgress:
     end_ns: int | None = None
 
 
-@frozen
-class Rejected:
+class Rejected(Struct, frozen=True):
     """Messages of one stream that could not go on for one reason; `first_*` is about the first of them."""
 
     target: str
@@ -112,8 +109,7 @@ class Rejected:
     """How many of them lie in the quarantine."""
 
 
-@frozen
-class Unreadable:
+class Unreadable(Struct, frozen=True):
     """A stretch of the recording that could not be read."""
 
     target: str | None
@@ -123,23 +119,20 @@ class Unreadable:
     reason: str
 
 
-@frozen
-class Noted:
+class Noted(Struct, frozen=True):
     """A finding about the recording that does not stop the run."""
 
     finding: Finding
 
 
-@frozen
-class Quarantined:
+class Quarantined(Struct, frozen=True):
     """Rejected messages lie in a file, from which they can be replayed."""
 
     messages: str
     """Its path."""
 
 
-@frozen
-class TopicClosed:
+class TopicClosed(Struct, frozen=True):
     """A stream came to its end."""
 
     target: str
@@ -150,15 +143,13 @@ class TopicClosed:
     checksum: str | None = None
 
 
-@frozen
-class Timed:
+class Timed(Struct, frozen=True):
     """What the recording's time was spent on, in seconds."""
 
     seconds: Mapping[Step, float]
 
 
-@frozen
-class RunFinished:
+class RunFinished(Struct, frozen=True):
     """The recording is done with, one way or another."""
 
     status: RunStatus

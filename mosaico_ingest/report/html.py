@@ -10,7 +10,8 @@ from importlib.resources import files
 from itertools import islice
 from pathlib import Path
 
-from mosaico_ingest.frozen import frozen
+from msgspec import Struct
+
 from mosaico_ingest.report.collect import (
     STEP_WORDS,
     longest_step,
@@ -106,8 +107,7 @@ _FEW = 4.0
 _LEAST_STRETCHES = 8
 
 
-@frozen
-class Gap:
+class Gap(Struct, frozen=True):
     """A time without rows in the middle of a topic, ns since the epoch."""
 
     start_ns: int

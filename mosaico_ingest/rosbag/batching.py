@@ -13,8 +13,8 @@ from types import TracebackType
 from typing import Generic, TypeVar
 
 import numpy as np
+from msgspec import Struct
 
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.rosbag.blocks import EARLIEST_NS, LATEST_NS, Block, Channel, RawBatch, Slab, in_time, pack
 
 __all__ = [
@@ -29,8 +29,7 @@ T = TypeVar("T")
 _LOOK_SECONDS = 0.1
 
 
-@frozen
-class _End:
+class _End(Struct, frozen=True):
     error: BaseException | None
 
 
@@ -87,8 +86,7 @@ class Prefetched(Generic[T]):
         return False
 
 
-@frozen
-class Turn:
+class Turn(Struct, frozen=True):
     """One block, the part it is of, and the time no later block goes behind."""
 
     part: int

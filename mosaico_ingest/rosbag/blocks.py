@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
+from msgspec import Struct, field
+from msgspec.structs import force_setattr
 from numpy.typing import NDArray
 
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
 
@@ -51,8 +52,7 @@ What is done once a block is done less often with larger ones; the first is smal
 T = TypeVar("T")
 
 
-@frozen
-class Stream:
+class Stream(Struct, frozen=True):
     """One connection as its file describes it."""
 
     key: int
@@ -69,8 +69,7 @@ class Stream:
     attributes: dict[str, str] = field(default_factory=dict[str, str])
 
 
-@frozen
-class Slab:
+class Slab(Struct, frozen=True):
     """n messages inside one buffer, of one stream; every start and length has been checked against the buffer."""
 
     key: int
@@ -79,11 +78,11 @@ class Slab:
     starts: NDArray[np.int64]
     lengths: NDArray[np.int64]
     offsets: NDArray[np.int64]
-    payload_bytes: int = field(init=False)
+    payload_bytes: int = -1
     """The sum of the lengths, which is asked for often."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "payload_bytes", int(self.lengths.sum()))
+        force_setattr(self, "payload_bytes", int(self.lengths.sum()))
 
     def __len__(self) -> int:
         """Return the number of messages."""
@@ -101,8 +100,7 @@ class Slab:
         )
 
 
-@frozen
-class Hole:
+class Hole(Struct, frozen=True):
     """What could not be read of one file: `bag.batch.Loss` before streams have become channels."""
 
     offset: int
@@ -120,16 +118,14 @@ def orphans(counts: Mapping[int, int] | None, known: Collection[int]) -> list[Ho
     ]
 
 
-@frozen
-class Loaded:
+class Loaded(Struct, frozen=True):
     """What one block gave."""
 
     slabs: list[Slab]
     holes: list[Hole]
 
 
-@frozen
-class Block:
+class Block(Struct, frozen=True):
     """A piece of a file that is read at once; none of its messages is older than `start_ns`."""
 
     start_ns: int
@@ -162,8 +158,7 @@ def in_groups(
         yield group
 
 
-@frozen
-class Want:
+class Want(Struct, frozen=True):
     """Which messages to read: streams by key, and times from `start_ns` up to, not including, `end_ns`."""
 
     keys: Collection[int]
@@ -346,8 +341,7 @@ class Encoding(str, Enum):
     """Not a ROS encoding (protobuf, json, …): named, never decoded."""
 
 
-@frozen
-class Channel:
+class Channel(Struct, frozen=True):
     """Messages of one type on one topic, written the same way; a topic may have several."""
 
     id: int
@@ -366,8 +360,7 @@ class Channel:
     """What else the recording says: QoS profiles, caller id, md5, raw encoding name."""
 
 
-@frozen
-class RawBatch:
+class RawBatch(Struct, frozen=True):
     """n messages of one channel in log-time order, their payloads inside one buffer."""
 
     channel: Channel
@@ -403,8 +396,7 @@ class RawBatch:
         return self.data[start : start + int(self.lengths[row])].tobytes()
 
 
-@frozen
-class Loss:
+class Loss(Struct, frozen=True):
     """Something of a recording that could not be read, and why."""
 
     file: str
@@ -418,8 +410,7 @@ class Loss:
     """How many messages were lost; None where that is unknown, 0 where all could be had another way."""
 
 
-@frozen
-class ROSHeader:
+class ROSHeader(Struct, frozen=True):
     """The `std_msgs/Header` of a message."""
 
     stamp_ns: int

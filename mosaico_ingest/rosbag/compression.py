@@ -12,10 +12,10 @@ import lz4.frame
 import numpy as np
 import pyarrow as pa
 import zstandard
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.rosbag.blocks import Hole, Slab, stretches
 from mosaico_ingest.rosbag.formats import ZSTD
 
@@ -85,8 +85,7 @@ def inflate(data: bytes | memoryview, compression: str, size: int) -> bytes | me
     return whole
 
 
-@frozen
-class Packed:
+class Packed(Struct, frozen=True):
     """Where a chunk's data lie in what was read, and what the chunk says of them."""
 
     begin: int
@@ -95,8 +94,7 @@ class Packed:
     size: int
 
 
-@frozen
-class Inflated:
+class Inflated(Struct, frozen=True):
     """One buffer with what is in some chunks, where in it each begins and ends, and which are damaged."""
 
     data: Bytes

@@ -7,9 +7,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from msgspec import Struct
+
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.findings import Finding, Severity
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.rosbag.opening import is_recording
 from mosaico_ingest.textfile import read_whole
@@ -27,8 +28,7 @@ FILE_NAME = "metadata.yaml"
 _LIMIT_BYTES = 16 << 20
 
 
-@frozen
-class TopicHint:
+class TopicHint(Struct, frozen=True):
     """What the metadata say of a topic."""
 
     topic: str
@@ -39,8 +39,7 @@ class TopicHint:
     """As the storage spells it; empty where this version of the metadata has another form."""
 
 
-@frozen
-class Metadata:
+class Metadata(Struct, frozen=True):
     """The parts of `metadata.yaml` that can be compared with the storage."""
 
     path: AnyPath
@@ -101,8 +100,7 @@ _SUFFIX = ".zstd"
 _NAMED = (".bag", ".db3", ".mcap")
 
 
-@frozen
-class Found:
+class Found(Struct, frozen=True):
     """The files of one recording, the metadata that describe all of them, and what is odd about either."""
 
     files: tuple[AnyPath, ...]

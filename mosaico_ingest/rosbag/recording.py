@@ -7,17 +7,18 @@ import weakref
 from collections import defaultdict
 from collections.abc import Collection, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from types import TracebackType
 
 import pyarrow as pa
+from msgspec import Struct
+from msgspec.structs import replace
 from typing_extensions import Self
 
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.findings import Finding, Severity
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote import AnyPath, RemotePath
 from mosaico_ingest.rosbag.batching import Gather, Prefetched, Turn, compact, in_turn
 from mosaico_ingest.rosbag.blocks import (
@@ -295,8 +296,7 @@ def _none_opened(failed: Sequence[BagError]) -> BagError:
     return BagError(what, where=first.where, hint=first.hint)
 
 
-@frozen
-class _Step:
+class _Step(Struct, frozen=True):
     """What one block gave, ready to be gathered."""
 
     part: int

@@ -7,9 +7,9 @@ import struct
 from collections.abc import Callable, Iterator
 
 import numpy as np
+from msgspec import Struct
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.rosbag.mcap import records as mcap_records
 from mosaico_ingest.rosbag.ros1 import records as ros1_records
 from mosaico_ingest.rosbag.source import Source, Window
@@ -23,8 +23,7 @@ _HEAD_BYTES = 256
 """More than the fixed part of any chunk record."""
 
 
-@frozen
-class _Ros1Kind:
+class _Ros1Kind(Struct, frozen=True):
     """How the records of a kind are recognised."""
 
     op: int

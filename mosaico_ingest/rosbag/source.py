@@ -13,8 +13,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Protocol
 
+from msgspec import Struct
+
 from mosaico_ingest.errors import BagError, Unreachable
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote import AnyPath, RemotePath, reaching
 from mosaico_ingest.rosbag.compression import room
 
@@ -280,8 +281,7 @@ _REQUESTS = 4
 """How many requests are under way at a time; with their answers they hold at most 32 MiB."""
 
 
-@frozen
-class _Stretch:
+class _Stretch(Struct, frozen=True):
     start: int
     data: bytes
 

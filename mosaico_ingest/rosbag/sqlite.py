@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.rosbag.blocks import (
     EARLIEST_NS,
@@ -110,8 +110,7 @@ _EVENT = "_Event"
 _ROW_TYPES = [int, int, int, bytes]
 
 
-@frozen
-class _Done:
+class _Done(Struct, frozen=True):
     """How far reading by time has come: up to `time_ns`, and of that very time these rows."""
 
     time_ns: int
@@ -128,8 +127,7 @@ class _Done:
         return row[2] > self.time_ns or (row[2] == self.time_ns and row[0] not in self.rows)
 
 
-@frozen
-class _Columns:
+class _Columns(Struct, frozen=True):
     """What the tables of this file have; rosbag2 added columns and tables over the years."""
 
     topics: frozenset[str]

@@ -6,10 +6,11 @@ from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
 from typing import Any
 
+from msgspec import Struct
+
 from mosaico_ingest import protocol
 from mosaico_ingest.destinations.store.model import Note
 from mosaico_ingest.destinations.store.store import Store
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.protocol.messages import Action, Body
@@ -25,8 +26,7 @@ _PROTOCOL = messages.SemVer(major=0, minor=7, patch=0)
 _EMPTY = messages.Empty()
 
 
-@frozen
-class Backend:
+class Backend(Struct, frozen=True):
     """What answers are made from."""
 
     store: Store

@@ -19,11 +19,11 @@ from typing import Any, Final, Protocol, cast
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
+from msgspec import Struct
 
 from mosaico_ingest.destinations.store.errors import explained
 from mosaico_ingest.destinations.store.model import SegmentInfo, SequenceInfo, TopicInfo
 from mosaico_ingest.destinations.store.store import Store
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.serve.errors import Refusal
@@ -70,8 +70,7 @@ _COMPARISONS: Mapping[str, Callable[[Any, Any], Any]] = {
 }
 
 
-@frozen
-class Comparison:
+class Comparison(Struct, frozen=True):
     """`$eq $neq $lt $leq $gt $geq`: how a value stands to another."""
 
     operator: str
@@ -96,8 +95,7 @@ class Comparison:
         return _compared(self.operator, column, self.bound, kind)
 
 
-@frozen
-class Outside:
+class Outside(Struct, frozen=True):
     """`$outside [low, high]`: below or above."""
 
     low: float
@@ -116,8 +114,7 @@ class Outside:
         return _compared("$lt", column, self.low, kind) | _compared("$gt", column, self.high, kind)
 
 
-@frozen
-class Choice:
+class Choice(Struct, frozen=True):
     """`$in [a, b, …]`: one of them."""
 
     choices: tuple[str | float, ...]
@@ -136,8 +133,7 @@ class Choice:
         return reduce(operator.or_, equal)
 
 
-@frozen
-class Glob:
+class Glob(Struct, frozen=True):
     """`$match pattern`: a whole text, with `*`, `?`, `[…]`, and `#` for a digit."""
 
     pattern: str
@@ -159,8 +155,7 @@ class Glob:
         return f"(?s:{''.join(map(_spelled, _GLOB_WORDS.findall(self.pattern)))})"
 
 
-@frozen
-class Presence:
+class Presence(Struct, frozen=True):
     """`$ex`, `$nex`: whether there is a value."""
 
     wanted: bool

@@ -9,11 +9,11 @@ from types import TracebackType
 
 import pyarrow as pa
 import pyarrow.flight as fl
+from msgspec import Struct
 from typing_extensions import Self
 
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import SinkError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.protocol.messages import ACTIONS, JSON, Permission
@@ -139,8 +139,7 @@ _TIDY_S = 30.0
 _HEARD_WITHIN_S = 0.5
 
 
-@frozen
-class Tls:
+class Tls(Struct, frozen=True):
     """The PEM files of the certificate chain a server shows, and of its private key."""
 
     certificate: Path

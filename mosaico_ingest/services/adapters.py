@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from os.path import relpath
@@ -11,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+from msgspec import Struct
+from msgspec.structs import replace
 
 from mosaico_ingest.adapters.adapter import AdapterSpec
 from mosaico_ingest.adapters.bridge import ROSBridge, installed_adapters, load_adapter_reference
@@ -23,7 +24,6 @@ from mosaico_ingest.adapters.mapping.testing import Outcome, run_tests
 from mosaico_ingest.decode.decoder import decoder_for
 from mosaico_ingest.errors import AdapterError, BagError, DecodeError, NothingMatched
 from mosaico_ingest.findings import Finding
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.manifest import load_manifest
 from mosaico_ingest.pipeline.compile import compile_manifest
@@ -131,8 +131,7 @@ def _row(batch: RawBatch, row: int) -> pa.StructArray:
     return decoded.rows
 
 
-@frozen
-class Known:
+class Known(Struct, frozen=True):
     """An adapter that can be named."""
 
     name: str
@@ -144,8 +143,7 @@ class Known:
     summary: str
 
 
-@frozen
-class Explained:
+class Explained(Struct, frozen=True):
     """An adapter in words, and what is known of the type it was explained for."""
 
     description: Description
@@ -158,8 +156,7 @@ class Explained:
     """Adapters that take the type where they are named for a topic."""
 
 
-@frozen
-class TopicChoice:
+class TopicChoice(Struct, frozen=True):
     """Which adapter a topic gets, and why."""
 
     recording: str
@@ -171,8 +168,7 @@ class TopicChoice:
     why: str
 
 
-@frozen
-class TestResult:
+class TestResult(Struct, frozen=True):
     """What testing one adapter file showed."""
 
     name: str

@@ -10,10 +10,11 @@ from dataclasses import replace
 from enum import Enum
 from pathlib import Path
 
+from msgspec import Struct
+
 from mosaico_ingest.destinations.store.files import Lease
 from mosaico_ingest.errors import ManifestError, NothingMatched, SinkUnavailable
 from mosaico_ingest.findings import a_few, encodable
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.config import (
     QuarantineSettings,
     ROSInjectionConfig,
@@ -40,8 +41,7 @@ class Whereabouts(Enum):
     """The run that kept them is not part of the sequence: it was stopped, or what it made was replaced or removed."""
 
 
-@frozen
-class Replay:
+class Replay(Struct, frozen=True):
     """Kept messages, what the destination knows of them, and the configuration that brings them in."""
 
     kept: Kept

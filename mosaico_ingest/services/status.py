@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from enum import Enum
 
+from msgspec import Struct
+
 from mosaico_ingest.errors import IngestError, SequenceExists
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.model import IfExists
 from mosaico_ingest.pipeline.provenance import (
@@ -35,8 +36,7 @@ class Standing(str, Enum):
     """The recording cannot be opened, or the job does not fit it."""
 
 
-@frozen
-class RecordingStatus:
+class RecordingStatus(Struct, frozen=True):
     """One recording: what it becomes, how it stands, and why where that is not plain."""
 
     sequence: str

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import pickle
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.adapters.mapping.loader import load_adapter

@@ -2,11 +2,11 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
 import pytest
+from msgspec.structs import replace
 
 from mosaico_ingest.decode import decoder as columnar
 from mosaico_ingest.decode.decoder import ColumnarDecoder, Decoded, decoder_for

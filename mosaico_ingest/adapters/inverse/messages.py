@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
+from msgspec import Struct
 
 from mosaico_ingest.adapters.mapping.columns import (
     Array,
@@ -24,7 +25,6 @@ from mosaico_ingest.adapters.mapping.columns import (
     var_list,
 )
 from mosaico_ingest.adapters.mapping.types import is_list
-from mosaico_ingest.frozen import frozen
 
 __all__ = [
     "CLOUD_FUNCTIONS",
@@ -45,8 +45,7 @@ CLOUD_FUNCTIONS: Mapping[str, tuple[str, int]] = {
 """What a function reads from a cloud: numpy's name of it, and the number PointField has for it."""
 
 
-@frozen
-class CloudField:
+class CloudField(Struct, frozen=True):
     """A field of the points of every row."""
 
     name: str
@@ -131,8 +130,7 @@ _ONTOLOGY_NAMES = {
 """What the ontology calls the fields of a header and of a time."""
 
 
-@frozen
-class _Mark:
+class _Mark(Struct, frozen=True):
     """A value that a field, or one element of its list, must have had in some rows; used where the field itself is not known."""
 
     index: int | None

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
 import pyarrow as pa
+from msgspec import Struct
+from msgspec.structs import replace
 
 from mosaico_ingest.adapters.adapter import Adapter, Envelope, UnmodeledAdapter
 from mosaico_ingest.adapters.image import without_png
@@ -31,7 +32,6 @@ from mosaico_ingest.adapters.mapping.loader import MappingAdapter
 from mosaico_ingest.adapters.mapping.typed import FieldOf, Typed, Whole
 from mosaico_ingest.adapters.mapping.types import is_list
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.frozen import frozen
 
 __all__ = [
     "Inverse",
@@ -90,8 +90,7 @@ _IMAGE = "Image"
 """The one type whose rows `topic_settings` may have packed."""
 
 
-@frozen
-class Restored:
+class Restored(Struct, frozen=True):
     """A batch of messages, and how far they are what was stored."""
 
     rows: pa.StructArray
@@ -125,8 +124,7 @@ def invert(adapter: Adapter, shape: pa.StructType, metadata: Mapping[str, Any]) 
     raise AdapterError("an adapter written in Python has no way back")
 
 
-@frozen
-class _Kept:
+class _Kept(Struct, frozen=True):
     """Of messages that kept their shape: exact."""
 
     shape: pa.StructType
@@ -138,8 +136,7 @@ class _Kept:
         return Restored(struct_of(columns, self.shape, None, len(rows)))
 
 
-@frozen
-class _Mapped:
+class _Mapped(Struct, frozen=True):
     """Of messages that went through a mapping."""
 
     adapter: MappingAdapter

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from mosaico_ingest.adapters.inverse.messages import (
     CLOUD_FUNCTIONS,
@@ -51,7 +52,6 @@ from mosaico_ingest.adapters.mapping.typed import (
     Whole,
 )
 from mosaico_ingest.adapters.mapping.types import is_number
-from mosaico_ingest.frozen import frozen
 
 __all__ = [
     "ONE_ARGUMENT",
@@ -145,8 +145,7 @@ _MOVES = frozenset({"ros_time", "ros_header"})
 _OPERANDS = 2
 
 
-@frozen
-class _Scope:
+class _Scope(Struct, frozen=True):
     """Where names are looked up, and the lists that were opened on the way there."""
 
     place: Place = ()

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from mosaico_ingest.adapters.mapping.columns import DataType, arrays, pt
 from mosaico_ingest.adapters.mapping.conversion import demand, peel
@@ -54,7 +56,6 @@ from mosaico_ingest.adapters.mapping.types import (
     spell,
 )
 from mosaico_ingest.findings import Finding, Severity
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.rosbag.definitions.model import MessageType
 
 if TYPE_CHECKING:
@@ -88,8 +89,7 @@ Report = Callable[[str, str, Place, "str | None"], None]
 _UNKNOWN, _TYPE = "unknown-field", "type"
 
 
-@frozen
-class Scope:
+class Scope(Struct, frozen=True):
     """Where names are looked up: a message and the types it is made of."""
 
     kind: Kind
@@ -364,8 +364,7 @@ SPECIAL = {
 """What looks like a function and is not: fewest and most arguments, spelling."""
 
 
-@frozen
-class Slot:
+class Slot(Struct, frozen=True):
     """A column to be filled: what it must be, where the file says so, and where names are read."""
 
     name: str

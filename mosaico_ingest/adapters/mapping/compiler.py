@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from collections.abc import Set as AbstractSet
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from mosaico_ingest.adapters.adapter import Adapter, AdapterSpec, Envelope
 from mosaico_ingest.adapters.mapping.checker import Analyzer, Scope, Slot, constant, is_short_cast
@@ -44,7 +45,6 @@ from mosaico_ingest.adapters.mapping.types import (
     within,
 )
 from mosaico_ingest.errors import AdapterError, SinkError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import AbsentRows, OntologyType
 from mosaico_ingest.protocol import check_metadata
 from mosaico_ingest.rosbag.definitions.model import Definition
@@ -68,22 +68,19 @@ __all__ = [
 ]
 
 
-@frozen
-class Absent:
+class Absent(Struct, frozen=True):
     """Nothing: null in every row."""
 
     rows: AbsentRows
 
 
-@frozen
-class Computed:
+class Computed(Struct, frozen=True):
     """An expression."""
 
     typed: Typed
 
 
-@frozen
-class Looked:
+class Looked(Struct, frozen=True):
     """A value looked up in a table."""
 
     typed: Typed
@@ -95,8 +92,7 @@ class Looked:
     """For a value that is not there; None: the row is rejected."""
 
 
-@frozen
-class ByAdapter:
+class ByAdapter(Struct, frozen=True):
     """What another adapter makes of a nested message."""
 
     of: Typed
@@ -105,8 +101,7 @@ class ByAdapter:
     msgtype: str
 
 
-@frozen
-class ByFields:
+class ByFields(Struct, frozen=True):
     """A struct, field by field; with `of`, names are read inside it."""
 
     of: Typed | None
@@ -116,8 +111,7 @@ class ByFields:
 Source: TypeAlias = "Absent | Computed | Looked | ByAdapter | ByFields"
 
 
-@frozen
-class Filled:
+class Filled(Struct, frozen=True):
     """One column of the ontology and where it comes from."""
 
     path: str

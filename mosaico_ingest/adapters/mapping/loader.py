@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from contextvars import ContextVar
-from dataclasses import field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
+from msgspec import Struct
+from msgspec.structs import replace
 from pydantic import ValidationError
 
 from mosaico_ingest.adapters.adapter import Adapted, Envelope
@@ -20,7 +22,6 @@ from mosaico_ingest.adapters.mapping.typed import Typed
 from mosaico_ingest.adapters.mapping.types import Kind
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.findings import Finding, RowFailure, Severity
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.registry import UnknownTag, ontology_type
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.rosbag.definitions.model import Definition, MessageType, normalize_msgtype
@@ -40,8 +41,7 @@ _Known: TypeAlias = tuple[str, int, tuple[MessageType, ...]]
 """All of a definition that decides how a mapping is compiled."""
 
 
-@frozen
-class MappingAdapter:
+class MappingAdapter(Struct, frozen=True):
     """A mapping bound to one message definition; satisfies `Adapter`."""
 
     ontology: OntologyType
@@ -81,7 +81,7 @@ class MappingAdapter:
             return {}
 
 
-@frozen
+@dataclass(frozen=True, slots=True)
 class MappingSpec:
     """An adapter file that reads well; satisfies `AdapterSpec`, and survives pickling if its look-up does."""
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import ast
 import warnings
 from collections.abc import Callable
-from dataclasses import field
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
-from mosaico_ingest.frozen import frozen
+from msgspec import Struct
 
 __all__ = [
     "Attribute",
@@ -16,6 +15,7 @@ __all__ = [
     "Choice",
     "Each",
     "ExpressionError",
+    "ExpressionNode",
     "Item",
     "ListOf",
     "Literal",
@@ -35,6 +35,10 @@ Place: TypeAlias = tuple[int, int]
 """First character and one past the last, within the expression's text."""
 
 
+_NOT_COMPARED = frozenset({"at", "name_at", "kind", "text", "function"})
+"""Fields that locate a node or follow from its other fields."""
+
+
 class ExpressionError(Exception):
     """The text is not an expression of this language; `place` says which part, `help` what to write."""
 
@@ -44,75 +48,82 @@ class ExpressionError(Exception):
         self.hint = hint
 
 
-@frozen
-class Literal:
+class ExpressionNode(Struct, frozen=True, eq=False):
+    """A node of an expression; positions, texts and derived types do not take part in comparisons."""
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether both nodes are of one class and have equal content."""
+        return type(self) is type(other) and self._content() == cast("ExpressionNode", other)._content()
+
+    def __hash__(self) -> int:
+        """Return a hash of the content."""
+        return hash((type(self), self._content()))
+
+    def _content(self) -> tuple[object, ...]:
+        return tuple(getattr(self, name) for name in self.__struct_fields__ if name not in _NOT_COMPARED)
+
+
+class Literal(ExpressionNode, frozen=True, eq=False):
     """A number, text, `true`, `false` or `null`."""
 
     value: LiteralValue
-    at: Place = field(compare=False)
+    at: Place
 
 
-@frozen
-class Name:
+class Name(ExpressionNode, frozen=True, eq=False):
     """A field or constant of the message."""
 
     name: str
-    at: Place = field(compare=False)
+    at: Place
 
 
-@frozen
-class Attribute:
+class Attribute(ExpressionNode, frozen=True, eq=False):
     """`of.name`."""
 
     of: Node
     name: str
-    at: Place = field(compare=False)
-    name_at: Place = field(compare=False)
+    at: Place
+    name_at: Place
 
 
-@frozen
-class Each:
+class Each(ExpressionNode, frozen=True, eq=False):
     """`of[]`: every element of a list."""
 
     of: Node
-    at: Place = field(compare=False)
+    at: Place
 
 
-@frozen
-class Item:
+class Item(ExpressionNode, frozen=True, eq=False):
     """`of[index]`."""
 
     of: Node
     index: int
-    at: Place = field(compare=False)
+    at: Place
 
 
-@frozen
-class ListOf:
+class ListOf(ExpressionNode, frozen=True, eq=False):
     """`[a, b, c]`."""
 
     items: tuple[Node, ...]
-    at: Place = field(compare=False)
+    at: Place
 
 
-@frozen
-class Call:
+class Call(ExpressionNode, frozen=True, eq=False):
     """A function or an operator, by its name (`sqrt`, `+`, `==`)."""
 
     name: str
     arguments: tuple[Node, ...]
-    at: Place = field(compare=False)
-    name_at: Place = field(compare=False)
+    at: Place
+    name_at: Place
 
 
-@frozen
-class Choice:
+class Choice(ExpressionNode, frozen=True, eq=False):
     """`then if condition else otherwise`."""
 
     condition: Node
     then: Node
     otherwise: Node
-    at: Place = field(compare=False)
+    at: Place
 
 
 Node: TypeAlias = "Literal | Name | Attribute | Each | Item | ListOf | Call | Choice"

@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
+from msgspec import Struct
 from pydantic import ValidationError
 
 from mosaico_ingest.adapters.adapter import Envelope
@@ -16,7 +17,6 @@ from mosaico_ingest.adapters.mapping.functions.registry import nearest
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.adapters.mapping.model import Case, Recorded
 from mosaico_ingest.errors import BagError, IngestError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, Resolver, normalize_msgtype
 
@@ -29,8 +29,7 @@ _RELATIVE, _ABSOLUTE = 1e-6, 1e-9
 """How far numbers may differ: float32 columns keep about seven digits."""
 
 
-@frozen
-class Outcome:
+class Outcome(Struct, frozen=True):
     """The result of one test."""
 
     name: str

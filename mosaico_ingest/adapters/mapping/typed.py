@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import field
 from typing import TYPE_CHECKING, TypeAlias
+
+from msgspec import Struct
 
 from mosaico_ingest.adapters.mapping.columns import DataType
 from mosaico_ingest.adapters.mapping.functions.registry import Function
-from mosaico_ingest.adapters.mapping.parser import LiteralValue, Node
+from mosaico_ingest.adapters.mapping.parser import ExpressionNode, LiteralValue, Node
 from mosaico_ingest.adapters.mapping.types import Kind
-from mosaico_ingest.frozen import frozen
 
 if TYPE_CHECKING:
     from mosaico_ingest.job.yaml_source import KeyPath
@@ -30,104 +30,93 @@ __all__ = [
 ]
 
 
-@frozen
-class Const:
+class Const(ExpressionNode, frozen=True, eq=False):
     """The same value for every row."""
 
     value: LiteralValue
     kind: Kind
-    text: str = field(compare=False, default="")
+    text: str = ""
 
 
-@frozen
-class Whole:
+class Whole(ExpressionNode, frozen=True, eq=False):
     """The message itself."""
 
-    kind: Kind = field(compare=False)
-    text: str = field(compare=False, default="self")
+    kind: Kind
+    text: str = "self"
 
 
-@frozen
-class FieldOf:
+class FieldOf(ExpressionNode, frozen=True, eq=False):
     """A field of a message."""
 
     of: Typed
     name: str
-    kind: Kind = field(compare=False)
-    text: str = field(compare=False, default="")
+    kind: Kind
+    text: str = ""
 
 
-@frozen
-class EachOf:
+class EachOf(ExpressionNode, frozen=True, eq=False):
     """A list, opened."""
 
     of: Typed
-    kind: Kind = field(compare=False)
-    text: str = field(compare=False, default="")
+    kind: Kind
+    text: str = ""
 
 
-@frozen
-class Fold:
+class Fold(ExpressionNode, frozen=True, eq=False):
     """The innermost open list, closed for a function that takes it whole."""
 
     of: Typed
-    kind: Kind = field(compare=False)
-    text: str = field(compare=False, default="")
+    kind: Kind
+    text: str = ""
 
 
-@frozen
-class ItemOf:
+class ItemOf(ExpressionNode, frozen=True, eq=False):
     """One element of a list."""
 
     of: Typed
     index: int
-    kind: Kind = field(compare=False)
-    text: str = field(compare=False, default="")
+    kind: Kind
+    text: str = ""
 
 
-@frozen
-class ListValue:
+class ListValue(ExpressionNode, frozen=True, eq=False):
     """Values side by side."""
 
     items: tuple[Typed, ...]
-    kind: Kind = field(compare=False)
-    text: str = field(compare=False, default="")
+    kind: Kind
+    text: str = ""
 
 
-@frozen
-class Cast:
+class Cast(ExpressionNode, frozen=True, eq=False):
     """A number in a type it may not fit."""
 
     of: Typed
     type: DataType
-    kind: Kind = field(compare=False)
-    text: str = field(compare=False, default="")
+    kind: Kind
+    text: str = ""
 
 
-@frozen
-class Apply:
+class Apply(ExpressionNode, frozen=True, eq=False):
     """A function of other values."""
 
     name: str
-    function: Function = field(compare=False)
+    function: Function
     arguments: tuple[Typed, ...]
-    kind: Kind = field(compare=False)
-    text: str = field(compare=False, default="")
+    kind: Kind
+    text: str = ""
 
 
-@frozen
-class ChoiceOf:
+class ChoiceOf(ExpressionNode, frozen=True, eq=False):
     """One of two values."""
 
     condition: Typed
     then: Typed
     otherwise: Typed
-    kind: Kind = field(compare=False)
-    text: str = field(compare=False, default="")
+    kind: Kind
+    text: str = ""
 
 
-@frozen
-class Written:
+class Written(Struct, frozen=True):
     """An expression as written and as understood; `typed` is None where there is no message to type it by."""
 
     path: KeyPath

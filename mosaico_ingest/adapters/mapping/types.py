@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pyarrow as pa
+from msgspec import Struct
+from msgspec.structs import replace
 
 from mosaico_ingest.adapters.mapping.columns import DataType, arrays, pt
-from mosaico_ingest.frozen import frozen
 
 __all__ = [
     "INT64",
@@ -42,8 +41,7 @@ class Unfit(Exception):  # noqa: N818 - a condition of two types, turned into a 
         self.hint = hint
 
 
-@frozen
-class Kind:
+class Kind(Struct, frozen=True):
     """The static type of an expression; of a computed float, `type` is the widest float field in it."""
 
     type: DataType

@@ -16,6 +16,7 @@ from typing import Any, TypeVar, cast
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.flight as fl
+from msgspec import Struct
 
 from mosaico_ingest.destinations.server.errors import (
     Address,
@@ -25,7 +26,6 @@ from mosaico_ingest.destinations.server.errors import (
     reraise,
 )
 from mosaico_ingest.errors import SinkError, SinkUnavailable
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.config import ServerTarget
 from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.errors import Condition, condition_of
@@ -97,8 +97,7 @@ _Answer = TypeVar("_Answer", bound=Body)
 _Result = TypeVar("_Result")
 
 
-@frozen
-class Uploaded:
+class Uploaded(Struct, frozen=True):
     """What a server says it holds of a topic."""
 
     rows: int

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import socket
 import ssl
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import NoReturn
 
 from mosaico_ingest.errors import IngestError, SinkError, SinkUnavailable
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.protocol.errors import Condition, condition_of, text_of
 from mosaico_ingest.protocol.messages import Permission
 from mosaico_ingest.protocol.names import key_problem
@@ -33,7 +32,7 @@ class Refused(SinkError):  # noqa: N818 - the condition, as in `errors`
         self.condition = condition
 
 
-@frozen
+@dataclass(frozen=True, slots=True)
 class Address:
     """Where a server is and how it is spoken to."""
 

@@ -6,6 +6,8 @@ from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+from msgspec import Struct
+
 from mosaico_ingest import protocol
 from mosaico_ingest.destinations.base import Session
 from mosaico_ingest.destinations.server.client import connect
@@ -13,7 +15,6 @@ from mosaico_ingest.destinations.server.errors import Refused, add_hint
 from mosaico_ingest.destinations.server.session import PlatformSession
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.findings import Finding, Severity
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.config import ServerTarget
 from mosaico_ingest.job.model import IfExists
 from mosaico_ingest.protocol import messages
@@ -55,8 +56,7 @@ def delete_finding(target: ServerTarget, sequence: str) -> Finding | None:
 _BUFFER_BYTES = 96 << 20
 
 
-@frozen
-class PlatformSink:
+class PlatformSink(Struct, frozen=True):
     """Writes sequences to a server; one session holds at most about `buffer_bytes` in memory.
 
     A server has no way to swap sequences, so `replace` deletes the old one when the session is opened; and it

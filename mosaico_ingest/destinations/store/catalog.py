@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+from msgspec import Struct
 
 from mosaico_ingest.destinations.base import check_same_type, sequence_exists
 from mosaico_ingest.destinations.store.errors import NotInStore, explained
@@ -29,7 +30,6 @@ from mosaico_ingest.destinations.store.model import (
 )
 from mosaico_ingest.destinations.store.segment import Segment
 from mosaico_ingest.errors import SequenceExists, SinkError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.model import IfExists
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 from mosaico_ingest.remote import AnyPath
@@ -207,8 +207,7 @@ def _paths(db: sqlite3.Connection, condition: str, value: int | str) -> list[str
     return [row["path"] for row in rows]
 
 
-@frozen
-class Claim:
+class Claim(Struct, frozen=True):
     """The sequence as it was when the session began; the commit insists on finding it so."""
 
     sequence: str
@@ -219,8 +218,7 @@ class Claim:
     """What its topics hold, for a session that appends to them."""
 
 
-@frozen
-class NewTopic:
+class NewTopic(Struct, frozen=True):
     """A topic of the session, and its segments under the paths the catalog will know them by."""
 
     name: str
@@ -231,8 +229,7 @@ class NewTopic:
     segments: Mapping[str, Segment]
 
 
-@frozen
-class NewNote:
+class NewNote(Struct, frozen=True):
     """An error to attach."""
 
     topic: str | None
@@ -240,8 +237,7 @@ class NewNote:
     created_ns: int
 
 
-@frozen
-class NewSession:
+class NewSession(Struct, frozen=True):
     """All a session wrote."""
 
     id: str

@@ -39,10 +39,10 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+from msgspec import Struct
 
 from mosaico_ingest.destinations.store.errors import explained
 from mosaico_ingest.errors import IngestError, SinkUnavailable
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote import AnyPath, RemotePath
 
 __all__ = [
@@ -129,8 +129,7 @@ _ATTEMPTS = 5
 _CROCKFORD = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
 
 
-@frozen
-class Layout:
+class Layout(Struct, frozen=True):
     """The paths of the store at `root`."""
 
     root: Path

@@ -6,17 +6,16 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import pyarrow as pa
+from msgspec import Struct
 
 from mosaico_ingest.destinations.store.checksum import combined
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote import AnyPath
 
 __all__ = ["Collected", "Note", "SegmentInfo", "SequenceInfo", "SessionInfo", "TopicInfo"]
 
 
-@frozen
-class SegmentInfo:
+class SegmentInfo(Struct, frozen=True):
     """One Parquet file: rows of one topic and session, sorted by `timestamp_ns`."""
 
     path: AnyPath
@@ -30,8 +29,7 @@ class SegmentInfo:
     """Of the values of its rows, see `ContentHash`; None where it was written before there were any."""
 
 
-@frozen
-class TopicInfo:
+class TopicInfo(Struct, frozen=True):
     """One topic: its type, its columns, and the segments that hold its rows."""
 
     sequence: str
@@ -72,8 +70,7 @@ class TopicInfo:
         return combined(segment.checksum for segment in self.segments)
 
 
-@frozen
-class SessionInfo:
+class SessionInfo(Struct, frozen=True):
     """One writing session that was committed."""
 
     id: str
@@ -84,8 +81,7 @@ class SessionInfo:
     completed_ns: int
 
 
-@frozen
-class Note:
+class Note(Struct, frozen=True):
     """An error somebody attached to a sequence, or to one of its topics."""
 
     topic: str | None
@@ -93,8 +89,7 @@ class Note:
     created_ns: int
 
 
-@frozen
-class SequenceInfo:
+class SequenceInfo(Struct, frozen=True):
     """One sequence with everything the catalog knows of it."""
 
     name: str
@@ -126,8 +121,7 @@ class SequenceInfo:
         return max(_known(topic.end_ns for topic in self.topics), default=None)
 
 
-@frozen
-class Collected:
+class Collected(Struct, frozen=True):
     """What garbage collection removed."""
 
     sessions: int

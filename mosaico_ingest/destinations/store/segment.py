@@ -10,12 +10,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from msgspec import Struct
 
 from mosaico_ingest.caching import remembered
 from mosaico_ingest.destinations.base import topic_schema
 from mosaico_ingest.destinations.store import files
 from mosaico_ingest.destinations.store.checksum import ContentHash, column_makers
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote import AnyPath
 
@@ -40,8 +40,7 @@ _TOO_LITTLE_A_COLUMN = 1 << 8
 _WORTH_IT = 0.9
 
 
-@frozen
-class Leaf:
+class Leaf(Struct, frozen=True):
     """One Parquet column: a value without children."""
 
     parquet_path: str
@@ -183,8 +182,7 @@ _SEND_BYTES = 4 << 20
 """As much as this is not left to be brought to the disk at the end."""
 
 
-@frozen
-class Segment:
+class Segment(Struct, frozen=True):
     """A finished segment."""
 
     path: AnyPath

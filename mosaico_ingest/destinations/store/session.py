@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any
 
 import pyarrow as pa
+from msgspec import Struct
 
 from mosaico_ingest import protocol
 from mosaico_ingest.destinations.base import Session, StoredTopic, check_batch, check_same_type
@@ -30,7 +31,6 @@ from mosaico_ingest.destinations.store.segment import (
 )
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import IngestError, SinkError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.model import IfExists
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote import AnyPath, RemotePath
@@ -351,8 +351,7 @@ def _settle(topics: Sequence[StoreTopic]) -> None:
 _BUFFER_BYTES = 96 << 20
 
 
-@frozen
-class StoreSink:
+class StoreSink(Struct, frozen=True):
     """Writes sequences into a store; one session holds at most about `buffer_bytes` in memory."""
 
     store: Store

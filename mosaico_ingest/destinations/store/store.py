@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from msgspec import Struct
 
 from mosaico_ingest import protocol
 from mosaico_ingest.destinations.store.catalog import Catalog, NewNote
@@ -20,7 +21,6 @@ from mosaico_ingest.destinations.store.protocols import Files, Records
 from mosaico_ingest.destinations.store.segment import sorted_rows, time_span
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.findings import offered
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.remote import AnyPath, RemotePath, as_path
 
 __all__ = [
@@ -33,8 +33,7 @@ __all__ = [
 ]
 
 
-@frozen
-class Checked:
+class Checked(Struct, frozen=True):
     """One segment that was read to its end, and what is wrong with it."""
 
     topic: str
@@ -82,8 +81,7 @@ def _rows_and_span(file: pq.ParquetFile, content: ContentHash) -> tuple[int, int
 _BATCH_ROWS = 1 << 16
 
 
-@frozen
-class Window:
+class Window(Struct, frozen=True):
     """A span of time, its start in, its end out; None is open."""
 
     start_ns: int | None = None
@@ -177,8 +175,7 @@ def _merge(streams: Sequence[Iterator[pa.RecordBatch]], schema: pa.Schema) -> It
 _GRACE_S = 10.0
 
 
-@frozen
-class Store:
+class Store(Struct, frozen=True):
     """A folder of Parquet segments and the catalog that says what they are; made by `Store.open`."""
 
     layout: Files

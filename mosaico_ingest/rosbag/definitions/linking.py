@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
+from msgspec.structs import replace
 
 from mosaico_ingest.errors import BagError, DecodeError
 from mosaico_ingest.rosbag.definitions.model import (

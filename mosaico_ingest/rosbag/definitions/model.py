@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from enum import Enum
 from typing import Protocol
 
-from mosaico_ingest.frozen import frozen
+from msgspec import Struct
 
 __all__ = [
     "DURATION",
@@ -76,8 +76,7 @@ class Source(str, Enum):
     """A public package that no distro's core has."""
 
 
-@frozen
-class Field:
+class Field(Struct, frozen=True):
     """One field: `type` is a primitive (`float64`, `string`, `wstring`, …) or a full message type name."""
 
     name: str
@@ -90,8 +89,7 @@ class Field:
     """What `string<=N` says (0: unbounded); the bytes do not depend on it."""
 
 
-@frozen
-class Constant:
+class Constant(Struct, frozen=True):
     """A named value of a message type, as `uint8 STATUS_FIX=0`."""
 
     name: str
@@ -99,8 +97,7 @@ class Constant:
     value: str | bool | int | float
 
 
-@frozen
-class MessageType:
+class MessageType(Struct, frozen=True):
     """A message type's own fields and constants; `name` is `pkg/msg/Name`, also for ROS 1."""
 
     name: str
@@ -108,8 +105,7 @@ class MessageType:
     constants: tuple[Constant, ...] = ()
 
 
-@frozen
-class Definition:
+class Definition(Struct, frozen=True):
     """A message type with every type it needs, and where it came from."""
 
     root: str
@@ -126,8 +122,7 @@ class Definition:
         return self.types[self.root]
 
 
-@frozen
-class Embedded:
+class Embedded(Struct, frozen=True):
     """The definition text a recording carries for a type, as it stands there."""
 
     encoding: str

@@ -5,15 +5,15 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from functools import lru_cache
 
+from msgspec import Struct
+from msgspec.structs import replace
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc, Typesdict
 from rosbags.typesys import TypesysError, get_types_from_idl
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.rosbag.definitions.model import (
     DURATION,
     TIME,
@@ -64,8 +64,7 @@ _MAX_SIZE = 2**31 - 1
 _BUILTIN = {"time": TIME, "duration": DURATION}
 
 
-@frozen
-class Section:
+class Section(Struct, frozen=True):
     """The text of one type among several; the first may have no name of its own."""
 
     kind: str

@@ -9,9 +9,10 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, ClassVar
 
+from msgspec import Struct
+
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.findings import Finding, Severity
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.job.model import Stores
 from mosaico_ingest.rosbag.definitions.distros import (
     BEFORE_IRON,
@@ -48,8 +49,7 @@ __all__ = [
 _SUFFIXES = (".msg", ".idl")
 
 
-@frozen
-class Registered:
+class Registered(Struct, frozen=True):
     """A definition text somebody gave: the type it is for, and every type it defines."""
 
     msgtype: str
@@ -200,8 +200,7 @@ _UNSAID = frozenset({"unknown", ""})
 _LANGUAGES = frozenset({"ros1msg", "ros2msg", "ros2idl", "omgidl", "idl", "msg"}) | _UNSAID
 
 
-@frozen
-class _Place:
+class _Place(Struct, frozen=True):
     """One place where types are looked for."""
 
     label: str

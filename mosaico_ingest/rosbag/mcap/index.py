@@ -5,10 +5,12 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Collection
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.rosbag.blocks import LATEST_NS, Hole
 from mosaico_ingest.rosbag.compression import inflate_some
 from mosaico_ingest.rosbag.formats import MCAP
@@ -34,8 +36,7 @@ _RUN_BYTES = 4 << 20
 _MESSAGE = struct.Struct("<HIQ")
 
 
-@frozen
-class Piece:
+class Piece(Struct, frozen=True):
     """Records that are read at once: a chunk with the message indexes behind it, or messages outside chunks."""
 
     offset: int

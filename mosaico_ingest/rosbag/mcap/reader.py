@@ -10,10 +10,10 @@ from itertools import pairwise
 from operator import itemgetter
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.rosbag.blocks import (
     EARLIEST_NS,
     LATEST_NS,
@@ -67,8 +67,7 @@ _FIXED_BYTES = _HEAD.itemsize - RECORD.size
 """How much of a message record's length is not payload."""
 
 
-@frozen
-class _Chunk:
+class _Chunk(Struct, frozen=True):
     """A piece as it was read, and its data."""
 
     piece: Piece

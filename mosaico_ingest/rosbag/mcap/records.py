@@ -5,8 +5,9 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Mapping
 
+from msgspec import Struct
+
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.rosbag.source import Fields
 
 __all__ = [
@@ -37,8 +38,7 @@ class Op:
     DATA_END = 0x0F
 
 
-@frozen
-class Schema:
+class Schema(Struct, frozen=True):
     """A message type as the file describes it."""
 
     name: str
@@ -46,8 +46,7 @@ class Schema:
     text: str
 
 
-@frozen
-class McapChannel:
+class McapChannel(Struct, frozen=True):
     """A channel as the file describes it."""
 
     schema: int
@@ -56,8 +55,7 @@ class McapChannel:
     metadata: dict[str, str]
 
 
-@frozen
-class ChunkHead:
+class ChunkHead(Struct, frozen=True):
     """A chunk's own fields; `begin` and `end` bound its data within the bytes it was read from."""
 
     start_ns: int

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.rosbag.blocks import Hole
 from mosaico_ingest.rosbag.compression import inflate_some
 from mosaico_ingest.rosbag.recovery import next_ros1_chunk
@@ -34,8 +35,7 @@ _RUN_BYTES = 4 << 20
 """How much of the messages outside chunks is read at once."""
 
 
-@frozen
-class Piece:
+class Piece(Struct, frozen=True):
     """A chunk and the index records behind it, read at once; or messages outside chunks."""
 
     offset: int

@@ -6,10 +6,10 @@ from collections.abc import Collection, Iterator, Sequence
 from functools import partial
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.rosbag.blocks import (
     Block,
     Bytes,
@@ -50,8 +50,7 @@ _CHUNKS = 16
 """How many chunks are read at once: only they themselves know to what size they inflate."""
 
 
-@frozen
-class _Chunk:
+class _Chunk(Struct, frozen=True):
     """A piece as it was read: its data, and the index records behind it."""
 
     piece: Piece
@@ -316,8 +315,7 @@ def _words(heads: Bytes, at: int, count: int) -> NDArray[np.uint32]:
     return np.ascontiguousarray(heads[:, at : at + 4 * count]).view("<u4")
 
 
-@frozen
-class _Layout:
+class _Layout(Struct, frozen=True):
     """How a message record begins: what lies where before its payload."""
 
     skipped: int

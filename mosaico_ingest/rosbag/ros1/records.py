@@ -7,10 +7,10 @@ from collections.abc import Iterator, Mapping
 from typing import Protocol
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.frozen import frozen
 
 __all__ = [
     "ENTRY",
@@ -42,8 +42,7 @@ class Op:
     MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 
 
-@frozen
-class Record:
+class Record(Struct, frozen=True):
     """Where a record's data are, and what its header says."""
 
     op: int
@@ -53,8 +52,7 @@ class Record:
     end: int
 
 
-@frozen
-class Message:
+class Message(Struct, frozen=True):
     """A message record as the slow way finds it."""
 
     connection: int
@@ -64,8 +62,7 @@ class Message:
     end: int
 
 
-@frozen
-class Connection:
+class Connection(Struct, frozen=True):
     """A connection as the file describes it."""
 
     topic: str
@@ -74,8 +71,7 @@ class Connection:
     attributes: dict[str, str]
 
 
-@frozen
-class ChunkHead:
+class ChunkHead(Struct, frozen=True):
     """A chunk's own fields; `begin` and `end` bound its data within the bytes it was read from."""
 
     compression: str

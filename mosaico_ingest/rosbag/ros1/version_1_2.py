@@ -10,10 +10,10 @@ from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.frozen import frozen
 from mosaico_ingest.rosbag.blocks import (
     Block,
     Encoding,
@@ -43,8 +43,7 @@ _RUN_BYTES = 4 << 20
 """How much of the file is read at once."""
 
 
-@frozen
-class _Name:
+class _Name(Struct, frozen=True):
     """What a message says about itself; each is a stream of its own."""
 
     topic: str
@@ -52,8 +51,7 @@ class _Name:
     md5sum: str
 
 
-@frozen
-class _Run:
+class _Run(Struct, frozen=True):
     """Messages that are read at once: their streams, times, and where they and their payloads lie."""
 
     keys: NDArray[np.int64]

@@ -8,6 +8,7 @@ from difflib import get_close_matches
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
+from msgspec import Struct
 
 from mosaico_ingest.adapters.mapping.columns import (
     Array,
@@ -26,7 +27,6 @@ from mosaico_ingest.adapters.mapping.types import (
     spell,
 )
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.frozen import frozen
 
 __all__ = [
     "ANY",
@@ -59,8 +59,7 @@ class Refuse(Protocol):
         ...
 
 
-@frozen
-class Take:
+class Take(Struct, frozen=True):
     """What a parameter accepts, and how the argument is made ready for it."""
 
     words: str
@@ -79,8 +78,7 @@ class Take:
 Gives: TypeAlias = "Callable[..., Kind]"
 
 
-@frozen
-class Function:
+class Function(Struct, frozen=True):
     """A function over whole columns: arguments are arrays of one length, or scalars where literal."""
 
     name: str
