@@ -1,4 +1,7 @@
-"""Declarative ingestion of ROS recordings into typed, queryable Mosaico sequences."""
+"""Declarative ingestion of ROS recordings into typed, queryable Mosaico sequences.
+
+The public names are imported on first access, so that `import mosaico_ingest` loads neither Arrow nor pydantic.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,8 @@
-"""ROS rows in, ontology rows out: the mapping language, the catalog written in it, adapters in Python.
+"""Adapters: Arrow rows in the shape of a ROS type in, rows in the columns of an ontology type out.
 
-Knows nothing of bytes. `from mosaico_ingest.adapters import IMUAdapter` gives any built-in adapter as a class.
+The package contains the mapping language, the catalog of built-in adapters written in it, and adapters in Python.
+It must not depend on containers, serialized messages or destinations.
+`from mosaico_ingest.adapters import IMUAdapter` returns any built-in adapter as a class.
 """
 
 from __future__ import annotations

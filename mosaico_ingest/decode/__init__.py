@@ -1,9 +1,12 @@
-"""Raw messages in, Arrow rows in the message's own shape out; a message that does not fit costs its row and no other.
+"""The decoder: message blocks and a message definition in, Arrow rows in the shape of the ROS type out.
 
-    definition ── layout ───────────────┐
-    batch ── locate ── places ── columns ── rows
-             (clustered, lockstep, stepwise)
+A message that does not fit its definition becomes a rejected row and affects no other message. The package must not
+depend on containers, adapters or destinations.
 
-A layout is data. `locate` finds where each of its steps lies in all messages, without reading a value; `columns` then
-copies every column in one go. What they do not vouch for goes through `rowwise`, whose word counts.
+    definition ── layout ─────────────┐
+    message block ── locate ── positions ── columns ── rows
+
+`layout` compiles a definition to a list of steps. `locate` finds the position of each step in all messages without
+reading a value, and `columns` then copies each column in one operation. Messages that these stages cannot verify fall
+back to the row-wise decoder, which is authoritative.
 """

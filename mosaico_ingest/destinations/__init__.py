@@ -1,1 +1,5 @@
-"""Where sequences go: batches in, committed sequences out. Knows no recordings and no messages."""
+"""Destinations: the sequence, its topics and Arrow batches in, a committed sequence out.
+
+`base` defines the protocols of a destination; each subpackage implements them for one kind. The package must not depend
+on recordings, message definitions or adapters.
+"""

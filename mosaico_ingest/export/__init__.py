@@ -1,6 +1,7 @@
-"""A stored sequence written back as a recording: topics of the store in, one file and an account of it out.
+"""Exports: a sequence of the store in, one recording and a report of its fidelity out.
 
-Whether messages are what was stored is tried on every batch; what is lost or left out is in the account.
+Every batch of messages is adapted again and compared with the stored rows; the report lists each difference and each
+excluded topic. The package must not depend on the pipeline.
 """
 
 from __future__ import annotations

@@ -1,1 +1,5 @@
-"""What to do: the types of a job, its manifest, and its configuration. Opens no recording."""
+"""Jobs: a manifest or the arguments of `ROSInjectionConfig` in, a validated job out.
+
+The package defines the sections of a job, composes manifests (`extends`, `matrix`) and knows the location of every value.
+It must not open recordings or destinations.
+"""

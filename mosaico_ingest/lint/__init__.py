@@ -1,1 +1,4 @@
-"""Judges job manifests, adapter files and `.msg` files without opening a recording or a socket; writes nothing but fixes."""
+"""The linter: manifests, adapter files and `.msg` files in, findings and safe fixes out.
+
+The package must not open recordings or connections, must not run Python adapters, and writes files only for `--fix`.
+"""

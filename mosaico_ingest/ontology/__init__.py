@@ -1,6 +1,7 @@
-"""Typed models and their exact Arrow columns; knows nothing of ROS.
+"""The ontology: typed models and their exact Arrow schemas, grouped by domain.
 
-`from mosaico_ingest.ontology import IMU` imports that model and what it is made of; nothing is imported before.
+The package receives field values and returns validated models or Arrow columns. It must not depend on ROS or on storage.
+`from mosaico_ingest.ontology import IMU` imports only that model and the models it is composed of.
 """
 
 from __future__ import annotations

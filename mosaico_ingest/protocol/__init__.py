@@ -1,8 +1,7 @@
-"""The platform's protocol, spelled once for client and server: names, bodies, actions, keys, conditions.
+"""The Mosaico protocol: typed requests and responses in, their encoded form out, and the reverse.
 
-`names` says what a sequence, a topic and a metadata key may be called; `bodies` is what travels; `actions` is the
-calls, with the permission each needs; `codec` is how bodies become bytes; `keys` is API keys; `conditions` is
-what can go wrong, as Flight tells it. Importing the package imports the rules for names only.
+Client (`destinations.server`) and server (`serve`) share the rules for names, the message bodies, actions with their
+permissions, and error conditions. The package must not depend on either side. Importing it loads the rules for names only.
 """
 
 from __future__ import annotations

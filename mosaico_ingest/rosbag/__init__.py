@@ -1,1 +1,5 @@
-"""Recordings: paths in, connections with their message definitions and message blocks out. Never changes a recording."""
+"""Recordings: paths or URLs in, connections with their definitions and message blocks in order of log time out.
+
+The package reads MCAP files, SQLite files and ROS 1 bags, including damaged ones, and never changes a recording. It must
+not depend on adapters, destinations or the pipeline.
+"""

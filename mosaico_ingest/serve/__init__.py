@@ -1,7 +1,7 @@
-"""The platform's protocol over the embedded store, so that its clients list, read, query and write here.
+"""The embedded store as a Mosaico server: Flight calls in, sequences of the store listed, read, queried and written.
 
-Calls come in over Flight, `Store` and `StoreSession` do the work. It never keeps state of its own beyond
-open sessions: what was finalized survives it, what was not is gone with it.
+`Store` and `StoreSession` do the work; the server keeps no state except open sessions, which end with it. The package
+must not depend on recordings or on the pipeline.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Adapters inverted: an adapter bound to a message type and stored rows in, messages in the ROS shape out.
+"""Inverted adapters: stored rows and the adapter that produced them in, rows in the shape of the ROS type out.
 
-Values that a mapping moved are moved back, those it computed are computed back where that is possible. The result is
-checked: the messages are adapted once more, and rows that differ are counted.
+Each result is verified: the restored messages are adapted again, and rows that differ from the stored ones are counted.
+The package must not depend on the store or on the writers of containers.
 """
 
 from __future__ import annotations

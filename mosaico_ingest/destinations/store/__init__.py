@@ -1,7 +1,7 @@
-"""The embedded store: a SQLite catalog over Parquet segments.
+"""The embedded store: Arrow batches in, a catalog and Parquet segments out.
 
-Batches go in through `StoreSink`, sequences come out of `Store`; nothing is visible before its session
-is committed, and no name leads out of the folder.
+`StoreSink` writes sequences and `Store` reads them. A session becomes visible in one transaction when it is committed,
+and no sequence or topic name can refer to a path outside the store. The package must not depend on recordings.
 """
 
 from __future__ import annotations

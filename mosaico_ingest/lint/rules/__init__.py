@@ -1,4 +1,7 @@
-"""Every rule, one file each; `RULES` is the list, in the order of their codes."""
+"""The rules of the linter, one module each; `RULES` lists them in the order of their codes.
+
+A rule receives a parsed document and returns findings. It must not open recordings or depend on an output format.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The functions of the language, one file a subject; Arrow columns in, Arrow columns out, no state."""
+"""The functions of the mapping language: Arrow columns in, one Arrow column out, one module per subject.
+
+Functions keep no state and must not depend on the adapter that calls them.
+"""
 
 from mosaico_ingest.adapters.mapping.functions import (
     clouds,
