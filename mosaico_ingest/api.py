@@ -19,7 +19,7 @@ from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.model import IfExists
 from mosaico_ingest.pipeline.plan import Plan
-from mosaico_ingest.pipeline.run import execute, make_plan
+from mosaico_ingest.pipeline.run import dry_run_report, execute, make_plan
 from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.report.events import (
     BatchObserver,
@@ -72,8 +72,10 @@ class RosbagInjector:
         """
         return make_plan(self._config)
 
-    def run(self) -> Report | None:
-        """Read, adapt and write the recording; return what happened, None for a dry run.
+    def run(self) -> Report:
+        """Read, adapt and write the recording, and return the report; a dry run writes nothing.
+
+        The report of a dry run names the topics, counts no messages, and has the status `skipped`.
 
         Raises:
             IngestError: What ended the run; what the session policy keeps is in the destination.
@@ -81,7 +83,7 @@ class RosbagInjector:
         watch = Stopwatch()
         plan = self.plan()
         if self._config.dry_run:
-            return None
+            return dry_run_report(plan, self._observe)
         report, failure = execute(plan, self._observe, watch=watch)
         if failure is not None:
             raise failure

@@ -47,6 +47,7 @@ from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry, TypeReso
 from mosaico_ingest.rosbag.recording import Recording, open_recording
 
 __all__ = [
+    "dry_run_report",
     "execute",
     "failed_report",
     "inject",
@@ -437,6 +438,16 @@ def run_config(config: ROSInjectionConfig, observe: Observer) -> Report:
         _log.debug("unexpected", exc_info=True)
         return failed_report(config, _unexpected(config, error), observe)
     return report
+
+
+def dry_run_report(plan: Plan, observe: Observer) -> Report:
+    """Return the report of a plan that is not run: its topics and findings, no messages, status `skipped`."""
+    collector = Collector()
+    noted = (Noted(finding) for finding in plan.findings)
+    for event in (_started(plan), *noted, RunFinished(RunStatus.SKIPPED, 0)):
+        collector(event)
+        observe(event)
+    return collector.report()
 
 
 def failed_report(config: ROSInjectionConfig, error: IngestError, observe: Observer) -> Report:
