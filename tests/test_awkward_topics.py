@@ -128,7 +128,7 @@ def test_two_types_on_a_topic_are_told_once_and_only_where_it_is_taken(tmp_path:
         RosbagInjector(one).run() for one in (config, replace(config, sequence_name="one", topics="/one"))
     )
     assert both is not None
-    assert [finding.partition("]")[0] for finding in both.findings] == ["warning[two-types-on-a-topic"]
+    assert [finding.partition("]")[0] for finding in both.findings] == ["warning[mixed-types"]
     assert without is not None
     assert without.findings == ()
 

@@ -190,7 +190,9 @@ class PythonAdapter(Struct, frozen=True):
         parts = [item for item in results if not isinstance(item, RowFailure)]
         index = [start + np.flatnonzero(part.is_valid()).astype(np.int64) for start, part in parts]
         rejected = [
-            RowFailure(int(row), "adapter", f"{self.adapter.__name__}.from_batch returned null for the row")
+            RowFailure(
+                int(row), "adapter-rejected", f"{self.adapter.__name__}.from_batch returned null for the row"
+            )
             for start, part in parts
             for row in start + np.flatnonzero(part.is_null())
         ]
@@ -295,7 +297,7 @@ class PythonAdapter(Struct, frozen=True):
             return _struct_array(part.rows, struct)
 
     def _failure(self, row: int, error: Exception) -> RowFailure:
-        return RowFailure(row, "adapter", f"{self.adapter.__name__}: {_say(error)}")
+        return RowFailure(row, "adapter-rejected", f"{self.adapter.__name__}: {_say(error)}")
 
 
 _MISFITS = (pa.ArrowException, OverflowError, TypeError, ValueError)

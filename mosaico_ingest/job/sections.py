@@ -277,11 +277,13 @@ class TargetSection(_Section):
     @model_validator(mode="after")
     def _one_place(self) -> TargetSection:
         if self.store is not None and self.host is not None:
-            raise PydanticCustomError("contradiction", "store and host are two targets", {"key": "host"})
+            raise PydanticCustomError("conflicting-keys", "store and host are two targets", {"key": "host"})
         alone = sorted(self.model_fields_set - {"store", "host"})
         if self.host is None and alone:
             raise PydanticCustomError(
-                "contradiction", "{key} says how to reach a server, and no host is named", {"key": alone[0]}
+                "conflicting-keys",
+                "{key} says how to reach a server, and no host is named",
+                {"key": alone[0]},
             )
         return self
 

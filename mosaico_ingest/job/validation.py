@@ -308,7 +308,7 @@ def _contradiction(problem: _Problem) -> Finding:
     """A section refuses two keys together; the error says which of them to point at."""
     key = problem.error.get("ctx", {}).get("key", "")
     span = problem.source.key_span((*problem.path, key))
-    return problem.finding("contradiction", problem.error["msg"], "keep one of the two", span)
+    return problem.finding("conflicting-keys", problem.error["msg"], "keep one of the two", span)
 
 
 _DESCRIBERS: dict[str, Callable[[_Problem], Finding]] = {
@@ -322,5 +322,5 @@ _DESCRIBERS: dict[str, Callable[[_Problem], Finding]] = {
     "less_than": _out_of_range,
     "string_too_short": _empty,
     "too_short": _empty,
-    "contradiction": _contradiction,
+    "conflicting-keys": _contradiction,
 }

@@ -212,7 +212,7 @@ def adapter_findings(document: Document) -> Iterator[Finding]:
         spec = load_adapter(document.text, file=document.file, adapters=KnownAdapters(document.folder))
     except AdapterError as error:
         start = Span(document.file, 1, 1, 1, 1)
-        yield from error.findings or [Finding("mapping", Severity.ERROR, error.what, start, error.hint)]
+        yield from error.findings or [Finding("adapter-file", Severity.ERROR, error.what, start, error.hint)]
         return
     said: set[Span | None] = set()
     for msgtype in spec.ros_types:

@@ -136,8 +136,8 @@ def _clash(first: TopicPlan, second: TopicPlan) -> tuple[str, str]:
     if first.topic != second.topic:
         return "name-clash", f"{first.topic} and {second.topic} have one name in the sequence, {first.target}"
     if first.msgtype != second.msgtype:
-        return "two-types-on-a-topic", f"{second.topic} carries {first.msgtype} and {second.msgtype}"
-    return "two-types-on-a-topic", f"{second.topic} carries two definitions of {second.msgtype}"
+        return "mixed-types", f"{second.topic} carries {first.msgtype} and {second.msgtype}"
+    return "mixed-types", f"{second.topic} carries two definitions of {second.msgtype}"
 
 
 def _bare(name: str) -> str:
@@ -334,7 +334,7 @@ def resolve(
 
 def _known(recording: Recording, resolver: TypeResolver, selection: Selection) -> Iterator[Finding]:
     """Yield what is odd about the recording and the types that are taken; `merge` tells of two types on a topic."""
-    yield from (finding for finding in recording.findings if finding.rule != "two-types")
+    yield from (finding for finding in recording.findings if finding.rule != "mixed-types")
     taken = [channel for channel in recording.channels if channel.topic in selection.selected]
     yield from resolver.findings_about(
         {name for channel in taken if channel.definition for name in channel.definition.types}
@@ -365,7 +365,7 @@ def _misfit(config: ROSInjectionConfig, misfits: list[tuple[str, AdapterError]])
         glob = first_match(config.adapter_override, topic)
         place = config.places.get(("adapters", "override", glob))
         said = f"{error.where}: {error.what}" if error.where else error.what
-        own = Finding("misfit", Severity.ERROR, said, place, error.hint)
+        own = Finding("type-mismatch", Severity.ERROR, said, place, error.hint)
         findings.update(dict.fromkeys(error.findings or (own,)))
     first = misfits[0][1]
     more = f" (and {len(misfits) - 1} more topics)" if len(misfits) > 1 else ""
@@ -393,7 +393,7 @@ def _findings(config: ROSInjectionConfig, selection: Selection, topics: tuple[st
 def _no_match(key: str, glob: str, topics: tuple[str, ...], place: Span | None) -> Finding:
     near = get_close_matches(glob.lstrip("!"), topics, n=1, cutoff=0.5)
     return Finding(
-        "matches-nothing",
+        "unmatched-pattern",
         Severity.WARNING,
         f"{key}: {glob!r} matches none of {len(topics)} topics",
         place,

@@ -301,7 +301,7 @@ def _all_of(refused: Sequence[IngestError], count: int) -> IngestError:
     findings = [
         finding
         for error in refused
-        for finding in error.findings or (Finding("refused", Severity.ERROR, str(error)),)
+        for finding in error.findings or (Finding("plan-failed", Severity.ERROR, str(error)),)
     ]
     one = min(refused, key=lambda error: error.exit_code)
     one.what, one.where, one.hint = f"{len(refused)} of {count} recordings cannot be ingested", None, None
@@ -347,7 +347,7 @@ def decide(config: ROSInjectionConfig, *, folder: Path) -> Decisions:
 def _losses(recording: Recording) -> Iterator[Finding]:
     for loss in recording.losses:
         where = f"{Path(loss.file).name} at {loss.offset}" if loss.file else "the recording"
-        yield Finding("unreadable", Severity.WARNING, f"{where}: {loss.reason}")
+        yield Finding("unreadable-range", Severity.WARNING, f"{where}: {loss.reason}")
 
 
 def _chosen(config: ROSInjectionConfig, plan: Plan) -> Iterator[Finding]:
@@ -357,7 +357,7 @@ def _chosen(config: ROSInjectionConfig, plan: Plan) -> Iterator[Finding]:
         if glob is not None:
             place = config.places.get(("adapters", "override", glob))
             yield Finding(
-                "override", Severity.INFO, f"{topic.topic}: {topic.adapter.name} by {glob!r}", place
+                "adapter-override", Severity.INFO, f"{topic.topic}: {topic.adapter.name} by {glob!r}", place
             )
 
 
@@ -365,4 +365,4 @@ def _left_out(plan: Plan) -> Iterator[Finding]:
     """Yield a note for each topic that is not read, with the line of the manifest that says so."""
     for topic in plan.left_out:
         severity = Severity.WARNING if topic.lost else Severity.INFO
-        yield Finding("left-out", severity, f"{topic.topic}: {topic.why}", topic.span)
+        yield Finding("skipped-topic", severity, f"{topic.topic}: {topic.why}", topic.span)

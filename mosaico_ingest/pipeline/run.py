@@ -200,7 +200,11 @@ def _pump(
         if loss.count == 0 and loss in said:
             continue
         if loss.count == 0:
-            observe(Noted(Finding("detour", Severity.INFO, f"{loss.file} at {loss.offset}: {loss.reason}")))
+            observe(
+                Noted(
+                    Finding("recovered-range", Severity.INFO, f"{loss.file} at {loss.offset}: {loss.reason}")
+                )
+            )
         else:
             observe(Unreadable(stream.plan.target if stream else None, loss.count, loss.offset, loss.reason))
 
@@ -248,7 +252,7 @@ def _missing(plan: Plan, recording: Recording, streams: tuple[Stream, ...], obse
             continue
         says = f"{target}: the index promises {promised} messages, {stream.seen} were read"
         if promised < found:
-            observe(Noted(Finding("more-than-promised", Severity.WARNING, says)))
+            observe(Noted(Finding("unexpected-messages", Severity.WARNING, says)))
         elif elsewhere:
             observe(Unreadable(target, promised - found, None, "they lie in what could not be read"))
         else:

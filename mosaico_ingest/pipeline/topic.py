@@ -146,7 +146,7 @@ class Stream:
                 self._configuration = adapter.topic_metadata(decoded.rows[0])
             adapted = adapter.adapt(decoded.rows, envelope)
         except AdapterError as error:
-            broken = tuple(RowFailure(row, "adapter-broken", str(error)) for row in range(len(index)))
+            broken = tuple(RowFailure(row, "adapter-error", str(error)) for row in range(len(index)))
             adapted = Adapted(decoded.rows[:0], index[:0], broken)
         lost += [_Lost(Stage.ADAPT, replace(f, row=int(index[f.row]))) for f in adapted.failures]
         times = envelope.log_times[adapted.index] if adapted.log_times is None else adapted.log_times

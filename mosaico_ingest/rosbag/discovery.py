@@ -150,7 +150,7 @@ def _file(path: AnyPath) -> Found:
     if len(names) == 1:
         return Found((path,), metadata, ())
     part = Finding(
-        "part-of-recording",
+        "single-split",
         Severity.INFO,
         f"{path.name} is one of the {len(names)} parts that {beside} lists",
         help=f"name {path.parent} to read all of them",
@@ -200,7 +200,7 @@ def _listed(metadata: Metadata) -> Found:
             )
     findings = tuple(
         Finding(
-            "missing-part",
+            "missing-split",
             Severity.WARNING,
             f"{metadata.path} lists {name}, which is not there",
             help="restore it, or accept that its messages are missing",

@@ -74,7 +74,7 @@ def _parts(parts: Sequence[Part]) -> Iterator[Finding]:
 
 def _losses(losses: Sequence[Loss]) -> Iterator[Finding]:
     for loss in losses:
-        yield Finding("damaged", Severity.WARNING, f"{loss.file}: at {loss.offset}: {loss.reason}")
+        yield Finding("unreadable-range", Severity.WARNING, f"{loss.file}: at {loss.offset}: {loss.reason}")
 
 
 def _channels(channels: Sequence[Channel]) -> Iterator[Finding]:
@@ -89,7 +89,7 @@ def _channels(channels: Sequence[Channel]) -> Iterator[Finding]:
         if len(names) > 1:
             listed = ", ".join(sorted(names))
             yield Finding(
-                "two-types", Severity.WARNING, f"{topic} has messages of {len(names)} types: {listed}"
+                "mixed-types", Severity.WARNING, f"{topic} has messages of {len(names)} types: {listed}"
             )
 
 

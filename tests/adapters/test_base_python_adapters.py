@@ -83,7 +83,7 @@ def test_an_exception_rejects_its_row_and_no_other(floats: Callable[..., Adapted
     adapted = floats(SpeedAdapter, 1, -2, 3)
     assert adapted.index.tolist() == [0, 2]
     (failure,) = adapted.failures
-    assert (failure.row, failure.rule) == (1, "adapter")
+    assert (failure.row, failure.rule) == (1, "adapter-rejected")
     assert failure.reason == "SpeedAdapter: ValueError: speed is -2.0"
 
 

@@ -56,7 +56,7 @@ def test_a_plan_says_what_becomes_of_each_topic_and_why_and_writes_nothing(inges
     battery = next(line for line in said.splitlines() if line.startswith("/battery"))
     assert "BatteryPackAdapter" in battery
     assert "10 fit" in battery
-    assert "configs/quickstart.yaml:15:15: info[left-out] /camera/image_raw: left out by" in said
+    assert "configs/quickstart.yaml:15:15: info[skipped-topic] /camera/image_raw: left out by" in said
     assert "will be made" in said
     assert not Path("mosaico").exists()
 
@@ -68,7 +68,9 @@ def test_what_the_manifest_names_and_the_recording_lacks_is_pointed_at(ingest: I
         file.write("topic_settings: {/gps/fixx: {every: 2}}\n")
     code, said = ingest("plan", JOB)
     assert code == 0
-    assert "quickstart.yaml:15:15: warning[matches-nothing] topics: '/imuu' matches none of 10 topics" in said
+    assert (
+        "quickstart.yaml:15:15: warning[unmatched-pattern] topics: '/imuu' matches none of 10 topics" in said
+    )
     assert "the nearest is /imu" in said
     assert "on_error.topic: '/kamera/*' matches none" in said
     assert "topic_settings: '/gps/fixx' matches none of 10 topics — the nearest is /gps/fix" in said
@@ -81,7 +83,7 @@ def test_an_adapter_that_is_named_is_told_with_the_line_that_does(ingest: Ingest
     code, said = ingest("plan", JOB, "--json")
     assert code == 0
     (recording,) = PlanDocument.model_validate_json(said).recordings
-    (note,) = (note for note in recording.notes if note.rule == "override")
+    (note,) = (note for note in recording.notes if note.rule == "adapter-override")
     assert note.message == "/odom: OdometryAdapter by '/od*'"
     assert note.place == "configs/quickstart.yaml:18:14"
     kept = recording.decisions.quarantine
@@ -95,7 +97,7 @@ def test_every_adapter_that_does_not_fit_is_told_at_once(ingest: Ingest) -> None
     code, said = ingest("plan", JOB)
     assert code == 1
     assert "battery_pack.yaml:10:12: error[unknown-field] no field 'gone'" in said
-    assert "quickstart.yaml:18:14: error[misfit]" in said
+    assert "quickstart.yaml:18:14: error[type-mismatch]" in said
     assert "GPSAdapter" in said
 
 
@@ -300,7 +302,10 @@ def test_a_plan_of_many_recordings_says_of_each_why_it_cannot_be_ingested(ingest
     assert "a.mcap: not a recording" in said
     assert "c.bag: the recording has no topic" in said
     Path("a.mcap").unlink()
-    assert ingest("plan", "job.yaml", "--json") == (3, "error[refused] c.bag: the recording has no topic\n")
+    assert ingest("plan", "job.yaml", "--json") == (
+        3,
+        "error[plan-failed] c.bag: the recording has no topic\n",
+    )
 
 
 def test_a_plan_of_topics_without_a_message_is_no_plan(ingest: Ingest) -> None:

@@ -96,8 +96,8 @@ run: {jobs: 2, memory: 512MiB, report: report.json, log_level: INFO}
         ("bag: {path: x}\ntopics: /imu", "2:9", "wrong-type", "topics must be a list, not the text '/imu'"),
         ("bag: {path: x}\non_error: {topic: rase}", "2:19", "wrong-value", "on_error.topic cannot be 'rase'"),
         ("bag: {path: x}\non_error: {topic: {/a: rase}}", "2:24", "wrong-value", None),
-        ("bag: {path: x}\ntarget: {store: a, host: b}", "2:20", "contradiction", None),
-        ("bag: {path: x}\ntarget: {port: 1}", "2:10", "contradiction", None),
+        ("bag: {path: x}\ntarget: {store: a, host: b}", "2:20", "conflicting-keys", None),
+        ("bag: {path: x}\ntarget: {port: 1}", "2:10", "conflicting-keys", None),
         ("bag: {path: x}\ntarget: {host: h, port: 0}", "2:25", "wrong-value", "target.port is 0"),
         ("bag: {path: x}\nrun: {memory: 1 cow}", "2:15", "wrong-value", None),
         (

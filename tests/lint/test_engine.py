@@ -211,7 +211,7 @@ fields:
 """
     assert rules(judged(project, text % "HeaderAdapter", "adapters/other.yaml")) == []
     assert rules(judged(project, text % "NoAdapter", "adapters/other.yaml")) == ["unknown-adapter"]
-    assert rules(judged(project, text % "PackAdapter", "adapters/other.yaml")) == ["misfit"]
+    assert rules(judged(project, text % "PackAdapter", "adapters/other.yaml")) == ["type-mismatch"]
 
 
 def test_the_text_of_a_definition_is_that_of_the_first_type(project: Path) -> None:

@@ -14,7 +14,7 @@ from mosaico_ingest.lint.rule import Rule
 from mosaico_ingest.lint.rules import RULES
 from mosaico_ingest.lint.settings import Settings
 
-WITHOUT_EXAMPLE = {"unreadable-file", "not-utf8", "yaml-character", "cycle"}
+WITHOUT_EXAMPLE = {"unreadable-file", "not-utf8", "yaml-character", "adapter-cycle"}
 """What a page cannot show in one file."""
 
 

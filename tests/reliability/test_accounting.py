@@ -71,7 +71,7 @@ def test_more_than_promised_is_no_loss() -> None:
     wrong, (event,) = missing(10, 12, [])
     assert not wrong
     assert isinstance(event, Noted)
-    assert event.finding.rule == "more-than-promised"
+    assert event.finding.rule == "unexpected-messages"
 
 
 def test_part_of_a_recording_owes_nothing() -> None:

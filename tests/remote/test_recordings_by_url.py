@@ -233,7 +233,7 @@ def test_a_rosbag2_directory_is_read_by_its_metadata(objects: ObjectStore, tmp_p
     put(objects, tmp_path / "metadata.yaml", "rosbag2/x/metadata.yaml")
     with opened(remote(objects, "rosbag2/x")) as there:
         assert [file.name for file in there.files] == ["x_0.mcap"]
-        assert any(one.rule == "missing-part" for one in there.findings)
+        assert any(one.rule == "missing-split" for one in there.findings)
 
 
 def test_what_is_not_there_is_said(objects: ObjectStore) -> None:

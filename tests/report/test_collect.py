@@ -88,7 +88,7 @@ def test_what_was_taken_back_leaves_no_time_span() -> None:
 
 def test_findings_and_losses_are_kept() -> None:
     collector = started()
-    collector(Noted(Finding("two-types", Severity.WARNING, "two types")))
+    collector(Noted(Finding("mixed-types", Severity.WARNING, "two types")))
     collector(Unreadable(None, 3, 100, "a broken chunk"))
     report = collector.report()
     assert "two types" in report.findings[0]

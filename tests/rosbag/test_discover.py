@@ -77,13 +77,13 @@ def test_a_part_that_is_missing_is_a_finding_and_a_loss(split: Path, recordings:
     (split / "part_9.mcap").unlink()
     with open_recording(split, resolve=recordings.blind) as recording:
         assert len(recordings.received(recording)) == 60
-        assert "missing-part" in [finding.rule for finding in recording.findings]
+        assert "missing-split" in [finding.rule for finding in recording.findings]
         assert any("part_9.mcap" in finding.message for finding in recording.findings)
         assert [(Path(loss.file).name, loss.count) for loss in recording.losses] == [("part_9.mcap", None)]
 
 
 def test_one_part_alone_says_that_there_are_others(split: Path, recordings: Any) -> None:
-    assert rules(split / "part_9.mcap", recordings) == ["part-of-recording"]
+    assert rules(split / "part_9.mcap", recordings) == ["single-split"]
 
 
 def test_the_storage_decides_and_metadata_that_differ_are_findings(split: Path, recordings: Any) -> None:
@@ -177,7 +177,7 @@ def test_metadata_that_list_nothing_that_is_there_fall_back_on_what_is(split: Pa
     info = read_info(split)
     write_metadata(split, info | {"relative_file_paths": ["gone.mcap"]})
     assert len(discover([split]).files) == 3
-    assert rules(split, recordings) == ["missing-part"]
+    assert rules(split, recordings) == ["missing-split"]
     with open_recording(split, resolve=recordings.blind) as recording:
         assert recording.losses == ()
     for file in split.glob("*.mcap"):
@@ -190,7 +190,7 @@ def test_a_part_that_cannot_be_opened_is_a_loss_and_a_finding(split: Path, recor
     (split / "part_10.mcap").write_bytes(b"")
     with open_recording(split, resolve=recordings.blind) as recording:
         assert len(recordings.received(recording)) == 60
-        assert "damaged" in [finding.rule for finding in recording.findings]
+        assert "unreadable-range" in [finding.rule for finding in recording.findings]
         assert [loss.reason for loss in recording.losses] == ["this part cannot be opened: the file is empty"]
     for file in split.glob("*.mcap"):
         file.write_bytes(b"")

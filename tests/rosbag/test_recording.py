@@ -154,7 +154,7 @@ def test_a_topic_of_two_types_is_two_channels_and_a_finding(tmp_path: Path, reco
             "std_msgs/msg/String",
             "std_msgs/msg/Empty",
         ]
-        assert [finding.rule for finding in recording.findings] == ["two-types"]
+        assert [finding.rule for finding in recording.findings] == ["mixed-types"]
 
 
 def test_a_channel_without_definition_says_why(tmp_path: Path, recordings: Any) -> None:

@@ -86,7 +86,7 @@ _NUMBERS = {"nan": math.nan, "inf": math.inf, "pi": math.pi}
 
 Report = Callable[[str, str, Place, "str | None"], None]
 """Takes a mistake: its rule, what, where in the expression, what to do."""
-_UNKNOWN, _TYPE = "unknown-field", "type"
+_UNKNOWN, _TYPE = "unknown-field", "operand-type"
 
 
 class Scope(Struct, frozen=True):
@@ -392,7 +392,9 @@ class Analyzer:
         self.findings: list[Finding] = []
         self._source = source
 
-    def report(self, path: KeyPath, message: str, help_: str | None = None, *, rule: str = "mapping") -> None:
+    def report(
+        self, path: KeyPath, message: str, help_: str | None = None, *, rule: str = "adapter-file"
+    ) -> None:
         """Note a mistake about a key or value."""
         self.findings.append(Finding(rule, Severity.ERROR, message, self._source().key_span(path), help_))
 
@@ -404,10 +406,10 @@ class Analyzer:
     def misfit(self, at: Written | KeyPath, unfit: Unfit) -> None:
         """Note that a value does not fit."""
         if isinstance(at, Written):
-            self.report_inside(at.path, at.node.at, "misfit", str(unfit), unfit.hint)
+            self.report_inside(at.path, at.node.at, "type-mismatch", str(unfit), unfit.hint)
         else:
             span = self._source().span(at)
-            self.findings.append(Finding("misfit", Severity.ERROR, str(unfit), span, unfit.hint))
+            self.findings.append(Finding("type-mismatch", Severity.ERROR, str(unfit), span, unfit.hint))
 
     def demand(self, at: Written | KeyPath, kind: Kind, target: DataType) -> bool:
         """Check that values fit a column; otherwise note it."""
@@ -430,7 +432,7 @@ class Analyzer:
         try:
             node = parse(text)
         except ExpressionError as error:
-            self.report_inside(path, error.place, "expression", str(error), error.hint)
+            self.report_inside(path, error.place, "expression-syntax", str(error), error.hint)
             return None
         known = len(self.findings)
         self._check_calls(path, node)
@@ -462,7 +464,7 @@ class Analyzer:
             return None
         if pt.is_nested(element) or pt.is_string(element) or pt.is_binary(element):
             message = f"cast makes numbers and booleans, the target is {spell(element)}"
-            self.report_inside(written.path, written.node.at, "misfit", message, None)
+            self.report_inside(written.path, written.node.at, "type-mismatch", message, None)
             return None
         checker = self.checker(written.path, written.text, slot.scope)
         return checker.cast(written.typed, element, written.node)
@@ -478,7 +480,7 @@ class Analyzer:
             return replace(scope, kind=element)
         hint = f"write {of.typed.text}[]" if is_list(element.type) else None
         message = f"`{of.typed.text}` is {spell(element)}, not a message"
-        self.report_inside(of.path, of.node.at, "type", message, hint)
+        self.report_inside(of.path, of.node.at, "operand-type", message, hint)
         return None
 
     def _check_calls(self, path: KeyPath, node: Node) -> None:
@@ -492,7 +494,7 @@ class Analyzer:
             fewest, most, spelling = SPECIAL[node.name]
             if not fewest <= len(node.arguments) <= most:
                 message = f"it is written {spelling}"
-                self.report_inside(path, node.at, "arguments", message, None)
+                self.report_inside(path, node.at, "function-arguments", message, None)
             return
         function = lookup(node.name)
         if function is None:
@@ -500,7 +502,7 @@ class Analyzer:
             message = f"there is no function {node.name!r}"
             self.report_inside(path, node.name_at, "unknown-function", message, near)
         elif problem := function.arity_problem(len(node.arguments)):
-            self.report_inside(path, node.at, "arguments", problem, None)
+            self.report_inside(path, node.at, "function-arguments", problem, None)
 
 
 def is_short_cast(node: Node) -> bool:

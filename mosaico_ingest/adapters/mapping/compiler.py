@@ -336,7 +336,7 @@ def _table(
     """Return keys and values that have the right types; None after a finding."""
     if pt.is_nested(slot.type) or pt.is_nested(typed.kind.type):
         message = f"a map is between plain values, not {spell(typed.kind.element)} and {spell(slot.type)}"
-        analyzer.report(slot.path, message, rule="misfit")
+        analyzer.report(slot.path, message, rule="type-mismatch")
         return None
     keys = [_key(analyzer, key, typed, slot) for key in entries]
     fitting = [_value_fits(analyzer, value, (*slot.path, key), slot.type) for key, value in entries.items()]
@@ -377,7 +377,7 @@ def _key(analyzer: Analyzer, key: Scalar, typed: Typed, slot: Slot) -> Scalar:
     except Unfit:
         fits = False
     if not fits or key is None:
-        analyzer.report(path, f"`{typed.text}` is {spell(kind)}, it is never {key!r}", rule="misfit")
+        analyzer.report(path, f"`{typed.text}` is {spell(kind)}, it is never {key!r}", rule="type-mismatch")
         return None
     return key
 
@@ -465,7 +465,7 @@ class Compiler:
         if position < 0:
             names = [field.name for field in owner.type]
             help_ = f"{nearest(name, names) or ''} it has {', '.join(names)}".strip()
-            self._analyzer.report(path, f"{owner.title} has no field {name!r}", help_, rule="unknown-target")
+            self._analyzer.report(path, f"{owner.title} has no field {name!r}", help_, rule="unknown-column")
             return None
         field = owner.type.field(position)
         full = owner.inside(name)
@@ -475,19 +475,19 @@ class Compiler:
         missing = [field.name for field in owner.type if not field.nullable and field.name not in given]
         if missing:
             message = f"{owner.title} requires {', '.join(missing)}"
-            self._analyzer.report(owner.path, message, "say where each comes from", rule="missing-target")
+            self._analyzer.report(owner.path, message, "say where each comes from", rule="missing-column")
 
     def _field(self, field: DataType, value: Value, slot: Slot) -> Filled | None:
         form = value if isinstance(value, Form) else Form.model_validate({"value": value})
         if problem := _form_problem(form):
-            self._analyzer.report(slot.path, *problem, rule="form")
+            self._analyzer.report(slot.path, *problem, rule="field-form")
             return None
         replaced = self._with(form.replaced, slot.at("with")) if form.replaced else ()
         when = self._condition(form.when, slot.at("when")) if form.when else None
         source = self._source(form, slot, slot if form is not value else slot.at("value"))
         if not field.nullable and isinstance(source, Absent):
             message = f"{slot.name} is required, it cannot be null"
-            self._analyzer.report(slot.path, message, "give it a value", rule="missing-target")
+            self._analyzer.report(slot.path, message, "give it a value", rule="missing-column")
             return None
         if source is None or replaced is None or (form.when and when is None):
             return None
@@ -530,7 +530,7 @@ class Compiler:
         if written.typed.kind.axes or not pt.is_boolean(written.typed.kind.type):
             message = f"`when` is true or false for the whole value, not {spell(written.typed.kind)}"
             hint = "compare it: x != 0; any(…) of a list"
-            self._analyzer.report_inside(slot.path, written.node.at, "type", message, hint)
+            self._analyzer.report_inside(slot.path, written.node.at, "operand-type", message, hint)
             return None
         return written.typed
 
@@ -538,7 +538,7 @@ class Compiler:
         element = _innermost(slot.type)
         if not pt.is_struct(element):
             message = f"`with` sets fields of a struct, {slot.name} is {spell(element)}"
-            self._analyzer.report(slot.path, message, "drop it", rule="form")
+            self._analyzer.report(slot.path, message, "drop it", rule="field-form")
             return None
         return self._targets(values, replace(slot, type=element))
 
@@ -557,7 +557,7 @@ class Compiler:
         inner = replace(slot.at("fields"), type=element, scope=self._analyzer.inside(of, slot.scope))
         if not pt.is_struct(element):
             message = f"{slot.name} is {spell(element)}, it has no fields"
-            self._analyzer.report(inner.path, message, "give an expression", rule="misfit")
+            self._analyzer.report(inner.path, message, "give an expression", rule="type-mismatch")
             return None
         fields = self._targets(values, inner, skip=skip)
         self._require(inner, {*values, *skip})
@@ -583,12 +583,14 @@ class Compiler:
             return None
         if element.msgtype is None or element.msgtype not in spec.ros_types:
             message = f"{use} takes {', '.join(spec.ros_types)}, not {spell(element)}"
-            analyzer.report(at, message, "use another adapter, or say {of: …, fields: {…}}", rule="misfit")
+            analyzer.report(
+                at, message, "use another adapter, or say {of: …, fields: {…}}", rule="type-mismatch"
+            )
             return None
         try:
             adapter = spec.bind(replace(self._definition, root=element.msgtype), element.type)
         except AdapterError as error:
-            analyzer.report(at, f"{use} cannot be used here: {error.what}", error.hint, rule="misfit")
+            analyzer.report(at, f"{use} cannot be used here: {error.what}", error.hint, rule="type-mismatch")
             return None
         made = replace(kind_of(adapter.ontology.struct), axes=of.typed.kind.axes)
         fits = analyzer.demand(of, made, slot.type)

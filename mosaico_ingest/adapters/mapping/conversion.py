@@ -162,7 +162,7 @@ def _convert_list(array: Array, target: DataType, refuse: Refuse) -> Array:
         if axis.null is not None:
             wrong &= ~axis.null
         if wrong.any():
-            refuse(wrong, "length", lambda i: f"the list has {axis.lengths[i]} elements, not {size}")
+            refuse(wrong, "list-length", lambda i: f"the list has {axis.lengths[i]} elements, not {size}")
         elements, axis = _stretched(elements, axis, size)
     values = convert(elements, target.value_type, _of_elements(axis, refuse))
     if pt.is_fixed_size_list(target):

@@ -177,7 +177,7 @@ class Evaluation:
         )  # in branches that are not taken, too, the elements would be misaligned
         try:
             refuse = self.refuser(left[:depth], text)
-            refuse(a != b, "length", lambda i: f"lists of {a[i]} and {b[i]} elements")
+            refuse(a != b, "list-length", lambda i: f"lists of {a[i]} and {b[i]} elements")
         finally:
             self._taken = taken
 

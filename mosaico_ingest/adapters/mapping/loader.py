@@ -151,12 +151,14 @@ class MappingSpec:
         if variant is None:
             where = self.source.key_span(("variants",) if self.model.variants else ("ros_type",))
             takes = f"{self.name} takes {', '.join(self.ros_types)}, not {definition.root}"
-            return None, (Finding("misfit", Severity.ERROR, takes, where),)
+            return None, (Finding("type-mismatch", Severity.ERROR, takes, where),)
         step, chain = (self.name, definition.root), _BINDING.get()
         if step in chain:
             names = " → ".join(name for name, _ in (*chain[chain.index(step) :], step))
             where = self.source.key_span(("adapter",))
-            return None, (Finding("cycle", Severity.ERROR, f"adapters use one another: {names}", where),)
+            return None, (
+                Finding("adapter-cycle", Severity.ERROR, f"adapters use one another: {names}", where),
+            )
         token = _BINDING.set((*chain, step))
         try:
             return self._compiled(definition, shape, variant)
@@ -245,7 +247,7 @@ def _ontology(model: MappingFile, analyzer: Analyzer) -> OntologyType | None:
     try:
         return ontology_type(model.ontology)
     except UnknownTag as unknown:
-        analyzer.report(("ontology",), unknown.what, unknown.hint, rule="unknown-tag")
+        analyzer.report(("ontology",), unknown.what, unknown.hint, rule="unknown-ontology")
         return None
 
 

@@ -131,7 +131,7 @@ def number(refuse: Refuse, s: Array) -> Array:
         return pc.cast(pc.utf8_trim_whitespace(s), arrays.float64())
     except arrays.ArrowInvalid:
         bad = bad_where(s, lambda value: _NUMBER.fullmatch(value) is not None)
-        refuse(bad, "number", lambda i: f"{s[i].as_py()!r} is no number")
+        refuse(bad, "number-syntax", lambda i: f"{s[i].as_py()!r} is no number")
         return pc.cast(pc.utf8_trim_whitespace(nullified(s, bad)), arrays.float64())
 
 

@@ -1,0 +1,42 @@
+"""`missing-definitions`: definitions that are not there.
+
+`custom_msgs` names a directory of `.msg` files, or one. Without them the messages that need them cannot be read.
+
+Bad:
+    bag:
+      path: data/run.db3
+      ros_distro: ros2_humble
+      custom_msgs:
+        - {package: acme_msgs, path: nowhere}
+
+Good:
+    bag:
+      path: data/run.db3
+      ros_distro: ros2_humble
+      custom_msgs:
+        - {package: acme_msgs, path: msgs}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.lint.job import Job
+from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.rosbag.definitions.registry import definition_files
+
+
+def check(job: Job) -> Iterator[Problem]:
+    """Yield a problem for each path that does not exist or holds no definition."""
+    for i, custom in enumerate(job.manifest.bag.custom_msgs):
+        if not job.known(custom.path):
+            continue
+        path, span = job.resolve(custom.path), job.span("bag", "custom_msgs", i, "path")
+        if not path.exists():
+            yield Problem(f"{path} is not there", span, "paths start at the manifest's folder")
+        elif not definition_files(path):
+            yield Problem(f"{path} has no .msg or .idl file", span, "name the directory they are in")
+
+
+RULE = Rule("ING217", __name__, Severity.ERROR, __doc__, job=check, disk=True)
