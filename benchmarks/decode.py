@@ -18,7 +18,7 @@ from rosbags.typesys import Stores as RosbagsStores
 from rosbags.typesys import get_typestore
 
 from mosaico_ingest.decode.decoder import ColumnarDecoder, Decoded, RowwiseDecoder
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
 from mosaico_ingest.rosbag.definitions.model import Definition
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mosaico_ingest.adapters.bridge import ROSBridge
     from mosaico_ingest.api import RosbagInjector
     from mosaico_ingest.job.config import ROSInjectionConfig
-    from mosaico_ingest.job.model import (
+    from mosaico_ingest.job.values import (
         IfExists,
         LoaderErrorPolicy,
         SessionLevelErrorPolicy,
@@ -49,8 +49,8 @@ __all__ = [
 ]
 
 _WHERE = {
-    "IfExists": "job.model",
-    "LoaderErrorPolicy": "job.model",
+    "IfExists": "job.values",
+    "LoaderErrorPolicy": "job.values",
     "Message": "ontology",
     "ROSAdapterBase": "adapters",
     "ROSBridge": "adapters.bridge",
@@ -60,9 +60,9 @@ _WHERE = {
     "ROSTypeRegistry": "rosbag.definitions.registry",
     "RosbagInjector": "api",
     "Serializable": "ontology",
-    "SessionLevelErrorPolicy": "job.model",
-    "Stores": "job.model",
-    "TopicLevelErrorPolicy": "job.model",
+    "SessionLevelErrorPolicy": "job.values",
+    "Stores": "job.values",
+    "TopicLevelErrorPolicy": "job.values",
     "register_default_adapter": "adapters",
 }
 """A name is imported when it is asked for, so that `ingest --help` does not wait for Arrow."""

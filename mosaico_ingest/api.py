@@ -17,7 +17,7 @@ from mosaico_ingest.errors import IngestError, ManifestError
 from mosaico_ingest.executors.in_process import Inline
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.run import dry_run_report, execute, make_plan
 from mosaico_ingest.remote import AnyPath

@@ -11,17 +11,15 @@ import pytest
 from rosbags.typesys import Stores as RosbagsStores
 
 from mosaico_ingest.errors import IngestError, ManifestError
-from mosaico_ingest.job.config import (
-    ROSInjectionConfig,
-    ServerTarget,
-    StoreTarget,
-    TimeBound,
-)
-from mosaico_ingest.job.model import (
+from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.values import (
     IfExists,
     LoaderErrorPolicy,
+    ServerTarget,
     SessionLevelErrorPolicy,
     Stores,
+    StoreTarget,
+    TimeBound,
     TopicLevelErrorPolicy,
 )
 

@@ -15,7 +15,7 @@ from mosaico_ingest.adapters.builtin import BY_NAME, Builtin
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.adapters.python import PythonAdapterSpec, ROSAdapterBase
 from mosaico_ingest.errors import AdapterError, BagError
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.ontology.header import Message
 from mosaico_ingest.ontology.model import Serializable
 from mosaico_ingest.ontology.registry import model

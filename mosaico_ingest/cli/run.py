@@ -18,7 +18,7 @@ from mosaico_ingest.cli.process import collect_as_usual, interrupt_on_terminate
 from mosaico_ingest.cli.progress import Tally, sizes_of
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.executors.in_process import Executor, Inline
-from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.report.events import (
     BatchObserver,
     Event,

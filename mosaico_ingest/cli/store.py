@@ -14,7 +14,7 @@ from rich.text import Text
 
 from mosaico_ingest.cli.console import plain_table
 from mosaico_ingest.cli.report import open_console, print_json
-from mosaico_ingest.job.config import LEDGER_KEY
+from mosaico_ingest.job.values import LEDGER_KEY
 from mosaico_ingest.report.units import (
     bytes_text,
     count_text,

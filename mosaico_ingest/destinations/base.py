@@ -13,7 +13,7 @@ from msgspec import Struct
 
 from mosaico_ingest import protocol
 from mosaico_ingest.errors import SequenceExists, SinkError
-from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType
 
 __all__ = [

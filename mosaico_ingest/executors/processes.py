@@ -24,7 +24,7 @@ from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.batch import Batch
 from mosaico_ingest.interrupts import Stop, counted_interrupts
 from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.pipeline.plan import DEFAULT_MEMORY_BYTES
 from mosaico_ingest.pipeline.run import failed_report, run_config
 from mosaico_ingest.report.events import BatchObserver, Event

@@ -21,7 +21,8 @@ from mosaico_ingest.executors.batch import Batch
 from mosaico_ingest.executors.processes import ATTEMPTS, Registrations
 from mosaico_ingest.executors.shipment import absolute, pack
 from mosaico_ingest.interrupts import counted_interrupts
-from mosaico_ingest.job.config import ROSInjectionConfig, StoreTarget
+from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.values import StoreTarget
 from mosaico_ingest.pipeline.plan import DEFAULT_MEMORY_BYTES
 from mosaico_ingest.pipeline.run import place
 from mosaico_ingest.report.events import BatchObserver, RunStarted

@@ -24,7 +24,8 @@ from mosaico_ingest.errors import (
 )
 from mosaico_ingest.executors.processes import Registrations
 from mosaico_ingest.interrupts import Stop
-from mosaico_ingest.job.config import ROSInjectionConfig, StoreTarget
+from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.values import StoreTarget
 from mosaico_ingest.pipeline.run import failed_report, run_config
 from mosaico_ingest.report.events import Event, RunFinished, RunStarted
 from mosaico_ingest.report.model import Report

@@ -13,7 +13,8 @@ from pathlib import Path
 from msgspec import Struct
 
 from mosaico_ingest.adapters.builtin import BY_NAME
-from mosaico_ingest.job.config import ROSInjectionConfig, StoreTarget
+from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.values import StoreTarget
 from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.rosbag.definitions.registry import definition_files
 

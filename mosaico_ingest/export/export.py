@@ -22,8 +22,8 @@ from mosaico_ingest.adapters.mapping.columns import struct_of
 from mosaico_ingest.destinations.store import SequenceInfo, Store, TopicInfo
 from mosaico_ingest.errors import AdapterError, BagError, NothingMatched
 from mosaico_ingest.findings import offered
-from mosaico_ingest.job.model import Stores
 from mosaico_ingest.job.patterns import select
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.blocks import Encoding
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded

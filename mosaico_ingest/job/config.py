@@ -12,43 +12,36 @@ from msgspec import Struct
 
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.findings import Span
-from mosaico_ingest.job.model import (
+from mosaico_ingest.job.patterns import first_match
+from mosaico_ingest.job.values import (
+    DEFAULT_PORT,
+    DEFAULT_STORE,
+    DEFAULT_TOPIC,
+    LEDGER_KEY,
     IfExists,
+    Limit,
     LoaderErrorPolicy,
     OnSchemaChange,
+    ServerTarget,
     SessionLevelErrorPolicy,
     Stores,
+    StoreTarget,
+    TimeBound,
     TopicLevelErrorPolicy,
     Unmodeled,
 )
-from mosaico_ingest.job.patterns import first_match
 from mosaico_ingest.protocol import check_metadata, check_sequence_name, check_topic_name
 from mosaico_ingest.remote import AnyPath, RemotePath, as_path
 
 __all__ = [
-    "DEFAULT_PORT",
-    "DEFAULT_STORE",
-    "DEFAULT_TOPIC",
-    "LEDGER_KEY",
     "AdapterReference",
     "Attempt",
     "ImageFormat",
-    "Limit",
     "LogLevel",
     "QuarantineSettings",
     "ROSInjectionConfig",
-    "ServerTarget",
-    "StoreTarget",
-    "TimeBound",
     "TimeRange",
 ]
-
-DEFAULT_STORE = Path("mosaico")
-DEFAULT_PORT = 6726
-DEFAULT_TOPIC = "default"
-"""The key of `topics_on_error` for every topic that no other key matches."""
-LEDGER_KEY = "mosaico_ingest"
-"""The key of a sequence's metadata, and of each of its sessions, that says what it was made from."""
 
 AdapterReference: TypeAlias = Any
 """An adapter: a class, an `AdapterSpec`, or how to find one: `module:Class`, `file.py:Class`, a YAML path, a name."""
@@ -63,31 +56,11 @@ _MAPPINGS = (
 _Choice = TypeVar("_Choice", bound=Enum)
 
 
-class TimeBound(Struct, frozen=True):
-    """A moment: ns since the epoch, or ns from the recording's first message (negative: back from its last)."""
-
-    ns: int
-    relative: bool = False
-
-    def at(self, start_ns: int, end_ns: int) -> int:
-        """Return ns since the epoch, given the recording's first and last log time."""
-        if not self.relative:
-            return self.ns
-        return (end_ns if self.ns < 0 else start_ns) + self.ns
-
-
 class TimeRange(Struct, frozen=True):
     """Part of a recording: `start` is in, `end` is out; None is its own start or end."""
 
     start: TimeBound | None = None
     end: TimeBound | None = None
-
-
-class Limit(Struct, frozen=True):
-    """At most so many messages, or at most this share of them, from 0 to 1; one of the two is None."""
-
-    count: int | None = None
-    share: float | None = None
 
 
 class QuarantineSettings(Struct, frozen=True):
@@ -98,23 +71,6 @@ class QuarantineSettings(Struct, frozen=True):
     max_run: Limit | None = None
     systematic: int = 100
     """So many failures from the very start of a topic end it."""
-
-
-class StoreTarget(Struct, frozen=True):
-    """The embedded store in a directory, or behind a URL."""
-
-    path: AnyPath
-
-
-@dataclass(frozen=True, slots=True)
-class ServerTarget:
-    """A Mosaico server."""
-
-    host: str
-    port: int
-    api_key: str | None = field(default=None, repr=False)
-    tls_cert: Path | None = None
-    tls: bool = False
 
 
 class Attempt(Struct, frozen=True):

@@ -22,7 +22,13 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from mosaico_ingest.job.compose import MAX_JOBS
-from mosaico_ingest.job.model import (
+from mosaico_ingest.job.units import (
+    parse_instant,
+    parse_limit,
+    parse_offset,
+    parse_size,
+)
+from mosaico_ingest.job.values import (
     IfExists,
     LoaderErrorPolicy,
     OnSchemaChange,
@@ -31,15 +37,8 @@ from mosaico_ingest.job.model import (
     TopicLevelErrorPolicy,
     Unmodeled,
 )
-from mosaico_ingest.job.units import (
-    parse_instant,
-    parse_limit,
-    parse_offset,
-    parse_size,
-)
 
 __all__ = [
-    "DEFAULT_TOPIC",
     "VERSION",
     "AdaptersSection",
     "BagSection",
@@ -56,8 +55,6 @@ __all__ = [
 
 VERSION = 1
 """The newest manifest version this tool reads."""
-DEFAULT_TOPIC = "default"
-"""The key of `on_error.topic` for every topic that no other key matches."""
 
 
 def _check_time(text: str) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from mosaico_ingest.findings import Span
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.distros import distro_type
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
 

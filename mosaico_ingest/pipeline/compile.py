@@ -16,21 +16,15 @@ from msgspec import Struct
 
 from mosaico_ingest.errors import ManifestError, NothingMatched
 from mosaico_ingest.job.compose import PLACEHOLDERS, Placeholder, placeholders_in
-from mosaico_ingest.job.config import (
-    Limit,
-    QuarantineSettings,
-    ROSInjectionConfig,
-    TimeBound,
-    TimeRange,
-)
+from mosaico_ingest.job.config import QuarantineSettings, ROSInjectionConfig, TimeRange
 from mosaico_ingest.job.manifest import LoadedManifest
-from mosaico_ingest.job.model import TopicLevelErrorPolicy
 from mosaico_ingest.job.units import (
     parse_instant,
     parse_limit,
     parse_offset,
     parse_size,
 )
+from mosaico_ingest.job.values import Limit, TimeBound, TopicLevelErrorPolicy
 from mosaico_ingest.remote import AnyPath, RemotePath, without_options
 from mosaico_ingest.rosbag.formats import RECORDING_NAME
 from mosaico_ingest.textfile import read_whole

@@ -18,18 +18,14 @@ from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.documents import Part, schema_of
 from mosaico_ingest.errors import IngestError, ManifestError
 from mosaico_ingest.findings import Finding, Severity, Span, Stage
-from mosaico_ingest.job.config import (
-    Attempt,
-    Limit,
-    QuarantineSettings,
-    ROSInjectionConfig,
-    ServerTarget,
-    StoreTarget,
-)
-from mosaico_ingest.job.model import (
+from mosaico_ingest.job.config import Attempt, QuarantineSettings, ROSInjectionConfig
+from mosaico_ingest.job.values import (
     IfExists,
+    Limit,
     LoaderErrorPolicy,
+    ServerTarget,
     SessionLevelErrorPolicy,
+    StoreTarget,
     TopicLevelErrorPolicy,
 )
 from mosaico_ingest.ontology.types import OntologyType

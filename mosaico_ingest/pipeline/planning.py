@@ -21,16 +21,17 @@ from mosaico_ingest.findings import (
     encodable,
     offered,
 )
-from mosaico_ingest.job.config import (
+from mosaico_ingest.job.config import ROSInjectionConfig, TimeRange
+from mosaico_ingest.job.patterns import Selection, first_match, select
+from mosaico_ingest.job.values import (
     DEFAULT_TOPIC,
     LEDGER_KEY,
-    ROSInjectionConfig,
+    LoaderErrorPolicy,
+    OnSchemaChange,
     StoreTarget,
     TimeBound,
-    TimeRange,
+    Unmodeled,
 )
-from mosaico_ingest.job.model import LoaderErrorPolicy, OnSchemaChange, Unmodeled
-from mosaico_ingest.job.patterns import Selection, first_match, select
 from mosaico_ingest.pipeline.plan import (
     DEFAULT_MEMORY_BYTES,
     LeftOut,

@@ -18,9 +18,9 @@ from mosaico_ingest.destinations.base import MemorySink, Session, StoredTopic, c
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import IngestError, SinkError, Unreachable
 from mosaico_ingest.findings import Finding, Severity
-from mosaico_ingest.job.config import ROSInjectionConfig, ServerTarget
-from mosaico_ingest.job.model import IfExists, LoaderErrorPolicy, TopicLevelErrorPolicy
+from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.patterns import first_match
+from mosaico_ingest.job.values import IfExists, LoaderErrorPolicy, ServerTarget, TopicLevelErrorPolicy
 from mosaico_ingest.pipeline.plan import (
     Decisions,
     DestinationState,

@@ -18,8 +18,7 @@ from xxhash import xxh3_128
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import BagError, SequenceExists
 from mosaico_ingest.findings import encodable
-from mosaico_ingest.job.config import LEDGER_KEY, ServerTarget, StoreTarget
-from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.job.values import LEDGER_KEY, IfExists, ServerTarget, StoreTarget
 from mosaico_ingest.pipeline.plan import Plan, decisions
 from mosaico_ingest.pipeline.quarantine import kept_name
 from mosaico_ingest.remote import AnyPath, RemotePath

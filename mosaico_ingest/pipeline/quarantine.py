@@ -21,7 +21,8 @@ from typing_extensions import Self
 
 from mosaico_ingest.errors import BagError, NothingMatched, SinkError
 from mosaico_ingest.findings import RowFailure, Stage
-from mosaico_ingest.job.config import Limit, QuarantineSettings
+from mosaico_ingest.job.config import QuarantineSettings
+from mosaico_ingest.job.values import Limit
 from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
 from mosaico_ingest.rosbag.definitions.model import Definition, Source, short_msgtype
 from mosaico_ingest.rosbag.formats import MCAP

@@ -16,8 +16,8 @@ from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import IngestError, Interrupted, NothingMatched, VerificationError
 from mosaico_ingest.findings import Finding, Severity, Stage
 from mosaico_ingest.interrupts import DeferredInterrupt
-from mosaico_ingest.job.config import ROSInjectionConfig, ServerTarget, StoreTarget
-from mosaico_ingest.job.model import IfExists, SessionLevelErrorPolicy
+from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.values import IfExists, ServerTarget, SessionLevelErrorPolicy, StoreTarget
 from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.planning import resolve
 from mosaico_ingest.pipeline.provenance import enter

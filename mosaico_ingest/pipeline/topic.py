@@ -24,7 +24,7 @@ from mosaico_ingest.errors import (
     SinkError,
 )
 from mosaico_ingest.findings import RowFailure, Stage
-from mosaico_ingest.job.model import LoaderErrorPolicy, TopicLevelErrorPolicy
+from mosaico_ingest.job.values import LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.ontology.types import OntologyType, RequiredFields
 from mosaico_ingest.pipeline.plan import TopicPlan
 from mosaico_ingest.pipeline.quarantine import Quarantine

@@ -16,7 +16,7 @@ from mosaico_ingest.destinations.base import ENVELOPE
 from mosaico_ingest.destinations.store.errors import NotInStore
 from mosaico_ingest.destinations.store.session import StoreSession, StoreTopic
 from mosaico_ingest.destinations.store.store import Store
-from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.errors import Condition

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from mosaico_ingest.adapters.adapter import UnmodeledSpec
 from mosaico_ingest.job.expand import plain
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.remote import AnyPath, RemotePath
 from mosaico_ingest.report.units import bytes_text, counted, seconds_text
 from mosaico_ingest.rosbag.blocks import Encoding

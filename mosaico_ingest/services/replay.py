@@ -15,13 +15,8 @@ from msgspec import Struct
 from mosaico_ingest.destinations.store.files import Lease
 from mosaico_ingest.errors import ManifestError, NothingMatched, SinkUnavailable
 from mosaico_ingest.findings import a_few, encodable
-from mosaico_ingest.job.config import (
-    QuarantineSettings,
-    ROSInjectionConfig,
-    StoreTarget,
-    TimeRange,
-)
-from mosaico_ingest.job.model import IfExists, SessionLevelErrorPolicy, TopicLevelErrorPolicy
+from mosaico_ingest.job.config import QuarantineSettings, ROSInjectionConfig, TimeRange
+from mosaico_ingest.job.values import IfExists, SessionLevelErrorPolicy, StoreTarget, TopicLevelErrorPolicy
 from mosaico_ingest.pipeline.provenance import content_digest, held
 from mosaico_ingest.pipeline.quarantine import Kept, find_kept
 

@@ -9,7 +9,7 @@ from msgspec import Struct
 
 from mosaico_ingest.errors import IngestError, SequenceExists
 from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.pipeline.provenance import (
     certain,
     held,

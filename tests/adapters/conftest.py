@@ -14,7 +14,7 @@ import pytest
 
 from mosaico_ingest.adapters.adapter import Adapted, AdapterSpec, Envelope
 from mosaico_ingest.adapters.builtin import BUILTIN
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.adapters.mapping.loader import load_adapter
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 

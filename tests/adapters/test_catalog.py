@@ -31,7 +31,7 @@ from mosaico_ingest.adapters.mapping.loader import load_adapter
 from mosaico_ingest.adapters.mapping.testing import run_tests
 from mosaico_ingest.adapters.python import ROSAdapterBase
 from mosaico_ingest.errors import AdapterError, BagError
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.ontology.registry import ontology_type
 from mosaico_ingest.rosbag.blocks import ROSMessage
 from mosaico_ingest.rosbag.definitions.linking import ros_shape

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pytest
 
 from mosaico_ingest.decode.decoder import ColumnarDecoder, Decoder, RowwiseDecoder
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition

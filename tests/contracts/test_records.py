@@ -17,7 +17,7 @@ from mosaico_ingest.destinations.store.files import new_session_id
 from mosaico_ingest.destinations.store.protocols import Records
 from mosaico_ingest.destinations.store.segment import Segment
 from mosaico_ingest.errors import SequenceExists, SinkError
-from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote import as_path
 

@@ -16,8 +16,7 @@ from mosaico_ingest.destinations.base import MemorySink, Sink, topic_schema
 from mosaico_ingest.destinations.server.sink import PlatformSink
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.errors import SequenceExists, SinkError
-from mosaico_ingest.job.config import ServerTarget
-from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.job.values import IfExists, ServerTarget
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 from mosaico_ingest.remote import AnyPath, as_path
 from mosaico_ingest.serve import serve

@@ -18,7 +18,7 @@ from pathlib import Path
 from mosaico_ingest.api import run
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.job.model import LoaderErrorPolicy, TopicLevelErrorPolicy
+from mosaico_ingest.job.values import LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.report.events import TopicStatus
 from mosaico_ingest.report.model import Report, TopicReport
 

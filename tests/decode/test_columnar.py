@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from mosaico_ingest.decode import decoder as columnar
 from mosaico_ingest.decode.decoder import ColumnarDecoder, Decoded, decoder_for
 from mosaico_ingest.errors import DecodeError
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
 from mosaico_ingest.rosbag.definitions.model import (
     Container,

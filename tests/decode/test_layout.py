@@ -13,7 +13,7 @@ from mosaico_ingest.decode.layout import (
     Words,
     compile_layout,
 )
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.blocks import Encoding
 from mosaico_ingest.rosbag.definitions.model import (
     Container,

@@ -13,7 +13,7 @@ from rosbags.typesys import get_typestore
 
 from mosaico_ingest.decode.decoder import Decoded, RowwiseDecoder, decoder_for
 from mosaico_ingest.errors import DecodeError, IngestError
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.blocks import Encoding, RawBatch
 from mosaico_ingest.rosbag.definitions.model import Container, Definition, Field
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver

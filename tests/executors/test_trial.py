@@ -9,7 +9,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from mosaico_ingest.job.config import ROSInjectionConfig, TimeBound, TimeRange
+from mosaico_ingest.job.config import ROSInjectionConfig, TimeRange
+from mosaico_ingest.job.values import TimeBound
 from mosaico_ingest.pipeline import preview as trial
 from mosaico_ingest.pipeline.plan import RecordingPlan, Sample
 from mosaico_ingest.pipeline.preview import preview

@@ -18,7 +18,7 @@ from mosaico_ingest.adapters.builtin import BUILTIN, Builtin
 from mosaico_ingest.adapters.direct import KnownTypes
 from mosaico_ingest.adapters.inverse import invert
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
 

@@ -17,7 +17,7 @@ from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import BagError, IngestError, NothingMatched
 from mosaico_ingest.export import export_sequence
 from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.job.model import LoaderErrorPolicy, TopicLevelErrorPolicy
+from mosaico_ingest.job.values import LoaderErrorPolicy, TopicLevelErrorPolicy
 
 DRIVE = Path(__file__).parents[2] / "configs" / "quickstart" / "drive.mcap"
 ODD = """

@@ -16,7 +16,7 @@ import pytest
 from mosaico_ingest.adapters.adapter import Adapted, Envelope
 from mosaico_ingest.adapters.bridge import ROSBridge, load_adapter_reference
 from mosaico_ingest.adapters.python import PythonAdapterSpec, ontology_of
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 

@@ -8,7 +8,7 @@ import pytest
 
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.job.manifest import check_manifest, load_manifest
-from mosaico_ingest.job.model import Stores, TopicLevelErrorPolicy
+from mosaico_ingest.job.values import Stores, TopicLevelErrorPolicy
 from mosaico_ingest.job.yaml_source import load_source
 
 

@@ -16,7 +16,7 @@ from mosaicod import Mosaicod, running
 
 from mosaico_ingest.destinations.server.client import _check_host, connect
 from mosaico_ingest.errors import SinkError, SinkUnavailable
-from mosaico_ingest.job.config import ServerTarget
+from mosaico_ingest.job.values import ServerTarget
 
 
 @pytest.fixture(scope="session")

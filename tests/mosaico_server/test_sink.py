@@ -21,8 +21,7 @@ from mosaico_ingest.destinations.server.client import connect
 from mosaico_ingest.destinations.server.errors import Address
 from mosaico_ingest.destinations.server.sink import PlatformSink, delete_finding
 from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
-from mosaico_ingest.job.config import ServerTarget
-from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.job.values import IfExists, ServerTarget
 from mosaico_ingest.ontology import Integer64
 from mosaico_ingest.ontology.types import OntologyType
 

@@ -9,22 +9,18 @@ from pathlib import Path
 import pytest
 
 from mosaico_ingest.errors import IngestError, ManifestError, NothingMatched
-from mosaico_ingest.job.config import (
-    Limit,
-    QuarantineSettings,
-    ROSInjectionConfig,
-    ServerTarget,
-    StoreTarget,
-    TimeBound,
-    TimeRange,
-)
+from mosaico_ingest.job.config import QuarantineSettings, ROSInjectionConfig, TimeRange
 from mosaico_ingest.job.manifest import load_manifest
-from mosaico_ingest.job.model import (
+from mosaico_ingest.job.values import (
     IfExists,
+    Limit,
     LoaderErrorPolicy,
     OnSchemaChange,
+    ServerTarget,
     SessionLevelErrorPolicy,
     Stores,
+    StoreTarget,
+    TimeBound,
     TopicLevelErrorPolicy,
     Unmodeled,
 )

@@ -26,7 +26,7 @@ from mosaico_ingest.destinations.store.session import StoreSession
 from mosaico_ingest.destinations.store.store import verify
 from mosaico_ingest.errors import BagError, VerificationError
 from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.job.model import LoaderErrorPolicy
+from mosaico_ingest.job.values import LoaderErrorPolicy
 from mosaico_ingest.pipeline.run import _missing, execute, make_plan
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.report.events import (

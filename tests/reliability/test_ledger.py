@@ -10,7 +10,7 @@ import pytest
 
 from mosaico_ingest import api
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.job.config import LEDGER_KEY
+from mosaico_ingest.job.values import LEDGER_KEY
 from mosaico_ingest.pipeline.provenance import content_digest
 from mosaico_ingest.report.events import Event, RunStatus, TopicProgress
 from mosaico_ingest.services.status import Standing

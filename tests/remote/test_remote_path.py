@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from mosaico_ingest.errors import IngestError, ManifestError, Unreachable
-from mosaico_ingest.job.config import ROSInjectionConfig, StoreTarget
+from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.manifest import load_manifest
+from mosaico_ingest.job.values import StoreTarget
 from mosaico_ingest.pipeline.compile import compile_manifest
 from mosaico_ingest.remote import RemotePath, as_path, filesystem, is_url, reaching
 

@@ -24,7 +24,7 @@ from mosaico_ingest.errors import (
     SinkUnavailable,
     Unreachable,
 )
-from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote import RemotePath, as_path
 from mosaico_ingest.serve import serve

@@ -15,7 +15,7 @@ from rosbags.typesys import get_typestore
 from rosbags.typesys.store import Typestore
 
 from mosaico_ingest.errors import BagError, DecodeError
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.blocks import Encoding
 from mosaico_ingest.rosbag.definitions.model import (
     Container,

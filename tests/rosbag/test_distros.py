@@ -4,7 +4,7 @@ import pytest
 from rosbags.typesys import Stores as RosbagsStores
 from rosbags.typesys import get_typestore
 
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.distros import FILE, distro_type
 from mosaico_ingest.rosbag.definitions.distros_file import distros_file
 from mosaico_ingest.rosbag.definitions.parser import message_type

@@ -13,7 +13,7 @@ from rosbags.typesys import Stores as RosbagsStores
 from rosbags.typesys import get_typestore
 
 from mosaico_ingest.errors import BagError, DecodeError, NothingMatched
-from mosaico_ingest.job.model import LoaderErrorPolicy, Stores
+from mosaico_ingest.job.values import LoaderErrorPolicy, Stores
 from mosaico_ingest.rosbag.blocks import Encoding, ROSHeader, ROSMessage
 from mosaico_ingest.rosbag.definitions.model import Embedded
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver

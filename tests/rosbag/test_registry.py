@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.model import Source
 from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry, TypeResolver
 

@@ -4,7 +4,7 @@ import pyarrow as pa
 import pytest
 
 from mosaico_ingest.errors import DecodeError
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import (
     Constant,

@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from mosaico_ingest.destinations.base import topic_schema
 from mosaico_ingest.destinations.store import Store, StoreSink
-from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType
 
 SAMPLE = OntologyType("Sample", pa.struct([pa.field("value", pa.float64()), pa.field("source", pa.int32())]))

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.blocks import Encoding
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver

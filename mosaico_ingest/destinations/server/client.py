@@ -26,7 +26,7 @@ from mosaico_ingest.destinations.server.errors import (
     reraise,
 )
 from mosaico_ingest.errors import SinkError, SinkUnavailable
-from mosaico_ingest.job.config import ServerTarget
+from mosaico_ingest.job.values import ServerTarget
 from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.errors import Condition, condition_of
 from mosaico_ingest.protocol.messages import (

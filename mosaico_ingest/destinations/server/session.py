@@ -12,8 +12,7 @@ from mosaico_ingest.destinations.server.client import PlatformClient, Uploaded, 
 from mosaico_ingest.destinations.server.errors import Refused, add_hint
 from mosaico_ingest.destinations.server.upload import Memory, Upload
 from mosaico_ingest.errors import SinkError, SinkUnavailable
-from mosaico_ingest.job.config import ServerTarget
-from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.job.values import IfExists, ServerTarget
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.errors import Condition

@@ -15,8 +15,7 @@ from mosaico_ingest.destinations.server.errors import Refused, add_hint
 from mosaico_ingest.destinations.server.session import PlatformSession
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.findings import Finding, Severity
-from mosaico_ingest.job.config import ServerTarget
-from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.job.values import IfExists, ServerTarget
 from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.errors import Condition
 

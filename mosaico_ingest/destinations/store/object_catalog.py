@@ -40,7 +40,7 @@ from mosaico_ingest.destinations.store.model import (
 )
 from mosaico_ingest.destinations.store.segment import Segment
 from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
-from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 from mosaico_ingest.remote import AnyPath, RemotePath
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import SinkError
-from mosaico_ingest.job.config import ServerTarget, StoreTarget
+from mosaico_ingest.job.values import ServerTarget, StoreTarget
 
 __all__ = ["Hold", "held_catalogs"]
 

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from mosaico_ingest.destinations.store.catalog import Claim, NewNote, NewSession
 from mosaico_ingest.destinations.store.model import SequenceInfo, TopicInfo
-from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.remote import AnyPath
 
 __all__ = ["Closable", "Files", "Lease", "Records"]

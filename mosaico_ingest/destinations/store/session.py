@@ -31,7 +31,7 @@ from mosaico_ingest.destinations.store.segment import (
 )
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import IngestError, SinkError
-from mosaico_ingest.job.model import IfExists
+from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote import AnyPath, RemotePath
 

@@ -17,8 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from mosaico_ingest.findings import Severity
-from mosaico_ingest.job.model import LoaderErrorPolicy, TopicLevelErrorPolicy
-from mosaico_ingest.job.sections import DEFAULT_TOPIC
+from mosaico_ingest.job.values import DEFAULT_TOPIC, LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.rule import Problem, Rule
 

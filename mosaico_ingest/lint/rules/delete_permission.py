@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from mosaico_ingest.findings import Severity
-from mosaico_ingest.job.model import SessionLevelErrorPolicy
+from mosaico_ingest.job.values import SessionLevelErrorPolicy
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.rule import Problem, Rule
 

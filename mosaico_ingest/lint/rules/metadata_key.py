@@ -25,7 +25,7 @@ import re
 from collections.abc import Iterator
 
 from mosaico_ingest.findings import Severity
-from mosaico_ingest.job.config import LEDGER_KEY
+from mosaico_ingest.job.values import LEDGER_KEY
 from mosaico_ingest.lint.job import Job, keys_below, metadata_places
 from mosaico_ingest.lint.rule import Problem, Rule
 

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from functools import cache, lru_cache
 from pathlib import Path
 
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.linking import link
 from mosaico_ingest.rosbag.definitions.model import DURATION, TIME, Definition, Field, MessageType, Source
 from mosaico_ingest.rosbag.definitions.parser import flatten, parse_msg, read_types

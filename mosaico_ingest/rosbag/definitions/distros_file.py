@@ -7,7 +7,7 @@ import json
 from rosbags.typesys import Stores as RosbagsStores
 from rosbags.typesys import get_typestore
 
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.distros import FILE
 from mosaico_ingest.rosbag.definitions.parser import message_type, spell
 

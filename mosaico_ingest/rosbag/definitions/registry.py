@@ -13,7 +13,7 @@ from msgspec import Struct
 
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.findings import Finding, Severity
-from mosaico_ingest.job.model import Stores
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.distros import (
     BEFORE_IRON,
     BUILTIN,

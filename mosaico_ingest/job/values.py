@@ -2,17 +2,39 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from enum import Enum
+from pathlib import Path
+
+from msgspec import Struct
+
+from mosaico_ingest.remote import AnyPath
 
 __all__ = [
+    "DEFAULT_PORT",
+    "DEFAULT_STORE",
+    "DEFAULT_TOPIC",
+    "LEDGER_KEY",
     "IfExists",
+    "Limit",
     "LoaderErrorPolicy",
     "OnSchemaChange",
+    "ServerTarget",
     "SessionLevelErrorPolicy",
+    "StoreTarget",
     "Stores",
+    "TimeBound",
     "TopicLevelErrorPolicy",
     "Unmodeled",
 ]
+
+
+DEFAULT_STORE = Path("mosaico")
+DEFAULT_PORT = 6726
+DEFAULT_TOPIC = "default"
+"""The key of `topics_on_error` for every topic that no other key matches."""
+LEDGER_KEY = "mosaico_ingest"
+"""The key of a sequence's metadata, and of each of its sessions, that says what it was made from."""
 
 
 class SessionLevelErrorPolicy(str, Enum):
@@ -89,3 +111,40 @@ class Stores(str, Enum):
     ROS2_JAZZY = "ros2_jazzy"
     ROS2_KILTED = "ros2_kilted"
     ROS2_LYRICAL = "ros2_lyrical"
+
+
+class TimeBound(Struct, frozen=True):
+    """A moment: ns since the epoch, or ns from the recording's first message (negative: back from its last)."""
+
+    ns: int
+    relative: bool = False
+
+    def at(self, start_ns: int, end_ns: int) -> int:
+        """Return ns since the epoch, given the recording's first and last log time."""
+        if not self.relative:
+            return self.ns
+        return (end_ns if self.ns < 0 else start_ns) + self.ns
+
+
+class Limit(Struct, frozen=True):
+    """At most so many messages, or at most this share of them, from 0 to 1; one of the two is None."""
+
+    count: int | None = None
+    share: float | None = None
+
+
+class StoreTarget(Struct, frozen=True):
+    """The embedded store in a directory, or behind a URL."""
+
+    path: AnyPath
+
+
+@dataclass(frozen=True, slots=True)
+class ServerTarget:
+    """A Mosaico server."""
+
+    host: str
+    port: int
+    api_key: str | None = field(default=None, repr=False)
+    tls_cert: Path | None = None
+    tls: bool = False
