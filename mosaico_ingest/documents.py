@@ -8,7 +8,7 @@ from __future__ import annotations
 import ast
 import inspect
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 from pydantic import BaseModel, ConfigDict, model_validator
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
@@ -17,9 +17,13 @@ from pydantic_core.core_schema import ModelSchema
 from mosaico_ingest.findings import encodable
 
 __all__ = [
+    "DIALECT",
     "Part",
     "schema_of",
+    "tidy",
 ]
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
 def schema_of(
@@ -57,6 +61,33 @@ def _docstrings(owner: type) -> dict[str, str]:
         if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
         if isinstance(below.value.value, str)
     }
+
+
+def tidy(node: dict[str, Any]) -> dict[str, Any]:
+    """Leave out titles, which repeat the keys, nulls for keys left out, and the defaults of whole sections."""
+    branches = [branch for branch in node.get("anyOf", ()) if branch != {"type": "null"}]
+    if len(branches) == 1:
+        node = {**{key: value for key, value in node.items() if key != "anyOf"}, **branches[0]}
+    noise = {"title", "default"} if "$ref" in node and isinstance(node.get("default"), dict) else {"title"}
+    kept = {
+        key: value for key, value in node.items() if key not in noise and (key, value) != ("default", None)
+    }
+    return {key: _tidy_member(key, value) for key, value in kept.items()}
+
+
+def _tidy_member(key: str, value: object) -> object:
+    if key in {"default", "examples"}:
+        return value
+    if key == "description":
+        return " ".join(str(value).split())
+    if key in {"properties", "$defs"}:
+        members = cast("dict[str, dict[str, Any]]", value)  # names, not keywords
+        return {name: tidy(member) for name, member in members.items()}
+    if isinstance(value, dict):
+        return tidy(cast("dict[str, Any]", value))
+    if isinstance(value, list):
+        return [tidy(cast("dict[str, Any]", item)) if isinstance(item, dict) else item for item in value]
+    return value
 
 
 class Part(BaseModel):

@@ -12,26 +12,17 @@ from typing import TYPE_CHECKING, Annotated, ParamSpec, TypeVar
 
 import typer
 
-from mosaico_ingest import api
 from mosaico_ingest.cli.logs import JsonLines, LogFormat, LogOption, set_up_logging
 from mosaico_ingest.cli.process import collect_as_usual, interrupt_on_terminate
-from mosaico_ingest.cli.progress import Tally, sizes_of
 from mosaico_ingest.errors import ManifestError, SinkError
-from mosaico_ingest.executors.in_process import Executor, Inline
 from mosaico_ingest.job.values import IfExists
-from mosaico_ingest.report.events import (
-    BatchObserver,
-    Event,
-    RunFinished,
-    ignore_batch,
-)
-from mosaico_ingest.report.model import RunReport, UsedManifest, write_report
-from mosaico_ingest.textfile import check_file
+from mosaico_ingest.report.events import BatchObserver, Event, RunFinished, ignore_batch
 
 if TYPE_CHECKING:
     from mosaico_ingest.executors.in_process import Executor
     from mosaico_ingest.findings import Finding
     from mosaico_ingest.job.config import ROSInjectionConfig
+    from mosaico_ingest.report.model import RunReport, UsedManifest
 
 __all__ = [
     "bag",
@@ -99,6 +90,10 @@ def run_configs(
     finished: Callable[[RunReport], None] = lambda _result: None,
 ) -> None:
     """Run the configurations, several at a time where asked for; exit with the report's code unless it is 0."""
+    from mosaico_ingest import api
+    from mosaico_ingest.report.model import write_report
+    from mosaico_ingest.textfile import check_file
+
     level = log or (configs[0].log_level if configs else "INFO")
     prepare = partial(set_up_logging, level, log_format)
     prepare()
@@ -142,11 +137,11 @@ def _display(
     """Return what shows the run while it goes; what draws is slow to import, and only people want it drawn."""
     if quiet and not as_json:
         return nullcontext(ignore_batch)
+    from mosaico_ingest.cli.progress import Tally, display, sizes_of
+
     tally = Tally(sizes_of(configs) if len(configs) > 1 else [1] * len(configs))
     if as_json:
         return nullcontext(JsonLines(tally))
-    from mosaico_ingest.cli.progress import display
-
     return display(tally)
 
 
@@ -170,6 +165,8 @@ def _executor(
 ) -> Executor:
     wanted = min(jobs or configs[0].jobs, len(configs)) if configs else 1
     if wanted == 1:
+        from mosaico_ingest.executors.in_process import Inline
+
         return Inline()
     from mosaico_ingest.executors.processes import Processes
 

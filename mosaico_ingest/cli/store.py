@@ -6,7 +6,6 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
-import pyarrow as pa
 import typer
 from rich.console import Console
 from rich.table import Table
@@ -23,6 +22,8 @@ from mosaico_ingest.report.units import (
 )
 
 if TYPE_CHECKING:
+    import pyarrow as pa
+
     from mosaico_ingest.destinations.store import SequenceInfo, TopicInfo
 
 __all__ = [
@@ -124,10 +125,12 @@ def _leaves(
     fields: Iterable[pa.Field[Any]], rows: Sequence[Mapping[str, Any] | None], above: str = ""
 ) -> Iterator[tuple[str, str, list[Any]]]:
     """Yield path, type and values of each column; those of a struct that no row has are one."""
+    from pyarrow.types import is_struct
+
     for field in fields:
         path = f"{above}{field.name}"
         values = [None if row is None else row[field.name] for row in rows]
-        if not pa.types.is_struct(field.type):
+        if not is_struct(field.type):
             yield path, f"{field.type}{'' if field.nullable else ' not null'}", values
         elif rows and all(value is None for value in values):
             yield f"{path}.*", f"{field.type.num_fields} columns", values

@@ -8,18 +8,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
-from mosaico_ingest.documents import schema_of
+from mosaico_ingest.documents import DIALECT, schema_of, tidy
 from mosaico_ingest.job.compose import EXTENDS_KEY as EXTENDS
 from mosaico_ingest.job.sections import Manifest
 
 __all__ = [
-    "DIALECT",
     "job_schema",
     "manifest_reference",
-    "tidy",
 ]
 
-DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _VARIABLE = {"type": "string", "pattern": r"\$\{[^{}]+\}", "description": "A variable of the environment."}
 
 
@@ -53,33 +50,6 @@ def _or_variable(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str,
         **about,
         "anyOf": [{k: v for k, v in node.items() if k not in about}, {"$ref": "#/$defs/Variable"}],
     }
-
-
-def tidy(node: dict[str, Any]) -> dict[str, Any]:
-    """Leave out titles, which repeat the keys, nulls for keys left out, and the defaults of whole sections."""
-    branches = [branch for branch in node.get("anyOf", ()) if branch != {"type": "null"}]
-    if len(branches) == 1:
-        node = {**{key: value for key, value in node.items() if key != "anyOf"}, **branches[0]}
-    noise = {"title", "default"} if "$ref" in node and isinstance(node.get("default"), dict) else {"title"}
-    kept = {
-        key: value for key, value in node.items() if key not in noise and (key, value) != ("default", None)
-    }
-    return {key: _tidy_member(key, value) for key, value in kept.items()}
-
-
-def _tidy_member(key: str, value: object) -> object:
-    if key in {"default", "examples"}:
-        return value
-    if key == "description":
-        return " ".join(str(value).split())
-    if key in {"properties", "$defs"}:
-        members = cast("dict[str, dict[str, Any]]", value)  # names, not keywords
-        return {name: tidy(member) for name, member in members.items()}
-    if isinstance(value, dict):
-        return tidy(cast("dict[str, Any]", value))
-    if isinstance(value, list):
-        return [tidy(cast("dict[str, Any]", item)) if isinstance(item, dict) else item for item in value]
-    return value
 
 
 _HEAD = """\

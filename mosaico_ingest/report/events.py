@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from enum import Enum
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from msgspec import Struct
 
 from mosaico_ingest.findings import Finding, Stage
-from mosaico_ingest.report.timing import Step, TimelineReport
+
+if TYPE_CHECKING:  # pydantic and NumPy are slow to import
+    from mosaico_ingest.report.timing import Step, TimelineReport
 
 __all__ = [
     "BatchObserver",

@@ -12,8 +12,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Fiel
 from pydantic_core import PydanticCustomError
 
 from mosaico_ingest.adapters.mapping.columns import DataType, arrays
-from mosaico_ingest.documents import schema_of
-from mosaico_ingest.job.reference import DIALECT, tidy
+from mosaico_ingest.documents import DIALECT, schema_of, tidy
 from mosaico_ingest.ontology.registry import MODULES, UnknownTag, ontology_type
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 

@@ -9,7 +9,8 @@ from rosbags.typesys import get_typestore
 
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.distros import FILE
-from mosaico_ingest.rosbag.definitions.parser import message_type, spell
+from mosaico_ingest.rosbag.definitions.idl import message_type
+from mosaico_ingest.rosbag.definitions.parser import spell
 
 __all__ = ["distros_file"]
 

@@ -1,4 +1,4 @@
-"""Parse `.msg` and IDL text, and write definitions as `.msg` text."""
+"""Parse `.msg` text, and write definitions as `.msg` text."""
 
 from __future__ import annotations
 
@@ -9,9 +9,6 @@ from functools import lru_cache
 
 from msgspec import Struct
 from msgspec.structs import replace
-from rosbags.interfaces import Nodetype
-from rosbags.interfaces.typing import FieldDesc, Typesdict
-from rosbags.typesys import TypesysError, get_types_from_idl
 
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.definitions.model import (
@@ -31,9 +28,7 @@ __all__ = [
     "SEPARATOR",
     "Section",
     "flatten",
-    "message_type",
     "parse_msg",
-    "read_idl",
     "read_types",
     "sections",
     "spell",
@@ -236,65 +231,6 @@ def _brackets(field: Field) -> str:
     return f"[<={field.size}]" if field.size else "[]"
 
 
-_NOT_CODE = re.compile(r"//[^\n]*|/\*.*?\*/|\"(?:\\.|[^\"\\])*\"", re.DOTALL)
-_PLACEHOLDER = "structure_needs_at_least_one_member"
-_CONTAINERS = {Nodetype.ARRAY: Container.ARRAY, Nodetype.SEQUENCE: Container.SEQUENCE}
-_IDL_ERRORS = (
-    TypesysError,
-    AssertionError,
-    LookupError,
-    TypeError,
-    ValueError,
-    ArithmeticError,
-    RecursionError,
-)
-"""What rosbags' IDL parser raises on text that is not IDL."""
-
-
-def read_idl(text: str, *, where: str) -> list[MessageType]:
-    """Return every type that `text` defines; `where` names its place in messages.
-
-    Raises:
-        BagError: It cannot be read.
-    """
-    if "<<" in _NOT_CODE.sub("", text):
-        # No ROS message shifts, and one line of it could ask for all memory there is.
-        raise BagError("shifts in IDL constants are not read", where=where)
-    try:
-        types = get_types_from_idl(text)
-    except _IDL_ERRORS as error:
-        reason = " ".join(str(error).split())[-200:]
-        raise BagError(f"cannot read the IDL: {reason}", where=where) from None
-    return [message_type(name, types) for name in types]
-
-
-def message_type(name: str, types: Typesdict) -> MessageType:
-    """Return one of rosbags' types in our form."""
-    constants, fields = types[name]
-    return MessageType(
-        name,
-        tuple(_field(field, desc) for field, desc in fields if field != _PLACEHOLDER),
-        tuple(Constant(constant, kind, value) for constant, kind, value in constants),
-    )
-
-
-def _field(name: str, desc: FieldDesc) -> Field:
-    if desc[0] == Nodetype.BASE:
-        return Field(name, desc[1][0], string_bound=desc[1][1])
-    if desc[0] == Nodetype.NAME:
-        return Field(name, desc[1], is_message=True)
-    element, size = desc[1]
-    plain = _field(name, element)
-    return Field(
-        name,
-        plain.type,
-        plain.is_message,
-        _CONTAINERS[Nodetype(desc[0])],
-        size,
-        string_bound=plain.string_bound,
-    )
-
-
 _MODULE = re.compile(r"^\s*module\s+\w+\s*\{", re.MULTILINE)
 _DASHES = re.compile(r"^---[ \t\r]*$", re.MULTILINE)
 _SERVICE_PARTS = re.compile(r"(.+/srv/.+)_(?:Event|Request|Response)")
@@ -321,6 +257,8 @@ def read_types(text: str, root: str, *, where: str | None = None) -> Mapping[str
 
 def _read_section(section: Section, root: str, where: str | None) -> list[MessageType]:
     if section.kind == "IDL" or (not section.kind and _MODULE.search(section.text)):
+        from mosaico_ingest.rosbag.definitions.idl import read_idl  # noqa: PLC0415 - rosbags is slow to import, and IDL is rare
+
         return read_idl(section.text, where=f"{where or root}:{section.line + 1}")
     name = normalize_msgtype(section.name) if section.name else root
     service, dashes = _SERVICE_PARTS.fullmatch(name), _DASHES.search(section.text)
