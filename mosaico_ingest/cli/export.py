@@ -98,7 +98,7 @@ def _print(report: ExportReport) -> None:
     console = open_console()
     table = plain_table("topic", "type", "adapter", "messages", numbers={"messages"})
     for topic in report.topics:
-        if not topic.left_out:
+        if not topic.excluded:
             table.add_row(topic.topic, topic.msgtype, topic.adapter, count_text(topic.messages))
     console.print(table)
     for topic in report.topics:
@@ -111,7 +111,7 @@ def _print(report: ExportReport) -> None:
 
 def _remarks(topic: TopicExport) -> list[str]:
     """Say in words what the messages lack."""
-    lines = [f"left out: {topic.left_out}"] if topic.left_out else []
+    lines = [f"left out: {topic.excluded}"] if topic.excluded else []
     lines += [f"{column} cannot be undone ({how})" for column, how in topic.not_undone.items()]
     if topic.unknown:
         lines.append(f"not in the store, written as zero or empty: {', '.join(topic.unknown)}")

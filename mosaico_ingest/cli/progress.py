@@ -94,7 +94,7 @@ class Tally:
         """Take one event of the recording at this position."""
         match event:
             case RunStarted():
-                promised = sum(topic.count or 0 for topic in event.topics if not topic.left_out)
+                promised = sum(topic.count or 0 for topic in event.topics if not topic.excluded)
                 self.at_work[position] = Underway(event, promised)
             case TopicProgress():
                 self.at_work[position].read += event.read
@@ -333,7 +333,7 @@ class _Tally:
         match event:
             case RunStarted():
                 self.start, self.began, self.payload_bytes = event, time.monotonic(), 0
-                self.topics = {t.target: _Count(t) for t in event.topics if not t.left_out}
+                self.topics = {t.target: _Count(t) for t in event.topics if not t.excluded}
             case TopicProgress():
                 count = self.topics[event.target]
                 count.read += event.read
@@ -447,6 +447,6 @@ class _Board:
 
 
 def _begins(start: RunStarted) -> str:
-    taken = sum(not topic.left_out for topic in start.topics)
+    taken = sum(not topic.excluded for topic in start.topics)
     size = bytes_text(start.source_bytes)
     return f"{start.sequence}: {counted(taken, 'topic')} from {', '.join(start.files)} ({size}) to {start.destination}"

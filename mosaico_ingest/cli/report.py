@@ -107,7 +107,7 @@ def _print_batch(report: RunReport, console: Console) -> None:
     for column in ("topics", "read", "written", "rejected", "stored", "time"):
         table.add_column(column, justify="right", no_wrap=True)
     for one in report.recordings:
-        totals, taken = one.totals, sum(t.status is not TopicStatus.LEFT_OUT for t in one.topics)
+        totals, taken = one.totals, sum(t.status is not TopicStatus.EXCLUDED for t in one.topics)
         counts = (taken, totals.read, totals.written, totals.rejected)
         style = STATUS_STYLE.get(one.status, "red")
         table.add_row(
@@ -141,11 +141,11 @@ def _print_recording(report: Report, console: Console) -> None:
     for column in columns:
         table.add_column(column, justify="right", no_wrap=True)
     for topic in report.topics:
-        if topic.status is not TopicStatus.LEFT_OUT:
+        if topic.status is not TopicStatus.EXCLUDED:
             cells = _cells(topic)
             table.add_row(topic.target, topic.ontology, *(cells[column] for column in columns))
     console.print(table)
-    _print_left_out(report, console)
+    _print_excluded(report, console)
     for line in _rejections(report):
         console.print(Text(line, style="yellow"), soft_wrap=True)
     _print_totals(report, console)
@@ -169,11 +169,11 @@ def _cells(topic: TopicReport) -> dict[str, str | Text]:
     }
 
 
-def _print_left_out(report: Report, console: Console) -> None:
+def _print_excluded(report: Report, console: Console) -> None:
     """Print the topics that were not read, those with the same reason together."""
     reasons: dict[str, list[str]] = {}
     for topic in report.topics:
-        if topic.status is TopicStatus.LEFT_OUT:
+        if topic.status is TopicStatus.EXCLUDED:
             reasons.setdefault(topic.why, []).append(topic.topic)
     for why, topics in reasons.items():
         console.print(Text(f"left out {', '.join(topics)}: {why}", style="dim"), soft_wrap=True)
@@ -182,7 +182,7 @@ def _print_left_out(report: Report, console: Console) -> None:
 def _sizes(report: Report) -> str:
     """Compare what is stored with the source where all of it was taken, else with the messages read."""
     stored = report.totals.stored_bytes
-    taken = [topic for topic in report.topics if topic.status is not TopicStatus.LEFT_OUT]
+    taken = [topic for topic in report.topics if topic.status is not TopicStatus.EXCLUDED]
     promised = sum(topic.promised or 0 for topic in taken)
     partial = len(taken) < len(report.topics) or report.totals.read < promised
     before = report.totals.payload_bytes if partial else report.source_bytes
@@ -196,8 +196,8 @@ def _print_totals(report: Report, console: Console) -> None:
     parts = [f"{count_text(totals.written)} of {count_text(totals.read)} messages written"]
     if totals.rejected:
         parts.append(f"{count_text(totals.rejected)} rejected")
-    if report.losses:
-        lost = sum(loss.count or 0 for loss in report.losses)
+    if report.unreadable_ranges:
+        lost = sum(item.count or 0 for item in report.unreadable_ranges)
         parts.append(f"{count_text(lost)} unreadable" if lost else "some unreadable")
     if totals.downsampled:
         parts.append(f"{count_text(totals.downsampled)} sampled away")

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from mosaico_ingest.cli.console import plain_table
 from mosaico_ingest.cli.report import open_console, print_json
-from mosaico_ingest.job.values import LEDGER_KEY
+from mosaico_ingest.job.values import PROVENANCE_KEY
 from mosaico_ingest.report.units import (
     bytes_text,
     count_text,
@@ -144,11 +144,11 @@ def _print_metadata(metadata: Mapping[str, Any], console: Console) -> None:
 
 
 def _metadata_lines(metadata: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield names and values; of what the ledger keeps for programs, the few words a person wants."""
+    """Yield names and values; of what the provenance keeps for programs, the few words a person wants."""
     for key, value in metadata.items():
         if not isinstance(value, dict) or not value:
             yield key, value
-        elif key == LEDGER_KEY and "sources" in value:
+        elif key == PROVENANCE_KEY and "sources" in value:
             names = (str(source["name"]) for source in value["sources"])
             yield key, f"{value.get('tool')} from {', '.join(names)}"
         else:

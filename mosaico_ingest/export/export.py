@@ -64,13 +64,13 @@ class TopicExport(_Record):
     """Columns that no field could be computed from, and what they were computed as."""
     changed: dict[str, int] = {}
     """Columns that would come out otherwise if the file were ingested, and in how many rows."""
-    left_out: str = ""
+    excluded: str = ""
     """Why it is not in the file; empty where it is."""
 
     @property
     def faithful(self) -> bool:
         """Whether the file, ingested in the same way, gives the same rows."""
-        return not self.left_out and not self.changed
+        return not self.excluded and not self.changed
 
 
 class ExportReport(_Record):
@@ -317,11 +317,11 @@ def _prepare(
 
 
 def _left(info: TopicInfo, msgtype: str, why: str) -> TopicExport:
-    return TopicExport(topic=info.name, msgtype=msgtype, ontology=info.ontology.tag, left_out=why)
+    return TopicExport(topic=info.name, msgtype=msgtype, ontology=info.ontology.tag, excluded=why)
 
 
 def _first(left: Sequence[TopicExport]) -> str:
-    return f"{left[0].topic}: {left[0].left_out}"
+    return f"{left[0].topic}: {left[0].excluded}"
 
 
 def _stream(

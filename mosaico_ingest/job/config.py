@@ -17,7 +17,7 @@ from mosaico_ingest.job.values import (
     DEFAULT_PORT,
     DEFAULT_STORE,
     DEFAULT_TOPIC,
-    LEDGER_KEY,
+    PROVENANCE_KEY,
     IfExists,
     Limit,
     LoaderErrorPolicy,
@@ -176,9 +176,9 @@ class ROSInjectionConfig:
             check_metadata(self.metadata, where=self.where or "metadata")
         except SinkError as error:
             raise ManifestError(error.what, where=error.where, hint=error.hint) from error
-        if LEDGER_KEY in self.metadata:
+        if PROVENANCE_KEY in self.metadata:
             raise ManifestError(
-                f"the metadata key {LEDGER_KEY!r} is where a run notes what the sequence was made from",
+                f"the metadata key {PROVENANCE_KEY!r} is where a run notes what the sequence was made from",
                 where=self.where or "metadata",
                 hint="use another key",
             )

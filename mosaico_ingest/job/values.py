@@ -14,7 +14,7 @@ __all__ = [
     "DEFAULT_PORT",
     "DEFAULT_STORE",
     "DEFAULT_TOPIC",
-    "LEDGER_KEY",
+    "PROVENANCE_KEY",
     "IfExists",
     "Limit",
     "LoaderErrorPolicy",
@@ -33,7 +33,7 @@ DEFAULT_STORE = Path("mosaico")
 DEFAULT_PORT = 6726
 DEFAULT_TOPIC = "default"
 """The key of `topics_on_error` for every topic that no other key matches."""
-LEDGER_KEY = "mosaico_ingest"
+PROVENANCE_KEY = "mosaico_ingest"
 """The key of a sequence's metadata, and of each of its sessions, that says what it was made from."""
 
 

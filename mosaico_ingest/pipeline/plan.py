@@ -38,9 +38,10 @@ __all__ = [
     "Decisions",
     "DestinationState",
     "Difference",
+    "ExcludedTopic",
+    "ExcludedTopicDocument",
     "FilePart",
     "Kept",
-    "LeftOut",
     "Note",
     "Plan",
     "PlanDocument",
@@ -49,7 +50,6 @@ __all__ = [
     "Sample",
     "SampleRejection",
     "TopicPlan",
-    "UnreadTopic",
     "check_digest",
     "decisions",
     "differences",
@@ -85,7 +85,7 @@ class TopicPlan(Struct, frozen=True):
     """Where each of its definitions was found, and the digest of its text, as `bag 1f0c9a22b7e4d8a3`."""
 
 
-class LeftOut(Struct, frozen=True):
+class ExcludedTopic(Struct, frozen=True):
     """A topic of the recording that will not be read, and why."""
 
     topic: str
@@ -93,9 +93,9 @@ class LeftOut(Struct, frozen=True):
     count: int | None
     why: str
     span: Span | None = None
-    """Where the manifest says so."""
-    lost: bool = False
-    """Nobody asked for that: its messages cannot be read for want of their definition."""
+    """The location in the manifest that excludes the topic."""
+    undefined: bool = False
+    """True if the topic is selected but no definition of its type is known: its messages count as unreadable."""
 
 
 class Plan(Struct, frozen=True):
@@ -112,7 +112,7 @@ class Plan(Struct, frozen=True):
     on_error: SessionLevelErrorPolicy
     on_message_error: LoaderErrorPolicy
     topics: tuple[TopicPlan, ...]
-    left_out: tuple[LeftOut, ...] = ()
+    excluded: tuple[ExcludedTopic, ...] = ()
     findings: tuple[Finding, ...] = ()
     start_ns: int | None = None
     """The first instant of the recording, ns since the epoch."""
@@ -124,7 +124,7 @@ class Plan(Struct, frozen=True):
     quarantine: QuarantineSettings | None = None
     """Where rejected messages are kept."""
     kept_as: str | None = None
-    """The name of the file they are kept in, as the ledger of the run has it."""
+    """The name of the file they are kept in, as the provenance of the run has it."""
     missing: tuple[AnyPath, ...] = ()
     """Parts of the recording that are not there, though its metadata list them."""
     family: str | None = None
@@ -171,7 +171,7 @@ class PlannedTopic(Part):
     metadata: dict[str, JsonValue]
 
 
-class UnreadTopic(Part):
+class ExcludedTopicDocument(Part):
     """A topic that will not be read."""
 
     topic: str
@@ -216,7 +216,7 @@ class Decisions(Part):
     on_message_error: LoaderErrorPolicy
     quarantine: Kept | None = None
     topics: tuple[PlannedTopic, ...]
-    left_out: tuple[UnreadTopic, ...]
+    excluded: tuple[ExcludedTopicDocument, ...]
 
     @property
     def digest(self) -> str:
@@ -361,7 +361,7 @@ def decisions(plan: Plan, *, folder: Path) -> Decisions:
         on_message_error=plan.on_message_error,
         quarantine=None if plan.quarantine is None else _kept(plan.quarantine, folder),
         topics=tuple(map(_planned, plan.topics)),
-        left_out=tuple(map(_unread, plan.left_out)),
+        excluded=tuple(map(_unread, plan.excluded)),
     )
 
 
@@ -429,8 +429,8 @@ def _name(spec: AdapterSpec) -> str:
     return f"{spec.name}, then PNG" if isinstance(spec, PngImageSpec) else spec.name
 
 
-def _unread(topic: LeftOut) -> UnreadTopic:
-    return UnreadTopic(topic=topic.topic, msgtype=topic.msgtype, count=topic.count, why=topic.why)
+def _unread(topic: ExcludedTopic) -> ExcludedTopicDocument:
+    return ExcludedTopicDocument(topic=topic.topic, msgtype=topic.msgtype, count=topic.count, why=topic.why)
 
 
 def _digest(spec: AdapterSpec) -> str | None:
@@ -450,7 +450,7 @@ def _seen_from(folder: Path, path: AnyPath) -> str:
 
 Json: TypeAlias = Any
 
-_NAMES = {"topics": ("topic", "target"), "left_out": ("left out", "topic"), "files": ("file", "path")}
+_NAMES = {"topics": ("topic", "target"), "excluded": ("excluded topic", "topic"), "files": ("file", "path")}
 """How an item of a list is called, and the key that tells it from the others."""
 
 

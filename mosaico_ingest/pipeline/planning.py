@@ -25,7 +25,7 @@ from mosaico_ingest.job.config import ROSInjectionConfig, TimeRange
 from mosaico_ingest.job.patterns import Selection, first_match, select
 from mosaico_ingest.job.values import (
     DEFAULT_TOPIC,
-    LEDGER_KEY,
+    PROVENANCE_KEY,
     LoaderErrorPolicy,
     OnSchemaChange,
     StoreTarget,
@@ -34,7 +34,7 @@ from mosaico_ingest.job.values import (
 )
 from mosaico_ingest.pipeline.plan import (
     DEFAULT_MEMORY_BYTES,
-    LeftOut,
+    ExcludedTopic,
     Plan,
     TopicPlan,
     check_digest,
@@ -58,7 +58,7 @@ T = TypeVar("T")
 
 def decide(
     config: ROSInjectionConfig, channel: Channel, selection: Selection, bridge: ROSBridge, source_file: str
-) -> TopicPlan | LeftOut:
+) -> TopicPlan | ExcludedTopic:
     """Return the plan for one channel, or why it is left out.
 
     Raises:
@@ -69,7 +69,7 @@ def decide(
         return _not_selected(config, channel, selection)
     if channel.encoding is Encoding.OTHER:
         encoding = channel.attributes.get("encoding", "unknown")
-        return _left_out(channel, channel.problem or f"not a ROS encoding: {encoding}")
+        return _excluded(channel, channel.problem or f"not a ROS encoding: {encoding}")
     if channel.definition is None:
         return _lost(config, channel, channel.problem or f"no definition of {channel.msgtype} is known")
     found = bridge.resolve(channel.topic, channel.msgtype)
@@ -81,7 +81,7 @@ def decide(
                 hint="name one in adapters.override, or set adapters.unmodeled to keep or skip",
             )
         place = config.places.get(("adapters", "unmodeled"))
-        return _left_out(
+        return _excluded(
             channel, f"no adapter takes {channel.msgtype}, and adapters.unmodeled is skip", place
         )
     bound = found.spec.bind(channel.definition, ros_shape(channel.definition))
@@ -157,22 +157,22 @@ def _free_name(plan: TopicPlan, used: set[str]) -> str:
     return next(name for name in candidates if _bare(name) not in used)
 
 
-def _left_out(channel: Channel, why: str, place: Span | None = None) -> LeftOut:
-    return LeftOut(channel.topic, channel.msgtype, channel.count, why, place)
+def _excluded(channel: Channel, why: str, place: Span | None = None) -> ExcludedTopic:
+    return ExcludedTopic(channel.topic, channel.msgtype, channel.count, why, place)
 
 
-def _lost(config: ROSInjectionConfig, channel: Channel, why: str) -> LeftOut:
+def _lost(config: ROSInjectionConfig, channel: Channel, why: str) -> ExcludedTopic:
     if channel.count != 0 and config.messages_on_error is LoaderErrorPolicy.RAISE:
         raise BagError(why, where=channel.topic)
-    return replace(_left_out(channel, why), lost=channel.count != 0)
+    return replace(_excluded(channel, why), undefined=channel.count != 0)
 
 
-def _not_selected(config: ROSInjectionConfig, channel: Channel, selection: Selection) -> LeftOut:
+def _not_selected(config: ROSInjectionConfig, channel: Channel, selection: Selection) -> ExcludedTopic:
     position = selection.decided_by[channel.topic]
     if position is None:
-        return _left_out(channel, "no pattern of `topics` matches it", config.places.get(("topics",)))
+        return _excluded(channel, "no pattern of `topics` matches it", config.places.get(("topics",)))
     why = f"left out by {(config.topics or ())[position]!r} in `topics`"
-    return _left_out(channel, why, config.places.get(("topics", position)))
+    return _excluded(channel, why, config.places.get(("topics", position)))
 
 
 class _Known(Struct, frozen=True):
@@ -236,7 +236,7 @@ def _known_definitions(target: StoreTarget, family: str | None) -> dict[str, lis
 
 
 def _family(metadata: Mapping[str, Any]) -> object:
-    return _member(metadata.get(LEDGER_KEY), "family")
+    return _member(metadata.get(PROVENANCE_KEY), "family")
 
 
 def _text(metadata: Mapping[str, Any]) -> str | None:
@@ -286,7 +286,7 @@ def resolve(
     selection = select(config.topics or (), topics)
     findings = [*_known(recording, resolver, selection), *_findings(config, selection, topics)]
     taken: list[TopicPlan] = []
-    left: list[LeftOut] = []
+    left: list[ExcludedTopic] = []
     misfits: list[tuple[str, AdapterError]] = []
     for channel in recording.channels:
         try:
@@ -294,7 +294,7 @@ def resolve(
         except AdapterError as error:
             misfits.append((channel.topic, error))
             continue
-        if isinstance(outcome, LeftOut):
+        if isinstance(outcome, ExcludedTopic):
             left.append(outcome)
         elif (finding := merge(taken, outcome)) is not None:
             findings.append(finding)
@@ -315,7 +315,7 @@ def resolve(
         on_error=config.on_error,
         on_message_error=config.messages_on_error,
         topics=tuple(taken),
-        left_out=tuple(left),
+        excluded=tuple(left),
         findings=tuple(findings),
         start_ns=recording.start_ns,
         end_ns=recording.end_ns,
@@ -402,7 +402,7 @@ def _no_match(key: str, glob: str, topics: tuple[str, ...], place: Span | None) 
     )
 
 
-def _nothing(config: ROSInjectionConfig, recording: Recording, left: list[LeftOut]) -> NothingMatched:
+def _nothing(config: ROSInjectionConfig, recording: Recording, left: list[ExcludedTopic]) -> NothingMatched:
     where = str(recording.files[0])
     if not left:
         return NothingMatched("the recording has no topic", where=where)

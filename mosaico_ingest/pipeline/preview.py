@@ -319,7 +319,7 @@ def preview(config: ROSInjectionConfig, *, connect: bool) -> RecordingPlan:
     with open_for(config) as (recording, resolver):
         plan = resolve(config, recording, bridge=bridge, resolver=resolver)
         samples = try_messages(plan, recording)
-        losses = tuple(_losses(recording))
+        unreadable_ranges = tuple(_unreadable(recording))
     decided = decisions(plan, folder=config.base_dir)
     state = ask_destination(plan, samples, connect=connect)
     warning = preflight(plan) if connect and state.exists else None
@@ -329,7 +329,7 @@ def preview(config: ROSInjectionConfig, *, connect: bool) -> RecordingPlan:
         decisions=decided,
         destination=state,
         samples=samples,
-        notes=notes((*plan.findings, *losses, *_chosen(config, plan), *_left_out(plan), *found)),
+        notes=notes((*plan.findings, *unreadable_ranges, *_chosen(config, plan), *_excluded(plan), *found)),
     )
 
 
@@ -344,10 +344,10 @@ def decide(config: ROSInjectionConfig, *, folder: Path) -> Decisions:
         return decisions(resolve(config, recording, bridge=bridge, resolver=resolver), folder=folder)
 
 
-def _losses(recording: Recording) -> Iterator[Finding]:
-    for loss in recording.losses:
-        where = f"{Path(loss.file).name} at {loss.offset}" if loss.file else "the recording"
-        yield Finding("unreadable-range", Severity.WARNING, f"{where}: {loss.reason}")
+def _unreadable(recording: Recording) -> Iterator[Finding]:
+    for item in recording.unreadable:
+        where = f"{Path(item.file).name} at {item.offset}" if item.file else "the recording"
+        yield Finding("unreadable-range", Severity.WARNING, f"{where}: {item.reason}")
 
 
 def _chosen(config: ROSInjectionConfig, plan: Plan) -> Iterator[Finding]:
@@ -361,8 +361,8 @@ def _chosen(config: ROSInjectionConfig, plan: Plan) -> Iterator[Finding]:
             )
 
 
-def _left_out(plan: Plan) -> Iterator[Finding]:
+def _excluded(plan: Plan) -> Iterator[Finding]:
     """Yield a note for each topic that is not read, with the line of the manifest that says so."""
-    for topic in plan.left_out:
-        severity = Severity.WARNING if topic.lost else Severity.INFO
+    for topic in plan.excluded:
+        severity = Severity.WARNING if topic.undefined else Severity.INFO
         yield Finding("skipped-topic", severity, f"{topic.topic}: {topic.why}", topic.span)

@@ -18,7 +18,7 @@ from xxhash import xxh3_128
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import BagError, SequenceExists
 from mosaico_ingest.findings import encodable
-from mosaico_ingest.job.values import LEDGER_KEY, IfExists, ServerTarget, StoreTarget
+from mosaico_ingest.job.values import PROVENANCE_KEY, IfExists, ServerTarget, StoreTarget
 from mosaico_ingest.pipeline.plan import Plan, decisions
 from mosaico_ingest.pipeline.quarantine import kept_name
 from mosaico_ingest.remote import AnyPath, RemotePath
@@ -26,13 +26,13 @@ from mosaico_ingest.version import __version__
 
 __all__ = [
     "Held",
-    "Ledger",
+    "Provenance",
     "Source",
     "certain",
     "content_digest",
     "enter",
     "held",
-    "ledger_of",
+    "provenance_of",
     "what_to_do",
     "whole_digest",
 ]
@@ -122,7 +122,7 @@ class Source(_Part):
         )
 
 
-class Ledger(_Part):
+class Provenance(_Part):
     """What a session was made from."""
 
     tool: str
@@ -136,7 +136,7 @@ class Ledger(_Part):
     quarantine: str | None = None
     """The name of the file that has its rejected messages, if there are any."""
 
-    def same_content(self, other: Ledger) -> bool:
+    def same_content(self, other: Provenance) -> bool:
         """Say whether both are about the same bytes, whatever the files are called."""
         pairs = zip(self.sources, other.sources, strict=False)
         return len(self.sources) == len(other.sources) and all(one.same_content(two) for one, two in pairs)
@@ -145,40 +145,42 @@ class Ledger(_Part):
 class Held(_Part):
     """What a destination has under a sequence's name."""
 
-    ledgers: tuple[Ledger, ...]
+    provenances: tuple[Provenance, ...]
     complete: bool
     """False where an error that ended a run is attached to it, or a server has no session of it that was finished."""
 
 
 def enter(plan: Plan) -> Plan | None:
-    """Return the plan with its ledger among its metadata; None where the same content is there and is to be skipped.
+    """Return the plan with its provenance among its metadata; None where the same content is there and is to be skipped.
 
     What an earlier attempt of the same run committed before its process died is no obstacle: it is made anew.
 
     Raises:
         SequenceExists: The plan skips the same content, and other content is there.
     """
-    ledger = ledger_of(plan)
+    provenance = provenance_of(plan)
     if_exists: IfExists | None = plan.if_exists
     if plan.attempt is not None and plan.attempt.number > 1:
         if_exists = _take_back(plan, plan.attempt.run)
     if if_exists is IfExists.SKIP:
         found = held(plan.target, plan.sequence)
-        ledger = certain(ledger, plan.files, found)
-        if_exists = what_to_do(ledger, found, plan.sequence)
+        provenance = certain(provenance, plan.files, found)
+        if_exists = what_to_do(provenance, found, plan.sequence)
     if if_exists is None:
         return None
-    ledger = _whole(ledger, plan.files)
+    provenance = _whole(provenance, plan.files)
     kept_as = kept_name(plan.sequence) if plan.quarantine else None
-    noted = ledger.model_copy(update={"quarantine": kept_as}).model_dump(mode="json")
-    return replace(plan, if_exists=if_exists, kept_as=kept_as, metadata={**plan.metadata, LEDGER_KEY: noted})
+    noted = provenance.model_copy(update={"quarantine": kept_as}).model_dump(mode="json")
+    return replace(
+        plan, if_exists=if_exists, kept_as=kept_as, metadata={**plan.metadata, PROVENANCE_KEY: noted}
+    )
 
 
-def ledger_of(plan: Plan) -> Ledger:
+def provenance_of(plan: Plan) -> Provenance:
     """Read the recording's files and return what this run is going to note."""
     sources = tuple(map(_source, plan.files))
     run = plan.attempt.run if plan.attempt else None
-    return Ledger(tool=__version__, job=_job_digest(plan), sources=sources, family=plan.family, run=run)
+    return Provenance(tool=__version__, job=_job_digest(plan), sources=sources, family=plan.family, run=run)
 
 
 def _source(path: AnyPath) -> Source:
@@ -192,23 +194,25 @@ def _source(path: AnyPath) -> Source:
     )
 
 
-def certain(ledger: Ledger, files: Sequence[AnyPath], found: Held | None) -> Ledger:
-    """Return the ledger with digests of whole files where samples leave a doubt.
+def certain(provenance: Provenance, files: Sequence[AnyPath], found: Held | None) -> Provenance:
+    """Return the provenance with digests of whole files where samples leave a doubt.
 
     They do where a file has the samples of one that is known, and was changed, or only copied, at another time.
     """
-    known = [source for each in (found.ledgers if found else ()) for source in each.sources]
+    known = [source for each in (found.provenances if found else ()) for source in each.sources]
     doubtful = {
         source.content
-        for source in ledger.sources
+        for source in provenance.sources
         if any(one.content == source.content and one.whole for one in known)
         and all((one.content, one.modified_ns) != (source.content, source.modified_ns) for one in known)
     }
-    return _whole(ledger, files, contents=doubtful) if doubtful else ledger
+    return _whole(provenance, files, contents=doubtful) if doubtful else provenance
 
 
-def _whole(ledger: Ledger, files: Sequence[AnyPath], *, contents: Container[str] | None = None) -> Ledger:
-    """Return the ledger with digests of whole files, of those with these `contents` or of all."""
+def _whole(
+    provenance: Provenance, files: Sequence[AnyPath], *, contents: Container[str] | None = None
+) -> Provenance:
+    """Return the provenance with digests of whole files, of those with these `contents` or of all."""
 
     def whole(source: Source, path: AnyPath) -> Source:
         wanted = source.whole is None and (contents is None or source.content in contents)
@@ -216,7 +220,7 @@ def _whole(ledger: Ledger, files: Sequence[AnyPath], *, contents: Container[str]
             return source
         return source.model_copy(update={"whole": whole_digest(path)}) if wanted else source
 
-    return ledger.model_copy(update={"sources": tuple(map(whole, ledger.sources, files))})
+    return provenance.model_copy(update={"sources": tuple(map(whole, provenance.sources, files))})
 
 
 def held(target: StoreTarget | ServerTarget, sequence: str) -> Held | None:
@@ -228,10 +232,10 @@ def held(target: StoreTarget | ServerTarget, sequence: str) -> Held | None:
     if info is None:
         return None
     complete = all(note.topic is not None for note in info.notes)
-    return Held(ledgers=_ledgers(session.metadata for session in info.sessions), complete=complete)
+    return Held(provenances=_provenances(session.metadata for session in info.sessions), complete=complete)
 
 
-def what_to_do(ledger: Ledger, found: Held | None, sequence: str) -> IfExists | None:
+def what_to_do(provenance: Provenance, found: Held | None, sequence: str) -> IfExists | None:
     """Return how to open a sequence that is to be skipped where it is the same; None: it is, so do nothing.
 
     Raises:
@@ -239,14 +243,14 @@ def what_to_do(ledger: Ledger, found: Held | None, sequence: str) -> IfExists | 
     """
     if found is None:
         return IfExists.FAIL
-    same = [known for known in found.ledgers if known.same_content(ledger)]
+    same = [known for known in found.provenances if known.same_content(provenance)]
     if not same:
-        names = ", ".join(source.name for known in found.ledgers for source in known.sources)
+        names = ", ".join(source.name for known in found.provenances for source in known.sources)
         made = f"it was made from other content ({names})" if names else "nothing says what it was made from"
         raise SequenceExists(f"the sequence exists, and {made}", where=sequence, hint=_HINT)
     if not found.complete:
         return IfExists.REPLACE
-    if all(known.job != ledger.job for known in same):
+    if all(known.job != provenance.job for known in same):
         raise SequenceExists(
             "the sequence exists, and was made from this recording by another job", where=sequence, hint=_HINT
         )
@@ -256,18 +260,18 @@ def what_to_do(ledger: Ledger, found: Held | None, sequence: str) -> IfExists | 
 def _take_back(plan: Plan, run: str) -> IfExists:
     """Return how to open the sequence so that what this run has committed already is not there twice.
 
-    On a server the ledger is that of the sequence: what was appended to another's is not recognised.
+    On a server the provenance is that of the sequence: what was appended to another's is not recognised.
     """
     if isinstance(plan.target, ServerTarget):
         found = _held_by_server(plan.target, plan.sequence)
-        own = found is not None and any(ledger.run == run for ledger in found.ledgers)
+        own = found is not None and any(provenance.run == run for provenance in found.provenances)
         return IfExists.REPLACE if own else plan.if_exists
     store = Store.find(plan.target.path)
     info = store.find_sequence(plan.sequence) if store else None
     if store is None or info is None:
         return plan.if_exists
     sessions = info.sessions
-    own = [s.id for s in sessions if any(ledger.run == run for ledger in _ledgers([s.metadata]))]
+    own = [s.id for s in sessions if any(provenance.run == run for provenance in _provenances([s.metadata]))]
     if own and len(own) == len(sessions):
         return IfExists.REPLACE
     for session in own:
@@ -290,15 +294,15 @@ def _held_by_server(target: ServerTarget, sequence: str) -> Held | None:
             messages.SEQUENCE_NOTIFICATION_LIST, messages.Located(locator=sequence)
         ).notifications
     complete = not notes and bool(info.sessions) and all(session.locked for session in info.sessions)
-    return Held(ledgers=_ledgers([info.user_metadata]), complete=complete)
+    return Held(provenances=_provenances([info.user_metadata]), complete=complete)
 
 
-def _ledgers(metadata: Iterable[Mapping[str, Any]]) -> tuple[Ledger, ...]:
-    found: list[Ledger] = []
+def _provenances(metadata: Iterable[Mapping[str, Any]]) -> tuple[Provenance, ...]:
+    found: list[Provenance] = []
     for one in metadata:
-        if LEDGER_KEY in one:
+        if PROVENANCE_KEY in one:
             try:
-                found.append(Ledger.model_validate(one[LEDGER_KEY]))
+                found.append(Provenance.model_validate(one[PROVENANCE_KEY]))
             except ValidationError:
                 continue  # written by somebody else, or by a version to come: it says nothing we know
     return tuple(found)

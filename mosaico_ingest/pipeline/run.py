@@ -185,7 +185,7 @@ def _pump(
 ) -> None:
     """Move every batch of the recording through its stream, writing on a thread of its own."""
     by_channel = {channel: stream for stream in streams for channel in stream.plan.channels}
-    said = frozenset(recording.losses)  # by a finding of the recording itself
+    said = frozenset(recording.unreadable)  # by a finding of the recording itself
     buffer = WriteBuffer(max_bytes=plan.memory_bytes // 4)
     try:
         _feed(plan, recording, by_channel, buffer, watch)
@@ -195,18 +195,29 @@ def _pump(
     for stream in streams:
         if stream.padded:
             observe(Noted(_padded(stream)))
-    for loss in recording.losses:
-        stream = by_channel.get(loss.channel) if loss.channel is not None else None
-        if loss.count == 0 and loss in said:
+    for item in recording.unreadable:
+        stream = by_channel.get(item.connection) if item.connection is not None else None
+        if item.count == 0 and item in said:
             continue
-        if loss.count == 0:
+        if item.count == 0:
             observe(
                 Noted(
-                    Finding("recovered-range", Severity.INFO, f"{loss.file} at {loss.offset}: {loss.reason}")
+                    Finding(
+                        "recovered-range",
+                        Severity.INFO,
+                        f"{item.file} at {item.offset}: {item.reason}",
+                    )
                 )
             )
         else:
-            observe(Unreadable(stream.plan.target if stream else None, loss.count, loss.offset, loss.reason))
+            observe(
+                Unreadable(
+                    stream.plan.target if stream else None,
+                    item.count,
+                    item.offset,
+                    item.reason,
+                )
+            )
 
 
 def _feed(
@@ -241,9 +252,9 @@ def _missing(plan: Plan, recording: Recording, streams: tuple[Stream, ...], obse
     if plan.read_from_ns is not None or plan.read_until_ns is not None:
         return []
     known = Counter[int]()
-    for loss in recording.losses:
-        known.update({} if loss.channel is None else {loss.channel: loss.count or 0})
-    elsewhere = any(loss.channel is None or loss.count is None for loss in recording.losses)
+    for item in recording.unreadable:
+        known.update({} if item.connection is None else {item.connection: item.count or 0})
+    elsewhere = any(item.connection is None or item.count is None for item in recording.unreadable)
     wrong: list[str] = []
     for stream in streams:
         target, promised = stream.plan.target, stream.plan.count
@@ -478,7 +489,7 @@ def _started(plan: Plan) -> RunStarted:
         for t in plan.topics
     )
     left = (
-        Expected(t.topic, t.topic, t.msgtype, "", "", t.why, t.count, left_out=True) for t in plan.left_out
+        Expected(t.topic, t.topic, t.msgtype, "", "", t.why, t.count, excluded=True) for t in plan.excluded
     )
     return RunStarted(
         sequence=plan.sequence,
@@ -493,8 +504,8 @@ def _undefined(plan: Plan) -> Iterator[Unreadable]:
     """Yield what is lost for want of a definition; how much that is of a stretch of time, the index does not say."""
     taken = {topic.target for topic in plan.topics}
     whole = plan.read_from_ns is None and plan.read_until_ns is None
-    for topic in plan.left_out:
-        if topic.lost:
+    for topic in plan.excluded:
+        if topic.undefined:
             target = None if topic.topic in taken else topic.topic
             reason = f"no definition of {topic.msgtype} can be used"
             yield Unreadable(target, topic.count if whole else None, None, reason)

@@ -23,11 +23,11 @@ from mosaico_ingest.report.events import (
     Unreadable,
 )
 from mosaico_ingest.report.model import (
-    Loss,
     Rejection,
     Report,
     Steps,
     TopicReport,
+    UnreadableRange,
 )
 from mosaico_ingest.report.timing import Stopwatch
 
@@ -134,7 +134,7 @@ class Collector:
         self._watch = watch or Stopwatch()
         self._start = RunStarted(sequence="", destination="", files=(), source_bytes=0, topics=())
         self._sums: dict[str, _Sum] = defaultdict(_Sum)
-        self._losses: list[Loss] = []
+        self._unreadable: list[UnreadableRange] = []
         self._findings: list[str] = []
         self._steps = Steps()
         self._quarantine: str | None = None
@@ -150,8 +150,10 @@ class Collector:
             case Unreadable():
                 if event.target is not None:
                     self._sums[event.target].unreadable += event.count or 0
-                self._losses.append(
-                    Loss(topic=event.target, count=event.count, offset=event.offset, reason=event.reason)
+                self._unreadable.append(
+                    UnreadableRange(
+                        topic=event.target, count=event.count, offset=event.offset, reason=event.reason
+                    )
                 )
             case Noted():
                 self._findings.append(str(event.finding))
@@ -170,7 +172,7 @@ class Collector:
     @property
     def unreadable(self) -> bool:
         """Whether a stretch of the recording could not be read."""
-        return bool(self._losses)
+        return bool(self._unreadable)
 
     def report(self) -> Report:
         """Return the sum so far; complete once the run has finished."""
@@ -187,16 +189,16 @@ class Collector:
             steps=self._steps,
             quarantine=self._quarantine,
             topics=tuple(self._topic(topic) for topic in self._start.topics),
-            losses=tuple(self._losses),
+            unreadable_ranges=tuple(self._unreadable),
             findings=tuple(self._findings),
         )
 
     def _unread(self, expected: Expected) -> _Sum:
-        lost = (loss.count or 0 for loss in self._losses if loss.topic == expected.topic)
+        lost = (item.count or 0 for item in self._unreadable if item.topic == expected.topic)
         return _Sum(unreadable=sum(lost))
 
     def _topic(self, expected: Expected) -> TopicReport:
-        total = self._sums[expected.target] if not expected.left_out else self._unread(expected)
+        total = self._sums[expected.target] if not expected.excluded else self._unread(expected)
         rejections = tuple(total.rejections.values())
         return TopicReport(
             topic=expected.topic,
@@ -226,8 +228,8 @@ class Collector:
 
 
 def _status(expected: Expected, total: _Sum) -> TopicStatus:
-    if expected.left_out:
-        return TopicStatus.LEFT_OUT
+    if expected.excluded:
+        return TopicStatus.EXCLUDED
     if total.closed is not None:
         return total.closed.status
     return TopicStatus.WRITTEN if total.written else TopicStatus.EMPTY

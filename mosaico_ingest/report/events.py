@@ -56,7 +56,7 @@ class TopicStatus(str, Enum):
     """Closed early by the `finalize` policy."""
     FAILED = "failed"
     """The destination or the adapter refused the topic; the `ignore` policy let the others go on."""
-    LEFT_OUT = "left_out"
+    EXCLUDED = "excluded"
     """Not selected, or nothing here can read it."""
 
 
@@ -71,7 +71,7 @@ class Expected(Struct, frozen=True):
     why: str
     count: int | None
     """How many messages the index promises."""
-    left_out: bool = False
+    excluded: bool = False
 
 
 class RunStarted(Struct, frozen=True):

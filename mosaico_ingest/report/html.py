@@ -464,7 +464,7 @@ def _inside(one: Report, aside: Markup | None) -> Iterator[Markup]:
     where = f"{', '.join(one.files)} ({bytes_text(one.source_bytes)}{stored}) to {one.destination}"
     yield element("p", f"{where}; {count_text(round(rate))} messages a second", class_="dim")
     yield from (part for part in (steps_line(one.steps), aside) if part is not None)
-    taken = [topic for topic in one.topics if topic.status is not TopicStatus.LEFT_OUT]
+    taken = [topic for topic in one.topics if topic.status is not TopicStatus.EXCLUDED]
     if taken:
         yield _topics(taken)
     yield from _lists(one)
@@ -502,16 +502,16 @@ def _lists(one: Report) -> Iterator[Markup]:
         for r in topic.rejections
     ]
     lost = [
-        f"{loss.topic or 'the recording'}: {'?' if loss.count is None else count_text(loss.count)} messages"
-        f"{'' if loss.offset is None else f' at offset {loss.offset}'}: {loss.reason}"
-        for loss in one.losses
+        f"{item.topic or 'the recording'}: {'?' if item.count is None else count_text(item.count)} messages"
+        f"{'' if item.offset is None else f' at offset {item.offset}'}: {item.reason}"
+        for item in one.unreadable_ranges
     ]
     kept = [
         f"{topic.target}: {count_text(topic.quarantined)} messages"
         for topic in one.topics
         if topic.quarantined
     ]
-    left = [f"{topic.topic}: {topic.why}" for topic in one.topics if topic.status is TopicStatus.LEFT_OUT]
+    left = [f"{topic.topic}: {topic.why}" for topic in one.topics if topic.status is TopicStatus.EXCLUDED]
     for title, lines in {
         "Rejected": rejected,
         "In the quarantine": kept,

@@ -28,7 +28,7 @@ def _lines(report: RunReport) -> Iterator[str]:
     yield from _gauge("messages", "Messages of the last run by what became of them.")
     for fate in ("read", "written", "filtered", "downsampled", "rejected"):
         yield f'{_PREFIX}_messages{{fate="{fate}"}} {sum(getattr(one, fate) for one in totals)}'
-    unread = sum(loss.count or 0 for one in report.recordings for loss in one.losses)
+    unread = sum(item.count or 0 for one in report.recordings for item in one.unreadable_ranges)
     yield f'{_PREFIX}_messages{{fate="unreadable"}} {unread}'
     yield from _gauge(
         "step_seconds", "Time of the last run by what it was spent on; write goes on beside the rest."

@@ -21,13 +21,13 @@ from mosaico_ingest.report.units import count_text, counted
 from mosaico_ingest.textfile import write_whole
 
 __all__ = [
-    "Loss",
     "Rejection",
     "Report",
     "RunReport",
     "Steps",
     "TopicReport",
     "Totals",
+    "UnreadableRange",
     "UsedManifest",
     "folder_link",
     "gravest",
@@ -62,7 +62,7 @@ class Rejection(_Part):
     """Where the first of them lies in the source: file offset of its record or chunk, or row id."""
 
 
-class Loss(_Part):
+class UnreadableRange(_Part):
     """A stretch of the recording that could not be read."""
 
     topic: str | None
@@ -95,7 +95,7 @@ class TopicReport(_Part):
     promised: int | None
     """How many messages the recording's index promises."""
     unreadable: int = 0
-    """How many of them could not be read, as far as that can be told; `losses` says where."""
+    """How many of them could not be read, as far as that can be told; `unreadable_ranges` says where."""
     read: int = 0
     written: int = 0
     filtered: int = 0
@@ -176,7 +176,7 @@ class Report(_Part):
     quarantine: str | None = None
     """The file that rejected messages were put into."""
     topics: tuple[TopicReport, ...] = ()
-    losses: tuple[Loss, ...] = ()
+    unreadable_ranges: tuple[UnreadableRange, ...] = ()
     """What could not be read at all."""
     findings: tuple[str, ...] = ()
     """What there was to say about the recording."""
@@ -185,7 +185,7 @@ class Report(_Part):
     @property
     def totals(self) -> Totals:
         """Sums over all topics that were taken."""
-        taken = [topic for topic in self.topics if topic.status is not TopicStatus.LEFT_OUT]
+        taken = [topic for topic in self.topics if topic.status is not TopicStatus.EXCLUDED]
         return Totals(
             read=sum(t.read for t in taken),
             written=sum(t.written for t in taken),

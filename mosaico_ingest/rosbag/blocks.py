@@ -23,15 +23,14 @@ __all__ = [
     "Bytes",
     "Channel",
     "Encoding",
-    "Hole",
     "Loaded",
-    "Loss",
     "Part",
     "ROSHeader",
     "ROSMessage",
     "RawBatch",
     "Slab",
     "Stream",
+    "UnreadableRange",
     "Want",
     "by_key",
     "in_groups",
@@ -100,20 +99,28 @@ class Slab(Struct, frozen=True):
         )
 
 
-class Hole(Struct, frozen=True):
-    """What could not be read of one file: `bag.batch.Loss` before streams have become channels."""
+class UnreadableRange(Struct, frozen=True):
+    """Bytes of a recording from which messages could not be read, and why."""
 
     offset: int
+    """File offset of the record or chunk, or the row id."""
     reason: str
-    key: int | None = None
+    """What was expected and what is there, in one line."""
+    connection: int | None = None
+    """The connection the messages belong to, None if unknown: its key in the file or, once `file` is set, its id."""
     count: int | None = None
+    """Number of unreadable messages; None if unknown, 0 if all of them were read in another way."""
+    file: str = ""
+    """The file; empty until the range becomes part of a recording."""
 
 
-def orphans(counts: Mapping[int, int] | None, known: Collection[int]) -> list[Hole]:
+def orphans(counts: Mapping[int, int] | None, known: Collection[int]) -> list[UnreadableRange]:
     """Return the messages whose stream the file does not describe."""
     strangers = {key: count for key, count in (counts or {}).items() if count and key not in known}
     return [
-        Hole(0, f"{count} messages of connection {key}, which the file does not describe", count=count)
+        UnreadableRange(
+            0, f"{count} messages of connection {key}, which the file does not describe", count=count
+        )
         for key, count in strangers.items()
     ]
 
@@ -122,7 +129,7 @@ class Loaded(Struct, frozen=True):
     """What one block gave."""
 
     slabs: list[Slab]
-    holes: list[Hole]
+    unreadable: list[UnreadableRange]
 
 
 class Block(Struct, frozen=True):
@@ -184,7 +191,7 @@ class Part(Protocol):
     start_ns: int | None
     end_ns: int | None
     """The last message's time, inclusive."""
-    holes: list[Hole]
+    unreadable: list[UnreadableRange]
     """What was found broken while opening."""
     notes: list[str]
     """What else is worth saying about the file, one line each."""
@@ -228,7 +235,7 @@ def by_key(keys: NDArray[np.integer]) -> Iterator[tuple[int, Longs]]:
 
 def keep(slab: Slab, want: Want, loaded: Loaded) -> None:
     """Add the messages within the wanted time."""
-    slab = _wanted(slab, want, loaded.holes)
+    slab = _wanted(slab, want, loaded.unreadable)
     if len(slab):
         loaded.slabs.append(slab)
 
@@ -250,7 +257,7 @@ def _is_inside(slab: Slab, want: Want) -> bool:
     return max(want.start_ns, 0) <= first and last < want.end_ns
 
 
-def _wanted(slab: Slab, want: Want, holes: list[Hole]) -> Slab:
+def _wanted(slab: Slab, want: Want, unreadable: list[UnreadableRange]) -> Slab:
     """Return the messages within the wanted time; those after 2262 are noted as lost."""
     if _is_inside(slab, want):
         return slab
@@ -259,7 +266,7 @@ def _wanted(slab: Slab, want: Want, holes: list[Hole]) -> Slab:
     if bool(broken.any()):
         offset = int(slab.offsets[int(broken.argmax())])
         reason = f"recorded at {int(times.view(np.uint64).max())} ns, which is after the year 2262"
-        holes.append(Hole(offset, reason, key=slab.key, count=int(broken.sum())))
+        unreadable.append(UnreadableRange(offset, reason, connection=slab.key, count=int(broken.sum())))
     keep_rows = ~broken & (times >= want.start_ns)
     if want.end_ns <= LATEST_NS:
         keep_rows &= times < want.end_ns
@@ -394,20 +401,6 @@ class RawBatch(Struct, frozen=True):
         """Return the bytes of one message."""
         start = int(self.starts[row])
         return self.data[start : start + int(self.lengths[row])].tobytes()
-
-
-class Loss(Struct, frozen=True):
-    """Something of a recording that could not be read, and why."""
-
-    file: str
-    offset: int
-    """Where in the file the record or chunk begins, or the row id."""
-    reason: str
-    """What was expected and what was found, in one line."""
-    channel: int | None = None
-    """The channel the messages belonged to; None where that is unknown."""
-    count: int | None = None
-    """How many messages were lost; None where that is unknown, 0 where all could be had another way."""
 
 
 class ROSHeader(Struct, frozen=True):

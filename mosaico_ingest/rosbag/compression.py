@@ -16,7 +16,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.rosbag.blocks import Hole, Slab, stretches
+from mosaico_ingest.rosbag.blocks import Slab, UnreadableRange, stretches
 from mosaico_ingest.rosbag.formats import ZSTD
 
 __all__ = [
@@ -246,7 +246,7 @@ _LIMIT_BYTES = 256 << 20
 _MAGIC = np.frombuffer(ZSTD, "<u4")[0]
 
 
-def inflate_messages(slab: Slab, holes: list[Hole]) -> Slab:
+def inflate_messages(slab: Slab, unreadable: list[UnreadableRange]) -> Slab:
     """Return CDR messages as they were before compression; no CDR message begins as a zstd frame does.
 
     Whether any is, the first and the last tell; others that are not stay as they are, damaged ones are noted as lost.
@@ -266,7 +266,7 @@ def inflate_messages(slab: Slab, holes: list[Hole]) -> Slab:
         try:
             payloads.append(inflate_message(payload, _LIMIT_BYTES) if is_packed[row] else payload)
         except BagError as err:
-            holes.append(Hole(int(slab.offsets[row]), err.what, key=slab.key, count=1))
+            unreadable.append(UnreadableRange(int(slab.offsets[row]), err.what, connection=slab.key, count=1))
         else:
             kept.append(row)
     rows = slab.rows(np.array(kept, np.int64))

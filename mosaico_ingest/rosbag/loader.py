@@ -20,9 +20,9 @@ from mosaico_ingest.remote import as_path
 from mosaico_ingest.rosbag.blocks import (
     Channel,
     Encoding,
-    Loss,
     RawBatch,
     ROSMessage,
+    UnreadableRange,
 )
 from mosaico_ingest.rosbag.definitions.registry import CustomMessages, TypeResolver
 from mosaico_ingest.rosbag.recording import Recording, open_recording, span, windows
@@ -37,7 +37,7 @@ class ROSLoader:
     """A recording's messages under a list of topic patterns; iterate it, once or again, and close it.
 
     A message whose bytes do not fit its type is left out and counted in `rejected`; the policy says whether it is
-    also logged or raised. What the container lost is in `losses` after an iteration.
+    also logged or raised. What the container lost is in `unreadable` after an iteration.
     """
 
     def __init__(
@@ -103,9 +103,9 @@ class ROSLoader:
         return (*self._recording.findings, *self._resolver.findings)
 
     @property
-    def losses(self) -> tuple[Loss, ...]:
+    def unreadable(self) -> tuple[UnreadableRange, ...]:
         """What of the recording could not be read, found so far."""
-        return self._recording.losses
+        return self._recording.unreadable
 
     def msg_count(self, topic: str | None = None) -> int:
         """Return how many messages a selected topic has, or all of them; an unindexed recording is read for it.

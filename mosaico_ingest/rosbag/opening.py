@@ -14,7 +14,7 @@ from stat import S_ISREG
 
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.remote import AnyPath, RemotePath
-from mosaico_ingest.rosbag.blocks import Hole, Part
+from mosaico_ingest.rosbag.blocks import Part, UnreadableRange
 from mosaico_ingest.rosbag.compression import inflate_file
 from mosaico_ingest.rosbag.formats import (
     MCAP,
@@ -118,7 +118,7 @@ def _inflated(path: Path, name: AnyPath, stack: ExitStack) -> Part:
         ) from err
     part = _open(plain, name, _head(plain), stack)
     if problem:
-        part.holes.append(Hole(plain.stat().st_size, problem))
+        part.unreadable.append(UnreadableRange(plain.stat().st_size, problem))
     return part
 
 

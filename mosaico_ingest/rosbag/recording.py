@@ -27,13 +27,12 @@ from mosaico_ingest.rosbag.blocks import (
     Block,
     Channel,
     Encoding,
-    Hole,
     Loaded,
-    Loss,
     Part,
     RawBatch,
     Slab,
     Stream,
+    UnreadableRange,
     Want,
 )
 from mosaico_ingest.rosbag.compression import inflate_messages
@@ -59,11 +58,14 @@ __all__ = [
 
 
 def compare(
-    parts: Sequence[Part], channels: Sequence[Channel], losses: Sequence[Loss], metadata: Metadata | None
+    parts: Sequence[Part],
+    channels: Sequence[Channel],
+    unreadable: Sequence[UnreadableRange],
+    metadata: Metadata | None,
 ) -> tuple[Finding, ...]:
     """Return what a reader of this recording should know, most of it harmless."""
     hints = _metadata(channels, metadata) if metadata else ()
-    return (*_parts(parts), *_losses(losses), *_channels(channels), *hints)
+    return (*_parts(parts), *_unreadable(unreadable), *_channels(channels), *hints)
 
 
 def _parts(parts: Sequence[Part]) -> Iterator[Finding]:
@@ -72,9 +74,13 @@ def _parts(parts: Sequence[Part]) -> Iterator[Finding]:
             yield Finding("container-note", Severity.INFO, f"{part.path}: {note}")
 
 
-def _losses(losses: Sequence[Loss]) -> Iterator[Finding]:
-    for loss in losses:
-        yield Finding("unreadable-range", Severity.WARNING, f"{loss.file}: at {loss.offset}: {loss.reason}")
+def _unreadable(unreadable: Sequence[UnreadableRange]) -> Iterator[Finding]:
+    for item in unreadable:
+        yield Finding(
+            "unreadable-range",
+            Severity.WARNING,
+            f"{item.file}: at {item.offset}: {item.reason}",
+        )
 
 
 def _channels(channels: Sequence[Channel]) -> Iterator[Finding]:
@@ -260,15 +266,15 @@ def open_recording(paths: AnyPath | Sequence[AnyPath], *, resolve: Resolver) -> 
     found = discover([paths] if isinstance(paths, Path | RemotePath) else list(paths))
     stack = ExitStack()
     try:
-        parts, losses = _open_parts(found.files, stack)
-        return Recording(parts, losses, found, resolve, stack)
+        parts, unreadable = _open_parts(found.files, stack)
+        return Recording(parts, unreadable, found, resolve, stack)
     except BaseException:
         stack.close()
         raise
 
 
-def _open_parts(files: Sequence[AnyPath], stack: ExitStack) -> tuple[list[Part], list[Loss]]:
-    """Open every file; one of several that cannot be opened is a loss, as a recorder that crashed leaves such."""
+def _open_parts(files: Sequence[AnyPath], stack: ExitStack) -> tuple[list[Part], list[UnreadableRange]]:
+    """Open every file; one of several that cannot be opened is a item, as a recorder that crashed leaves such."""
     parts: list[Part] = []
     failed: list[BagError] = []
     for file in files:
@@ -285,7 +291,9 @@ def _open_parts(files: Sequence[AnyPath], stack: ExitStack) -> tuple[list[Part],
             where=str(files[0].parent),
             hint="name the files of one format",
         )
-    return parts, [Loss(err.where or "", 0, f"this part cannot be opened: {err.what}") for err in failed]
+    return parts, [
+        UnreadableRange(0, f"this part cannot be opened: {err.what}", file=err.where or "") for err in failed
+    ]
 
 
 def _none_opened(failed: Sequence[BagError]) -> BagError:
@@ -301,7 +309,7 @@ class _Step(Struct, frozen=True):
 
     part: int
     slabs: list[Slab]
-    holes: list[Hole]
+    unreadable: list[UnreadableRange]
     start_ns: int
     next_ns: int
 
@@ -312,7 +320,7 @@ class Recording:
     def __init__(
         self,
         parts: Sequence[Part],
-        losses: Sequence[Loss],
+        unreadable: Sequence[UnreadableRange],
         found: Found,
         resolver: Resolver,
         stack: ExitStack,
@@ -321,10 +329,10 @@ class Recording:
         self._stack = stack
         self._table = ChannelTable(parts, resolver)
         self._running: weakref.WeakSet[Generator[RawBatch, None, None]] = weakref.WeakSet()
-        self._losses: dict[Loss, None] = dict.fromkeys(losses)
+        self._unreadable: dict[UnreadableRange, None] = dict.fromkeys(unreadable)
         self.files: tuple[AnyPath, ...] = found.files
         self.missing: tuple[AnyPath, ...] = found.missing
-        """Parts that are not there, though the metadata list them; they are among the losses too."""
+        """Parts that are not there, though the metadata list them; they are among the unreadable too."""
         self.container: str = parts[0].container
         """`mcap`, `sqlite3` or `ros1`."""
         self.size_bytes: int = sum(file.stat().st_size for file in found.files)
@@ -335,11 +343,13 @@ class Recording:
         counts = [part.message_count for part in parts]
         self.message_count: int | None = None if None in counts else sum(count or 0 for count in counts)
         for number, part in enumerate(parts):
-            self._note(number, part.holes)
-        oddities = compare(parts, self.channels, self.losses, found.metadata)
-        self._losses |= dict.fromkeys(Loss(str(file), 0, "this part is not there") for file in found.missing)
+            self._note(number, part.unreadable)
+        oddities = compare(parts, self.channels, self.unreadable, found.metadata)
+        self._unreadable |= dict.fromkeys(
+            UnreadableRange(0, "this part is not there", file=str(file)) for file in found.missing
+        )
         self.findings: tuple[Finding, ...] = (*found.findings, *oddities)
-        """What to know before reading; what reading itself finds broken is in `losses`."""
+        """What to know before reading; what reading itself finds broken is in `unreadable`."""
 
     def __enter__(self) -> Self:
         """Return the recording."""
@@ -358,9 +368,9 @@ class Recording:
         self._stack.close()
 
     @property
-    def losses(self) -> tuple[Loss, ...]:
+    def unreadable(self) -> tuple[UnreadableRange, ...]:
         """What could not be read: found when opening, and by every iteration so far."""
-        return tuple(self._losses)
+        return tuple(self._unreadable)
 
     def batches(
         self,
@@ -375,7 +385,7 @@ class Recording:
 
         The batches of a channel follow each other in log time, unless its messages are so much out of order that
         sorting them would take more than about `memory_bytes`. A batch has at most `rows` messages.
-        What cannot be read is left out and listed in `losses`.
+        What cannot be read is left out and listed in `unreadable`.
         """
         ids = (
             frozenset(channel.id for channel in self.channels)
@@ -402,7 +412,7 @@ class Recording:
         blocks = self._steps(wants)
         with Prefetched(blocks) if ahead else closing(blocks) as steps:
             for step in steps:
-                self._note(step.part, step.holes)
+                self._note(step.part, step.unreadable)
                 for slab in step.slabs:
                     yield from gather.add(self._table.channel_id(step.part, slab.key), slab, step.start_ns)
                 yield from gather.settle(step.next_ns)
@@ -425,29 +435,30 @@ class Recording:
         try:
             loaded = turn.block.load()
         except BagError as err:
-            return _Step(number, [], [Hole(0, err.what)], turn.block.start_ns, turn.next_ns)
-        slabs = [self._plain(number, slab, loaded.holes) for slab in loaded.slabs]
+            return _Step(number, [], [UnreadableRange(0, err.what)], turn.block.start_ns, turn.next_ns)
+        slabs = [self._plain(number, slab, loaded.unreadable) for slab in loaded.slabs]
         compacted = [compact(slab) for slab in slabs if len(slab)]
-        return _Step(number, compacted, loaded.holes, turn.block.start_ns, turn.next_ns)
+        return _Step(number, compacted, loaded.unreadable, turn.block.start_ns, turn.next_ns)
 
-    def _plain(self, number: int, slab: Slab, holes: list[Hole]) -> Slab:
+    def _plain(self, number: int, slab: Slab, unreadable: list[UnreadableRange]) -> Slab:
         channel = self.channels[self._table.channel_id(number, slab.key)]
-        return inflate_messages(slab, holes) if channel.encoding is Encoding.CDR else slab
+        return inflate_messages(slab, unreadable) if channel.encoding is Encoding.CDR else slab
 
-    def _note(self, number: int, holes: Sequence[Hole]) -> None:
-        for hole in holes:
-            channel = None if hole.key is None else self._table.channel_id(number, hole.key)
-            loss = Loss(str(self._parts[number].path), hole.offset, hole.reason, channel, hole.count)
-            self._losses[loss] = None
+    def _note(self, number: int, unreadable: Sequence[UnreadableRange]) -> None:
+        """Add ranges of a file to those of the recording."""
+        file = str(self._parts[number].path)
+        for item in unreadable:
+            connection = None if item.connection is None else self._table.channel_id(number, item.connection)
+            self._unreadable[replace(item, connection=connection, file=file)] = None
 
 
 def _blocks(part: Part, want: Want) -> Iterator[Block]:
-    """Yield the blocks of a part; where it can tell of no more, that is a hole and not the end of the recording."""
+    """Yield the blocks of a part; where it can tell of no more, that is a item and not the end of the recording."""
     try:
         yield from part.blocks(want)
     except BagError as err:
-        hole = Hole(0, err.what)
-        yield Block(LATEST_NS, lambda: Loaded([], [hole]))
+        item = UnreadableRange(0, err.what)
+        yield Block(LATEST_NS, lambda: Loaded([], [item]))
 
 
 _USUAL_BYTES = 32 << 20

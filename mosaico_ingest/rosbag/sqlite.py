@@ -23,10 +23,10 @@ from mosaico_ingest.rosbag.blocks import (
     LATEST_NS,
     Block,
     Encoding,
-    Hole,
     Loaded,
     Slab,
     Stream,
+    UnreadableRange,
     Want,
     by_key,
     in_groups,
@@ -51,10 +51,10 @@ _LAST_ROWID = 2**63 - 1
 
 @dataclass(slots=True)
 class Salvage:
-    """Rows by row id instead of by time; what had to be stepped over is in `holes`."""
+    """Rows by row id instead of by time; what had to be stepped over is in `unreadable`."""
 
     connection: sqlite3.Connection
-    holes: list[Hole] = field(default_factory=list[Hole])
+    unreadable: list[UnreadableRange] = field(default_factory=list[UnreadableRange])
 
     def rows(self) -> Iterator[Row]:
         """Yield every row that can be read."""
@@ -68,7 +68,7 @@ class Salvage:
                 found = self._next_row(at)
                 upto = "the end" if found is None else f"row {found[0]}"
                 if found is None or found[0] > at:
-                    self.holes.append(Hole(at, f"{err}: rows are missing before {upto}"))
+                    self.unreadable.append(UnreadableRange(at, f"{err}: rows are missing before {upto}"))
                 if found is None:
                     return
                 yield found  # by itself: where the row behind it is damaged, a query for both may give neither
@@ -141,7 +141,7 @@ class SqlitePart:
 
     def __init__(self, path: Path, name: AnyPath | None = None) -> None:
         self.path: AnyPath = name or path
-        self.holes: list[Hole] = []
+        self.unreadable: list[UnreadableRange] = []
         self.notes: list[str] = []
         self._stack = ExitStack()
         try:
@@ -150,7 +150,7 @@ class SqlitePart:
             self._counts = self._read_counts()
             self.streams: tuple[Stream, ...] = self._read_streams()
             self.message_count: int | None = None if self._counts is None else sum(self._counts.values())
-            self.holes.extend(orphans(self._counts, {stream.key for stream in self.streams}))
+            self.unreadable.extend(orphans(self._counts, {stream.key for stream in self.streams}))
             self.start_ns, self.end_ns = self._read_bounds()
         except (*BROKEN, OSError, TypeError, ValueError) as err:
             self._stack.close()
@@ -183,8 +183,10 @@ class SqlitePart:
         )
         for page in _pages(wanted, want):
             yield Block(done.time_ns, partial(_load, page))
-        holes = salvage.holes or [Hole(0, f"{reason}; every row could be read in another way", count=0)]
-        yield Block(done.time_ns, lambda: Loaded([], holes))
+        unreadable = salvage.unreadable or [
+            UnreadableRange(0, f"{reason}; every row could be read in another way", count=0)
+        ]
+        yield Block(done.time_ns, lambda: Loaded([], unreadable))
 
     def check_unchanged(self) -> None:
         """Do nothing; see `FileSource.check_unchanged`."""
@@ -322,13 +324,13 @@ def _data_bytes(row: Row) -> int:
 def _load(page: list[Row]) -> Loaded:
     """Return a page's rows by topic; SQLite keeps any value in any column, so the types are looked at."""
     good = [row for row in page if [type(value) for value in row] == _ROW_TYPES]
-    holes = [
-        Hole(row[0], "a row whose values have the wrong types", key=row[1], count=1)
+    unreadable = [
+        UnreadableRange(row[0], "a row whose values have the wrong types", connection=row[1], count=1)
         for row in page
         if len(good) < len(page) and [type(value) for value in row] != _ROW_TYPES
     ]
     if not good:
-        return Loaded([], holes)
+        return Loaded([], unreadable)
     ids, topics, times, blobs = zip(*good, strict=True)
     data = np.frombuffer(b"".join(blobs), np.uint8)
     lengths = np.fromiter(map(len, blobs), np.int64, len(blobs))
@@ -337,4 +339,4 @@ def _load(page: list[Row]) -> Loaded:
     keys = np.array(topics, np.int64)
     whole = Slab(-1, all_times, data, starts, lengths, all_ids)
     slabs = [whole.rows(rows, key=key) for key, rows in by_key(keys)]
-    return Loaded(slabs, holes)
+    return Loaded(slabs, unreadable)

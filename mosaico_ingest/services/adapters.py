@@ -293,7 +293,7 @@ def _choices(config: ROSInjectionConfig) -> Iterator[TopicChoice]:
         TopicChoice(name, one.topic, one.msgtype, one.adapter.name, one.ontology.tag, one.why)
         for one in plan.topics
     ]
-    chosen += [TopicChoice(name, one.topic, one.msgtype, "", "", one.why) for one in plan.left_out]
+    chosen += [TopicChoice(name, one.topic, one.msgtype, "", "", one.why) for one in plan.excluded]
     yield from sorted(chosen, key=lambda one: one.topic)
 
 

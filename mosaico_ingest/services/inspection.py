@@ -7,7 +7,7 @@ from mosaico_ingest.documents import Part
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.patterns import select
-from mosaico_ingest.pipeline.plan import LeftOut
+from mosaico_ingest.pipeline.plan import ExcludedTopic
 from mosaico_ingest.pipeline.planning import decide
 from mosaico_ingest.pipeline.run import open_for
 from mosaico_ingest.rosbag.blocks import Channel
@@ -89,12 +89,12 @@ def _topic(
     try:
         outcome = decide(config, channel, select((), [channel.topic]), bridge, "")
     except AdapterError as error:
-        outcome = LeftOut(channel.topic, channel.msgtype, channel.count, str(error))
+        outcome = ExcludedTopic(channel.topic, channel.msgtype, channel.count, str(error))
     rate = None
     if channel.count and channel.count > 1 and duration_ns:
         rate = (channel.count - 1) / (duration_ns / 1e9)
     source = channel.definition.source.value if channel.definition else "none"
-    left = isinstance(outcome, LeftOut)
+    left = isinstance(outcome, ExcludedTopic)
     return InspectedTopic(
         topic=channel.topic,
         msgtype=channel.msgtype,

@@ -93,16 +93,16 @@ def _replay(kept: Kept, known: dict[str, ROSInjectionConfig]) -> Replay:
 
 
 def _whereabouts(kept: Kept, config: ROSInjectionConfig) -> Whereabouts:
-    """Ask the ledgers of the sequence; a server keeps that of its first session only, and adds to no topic twice."""
+    """Ask the provenances of the sequence; a server keeps that of its first session only, and adds to no topic twice."""
     found = held(config.target, kept.sequence)
     if found is None:
         return Whereabouts.FORGOTTEN
     name = encodable(kept.messages.name)
-    made_from = {(source.name, source.content) for known in found.ledgers for source in known.sources}
+    made_from = {(source.name, source.content) for known in found.provenances for source in known.sources}
     if (name, content_digest(kept.messages)) in made_from:
         return Whereabouts.STORED
-    ledgers = found.ledgers if isinstance(config.target, StoreTarget) else ()
-    if ledgers and all(known.quarantine != name for known in ledgers):
+    provenances = found.provenances if isinstance(config.target, StoreTarget) else ()
+    if provenances and all(known.quarantine != name for known in provenances):
         return Whereabouts.FORGOTTEN
     return Whereabouts.WAITING
 

@@ -1,4 +1,4 @@
-"""This file says where a job's recordings stand: held against what the ledgers of the destination know."""
+"""This file says where a job's recordings stand: held against what the provenances of the destination know."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.pipeline.provenance import (
     certain,
     held,
-    ledger_of,
+    provenance_of,
     what_to_do,
 )
 from mosaico_ingest.pipeline.run import make_plan
@@ -58,7 +58,7 @@ def _standing(config: ROSInjectionConfig) -> tuple[Standing, str]:
         found = held(plan.target, plan.sequence)
         if found is None:
             return Standing.NEW, ""
-        decided = what_to_do(certain(ledger_of(plan), plan.files, found), found, plan.sequence)
+        decided = what_to_do(certain(provenance_of(plan), plan.files, found), found, plan.sequence)
     except SequenceExists as error:
         return Standing.CHANGED, error.what
     except IngestError as error:

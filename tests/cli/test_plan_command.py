@@ -119,7 +119,7 @@ def test_the_document_fits_its_schema_and_reads_back(ingest: Ingest) -> None:
     assert document.job == JOB
     (recording,) = document.recordings
     assert recording.digest == recording.decisions.digest
-    assert [topic.topic for topic in recording.decisions.left_out] == ["/camera/image_raw"]
+    assert [topic.topic for topic in recording.decisions.excluded] == ["/camera/image_raw"]
     assert sum(topic.count or 0 for topic in recording.decisions.topics) == 2110
     assert {sample.target: sample.rejected for sample in recording.samples if sample.rejected} == {}
     assert all(sample.row_bytes for sample in recording.samples)
@@ -148,7 +148,7 @@ def test_check_tells_what_has_changed(ingest: Ingest) -> None:
     lines = said.splitlines()
     assert "quickstart_drive: metadata vehicle: demo-01 → demo-02" in lines
     assert "quickstart_drive: - topic /odom: nav_msgs/msg/Odometry by OdometryAdapter to MotionState" in lines
-    assert "quickstart_drive: + left out /odom: left out by '!/odom' in `topics`" in lines
+    assert "quickstart_drive: + excluded topic /odom: left out by '!/odom' in `topics`" in lines
     assert "quickstart_drive: topic /camera/camera_info on_error: ignore → finalize" in lines
     assert len(lines) == 5
 
@@ -240,7 +240,7 @@ def test_diff_tells_what_another_manifest_would_do(ingest: Ingest) -> None:
     assert "quickstart_drive: sequence: quickstart_drive → other_drive" in lines
     assert "quickstart_drive: destination: mosaico → h:6726" in lines
     assert any(line.startswith("quickstart_drive: - topic /battery: ") for line in lines)
-    assert any(line.startswith("quickstart_drive: + left out /battery: ") for line in lines)
+    assert any(line.startswith("quickstart_drive: + excluded topic /battery: ") for line in lines)
     code, said = ingest("diff", JOB, "configs/other.yaml", "--json")
     assert code == 1
     assert {"sequence", "what", "before", "after"} == set(json.loads(said)[0])

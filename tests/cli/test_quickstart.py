@@ -60,7 +60,7 @@ def test_the_report_accounts_for_every_message(project: Path) -> None:
     recording = report.recordings[0]
     assert recording.totals.read == recording.totals.written == sum(count for _, count in TYPED.values())
     assert recording.totals.rejected == 0
-    assert {topic.topic for topic in recording.topics if topic.status == "left_out"} == {"/camera/image_raw"}
+    assert {topic.topic for topic in recording.topics if topic.status == "excluded"} == {"/camera/image_raw"}
 
 
 def test_the_battery_went_through_the_declared_adapter(project: Path) -> None:

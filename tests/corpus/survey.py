@@ -43,7 +43,7 @@ class Row:
     rejected: int
     typed: int
     unmodeled: int
-    left_out: int
+    excluded: int
     empty: int
     seconds: float
 
@@ -104,7 +104,7 @@ def row(path: str, report: Report, known_messages: int | None, seconds: float, c
         rejected=report.totals.rejected,
         typed=sum(topic.adapter != UNMODELED for topic in counted),
         unmodeled=sum(topic.adapter == UNMODELED for topic in counted),
-        left_out=sum(topic.status is TopicStatus.LEFT_OUT for topic in report.topics),
+        excluded=sum(topic.status is TopicStatus.EXCLUDED for topic in report.topics),
         empty=sum(topic.status is TopicStatus.EMPTY for topic in report.topics),
         seconds=seconds,
     )
@@ -115,32 +115,32 @@ def reasons_of(report: Report) -> Iterator[str]:
     if report.error:
         yield report.error
     for topic in report.topics:
-        if topic.status is TopicStatus.LEFT_OUT:
+        if topic.status is TopicStatus.EXCLUDED:
             yield f"{topic.topic} left out: {topic.why}"
         if topic.error:
             yield f"{topic.topic}: {topic.error}"
         for rejection in topic.rejections:
             yield f"{topic.topic}: {rejection.count} by {rejection.rule}: {rejection.reason}"
-    for loss in report.losses:
-        if loss.count == 0:
+    for item in report.unreadable_ranges:
+        if item.count == 0:
             continue  # nothing is missing: it could be had another way
-        yield f"lost {loss.count if loss.count is not None else '?'}: {loss.reason}"
+        yield f"lost {item.count if item.count is not None else '?'}: {item.reason}"
 
 
 def wrongs_of(report: Report) -> Iterator[str]:
     """Yield where the numbers contradict each other."""
     for topic in report.topics:
-        if topic.status is TopicStatus.LEFT_OUT:
+        if topic.status is TopicStatus.EXCLUDED:
             continue
         if topic.read != topic.written + topic.filtered + topic.downsampled + topic.rejected:
             yield f"{topic.topic}: read {topic.read} is not the sum of what became of it"
         if topic.promised is not None and topic.promised != topic.read and not lost(report, topic):
-            yield f"{topic.topic}: {topic.promised} promised, {topic.read} read, no loss noted"
+            yield f"{topic.topic}: {topic.promised} promised, {topic.read} read, no item noted"
 
 
 def lost(report: Report, topic: TopicReport) -> bool:
     """Say whether the report explains that messages of a topic are missing."""
-    return bool(report.error) or any(loss.topic in {None, topic.topic} for loss in report.losses)
+    return bool(report.error) or any(item.topic in {None, topic.topic} for item in report.unreadable_ranges)
 
 
 def unique(texts: Iterable[str]) -> list[str]:
@@ -183,7 +183,7 @@ def totals(rows: Sequence[Row]) -> str:
     known = sum(row.known_messages or 0 for row in rows)
     messages, topics = (
         {name: sum(getattr(row, name) for row in rows) for name in names}
-        for names in (("read", "written", "rejected"), ("typed", "unmodeled", "left_out", "empty"))
+        for names in (("read", "written", "rejected"), ("typed", "unmodeled", "excluded", "empty"))
     )
     wrong, seconds = sum(bool(row.wrong) for row in rows), sum(row.seconds for row in rows)
     lines = [

@@ -113,7 +113,7 @@ def test_a_ros_1_topic_in_a_container_of_ros_2_is_left_out_and_named(
 ) -> None:
     source = record(tmp_path / "in.bag", ros_1_messages())
     report = export_sequence(ingested(source), "s", tmp_path / "out.db3")
-    left = {topic.topic: topic.left_out for topic in report.topics if topic.left_out}
+    left = {topic.topic: topic.excluded for topic in report.topics if topic.excluded}
     assert set(left) == {"/p"}
     assert "ROS 1" in left["/p"]
     assert not report.faithful
@@ -138,7 +138,7 @@ def test_a_type_that_a_container_cannot_describe_is_left_out(ingested: Ingest, t
     odd, plain = define("acme_msgs/msg/Odd", ODD), define("std_msgs/msg/String", "string data\n")
     messages = [("/odd", odd, 1, ODD_VALUES), ("/s", plain, 2, {"data": "x"})]
     report = export_sequence(ingested(record(tmp_path / "in.mcap", messages)), "s", tmp_path / "out.db3")
-    assert {topic.topic for topic in report.topics if "wstring" in topic.left_out} == {"/odd"}
+    assert {topic.topic for topic in report.topics if "wstring" in topic.excluded} == {"/odd"}
 
 
 def test_pictures_packed_as_png_come_back_as_pixels(ingested: Ingest, tmp_path: Path) -> None:
@@ -212,7 +212,7 @@ def test_a_topic_that_does_not_say_what_it_was_is_left_out(ingested: Ingest, tmp
     with store.catalog.write() as db:
         db.execute("UPDATE topics SET metadata = '{}' WHERE name = '/imu'")
     report = export_sequence(store, "s", tmp_path / "out.mcap", topics=["/imu", "/joint_states"])
-    assert "does not say" in report.topics[0].left_out
+    assert "does not say" in report.topics[0].excluded
     assert report.topics[1].messages == 500
 
 
@@ -254,7 +254,7 @@ def round_trip(path: Path, folder: Path) -> int:
         assert done.recordings[0].totals.written == 0 or done.recordings[0].error
         return 0
     for topic in report.topics:
-        assert not topic.left_out
+        assert not topic.excluded
         assert not topic.changed
         wrong = found.get(topic.topic, set()) - LISTED.get(topic.msgtype.rpartition("/")[2], set())
         wrong = {field for field in wrong if not field.endswith(("header.seq", "covariance"))}

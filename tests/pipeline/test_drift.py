@@ -44,7 +44,7 @@ def plan(**changes: Any) -> Decisions:
             "on_error": "report",
             "on_message_error": "log_warn",
             "topics": [TOPIC],
-            "left_out": [],
+            "excluded": [],
             **changes,
         }
     )
@@ -67,7 +67,7 @@ def test_a_plan_does_not_differ_from_itself() -> None:
         ({"topics": [{**TOPIC, "count": None}]}, "s: topic /a count: 3 → none"),
         ({"topics": []}, "s: - topic /a: p/msg/A by A to O"),
         ({"topics": [{**TOPIC, "definitions": ("bag 01",)}]}, 's: topic /a definitions: ["bag 00"] → ["bag 01"]'),
-        ({"left_out": [{"topic": "/b", "msgtype": "B", "count": 0, "why": "no"}]}, "s: + left out /b: no"),
+        ({"excluded": [{"topic": "/b", "msgtype": "B", "count": 0, "why": "no"}]}, "s: + excluded topic /b: no"),
         ({"sequence": "t"}, "s: sequence: s → t"),
     ],
 )  # fmt: skip

@@ -35,7 +35,7 @@ from mosaico_ingest.report.events import (
     RunStatus,
     Unreadable,
 )
-from mosaico_ingest.rosbag.blocks import Loss
+from mosaico_ingest.rosbag.blocks import UnreadableRange
 
 from .conftest import RunJob, WriteBag, number
 
@@ -44,27 +44,27 @@ DRIVE = Path(__file__).parents[2] / "configs" / "quickstart" / "drive.mcap"
 
 
 def missing(
-    promised: int | None, seen: int, losses: list[Loss], **plan: Any
+    promised: int | None, seen: int, unreadable_ranges: list[UnreadableRange], **plan: Any
 ) -> tuple[list[str], list[Event]]:
     events: list[Event] = []
     topic = SimpleNamespace(target="/t", count=promised, channels=(7,))
-    recording: Any = SimpleNamespace(losses=losses)
+    recording: Any = SimpleNamespace(unreadable=unreadable_ranges)
     wanted: Any = SimpleNamespace(**{"read_from_ns": None, "read_until_ns": None, **plan})
     streams: Any = (SimpleNamespace(plan=topic, seen=seen),)
     return _missing(wanted, recording, streams, events.append), events
 
 
 def test_messages_nobody_can_account_for_are_a_difference() -> None:
-    wrong, events = missing(10, 8, [Loss("f", 0, "bad", 7, 1)])
+    wrong, events = missing(10, 8, [UnreadableRange(0, "bad", 7, 1, "f")])
     assert wrong == ["/t: the index promises 10 messages, 8 were read and nothing says where the others are"]
     assert not events
 
 
 def test_messages_in_a_stretch_nobody_can_read_are_accounted_for() -> None:
-    wrong, events = missing(10, 8, [Loss("f", 0, "bad", None, None)])
+    wrong, events = missing(10, 8, [UnreadableRange(0, "bad", file="f")])
     assert not wrong
     assert events == [Unreadable("/t", 2, None, "they lie in what could not be read")]
-    assert missing(10, 8, [Loss("f", 0, "bad", 7, 2)]) == ([], [])
+    assert missing(10, 8, [UnreadableRange(0, "bad", 7, 2, "f")]) == ([], [])
 
 
 def test_more_than_promised_is_no_loss() -> None:
@@ -87,7 +87,7 @@ def test_the_sums_of_a_damaged_recording_hold(tmp_path: Path) -> None:
     bag.write_bytes(data)
     (report,) = api.run([ROSInjectionConfig(bag, "drive", store=tmp_path / "store")]).recordings
     assert (report.status, report.exit_code) == (RunStatus.REJECTED, 4)
-    assert report.losses
+    assert report.unreadable_ranges
     taken = [topic for topic in report.topics if topic.promised is not None]
     assert sum(topic.unreadable for topic in taken) > 0
     for topic in taken:
@@ -122,9 +122,10 @@ def test_messages_of_a_type_nobody_defines_are_lost_and_not_left_out_on_purpose(
         ("/known", 3, 3, 0),
         ("/own", 3, 0, 3),
     ]
-    assert [(loss.topic, loss.count, loss.reason) for loss in report.losses] == [
-        ("/own", 3, "no definition of own_msgs/msg/Thing can be used")
-    ]
+    assert [
+        (unreadable_range.topic, unreadable_range.count, unreadable_range.reason)
+        for unreadable_range in report.unreadable_ranges
+    ] == [("/own", 3, "no definition of own_msgs/msg/Thing can be used")]
     (chosen,) = api.run([replace(config, sequence_name="chosen", topics=("!/own",))]).recordings
     assert chosen.exit_code == 0
 

@@ -101,7 +101,7 @@ def test_every_container_gives_what_the_file_gives(objects: ObjectStore, small: 
     path = put(objects, small, f"every/{small.name}")
     with opened(small) as here, opened(path) as there:
         assert messages(there) == messages(here)
-        assert there.losses == here.losses == ()
+        assert there.unreadable == here.unreadable == ()
         assert (there.message_count, there.start_ns, there.end_ns) == (
             here.message_count,
             here.start_ns,
@@ -146,7 +146,9 @@ def test_one_without_its_index_is_fetched_and_read_record_by_record(
     path = put(objects, cut, f"cut/{cut.name}")
     with opened(cut) as here, opened(path) as there:
         assert messages(there) == messages(here)
-        assert [loss.reason for loss in there.losses] == [loss.reason for loss in here.losses]
+        assert [unreadable_range.reason for unreadable_range in there.unreadable] == [
+            unreadable_range.reason for unreadable_range in here.unreadable
+        ]
         assert any("it has no index" in one.message for one in there.findings)
 
 
@@ -267,10 +269,10 @@ def test_a_server_that_goes_away_is_an_error_and_no_loss(
     assert Store.open(store).names() == ()
 
 
-def test_the_ledger_knows_a_recording_by_what_its_store_says(
+def test_provenance_knows_a_recording_by_what_its_store_says(
     objects: ObjectStore, small: Path, tmp_path: Path
 ) -> None:
-    path = put(objects, small, f"ledger/{small.name}")
+    path = put(objects, small, f"provenance/{small.name}")
     job = tmp_path / "job.yaml"
     job.write_text(
         f'bag: {{path: "{path.url}", ros_distro: ros2_humble}}\n'
@@ -287,6 +289,6 @@ def test_the_ledger_knows_a_recording_by_what_its_store_says(
     objects.counts()
     assert standing() == "done"
     if small.suffix != ".db3":  # that one is fetched to be looked into
-        assert sum(line.startswith("GET /bucket/ledger") for line in objects.counts().requests) <= 4
+        assert sum(line.startswith("GET /bucket/provenance") for line in objects.counts().requests) <= 4
     path.write_bytes(small.read_bytes() + b"\n")
     assert standing() in {"changed", "unreadable"}

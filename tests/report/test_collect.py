@@ -26,7 +26,7 @@ from mosaico_ingest.report.events import (
 from mosaico_ingest.report.model import Report, RunReport, write_report
 
 IMU = Expected("/imu", "/sensors/imu", "sensor_msgs/msg/Imu", "IMUAdapter", "IMU", "built-in", 10)
-LEFT = Expected("/debug", "/debug", "std_msgs/msg/String", "", "", "left out", None, left_out=True)
+LEFT = Expected("/debug", "/debug", "std_msgs/msg/String", "", "", "left out", None, excluded=True)
 
 
 def started() -> Collector:
@@ -65,7 +65,7 @@ def test_a_reason_is_that_of_the_first_message() -> None:
 
 def test_a_topic_left_out_is_in_the_report_but_not_in_the_totals() -> None:
     report = started().report()
-    assert [topic.status for topic in report.topics] == [TopicStatus.EMPTY, TopicStatus.LEFT_OUT]
+    assert [topic.status for topic in report.topics] == [TopicStatus.EMPTY, TopicStatus.EXCLUDED]
     assert report.totals.read == 0
 
 
@@ -92,7 +92,7 @@ def test_findings_and_losses_are_kept() -> None:
     collector(Unreadable(None, 3, 100, "a broken chunk"))
     report = collector.report()
     assert "two types" in report.findings[0]
-    assert report.losses[0].count == 3
+    assert report.unreadable_ranges[0].count == 3
     assert collector.unreadable
 
 

@@ -18,12 +18,12 @@ from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.html import gaps, html_page
 from mosaico_ingest.report.markdown import markdown_summary
 from mosaico_ingest.report.model import (
-    Loss,
     Rejection,
     Report,
     RunReport,
     Steps,
     TopicReport,
+    UnreadableRange,
     UsedManifest,
 )
 from mosaico_ingest.report.timing import TimelineReport
@@ -83,7 +83,9 @@ def recording(number: int, status: RunStatus = RunStatus.COMPLETED, topics: int 
         else Steps(prepare=0.1, read=0.6, decode=0.3, adapt=0.2, commit=0.3, write=0.4),
         quarantine="kept here/drive-1.mcap" if status is RunStatus.REJECTED else None,
         topics=() if failed else tuple(made),
-        losses=(Loss(topic=None, count=4, offset=99, reason="bad checksum"),) if failed else (),
+        unreadable_ranges=(UnreadableRange(topic=None, count=4, offset=99, reason="bad checksum"),)
+        if failed
+        else (),
         findings=("a note",),
     )
 

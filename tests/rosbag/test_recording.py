@@ -39,7 +39,7 @@ def test_an_mcap_of_any_form_gives_every_message_back(
     with open_recording(path, resolve=recordings.blind) as recording:
         assert recording.container == "mcap"
         assert recordings.received(recording) == sorted(messages)
-        assert recording.losses == ()
+        assert recording.unreadable == ()
         assert recording.message_count in {300, None}
         assert (recording.start_ns, recording.end_ns) == (messages[0].time_ns, messages[-1].time_ns)
 
@@ -63,7 +63,7 @@ def test_a_rosbag2_directory_reads_as_rosbags_reads_it(
         assert recording.container == storage
         assert recordings.received(recording) == expected
         assert recording.message_count == len(expected)
-        assert recording.losses == ()
+        assert recording.unreadable == ()
         assert not [finding for finding in recording.findings if finding.rule != "container-note"]
 
 
@@ -78,7 +78,7 @@ def test_a_ros1_bag_reads_as_rosbags_reads_it(tmp_path: Path, recordings: Any, c
     with open_recording(path, resolve=recordings.blind) as recording:
         assert recording.container == "ros1"
         assert recordings.received(recording) == expected
-        assert recording.losses == ()
+        assert recording.unreadable == ()
         assert {channel.encoding for channel in recording.channels} == {Encoding.ROS1}
         assert sum(channel.count or 0 for channel in recording.channels) == len(expected)
 
@@ -202,7 +202,7 @@ def test_a_file_that_shrinks_while_it_is_read_costs_only_its_end(
         found = recordings.received(recording)
         assert found
         assert set(found) < set(messages)
-        assert any("shorter" in loss.reason for loss in recording.losses)
+        assert any("shorter" in unreadable_range.reason for unreadable_range in recording.unreadable)
 
 
 def test_parts_of_different_formats_are_refused(tmp_path: Path, recordings: Any) -> None:

@@ -95,7 +95,7 @@ def test_every_message_is_read_with_or_without_an_index(tmp_path: Path, recordin
         with open_recording(path, resolve=recordings.blind) as recording:
             assert recordings.received(recording) == sorted(messages)
             assert recording.message_count == len(messages)
-            assert not recording.losses
+            assert not recording.unreadable
             assert any("version 1.2" in finding.message for finding in recording.findings)
 
 
@@ -160,7 +160,7 @@ def test_a_bag_cut_off_at_any_byte_gives_what_is_left_and_says_so(
         with open_recording(path, resolve=recordings.blind) as recording:
             assert recordings.received(recording) == sorted(texts[: sum(end <= size for end in ends)])
             if indexed:
-                assert any("cut off" in loss.reason for loss in recording.losses)
+                assert any("cut off" in unreadable_range.reason for unreadable_range in recording.unreadable)
 
 
 def test_a_bag_that_was_not_closed_says_so_and_misses_nothing(
@@ -172,7 +172,9 @@ def test_a_bag_that_was_not_closed_says_so_and_misses_nothing(
     path.write_bytes(content[:end].replace(b"index_pos=" + struct.pack("<Q", end), b"index_pos=" + bytes(8)))
     with open_recording(path, resolve=recordings.blind) as recording:
         assert recordings.received(recording) == sorted(texts)
-        assert [(loss.count, loss.reason) for loss in recording.losses] == [(0, "the bag was not closed")]
+        assert [
+            (unreadable_range.count, unreadable_range.reason) for unreadable_range in recording.unreadable
+        ] == [(0, "the bag was not closed")]
 
 
 def test_damage_costs_what_it_destroys(tmp_path: Path, recordings: Any, texts: list[Any]) -> None:
@@ -183,7 +185,7 @@ def test_damage_costs_what_it_destroys(tmp_path: Path, recordings: Any, texts: l
     path.write_bytes(content)
     with open_recording(path, resolve=recordings.blind) as recording:
         found = recordings.received(recording)
-        assert len(recording.losses) == 1
+        assert len(recording.unreadable) == 1
     assert found == sorted(texts[:10] + texts[11:])
 
 

@@ -25,7 +25,7 @@ import re
 from collections.abc import Iterator
 
 from mosaico_ingest.findings import Severity
-from mosaico_ingest.job.values import LEDGER_KEY
+from mosaico_ingest.job.values import PROVENANCE_KEY
 from mosaico_ingest.lint.job import Job, keys_below, metadata_places
 from mosaico_ingest.lint.rule import Problem, Rule
 
@@ -40,9 +40,9 @@ def check(job: Job) -> Iterator[Problem]:
                 yield Problem(
                     f"the metadata key {key!r} is refused by the platform", job.source.key_span(path), remedy
                 )
-    taken = ("sequence", "metadata", LEDGER_KEY)
-    if LEDGER_KEY in job.manifest.sequence.metadata:
-        what = f"the metadata key {LEDGER_KEY!r} is where a run notes what the sequence was made from"
+    taken = ("sequence", "metadata", PROVENANCE_KEY)
+    if PROVENANCE_KEY in job.manifest.sequence.metadata:
+        what = f"the metadata key {PROVENANCE_KEY!r} is where a run notes what the sequence was made from"
         yield Problem(what, job.source.key_span(taken), "use another key")
 
 

@@ -11,7 +11,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.rosbag.blocks import LATEST_NS, Hole
+from mosaico_ingest.rosbag.blocks import LATEST_NS, UnreadableRange
 from mosaico_ingest.rosbag.compression import inflate_some
 from mosaico_ingest.rosbag.formats import MCAP
 from mosaico_ingest.rosbag.mcap.records import (
@@ -72,7 +72,7 @@ class McapIndex:
     end_ns: int | None = None
     data_end: int = 0
     """Where the summary, or what cannot be read, begins."""
-    holes: list[Hole] = field(default_factory=list[Hole])
+    unreadable: list[UnreadableRange] = field(default_factory=list[UnreadableRange])
     walked: bool = False
     """Whether every record was looked at, and not only the summary."""
 
@@ -89,13 +89,15 @@ def read_index(source: Source) -> McapIndex:
         return index
     index = McapIndex(data_end=source.size)
     if problem:
-        index.holes.append(Hole(source.size, f"{problem}; the file was read record by record", count=0))
+        index.unreadable.append(
+            UnreadableRange(source.size, f"{problem}; the file was read record by record", count=0)
+        )
     source.fetch_whole()
     _Walk(source, index).over(len(MCAP), source.size)
     return index
 
 
-def read_pieces(source: Source, index: McapIndex) -> tuple[list[Piece], list[Hole]]:
+def read_pieces(source: Source, index: McapIndex) -> tuple[list[Piece], list[UnreadableRange]]:
     """Return all pieces by time, also those that the summary does not name, and what is broken between its chunks."""
     known = sorted(index.pieces, key=lambda piece: piece.offset)
     found = McapIndex()
@@ -107,7 +109,7 @@ def read_pieces(source: Source, index: McapIndex) -> tuple[list[Piece], list[Hol
                 walk.over(at, piece.offset)
             at = max(at, piece.stop)
         walk.over(at, index.data_end)
-    return sorted(known + found.pieces, key=lambda piece: piece.start_ns), found.holes
+    return sorted(known + found.pieces, key=lambda piece: piece.start_ns), found.unreadable
 
 
 def _summary(source: Source) -> McapIndex | None:
@@ -228,7 +230,9 @@ class _Walk:
             try:
                 _describe(op, Fields(self._source.read(start, end - start)), self._index)
             except BagError as err:
-                self._index.holes.append(Hole(at, f"a damaged record of kind {op}: {err.what}"))
+                self._index.unreadable.append(
+                    UnreadableRange(at, f"a damaged record of kind {op}: {err.what}")
+                )
 
     def _stray(self, op: int, at: int, end: int, stop: int) -> None:
         """Say what does not fit; a chunk that is cut off may still hold messages."""
@@ -244,7 +248,9 @@ class _Walk:
                 self._learn(piece)
                 return
         found = f"a record of kind {op} with {end - at} bytes" if op else "no record"
-        self._index.holes.append(Hole(at, f"{found} where {stop - at} bytes are left; they are not read"))
+        self._index.unreadable.append(
+            UnreadableRange(at, f"{found} where {stop - at} bytes are left; they are not read")
+        )
         self._counts = None
 
     def _doubt_last_chunk(self, at: int) -> None:
@@ -259,8 +265,8 @@ class _Walk:
         fixed = self._window.peek(at + RECORD.size, _MESSAGE.size)
         if min(len(fixed), end - at - RECORD.size) < _MESSAGE.size:
             self._finish_run()
-            self._index.holes.append(
-                Hole(at, f"a message record of {end - at} bytes, too few for its fields")
+            self._index.unreadable.append(
+                UnreadableRange(at, f"a message record of {end - at} bytes, too few for its fields")
             )
             return
         channel, _, time_ns = _MESSAGE.unpack(fixed)
@@ -284,7 +290,7 @@ class _Walk:
         try:
             head = chunk_head(self._source.read(at, min(end - at, 1 << 12)))
         except BagError as err:
-            self._index.holes.append(Hole(at, f"a damaged chunk record: {err.what}"))
+            self._index.unreadable.append(UnreadableRange(at, f"a damaged chunk record: {err.what}"))
             return
         piece = Piece(at, end, head.start_ns, head.end_ns, size=head.size)
         self._index.pieces.append(piece)

@@ -20,10 +20,10 @@ from mosaico_ingest.rosbag.blocks import (
     Block,
     Bytes,
     Encoding,
-    Hole,
     Loaded,
     Slab,
     Stream,
+    UnreadableRange,
     Want,
     by_key,
     in_groups,
@@ -103,17 +103,17 @@ class McapPart:
         self.start_ns: int | None = index.start_ns
         self.end_ns: int | None = index.end_ns
         self.message_count: int | None = sum(index.counts.values()) if index.counts is not None else None
-        self.holes: list[Hole] = [*index.holes, *orphans(index.counts, index.channels)]
+        self.unreadable: list[UnreadableRange] = [*index.unreadable, *orphans(index.counts, index.channels)]
         self.notes: list[str] = source.notes
-        self._pieces: tuple[list[Piece], list[Hole]] | None = None
+        self._pieces: tuple[list[Piece], list[UnreadableRange]] | None = None
 
     def blocks(self, want: Want) -> Iterator[Block]:
         """Yield the chunks, and the stretches between chunks, that may hold wanted messages."""
         if self._pieces is None:
             self._pieces = read_pieces(self._source, self._index)
-        pieces, holes = self._pieces
-        if holes:
-            yield Block(EARLIEST_NS, lambda: Loaded([], list(holes)))
+        pieces, unreadable = self._pieces
+        if unreadable:
+            yield Block(EARLIEST_NS, lambda: Loaded([], list(unreadable)))
         wanted = [
             piece
             for piece in pieces
@@ -143,7 +143,7 @@ class McapPart:
         return loaded
 
     def _chunks(self, pieces: Sequence[Piece], want: Want, loaded: Loaded) -> list[_Chunk]:
-        """Read and inflate; what is whole lies in one buffer, what is broken is among the holes."""
+        """Read and inflate; what is whole lies in one buffer, what is broken is among the unreadable."""
         found: list[_Chunk] = []
         packed: list[tuple[Piece, memoryview, ChunkHead, Packed]] = []
         stretches = Stretches(self._source, ((piece.offset, piece.stop) for piece in pieces))
@@ -160,13 +160,13 @@ class McapPart:
                     where = Packed(at.start + head.begin, end, head.compression, head.size)
                     packed.append((piece, raw, head, where))
             except BagError as err:
-                loaded.holes.extend(_whole_chunk(piece, raw, want, err))
+                loaded.unreadable.extend(_whole_chunk(piece, raw, want, err))
         inflated = inflate_all(stretches.data, [where for *_, where in packed])
         for place, (piece, raw, head, _) in enumerate(packed):
             chunk = _Chunk(piece, raw, inflated.data, *inflated.places[place])
             broken = inflated.failures.get(place) or _wrong_checksum(chunk.data, head)
             if broken:
-                loaded.holes.extend(_whole_chunk(piece, raw, want, broken))
+                loaded.unreadable.extend(_whole_chunk(piece, raw, want, broken))
             else:
                 found.append(chunk)
         return found
@@ -181,7 +181,7 @@ class McapPart:
                     self._by_index([chunk], want, loaded)
                 return
             reason = f"{err.what}; the chunk was read record by record"
-            loaded.holes.append(Hole(chunks[0].piece.offset, reason, count=0))
+            loaded.unreadable.append(UnreadableRange(chunks[0].piece.offset, reason, count=0))
             self._scan(chunks[0], want, loaded)
 
     def _scan(self, chunk: _Chunk, want: Want, loaded: Loaded) -> None:
@@ -196,7 +196,7 @@ class McapPart:
         keep_each(_slab(records, heads, starts, offsets), wanted, want, loaded)
         if self._index.counts is None:
             unwanted = {key: len(rows) for key, rows in found if key not in want.keys}
-            loaded.holes.extend(orphans(unwanted, self._index.channels))
+            loaded.unreadable.extend(orphans(unwanted, self._index.channels))
 
 
 def _inflated_bytes(piece: Piece) -> int:
@@ -233,22 +233,22 @@ def _wrong_checksum(data: Bytes, head: ChunkHead) -> BagError | None:
 def _cut(raw: memoryview, head: ChunkHead, piece: Piece, loaded: Loaded) -> memoryview:
     data = inflate_some(raw[head.begin : head.end], head.compression, head.size)
     reason = f"this chunk is cut off; {len(data)} of its {head.size} bytes could be read"
-    loaded.holes.append(Hole(piece.offset, reason))
+    loaded.unreadable.append(UnreadableRange(piece.offset, reason))
     return memoryview(data)
 
 
-def _whole_chunk(piece: Piece, raw: memoryview, want: Want, err: BagError) -> Iterator[Hole]:
-    """Yield the loss of a chunk, by channel where its index says how many messages each had."""
+def _whole_chunk(piece: Piece, raw: memoryview, want: Want, err: BagError) -> Iterator[UnreadableRange]:
+    """Yield the unreadable_range of a chunk, by channel where its index says how many messages each had."""
     reason = f"broken chunk: {err.what}"
     if not piece.indexes:
-        yield Hole(piece.offset, reason)
+        yield UnreadableRange(piece.offset, reason)
     for key, offset in piece.index_offsets():
         if key in want.keys:
             try:
                 count: int | None = len(_entries(raw, piece, key, offset)) // _ENTRY.itemsize
             except BagError:
                 count = None
-            yield Hole(piece.offset, reason, key=key, count=count)
+            yield UnreadableRange(piece.offset, reason, connection=key, count=count)
 
 
 def _entries(raw: memoryview, piece: Piece, key: int, offset: int) -> memoryview:
@@ -324,13 +324,13 @@ def _message_starts(data: memoryview, piece: Piece, loaded: Loaded) -> NDArray[n
         end = at + RECORD.size + length
         if op == 0 or end > len(data):
             reason = f"no whole record at byte {at} of {len(data)}; the rest is not read"
-            loaded.holes.append(Hole(piece.offset, reason))
+            loaded.unreadable.append(UnreadableRange(piece.offset, reason))
             break
         if op == Op.MESSAGE and length >= _FIXED_BYTES:
             found.append(at)
         elif op == Op.MESSAGE:
             reason = f"a message record of {length} bytes at byte {at}, too few for its fields"
-            loaded.holes.append(Hole(piece.offset, reason))
+            loaded.unreadable.append(UnreadableRange(piece.offset, reason))
         at = end
     return np.array(found, np.int64)
 

@@ -10,7 +10,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.rosbag.blocks import Hole
+from mosaico_ingest.rosbag.blocks import UnreadableRange
 from mosaico_ingest.rosbag.compression import inflate_some
 from mosaico_ingest.rosbag.recovery import next_ros1_chunk
 from mosaico_ingest.rosbag.ros1.records import (
@@ -54,7 +54,7 @@ class Ros1Index:
 
     connections: dict[int, Connection] = field(default_factory=dict[int, Connection])
     pieces: list[Piece] = field(default_factory=list[Piece])
-    holes: list[Hole] = field(default_factory=list[Hole])
+    unreadable: list[UnreadableRange] = field(default_factory=list[UnreadableRange])
 
 
 def read_index(source: Source) -> Ros1Index:
@@ -89,7 +89,9 @@ def read_index(source: Source) -> Ros1Index:
         except BagError as err:
             problem = f"its index is damaged ({err.what})"
     index = Ros1Index()
-    index.holes.append(Hole(len(_VERSION), f"{problem}; the file was read record by record", count=0))
+    index.unreadable.append(
+        UnreadableRange(len(_VERSION), f"{problem}; the file was read record by record", count=0)
+    )
     source.fetch_whole()
     _Walk(source, index).over(head.end, source.size)
     return index
@@ -153,7 +155,9 @@ class _Walk:
             try:
                 self._record(record)
             except BagError as err:
-                self._index.holes.append(Hole(at, f"a damaged record of kind {record.op}: {err.what}"))
+                self._index.unreadable.append(
+                    UnreadableRange(at, f"a damaged record of kind {record.op}: {err.what}")
+                )
             at = record.end
         self._doubt_last_chunk(at)
 
@@ -227,4 +231,4 @@ class _Walk:
         if piece.counts:
             self._index.pieces.append(piece)
         else:
-            self._index.holes.append(Hole(at, f"{reason}; {stop - at} bytes are not read"))
+            self._index.unreadable.append(UnreadableRange(at, f"{reason}; {stop - at} bytes are not read"))

@@ -14,10 +14,10 @@ from mosaico_ingest.rosbag.blocks import (
     Block,
     Bytes,
     Encoding,
-    Hole,
     Loaded,
     Slab,
     Stream,
+    UnreadableRange,
     Want,
     by_key,
     in_groups,
@@ -94,7 +94,10 @@ class Ros1Part:
         self.start_ns: int | None = min((piece.start_ns for piece in filled), default=None)
         self.end_ns: int | None = max((piece.end_ns for piece in filled), default=None)
         self.message_count: int | None = sum(counts.values())
-        self.holes: list[Hole] = [*self._index.holes, *orphans(counts, self._index.connections)]
+        self.unreadable: list[UnreadableRange] = [
+            *self._index.unreadable,
+            *orphans(counts, self._index.connections),
+        ]
         self.notes: list[str] = source.notes
 
     def blocks(self, want: Want) -> Iterator[Block]:
@@ -129,7 +132,7 @@ class Ros1Part:
         return loaded
 
     def _chunks(self, pieces: Sequence[Piece], want: Want, loaded: Loaded) -> list[_Chunk]:
-        """Read and inflate; what is whole lies in one buffer, what is broken is among the holes."""
+        """Read and inflate; what is whole lies in one buffer, what is broken is among the unreadable."""
         found: list[_Chunk] = []
         packed: list[tuple[Piece, memoryview, Packed]] = []
         stretches = Stretches(self._source, ((piece.offset, piece.stop) for piece in pieces))
@@ -144,11 +147,11 @@ class Ros1Part:
                     where = Packed(at.start + head.begin, at.start + head.end, head.compression, head.size)
                     packed.append((piece, raw[head.end :], where))
             except BagError as err:  # noqa: PERF203 - each chunk may fail for itself
-                loaded.holes.extend(_broken(piece, want, err))
+                loaded.unreadable.extend(_broken(piece, want, err))
         inflated = inflate_all(stretches.data, [where for *_, where in packed])
         for place, (piece, after, _) in enumerate(packed):
             if place in inflated.failures:
-                loaded.holes.extend(_broken(piece, want, inflated.failures[place]))
+                loaded.unreadable.extend(_broken(piece, want, inflated.failures[place]))
             else:
                 found.append(_Chunk(piece, after, inflated.data, *inflated.places[place]))
         return found
@@ -189,13 +192,15 @@ def _head(raw: memoryview, piece: Piece) -> ChunkHead:
 def _cut(raw: memoryview, head: ChunkHead, piece: Piece, loaded: Loaded) -> memoryview:
     data = inflate_some(raw[head.begin : head.end], head.compression, head.size)
     reason = f"this chunk is cut off; {len(data)} of its {head.size} bytes could be read"
-    loaded.holes.append(Hole(piece.offset, reason))
+    loaded.unreadable.append(UnreadableRange(piece.offset, reason))
     return memoryview(data)
 
 
-def _broken(piece: Piece, want: Want, err: BagError) -> Iterator[Hole]:
+def _broken(piece: Piece, want: Want, err: BagError) -> Iterator[UnreadableRange]:
     for key in piece.counts.keys() & want.keys:
-        yield Hole(piece.offset, f"broken chunk: {err.what}", key=key, count=piece.counts[key])
+        yield UnreadableRange(
+            piece.offset, f"broken chunk: {err.what}", connection=key, count=piece.counts[key]
+        )
 
 
 def _by_index(chunks: Sequence[_Chunk], want: Want, loaded: Loaded) -> None:
@@ -208,7 +213,7 @@ def _by_index(chunks: Sequence[_Chunk], want: Want, loaded: Loaded) -> None:
                 _by_index([chunk], want, loaded)
             return
         reason = f"{err.what}; the chunk was read record by record"
-        loaded.holes.append(Hole(chunks[0].piece.offset, reason, count=0))
+        loaded.unreadable.append(UnreadableRange(chunks[0].piece.offset, reason, count=0))
         _scan(chunks[0], want, loaded)
         return
     for slab in slabs:
@@ -358,7 +363,7 @@ def _scan(chunk: _Chunk, want: Want, loaded: Loaded) -> None:
         for message in messages_in(records.data):
             found.append((message.connection, message.time_ns, message.begin, message.end, message.at))  # noqa: PERF401 - what came before an error counts
     except BagError as err:
-        loaded.holes.append(Hole(piece.offset, f"{err.what}; the rest is not read"))
+        loaded.unreadable.append(UnreadableRange(piece.offset, f"{err.what}; the rest is not read"))
     columns = np.array(found, np.int64).reshape(-1, 5)
     keys, times, begins, ends, ats = columns.T
     offsets = np.full(len(ats), piece.offset, np.int64) if piece.is_chunk else ats + piece.offset

@@ -17,10 +17,10 @@ from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.blocks import (
     Block,
     Encoding,
-    Hole,
     Loaded,
     Slab,
     Stream,
+    UnreadableRange,
     Want,
     by_key,
     keep_each,
@@ -77,7 +77,7 @@ class RosrecordPart:
             source.close()
             raise
         self.notes.append("a bag of version 1.2, read record by record; `rosbag fix` makes it one of 2.0")
-        self.holes: list[Hole] = walk.holes
+        self.unreadable: list[UnreadableRange] = walk.unreadable
         found = np.frombuffer(walk.messages, np.int64).reshape(-1, 5)
         self._runs = sorted(_runs(found), key=lambda run: int(run.times.min()))
         self.streams: tuple[Stream, ...] = walk.streams(np.bincount(found[:, 0], minlength=len(walk.keys)))
@@ -107,7 +107,9 @@ class RosrecordPart:
         try:
             data = self._source.read(begin, int(run.ends[-1]) - begin)
         except BagError as err:
-            loaded.holes.extend(Hole(begin, err.what, key=key, count=len(rows)) for key, rows in wanted)
+            loaded.unreadable.extend(
+                UnreadableRange(begin, err.what, connection=key, count=len(rows)) for key, rows in wanted
+            )
             return loaded
         lengths = run.ends - run.begins
         whole = Slab(-1, run.times, np.frombuffer(data, np.uint8), run.begins - begin, lengths, run.ats)
@@ -139,7 +141,7 @@ class _Walk:
         self._index_at: int | None = None
         self.messages = array("q")
         """Of each its stream, time, record, and where its payload begins and ends."""
-        self.holes: list[Hole] = []
+        self.unreadable: list[UnreadableRange] = []
 
     def over(self) -> None:
         """Look at every record; where one does not fit, go on at the next message."""
@@ -151,9 +153,11 @@ class _Walk:
         while at < stop:
             at = self._step(window, at, stop)
         if self._index_at == 0:
-            self.holes.append(Hole(stop, "the bag was not closed", count=0))
+            self.unreadable.append(UnreadableRange(stop, "the bag was not closed", count=0))
         elif self._index_at and self._index_at >= stop:
-            self.holes.append(Hole(stop, f"cut off: its index would begin at {self._index_at}"))
+            self.unreadable.append(
+                UnreadableRange(stop, f"cut off: its index would begin at {self._index_at}")
+            )
 
     def _step(self, window: Window, at: int, stop: int) -> int:
         try:
@@ -161,7 +165,7 @@ class _Walk:
             self._record(record)
         except BagError as err:
             resumed = next_ros1_message(self._source, at + 1, stop) or stop
-            self.holes.append(Hole(at, f"{err.what}; {resumed - at} bytes are not read"))
+            self.unreadable.append(UnreadableRange(at, f"{err.what}; {resumed - at} bytes are not read"))
             return resumed
         return record.end
 

@@ -10,7 +10,7 @@ import pytest
 
 from mosaico_ingest import api
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.job.values import LEDGER_KEY
+from mosaico_ingest.job.values import PROVENANCE_KEY
 from mosaico_ingest.pipeline.provenance import content_digest
 from mosaico_ingest.report.events import Event, RunStatus, TopicProgress
 from mosaico_ingest.services.status import Standing
@@ -79,7 +79,7 @@ def test_a_sequence_nobody_noted_anything_about_is_not_taken_for_the_same(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(1)]})
-    Store.open(tmp_path / "store").create_sequence("drive", {LEDGER_KEY: "no ledger"})
+    Store.open(tmp_path / "store").create_sequence("drive", {PROVENANCE_KEY: "no provenance"})
     assert "nothing says" in str(run_job(write_job(sequence=SKIP)).error)
 
 
