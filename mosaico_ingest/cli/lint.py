@@ -158,16 +158,16 @@ def _summary(report: LintReport) -> str:
     return f"{counted(len(report.files), 'file')}, {counted(found, 'finding')}{mended}"
 
 
-def _explanation(rule: str) -> str:
+def _explanation(name: str) -> str:
     from mosaico_ingest.job.validation import nearest
-    from mosaico_ingest.lint.pages import index, page
-    from mosaico_ingest.lint.rules import RULES
-    from mosaico_ingest.lint.settings import NAMES
+    from mosaico_ingest.lint.pages import page_of, rule_index
+    from mosaico_ingest.rules import RULES, find_rule
 
-    if rule == "all":
-        return index()
-    if rule not in NAMES:
-        close = nearest(rule, NAMES)
+    if name == "all":
+        return rule_index()
+    rule = find_rule(name)
+    if rule is None:
+        close = nearest(name, RULES)
         hint = f"; did you mean {close!r}?" if close else "; `--explain all` lists them"
-        raise typer.BadParameter(f"there is no rule {rule!r}{hint}", param_hint="--explain")
-    return page(next(known for known in RULES if known.name == NAMES[rule]))
+        raise typer.BadParameter(f"there is no rule {name!r}{hint}", param_hint="--explain")
+    return page_of(rule)

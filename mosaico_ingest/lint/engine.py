@@ -25,7 +25,7 @@ from mosaico_ingest.job.manifest import read_text
 from mosaico_ingest.job.yaml_source import load_source
 from mosaico_ingest.lint.job import Job, read_job
 from mosaico_ingest.lint.message import MessageFile, read_message
-from mosaico_ingest.lint.rules import RULES
+from mosaico_ingest.lint.rules import CHECKS
 from mosaico_ingest.lint.settings import NAMES, Settings, settings_for
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
@@ -364,15 +364,15 @@ def _raw_findings(document: Document, env: Mapping[str, str] | None) -> Iterator
 
 
 def _run_job(job: Job, *, example: bool) -> Iterator[Finding]:
-    for rule in RULES:
-        if rule.job is not None and not (example and rule.disk):
-            yield from map(rule.finding, rule.job(job))
+    for check in CHECKS:
+        if check.job is not None and not (example and check.reads_files):
+            yield from map(check.finding, check.job(job))
 
 
 def _run_message(message: MessageFile) -> Iterator[Finding]:
-    for rule in RULES:
-        if rule.message is not None:
-            yield from map(rule.finding, rule.message(message))
+    for check in CHECKS:
+        if check.message is not None:
+            yield from map(check.finding, check.message(message))
 
 
 def _collect(folder: Path) -> Iterator[Path]:

@@ -16,8 +16,8 @@ from mosaico_ingest.findings import (
     Span,
 )
 from mosaico_ingest.lint.engine import Judged, LintReport
-from mosaico_ingest.lint.rule import Rule
-from mosaico_ingest.lint.rules import RULES
+from mosaico_ingest.lint.pages import page_of
+from mosaico_ingest.rules import RULES, Rule
 from mosaico_ingest.version import __version__
 
 __all__ = ["FORMATS"]
@@ -126,7 +126,7 @@ def _render_sarif(report: LintReport) -> str:
     driver = {
         "name": "mosaico-ingest",
         "semanticVersion": __version__,
-        "rules": [_rule(rule) for rule in RULES if rule.name in broken],
+        "rules": [_rule(rule) for rule in RULES.values() if rule.id in broken],
     }
     run = {
         "tool": {"driver": driver},
@@ -138,10 +138,10 @@ def _render_sarif(report: LintReport) -> str:
 
 def _rule(rule: Rule) -> dict[str, Any]:
     return {
-        "id": rule.name,
+        "id": rule.id,
         "name": rule.code,
-        "shortDescription": {"text": rule.title},
-        "help": {"text": rule.page or rule.title},
+        "shortDescription": {"text": rule.summary},
+        "help": {"text": page_of(rule), "markdown": page_of(rule)},
         "defaultConfiguration": {"level": _LEVELS[rule.severity]},
     }
 

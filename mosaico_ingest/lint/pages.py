@@ -1,54 +1,45 @@
-"""This file makes the rules' pages from their docstrings: for `docs/rules/` and for `ingest lint --explain`."""
+"""Access to the documentation pages of the rules, and the generator of their index, `docs/rules/README.md`."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from itertools import groupby
 from pathlib import Path
 
-from mosaico_ingest.lint.rule import Rule
-from mosaico_ingest.lint.rules import RULES
+from mosaico_ingest.rules import RULES, Rule
 
-__all__ = ["index", "page", "write_pages"]
+__all__ = ["page_of", "rule_index"]
 
-_NOTICE = "<!-- made from the rules' docstrings -->\n\n"
+_PACKAGE = Path(__file__).parents[1]
+_FOLDERS = (_PACKAGE / "rule_pages", _PACKAGE.parent / "docs" / "rules")
+"""The folder of the pages in an installed wheel, and in a checkout."""
 
-
-def page(rule: Rule) -> str:
-    """Return a rule's page as Markdown."""
-    body = (rule.page or "").strip("\n").split("\n", 2)[2].strip("\n")
-    why = body.split("\nBad:\n", 1)[0].strip("\n")
-    head = f"# {rule.name} ({rule.code})\n\n**{rule.severity.value}** · {rule.title}\n\n{why}\n"
-    return head + "".join(_blocks(rule))
+_NOTICE = (
+    "<!-- Generated from mosaico_ingest/rules.py by `python -m mosaico_ingest.lint.pages docs/rules`. -->\n\n"
+)
 
 
-def index() -> str:
-    """Return the table of all rules as Markdown."""
-    rows = "".join(
-        f"| {rule.code} | [{rule.name}]({rule.name}.md) | {rule.severity.value} | {rule.title.rstrip('.')} |\n"
-        for rule in RULES
+def page_of(rule: Rule) -> str:
+    """Return the documentation page of a rule as Markdown."""
+    folder = next(folder for folder in _FOLDERS if folder.is_dir())
+    return (folder / f"{rule.id}.md").read_text(encoding="utf-8")
+
+
+def rule_index() -> str:
+    """Return a Markdown table of all rules for each group."""
+    tables = [
+        f"\n## {group}\n\n| code | rule | severity | problem |\n|---|---|---|---|\n{''.join(map(_row, rules))}"
+        for group, rules in groupby(RULES.values(), key=lambda rule: rule.group)
+    ]
+    return (
+        "# Rules\n\nLook up a finding of lint, plan or run, or the reason of a rejected row. "
+        "`ingest lint --explain RULE` prints the same page.\n" + "".join(tables)
     )
-    return f"# Rules of `ingest lint`\n\n| code | rule | severity | finds |\n|---|---|---|---|\n{rows}"
 
 
-def write_pages(folder: Path) -> None:
-    """Write every page and the index into a folder, which then holds nothing else of ours."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for stale in folder.glob("*.md"):
-        stale.unlink()
-    (folder / "README.md").write_text(_NOTICE + index(), encoding="utf-8")
-    for rule in RULES:
-        (folder / f"{rule.name}.md").write_text(_NOTICE + page(rule), encoding="utf-8")
-
-
-def _blocks(rule: Rule) -> Iterator[str]:
-    """Yield the examples; the bad ones are marked, so that linting the page does not find them."""
-    language = "text" if rule.message is not None else "yaml"
-    for heading in ("Bad", "Good"):
-        for example in rule.examples(heading):
-            shown = language if heading == "Good" else "text"
-            yield f"\n{heading}:\n\n```{shown}\n{example}```\n"
+def _row(rule: Rule) -> str:
+    return f"| {rule.code} | [{rule.id}]({rule.id}.md) | {rule.severity.value} | {rule.summary} |\n"
 
 
 if __name__ == "__main__":
-    write_pages(Path(sys.argv[1]))
+    Path(sys.argv[1], "README.md").write_text(_NOTICE + rule_index(), encoding="utf-8")

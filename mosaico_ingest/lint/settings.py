@@ -16,7 +16,7 @@ from mosaico_ingest.findings import Finding, Severity, Span
 from mosaico_ingest.job.manifest import read_text
 from mosaico_ingest.job.validation import explain, nearest
 from mosaico_ingest.job.yaml_source import Source, Value, load_source
-from mosaico_ingest.lint.rules import RULES
+from mosaico_ingest.rules import LINT_RULES
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -25,7 +25,7 @@ else:
 
 __all__ = ["NAMES", "Settings", "settings_for"]
 
-NAMES = {rule.name: rule.name for rule in RULES} | {rule.code: rule.name for rule in RULES}
+NAMES = {name: rule.id for rule in LINT_RULES.values() for name in (rule.id, rule.code)}
 """Every code and every name of a rule, to its name."""
 
 

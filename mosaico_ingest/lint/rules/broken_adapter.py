@@ -1,25 +1,10 @@
-"""`broken-adapter`: an adapter that is no adapter.
-
-The file is there, but it is no Python, has no such class, or has something of that name that cannot be an adapter.
-Nothing of it is run to find out.
-
-Bad:
-    bag: {path: data/run.mcap}
-    adapters:
-      load: ["adapters/wheel.py:WheelAdaptor"]
-
-Good:
-    bag: {path: data/run.mcap}
-    adapters:
-      load: ["adapters/wheel.py:WheelAdapter"]
-"""
+"""The rule `broken-adapter`: a Python adapter that cannot be used."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.job.validation import nearest
 from mosaico_ingest.lint.job import (
     Job,
@@ -28,7 +13,7 @@ from mosaico_ingest.lint.job import (
     python_reference,
     read_classes,
 )
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -60,4 +45,4 @@ def _fault(file: Path, name: str) -> tuple[str, str] | None:
     return None
 
 
-RULE = Rule("ING220", __name__, Severity.ERROR, __doc__, job=check, disk=True)
+CHECK = Check("broken-adapter", job=check, reads_files=True)

@@ -1,17 +1,4 @@
-"""`changed-number`: a number that is not kept as it is written.
-
-Unquoted, `1.10` is the number 1.1 and a serial number of twenty digits is rounded. Versions and serial numbers are texts.
-
-Bad:
-    bag: {path: data/run.mcap}
-    sequence:
-      metadata: {firmware: 1.10}
-
-Good:
-    bag: {path: data/run.mcap}
-    sequence:
-      metadata: {firmware: "1.10"}
-"""
+"""The rule `changed-number`: a metadata number that loses digits."""
 
 from __future__ import annotations
 
@@ -20,9 +7,9 @@ import re
 from collections.abc import Iterator
 from decimal import Decimal
 
-from mosaico_ingest.findings import Edit, Severity
+from mosaico_ingest.findings import Edit
 from mosaico_ingest.lint.job import Job, metadata_places, values_below
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -45,4 +32,4 @@ def _loses(written: str, value: float) -> bool:
     )
 
 
-RULE = Rule("ING211", __name__, Severity.WARNING, __doc__, job=check)
+CHECK = Check("changed-number", job=check)

@@ -1,31 +1,12 @@
-"""`delete-permission`: deleting with a key that may only write.
-
-`on_error.session: delete` removes what a failed run has written. On a server this needs a key with delete permission;
-a key with write permission leaves the broken session behind.
-
-Bad:
-    bag: {path: data/run.mcap}
-    on_error: {session: delete}
-    target:
-      host: localhost
-      api_key: ${WRITE_KEY:-}
-
-Good:
-    bag: {path: data/run.mcap}
-    on_error: {session: report}
-    target:
-      host: localhost
-      api_key: ${MOSAICO_KEY:-}
-"""
+"""The rule `delete-permission`: `session: delete` with a key that may not delete."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.job.values import SessionLevelErrorPolicy
 from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -39,4 +20,4 @@ def check(job: Job) -> Iterator[Problem]:
         yield Problem(message, job.span("on_error", "session"), "say report, or use another key")
 
 
-RULE = Rule("ING229", __name__, Severity.WARNING, __doc__, job=check)
+CHECK = Check("delete-permission", job=check)

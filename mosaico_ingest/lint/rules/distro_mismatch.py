@@ -1,21 +1,11 @@
-"""`distro-mismatch`: a distro of the other ROS.
-
-A `.bag` file is ROS 1 and a `.db3` file ROS 2; the definitions of the other one do not fit their messages.
-
-Bad:
-    bag: {path: data/run.bag, ros_distro: ros2_humble}
-
-Good:
-    bag: {path: data/run.bag, ros_distro: ros1_noetic}
-"""
+"""The rule `distro-mismatch`: a ROS distribution of the other ROS version."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job, recording_paths
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 _VERSIONS = {".bag": "ros1", ".db3": "ros2"}
 
@@ -33,4 +23,4 @@ def check(job: Job) -> Iterator[Problem]:
             return
 
 
-RULE = Rule("ING213", __name__, Severity.WARNING, __doc__, job=check)
+CHECK = Check("distro-mismatch", job=check)

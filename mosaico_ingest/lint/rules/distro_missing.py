@@ -1,22 +1,11 @@
-"""`distro-missing`: a `.db3` recording without a distro.
-
-SQLite recordings of most distros carry no definitions of their messages. Types that changed between distros then
-cannot be read.
-
-Bad:
-    bag: {path: data/run.db3}
-
-Good:
-    bag: {path: data/run.db3, ros_distro: ros2_humble}
-"""
+"""The rule `distro-missing`: a `.db3` recording without a ROS distribution."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job, recording_paths
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -34,4 +23,4 @@ def check(job: Job) -> Iterator[Problem]:
             return
 
 
-RULE = Rule("ING212", __name__, Severity.WARNING, __doc__, job=check)
+CHECK = Check("distro-missing", job=check)

@@ -1,24 +1,11 @@
-"""`early-exclusion`: an exclusion before anything is included.
-
-With a plain pattern in the list, the start is no topic at all. An exclusion above the first plain pattern has nothing
-to leave out.
-
-Bad:
-    bag: {path: data/run.mcap}
-    topics: ["!/camera/debug", /imu]
-
-Good:
-    bag: {path: data/run.mcap}
-    topics: [/imu]
-"""
+"""The rule `early-exclusion`: an exclusion above the first topic pattern that includes anything."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job, bare, covers
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -31,4 +18,4 @@ def check(job: Job) -> Iterator[Problem]:
             yield Problem(message, job.span("topics", i), "put it below what it is an exception of")
 
 
-RULE = Rule("ING205", __name__, Severity.WARNING, __doc__, job=check)
+CHECK = Check("early-exclusion", job=check)

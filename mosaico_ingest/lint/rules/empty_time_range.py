@@ -1,26 +1,12 @@
-"""`empty-time-range`: a time range with nothing in it.
-
-`start` is the first moment that is in and `end` the first that is out; an end that is not later leaves nothing.
-
-Bad:
-    bag:
-      path: data/run.mcap
-      time: {start: +20s, end: +10s}
-
-Good:
-    bag:
-      path: data/run.mcap
-      time: {start: +10s, end: +20s}
-"""
+"""The rule `empty-time-range`: a time range that selects nothing."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.job.units import parse_instant, parse_offset
 from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -42,4 +28,4 @@ def _moment(text: str) -> tuple[str, int]:
     return "epoch", parse_instant(text)
 
 
-RULE = Rule("ING231", __name__, Severity.ERROR, __doc__, job=check)
+CHECK = Check("empty-time-range", job=check)

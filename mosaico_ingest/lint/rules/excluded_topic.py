@@ -1,28 +1,12 @@
-"""`excluded-topic`: a setting for a topic that is left out.
-
-`topics` selects what is ingested. A setting, an override or a policy for a topic outside of it has no effect.
-
-Bad:
-    bag: {path: data/run.mcap}
-    topics: [/camera/*]
-    topic_settings:
-      /imu: {every: 2}
-
-Good:
-    bag: {path: data/run.mcap}
-    topics: [/camera/*, /imu]
-    topic_settings:
-      /imu: {every: 2}
-"""
+"""The rule `excluded-topic`: a setting for a topic that `topics` excludes."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.job.patterns import select
 from mosaico_ingest.lint.job import Job, is_glob, keyed_patterns
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -37,4 +21,4 @@ def check(job: Job) -> Iterator[Problem]:
             )
 
 
-RULE = Rule("ING222", __name__, Severity.WARNING, __doc__, job=check)
+CHECK = Check("excluded-topic", job=check)

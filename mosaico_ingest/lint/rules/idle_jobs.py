@@ -1,24 +1,11 @@
-"""`idle-jobs`: parallel jobs for a single recording.
-
-`run.jobs` is how many recordings are ingested at the same time; here there is one.
-
-Bad:
-    bag: {path: data/run.mcap}
-    run: {jobs: 4}
-
-Good:
-    bag: {path: "data/*.mcap"}
-    sequence: {name: "{stem}"}
-    run: {jobs: 4}
-"""
+"""The rule `idle-jobs`: parallel jobs for a single recording."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job, is_glob
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 from mosaico_ingest.remote import without_options
 
 
@@ -31,4 +18,4 @@ def check(job: Job) -> Iterator[Problem]:
         yield Problem("there is one recording, so one job", job.span("run", "jobs"), "remove it")
 
 
-RULE = Rule("ING237", __name__, Severity.INFO, __doc__, job=check)
+CHECK = Check("idle-jobs", job=check)

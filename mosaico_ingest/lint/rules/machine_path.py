@@ -1,21 +1,11 @@
-"""`machine-path`: a path that only this machine has.
-
-An absolute path, or one that starts at somebody's home, makes the manifest work for one person.
-
-Bad:
-    bag: {path: /home/ada/run.mcap}
-
-Good:
-    bag: {path: "${DATA:-data}/run.mcap"}
-"""
+"""The rule `machine-path`: a path that exists only on one machine."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job, all_paths
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -28,4 +18,4 @@ def check(job: Job) -> Iterator[Problem]:
             )
 
 
-RULE = Rule("ING236", __name__, Severity.WARNING, __doc__, job=check)
+CHECK = Check("machine-path", job=check)

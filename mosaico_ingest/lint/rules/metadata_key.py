@@ -1,33 +1,13 @@
-"""`metadata-key`: a metadata key the platform refuses, or one that is taken.
-
-Keys are letters, digits, blanks, `_` and single `-`, at every depth: a dot or slash would clash with the paths of queries.
-Under `mosaico_ingest` a run notes what the sequence was made from.
-
-Bad:
-    bag: {path: data/run.mcap}
-    sequence:
-      metadata: {driver: {v2.1: true}}
-
-Bad:
-    bag: {path: data/run.mcap}
-    sequence:
-      metadata: {mosaico_ingest: nightly}
-
-Good:
-    bag: {path: data/run.mcap}
-    sequence:
-      metadata: {driver: {version: v2.1}}
-"""
+"""The rule `metadata-key`: a metadata key that is invalid or reserved."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.job.values import PROVENANCE_KEY
 from mosaico_ingest.lint.job import Job, keys_below, metadata_places
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -49,4 +29,4 @@ def check(job: Job) -> Iterator[Problem]:
 _KEY = re.compile(r"[A-Za-z0-9 _-]+")
 
 
-RULE = Rule("ING209", __name__, Severity.ERROR, __doc__, job=check)
+CHECK = Check("metadata-key", job=check)

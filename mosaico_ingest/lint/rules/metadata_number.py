@@ -1,26 +1,12 @@
-"""`metadata-number`: a number that JSON cannot hold.
-
-Metadata is kept as JSON, which has no infinity and no NaN.
-
-Bad:
-    bag: {path: data/run.mcap}
-    sequence:
-      metadata: {max_range: .inf}
-
-Good:
-    bag: {path: data/run.mcap}
-    sequence:
-      metadata: {max_range: null}
-"""
+"""The rule `metadata-number`: a metadata number that JSON cannot represent."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job, metadata_places, values_below
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -34,4 +20,4 @@ def check(job: Job) -> Iterator[Problem]:
                 )
 
 
-RULE = Rule("ING210", __name__, Severity.ERROR, __doc__, job=check)
+CHECK = Check("metadata-number", job=check)

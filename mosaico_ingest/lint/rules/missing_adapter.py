@@ -1,24 +1,9 @@
-"""`missing-adapter`: an adapter whose file or module is not there.
-
-Paths start at the manifest's folder. A module is looked for where Python looks, and then in that folder; nothing of it
-is run.
-
-Bad:
-    bag: {path: data/run.mcap}
-    adapters:
-      load: [nowhere/pack.yaml]
-
-Good:
-    bag: {path: data/run.mcap}
-    adapters:
-      load: [adapters/pack.yaml]
-"""
+"""The rule `missing-adapter`: an adapter file or module that does not exist."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import (
     Job,
     adapter_references,
@@ -26,7 +11,7 @@ from mosaico_ingest.lint.job import (
     is_mapping_file,
     python_reference,
 )
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -50,4 +35,4 @@ def _missing(job: Job, reference: str) -> tuple[str, str] | None:
     return f"there is no file {file}", "paths start at the manifest's folder"
 
 
-RULE = Rule("ING238", __name__, Severity.ERROR, __doc__, job=check, disk=True)
+CHECK = Check("missing-adapter", job=check, reads_files=True)

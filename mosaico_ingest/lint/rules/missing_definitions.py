@@ -1,29 +1,11 @@
-"""`missing-definitions`: definitions that are not there.
-
-`custom_msgs` names a directory of `.msg` files, or one. Without them the messages that need them cannot be read.
-
-Bad:
-    bag:
-      path: data/run.db3
-      ros_distro: ros2_humble
-      custom_msgs:
-        - {package: acme_msgs, path: nowhere}
-
-Good:
-    bag:
-      path: data/run.db3
-      ros_distro: ros2_humble
-      custom_msgs:
-        - {package: acme_msgs, path: msgs}
-"""
+"""The rule `missing-definitions`: a path in `custom_msgs` without message definitions."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 from mosaico_ingest.rosbag.definitions.registry import definition_files
 
 
@@ -39,4 +21,4 @@ def check(job: Job) -> Iterator[Problem]:
             yield Problem(f"{path} has no .msg or .idl file", span, "name the directory they are in")
 
 
-RULE = Rule("ING217", __name__, Severity.ERROR, __doc__, job=check, disk=True)
+CHECK = Check("missing-definitions", job=check, reads_files=True)

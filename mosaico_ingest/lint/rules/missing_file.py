@@ -1,23 +1,11 @@
-"""`missing-file`: a file the job needs and that is not there.
-
-The metadata file and the certificate are read when the job starts.
-
-Bad:
-    bag: {path: data/run.mcap}
-    sequence: {metadata_file: nowhere.json}
-
-Good:
-    bag: {path: data/run.mcap}
-    sequence: {metadata_file: metadata.json}
-"""
+"""The rule `missing-file`: a file that the job needs and that does not exist."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -32,4 +20,4 @@ def check(job: Job) -> Iterator[Problem]:
             yield Problem(f"there is no file {job.resolve(path)}", job.source.span(place), remedy)
 
 
-RULE = Rule("ING232", __name__, Severity.ERROR, __doc__, job=check, disk=True)
+CHECK = Check("missing-file", job=check, reads_files=True)

@@ -1,23 +1,11 @@
-"""`missing-folder`: a report for a folder that is not there.
-
-The report is written when the run is over; a folder that is not there by then loses it.
-
-Bad:
-    bag: {path: data/run.mcap}
-    run: {report: nowhere/report.json}
-
-Good:
-    bag: {path: data/run.mcap}
-    run: {report: report.json}
-"""
+"""The rule `missing-folder`: a report path in a folder that does not exist."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -28,4 +16,4 @@ def check(job: Job) -> Iterator[Problem]:
         yield Problem(message, job.span("run", "report"), "make it, or write the report elsewhere")
 
 
-RULE = Rule("ING233", __name__, Severity.WARNING, __doc__, job=check, disk=True)
+CHECK = Check("missing-folder", job=check, reads_files=True)

@@ -1,22 +1,12 @@
-"""`mixed-formats`: parts of different formats in one recording.
-
-A list names the parts of one recording, which one recorder wrote in one format.
-
-Bad:
-    bag: {path: [data/part_0.bag, data/part_1.mcap]}
-
-Good:
-    bag: {path: [data/part_0.mcap, data/part_1.mcap]}
-"""
+"""The rule `mixed-formats`: splits of one recording in different formats."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job, recording_paths
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -30,4 +20,4 @@ def check(job: Job) -> Iterator[Problem]:
             return
 
 
-RULE = Rule("ING215", __name__, Severity.ERROR, __doc__, job=check)
+CHECK = Check("mixed-formats", job=check)

@@ -1,22 +1,12 @@
-"""`msg-constant-name`: a constant name that ROS 2 refuses.
-
-ROS 2 wants constants in capital letters, digits and single underscores.
-
-Bad:
-    uint8 statusOk=0
-
-Good:
-    uint8 STATUS_OK=0
-"""
+"""The rule `msg-constant-name`: a constant name that ROS 2 rejects."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.message import MessageFile
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 _CONSTANT = re.compile(r"[A-Z](_?[A-Z0-9]+)*")
 
@@ -31,4 +21,4 @@ def check(message: MessageFile) -> Iterator[Problem]:
             )
 
 
-RULE = Rule("ING305", __name__, Severity.WARNING, __doc__, message=check)
+CHECK = Check("msg-constant-name", message=check)

@@ -1,22 +1,12 @@
-"""`msg-field-name`: a field name that ROS 2 refuses.
-
-ROS 2 wants field names in small letters, digits and single underscores, not at the end. ROS 1 allowed more.
-
-Bad:
-    float64 batteryVoltage
-
-Good:
-    float64 battery_voltage
-"""
+"""The rule `msg-field-name`: a field name that ROS 2 rejects."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.message import MessageFile
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 _FIELD = re.compile(r"[a-z](_?[a-z0-9]+)*")
 
@@ -29,4 +19,4 @@ def check(message: MessageFile) -> Iterator[Problem]:
             yield Problem(f"{name!r} is no field name of ROS 2", declaration.name_span, "write_it_like_this")
 
 
-RULE = Rule("ING304", __name__, Severity.WARNING, __doc__, message=check)
+CHECK = Check("msg-field-name", message=check)

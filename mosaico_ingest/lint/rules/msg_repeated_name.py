@@ -1,23 +1,11 @@
-"""`msg-repeated-name`: two declarations of one name.
-
-A field could not be told from the other one.
-
-Bad:
-    float64 voltage
-    float32 voltage
-
-Good:
-    float64 voltage
-    float32 current
-"""
+"""The rule `msg-repeated-name`: two declarations with the same name."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.message import MessageFile
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(message: MessageFile) -> Iterator[Problem]:
@@ -32,4 +20,4 @@ def check(message: MessageFile) -> Iterator[Problem]:
         lines.setdefault(name, span.line)
 
 
-RULE = Rule("ING303", __name__, Severity.ERROR, __doc__, message=check)
+CHECK = Check("msg-repeated-name", message=check)

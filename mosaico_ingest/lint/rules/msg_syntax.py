@@ -1,24 +1,12 @@
-"""`msg-syntax`: a line that declares nothing.
-
-A line of a `.msg` file is `type name`, `type NAME=value`, or a comment. The whole type cannot be used otherwise.
-
-Bad:
-    float64 voltage
-    current
-
-Good:
-    float64 voltage
-    float64 current
-"""
+"""The rule `msg-syntax`: a line of a `.msg` file that is not a declaration."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.message import MessageFile
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 from mosaico_ingest.rosbag.definitions.parser import parse_msg
 
 
@@ -38,4 +26,4 @@ def _fault(line: str, name: str) -> str | None:
     return None
 
 
-RULE = Rule("ING301", __name__, Severity.ERROR, __doc__, message=check)
+CHECK = Check("msg-syntax", message=check)

@@ -1,23 +1,11 @@
-"""`msg-unknown-type`: a field of a type that is nowhere.
-
-It is no primitive, no file beside this one, and in no distro. Bags that carry it cannot be read with this definition.
-
-Bad:
-    geometry_msgs/Pose pose
-    CellState[] cells
-
-Good:
-    geometry_msgs/Pose pose
-    Cell[] cells
-"""
+"""The rule `msg-unknown-type`: a field whose type is not defined."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.message import MessageFile, is_known
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 from mosaico_ingest.rosbag.definitions.parser import PRIMITIVES
 
 
@@ -34,4 +22,4 @@ def check(message: MessageFile) -> Iterator[Problem]:
 _SPECIAL = {"time", "duration", "Header"}
 
 
-RULE = Rule("ING302", __name__, Severity.ERROR, __doc__, message=check)
+CHECK = Check("msg-unknown-type", message=check)

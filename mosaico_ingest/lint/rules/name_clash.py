@@ -1,27 +1,11 @@
-"""`name-clash`: two topics with the same new name.
-
-Each topic of a sequence has its own name; the second one would be refused.
-
-Bad:
-    bag: {path: data/run.mcap}
-    topic_settings:
-      /imu/left: {rename: /imu}
-      /imu/right: {rename: /imu}
-
-Good:
-    bag: {path: data/run.mcap}
-    topic_settings:
-      /imu/left: {rename: /imu/l}
-      /imu/right: {rename: /imu/r}
-"""
+"""The rule `name-clash`: two topics with the same name in the sequence."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -35,4 +19,4 @@ def check(job: Job) -> Iterator[Problem]:
         taken.setdefault(name, topic)
 
 
-RULE = Rule("ING225", __name__, Severity.ERROR, __doc__, job=check)
+CHECK = Check("name-clash", job=check)

@@ -1,24 +1,12 @@
-"""`name-without-placeholder`: one name for every match of a glob.
-
-A glob is one sequence for each recording it matches; with a fixed name the second one finds it taken.
-
-Bad:
-    bag: {path: "data/*.mcap"}
-    sequence: {name: run}
-
-Good:
-    bag: {path: "data/*.mcap"}
-    sequence: {name: "run_{stem}"}
-"""
+"""The rule `name-without-placeholder`: a fixed sequence name for a glob of recordings."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.job.compose import placeholders_in
 from mosaico_ingest.lint.job import Job, is_glob
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 from mosaico_ingest.remote import without_options
 
 
@@ -34,4 +22,4 @@ def check(job: Job) -> Iterator[Problem]:
         yield Problem(message, span, "put {stem} or {index} into it")
 
 
-RULE = Rule("ING208", __name__, Severity.ERROR, __doc__, job=check)
+CHECK = Check("name-without-placeholder", job=check)

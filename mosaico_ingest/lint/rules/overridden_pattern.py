@@ -1,24 +1,11 @@
-"""`overridden-pattern`: a pattern that a later one undoes.
-
-Patterns apply in order and the last that matches decides. What this one takes in, or leaves out, is turned round again
-below, so it has no effect.
-
-Bad:
-    bag: {path: data/run.mcap}
-    topics: [/camera/front, /imu, "!/camera/*"]
-
-Good:
-    bag: {path: data/run.mcap}
-    topics: [/camera/*, /imu, "!/camera/front"]
-"""
+"""The rule `overridden-pattern`: a topic pattern that a later pattern cancels."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job, bare, covers
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -34,4 +21,4 @@ def check(job: Job) -> Iterator[Problem]:
                 break
 
 
-RULE = Rule("ING203", __name__, Severity.WARNING, __doc__, job=check)
+CHECK = Check("overridden-pattern", job=check)

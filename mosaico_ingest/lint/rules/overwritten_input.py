@@ -1,26 +1,12 @@
-"""`overwritten-input`: a report that would overwrite an input.
-
-The report's path is that of a file the job reads.
-
-Bad:
-    bag: {path: data/run.mcap}
-    sequence: {metadata_file: metadata.json}
-    run: {report: metadata.json}
-
-Good:
-    bag: {path: data/run.mcap}
-    sequence: {metadata_file: metadata.json}
-    run: {report: report.json}
-"""
+"""The rule `overwritten-input`: a report that would overwrite an input of the job."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from os.path import normpath
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job, recording_paths
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -36,4 +22,4 @@ def check(job: Job) -> Iterator[Problem]:
         )
 
 
-RULE = Rule("ING234", __name__, Severity.ERROR, __doc__, job=check)
+CHECK = Check("overwritten-input", job=check)

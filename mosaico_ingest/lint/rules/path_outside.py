@@ -1,13 +1,4 @@
-"""`path-outside`: a path that leaves the repository.
-
-A relative path that climbs above the repository's root leads somewhere else on every machine.
-
-Bad:
-    bag: {path: ../../../../run.mcap}
-
-Good:
-    bag: {path: data/run.mcap}
-"""
+"""The rule `path-outside`: a relative path that leaves the repository."""
 
 from __future__ import annotations
 
@@ -15,9 +6,8 @@ from collections.abc import Iterator
 from os.path import normpath
 from pathlib import Path
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job, all_paths
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -35,4 +25,4 @@ def _ancestors(folder: Path) -> list[Path]:
     return [folder.resolve(), *folder.resolve().parents]
 
 
-RULE = Rule("ING235", __name__, Severity.WARNING, __doc__, job=check, disk=True)
+CHECK = Check("path-outside", job=check, reads_files=True)

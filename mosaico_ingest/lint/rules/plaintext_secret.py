@@ -1,28 +1,12 @@
-"""`plaintext-secret`: a key written into a manifest.
-
-Manifests are committed, copied and mailed. Whoever has one has the key.
-
-Bad:
-    bag: {path: data/run.mcap}
-    target: {host: localhost, api_key: not_a_real_key}
-
-Bad:
-    bag: {path: data/run.mcap}
-    target: {host: localhost, api_key: "${MOSAICO_API_KEY:-not_a_real_key}"}
-
-Good:
-    bag: {path: data/run.mcap}
-    target: {host: localhost, api_key: "${MOSAICO_API_KEY:-}"}
-"""
+"""The rule `plaintext-secret`: an API key or password written into a manifest."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job, values_below
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -41,4 +25,4 @@ _DEFAULT = re.compile(r"\$\{\w+:-[^}]")
 _KEY = re.compile(r"msco_[a-z0-9]{32}_[0-9a-f]{8}")
 
 
-RULE = Rule("ING226", __name__, Severity.ERROR, __doc__, job=check)
+CHECK = Check("plaintext-secret", job=check)

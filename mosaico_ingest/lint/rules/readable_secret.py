@@ -1,24 +1,12 @@
-"""`readable-secret`: a key that others on this machine can read.
-
-The manifest holds a key and its file mode lets every user of the machine read it.
-
-Bad:
-    bag: {path: data/run.mcap}
-    target: {host: localhost, api_key: not_a_real_key}  # ingest: ignore[plaintext-secret]
-
-Good:
-    bag: {path: data/run.mcap}
-    target: {host: localhost, api_key: "${MOSAICO_API_KEY:-}"}
-"""
+"""The rule `readable-secret`: a secret in a file that every user can read."""
 
 from __future__ import annotations
 
 import stat
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -32,4 +20,4 @@ def check(job: Job) -> Iterator[Problem]:
         yield Problem(message, job.key_span("target", "api_key"), f"chmod 600 {job.file}")
 
 
-RULE = Rule("ING228", __name__, Severity.ERROR, __doc__, job=check, disk=True)
+CHECK = Check("readable-secret", job=check, reads_files=True)

@@ -1,25 +1,11 @@
-"""`renamed-glob`: one new name for all topics of a glob.
-
-A new name is for one topic; all topics that a glob matches cannot have the same.
-
-Bad:
-    bag: {path: data/run.mcap}
-    topic_settings:
-      "/camera/*": {rename: /camera}
-
-Good:
-    bag: {path: data/run.mcap}
-    topic_settings:
-      /camera/front: {rename: /camera}
-"""
+"""The rule `renamed-glob`: one new name for all topics that a glob matches."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job, is_glob
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -32,4 +18,4 @@ def check(job: Job) -> Iterator[Problem]:
             )
 
 
-RULE = Rule("ING224", __name__, Severity.ERROR, __doc__, job=check)
+CHECK = Check("renamed-glob", job=check)

@@ -1,28 +1,11 @@
-"""`repeated-definition`: one message type defined twice.
-
-Two entries of `custom_msgs` define the same type for the same distro; which one is used would depend on their order.
-
-Bad:
-    bag:
-      path: data/run.mcap
-      custom_msgs:
-        - {package: acme_msgs, path: msgs}
-        - {package: acme_msgs, path: msgs/BatteryPack.msg}
-
-Good:
-    bag:
-      path: data/run.mcap
-      custom_msgs:
-        - {package: acme_msgs, path: msgs}
-"""
+"""The rule `repeated-definition`: a message type that is defined twice."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 from mosaico_ingest.rosbag.definitions.registry import definition_files
 
 
@@ -40,4 +23,4 @@ def check(job: Job) -> Iterator[Problem]:
         first.update({key: line for key in keys if key not in first})
 
 
-RULE = Rule("ING218", __name__, Severity.ERROR, __doc__, job=check, disk=True)
+CHECK = Check("repeated-definition", job=check, reads_files=True)

@@ -1,23 +1,11 @@
-"""`repeated-pattern`: a pattern that another one contains.
-
-Everything it matches is matched by another pattern of the same kind, with nothing in between that would matter.
-
-Bad:
-    bag: {path: data/run.mcap}
-    topics: [/camera/*, /camera/front]
-
-Good:
-    bag: {path: data/run.mcap}
-    topics: [/camera/*]
-"""
+"""The rule `repeated-pattern`: a topic pattern that an earlier pattern already covers."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job, bare, covers
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -35,4 +23,4 @@ def check(job: Job) -> Iterator[Problem]:
                 break
 
 
-RULE = Rule("ING204", __name__, Severity.WARNING, __doc__, job=check)
+CHECK = Check("repeated-pattern", job=check)

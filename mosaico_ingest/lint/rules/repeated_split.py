@@ -1,22 +1,12 @@
-"""`repeated-split`: a part that is named twice.
-
-Its messages would be in the sequence twice.
-
-Bad:
-    bag: {path: [data/part_0.mcap, ./data/part_0.mcap]}
-
-Good:
-    bag: {path: [data/part_0.mcap, data/part_1.mcap]}
-"""
+"""The rule `repeated-split`: a split that is listed twice."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from os.path import normpath
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job, recording_paths
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -30,4 +20,4 @@ def check(job: Job) -> Iterator[Problem]:
         seen.setdefault(normal, job.source.span(place).line)
 
 
-RULE = Rule("ING216", __name__, Severity.ERROR, __doc__, job=check)
+CHECK = Check("repeated-split", job=check)

@@ -1,16 +1,4 @@
-"""`sequence-name`: a sequence name the platform refuses.
-
-Names go into paths and queries: ASCII, no blank, no slash, none of ``! " ' * $ % & . :``. What placeholders stand for is
-made to fit, what is written is not.
-
-Bad:
-    bag: {path: data/run.mcap}
-    sequence: {name: "run 1.2"}
-
-Good:
-    bag: {path: data/run.mcap}
-    sequence: {name: run_1_2}
-"""
+"""The rule `sequence-name`: a sequence name that the platform rejects."""
 
 from __future__ import annotations
 
@@ -18,10 +6,9 @@ import re
 from collections.abc import Iterator
 
 from mosaico_ingest.errors import SinkError
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.job.compose import placeholders_in
 from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 from mosaico_ingest.protocol import check_sequence_name
 
 
@@ -48,4 +35,4 @@ def check(job: Job) -> Iterator[Problem]:
         )
 
 
-RULE = Rule("ING206", __name__, Severity.ERROR, __doc__, job=check)
+CHECK = Check("sequence-name", job=check)

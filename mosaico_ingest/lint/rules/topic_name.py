@@ -1,26 +1,12 @@
-"""`topic-name`: a new topic name the platform refuses.
-
-Topic names go into paths and queries: words between single slashes, ASCII, no blank, none of ``! " ' * $ % & . :``.
-
-Bad:
-    bag: {path: data/run.mcap}
-    topic_settings:
-      /imu: {rename: "/sensors/imu.raw"}
-
-Good:
-    bag: {path: data/run.mcap}
-    topic_settings:
-      /imu: {rename: /sensors/imu_raw}
-"""
+"""The rule `topic-name`: a new topic name that the platform rejects."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 from mosaico_ingest.errors import SinkError
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 from mosaico_ingest.protocol import check_topic_name
 
 
@@ -37,4 +23,4 @@ def check(job: Job) -> Iterator[Problem]:
             )
 
 
-RULE = Rule("ING223", __name__, Severity.ERROR, __doc__, job=check)
+CHECK = Check("topic-name", job=check)

@@ -1,25 +1,12 @@
-"""`topic-pattern`: a pattern that no topic name can match.
-
-Topic names are words between slashes. A pattern with a blank, with two slashes in a row, with one at its end, or
-written as a regular expression takes nothing, and the topic goes missing without a word.
-
-Bad:
-    bag: {path: data/run.mcap}
-    topics: [/camera/.*]
-
-Good:
-    bag: {path: data/run.mcap}
-    topics: [/camera/*]
-"""
+"""The rule `topic-pattern`: a topic pattern that cannot match any topic name."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 _FAULTS = (
     (
@@ -48,4 +35,4 @@ def check(job: Job) -> Iterator[Problem]:
                 break
 
 
-RULE = Rule("ING201", __name__, Severity.ERROR, __doc__, job=check)
+CHECK = Check("topic-pattern", job=check)

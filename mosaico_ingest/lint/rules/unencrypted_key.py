@@ -1,23 +1,11 @@
-"""`unencrypted-key`: a key sent without encryption.
-
-Without TLS the API key crosses the network as plain text with every call.
-
-Bad:
-    bag: {path: data/run.mcap}
-    target: {host: mosaico.example.org, api_key: "${MOSAICO_API_KEY:-}"}
-
-Good:
-    bag: {path: data/run.mcap}
-    target: {host: mosaico.example.org, api_key: "${MOSAICO_API_KEY:-}", tls: true}
-"""
+"""The rule `unencrypted-key`: an API key that is sent without encryption."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 _HERE = {"localhost", "127.0.0.1", "::1"}
 
@@ -31,4 +19,4 @@ def check(job: Job) -> Iterator[Problem]:
         yield Problem(f"the key is sent to {target.host} without encryption", span, "set target.tls: true")
 
 
-RULE = Rule("ING227", __name__, Severity.WARNING, __doc__, job=check)
+CHECK = Check("unencrypted-key", job=check)

@@ -1,23 +1,4 @@
-"""`unknown-adapter`: a name that no adapter has.
-
-An adapter is called by the name of a built-in, a loaded or an installed one, by the path of its YAML file, or by `module:Class` or
-`file.py:Class`.
-
-Bad:
-    bag: {path: data/run.mcap}
-    adapters:
-      override: {/lidar: LidarAdaptor}
-
-Bad:
-    bag: {path: data/run.mcap}
-    adapters:
-      load: [wheels.py]
-
-Good:
-    bag: {path: data/run.mcap}
-    adapters:
-      override: {/lidar: LidarAdapter}
-"""
+"""The rule `unknown-adapter`: an adapter name that does not exist."""
 
 from __future__ import annotations
 
@@ -27,7 +8,6 @@ from mosaico_ingest.adapters.adapter import UnmodeledSpec
 from mosaico_ingest.adapters.bridge import installed_adapters, what_was_meant
 from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.job.validation import nearest
 from mosaico_ingest.lint.job import (
     Job,
@@ -36,7 +16,7 @@ from mosaico_ingest.lint.job import (
     loaded_names,
     python_reference,
 )
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 _UNMODELED = UnmodeledSpec().name
 
@@ -63,4 +43,4 @@ def _installed(name: str) -> bool:
         return True
 
 
-RULE = Rule("ING219", __name__, Severity.ERROR, __doc__, job=check)
+CHECK = Check("unknown-adapter", job=check)

@@ -1,22 +1,12 @@
-"""`unknown-format`: a recording whose format is not known by its name.
-
-Recordings are `.bag`, `.db3` and `.mcap` files, packed or not, or rosbag2 directories.
-
-Bad:
-    bag: {path: data/run.csv}
-
-Good:
-    bag: {path: data/run.mcap}
-"""
+"""The rule `unknown-format`: a recording with an unknown file name extension."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job, is_glob, recording_paths
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 from mosaico_ingest.rosbag.formats import RECORDING_NAME
 
 
@@ -30,4 +20,4 @@ def check(job: Job) -> Iterator[Problem]:
             yield Problem(f"{path} does not look like a recording", job.source.span(place), remedy)
 
 
-RULE = Rule("ING214", __name__, Severity.WARNING, __doc__, job=check)
+CHECK = Check("unknown-format", job=check)

@@ -1,25 +1,13 @@
-"""`unknown-placeholder`: a placeholder that nothing stands for.
-
-The placeholders are {stem}, {name}, {parent}, {date} and {index}; `{index:03}` writes the index with leading zeros.
-
-Bad:
-    bag: {path: data/run.mcap}
-    sequence: {name: "{file}_raw"}
-
-Good:
-    bag: {path: data/run.mcap}
-    sequence: {name: "{stem}_raw"}
-"""
+"""The rule `unknown-placeholder`: an unknown placeholder in the sequence name."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.job.compose import PLACEHOLDERS, placeholders_in
 from mosaico_ingest.job.validation import nearest
 from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -37,4 +25,4 @@ def check(job: Job) -> Iterator[Problem]:
         )
 
 
-RULE = Rule("ING207", __name__, Severity.ERROR, __doc__, job=check)
+CHECK = Check("unknown-placeholder", job=check)

@@ -1,28 +1,11 @@
-"""`unreachable-key`: a glob that an earlier glob hides.
-
-An exact name comes before every glob, and of the globs the first that matches counts. Every topic this one matches is
-taken by a glob above it.
-
-Bad:
-    bag: {path: data/run.mcap}
-    topic_settings:
-      "/camera/*": {every: 2}
-      "/camera/front/*": {every: 5}
-
-Good:
-    bag: {path: data/run.mcap}
-    topic_settings:
-      "/camera/front/*": {every: 5}
-      "/camera/*": {every: 2}
-"""
+"""The rule `unreachable-key`: a glob that an earlier glob hides."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job, covers, is_glob, keyed_patterns
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -39,4 +22,4 @@ def check(job: Job) -> Iterator[Problem]:
         above.append((section, pattern, span.line))
 
 
-RULE = Rule("ING221", __name__, Severity.WARNING, __doc__, job=check)
+CHECK = Check("unreachable-key", job=check)

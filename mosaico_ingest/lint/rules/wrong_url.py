@@ -1,23 +1,12 @@
-"""`wrong-url`: a URL that cannot be reached as it is written.
-
-Recordings and stores may lie behind `s3://` and `gs://`; other places are files, and a password belongs into the
-environment.
-
-Bad:
-    bag: {path: "ftp://example.org/drives/run.mcap"}
-
-Good:
-    bag: {path: "s3://drives/run.mcap"}
-"""
+"""The rule `wrong-url`: a URL that cannot be used."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 from mosaico_ingest.errors import IngestError
-from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.job import Job, all_paths
-from mosaico_ingest.lint.rule import Problem, Rule
+from mosaico_ingest.lint.rule import Check, Problem
 from mosaico_ingest.remote import as_path, is_url
 
 _MAY_BE_URLS = {("bag", "path"), ("target", "store")}
@@ -38,4 +27,4 @@ def check(job: Job) -> Iterator[Problem]:
             yield Problem(f"{error.where}: {error.what}", job.source.span(place), error.hint or "")
 
 
-RULE = Rule("ING240", __name__, Severity.ERROR, __doc__, job=check)
+CHECK = Check("wrong-url", job=check)
