@@ -1,26 +1,28 @@
-"""This file is the destination's seam: a sink opens a session, a session opens topics, a topic takes batches."""
+"""The interfaces of a destination: `Destination`, `Sink`, `Session` and `TopicWriter`."""
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
 
 import pyarrow as pa
-import pyarrow.compute as pc
 from msgspec import Struct
 
-from mosaico_ingest import protocol
 from mosaico_ingest.errors import SequenceExists, SinkError
-from mosaico_ingest.job.values import IfExists
+from mosaico_ingest.findings import Finding
+from mosaico_ingest.job.values import IfExists, SessionLevelErrorPolicy
 from mosaico_ingest.ontology.types import OntologyType
 
 __all__ = [
     "ENVELOPE",
-    "MemorySequence",
-    "MemorySink",
-    "MemoryTopic",
+    "Destination",
+    "DestinationStatus",
+    "ExistingSequence",
+    "ExistingSession",
+    "ExistingTopic",
     "Session",
     "Sink",
     "StoredTopic",
@@ -32,37 +34,126 @@ __all__ = [
 ]
 
 ENVELOPE = pa.field("timestamp_ns", pa.int64(), nullable=False)
-"""The first column of every batch: when the message was recorded, ns since the epoch."""
+"""The first column of every batch: the log time of the message, ns since the epoch."""
 
 
-class StoredTopic(Struct, frozen=True):
-    """What the destination says it holds of one topic of this session after the commit."""
+class ExistingSession(Struct, frozen=True):
+    """A committed session of a stored sequence."""
 
-    topic: str
-    """The name as it was given."""
-    rows: int
-    start_ns: int | None
-    end_ns: int | None
-    """The largest time stamp, inclusive."""
-    stored_bytes: int
-    checksum: str | None = None
-    """Of the values of its rows, where the destination makes one."""
+    id: str
+    metadata: Mapping[str, Any]
 
 
-class TopicWriter(Protocol):
-    """Takes the batches of one topic."""
+class ExistingTopic(Struct, frozen=True):
+    """A topic of a stored sequence."""
 
-    def write(self, batch: pa.RecordBatch) -> None:
-        """Append rows: `timestamp_ns` first, then the ontology's columns.
+    session: str
+    """The id of the session that created it."""
+    ontology: OntologyType
+    metadata: Mapping[str, Any]
+
+
+class ExistingSequence(Struct, frozen=True):
+    """The content of a sequence that a destination already has."""
+
+    name: str
+    complete: bool
+    """False if a run ended with an error, or if a session was never finished."""
+    sessions: tuple[ExistingSession, ...]
+    topics: Mapping[str, ExistingTopic] = {}
+    """By name, with the leading slash; empty if the destination does not list types."""
+    has_all_sessions: bool = True
+    """False if `sessions` holds only the metadata of the first session."""
+
+
+class DestinationStatus(Struct, frozen=True):
+    """The state of a destination before a run; None for a value that is unknown."""
+
+    exists: bool | None = None
+    """Whether the store exists or the server responds."""
+    sequence: ExistingSequence | None = None
+    """The sequence of the requested name, if the destination has one."""
+    problem: str | None = None
+    """The reason why the destination cannot be written."""
+    free_bytes: int | None = None
+
+
+class Destination(ABC):
+    """A store, a server or another system that sequences are written to.
+
+    A destination is cheap to create and connects only when a method is called. Packages add destinations through the
+    entry point group `mosaico_ingest.destinations`; see `registry`.
+    """
+
+    kind: ClassVar[str]
+    """The name of this type of destination in plans."""
+
+    @abstractmethod
+    def describe(self, *, folder: Path | None = None) -> str:
+        """Return the location for people, without credentials; paths are relative to `folder` if it is given."""
+
+    @abstractmethod
+    def inspect(self, sequence: str, *, connect: bool) -> DestinationStatus:
+        """Return the current state, with the sequence of this name; network access requires `connect`."""
+
+    @abstractmethod
+    def find(self, sequence: str) -> ExistingSequence | None:
+        """Return the stored sequence of this name, or None.
 
         Raises:
-            SinkError: The destination refused them; nothing of this batch is stored.
+            SinkError: The destination cannot be read.
+        """
+
+    @abstractmethod
+    def open_sink(self, *, buffer_bytes: int) -> Sink:
+        """Return the sink for this destination; one session buffers at most about `buffer_bytes`.
+
+        Raises:
+            SinkError: The destination cannot be opened.
+        """
+
+    def preflight(self, sequence: str, on_error: SessionLevelErrorPolicy) -> Finding | None:  # noqa: ARG002 - for subclasses
+        """Return a warning if a run could not follow its session error policy; asks the destination."""
+        return None
+
+    def sequences(self) -> tuple[ExistingSequence, ...] | None:
+        """Return every stored sequence, or None if the destination cannot list topics with their metadata."""
+        return None
+
+    def delete_sessions(self, sequence: str, sessions: Collection[str]) -> bool:  # noqa: ARG002 - for subclasses
+        """Delete some sessions of a sequence; return False if the destination can only replace whole sequences."""
+        return False
+
+    @property
+    def local_folder(self) -> Path | None:
+        """The folder on this machine that is written to, or None for a destination reached by network."""
+        return None
+
+    def keep_open(self) -> AbstractContextManager[object] | None:
+        """Return a context that makes subsequent calls cheaper, or None if there is nothing to keep open yet."""
+        return None
+
+
+class Sink(Protocol):
+    """Opens writing sessions at a destination."""
+
+    def open(
+        self, sequence: str, metadata: Mapping[str, Any], *, if_exists: IfExists = IfExists.FAIL
+    ) -> AbstractContextManager[Session]:
+        """Open a session. A normal exit commits it; an exception discards everything it wrote.
+
+        If the sequence exists, `fail` and `skip` raise, `append` adds a session to the sequence, and `replace` swaps the
+        old sequence for the new one at the commit.
+
+        Raises:
+            SequenceExists: The sequence exists and `if_exists` is `fail` or `skip`.
+            SinkError: The destination refuses the name or the metadata.
         """
         ...
 
 
 class Session(Protocol):
-    """One writing session of a sequence; what it wrote becomes visible at once, when it ends."""
+    """A writing session of one sequence; its topics become visible atomically at the commit."""
 
     def topic(self, name: str, ontology: OntologyType, metadata: Mapping[str, Any]) -> TopicWriter:
         """Open a topic; once per name and session.
@@ -77,156 +168,67 @@ class Session(Protocol):
         ...
 
     def stored(self) -> tuple[StoredTopic, ...]:
-        """Return what the destination holds, asked from it anew; only after a commit."""
+        """Return the stored content, read from the destination again; only after a commit."""
         ...
 
 
-class Sink(Protocol):
-    """A place sequences go to."""
+class TopicWriter(Protocol):
+    """Writes the batches of one topic."""
 
-    def open(
-        self, sequence: str, metadata: Mapping[str, Any], *, if_exists: IfExists = IfExists.FAIL
-    ) -> AbstractContextManager[Session]:
-        """Open a session; leaving it normally commits, leaving it by an exception discards what it wrote.
-
-        A taken name: `fail` and `skip` refuse it (to skip is the caller's decision), `append` adds a session
-        to the sequence, `replace` swaps the old one for the new one at the commit.
+    def write(self, batch: pa.RecordBatch) -> None:
+        """Append rows: `timestamp_ns` first, then the columns of the ontology type.
 
         Raises:
-            SequenceExists: The name is taken and `if_exists` is `fail` or `skip`.
-            SinkError: The destination refuses the name or the metadata.
+            SinkError: The destination refuses the rows; none of this batch are stored.
         """
         ...
 
 
+class StoredTopic(Struct, frozen=True):
+    """The content of one topic that a destination reports after the commit."""
+
+    topic: str
+    """The name that was passed to `Session.topic`."""
+    rows: int
+    start_ns: int | None
+    end_ns: int | None
+    """The largest time stamp, inclusive."""
+    stored_bytes: int
+    checksum: str | None = None
+    """Checksum of the row values; None if the destination has none."""
+
+
 def topic_schema(ontology: OntologyType) -> pa.Schema:
-    """Return the columns of a topic: the envelope, then those of its type."""
+    """Return the columns of a topic: the envelope, then the columns of its type."""
     return pa.schema([ENVELOPE, *ontology.struct])
 
 
 def sequence_exists(sequence: str) -> SequenceExists:
-    """Return the error for a name that is taken."""
+    """Return the error for a sequence name that is already in use."""
     return SequenceExists(
-        "the sequence exists",
+        "the sequence already exists",
         where=sequence,
-        hint="choose another name, or set sequence.if_exists: skip (where the content is the same), append or replace;"
+        hint="choose another name, or set sequence.if_exists to skip (if the content is the same), append or replace;"
         " `ingest bag` has --if-exists",
     )
 
 
 def check_batch(batch: pa.RecordBatch, schema: pa.Schema, *, where: str) -> None:
-    """Raise SinkError where the batch has not exactly the topic's columns, or a row without a time stamp."""
+    """Raise SinkError if the columns of a batch differ from `schema` or a row has no time stamp."""
     if not batch.schema.equals(schema):
-        for given, wanted in zip(batch.schema, schema, strict=False):
-            if not given.equals(wanted):
-                raise SinkError(f"column is {given}, the topic's is {wanted}", where=where)
-        raise SinkError(f"batch has columns {batch.schema.names}, the topic has {schema.names}", where=where)
+        for actual, expected in zip(batch.schema, schema, strict=False):
+            if not actual.equals(expected):
+                raise SinkError(f"column is {actual}, expected {expected}", where=where)
+        raise SinkError(f"batch has columns {batch.schema.names}, expected {schema.names}", where=where)
     if batch.column(0).null_count:
         raise SinkError("a row has no timestamp_ns", where=where)
 
 
-def check_same_type(held: OntologyType, given: OntologyType, *, where: str) -> None:
-    """Raise SinkError where rows of `given` cannot join a topic that holds `held`."""
-    if (held.tag, held.fingerprint) != (given.tag, given.fingerprint):
+def check_same_type(existing: OntologyType, new: OntologyType, *, where: str) -> None:
+    """Raise SinkError if rows of type `new` cannot be appended to a topic of type `existing`."""
+    if (existing.tag, existing.fingerprint) != (new.tag, new.fingerprint):
         raise SinkError(
-            f"the topic holds {held.tag} ({held.fingerprint}), not {given.tag} ({given.fingerprint})",
+            f"the topic holds {existing.tag} ({existing.fingerprint}), not {new.tag} ({new.fingerprint})",
             where=where,
-            hint="rename it in topic_settings, or replace the sequence",
+            hint="rename the topic in topic_settings, or replace the sequence",
         )
-
-
-@dataclass(slots=True)
-class MemoryTopic:
-    """A topic held in memory; it is its own writer."""
-
-    name: str
-    ontology: OntologyType
-    metadata: Mapping[str, Any]
-    batches: list[pa.RecordBatch] = field(default_factory=list[pa.RecordBatch])
-
-    def write(self, batch: pa.RecordBatch) -> None:
-        """Append the batch."""
-        check_batch(batch, topic_schema(self.ontology), where=self.name)
-        self.batches.append(batch)
-
-    def table(self) -> pa.Table:
-        """Return all rows in the order they came."""
-        return pa.Table.from_batches(self.batches, topic_schema(self.ontology))
-
-    def stored(self, given: str) -> StoredTopic:
-        """Return what is held, under the name the caller knows."""
-        table = self.table()
-        span = pc.min_max(table.column(0))
-        return StoredTopic(given, table.num_rows, span["min"].as_py(), span["max"].as_py(), table.nbytes)
-
-
-@dataclass(slots=True)
-class MemorySequence:
-    """A sequence held in memory."""
-
-    metadata: Mapping[str, Any]
-    topics: dict[str, MemoryTopic] = field(default_factory=dict[str, MemoryTopic])
-    errors: list[tuple[str | None, str]] = field(default_factory=list[tuple[str | None, str]])
-    """Topic or None, and the message."""
-
-
-@dataclass(slots=True)
-class _MemorySession:
-    sequence: MemorySequence
-    held: Mapping[str, MemoryTopic]
-    """What the sequence has from earlier sessions."""
-    given: dict[str, MemoryTopic] = field(default_factory=dict[str, MemoryTopic])
-
-    def topic(self, name: str, ontology: OntologyType, metadata: Mapping[str, Any]) -> MemoryTopic:
-        path = protocol.check_topic_name(name)
-        protocol.check_metadata(metadata, where=name)
-        if path in self.sequence.topics:
-            raise SinkError("the topic is open already", where=name)
-        if path in self.held:
-            check_same_type(self.held[path].ontology, ontology, where=name)
-        topic = MemoryTopic(path, ontology, dict(metadata))
-        self.sequence.topics[path] = self.given[name] = topic
-        return topic
-
-    def note_error(self, message: str, *, topic: str | None = None) -> None:
-        self.sequence.errors.append((topic and protocol.check_topic_name(topic), message))
-
-    def stored(self) -> tuple[StoredTopic, ...]:
-        return tuple(topic.stored(name) for name, topic in self.given.items())
-
-
-@dataclass(slots=True)
-class MemorySink:
-    """Keeps sequences in memory: for tests, notebooks and dry runs of adapters."""
-
-    sequences: dict[str, MemorySequence] = field(default_factory=dict[str, MemorySequence])
-
-    @contextmanager
-    def open(
-        self, sequence: str, metadata: Mapping[str, Any], *, if_exists: IfExists = IfExists.FAIL
-    ) -> Generator[Session, None, None]:
-        """Open a session; see `Sink.open`."""
-        protocol.check_sequence_name(sequence)
-        protocol.check_metadata(metadata, where=sequence)
-        self._refuse_taken(sequence, if_exists)
-        old = self.sequences.get(sequence) if if_exists is IfExists.APPEND else None
-        session = _MemorySession(MemorySequence(dict(metadata)), old.topics if old else {})
-        yield session
-        self._refuse_taken(sequence, if_exists)
-        if old is None:
-            self.sequences[sequence] = session.sequence
-        else:
-            _append(old, session.sequence)
-
-    def _refuse_taken(self, sequence: str, if_exists: IfExists) -> None:
-        if sequence in self.sequences and if_exists in {IfExists.FAIL, IfExists.SKIP}:
-            raise sequence_exists(sequence)
-
-
-def _append(old: MemorySequence, new: MemorySequence) -> None:
-    for name, topic in new.topics.items():
-        if name in old.topics:
-            old.topics[name].batches += topic.batches
-        else:
-            old.topics[name] = topic
-    old.errors += new.errors

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Protocol
 
-from mosaico_ingest.destinations.store.open_stores import held_catalogs
+from mosaico_ingest.destinations.registry import keep_destinations_open
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.pipeline.run import run_config
 from mosaico_ingest.report.events import BatchObserver, RunStatus
@@ -34,11 +34,11 @@ class Inline:
 
     def map(self, configs: Sequence[ROSInjectionConfig], observe: BatchObserver) -> Iterator[Report]:
         """Yield a report for each configuration; see `Executor.map`."""
-        with held_catalogs() as hold:
+        with keep_destinations_open() as keep_open:
             for position, config in enumerate(configs):
                 report = run_config(config, partial(observe, position))
                 yield report
                 if report.status is RunStatus.INTERRUPTED:
                     return
                 if position + 1 < len(configs):
-                    hold(config.target)
+                    keep_open(config.target)

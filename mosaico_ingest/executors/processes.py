@@ -19,7 +19,7 @@ import pyarrow as pa
 from msgspec import Struct
 
 from mosaico_ingest.adapters.python import register_default_adapter, registered_adapters
-from mosaico_ingest.destinations.store.open_stores import Hold, held_catalogs
+from mosaico_ingest.destinations.registry import KeepOpen, keep_destinations_open
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.batch import Batch
 from mosaico_ingest.interrupts import Stop, counted_interrupts
@@ -70,12 +70,12 @@ def work(pipe: Connection, registrations: Registrations, prepare: Callable[[], N
     pa.set_cpu_count(max(1, (os.cpu_count() or 1) // jobs))
     prepare()
     registrations.register()
-    with held_catalogs() as hold, suppress(EOFError, BrokenPipeError, ConnectionResetError):
+    with keep_destinations_open() as keep_open, suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while not stop.asked:
-            _ingest(pipe, pipe.recv_bytes(), stop, hold)
+            _ingest(pipe, pipe.recv_bytes(), stop, keep_open)
 
 
-def _ingest(pipe: Connection, pickled: bytes, stop: Stop, hold: Hold) -> None:
+def _ingest(pipe: Connection, pickled: bytes, stop: Stop, keep_open: KeepOpen) -> None:
     def tell(event: Event) -> None:
         stop.hold()  # an interrupt in the middle of a message would leave half of it in the pipe
         pipe.send(event)
@@ -93,7 +93,7 @@ def _ingest(pipe: Connection, pickled: bytes, stop: Stop, hold: Hold) -> None:
         report = failed_report(config, Interrupted("stopped before it was begun"), tell)
     stop.hold()
     pipe.send(report)
-    hold(config.target)
+    keep_open(config.target)
 
 
 ATTEMPTS = 2

@@ -15,6 +15,7 @@ from typing import Any
 
 from msgspec import Struct
 
+from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.destinations.store.errors import explained
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.batch import Batch
@@ -22,9 +23,7 @@ from mosaico_ingest.executors.processes import ATTEMPTS, Registrations
 from mosaico_ingest.executors.shipment import absolute, pack
 from mosaico_ingest.interrupts import counted_interrupts
 from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.job.values import StoreTarget
 from mosaico_ingest.pipeline.plan import DEFAULT_MEMORY_BYTES
-from mosaico_ingest.pipeline.run import place
 from mosaico_ingest.report.events import BatchObserver, RunStarted
 from mosaico_ingest.report.model import Report
 
@@ -206,7 +205,7 @@ class _Run:
         if not isinstance(said, RunStarted | Report):
             return said
         given = self.batch.configs[position]
-        files, destination = said.files, place(given.target)
+        files, destination = said.files, destination_of(given.target).describe()
         if all(isinstance(path, Path) and not path.is_absolute() for path in given.paths):
             files = tuple(map(relpath, files))
         if isinstance(said, Report):
@@ -273,8 +272,8 @@ def _unreachable(address: str | None, error: Exception) -> IngestError:
 def _beacon(configs: Sequence[ROSInjectionConfig], run: str) -> Generator[str]:
     """Put a file into every store while the run goes on, so that no worker takes another folder for it."""
     name = f".run-{run}"
-    stores = {config.target.path for config in configs if isinstance(config.target, StoreTarget)}
-    folders = [path for path in stores if isinstance(path, Path)]
+    stores = {destination_of(config.target).local_folder for config in configs}
+    folders = [path for path in stores if path is not None]
     for folder in folders:
         with explained(folder):
             folder.mkdir(parents=True, exist_ok=True)

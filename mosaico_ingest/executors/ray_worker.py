@@ -16,6 +16,7 @@ import pyarrow as pa
 import ray
 from msgspec import Struct
 
+from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import (
     BagError,
     IngestError,
@@ -25,7 +26,6 @@ from mosaico_ingest.errors import (
 from mosaico_ingest.executors.processes import Registrations
 from mosaico_ingest.interrupts import Stop
 from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.job.values import StoreTarget
 from mosaico_ingest.pipeline.run import failed_report, run_config
 from mosaico_ingest.report.events import Event, RunFinished, RunStarted
 from mosaico_ingest.report.model import Report
@@ -111,8 +111,8 @@ def out_of_reach(config: ROSInjectionConfig, setting: Setting) -> IngestError | 
                 where=str(path),
                 hint="put recordings on storage that every node mounts at the same place, or name them by URL",
             )
-    store = config.target.path if isinstance(config.target, StoreTarget) else None
-    if not isinstance(store, Path) or (setting.machine == machine() and (store / setting.beacon).exists()):
+    store = destination_of(config.target).local_folder
+    if store is None or (setting.machine == machine() and (store / setting.beacon).exists()):
         return None
     return SinkError(
         f"the node {_node()} cannot write to this store: its catalog works on one machine only",

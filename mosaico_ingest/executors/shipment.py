@@ -10,11 +10,11 @@ from dataclasses import replace
 from os.path import abspath
 from pathlib import Path
 
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from mosaico_ingest.adapters.builtin import BY_NAME
+from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.job.values import StoreTarget
 from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.rosbag.definitions.registry import definition_files
 
@@ -29,12 +29,13 @@ _CODE = _YAML | {".py"}
 
 def absolute(config: ROSInjectionConfig) -> ROSInjectionConfig:
     """Return a configuration whose paths mean the same in every folder."""
-    kept, target = config.quarantine, config.target
+    kept, store = config.quarantine, destination_of(config.target).local_folder
     cert = config.tls_cert_path
     return replace(
         config,
         file_path=tuple(_anywhere(path) for path in config.paths),
-        store=_anywhere(target.path) if isinstance(target, StoreTarget) else None,
+        store=config.store if store is None or config.plugin else _absolute(store),
+        plugin=config.plugin and structs.replace(config.plugin, base_dir=_absolute(config.plugin.base_dir)),
         base_dir=_absolute(config.base_dir),
         quarantine=None if kept is None else replace(kept, path=_anywhere(kept.path)),
         custom_msgs=tuple((package, _absolute(path), store) for package, path, store in config.custom_msgs),

@@ -22,10 +22,12 @@ from mosaico_ingest.job.values import (
     Limit,
     LoaderErrorPolicy,
     OnSchemaChange,
+    PluginTarget,
     ServerTarget,
     SessionLevelErrorPolicy,
     Stores,
     StoreTarget,
+    Target,
     TimeBound,
     TopicLevelErrorPolicy,
     Unmodeled,
@@ -162,6 +164,8 @@ class ROSInjectionConfig:
     """Set by executors that may begin a recording more than once."""
     code_dir: Path | None = None
     """Where the relative paths of adapter references start instead of `base_dir`, on a machine they were sent to."""
+    plugin: PluginTarget | None = None
+    """A destination that an installed package provides, instead of `store` and `host`."""
 
     def __post_init__(self) -> None:
         """Bring every value into its one form and check it."""
@@ -191,8 +195,10 @@ class ROSInjectionConfig:
         return tuple(as_path(path) for path in self.file_path)
 
     @property
-    def target(self) -> StoreTarget | ServerTarget:
+    def target(self) -> Target:
         """Where the sequence goes."""
+        if self.plugin is not None:
+            return self.plugin
         if self.host is None:
             return StoreTarget(as_path(self.store) if self.store is not None else DEFAULT_STORE)
         cert = Path(self.tls_cert_path) if self.tls_cert_path is not None else None
@@ -279,6 +285,11 @@ class ROSInjectionConfig:
         if self.host is not None and self.store is not None:
             raise self._error(
                 f"store {str(self.store)!r} and host {self.host!r} are two targets", "keep one of the two"
+            )
+        if self.plugin is not None and (self.host is not None or self.store is not None):
+            raise self._error(
+                f"plugin {self.plugin.kind!r} and {'store' if self.host is None else 'host'} are two targets",
+                "keep one of the two",
             )
         if not 1 <= self.port <= 65535:  # noqa: PLR2004 - TCP's range
             raise self._error(f"port is {self.port}", "it must be from 1 to 65535")

@@ -270,12 +270,25 @@ class TargetSection(_Section):
     """The certificate to trust; naming one turns TLS on."""
     tls: bool = False
     """Whether the connection is encrypted; certificates are those the system trusts, unless one is named."""
+    type: Text | None = Field(default=None, examples=["lake"])
+    """The name of a destination that an installed package provides, instead of `store` and `host`."""
+    options: dict[Text, JsonValue] = Field(default={}, examples=[{"bucket": "recordings"}])
+    """The options of this destination; the package that provides it defines them."""
 
     @model_validator(mode="after")
     def _one_place(self) -> TargetSection:
+        if self.type is not None and (self.store is not None or self.host is not None):
+            other = "store" if self.host is None else "host"
+            raise PydanticCustomError(
+                "conflicting-keys", "{other} and type are two targets", {"key": "type", "other": other}
+            )
+        if self.options and self.type is None:
+            raise PydanticCustomError(
+                "conflicting-keys", "options are given, but no type", {"key": "options"}
+            )
         if self.store is not None and self.host is not None:
             raise PydanticCustomError("conflicting-keys", "store and host are two targets", {"key": "host"})
-        alone = sorted(self.model_fields_set - {"store", "host"})
+        alone = sorted(self.model_fields_set - {"store", "host", "type", "options"})
         if self.host is None and alone:
             raise PydanticCustomError(
                 "conflicting-keys",

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
+from typing import Any, ClassVar, TypeAlias
 
 from msgspec import Struct
 
@@ -19,10 +21,12 @@ __all__ = [
     "Limit",
     "LoaderErrorPolicy",
     "OnSchemaChange",
+    "PluginTarget",
     "ServerTarget",
     "SessionLevelErrorPolicy",
     "StoreTarget",
     "Stores",
+    "Target",
     "TimeBound",
     "TopicLevelErrorPolicy",
     "Unmodeled",
@@ -136,6 +140,7 @@ class Limit(Struct, frozen=True):
 class StoreTarget(Struct, frozen=True):
     """The embedded store in a directory, or behind a URL."""
 
+    kind: ClassVar[str] = "store"
     path: AnyPath
 
 
@@ -143,8 +148,22 @@ class StoreTarget(Struct, frozen=True):
 class ServerTarget:
     """A Mosaico server."""
 
+    kind: ClassVar[str] = "server"
     host: str
     port: int
     api_key: str | None = field(default=None, repr=False)
     tls_cert: Path | None = None
     tls: bool = False
+
+
+class PluginTarget(Struct, frozen=True):
+    """A destination that an installed package provides; see `mosaico_ingest.destinations.registry`."""
+
+    kind: str
+    """The name of its entry point."""
+    options: Mapping[str, Any] = {}
+    base_dir: Path = Path()
+    """The folder that relative paths of `options` start from."""
+
+
+Target: TypeAlias = StoreTarget | ServerTarget | PluginTarget

@@ -24,7 +24,7 @@ from mosaico_ingest.job.units import (
     parse_offset,
     parse_size,
 )
-from mosaico_ingest.job.values import Limit, TimeBound, TopicLevelErrorPolicy
+from mosaico_ingest.job.values import Limit, PluginTarget, TimeBound, TopicLevelErrorPolicy
 from mosaico_ingest.remote import AnyPath, RemotePath, without_options
 from mosaico_ingest.rosbag.formats import RECORDING_NAME
 from mosaico_ingest.textfile import read_whole
@@ -248,6 +248,8 @@ def _fields(loaded: LoadedManifest) -> dict[str, Any]:
 
 def _target(loaded: LoadedManifest) -> dict[str, Any]:
     target = loaded.manifest.target
+    if target.type is not None:
+        return {"plugin": PluginTarget(target.type, dict(target.options), loaded.path.parent)}
     if target.host is None:
         store = target.store
         return {"store": None if store is None else loaded.locate(store, "target", "store")}

@@ -15,6 +15,7 @@ from pydantic import Field, JsonValue, ValidationError
 from mosaico_ingest.adapters.adapter import ROS_METADATA_KEY, AdapterSpec
 from mosaico_ingest.adapters.image import PngImageSpec
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
+from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.documents import Part, schema_of
 from mosaico_ingest.errors import IngestError, ManifestError
 from mosaico_ingest.findings import Finding, Severity, Span, Stage
@@ -23,9 +24,8 @@ from mosaico_ingest.job.values import (
     IfExists,
     Limit,
     LoaderErrorPolicy,
-    ServerTarget,
     SessionLevelErrorPolicy,
-    StoreTarget,
+    Target,
     TopicLevelErrorPolicy,
 )
 from mosaico_ingest.ontology.types import OntologyType
@@ -107,7 +107,7 @@ class Plan(Struct, frozen=True):
     resolver: Resolver
     sequence: str
     metadata: Mapping[str, Any]
-    target: StoreTarget | ServerTarget
+    target: Target
     if_exists: IfExists
     on_error: SessionLevelErrorPolicy
     on_message_error: LoaderErrorPolicy
@@ -258,7 +258,8 @@ class Sample(Part):
 class DestinationState(Part):
     """What the destination said; null where it was not asked."""
 
-    kind: Literal["store", "server"]
+    kind: str
+    """`store`, `server`, or the type of an installed destination."""
     exists: bool | None
     """Whether there is a store, or a server that answers."""
     taken: bool | None
@@ -341,7 +342,6 @@ def write_plan(document: PlanDocument, path: Path) -> None:
 
 def decisions(plan: Plan, *, folder: Path) -> Decisions:
     """Return what a run of the plan follows; paths are seen from `folder`."""
-    target = plan.target
     return Decisions(
         sequence=plan.sequence,
         metadata=dict(plan.metadata),
@@ -353,9 +353,7 @@ def decisions(plan: Plan, *, folder: Path) -> Decisions:
         end_ns=plan.end_ns,
         read_from_ns=plan.read_from_ns,
         read_until_ns=plan.read_until_ns,
-        destination=_seen_from(folder, target.path)
-        if isinstance(target, StoreTarget)
-        else f"{target.host}:{target.port}",
+        destination=destination_of(plan.target).describe(folder=folder),
         if_exists=plan.if_exists,
         on_error=plan.on_error,
         on_message_error=plan.on_message_error,

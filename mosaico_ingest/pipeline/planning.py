@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from mosaico_ingest.adapters.adapter import ROS_METADATA_KEY, ros_metadata
 from mosaico_ingest.adapters.bridge import ROSBridge
-from mosaico_ingest.destinations.store.store import Store
+from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import AdapterError, BagError, IngestError, NothingMatched
 from mosaico_ingest.findings import (
     Finding,
@@ -28,7 +28,7 @@ from mosaico_ingest.job.values import (
     PROVENANCE_KEY,
     LoaderErrorPolicy,
     OnSchemaChange,
-    StoreTarget,
+    Target,
     TimeBound,
     Unmodeled,
 )
@@ -188,14 +188,14 @@ def follow_schema_changes(plan: Plan, wanted: OnSchemaChange) -> Plan:
     Raises:
         IngestError: A definition has changed and the job says to fail then; `findings` has every difference.
     """
-    if not isinstance(plan.target, StoreTarget):
+    known = _known_definitions(plan.target, plan.family)
+    if known is None:
         unchecked = Finding(
             "schema-change-unchecked",
             Severity.WARNING,
             "on_schema_change is for stores: a server is not asked for the definitions it has",
         )
         return replace(plan, findings=(*plan.findings, unchecked))
-    known = _known_definitions(plan.target, plan.family)
     findings: list[Finding] = []
     topics: list[TopicPlan] = []
     for topic in plan.topics:
@@ -219,16 +219,18 @@ def follow_schema_changes(plan: Plan, wanted: OnSchemaChange) -> Plan:
     return replace(plan, topics=tuple(topics), findings=(*plan.findings, *findings))
 
 
-def _known_definitions(target: StoreTarget, family: str | None) -> dict[str, list[_Known]]:
-    """Return the definitions by topic, in the order the family's sessions were written."""
-    store = Store.find(target.path)
+def _known_definitions(target: Target, family: str | None) -> dict[str, list[_Known]] | None:
+    """Return the stored definitions by topic in the order of the family's sessions, or None if they cannot be listed."""
+    sequences = destination_of(target).sequences()
+    if sequences is None:
+        return None
     found: dict[str, list[tuple[str, _Known]]] = {}
-    for info in store.sequences() if store else ():
-        sessions = {one.id for one in info.sessions if _family(one.metadata) == family}
-        for topic in info.topics:
+    for sequence in sequences:
+        sessions = {one.id for one in sequence.sessions if _family(one.metadata) == family}
+        for name, topic in sequence.topics.items():
             text = _text(topic.metadata)
             if topic.session in sessions and text is not None:
-                found.setdefault(topic.name, []).append((topic.session, _Known(info.name, text)))
+                found.setdefault(name, []).append((topic.session, _Known(sequence.name, text)))
     return {
         name: [known for _, known in sorted(history, key=lambda one: one[0])]
         for name, history in found.items()

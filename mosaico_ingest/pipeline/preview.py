@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -14,13 +12,14 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from mosaico_ingest.adapters.bridge import ROSBridge
-from mosaico_ingest.destinations.base import MemorySink, Session, StoredTopic, check_same_type
-from mosaico_ingest.destinations.store.store import Store
-from mosaico_ingest.errors import IngestError, SinkError, Unreachable
+from mosaico_ingest.destinations.base import ExistingSequence, Session, StoredTopic, check_same_type
+from mosaico_ingest.destinations.memory import MemorySink
+from mosaico_ingest.destinations.registry import destination_of
+from mosaico_ingest.errors import IngestError, SinkError
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.patterns import first_match
-from mosaico_ingest.job.values import IfExists, LoaderErrorPolicy, ServerTarget, TopicLevelErrorPolicy
+from mosaico_ingest.job.values import IfExists, LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.pipeline.plan import (
     Decisions,
     DestinationState,
@@ -38,7 +37,6 @@ from mosaico_ingest.pipeline.run import open_for, preflight
 from mosaico_ingest.pipeline.topic import Stream
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.protocol import check_topic_name
-from mosaico_ingest.remote import RemotePath
 from mosaico_ingest.report.events import Event, Rejected
 from mosaico_ingest.rosbag.blocks import RawBatch
 from mosaico_ingest.rosbag.recording import Recording
@@ -55,26 +53,20 @@ __all__ = [
 
 
 def ask_destination(plan: Plan, samples: Iterable[Sample], *, connect: bool) -> DestinationState:
-    """Return what the destination says; a server is asked only with `connect`."""
-    estimated = _estimate(plan, {sample.target: sample for sample in samples})
-    if isinstance(plan.target, ServerTarget):
-        return _server(plan, plan.target, estimated, connect=connect)
-    folder = plan.target.path
-    base = None if isinstance(folder, RemotePath) else _base(folder)
-    store = None
-    try:
-        store = Store.find(folder)
-        taken = store is not None and _taken(plan, store)
-        problem = (base and _refusal_of_folder(base)) or _refusal_of_name(plan, taken=taken)
-    except (SinkError, Unreachable) as error:
-        taken, problem = None, str(error)
+    """Return the state of the destination; a server is asked only with `connect`."""
+    destination = destination_of(plan.target)
+    status = destination.inspect(plan.sequence, connect=connect)
+    taken: bool | None = None if status.exists is None else status.sequence is not None
+    problem = status.problem
+    if problem is None and status.sequence is not None:
+        problem = _sequence_problem(plan, status.sequence)
     return DestinationState(
-        kind="store",
-        exists=store is not None,
-        taken=taken,
+        kind=destination.kind,
+        exists=status.exists,
+        taken=taken if status.problem is None else None,
         problem=problem,
-        free_bytes=None if base is None else shutil.disk_usage(base).free,
-        estimated_bytes=estimated,
+        free_bytes=status.free_bytes,
+        estimated_bytes=_estimate(plan, {sample.target: sample for sample in samples}),
     )
 
 
@@ -90,66 +82,19 @@ def space_finding(state: DestinationState) -> Finding | None:
     )
 
 
-def _taken(plan: Plan, store: Store) -> bool:
-    """Say whether the name is taken.
-
-    Raises:
-        SinkError: Rows of the plan cannot join what is there.
-    """
-    info = store.find_sequence(plan.sequence)
-    if info is None:
-        return False
-    if plan.if_exists is IfExists.APPEND:
-        held = {topic.name: topic.ontology for topic in info.topics}
-        for topic in plan.topics:
-            name = check_topic_name(topic.target)
-            if name in held:
-                check_same_type(held[name], topic.ontology, where=topic.target)
-    return True
-
-
-def _base(folder: Path) -> Path:
-    """Return the folder itself, or what is there of the way to it."""
-    return next(path for path in (folder, *folder.absolute().parents) if path.exists())
-
-
-def _refusal_of_folder(base: Path) -> str | None:
-    if not base.is_dir():
-        return f"{base} is no folder"
-    return None if os.access(base, os.W_OK | os.X_OK) else f"{base} cannot be written"
-
-
-def _refusal_of_name(plan: Plan, *, taken: bool) -> str | None:
-    if taken and plan.if_exists is IfExists.FAIL:
+def _sequence_problem(plan: Plan, existing: ExistingSequence) -> str | None:
+    """Return why a plan cannot write a sequence that exists, None if it can."""
+    if plan.if_exists is IfExists.FAIL:
         return f"there is a sequence {plan.sequence!r}, and sequence.if_exists is fail"
-    return None
-
-
-def _server(plan: Plan, target: ServerTarget, estimated: int | None, *, connect: bool) -> DestinationState:
-    taken: bool | None = None
-    exists: bool | None = None
-    problem: str | None = None
-    if connect:
+    if plan.if_exists is IfExists.APPEND:
         try:
-            taken, exists = _found(plan, target), True
-            problem = _refusal_of_name(plan, taken=taken)
+            for topic in plan.topics:
+                stored = existing.topics.get(check_topic_name(topic.target))
+                if stored is not None:
+                    check_same_type(stored.ontology, topic.ontology, where=topic.target)
         except SinkError as error:
-            exists, problem = False, str(error)
-    return DestinationState(
-        kind="server",
-        exists=exists,
-        taken=taken,
-        problem=problem,
-        free_bytes=None,
-        estimated_bytes=estimated,
-    )
-
-
-def _found(plan: Plan, target: ServerTarget) -> bool:
-    from mosaico_ingest.destinations.server.client import connect  # noqa: PLC0415 - Flight is slow to import and rarely needed
-
-    with connect(target) as client:
-        return client.find(plan.sequence) is not None
+            return str(error)
+    return None
 
 
 def _estimate(plan: Plan, samples: dict[str, Sample]) -> int | None:

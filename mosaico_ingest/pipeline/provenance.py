@@ -15,10 +15,10 @@ from msgspec.structs import replace
 from pydantic import BaseModel, ConfigDict, ValidationError
 from xxhash import xxh3_128
 
-from mosaico_ingest.destinations.store.store import Store
+from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import BagError, SequenceExists
 from mosaico_ingest.findings import encodable
-from mosaico_ingest.job.values import PROVENANCE_KEY, IfExists, ServerTarget, StoreTarget
+from mosaico_ingest.job.values import PROVENANCE_KEY, IfExists, Target
 from mosaico_ingest.pipeline.plan import Plan, decisions
 from mosaico_ingest.pipeline.quarantine import kept_name
 from mosaico_ingest.remote import AnyPath, RemotePath
@@ -148,6 +148,8 @@ class Held(_Part):
     provenances: tuple[Provenance, ...]
     complete: bool
     """False where an error that ended a run is attached to it, or a server has no session of it that was finished."""
+    has_all_sessions: bool = True
+    """False if `provenances` holds that of the first session only."""
 
 
 def enter(plan: Plan) -> Plan | None:
@@ -223,16 +225,16 @@ def _whole(
     return provenance.model_copy(update={"sources": tuple(map(whole, provenance.sources, files))})
 
 
-def held(target: StoreTarget | ServerTarget, sequence: str) -> Held | None:
-    """Return what the destination has of a sequence, None where it has none."""
-    if isinstance(target, ServerTarget):
-        return _held_by_server(target, sequence)
-    store = Store.find(target.path)
-    info = store.find_sequence(sequence) if store else None
-    if info is None:
+def held(target: Target, sequence: str) -> Held | None:
+    """Return the provenance of a stored sequence, or None if the destination has no sequence of this name."""
+    existing = destination_of(target).find(sequence)
+    if existing is None:
         return None
-    complete = all(note.topic is not None for note in info.notes)
-    return Held(provenances=_provenances(session.metadata for session in info.sessions), complete=complete)
+    return Held(
+        provenances=_provenances(session.metadata for session in existing.sessions),
+        complete=existing.complete,
+        has_all_sessions=existing.has_all_sessions,
+    )
 
 
 def what_to_do(provenance: Provenance, found: Held | None, sequence: str) -> IfExists | None:
@@ -258,43 +260,22 @@ def what_to_do(provenance: Provenance, found: Held | None, sequence: str) -> IfE
 
 
 def _take_back(plan: Plan, run: str) -> IfExists:
-    """Return how to open the sequence so that what this run has committed already is not there twice.
+    """Delete what an earlier attempt of this run committed; return how to open the sequence afterwards.
 
-    On a server the provenance is that of the sequence: what was appended to another's is not recognised.
+    A server knows only the provenance of a sequence's first session, so sessions that were appended to another run's
+    sequence are not recognised there.
     """
-    if isinstance(plan.target, ServerTarget):
-        found = _held_by_server(plan.target, plan.sequence)
-        own = found is not None and any(provenance.run == run for provenance in found.provenances)
-        return IfExists.REPLACE if own else plan.if_exists
-    store = Store.find(plan.target.path)
-    info = store.find_sequence(plan.sequence) if store else None
-    if store is None or info is None:
+    destination = destination_of(plan.target)
+    existing = destination.find(plan.sequence)
+    if existing is None:
         return plan.if_exists
-    sessions = info.sessions
-    own = [s.id for s in sessions if any(provenance.run == run for provenance in _provenances([s.metadata]))]
-    if own and len(own) == len(sessions):
+    own = [s.id for s in existing.sessions if any(one.run == run for one in _provenances([s.metadata]))]
+    if own and (len(own) == len(existing.sessions) or not destination.delete_sessions(plan.sequence, own)):
         return IfExists.REPLACE
-    for session in own:
-        store.delete_session(plan.sequence, session)
     return plan.if_exists
 
 
 _HINT = "set sequence.if_exists (or --if-exists of `ingest bag`) to replace or append, or choose another name"
-
-
-def _held_by_server(target: ServerTarget, sequence: str) -> Held | None:
-    from mosaico_ingest.destinations.server.client import connect  # noqa: PLC0415 - Flight is slow to import and rarely needed
-    from mosaico_ingest.protocol import messages  # noqa: PLC0415 - the same
-
-    with connect(target) as client:
-        info = client.find(sequence)
-        if info is None:
-            return None
-        notes = client.act(
-            messages.SEQUENCE_NOTIFICATION_LIST, messages.Located(locator=sequence)
-        ).notifications
-    complete = not notes and bool(info.sessions) and all(session.locked for session in info.sessions)
-    return Held(provenances=_provenances([info.user_metadata]), complete=complete)
 
 
 def _provenances(metadata: Iterable[Mapping[str, Any]]) -> tuple[Provenance, ...]:

@@ -6,25 +6,22 @@ import logging
 from collections import Counter
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from os.path import normpath
 from pathlib import Path
 
 from mosaico_ingest.adapters.bridge import ROSBridge
 from mosaico_ingest.destinations.base import Session, Sink, StoredTopic
-from mosaico_ingest.destinations.store.session import StoreSink
-from mosaico_ingest.destinations.store.store import Store
+from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import IngestError, Interrupted, NothingMatched, VerificationError
 from mosaico_ingest.findings import Finding, Severity, Stage
 from mosaico_ingest.interrupts import DeferredInterrupt
 from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.job.values import IfExists, ServerTarget, SessionLevelErrorPolicy, StoreTarget
+from mosaico_ingest.job.values import IfExists, SessionLevelErrorPolicy
 from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.planning import resolve
 from mosaico_ingest.pipeline.provenance import enter
 from mosaico_ingest.pipeline.quarantine import Quarantine
 from mosaico_ingest.pipeline.topic import Stream
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
-from mosaico_ingest.remote import RemotePath
 from mosaico_ingest.report.collect import Collector
 from mosaico_ingest.report.events import (
     Event,
@@ -55,7 +52,6 @@ __all__ = [
     "open_for",
     "preflight",
     "run_config",
-    "sink_for",
 ]
 
 
@@ -366,22 +362,9 @@ def _planned(config: ROSInjectionConfig) -> Generator[tuple[Plan, Recording]]:
         yield resolve(config, recording, bridge=ROSBridge.for_config(config), resolver=resolver), recording
 
 
-def sink_for(target: StoreTarget | ServerTarget, *, buffer_bytes: int) -> Sink:
-    """Turn a target into the object that writes there and holds at most about `buffer_bytes` in memory."""
-    if isinstance(target, StoreTarget):
-        return StoreSink(Store.open(target.path), buffer_bytes)
-    from mosaico_ingest.destinations.server.sink import PlatformSink  # noqa: PLC0415 - Flight is slow to import and rarely needed
-
-    return PlatformSink(target, buffer_bytes)
-
-
 def preflight(plan: Plan) -> Finding | None:
-    """Return what a server's key would not let the session policy do; the server is asked."""
-    if not isinstance(plan.target, ServerTarget) or plan.on_error is not SessionLevelErrorPolicy.Delete:
-        return None
-    from mosaico_ingest.destinations.server.sink import delete_finding  # noqa: PLC0415 - as in sink_for
-
-    return delete_finding(plan.target, plan.sequence)
+    """Return a warning if the destination would not let the run follow its session error policy."""
+    return destination_of(plan.target).preflight(plan.sequence, plan.on_error)
 
 
 def execute(
@@ -421,7 +404,7 @@ def execute(
         for lost in _undefined(plan):
             tell(lost)
         with _opened(plan, recording) as source:
-            destination = sink or sink_for(plan.target, buffer_bytes=plan.memory_bytes // 4)
+            destination = sink or destination_of(plan.target).open_sink(buffer_bytes=plan.memory_bytes // 4)
             watch.lap(Step.PREPARE)
             inject(entered, source, destination, tell, watch)
     except IngestError as error:
@@ -493,7 +476,7 @@ def _started(plan: Plan) -> RunStarted:
     )
     return RunStarted(
         sequence=plan.sequence,
-        destination=place(plan.target),
+        destination=destination_of(plan.target).describe(),
         files=tuple(str(path) for path in plan.files),
         source_bytes=plan.source_bytes,
         topics=(*taken, *left),
@@ -514,18 +497,11 @@ def _undefined(plan: Plan) -> Iterator[Unreadable]:
 def _unplanned(config: ROSInjectionConfig) -> RunStarted:
     return RunStarted(
         sequence=config.sequence_name,
-        destination=place(config.target),
+        destination=destination_of(config.target).describe(),
         files=tuple(str(path) for path in config.paths),
         source_bytes=0,
         topics=(),
     )
-
-
-def place(target: StoreTarget | ServerTarget) -> str:
-    """Return a target as people write it, without its key."""
-    if isinstance(target, ServerTarget):
-        return f"{target.host}:{target.port}"
-    return str(target.path) if isinstance(target.path, RemotePath) else normpath(target.path)
 
 
 def _failed(error: IngestError) -> RunFinished:

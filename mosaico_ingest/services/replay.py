@@ -16,7 +16,7 @@ from mosaico_ingest.destinations.store.files import Lease
 from mosaico_ingest.errors import ManifestError, NothingMatched, SinkUnavailable
 from mosaico_ingest.findings import a_few, encodable
 from mosaico_ingest.job.config import QuarantineSettings, ROSInjectionConfig, TimeRange
-from mosaico_ingest.job.values import IfExists, SessionLevelErrorPolicy, StoreTarget, TopicLevelErrorPolicy
+from mosaico_ingest.job.values import IfExists, SessionLevelErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.pipeline.provenance import content_digest, held
 from mosaico_ingest.pipeline.quarantine import Kept, find_kept
 
@@ -101,7 +101,7 @@ def _whereabouts(kept: Kept, config: ROSInjectionConfig) -> Whereabouts:
     made_from = {(source.name, source.content) for known in found.provenances for source in known.sources}
     if (name, content_digest(kept.messages)) in made_from:
         return Whereabouts.STORED
-    provenances = found.provenances if isinstance(config.target, StoreTarget) else ()
+    provenances = found.provenances if found.has_all_sessions else ()
     if provenances and all(known.quarantine != name for known in provenances):
         return Whereabouts.FORGOTTEN
     return Whereabouts.WAITING

@@ -101,7 +101,7 @@ def test_the_report_of_a_run_that_failed_says_why(project: Path) -> None:
     assert ingest("run", "configs/quickstart.yaml", "--report", "failed.json", cwd=project).returncode == 1
     shown = ingest("report", "failed.json", cwd=project)
     assert shown.returncode == 0
-    assert "error: quickstart_drive: the sequence exists" in shown.stdout
+    assert "error: quickstart_drive: the sequence already exists" in shown.stdout
 
 
 def test_the_store_can_be_looked_into(project: Path) -> None:

@@ -103,7 +103,7 @@ def test_a_claim_is_not_seen_before_its_commit(records: Records) -> None:
 @pytest.mark.parametrize("policy", [IfExists.FAIL, IfExists.SKIP])
 def test_a_taken_name_is_refused(records: Records, policy: IfExists) -> None:
     commit(records, ("/a", POINT))
-    with pytest.raises(SequenceExists, match="the sequence exists"):
+    with pytest.raises(SequenceExists, match="the sequence already exists"):
         records.claim(new_session_id(), "s", policy, is_live=alive)
 
 

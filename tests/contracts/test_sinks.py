@@ -12,7 +12,8 @@ import pytest
 from mosaicod import Mosaicod, running
 from object_store import ObjectStore
 
-from mosaico_ingest.destinations.base import MemorySink, Sink, topic_schema
+from mosaico_ingest.destinations.base import Sink, topic_schema
+from mosaico_ingest.destinations.memory import MemorySink
 from mosaico_ingest.destinations.server.sink import PlatformSink
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.errors import SequenceExists, SinkError

@@ -5,8 +5,8 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from mosaico_ingest.destinations.registry import keep_destinations_open
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.destinations.store.open_stores import held_catalogs
 from mosaico_ingest.executors.in_process import Inline
 from mosaico_ingest.job.config import ROSInjectionConfig
 
@@ -27,10 +27,10 @@ def test_the_log_of_the_catalog_is_there_between_recordings_only(tmp_path: Path)
 
 def test_a_store_that_is_removed_meanwhile_is_made_anew(tmp_path: Path) -> None:
     """Letting go of the old catalog must not take the files of the new one."""
-    with held_catalogs() as hold:
+    with keep_destinations_open() as keep_open:
         for name in "ab":
             list(Inline().map([config(tmp_path, name)], lambda *_: None))
-            hold(config(tmp_path, name).target)
+            keep_open(config(tmp_path, name).target)
             if name == "a":
                 shutil.rmtree(tmp_path / "store")
         kept = Store.open(tmp_path / "store", create=False).catalog.keep_open()
@@ -40,6 +40,6 @@ def test_a_store_that_is_removed_meanwhile_is_made_anew(tmp_path: Path) -> None:
 
 
 def test_where_there_is_no_store_nothing_is_held_or_made(tmp_path: Path) -> None:
-    with held_catalogs() as hold:
-        hold(config(tmp_path, "a").target)
+    with keep_destinations_open() as keep_open:
+        keep_open(config(tmp_path, "a").target)
     assert list(tmp_path.iterdir()) == []

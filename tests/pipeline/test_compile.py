@@ -115,7 +115,8 @@ run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
         "plan_digest",
         "attempt",
         "code_dir",
-    }  # if_exists, a command, Python's, the host, a plan, an executor's two
+        "plugin",
+    }  # if_exists, a command, Python's, the host, a plan, an executor's two, another destination
 
 
 def test_the_smallest_manifest_is_a_job(folder: Path) -> None:

@@ -20,7 +20,8 @@ from made_recordings import define, record
 
 from mosaico_ingest import api
 from mosaico_ingest.cli.app import main
-from mosaico_ingest.destinations.base import MemorySink, StoredTopic, TopicWriter
+from mosaico_ingest.destinations.base import StoredTopic, TopicWriter
+from mosaico_ingest.destinations.memory import MemorySink
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.destinations.store.session import StoreSession
 from mosaico_ingest.destinations.store.store import verify
@@ -145,7 +146,7 @@ def test_a_destination_that_loses_rows_fails_the_run(
     write_bag({"/speed": [number(1), number(2)]})
     (config,) = api.compile_job(write_job())
     monkeypatch.setattr(
-        "mosaico_ingest.destinations.base._MemorySession.stored",
+        "mosaico_ingest.destinations.memory._MemorySession.stored",
         lambda _self: (StoredTopic("/speed", 1, 0, 0, 8),),
     )
     report, failure = execute(make_plan(config), lambda _event: None, sink=MemorySink())

@@ -1,0 +1,70 @@
+"""A Mosaico server as a destination."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+from mosaico_ingest.destinations.base import (
+    Destination,
+    DestinationStatus,
+    ExistingSequence,
+    ExistingSession,
+    Sink,
+)
+from mosaico_ingest.destinations.server.client import connect as connect_to
+from mosaico_ingest.destinations.server.sink import PlatformSink, delete_finding
+from mosaico_ingest.errors import SinkError
+from mosaico_ingest.findings import Finding
+from mosaico_ingest.job.values import ServerTarget, SessionLevelErrorPolicy
+from mosaico_ingest.protocol import messages
+
+__all__ = ["ServerDestination"]
+
+
+class ServerDestination(Destination):
+    """A Mosaico server; every method but `describe` and `open_sink` connects to it."""
+
+    kind: ClassVar[str] = "server"
+
+    def __init__(self, target: ServerTarget) -> None:
+        self.target = target
+
+    def describe(self, *, folder: Path | None = None) -> str:  # noqa: ARG002 - a server has no path
+        """Return `host:port`."""
+        return f"{self.target.host}:{self.target.port}"
+
+    def inspect(self, sequence: str, *, connect: bool) -> DestinationStatus:
+        """Return the current state, which is unknown without `connect`."""
+        if not connect:
+            return DestinationStatus()
+        try:
+            return DestinationStatus(exists=True, sequence=self.find(sequence))
+        except SinkError as error:
+            return DestinationStatus(exists=False, problem=str(error))
+
+    def find(self, sequence: str) -> ExistingSequence | None:
+        """Return the stored sequence of this name, or None; it has the metadata of its first session only."""
+        with connect_to(self.target) as client:
+            info = client.find(sequence)
+            if info is None:
+                return None
+            question = messages.Located(locator=sequence)
+            notifications = client.act(messages.SEQUENCE_NOTIFICATION_LIST, question).notifications
+        finished = bool(info.sessions) and all(session.locked for session in info.sessions)
+        return ExistingSequence(
+            name=sequence,
+            complete=finished and not notifications,
+            sessions=(ExistingSession("", info.user_metadata),),
+            has_all_sessions=False,
+        )
+
+    def open_sink(self, *, buffer_bytes: int) -> Sink:
+        """Return a sink; its sessions connect."""
+        return PlatformSink(self.target, buffer_bytes)
+
+    def preflight(self, sequence: str, on_error: SessionLevelErrorPolicy) -> Finding | None:
+        """Return a warning if `on_error` is `delete` and the API key has no permission to delete."""
+        if on_error is not SessionLevelErrorPolicy.Delete:
+            return None
+        return delete_finding(self.target, sequence)
