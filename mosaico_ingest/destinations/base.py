@@ -208,7 +208,7 @@ def sequence_exists(sequence: str) -> SequenceExists:
     return SequenceExists(
         "the sequence already exists",
         where=sequence,
-        hint="choose another name, or set sequence.if_exists to skip (if the content is the same), append or replace;"
+        hint="choose another name, or set sequence.if_exists: skip (if the content is the same), append or replace;"
         " `ingest bag` has --if-exists",
     )
 
