@@ -9,7 +9,7 @@ from collections.abc import Callable
 from threading import Lock
 from typing import TypeVar
 
-__all__ = ["remembered"]
+__all__ = ["cache_by_identity"]
 
 _Given = TypeVar("_Given")
 _Made = TypeVar("_Made")
@@ -17,7 +17,7 @@ _MOST = 256
 """How many are remembered; the topics of one recording are those of the next."""
 
 
-def remembered(make: Callable[[_Given], _Made]) -> Callable[[_Given], _Made]:
+def cache_by_identity(make: Callable[[_Given], _Made]) -> Callable[[_Given], _Made]:
     """Make a function remember its results by the identity of its argument (a decorator)."""
     # What is remembered holds its argument, whose identity is not used again then.
     known: dict[int, tuple[_Given, _Made]] = {}

@@ -25,7 +25,7 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401 - a class or a function
         from mosaico_ingest.adapters.builtin import BY_NAME  # noqa: PLC0415 - on demand
 
         if name in BY_NAME:
-            from mosaico_ingest.adapters.direct import adapter_class  # noqa: PLC0415 - on demand
+            from mosaico_ingest.adapters.standalone import adapter_class  # noqa: PLC0415 - on demand
 
             return adapter_class(name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

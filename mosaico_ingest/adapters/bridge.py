@@ -39,14 +39,14 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ENTRY_POINTS",
-    "KnownAdapters",
+    "AdapterFinder",
     "ROSBridge",
     "Reason",
     "Resolution",
     "adapter_spec",
     "installed_adapters",
     "load_adapter_reference",
-    "what_was_meant",
+    "suggest_reference",
 ]
 
 _MAPPING_SUFFIXES = frozenset({".yaml", ".yml"})
@@ -88,7 +88,7 @@ def load_adapter_reference(ref: str, base_dir: Path) -> AdapterSpec:
         return _load_mapping(base_dir / ref)
     place, colon, qualname = ref.rpartition(":")
     if not colon or not place or not qualname:
-        raise AdapterError(f"no adapter is called {ref!r}", hint=what_was_meant(ref, BY_NAME))
+        raise AdapterError(f"no adapter is called {ref!r}", hint=suggest_reference(ref, BY_NAME))
     module = _load_file(base_dir / place) if place.endswith(".py") else _load_module(place, base_dir)
     found = _attribute(module, qualname, ref)
     spec = adapter_spec(found, base_dir)
@@ -97,7 +97,7 @@ def load_adapter_reference(ref: str, base_dir: Path) -> AdapterSpec:
     return spec
 
 
-def what_was_meant(ref: str, known: Iterable[str] = ()) -> str:
+def suggest_reference(ref: str, known: Iterable[str] = ()) -> str:
     """Return what to write instead of a name that no adapter has."""
     if ref.endswith(".py"):
         return f"name the class in it: {ref}:Class"
@@ -106,7 +106,7 @@ def what_was_meant(ref: str, known: Iterable[str] = ()) -> str:
     return "see `ingest adapters list`, or write a YAML path, module:Class or file.py:Class"
 
 
-class KnownAdapters(Struct, frozen=True):
+class AdapterFinder(Struct, frozen=True):
     """Finds the adapters a mapping may use: the built-in ones, and those of the files beside it."""
 
     folder: Path
@@ -130,7 +130,7 @@ def _text_of(path: Path) -> str:
 
 
 def _load_mapping(path: Path) -> AdapterSpec:
-    return load_adapter(path, adapters=KnownAdapters(path.parent))
+    return load_adapter(path, adapters=AdapterFinder(path.parent))
 
 
 def _attribute(module: ModuleType, qualname: str, ref: str) -> object:
@@ -334,7 +334,7 @@ class ROSBridge:
         Raises:
             AdapterError: No adapter takes the type, or the message does not fit.
         """
-        from mosaico_ingest.adapters.direct import translate  # noqa: PLC0415 - a run has no single messages
+        from mosaico_ingest.adapters.standalone import translate  # noqa: PLC0415 - a run has no single messages
 
         found = cls().resolve(msg.topic, msg.msg_type)
         if found.unmodeled:

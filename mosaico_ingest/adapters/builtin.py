@@ -14,13 +14,13 @@ import pyarrow as pa
 from msgspec import Struct
 
 from mosaico_ingest.adapters.adapter import Adapter
-from mosaico_ingest.adapters.mapping.loader import MappingSpec, known_adapter
+from mosaico_ingest.adapters.mapping.loader import MappingSpec, adapter_from_model
 from mosaico_ingest.rosbag.definitions.model import Definition
 
-__all__ = ["BUILTIN", "BY_NAME", "BY_TYPE", "CATALOG", "FILE", "Builtin", "find_builtin"]
+__all__ = ["BUILTIN", "BY_NAME", "BY_TYPE", "CATALOG", "CATALOG_FILE", "Builtin", "find_builtin"]
 
 CATALOG = Path(__file__).parent / "catalog"
-FILE = CATALOG.with_suffix(".json")
+CATALOG_FILE = CATALOG.with_suffix(".json")
 
 
 class Builtin(Struct, frozen=True):
@@ -51,12 +51,12 @@ class Builtin(Struct, frozen=True):
 
 @cache
 def _load(stem: str) -> MappingSpec:
-    return known_adapter(_values()[stem], CATALOG / f"{stem}.yaml", adapters=find_builtin)
+    return adapter_from_model(_values()[stem], CATALOG / f"{stem}.yaml", adapters=find_builtin)
 
 
 @cache
 def _values() -> dict[str, Any]:
-    return json.loads(FILE.read_bytes(), object_hook=_mapping)
+    return json.loads(CATALOG_FILE.read_bytes(), object_hook=_mapping)
 
 
 def _mapping(read: dict[str, Any]) -> dict[Any, Any]:

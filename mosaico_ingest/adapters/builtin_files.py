@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mosaico_ingest.adapters.builtin import BUILTIN, FILE, Builtin, find_builtin
+from mosaico_ingest.adapters.builtin import BUILTIN, CATALOG_FILE, Builtin, find_builtin
 from mosaico_ingest.adapters.mapping.loader import load_adapter
 
 __all__ = [
@@ -71,6 +71,6 @@ def _types(names: tuple[str, ...]) -> str:
 
 
 if __name__ == "__main__":
-    FILE.write_text(catalog_file(), encoding="utf-8")
+    CATALOG_FILE.write_text(catalog_file(), encoding="utf-8")
     path = Path(sys.argv[1])
     path.write_text(with_catalog(path.read_text("utf-8")), "utf-8")

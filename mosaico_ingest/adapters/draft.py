@@ -17,13 +17,13 @@ from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.builtin import BY_TYPE, find_builtin
 from mosaico_ingest.adapters.explain import unread_fields
 from mosaico_ingest.adapters.mapping.columns import DataType, pt
-from mosaico_ingest.adapters.mapping.conversion import demand
+from mosaico_ingest.adapters.mapping.conversion import check_fits
 from mosaico_ingest.adapters.mapping.loader import MappingAdapter, MappingSpec, load_adapter
 from mosaico_ingest.adapters.mapping.types import (
-    Unfit,
+    TypeMismatch,
+    expr_type_of,
+    format_type,
     is_number,
-    kind_of,
-    spell,
 )
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.job.yaml_source import resolve_plain
@@ -33,35 +33,39 @@ from mosaico_ingest.rosbag.definitions.model import Container, Definition, Field
 from mosaico_ingest.rosbag.definitions.parser import BYTES
 
 __all__ = [
-    "Example",
-    "Guess",
+    "ColumnDraft",
+    "RecordedExample",
     "draft",
-    "flow",
-    "guess_columns",
-    "guess_type",
-    "key",
-    "word",
+    "draft_columns",
+    "draft_ontology_type",
+    "flow_style",
+    "quote_expression",
+    "quote_key",
 ]
 
 
-def key(name: str) -> str:
+def quote_key(name: str) -> str:
     """Return a mapping's key, quoted where it would not be read as text."""
     return name if name.isidentifier() and resolve_plain(name) == (name, None) else json.dumps(name)
 
 
-def word(text: str) -> str:
+def quote_expression(text: str) -> str:
     """Return an expression, quoted where it would not be read as text."""
     return text if resolve_plain(text) == (text, None) else json.dumps(text)
 
 
-def flow(value: Any) -> str:  # noqa: ANN401 - whatever a message holds
+def flow_style(value: Any) -> str:  # noqa: ANN401 - whatever a message holds
     """Return a value in flow style; bytes become a list of numbers."""
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key(str(name))}: {flow(item)}" for name, item in value.items()) + "}"
+        return (
+            "{"
+            + ", ".join(f"{quote_key(str(name))}: {flow_style(item)}" for name, item in value.items())
+            + "}"
+        )
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=True)
     if isinstance(value, Sequence):  # bytes too
-        return "[" + ", ".join(flow(item) for item in value) + "]"
+        return "[" + ", ".join(flow_style(item) for item in value) + "]"
     if isinstance(value, float):
         return _number(value)
     return json.dumps(value)
@@ -81,7 +85,7 @@ _TELLING = 4
 """From how many letters on a column's name is looked for inside longer ones."""
 
 
-class Guess(Struct, frozen=True):
+class ColumnDraft(Struct, frozen=True):
     """What may fill a column."""
 
     name: str
@@ -89,7 +93,7 @@ class Guess(Struct, frozen=True):
     """As the file spells it, the `of` of one with fields; None: nothing is known, the column stays null."""
     note: str = ""
     """What a reader should know: the column's type, and what was taken for it."""
-    fields: tuple[Guess, ...] = ()
+    fields: tuple[ColumnDraft, ...] = ()
 
 
 class _Candidate(Struct, frozen=True):
@@ -106,28 +110,30 @@ class _Candidate(Struct, frozen=True):
         return _expression(*self.path)
 
 
-def guess_columns(struct: DataType, definition: Definition, shape: pa.StructType) -> tuple[Guess, ...]:
+def draft_columns(struct: DataType, definition: Definition, shape: pa.StructType) -> tuple[ColumnDraft, ...]:
     """Return a guess for every column of an ontology type; one that is required gets some value."""
     known = sorted(_candidates(definition, definition.root, shape, ()), key=lambda one: len(one.path))
     return tuple(_column(field, known) for field in struct)
 
 
-def _column(field: DataType, known: Sequence[_Candidate]) -> Guess:
-    type_ = spell(field.type)
+def _column(field: DataType, known: Sequence[_Candidate]) -> ColumnDraft:
+    type_ = format_type(field.type)
     for some in _by_likeness(field, known):
         values = [value for one in some if (value := _fitting(one, field.type)) is not None]
         if len(values) == 1:
-            return Guess(field.name, values[0], f"{type_}, {'may be null' if field.nullable else 'required'}")
+            return ColumnDraft(
+                field.name, values[0], f"{type_}, {'may be null' if field.nullable else 'required'}"
+            )
     perhaps = ", ".join(
         one.text for one in known if len(one.path) == 1 and _resembles(field.name, one.path[0])
     )
     note = f"{type_}, perhaps {perhaps}" if perhaps else type_
     if field.nullable:
-        return Guess(field.name, None, note)
+        return ColumnDraft(field.name, None, note)
     if pt.is_struct(field.type):
         inner = tuple(_column(child, ()) for child in field.type)
-        return Guess(field.name, None, "required: no field is called so", inner)
-    return Guess(field.name, _nothing(field.type), f"{note}, required: no field is called so")
+        return ColumnDraft(field.name, None, "required: no field is called so", inner)
+    return ColumnDraft(field.name, _nothing(field.type), f"{note}, required: no field is called so")
 
 
 def _by_likeness(field: DataType, known: Sequence[_Candidate]) -> Iterator[list[_Candidate]]:
@@ -182,8 +188,8 @@ def _expression(first: str, *rest: str) -> str:
 
 def _fits(source: DataType, target: DataType, msgtype: str | None = None) -> bool:
     try:
-        demand(kind_of(source, msgtype=msgtype), target)
-    except Unfit:
+        check_fits(expr_type_of(source, msgtype=msgtype), target)
+    except TypeMismatch:
         return False
     return True
 
@@ -218,13 +224,13 @@ def _plain(name: str) -> str:
     return name.replace("_", "").lower()
 
 
-def guess_type(definition: Definition) -> tuple[list[str], tuple[Guess, ...]]:
+def draft_ontology_type(definition: Definition) -> tuple[list[str], tuple[ColumnDraft, ...]]:
     """Return the fields of an ontology type of one's own as lines of YAML, and what fills each."""
     made = _own_fields(definition, definition.root, ros_shape(definition), "    ", top=True)
     return [line for lines, _ in made for line in lines], tuple(guess for _, some in made for guess in some)
 
 
-_Made = tuple[list[str], list[Guess]]
+_Made = tuple[list[str], list[ColumnDraft]]
 
 
 def _own_fields(
@@ -244,12 +250,18 @@ def _own(definition: Definition, field: Field, name: str, type_: DataType, margi
     """Return what a field of the message becomes: a column like it, or some for a list of messages."""
     listed, text = field.container is not Container.SCALAR, _expression(field.name)
     if not field.is_message:
-        return [f"{margin}{key(name)}: {spell(type_)}"], [Guess(name, word(text))]
+        return [f"{margin}{quote_key(name)}: {format_type(type_)}"], [
+            ColumnDraft(name, quote_expression(text))
+        ]
     used = _adapted(field.type, listed=listed)
     if used is not None:
         tag = BY_TYPE[field.type].tag
-        own = word(text) if tag == "Header" and not listed else _by_adapter(used[0], text, listed=listed)
-        return [f"{margin}{key(name)}: {f'list[{tag}]' if listed else tag}"], [Guess(name, own)]
+        own = (
+            quote_expression(text)
+            if tag == "Header" and not listed
+            else _by_adapter(used[0], text, listed=listed)
+        )
+        return [f"{margin}{quote_key(name)}: {f'list[{tag}]' if listed else tag}"], [ColumnDraft(name, own)]
     if listed:
         return _spread(definition, field, margin)
     inner = _own_fields(definition, field.type, type_, margin + "    ")
@@ -257,7 +269,9 @@ def _own(definition: Definition, field: Field, name: str, type_: DataType, margi
     guesses = tuple(guess for _, part in inner for guess in part)
     if not lines:
         return [], []
-    return [f"{margin}{key(name)}:", f"{margin}  fields:", *lines], [Guess(name, word(text), fields=guesses)]
+    return [f"{margin}{quote_key(name)}:", f"{margin}  fields:", *lines], [
+        ColumnDraft(name, quote_expression(text), fields=guesses)
+    ]
 
 
 def _spread(definition: Definition, field: Field, margin: str) -> _Made:
@@ -267,8 +281,8 @@ def _spread(definition: Definition, field: Field, margin: str) -> _Made:
         if not child.is_message and child.container is Container.SCALAR:
             name = f"{field.name}_{child.name}"
             kind = "uint8" if child.type in BYTES else "string" if child.type in TEXTS else child.type
-            made[0].append(f"{margin}{key(name)}: list[{kind}]")
-            made[1].append(Guess(name, f"{_expression(field.name)}[]{_expression('', child.name)}"))
+            made[0].append(f"{margin}{quote_key(name)}: list[{kind}]")
+            made[1].append(ColumnDraft(name, f"{_expression(field.name)}[]{_expression('', child.name)}"))
     return made
 
 
@@ -276,7 +290,7 @@ _LONG = 1500
 """How many characters of a message a test spells out; a longer one is named by its place in the recording."""
 
 
-class Example(Struct, frozen=True):
+class RecordedExample(Struct, frozen=True):
     """A recorded message for the draft's test."""
 
     row: pa.StructArray
@@ -290,7 +304,7 @@ def draft(
     *,
     ontology: str | None = None,
     embed: bool = False,
-    example: Example | None = None,
+    example: RecordedExample | None = None,
 ) -> str:
     """Return an adapter file for a message type that binds to it as it is.
 
@@ -303,10 +317,10 @@ def draft(
     if not definition.message.fields:
         raise AdapterError(f"{definition.root} has no fields", hint="there is nothing to adapt")
     if ontology is None:
-        own, guesses = guess_type(definition)
+        own, guesses = draft_ontology_type(definition)
         target = "\n".join(["ontology:", f"  tag: {_tag(definition)}", "  fields:", *own])
     else:
-        guesses = guess_columns(ontology_type(ontology).struct, definition, shape)
+        guesses = draft_columns(ontology_type(ontology).struct, definition, shape)
         target = f"ontology: {ontology}"
     lines = list(_lines(guesses, "  "))
     head = [*_head(definition), target, "", _opening(lines), *lines]
@@ -335,21 +349,21 @@ def _head(definition: Definition) -> Iterator[str]:
     yield f"ros_type: {definition.root}"
 
 
-def _lines(guesses: tuple[Guess, ...], margin: str) -> Iterator[str]:
+def _lines(guesses: tuple[ColumnDraft, ...], margin: str) -> Iterator[str]:
     for guess in guesses:
         note = f"  # {guess.note}" if guess.note else ""
         if guess.fields:
             of = f"of: {guess.value}" if guess.value else None
-            yield f"{margin}{key(guess.name)}:{note}"
+            yield f"{margin}{quote_key(guess.name)}:{note}"
             if of:
                 yield f"{margin}  {of}"
             inner = list(_lines(guess.fields, margin + "    "))
             yield f"{margin}  {_opening(inner)}"
             yield from inner
         elif guess.value is None:
-            yield f"{margin}# {key(guess.name)}:{note}"
+            yield f"{margin}# {quote_key(guess.name)}:{note}"
         else:
-            yield f"{margin}{key(guess.name)}: {guess.value}{note}"
+            yield f"{margin}{quote_key(guess.name)}: {guess.value}{note}"
 
 
 def _opening(lines: list[str]) -> str:
@@ -364,7 +378,7 @@ def _unread(adapter: MappingAdapter, definition: Definition, shape: pa.StructTyp
 
 
 def _test(
-    spec: MappingSpec, adapter: MappingAdapter, definition: Definition, example: Example | None
+    spec: MappingSpec, adapter: MappingAdapter, definition: Definition, example: RecordedExample | None
 ) -> Iterator[str]:
     if example is None:
         yield "  - name: nothing but zeros"
@@ -372,18 +386,20 @@ def _test(
         yield "    expect: {}"
         return
     adapted = adapter.adapt(example.row, Envelope("", definition.root, np.zeros(1, np.int64)))
-    given = flow(_said(cast("Any", example.row)[0].as_py()))
+    given = flow_style(_said(cast("Any", example.row)[0].as_py()))
     yield f"  - name: a message of {example.place['topic']}"
-    yield f"    given: {given if len(given) <= _LONG else flow(example.place)}"
+    yield f"    given: {given if len(given) <= _LONG else flow_style(example.place)}"
     if adapted.failures:
         yield f"    # {spec.name} rejects it: {adapted.failures[0].reason}"
-        yield f"    rejects: {flow(adapted.failures[0].reason)}"
+        yield f"    rejects: {flow_style(adapted.failures[0].reason)}"
         return
-    expected = {name: flow(value) for name, value in _known(cast("Any", adapted.rows)[0].as_py()).items()}
+    expected = {
+        name: flow_style(value) for name, value in _known(cast("Any", adapted.rows)[0].as_py()).items()
+    }
     short = {name: text for name, text in expected.items() if len(text) <= _LONG}
     yield "    expect:" if short else "    expect: {}"
     for name, text in short.items():
-        yield f"      {key(name)}: {text}"
+        yield f"      {quote_key(name)}: {text}"
 
 
 def _said(message: dict[str, Any]) -> dict[str, Any]:

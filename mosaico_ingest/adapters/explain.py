@@ -9,32 +9,32 @@ import pyarrow as pa
 from msgspec import Struct
 
 from mosaico_ingest.adapters.adapter import Adapter, AdapterSpec
-from mosaico_ingest.adapters.direct import mapping_of
+from mosaico_ingest.adapters.mapping.column_plan import (
+    ColumnPlan,
+    ExpressionSource,
+    MapLookup,
+    NestedAdapter,
+    StructSource,
+)
 from mosaico_ingest.adapters.mapping.columns import DataType, pt
-from mosaico_ingest.adapters.mapping.compiler import (
-    ByAdapter,
-    ByFields,
-    Computed,
-    Filled,
-    Looked,
+from mosaico_ingest.adapters.mapping.expressions import (
+    Cast,
+    CloseList,
+    Conditional,
+    Constant,
+    ElementAt,
+    FieldAccess,
+    FunctionCall,
+    MakeList,
+    MessageRef,
+    OpenList,
+    TypedExpression,
 )
 from mosaico_ingest.adapters.mapping.loader import MappingAdapter, MappingSpec
-from mosaico_ingest.adapters.mapping.model import Form, Scalar, Value
-from mosaico_ingest.adapters.mapping.typed import (
-    Apply,
-    Cast,
-    ChoiceOf,
-    Const,
-    EachOf,
-    FieldOf,
-    Fold,
-    ItemOf,
-    ListValue,
-    Typed,
-    Whole,
-)
-from mosaico_ingest.adapters.mapping.types import is_list, spell
+from mosaico_ingest.adapters.mapping.model import Scalar, Value, ValueForm
+from mosaico_ingest.adapters.mapping.types import format_type, is_list
 from mosaico_ingest.adapters.python import PythonAdapterSpec, ontology_of
+from mosaico_ingest.adapters.standalone import mapping_of
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
 
@@ -79,68 +79,68 @@ def _of_adapter(adapter: MappingAdapter, at: _Place) -> Iterator[_Place]:
         yield from _of_value(typed, at)
 
 
-def _of_field(field: Filled, at: _Place) -> Iterator[_Place]:
+def _of_field(field: ColumnPlan, at: _Place) -> Iterator[_Place]:
     """Yield what a column reads, as seen from the message; `at` is where its names are looked up."""
     source = field.source
     match source:
-        case Computed():
-            yield from _of_value(source.typed, at)
-        case Looked():
-            yield from _of_value(source.typed, at)
+        case ExpressionSource():
+            yield from _of_value(source.expression, at)
+        case MapLookup():
+            yield from _of_value(source.operand, at)
             if source.otherwise is not None:
                 yield from _of_value(source.otherwise, at)
-        case ByAdapter():
+        case NestedAdapter():
             inner = source.adapter
-            place = _place(source.of, at)
+            place = _place(source.operand, at)
             yield from _of_adapter(inner, place) if isinstance(inner, MappingAdapter) else (place,)
-        case ByFields():
-            inside = at if source.of is None else _place(source.of, at)
+        case StructSource():
+            inside = at if source.operand is None else _place(source.operand, at)
             for one in source.fields:
                 yield from _of_field(one, inside)
         case _:
             pass
-    for one in field.replaced:
+    for one in field.overrides:
         yield from _of_field(one, at)
     if field.when is not None:
         yield from _of_value(field.when, at)
 
 
-def _of_value(typed: Typed, at: _Place) -> Iterator[_Place]:
+def _of_value(typed: TypedExpression, at: _Place) -> Iterator[_Place]:
     match typed:
-        case Const():
+        case Constant():
             return
-        case Apply(arguments=parts) | ListValue(items=parts):
+        case FunctionCall(arguments=parts) | MakeList(items=parts):
             pass
-        case ChoiceOf():
+        case Conditional():
             parts = (typed.condition, typed.then, typed.otherwise)
         case Cast():
-            parts = (typed.of,)
+            parts = (typed.operand,)
         case _:
             yield _place(typed, at)
-            if not isinstance(typed, Whole):
+            if not isinstance(typed, MessageRef):
                 yield from _computed_inside(typed, at)
             return
     for part in parts:
         yield from _of_value(part, at)
 
 
-def _computed_inside(typed: FieldOf | EachOf | Fold | ItemOf, at: _Place) -> Iterator[_Place]:
+def _computed_inside(typed: FieldAccess | OpenList | CloseList | ElementAt, at: _Place) -> Iterator[_Place]:
     """Yield what is read under a list that is computed before it is opened, as `sorted(a)[0]`."""
     inner: Any = typed
-    while isinstance(inner, (FieldOf, EachOf, Fold, ItemOf)):
-        inner = inner.of
-    if not isinstance(inner, Whole):
+    while isinstance(inner, (FieldAccess, OpenList, CloseList, ElementAt)):
+        inner = inner.operand
+    if not isinstance(inner, MessageRef):
         yield from _of_value(inner, at)
 
 
-def _place(typed: Typed, at: _Place) -> _Place:
+def _place(typed: TypedExpression, at: _Place) -> _Place:
     """Return the field an expression walks to; where it starts from something computed, that adds nothing."""
     match typed:
-        case FieldOf():
-            return (*_place(typed.of, at), typed.name)
-        case EachOf() | Fold() | ItemOf():
-            return _place(typed.of, at)
-        case Whole():
+        case FieldAccess():
+            return (*_place(typed.operand, at), typed.name)
+        case OpenList() | CloseList() | ElementAt():
+            return _place(typed.operand, at)
+        case MessageRef():
             return at
         case _:
             return ("",)  # no field is called so
@@ -208,7 +208,8 @@ def _of_class(spec: PythonAdapterSpec) -> Description:
     origin = f"{cls.__module__}.{cls.__qualname__}.{method}"
     doc = (cls.__doc__ or "").strip().partition("\n")[0]
     columns = [
-        ColumnOrigin(field.name, spell(field.type), not field.nullable, origin) for field in ontology.struct
+        ColumnOrigin(field.name, format_type(field.type), not field.nullable, origin)
+        for field in ontology.struct
     ]
     takes = dict.fromkeys(spec.ros_types, "")
     layout = ontology.serialization_format.value
@@ -220,9 +221,9 @@ def _columns(struct: DataType, values: Mapping[str, Value], prefix: str) -> Iter
     for field in struct:
         name = f"{prefix}{field.name}"
         value = values.get(field.name)
-        origin = _origin(value) if isinstance(value, Form) else None if value is None else _text(value)
-        yield ColumnOrigin(name, spell(field.type), not field.nullable, origin)
-        if not isinstance(value, Form):
+        origin = _origin(value) if isinstance(value, ValueForm) else None if value is None else _text(value)
+        yield ColumnOrigin(name, format_type(field.type), not field.nullable, origin)
+        if not isinstance(value, ValueForm):
             continue
         element, inner = field.type, f"{name}."
         while is_list(element):
@@ -236,7 +237,7 @@ def _columns(struct: DataType, values: Mapping[str, Value], prefix: str) -> Iter
             yield from _columns(named, value.replaced, inner)
 
 
-def _origin(form: Form) -> str:
+def _origin(form: ValueForm) -> str:
     """Return a form in one line."""
     if form.use is not None:
         text = f"{form.use} of {form.of}"
@@ -252,7 +253,7 @@ def _origin(form: Form) -> str:
 
 def _text(value: Value) -> str:
     """Return a plain value as the file spells it."""
-    if isinstance(value, Form):
+    if isinstance(value, ValueForm):
         return _origin(value)
     words: dict[Scalar, str] = {None: "null", True: "true", False: "false"}
     return words[value] if value is None or isinstance(value, bool) else str(value)

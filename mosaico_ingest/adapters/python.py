@@ -182,7 +182,7 @@ class PythonAdapter(Struct, frozen=True):
         try:
             return dict(method(first_row.as_py()) or {})
         except Exception as error:
-            raise AdapterError(f"{self.adapter.__name__}.schema_metadata: {_say(error)}") from error
+            raise AdapterError(f"{self.adapter.__name__}.schema_metadata: {_one_line(error)}") from error
 
     def _by_columns(self, rows: pa.StructArray) -> Adapted:
         results = list(self._columns(rows, first=0))
@@ -237,9 +237,9 @@ class PythonAdapter(Struct, frozen=True):
 
     def _by_messages(self, rows: pa.StructArray, envelope: Envelope) -> Adapted:
         convert = self._translate if _overrides(self.adapter, "translate") else self._from_dict
-        parts: list[_Part] = []
+        parts: list[_Rows] = []
         for start in range(0, len(rows), _ROWS_AS_DICTS):
-            part = _Part()
+            part = _Rows()
             for row, ros_data in enumerate(_as_dicts(rows.slice(start, _ROWS_AS_DICTS)), start):
                 try:
                     part.add(row, *convert(ros_data, envelope, row))
@@ -281,7 +281,7 @@ class PythonAdapter(Struct, frozen=True):
         own: Any = value
         return own.to_row() if hasattr(own, "to_row") else own.model_dump()  # the SDK's are plain pydantic
 
-    def _columns_of(self, part: _Part) -> pa.StructArray:
+    def _columns_of(self, part: _Rows) -> pa.StructArray:
         """Make columns of the rows; where one does not fit them, move it to the failures."""
         struct = self.ontology.struct
         try:
@@ -297,14 +297,14 @@ class PythonAdapter(Struct, frozen=True):
             return _struct_array(part.rows, struct)
 
     def _failure(self, row: int, error: Exception) -> RowFailure:
-        return RowFailure(row, "adapter-rejected", f"{self.adapter.__name__}: {_say(error)}")
+        return RowFailure(row, "adapter-rejected", f"{self.adapter.__name__}: {_one_line(error)}")
 
 
 _MISFITS = (pa.ArrowException, OverflowError, TypeError, ValueError)
 
 
 @dataclass(slots=True)
-class _Part:
+class _Rows:
     """The rows of one stretch while they are Python objects."""
 
     index: list[int] = field(default_factory=list[int])
@@ -347,7 +347,7 @@ def _message_class(adapter: type[Any]) -> Callable[..., Any]:
     return getattr(sys.modules[base.__module__], "ROSMessage", ROSMessage)
 
 
-def _say(error: Exception) -> str:
+def _one_line(error: Exception) -> str:
     """Return an exception in one line."""
     text = " ".join(str(error).split())
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -20,7 +20,7 @@ from mosaico_ingest.report.units import counted
 
 if TYPE_CHECKING:
     from mosaico_ingest.adapters.adapter import AdapterSpec
-    from mosaico_ingest.adapters.direct import KnownTypes
+    from mosaico_ingest.adapters.standalone import DefinitionFinder
     from mosaico_ingest.services.adapters import (
         Explained,
         Known,
@@ -310,10 +310,10 @@ def _spec(adapter: str) -> AdapterSpec:
     return find_adapter(adapter)
 
 
-def _types(distro: str | None, folders: list[str] | None) -> KnownTypes:
-    from mosaico_ingest.adapters.direct import KnownTypes
+def _types(distro: str | None, folders: list[str] | None) -> DefinitionFinder:
+    from mosaico_ingest.adapters.standalone import DefinitionFinder
 
-    return KnownTypes(distro, _custom(folders))
+    return DefinitionFinder(distro, _custom(folders))
 
 
 def _custom(folders: list[str] | None) -> list[tuple[str, Path, None]]:

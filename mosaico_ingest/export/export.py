@@ -194,8 +194,8 @@ class Restorer:
 
     def _count(self, restored: Restored) -> None:
         self.messages += len(restored.rows)
-        self._unknown.update(dict.fromkeys(restored.unknown))
-        self._kept_out.update(restored.kept_out or {})
+        self._unknown.update(dict.fromkeys(restored.defaulted))
+        self._kept_out.update(restored.not_invertible or {})
         self._changed.update(restored.changed or {})
 
 

@@ -14,9 +14,9 @@ from pathlib import Path
 from msgspec import Struct
 from msgspec.structs import replace
 
-from mosaico_ingest.adapters.bridge import KnownAdapters
-from mosaico_ingest.adapters.direct import KnownTypes
+from mosaico_ingest.adapters.bridge import AdapterFinder
 from mosaico_ingest.adapters.mapping.loader import MappingSpec, load_adapter
+from mosaico_ingest.adapters.standalone import DefinitionFinder
 from mosaico_ingest.errors import AdapterError, BagError, ManifestError
 from mosaico_ingest.findings import Edit, Finding, Severity, Span
 from mosaico_ingest.job.compose import EXTENDS_KEY as EXTENDS
@@ -209,7 +209,7 @@ def _is_inside(fence: str, numbered: tuple[int, str]) -> bool:
 def adapter_findings(document: Document) -> Iterator[Finding]:
     """Yield what is wrong with an adapter file, once for each place."""
     try:
-        spec = load_adapter(document.text, file=document.file, adapters=KnownAdapters(document.folder))
+        spec = load_adapter(document.text, file=document.file, adapters=AdapterFinder(document.folder))
     except AdapterError as error:
         start = Span(document.file, 1, 1, 1, 1)
         yield from error.findings or [Finding("adapter-file", Severity.ERROR, error.what, start, error.hint)]
@@ -233,8 +233,8 @@ def _definition(spec: MappingSpec, msgtype: str) -> Definition | None:
 
 
 @cache
-def _known_types() -> KnownTypes:
-    return KnownTypes()
+def _known_types() -> DefinitionFinder:
+    return DefinitionFinder()
 
 
 STDIN = "-"

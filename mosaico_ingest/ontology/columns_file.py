@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from mosaico_ingest.ontology.registry import FILE, MODULES, model, written_fields
+from mosaico_ingest.ontology.registry import COLUMNS_FILE, MODULES, encode_fields, model
 from mosaico_ingest.ontology.types import OntologyType
 
 __all__ = ["columns_file"]
@@ -18,10 +18,10 @@ def columns_file() -> str:
 
 def _entry(tag: str, made: OntologyType) -> str:
     columns = ",\n".join(
-        f'  "{name}": {json.dumps(kind)}' for name, kind in written_fields(made.struct).items()
+        f'  "{name}": {json.dumps(kind)}' for name, kind in encode_fields(made.struct).items()
     )
     return f' "{tag}": {{"format": "{made.serialization_format.value}", "columns": {{\n{columns}\n }}}}'
 
 
 if __name__ == "__main__":
-    FILE.write_text(columns_file(), encoding="utf-8")
+    COLUMNS_FILE.write_text(columns_file(), encoding="utf-8")

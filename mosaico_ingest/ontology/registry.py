@@ -28,16 +28,16 @@ if TYPE_CHECKING:
     from mosaico_ingest.ontology.model import Serializable
 
 __all__ = [
+    "COLUMNS_FILE",
     "DEFINED",
-    "FILE",
     "MODULES",
+    "EncodedType",
     "UnknownTag",
-    "Written",
     "builtin_type",
+    "encode_fields",
     "model",
     "ontology_type",
     "tags",
-    "written_fields",
 ]
 
 DEFINED: dict[str, type[Serializable]] = {}
@@ -68,9 +68,9 @@ MODULES: Mapping[str, str] = MappingProxyType(
 )
 """The built-in tags, which are class names, and the module each is defined in."""
 
-FILE = Path(__file__).with_name("columns.json")
+COLUMNS_FILE = Path(__file__).with_name("columns.json")
 
-Written: TypeAlias = "str | list[Any] | dict[str, Any]"
+EncodedType: TypeAlias = "str | list[Any] | dict[str, Any]"
 """An Arrow type as the file has it."""
 _arrow: Any = pa
 """The stubs know each name of a type for itself, but not `str`."""
@@ -85,17 +85,17 @@ def builtin_type(tag: str) -> OntologyType:
 
 @cache
 def _known() -> dict[str, dict[str, Any]]:
-    return json.loads(FILE.read_bytes())
+    return json.loads(COLUMNS_FILE.read_bytes())
 
 
-def _fields(columns: Mapping[str, Written]) -> list[pa.Field[Any]]:
+def _fields(columns: Mapping[str, EncodedType]) -> list[pa.Field[Any]]:
     return [
         pa.field(name.removesuffix("?"), _type(kind), nullable=name.endswith("?"))
         for name, kind in columns.items()
     ]
 
 
-def _type(kind: Written) -> pa.DataType:
+def _type(kind: EncodedType) -> pa.DataType:
     if isinstance(kind, str):
         return _arrow.type_for_alias(kind)
     if isinstance(kind, dict):
@@ -103,14 +103,14 @@ def _type(kind: Written) -> pa.DataType:
     return pa.list_(_type(kind[0]), *kind[1:])
 
 
-def written_fields(struct: pa.StructType) -> dict[str, Written]:
+def encode_fields(struct: pa.StructType) -> dict[str, EncodedType]:
     """Return the fields of a struct as the file has them."""
     return {field.name + "?" * field.nullable: _written(field.type) for field in struct}
 
 
-def _written(kind: Any) -> Written:  # noqa: ANN401 - the stubs hide what a nested type is made of
+def _written(kind: Any) -> EncodedType:  # noqa: ANN401 - the stubs hide what a nested type is made of
     if pa.types.is_struct(kind):
-        return written_fields(kind)
+        return encode_fields(kind)
     if pa.types.is_fixed_size_list(kind):
         return [_written(kind.value_type), kind.list_size]
     return [_written(kind.value_type)] if pa.types.is_list(kind) else str(kind)

@@ -13,10 +13,10 @@ import pyarrow.compute as pc
 import pyarrow.types as pt
 from msgspec import Struct
 
-from mosaico_ingest.caching import remembered
+from mosaico_ingest.caching import cache_by_identity
 
 __all__ = [
-    "AbsentRows",
+    "NullRows",
     "OntologyType",
     "RequiredFields",
     "SerializationFormat",
@@ -52,7 +52,7 @@ class OntologyType(Struct, frozen=True):
         return fingerprint(self.struct)
 
 
-@remembered
+@cache_by_identity
 def fingerprint(struct: pa.StructType) -> str:
     """Return the first ten hex digits of the SHA-1 of the struct's spelling; top-level large and view types count as plain."""
     fields = [pa.field(field.name, _PLAIN.get(field.type) or field.type, field.nullable) for field in struct]
@@ -81,7 +81,7 @@ class RequiredFields:
         return rows if self._fill is None else cast("pa.StructArray", self._fill(rows))  # a struct stays one
 
 
-class AbsentRows:
+class NullRows:
     """Rows of one type that are all null, with zeros where fields are required; few of them are made only once."""
 
     def __init__(self, kind: Any) -> None:  # noqa: ANN401 - any Arrow type; the stubs have no common base with children
@@ -91,7 +91,7 @@ class AbsentRows:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Travel without what was made."""
-        return AbsentRows, (self._kind,)
+        return NullRows, (self._kind,)
 
     def of(self, count: int) -> Any:  # noqa: ANN401 - an array of whatever type it is
         """Return `count` nulls."""

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from mosaico_ingest.adapters.adapter import Adapted, Adapter, Envelope
-from mosaico_ingest.caching import remembered
+from mosaico_ingest.caching import cache_by_identity
 from mosaico_ingest.decode.decoder import Decoder, decoder_for
 from mosaico_ingest.destinations.base import ENVELOPE, Session, TopicWriter
 from mosaico_ingest.errors import (
@@ -297,7 +297,7 @@ class Stream:
             )
 
 
-@remembered
+@cache_by_identity
 def _columns(ontology: OntologyType) -> _Columns:
     return _Columns(ontology.struct)
 

@@ -16,11 +16,11 @@ from msgspec.structs import replace
 from mosaico_ingest.adapters.adapter import AdapterSpec
 from mosaico_ingest.adapters.bridge import ROSBridge, installed_adapters, load_adapter_reference
 from mosaico_ingest.adapters.builtin import BUILTIN, BY_NAME, Builtin
-from mosaico_ingest.adapters.direct import KnownTypes, mapping_of
-from mosaico_ingest.adapters.draft import Example, draft
+from mosaico_ingest.adapters.draft import RecordedExample, draft
 from mosaico_ingest.adapters.explain import Description, describe, unread_fields
-from mosaico_ingest.adapters.mapping.model import Recorded
-from mosaico_ingest.adapters.mapping.testing import Outcome, run_tests
+from mosaico_ingest.adapters.mapping.model import RecordedMessage
+from mosaico_ingest.adapters.mapping.testing import CaseResult, run_tests
+from mosaico_ingest.adapters.standalone import DefinitionFinder, mapping_of
 from mosaico_ingest.decode.decoder import decoder_for
 from mosaico_ingest.errors import AdapterError, BagError, DecodeError, NothingMatched
 from mosaico_ingest.findings import Finding
@@ -177,7 +177,7 @@ class TestResult(Struct, frozen=True):
     """Where it does not fit a message type it takes."""
     unknown: tuple[str, ...]
     """Types it takes whose definition is not known here, so that it could not be held against them."""
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[CaseResult, ...]
 
     @property
     def passed(self) -> bool:
@@ -231,7 +231,7 @@ def source_text(spec: AdapterSpec) -> str:
     return mapping.source.text
 
 
-def explain_adapter(given: str, types: KnownTypes) -> Explained:
+def explain_adapter(given: str, types: DefinitionFinder) -> Explained:
     """Explain an adapter, or the one that a message type gets without a job.
 
     Raises:
@@ -256,7 +256,7 @@ def _is_type(given: str) -> bool:
     return given not in BY_NAME and "/" in given and ":" not in given and not Path(given).suffix
 
 
-def _unread(spec: AdapterSpec, msgtype: str, types: KnownTypes) -> tuple[str, ...]:
+def _unread(spec: AdapterSpec, msgtype: str, types: DefinitionFinder) -> tuple[str, ...]:
     if not msgtype:
         return ()
     try:
@@ -297,7 +297,7 @@ def _choices(config: ROSInjectionConfig) -> Iterator[TopicChoice]:
     yield from sorted(chosen, key=lambda one: one.topic)
 
 
-def run_adapter_tests(spec: AdapterSpec, types: KnownTypes) -> TestResult:
+def run_adapter_tests(spec: AdapterSpec, types: DefinitionFinder) -> TestResult:
     """Hold an adapter file against the types it takes, and run its tests; recordings are read from its folder.
 
     Raises:
@@ -311,7 +311,7 @@ def run_adapter_tests(spec: AdapterSpec, types: KnownTypes) -> TestResult:
         )
     folder = Path(mapping.source.file).parent
 
-    def recorded(place: Recorded) -> tuple[Definition, pa.StructArray]:
+    def recorded(place: RecordedMessage) -> tuple[Definition, pa.StructArray]:
         return message_in(folder / place.bag, place.topic, place.index, resolve=types)
 
     findings: dict[Finding, None] = {}
@@ -330,7 +330,7 @@ def run_adapter_tests(spec: AdapterSpec, types: KnownTypes) -> TestResult:
 
 def draft_adapter(
     msgtype: str,
-    types: KnownTypes,
+    types: DefinitionFinder,
     *,
     bag: Path | None = None,
     record: str | None = None,
@@ -355,7 +355,7 @@ def draft_adapter(
     else:
         definition, row = message_in(bag, record, resolve=types)
         place = {"bag": relpath(bag, folder), "topic": record, "index": 0}
-        example = Example(row, place)
+        example = RecordedExample(row, place)
         if definition.root != name:
             raise AdapterError(
                 f"it carries {definition.root}, not {name}", where=record, hint="name another topic"
@@ -366,7 +366,7 @@ def draft_adapter(
 def _in_distros(definition: Definition) -> bool:
     """Whether a distro has the very same type, so that a file need not hold it."""
     try:
-        known = KnownTypes().find(definition.root)
+        known = DefinitionFinder().find(definition.root)
     except BagError:
         return False
     return replace(known.message, constants=()) == replace(definition.message, constants=())

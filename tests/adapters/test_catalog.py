@@ -22,7 +22,7 @@ from mosaico_ingest.adapters.builtin import (
     BY_NAME,
     BY_TYPE,
     CATALOG,
-    FILE,
+    CATALOG_FILE,
     Builtin,
     find_builtin,
 )
@@ -83,7 +83,7 @@ def test_what_is_read_in_place_of_the_file_says_the_same(builtin: Builtin) -> No
 
 
 def test_the_file_of_the_catalog_is_up_to_date() -> None:
-    assert FILE.read_text(encoding="utf-8") == catalog_file(), "run ./dev docs"
+    assert CATALOG_FILE.read_text(encoding="utf-8") == catalog_file(), "run ./dev docs"
 
 
 @EVERY

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from mosaico_ingest.adapters.builtin import BUILTIN, find_builtin
-from mosaico_ingest.adapters.direct import KnownTypes
 from mosaico_ingest.adapters.draft import draft
 from mosaico_ingest.adapters.mapping.loader import load_adapter
 from mosaico_ingest.adapters.mapping.testing import run_tests
+from mosaico_ingest.adapters.standalone import DefinitionFinder
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.ontology.registry import MODULES
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
@@ -67,19 +67,19 @@ def test_a_draft_with_a_type_of_its_own_passes_its_own_test(msgtype: str) -> Non
 @pytest.mark.parametrize("tag", sorted(set(MODULES) - {"Unmodeled", "Floating16"}))
 @pytest.mark.parametrize("msgtype", ["sensor_msgs/msg/Imu", "sensor_msgs/msg/Image", "nav_msgs/msg/Odometry"])
 def test_a_draft_for_an_ontology_type_passes_its_own_test(msgtype: str, tag: str) -> None:
-    definition = KnownTypes().find(msgtype)
+    definition = DefinitionFinder().find(msgtype)
     fits(draft(definition, ontology=tag), definition)
 
 
 def test_a_draft_takes_every_field_that_has_a_column_s_name() -> None:
-    text = draft(KnownTypes().find("sensor_msgs/msg/BatteryState"), ontology="BatteryState")
+    text = draft(DefinitionFinder().find("sensor_msgs/msg/BatteryState"), ontology="BatteryState")
     assert "  voltage: voltage  # float32, required\n" in text
     assert "  present: present" in text
     assert "Not used" not in text
 
 
 def test_a_draft_says_what_it_leaves_out_and_takes_longer_names_for_a_column_s() -> None:
-    text = draft(KnownTypes().find("sensor_msgs/msg/Imu"), ontology="IMU")
+    text = draft(DefinitionFinder().find("sensor_msgs/msg/Imu"), ontology="IMU")
     assert "  acceleration: linear_acceleration" in text
     assert "Not used yet, of sensor_msgs/msg/Imu: orientation_covariance, angular_velocity_covariance" in text
 
@@ -100,13 +100,15 @@ def test_a_draft_with_its_definition_needs_no_distro() -> None:
 
 def test_a_type_without_fields_cannot_be_drafted() -> None:
     with pytest.raises(AdapterError, match="has no fields"):
-        draft(KnownTypes().find("std_msgs/msg/Empty"))
+        draft(DefinitionFinder().find("std_msgs/msg/Empty"))
 
 
 def test_every_message_type_of_the_catalog_can_be_drafted_towards_its_ontology() -> None:
     for builtin in BUILTIN:
         definition = (
-            KnownTypes().find(builtin.ros_types[0], builtin) if builtin.mapping.model.definition else None
+            DefinitionFinder().find(builtin.ros_types[0], builtin)
+            if builtin.mapping.model.definition
+            else None
         )
         if definition is not None:
             draft(definition, ontology=builtin.tag, embed=True)

@@ -107,7 +107,7 @@ def restore(type_: str, value: str, message: dict[str, Any]) -> Restored:
 )  # fmt: skip
 def test_an_expression_is_undone(type_: str, value: str, field: str) -> None:
     restored = restore(type_, value, MESSAGE)
-    assert not restored.kept_out
+    assert not restored.not_invertible
     got = pa.array([MESSAGE], ros_shape(DEFINITION))
     assert restored.rows.field(field).to_pylist() == got.field(field).to_pylist()
     assert not restored.changed
@@ -116,8 +116,8 @@ def test_an_expression_is_undone(type_: str, value: str, field: str) -> None:
 @pytest.mark.parametrize("value", ["i + u", "len(many)", "sum(many)", "i % 3", "i if flag else u", "d ** 2"])
 def test_what_has_many_sources_is_named_and_nothing_is_made_up(value: str) -> None:
     restored = restore("float64", value, MESSAGE)
-    assert restored.kept_out == {"x": value} or restored.changed
-    assert {"text", "many", "cells"} <= set(restored.unknown)
+    assert restored.not_invertible == {"x": value} or restored.changed
+    assert {"text", "many", "cells"} <= set(restored.defaulted)
     assert restored.rows.field("cells").to_pylist() == [[]]
 
 

@@ -5,13 +5,13 @@ import pytest
 from mosaico_ingest.adapters.mapping.parser import (
     Attribute,
     Call,
-    Choice,
-    Each,
+    EachElement,
     ExpressionError,
-    Item,
-    ListOf,
+    ListLiteral,
     Literal,
     Name,
+    Subscript,
+    Ternary,
     parse,
 )
 
@@ -21,20 +21,20 @@ AT = (0, 0)
 def refused(text: str) -> tuple[str, str]:
     with pytest.raises(ExpressionError) as caught:
         parse(text)
-    start, end = caught.value.place
+    start, end = caught.value.span
     return text[start:end], str(caught.value)
 
 
 def test_names_attributes_and_lists_are_read() -> None:
-    assert parse("a.b[].c") == Attribute(Each(Attribute(Name("a", AT), "b", AT, AT), AT), "c", AT, AT)
-    assert parse("a[-1]") == Item(Name("a", AT), -1, AT)
-    assert parse("[]") == ListOf((), AT)
+    assert parse("a.b[].c") == Attribute(EachElement(Attribute(Name("a", AT), "b", AT, AT), AT), "c", AT, AT)
+    assert parse("a[-1]") == Subscript(Name("a", AT), -1, AT)
+    assert parse("[]") == ListLiteral((), AT)
     assert parse("self['from']") == Attribute(Name("self", AT), "from", AT, AT)
 
 
 def test_yaml_words_are_values() -> None:
     assert parse("null") == Literal(None, AT)
-    assert parse("true") == Literal(value=True, at=AT)
+    assert parse("true") == Literal(value=True, span=AT)
     assert parse("-1.5") == Literal(-1.5, AT)
 
 
@@ -47,7 +47,7 @@ def test_operators_are_calls() -> None:
 
 def test_if_else_is_the_conditional() -> None:
     assert parse("if_else(a, b, c)") == parse("b if a else c")
-    assert isinstance(parse("b if a else c"), Choice)
+    assert isinstance(parse("b if a else c"), Ternary)
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_places_count_characters_as_written() -> None:
     node = parse(text)
     assert isinstance(node, Call)
     last = node.arguments[1]
-    assert text[last.at[0] : last.at[1]] == "c[].d"
+    assert text[last.span[0] : last.span[1]] == "c[].d"
 
 
 def test_brackets_in_text_are_left_alone() -> None:

@@ -12,12 +12,12 @@ import pytest
 
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.mapping.checker import Checker, Scope
-from mosaico_ingest.adapters.mapping.evaluator import Evaluation, RowsRefused
+from mosaico_ingest.adapters.mapping.evaluator import Evaluation, RowsRejected
 from mosaico_ingest.adapters.mapping.functions import SUBJECTS, functions, operators
 from mosaico_ingest.adapters.mapping.functions.reference import with_reference
 from mosaico_ingest.adapters.mapping.functions.ros import HEADER_TYPE, STAMP_TYPE
 from mosaico_ingest.adapters.mapping.parser import parse
-from mosaico_ingest.adapters.mapping.types import Kind
+from mosaico_ingest.adapters.mapping.types import ExprType
 from mosaico_ingest.ontology.registry import ontology_type
 
 STAMP = pa.struct([("sec", pa.int32()), ("nanosec", pa.uint32())])
@@ -31,11 +31,13 @@ def column(text: str, values: list[Any], type_: pa.DataType, other: list[Any] | 
     shape = pa.struct([("x", type_), ("y", type_)])
     rows: Any = pa.array([{"x": x, "y": y} for x, y in zip(values, other or values, strict=True)], shape)
     problems: list[Any] = []
-    typed = Checker(Scope(Kind(shape), {}), lambda *problem: problems.append(problem), text).infer(
+    typed = Checker(Scope(ExprType(shape), {}), lambda *problem: problems.append(problem), text).infer(
         parse(text)
     )
     assert typed is not None, problems
-    array = Evaluation(rows, Envelope("", "", np.zeros(len(rows), np.int64))).of(typed).closed(len(rows))
+    array = (
+        Evaluation(rows, Envelope("", "", np.zeros(len(rows), np.int64))).evaluate(typed).close_all(len(rows))
+    )
     array.validate(full=True)
     return array.to_pylist()
 
@@ -206,7 +208,7 @@ def test_the_reference_in_the_documentation_is_current() -> None:
 
 def test_a_sum_of_more_than_64_bits_rejects_the_row() -> None:
     for type_ in (pa.int64(), pa.uint64()):
-        with pytest.raises(RowsRefused):
+        with pytest.raises(RowsRejected):
             column("sum(x)", [[2**63 - 1, 1]], pa.list_(type_))
 
 

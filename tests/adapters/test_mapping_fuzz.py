@@ -14,13 +14,13 @@ from every_kind import every_kind
 import mosaico_ingest
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.mapping.checker import Checker, Scope
-from mosaico_ingest.adapters.mapping.conversion import convert, demand
-from mosaico_ingest.adapters.mapping.evaluator import Evaluation, RowsRefused
+from mosaico_ingest.adapters.mapping.conversion import check_fits, convert
+from mosaico_ingest.adapters.mapping.evaluator import Evaluation, RowsRejected
+from mosaico_ingest.adapters.mapping.expressions import TypedExpression
 from mosaico_ingest.adapters.mapping.functions import functions
 from mosaico_ingest.adapters.mapping.loader import load_adapter
 from mosaico_ingest.adapters.mapping.parser import ExpressionError, parse
-from mosaico_ingest.adapters.mapping.typed import Typed
-from mosaico_ingest.adapters.mapping.types import Kind, Unfit
+from mosaico_ingest.adapters.mapping.types import ExprType, TypeMismatch
 from mosaico_ingest.errors import AdapterError
 
 STAMP = pa.struct([("sec", pa.int32()), ("nanosec", pa.uint32())])
@@ -74,7 +74,7 @@ class Writer:
         if form == 5:
             return f"cast({inner()}, '{pick.choice(TYPES)}')"
         called = pick.choice(CALLED)
-        taken = [called.take(k) for k in range(len(called.takes) + called.variadic)]
+        taken = [called.parameter(k) for k in range(len(called.parameter_types) + called.variadic)]
         texts = (pick.choice(["'a'", "''", "'(a)'", "'('"]) if take.literal else inner() for take in taken)
         return f"{called.name}({', '.join(texts)})"
 
@@ -99,17 +99,17 @@ class Writer:
         return pick.choice(["", "a", "12", "ż"]) if pa.types.is_string(type_) else pick.choice([b"", b"ab"])
 
 
-def run(typed: Typed, rows: Any) -> None:
+def run(typed: TypedExpression, rows: Any) -> None:
     """Evaluate and convert to whatever it surely fits; every round leaves out the rows that were refused."""
     while True:
         evaluation = Evaluation(rows, Envelope("", "", np.zeros(len(rows), np.int64)))
         try:
-            result = evaluation.of(typed).closed(len(rows))
+            result = evaluation.evaluate(typed).close_all(len(rows))
             result.validate(full=True)
             assert len(result) == len(rows)
             for target in TARGETS:
                 check_fit(typed, result, target, evaluation)
-        except RowsRefused as refused:
+        except RowsRejected as refused:
             good = np.ones(len(rows), bool)
             good[list(refused.refusals)] = False
             remaining = rows.filter(pa.array(good))
@@ -119,12 +119,12 @@ def run(typed: Typed, rows: Any) -> None:
         rows = remaining
 
 
-def check_fit(typed: Typed, result: Any, target: Any, evaluation: Evaluation) -> None:
+def check_fit(typed: TypedExpression, result: Any, target: Any, evaluation: Evaluation) -> None:
     try:
-        demand(typed.kind, target)
-    except Unfit:
+        check_fits(typed.type, target)
+    except TypeMismatch:
         return
-    fitted = convert(result, target, evaluation.refuser((), "it"))
+    fitted = convert(result, target, evaluation.rejecter((), "it"))
     fitted.validate(full=True)
     assert (fitted.type, len(fitted)) == (target, len(result))
 
@@ -137,7 +137,7 @@ def attempts(seed: int, count: int) -> int:
     for _ in range(count):
         text = writer.program(3)
         try:
-            typed = Checker(Scope(Kind(MESSAGE), {}), lambda *_: None, text).infer(parse(text))
+            typed = Checker(Scope(ExprType(MESSAGE), {}), lambda *_: None, text).infer(parse(text))
         except ExpressionError:
             continue
         if typed is not None:

@@ -17,22 +17,22 @@ from hypothesis import strategies as st
 
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.mapping.checker import Checker, Scope
-from mosaico_ingest.adapters.mapping.evaluator import Evaluation, RowsRefused
-from mosaico_ingest.adapters.mapping.parser import parse
-from mosaico_ingest.adapters.mapping.typed import (
-    Apply,
+from mosaico_ingest.adapters.mapping.evaluator import Evaluation, RowsRejected
+from mosaico_ingest.adapters.mapping.expressions import (
     Cast,
-    ChoiceOf,
-    Const,
-    EachOf,
-    FieldOf,
-    Fold,
-    ItemOf,
-    ListValue,
-    Typed,
-    Whole,
+    CloseList,
+    Conditional,
+    Constant,
+    ElementAt,
+    FieldAccess,
+    FunctionCall,
+    MakeList,
+    MessageRef,
+    OpenList,
+    TypedExpression,
 )
-from mosaico_ingest.adapters.mapping.types import Kind
+from mosaico_ingest.adapters.mapping.parser import parse
+from mosaico_ingest.adapters.mapping.types import ExprType
 
 MESSAGE = every_kind()
 
@@ -44,37 +44,41 @@ class RefusedError(Exception):
 # --- the slow twin -------------------------------------------------------------------------------------------------
 
 
-def interpret(typed: Typed, row: dict[str, Any]) -> Any:  # noqa: PLR0911 - a return for each kind of node
+def interpret(typed: TypedExpression, row: dict[str, Any]) -> Any:  # noqa: PLR0911 - a return for each kind of node
     """Return the value for one message; open lists are Python lists."""
     match typed:
-        case Whole():
+        case MessageRef():
             return row
-        case Const():
+        case Constant():
             return typed.value
-        case FieldOf():
+        case FieldAccess():
             return each(
-                lambda of: None if of is None else of[typed.name], interpret(typed.of, row), depth(typed.of)
+                lambda of: None if of is None else of[typed.name],
+                interpret(typed.operand, row),
+                depth(typed.operand),
             )
-        case EachOf() | Fold():
-            return interpret(typed.of, row)
-        case ItemOf():
-            return each(lambda of: item(of, typed.index), interpret(typed.of, row), depth(typed.of))
+        case OpenList() | CloseList():
+            return interpret(typed.operand, row)
+        case ElementAt():
+            return each(lambda of: item(of, typed.index), interpret(typed.operand, row), depth(typed.operand))
         case Cast():
-            return each(lambda of: cast(of, typed.type), interpret(typed.of, row), depth(typed.of))
-        case ListValue():
+            return each(
+                lambda of: cast(of, typed.target), interpret(typed.operand, row), depth(typed.operand)
+            )
+        case MakeList():
             return spread(lambda *items: list(items), typed.items, row)
-        case ChoiceOf():
+        case Conditional():
             return choose(typed, row)
-        case Apply():
-            whole = all(a.kind.bounds is not None for a in typed.arguments)
+        case FunctionCall():
+            whole = all(a.type.bounds is not None for a in typed.arguments)
             numeric = COMPUTED.get(typed.name)
             return spread(
                 partial(numeric, whole=whole) if numeric else PLAIN[typed.name], typed.arguments, row
             )
 
 
-def depth(typed: Typed) -> int:
-    return len(typed.kind.axes)
+def depth(typed: TypedExpression) -> int:
+    return len(typed.type.axes)
 
 
 def each(run: Callable[[Any], Any], value: Any, levels: int) -> Any:
@@ -83,7 +87,7 @@ def each(run: Callable[[Any], Any], value: Any, levels: int) -> Any:
     return [each(run, element, levels - 1) for element in value]
 
 
-def spread(run: Callable[..., Any], arguments: tuple[Typed, ...], row: dict[str, Any]) -> Any:
+def spread(run: Callable[..., Any], arguments: tuple[TypedExpression, ...], row: dict[str, Any]) -> Any:
     return broadcast(run, [interpret(a, row) for a in arguments], [depth(a) for a in arguments])
 
 
@@ -103,7 +107,7 @@ def broadcast(run: Callable[..., Any], values: list[Any], depths: list[int]) -> 
     ]
 
 
-def choose(typed: ChoiceOf, row: dict[str, Any]) -> Any:
+def choose(typed: Conditional, row: dict[str, Any]) -> Any:
     condition = interpret(typed.condition, row)
     if depth(typed.condition) == 0 and depth(typed) == 0:
         return None if condition is None else interpret(typed.then if condition else typed.otherwise, row)
@@ -371,29 +375,29 @@ OTHERS = st.sampled_from(
 )  # fmt: skip
 
 
-def typed_of(text: str) -> Typed | None:
-    scope = Scope(Kind(MESSAGE), {})
+def typed_of(text: str) -> TypedExpression | None:
+    scope = Scope(ExprType(MESSAGE), {})
     return Checker(scope, lambda *_: None, text).infer(parse(text))
 
 
-def over_columns(typed: Typed, rows: list[dict[str, Any]]) -> dict[int, Any]:
+def over_columns(typed: TypedExpression, rows: list[dict[str, Any]]) -> dict[int, Any]:
     """Return the value of every row that is not refused."""
     array, index = pa.array(rows, MESSAGE), np.arange(len(rows))
     while True:
         envelope = Envelope("", "", np.zeros(len(array), np.int64))
         try:
-            column = Evaluation(array, envelope).of(typed)
-        except RowsRefused as refused:
+            column = Evaluation(array, envelope).evaluate(typed)
+        except RowsRejected as refused:
             good = np.ones(len(array), bool)
             good[list(refused.refusals)] = False
             array, index = array.filter(pa.array(good)), index[good]
             continue
-        values = column.closed(len(array))
+        values = column.close_all(len(array))
         values.validate(full=True)
         return dict(zip(index.tolist(), values.to_pylist(), strict=True))
 
 
-def over_rows(typed: Typed, rows: list[dict[str, Any]]) -> dict[int, Any]:
+def over_rows(typed: TypedExpression, rows: list[dict[str, Any]]) -> dict[int, Any]:
     values: dict[int, Any] = {}
     for position, row in enumerate(pa.array(rows, MESSAGE).to_pylist()):
         with contextlib.suppress(RefusedError):
@@ -440,8 +444,8 @@ def test_integers_stay_within_the_bounds_that_were_promised(text: str, rows: lis
     typed = typed_of(text)
     assume(typed is not None)
     assert typed is not None
-    bounds = typed.kind.bounds
-    assume(bounds is not None and not typed.kind.axes)
+    bounds = typed.type.bounds
+    assume(bounds is not None and not typed.type.axes)
     assert bounds is not None
     for value in over_columns(typed, rows).values():
         assert value is None or bounds[0] <= value <= bounds[1], text

@@ -11,7 +11,7 @@ import pytest
 
 from mosaico_ingest.adapters.bridge import installed_adapters
 from mosaico_ingest.adapters.builtin import BUILTIN, BY_NAME
-from mosaico_ingest.adapters.direct import KnownTypes
+from mosaico_ingest.adapters.standalone import DefinitionFinder
 from mosaico_ingest.cli.app import main
 from mosaico_ingest.services.adapters import explain_adapter
 
@@ -89,7 +89,7 @@ def test_an_adapter_that_is_not_there_names_the_nearest(ingest: Ingest) -> None:
 
 
 def test_every_built_in_adapter_is_explained_column_by_column() -> None:
-    types = KnownTypes()
+    types = DefinitionFinder()
     for builtin in BUILTIN:
         found = explain_adapter(builtin.name, types).description
         struct = builtin.mapping.ontology.struct

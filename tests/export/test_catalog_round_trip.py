@@ -15,8 +15,8 @@ from random_messages import random_rows
 
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.builtin import BUILTIN, Builtin
-from mosaico_ingest.adapters.direct import KnownTypes
 from mosaico_ingest.adapters.inverse import invert
+from mosaico_ingest.adapters.standalone import DefinitionFinder
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
@@ -54,7 +54,7 @@ def is_listed(adapter: str, field: str) -> bool:
 
 def definition_of(spec: Builtin, msgtype: str, distro: Stores) -> Definition | None:
     try:
-        return KnownTypes(distro).find(msgtype, spec)
+        return DefinitionFinder(distro).find(msgtype, spec)
     except BagError:
         return None
 
@@ -129,7 +129,7 @@ def has_field(shape: pa.DataType, field: str) -> bool:
 
 def test_a_quantity_that_was_not_measured_is_told_from_one_that_is_nan() -> None:
     spec = next(one for one in BUILTIN if one.name == "IMUAdapter")
-    definition = KnownTypes().find("sensor_msgs/msg/Imu")
+    definition = DefinitionFinder().find("sensor_msgs/msg/Imu")
     nan, none = float("nan"), [-1.0] + [0.0] * 8
     message = random_rows(ros_shape(definition), 1)[0].as_py()
     vector = {"x": nan, "y": 1.0, "z": 2.0}
@@ -149,7 +149,7 @@ def cloud(points: list[tuple[float, float, float, int]]) -> bytes:
 
 def test_a_cloud_of_stored_columns_has_the_same_points() -> None:
     spec = next(one for one in BUILTIN if one.name == "LidarAdapter")
-    definition = KnownTypes().find("sensor_msgs/msg/PointCloud2")
+    definition = DefinitionFinder().find("sensor_msgs/msg/PointCloud2")
     fields = [
         {"name": name, "offset": offset, "datatype": datatype, "count": 1}
         for name, offset, datatype in (("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("ring", 12, 4))

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mosaico_ingest.ontology.columns_file import columns_file
-from mosaico_ingest.ontology.registry import FILE, MODULES, model, ontology_type
+from mosaico_ingest.ontology.registry import COLUMNS_FILE, MODULES, model, ontology_type
 
 GOLDEN: dict[str, list[str]] = json.loads(Path(__file__).with_name("fingerprints.json").read_text())
 
@@ -34,7 +34,7 @@ def test_a_model_has_the_columns_of_the_file_that_is_read_in_its_place(tag: str)
 
 
 def test_the_file_of_columns_is_up_to_date() -> None:
-    assert FILE.read_text(encoding="utf-8") == columns_file(), "run ./dev docs"
+    assert COLUMNS_FILE.read_text(encoding="utf-8") == columns_file(), "run ./dev docs"
 
 
 def test_columns_equal_the_reference_name_by_name(shared: Path) -> None:

@@ -12,8 +12,8 @@ from msgspec.structs import replace
 
 from mosaico_ingest.adapters.adapter import Adapter, Envelope, UnmodeledAdapter
 from mosaico_ingest.adapters.image import without_png
-from mosaico_ingest.adapters.inverse.messages import Parts, Place
-from mosaico_ingest.adapters.inverse.undo import Undo
+from mosaico_ingest.adapters.inverse.columns import ColumnInverter
+from mosaico_ingest.adapters.inverse.message_builder import FieldPath, MessageBuilder
 from mosaico_ingest.adapters.mapping.columns import (
     Array,
     DataType,
@@ -21,15 +21,15 @@ from mosaico_ingest.adapters.mapping.columns import (
     arrays,
     field_of,
     fixed_list,
-    nulls,
+    null_mask,
     open_list,
     pc,
     pt,
     struct_of,
-    var_list,
+    variable_list,
 )
+from mosaico_ingest.adapters.mapping.expressions import FieldAccess, MessageRef, TypedExpression
 from mosaico_ingest.adapters.mapping.loader import MappingAdapter
-from mosaico_ingest.adapters.mapping.typed import FieldOf, Typed, Whole
 from mosaico_ingest.adapters.mapping.types import is_list
 from mosaico_ingest.errors import AdapterError
 
@@ -95,9 +95,9 @@ class Restored(Struct, frozen=True):
 
     rows: pa.StructArray
     """In the ROS shape, without nulls."""
-    unknown: tuple[str, ...] = ()
+    defaulted: tuple[str, ...] = ()
     """Fields of the message that are not in the rows; they are zero, empty or false."""
-    kept_out: Mapping[str, str] | None = None
+    not_invertible: Mapping[str, str] | None = None
     """Columns that no field could be computed from, and what they were computed as."""
     changed: Mapping[str, int] | None = None
     """Columns that would come out otherwise if the messages were ingested again, and in how many rows."""
@@ -118,13 +118,13 @@ def invert(adapter: Adapter, shape: pa.StructType, metadata: Mapping[str, Any]) 
         AdapterError: The adapter is a class, of which nobody knows what it does.
     """
     if isinstance(adapter, UnmodeledAdapter):
-        return _Kept(shape)
+        return _UnmodeledInverse(shape)
     if isinstance(adapter, MappingAdapter):
-        return _Mapped(adapter, shape, _said(adapter.metadata, metadata))
+        return _MappingInverse(adapter, shape, _metadata_texts(adapter.metadata, metadata))
     raise AdapterError("an adapter written in Python has no way back")
 
 
-class _Kept(Struct, frozen=True):
+class _UnmodeledInverse(Struct, frozen=True):
     """Of messages that kept their shape: exact."""
 
     shape: pa.StructType
@@ -136,22 +136,22 @@ class _Kept(Struct, frozen=True):
         return Restored(struct_of(columns, self.shape, None, len(rows)))
 
 
-class _Mapped(Struct, frozen=True):
+class _MappingInverse(Struct, frozen=True):
     """Of messages that went through a mapping."""
 
     adapter: MappingAdapter
     shape: pa.StructType
-    said: Mapping[Place, str]
+    metadata_texts: Mapping[FieldPath, str]
 
     def restore(self, rows: pa.StructArray, envelope: Envelope) -> Restored:
         if self.adapter.ontology.tag == _IMAGE:
             rows = without_png(rows)
-        parts = Parts(self.shape, len(rows))
-        undo = Undo(parts, self.said)
+        parts = MessageBuilder(self.shape, len(rows))
+        undo = ColumnInverter(parts, self.metadata_texts)
         undo.record(self.adapter.record, rows)
         messages = parts.build()
         changed = self._changed(rows, messages, replace(envelope, msgtype=self.adapter.msgtype))
-        return Restored(messages, tuple(parts.unknown), undo.kept_out, changed)
+        return Restored(messages, tuple(parts.defaulted), undo.not_invertible, changed)
 
     def _changed(self, rows: Array, messages: Array, envelope: Envelope) -> Mapping[str, int]:
         again = self.adapter.adapt(messages, envelope)
@@ -160,11 +160,17 @@ class _Mapped(Struct, frozen=True):
         return changed | ({"(refused)": len(again.failures)} if again.failures else {})
 
 
-def _said(values: Mapping[str, Typed], metadata: Mapping[str, Any]) -> Mapping[Place, str]:
+def _metadata_texts(
+    values: Mapping[str, TypedExpression], metadata: Mapping[str, Any]
+) -> Mapping[FieldPath, str]:
     """Return what the metadata keeps of fields of the first message."""
-    found: dict[Place, str] = {}
+    found: dict[FieldPath, str] = {}
     for key, typed in values.items():
-        if isinstance(typed, FieldOf) and isinstance(typed.of, Whole) and isinstance(metadata.get(key), str):
+        if (
+            isinstance(typed, FieldAccess)
+            and isinstance(typed.operand, MessageRef)
+            and isinstance(metadata.get(key), str)
+        ):
             found[(typed.name,)] = metadata[key]
     return found
 
@@ -182,7 +188,7 @@ def _in_shape(values: Array, kind: DataType) -> Array:
         elements = _in_shape(elements, kind.value_type)
         if pt.is_fixed_size_list(kind):
             return fixed_list(elements, kind.list_size, None, len(values), kind)
-        return var_list(elements, axis.offsets, None, kind)
-    if nulls(values) is not None:
+        return variable_list(elements, axis.offsets, None, kind)
+    if null_mask(values) is not None:
         raise AdapterError(f"null where a {kind} is needed; the topic was not written by an ingestion")
     return values.cast(kind)

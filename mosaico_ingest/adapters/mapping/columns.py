@@ -21,16 +21,16 @@ __all__ = [
     "arrays",
     "field_of",
     "fixed_list",
+    "null_mask",
     "null_where",
-    "nulls",
-    "one_type",
     "open_list",
     "pc",
+    "promote",
     "pt",
     "repeat",
     "struct_of",
-    "true_where",
-    "var_list",
+    "true_mask",
+    "variable_list",
 ]
 
 Array: TypeAlias = Any
@@ -66,7 +66,7 @@ class Axis:
         """The row of each element, shape (elements,)."""
         return np.repeat(np.arange(len(self.offsets) - 1), self.lengths)
 
-    def like(self, other: Axis) -> bool:
+    def matches(self, other: Axis) -> bool:
         """Return whether elements of both stand side by side."""
         return self is other or np.array_equal(self.offsets, other.offsets)
 
@@ -75,7 +75,7 @@ class Axis:
         size = self.size if type_ is None or pt.is_fixed_size_list(type_) else None
         if size is not None:
             return fixed_list(values, size, self.null, len(self.offsets) - 1, type_)
-        return var_list(values, self.offsets, self.null, type_)
+        return variable_list(values, self.offsets, self.null, type_)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,18 +91,18 @@ class Column:
             return repeat(self.values, rows)
         return self.values
 
-    def closed(self, rows: int) -> Array:
+    def close_all(self, rows: int) -> Array:
         """Return the column with its lists closed, one value a row."""
         values = self.array(rows)
         for axis in reversed(self.axes):
             values = axis.close(values)
         return values
 
-    def folded(self) -> Column:
+    def close_innermost(self) -> Column:
         """Close the innermost list."""
         return Column(self.axes[-1].close(self.array(0)), self.axes[:-1])
 
-    def over(self, axes: tuple[Axis, ...]) -> Column:
+    def broadcast_to(self, axes: tuple[Axis, ...]) -> Column:
         """Repeat the values for the elements of further axes; literals stay as they are."""
         values = self.values
         if isinstance(values, pa.Array):
@@ -116,12 +116,12 @@ def repeat(scalar: Scalar, length: int) -> Array:
     return arrays.repeat(scalar, length) if scalar.is_valid else arrays.nulls(length, scalar.type)
 
 
-def nulls(array: Array) -> Mask | None:
+def null_mask(array: Array) -> Mask | None:
     """Return where an array is null, or None where it never is."""
     return np.asarray(array.is_null()) if array.null_count else None
 
 
-def true_where(values: Array | Scalar, *, null: bool = False) -> Mask:
+def true_mask(values: Array | Scalar, *, null: bool = False) -> Mask:
     """Return where a boolean column is true; nulls count as `null`; of a scalar, shape (1,)."""
     if isinstance(values, pa.Scalar):
         return np.array([values.as_py() if values.is_valid else null])
@@ -140,7 +140,7 @@ def field_of(rows: Array, name: str) -> Array:
 
 def open_list(array: Array) -> tuple[Array, Axis]:
     """Return the elements of a list column and how they make up its rows."""
-    null = nulls(array)
+    null = null_mask(array)
     if pt.is_fixed_size_list(array.type):
         size = array.type.list_size
         values = array.values.slice(array.offset * size, len(array) * size)
@@ -150,7 +150,9 @@ def open_list(array: Array) -> tuple[Array, Axis]:
     return array.flatten(), Axis(offsets, null, None)
 
 
-def var_list(values: Array, offsets: NDArray[np.int64], null: Mask | None, type_: DataType = None) -> Array:
+def variable_list(
+    values: Array, offsets: NDArray[np.int64], null: Mask | None, type_: DataType = None
+) -> Array:
     """Return a list column over `values`."""
     mask = None if null is None else arrays.array(null)
     starts = arrays.array(offsets.astype(np.int32))
@@ -178,7 +180,7 @@ def null_where(array: Array, mask: Mask) -> Array:
     """Return the array with further rows null; what they held stays below, so that nothing is copied."""
     if not mask.any():
         return array
-    known = nulls(array)
+    known = null_mask(array)
     null = mask if known is None else mask | known
     if pt.is_struct(array.type):
         children = [array.field(i) for i in range(array.type.num_fields)]
@@ -186,7 +188,7 @@ def null_where(array: Array, mask: Mask) -> Array:
     return arrays.array(pc.if_else(arrays.array(null), arrays.scalar(None, array.type), array))
 
 
-def one_type(*values: Array) -> list[Array]:
+def promote(*values: Array) -> list[Array]:
     """Return arrays or scalars in a type that holds them all; the checker made sure that there is one."""
     known = [v.type for v in values if not pt.is_null(v.type)]
     if not known:

@@ -15,31 +15,31 @@ from mosaico_ingest.adapters.mapping.columns import (
     Mask,
     arrays,
     fixed_list,
-    nulls,
+    null_mask,
     open_list,
     pc,
     pt,
     struct_of,
-    var_list,
+    variable_list,
 )
-from mosaico_ingest.adapters.mapping.functions.registry import Refuse, nullified
+from mosaico_ingest.adapters.mapping.functions.registry import RejectRows, set_null
 from mosaico_ingest.adapters.mapping.functions.ros import HEADER_TYPE, STAMP_TYPE, as_header, as_stamp
 from mosaico_ingest.adapters.mapping.types import (
-    Kind,
-    Unfit,
-    float_of,
+    ExprType,
+    TypeMismatch,
+    exact_float,
+    expr_type_of,
+    format_type,
     int_bounds,
     is_list,
     is_number,
-    kind_of,
-    spell,
     within,
 )
 
-__all__ = ["convert", "demand", "peel", "refuse_nulls", "to_number"]
+__all__ = ["check_fits", "convert", "element_type", "refuse_nulls", "to_number"]
 
 
-def peel(target: DataType, axes: tuple[int | None, ...]) -> DataType:
+def element_type(target: DataType, axes: tuple[int | None, ...]) -> DataType:
     """Return what an element must be, for a target that holds the lists around it.
 
     Raises:
@@ -47,54 +47,54 @@ def peel(target: DataType, axes: tuple[int | None, ...]) -> DataType:
     """
     for size in axes:
         if not is_list(target):
-            raise Unfit(
-                f"a list for {spell(target)}",
+            raise TypeMismatch(
+                f"a list for {format_type(target)}",
                 hint="a[0] is one element, len sum mean least greatest are one value",
             )
         if size is not None and pt.is_fixed_size_list(target) and target.list_size != size:
-            raise Unfit(f"a list of {size} for one of {target.list_size}")
+            raise TypeMismatch(f"a list of {size} for one of {target.list_size}")
         target = target.value_type
     return target
 
 
-def demand(kind: Kind, target: DataType) -> None:
-    """Check that every value of a kind fits a column.
+def check_fits(expr_type: ExprType, target: DataType) -> None:
+    """Check that every value of a expr_type fits a column.
 
     Raises:
         Unfit: Some value may not.
     """
-    _demand(kind.element, peel(target, kind.axes))
+    _demand(expr_type.element, element_type(target, expr_type.axes))
 
 
-def _demand(kind: Kind, target: DataType) -> None:
-    source = kind.type
+def _demand(expr_type: ExprType, target: DataType) -> None:
+    source = expr_type.arrow
     if source == target or pt.is_null(source):
         return
     if is_list(source) and is_list(target):
         if pt.is_fixed_size_list(source) and pt.is_fixed_size_list(target):
-            peel(target, (source.list_size,))
-        _demand(kind_of(source.value_type, msgtype=kind.msgtype), target.value_type)
+            element_type(target, (source.list_size,))
+        _demand(expr_type_of(source.value_type, msgtype=expr_type.msgtype), target.value_type)
     elif pt.is_struct(source) and pt.is_struct(target):
-        _demand_fields(kind, target)
-    elif not (is_number(source) and is_number(target) and _surely(kind, target)):
-        raise Unfit(_misfit(kind, target), hint=_remedy(source, target))
+        _demand_fields(expr_type, target)
+    elif not (is_number(source) and is_number(target) and _surely(expr_type, target)):
+        raise TypeMismatch(_misfit(expr_type, target), hint=_remedy(source, target))
 
 
-def _surely(kind: Kind, target: DataType) -> bool:
+def _surely(expr_type: ExprType, target: DataType) -> bool:
     if pt.is_integer(target):
-        return kind.bounds is not None and within(kind.bounds, int_bounds(target))
-    return float_of(kind).bit_width <= target.bit_width
+        return expr_type.bounds is not None and within(expr_type.bounds, int_bounds(target))
+    return exact_float(expr_type).bit_width <= target.bit_width
 
 
-def _misfit(kind: Kind, target: DataType) -> str:
-    if not (is_number(kind.type) and is_number(target)):
-        return f"{spell(kind)} for {spell(target)}"
-    if kind.bounds is None or kind.bounds == int_bounds(kind.type):
-        return f"{spell(kind)} may not fit {spell(target)}"
-    low, high = kind.bounds
+def _misfit(expr_type: ExprType, target: DataType) -> str:
+    if not (is_number(expr_type.arrow) and is_number(target)):
+        return f"{format_type(expr_type)} for {format_type(target)}"
+    if expr_type.bounds is None or expr_type.bounds == int_bounds(expr_type.arrow):
+        return f"{format_type(expr_type)} may not fit {format_type(target)}"
+    low, high = expr_type.bounds
     if low == high:
-        return f"{low} does not fit {spell(target)}"
-    return f"{spell(kind)} from {low} to {high} may not fit {spell(target)}"
+        return f"{low} does not fit {format_type(target)}"
+    return f"{format_type(expr_type)} from {low} to {high} may not fit {format_type(target)}"
 
 
 def _remedy(source: DataType, target: DataType) -> str | None:
@@ -114,25 +114,27 @@ def _remedy(source: DataType, target: DataType) -> str | None:
     return "name one of its fields" if pt.is_struct(source) else None
 
 
-def _demand_fields(kind: Kind, target: DataType) -> None:
-    if _special(kind.type, target) is not None:
+def _demand_fields(expr_type: ExprType, target: DataType) -> None:
+    if _special(expr_type.arrow, target) is not None:
         return
     there = {field.name for field in target}
-    extra = [field.name for field in kind.type if field.name not in there]
+    extra = [field.name for field in expr_type.arrow if field.name not in there]
     if extra:
-        raise Unfit(
-            f"{spell(kind)} has {', '.join(extra)}, which {spell(target)} has not",
+        raise TypeMismatch(
+            f"{format_type(expr_type)} has {', '.join(extra)}, which {format_type(target)} has not",
             hint="name what goes where: {of: …, fields: {…}}, or another adapter: {use: …, of: …}",
         )
     for field in target:
-        position = kind.type.get_field_index(field.name)
+        position = expr_type.arrow.get_field_index(field.name)
         if position >= 0:
-            _demand(kind_of(kind.type.field(position).type), field.type)
+            _demand(expr_type_of(expr_type.arrow.field(position).type), field.type)
         elif not field.nullable:
-            raise Unfit(f"{spell(kind)} has no {field.name}, which {spell(target)} requires")
+            raise TypeMismatch(
+                f"{format_type(expr_type)} has no {field.name}, which {format_type(target)} requires"
+            )
 
 
-def _special(source: DataType, target: DataType) -> Callable[[Refuse, Array], Array] | None:
+def _special(source: DataType, target: DataType) -> Callable[[RejectRows, Array], Array] | None:
     """Return the conversion of a header or time stamp."""
     if target == HEADER_TYPE and {field.name for field in source} >= {"stamp", "frame_id"}:
         return as_header
@@ -141,7 +143,7 @@ def _special(source: DataType, target: DataType) -> Callable[[Refuse, Array], Ar
     return None
 
 
-def convert(array: Array, target: DataType, refuse: Refuse) -> Array:
+def convert(array: Array, target: DataType, refuse: RejectRows) -> Array:
     """Return the column in exactly the target's type; what fits as it is, is not copied."""
     if array.type == target:
         return array
@@ -154,7 +156,7 @@ def convert(array: Array, target: DataType, refuse: Refuse) -> Array:
     return to_number(array, target, refuse)
 
 
-def _convert_list(array: Array, target: DataType, refuse: Refuse) -> Array:
+def _convert_list(array: Array, target: DataType, refuse: RejectRows) -> Array:
     elements, axis = open_list(array)
     if pt.is_fixed_size_list(target) and axis.size is None:
         size = target.list_size
@@ -167,7 +169,7 @@ def _convert_list(array: Array, target: DataType, refuse: Refuse) -> Array:
     values = convert(elements, target.value_type, _of_elements(axis, refuse))
     if pt.is_fixed_size_list(target):
         return fixed_list(values, target.list_size, axis.null, len(array), target)
-    return var_list(values, axis.offsets, axis.null, target)
+    return variable_list(values, axis.offsets, axis.null, target)
 
 
 def _stretched(elements: Array, axis: Axis, size: int) -> tuple[Array, Axis]:
@@ -182,7 +184,7 @@ def _stretched(elements: Array, axis: Axis, size: int) -> tuple[Array, Axis]:
     return taken, Axis(offsets, ~fits, size)
 
 
-def _of_elements(axis: Axis, refuse: Refuse) -> Refuse:
+def _of_elements(axis: Axis, refuse: RejectRows) -> RejectRows:
     """Return a way to reject rows by the elements of their lists."""
 
     def refuse_elements(bad: Mask, rule: str, says: Callable[[int], str]) -> None:
@@ -199,11 +201,11 @@ def _of_elements(axis: Axis, refuse: Refuse) -> Refuse:
     return refuse_elements
 
 
-def _convert_struct(array: Array, target: DataType, refuse: Refuse) -> Array:
+def _convert_struct(array: Array, target: DataType, refuse: RejectRows) -> Array:
     conversion = _special(array.type, target)
     if conversion is not None:
         return conversion(refuse, array)
-    absent = nulls(array)
+    absent = null_mask(array)
     children: list[Array] = []
     for field in target:
         position = array.type.get_field_index(field.name)
@@ -213,16 +215,16 @@ def _convert_struct(array: Array, target: DataType, refuse: Refuse) -> Array:
     return struct_of(children, target, absent, len(array))
 
 
-def _named(name: str, refuse: Refuse) -> Refuse:
+def _named(name: str, refuse: RejectRows) -> RejectRows:
     def refuse_named(bad: Mask, rule: str, says: Callable[[int], str]) -> None:
         refuse(bad, rule, lambda i: f"{name}: {says(i)}")
 
     return refuse_named
 
 
-def refuse_nulls(array: Array, parent_null: Mask | None, refuse: Refuse) -> Array:
+def refuse_nulls(array: Array, parent_null: Mask | None, refuse: RejectRows) -> Array:
     """Reject rows without a required value, unless what it belongs to is null as well."""
-    absent = nulls(array)
+    absent = null_mask(array)
     if absent is None:
         return array
     bad = absent if parent_null is None else absent & ~parent_null
@@ -249,21 +251,21 @@ def _zeros(type_: DataType, length: int) -> Array:
             _zeros(type_.value_type, length * type_.list_size), type_.list_size, None, length, type_
         )
     if pt.is_list(type_):
-        return var_list(_zeros(type_.value_type, 0), np.zeros(length + 1, np.int64), None, type_)
+        return variable_list(_zeros(type_.value_type, 0), np.zeros(length + 1, np.int64), None, type_)
     plain = "" if pt.is_string(type_) else b"" if pt.is_binary(type_) else 0
     return (
         arrays.array([plain] * length, type_) if type_ != arrays.bool_() else arrays.array([False] * length)
     )
 
 
-def to_number(array: Array, target: DataType, refuse: Refuse) -> Array:
+def to_number(array: Array, target: DataType, refuse: RejectRows) -> Array:
     """Return numbers in another type; a value outside it rejects its row."""
     if array.type == target:
         return array
     bad = _outside(array, target)
     if bad is not None and bad.any():
-        refuse(bad, "out-of-range", lambda i: f"{array[i].as_py()} does not fit {spell(target)}")
-        array = nullified(array, bad)
+        refuse(bad, "out-of-range", lambda i: f"{array[i].as_py()} does not fit {format_type(target)}")
+        array = set_null(array, bad)
     return pc.cast(array, target, safe=False)
 
 

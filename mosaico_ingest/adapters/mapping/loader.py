@@ -15,11 +15,12 @@ from pydantic import ValidationError
 
 from mosaico_ingest.adapters.adapter import Adapted, Envelope
 from mosaico_ingest.adapters.mapping.checker import Analyzer, Scope
-from mosaico_ingest.adapters.mapping.compiler import AdapterLookup, Compiler, Filled, fill
-from mosaico_ingest.adapters.mapping.evaluator import Evaluation, Refusal, RowsRefused
-from mosaico_ingest.adapters.mapping.model import InlineType, MappingFile, make_type
-from mosaico_ingest.adapters.mapping.typed import Typed
-from mosaico_ingest.adapters.mapping.types import Kind
+from mosaico_ingest.adapters.mapping.column_plan import ColumnPlan, evaluate_column
+from mosaico_ingest.adapters.mapping.compiler import AdapterLookup, Compiler
+from mosaico_ingest.adapters.mapping.evaluator import Evaluation, Rejection, RowsRejected
+from mosaico_ingest.adapters.mapping.expressions import TypedExpression
+from mosaico_ingest.adapters.mapping.model import InlineType, MappingFile, inline_ontology_type
+from mosaico_ingest.adapters.mapping.types import ExprType
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.findings import Finding, RowFailure, Severity
 from mosaico_ingest.ontology.registry import UnknownTag, ontology_type
@@ -30,7 +31,7 @@ from mosaico_ingest.textfile import read_whole
 if TYPE_CHECKING:
     from mosaico_ingest.job.yaml_source import Source
 
-__all__ = ["MappingAdapter", "MappingSpec", "known_adapter", "load_adapter"]
+__all__ = ["MappingAdapter", "MappingSpec", "adapter_from_model", "load_adapter"]
 
 _BINDING: ContextVar[tuple[tuple[str, str], ...]] = ContextVar("binding", default=())
 """The adapters being bound and the types they are bound to, to notice one that uses itself."""
@@ -45,19 +46,19 @@ class MappingAdapter(Struct, frozen=True):
     """A mapping bound to one message definition; satisfies `Adapter`."""
 
     ontology: OntologyType
-    record: Filled
-    metadata: dict[str, Typed]
+    record: ColumnPlan
+    metadata: dict[str, TypedExpression]
     msgtype: str
 
     def adapt(self, rows: pa.StructArray, envelope: Envelope) -> Adapted:
         """Adapt a whole batch; a row that does not fit is a failure, the others go on."""
         try:
-            adapted = fill(Evaluation(rows, envelope), self.record)
-        except RowsRefused as refused:
+            adapted = evaluate_column(Evaluation(rows, envelope), self.record)
+        except RowsRejected as refused:
             return self._adapt_others(rows, envelope, refused.refusals)
         return Adapted(adapted, np.arange(len(rows), dtype=np.int64), ())
 
-    def _adapt_others(self, rows: Any, envelope: Envelope, refusals: dict[int, Refusal]) -> Adapted:  # noqa: ANN401 - an Arrow array
+    def _adapt_others(self, rows: Any, envelope: Envelope, refusals: dict[int, Rejection]) -> Adapted:  # noqa: ANN401 - an Arrow array
         """Adapt the rows that were not refused; each round finds at least one of what is wrong with a batch."""
         good = np.ones(len(rows), bool)
         good[list(refusals)] = False
@@ -76,8 +77,11 @@ class MappingAdapter(Struct, frozen=True):
         row: Any = pa.array([first_row.as_py()], first_row.type)
         evaluation = Evaluation(row, Envelope("", self.msgtype, np.zeros(1, np.int64)))
         try:
-            return {key: evaluation.of(typed).closed(1)[0].as_py() for key, typed in self.metadata.items()}
-        except RowsRefused:
+            return {
+                key: evaluation.evaluate(typed).close_all(1)[0].as_py()
+                for key, typed in self.metadata.items()
+            }
+        except RowsRejected:
             return {}
 
 
@@ -86,7 +90,7 @@ class MappingSpec:
     """An adapter file that reads well; satisfies `AdapterSpec`, and survives pickling if its look-up does."""
 
     model: MappingFile
-    written: Source | Path
+    origin: Source | Path
     """Its text and the place of everything in it, or the file that has them."""
     ontology: OntologyType
     adapters: AdapterLookup | None = None
@@ -99,7 +103,7 @@ class MappingSpec:
     @property
     def source(self) -> Source:
         """Its text and the place of everything in it; read now where only its file is known."""
-        return _source(self.written) if isinstance(self.written, Path) else self.written
+        return _source(self.origin) if isinstance(self.origin, Path) else self.origin
 
     @property
     def name(self) -> str:
@@ -142,7 +146,7 @@ class MappingSpec:
 
     def __reduce__(self) -> tuple[type[MappingSpec], tuple[object, ...]]:
         """Leave what was compiled behind: it is quickly made anew, and large."""
-        return MappingSpec, (self.model, self.written, self.ontology, self.adapters)
+        return MappingSpec, (self.model, self.origin, self.ontology, self.adapters)
 
     def _compile(
         self, definition: Definition, shape: pa.StructType
@@ -170,7 +174,7 @@ class MappingSpec:
     ) -> tuple[MappingAdapter | None, tuple[Finding, ...]]:
         analyzer = Analyzer(lambda: self.source)
         compiler = Compiler(analyzer, definition, self.adapters)
-        scope = Scope(Kind(shape, msgtype=definition.root), definition.types)
+        scope = Scope(ExprType(shape, msgtype=definition.root), definition.types)
         record = compiler.record(self.model, self.ontology, scope, variant)
         metadata = compiler.metadata(self.model.schema_metadata, scope)
         if record is None:
@@ -197,7 +201,7 @@ def load_adapter(
     return spec
 
 
-def known_adapter(value: object, path: Path, *, adapters: AdapterLookup) -> MappingSpec:
+def adapter_from_model(value: object, path: Path, *, adapters: AdapterLookup) -> MappingSpec:
     """Return the adapter that `value`, read from the file at `path`, is known to be: what is in the file is not checked."""
     model = MappingFile.model_validate(value)
     return MappingSpec(model, path, ontology_type(str(model.ontology)), adapters)
@@ -243,7 +247,7 @@ def _read(source: Source, adapters: AdapterLookup | None) -> tuple[MappingSpec |
 
 def _ontology(model: MappingFile, analyzer: Analyzer) -> OntologyType | None:
     if isinstance(model.ontology, InlineType):
-        return make_type(model.ontology, analyzer.report)
+        return inline_ontology_type(model.ontology, analyzer.report)
     try:
         return ontology_type(model.ontology)
     except UnknownTag as unknown:

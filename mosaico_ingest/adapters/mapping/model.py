@@ -20,17 +20,17 @@ if TYPE_CHECKING:
     from mosaico_ingest.job.yaml_source import KeyPath
 
 __all__ = [
-    "Case",
+    "AdapterTest",
+    "FieldDeclaration",
     "FieldType",
-    "Form",
     "InlineType",
     "MappingFile",
-    "Recorded",
+    "RecordedMessage",
     "Scalar",
-    "TypedField",
     "Value",
+    "ValueForm",
     "adapter_schema",
-    "make_type",
+    "inline_ontology_type",
 ]
 
 
@@ -66,7 +66,7 @@ def _type_or_text(value: object) -> str:
     return "inline" if isinstance(value, (Mapping, BaseModel)) else "text"
 
 
-class Form(_Strict):
+class ValueForm(_Strict):
     """A value that needs more than an expression; one of `value`, `use` and `fields` says where it comes from."""
 
     value: Scalar = None
@@ -90,12 +90,12 @@ class Form(_Strict):
 
 
 Value: TypeAlias = Annotated[
-    Annotated[Scalar, Tag("scalar")] | Annotated[Form, Tag("form")], Discriminator(_form_or_scalar)
+    Annotated[Scalar, Tag("scalar")] | Annotated[ValueForm, Tag("form")], Discriminator(_form_or_scalar)
 ]
 """Text is an expression; numbers, `true`, `false` and `null` are themselves; a mapping is a `Form`."""
 
 
-class TypedField(_Strict):
+class FieldDeclaration(_Strict):
     """A field of an ontology type of one's own."""
 
     type: str | None = None
@@ -111,7 +111,7 @@ class TypedField(_Strict):
 
 
 FieldType: TypeAlias = Annotated[
-    Annotated[str, Tag("text")] | Annotated[TypedField, Tag("inline")], Discriminator(_type_or_text)
+    Annotated[str, Tag("text")] | Annotated[FieldDeclaration, Tag("inline")], Discriminator(_type_or_text)
 ]
 
 
@@ -126,7 +126,7 @@ class InlineType(_Strict):
     """Column → type."""
 
 
-class Recorded(_Strict):
+class RecordedMessage(_Strict):
     """A recorded message."""
 
     bag: str
@@ -137,7 +137,7 @@ class Recorded(_Strict):
     """Which of the topic's messages."""
 
 
-class Case(_Strict):
+class AdapterTest(_Strict):
     """What must come out of what."""
 
     name: str
@@ -183,7 +183,7 @@ class MappingFile(_Strict):
     """What the topic's metadata says, read from the first row."""
     definition: str | None = None
     """The `.msg` text of a type that no distro knows, so that the tests run without a recording."""
-    tests: Sequence[Case] = ()
+    tests: Sequence[AdapterTest] = ()
     """Messages and what must come out of them."""
 
     @property
@@ -223,7 +223,7 @@ Report: TypeAlias = "Callable[[KeyPath, str, str | None], None]"
 """Takes a mistake: the path of the value, what, what to do."""
 
 
-def make_type(inline: InlineType, report: Report) -> OntologyType:
+def inline_ontology_type(inline: InlineType, report: Report) -> OntologyType:
     """Return the ontology type; a field with a mistake is reported and left out."""
     path: KeyPath = ("ontology", "fields")
     if _ENVELOPE in inline.fields:
@@ -245,7 +245,7 @@ def _field(name: str, field: FieldType, path: KeyPath, report: Report) -> DataTy
     if not name.isidentifier():  # queries and SQL spell a path with dots
         report(path, f"a field cannot be called {name!r}", "use letters, digits and _")
         return None
-    typed = TypedField(type=field) if isinstance(field, str) else field
+    typed = FieldDeclaration(type=field) if isinstance(field, str) else field
     if typed.fields is not None and typed.type in {None, _LIST_OF_STRUCTS}:
         struct = pa.struct(_fields(typed.fields, (*path, "fields"), report))
         type_: DataType = struct if typed.type is None else arrays.list_(struct)

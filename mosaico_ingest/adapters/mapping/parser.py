@@ -12,17 +12,17 @@ from msgspec import Struct
 __all__ = [
     "Attribute",
     "Call",
-    "Choice",
-    "Each",
+    "EachElement",
     "ExpressionError",
     "ExpressionNode",
-    "Item",
-    "ListOf",
+    "ListLiteral",
     "Literal",
     "LiteralValue",
     "Name",
     "Node",
-    "Place",
+    "Subscript",
+    "Ternary",
+    "TextRange",
     "children",
     "parse",
 ]
@@ -31,20 +31,20 @@ MAX_CHARACTERS = 4000
 MAX_DEPTH = 60
 
 LiteralValue: TypeAlias = "bool | int | float | str | None"
-Place: TypeAlias = tuple[int, int]
+TextRange: TypeAlias = tuple[int, int]
 """First character and one past the last, within the expression's text."""
 
 
-_NOT_COMPARED = frozenset({"at", "name_at", "kind", "text", "function"})
+_NOT_COMPARED = frozenset({"span", "name_span", "type", "text", "function"})
 """Fields that locate a node or follow from its other fields."""
 
 
 class ExpressionError(Exception):
     """The text is not an expression of this language; `place` says which part, `help` what to write."""
 
-    def __init__(self, message: str, place: Place, hint: str | None = None) -> None:
+    def __init__(self, message: str, place: TextRange, hint: str | None = None) -> None:
         super().__init__(message)
-        self.place = place
+        self.span = place
         self.hint = hint
 
 
@@ -67,45 +67,45 @@ class Literal(ExpressionNode, frozen=True, eq=False):
     """A number, text, `true`, `false` or `null`."""
 
     value: LiteralValue
-    at: Place
+    span: TextRange
 
 
 class Name(ExpressionNode, frozen=True, eq=False):
     """A field or constant of the message."""
 
     name: str
-    at: Place
+    span: TextRange
 
 
 class Attribute(ExpressionNode, frozen=True, eq=False):
     """`of.name`."""
 
-    of: Node
+    base: Node
     name: str
-    at: Place
-    name_at: Place
+    span: TextRange
+    name_span: TextRange
 
 
-class Each(ExpressionNode, frozen=True, eq=False):
+class EachElement(ExpressionNode, frozen=True, eq=False):
     """`of[]`: every element of a list."""
 
-    of: Node
-    at: Place
+    base: Node
+    span: TextRange
 
 
-class Item(ExpressionNode, frozen=True, eq=False):
+class Subscript(ExpressionNode, frozen=True, eq=False):
     """`of[index]`."""
 
-    of: Node
+    base: Node
     index: int
-    at: Place
+    span: TextRange
 
 
-class ListOf(ExpressionNode, frozen=True, eq=False):
+class ListLiteral(ExpressionNode, frozen=True, eq=False):
     """`[a, b, c]`."""
 
     items: tuple[Node, ...]
-    at: Place
+    span: TextRange
 
 
 class Call(ExpressionNode, frozen=True, eq=False):
@@ -113,20 +113,20 @@ class Call(ExpressionNode, frozen=True, eq=False):
 
     name: str
     arguments: tuple[Node, ...]
-    at: Place
-    name_at: Place
+    span: TextRange
+    name_span: TextRange
 
 
-class Choice(ExpressionNode, frozen=True, eq=False):
+class Ternary(ExpressionNode, frozen=True, eq=False):
     """`then if condition else otherwise`."""
 
     condition: Node
     then: Node
     otherwise: Node
-    at: Place
+    span: TextRange
 
 
-Node: TypeAlias = "Literal | Name | Attribute | Each | Item | ListOf | Call | Choice"
+Node: TypeAlias = "Literal | Name | Attribute | EachElement | Subscript | ListLiteral | Call | Ternary"
 
 _WORDS: dict[str, LiteralValue] = {"null": None, "true": True, "false": False}
 _OPERATORS: dict[type[ast.AST], str] = {
@@ -161,7 +161,7 @@ def parse(text: str) -> Node:
         raise ExpressionError(
             f"the expression has {len(text)} characters; {MAX_CHARACTERS} are allowed", (0, 1)
         )
-    code, moved = _spell_each(text.replace("\n", " "))
+    code, moved = _rewrite_empty_brackets(text.replace("\n", " "))
     lead = len(code) - len(code.lstrip())
     code = code[lead:]
     if not code:
@@ -174,25 +174,25 @@ def parse(text: str) -> Node:
         raise _syntax_error(error, text, moved, lead) from None
     except (ValueError, MemoryError, RecursionError):
         raise ExpressionError("the expression cannot be read: it nests too deeply", (0, len(text))) from None
-    return _Reader(code, text, moved, lead).read(tree.body, 0)
+    return _Parser(code, text, moved, lead).parse(tree.body, 0)
 
 
 def children(node: Node) -> tuple[Node, ...]:
     """Return the nodes directly below."""
     match node:
-        case Attribute() | Each() | Item():
-            return (node.of,)
-        case ListOf():
+        case Attribute() | EachElement() | Subscript():
+            return (node.base,)
+        case ListLiteral():
             return node.items
         case Call():
             return node.arguments
-        case Choice():
+        case Ternary():
             return (node.condition, node.then, node.otherwise)
         case _:
             return ()
 
 
-def _spell_each(text: str) -> tuple[str, list[int]]:
+def _rewrite_empty_brackets(text: str) -> tuple[str, list[int]]:
     """Spell `a[]` as `a[:]`, which Python can read; return where characters were put in."""
     out: list[str] = []
     moved: list[int] = []
@@ -225,7 +225,7 @@ def _original(position: int, moved: list[int]) -> int:
     return position - sum(1 for put_in in moved if put_in < position)
 
 
-class _Reader:
+class _Parser:
     """Turns Python's tree into ours, refusing what the language does not have."""
 
     def __init__(self, code: str, text: str, moved: list[int], lead: int) -> None:
@@ -247,7 +247,7 @@ class _Reader:
             ast.Call: self._call,
         }
 
-    def read(self, node: ast.expr, depth: int) -> Node:
+    def parse(self, node: ast.expr, depth: int) -> Node:
         """Read one node and all below."""
         reader = self._readers.get(type(node))
         if reader is None:
@@ -260,7 +260,7 @@ class _Reader:
             raise ExpressionError(f"more than {MAX_DEPTH} levels of nesting", self._place(node))
         return reader(node, depth + 1)
 
-    def _place(self, node: ast.expr) -> Place:
+    def _place(self, node: ast.expr) -> TextRange:
         end = len(self._bytes) if node.end_col_offset is None else node.end_col_offset
         return (self._position(node.col_offset), self._position(end))
 
@@ -290,20 +290,20 @@ class _Reader:
 
     def _attribute(self, node: ast.Attribute, depth: int) -> Node:
         start, end = self._place(node)
-        return Attribute(self.read(node.value, depth), node.attr, (start, end), (end - len(node.attr), end))
+        return Attribute(self.parse(node.value, depth), node.attr, (start, end), (end - len(node.attr), end))
 
     def _subscript(self, node: ast.Subscript, depth: int) -> Node:
-        of = self.read(node.value, depth)
+        of = self.parse(node.value, depth)
         place = self._place(node)
         match node.slice:
             case ast.Slice(lower=None, upper=None, step=None):
-                return Each(of, place)
+                return EachElement(of, place)
             case ast.Constant(value=str() as name):
                 return Attribute(of, name, place, self._place(node.slice))
             case ast.Constant(value=int() as index) if not isinstance(index, bool):
-                return Item(of, index, place)
+                return Subscript(of, index, place)
             case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() as index)):
-                return Item(of, -index, place)
+                return Subscript(of, -index, place)
             case _:
                 raise ExpressionError(
                     "an index is a number",
@@ -312,11 +312,11 @@ class _Reader:
                 )
 
     def _list(self, node: ast.List, depth: int) -> Node:
-        return ListOf(tuple(self.read(item, depth) for item in node.elts), self._place(node))
+        return ListLiteral(tuple(self.parse(item, depth) for item in node.elts), self._place(node))
 
     def _unary(self, node: ast.UnaryOp, depth: int) -> Node:
         place = self._place(node)
-        operand = self.read(node.operand, depth)
+        operand = self.parse(node.operand, depth)
         if isinstance(node.op, ast.USub) and isinstance(operand, Literal):
             value = operand.value
             if isinstance(value, (int, float)) and not isinstance(value, bool):
@@ -325,14 +325,14 @@ class _Reader:
 
     def _binary(self, node: ast.BinOp, depth: int) -> Node:
         return self._operation(
-            node.op, (self.read(node.left, depth), self.read(node.right, depth)), self._place(node)
+            node.op, (self.parse(node.left, depth), self.parse(node.right, depth)), self._place(node)
         )
 
     def _logic(self, node: ast.BoolOp, depth: int) -> Node:
         place = self._place(node)
-        result = self.read(node.values[0], depth)
+        result = self.parse(node.values[0], depth)
         for value in node.values[1:]:
-            result = self._operation(node.op, (result, self.read(value, depth)), place)
+            result = self._operation(node.op, (result, self.parse(value, depth)), place)
         return result
 
     def _compare(self, node: ast.Compare, depth: int) -> Node:
@@ -343,10 +343,10 @@ class _Reader:
             if isinstance(operator, (ast.In, ast.NotIn)):
                 pair = self._member(operator, left, right, depth)
             else:
-                pair = self._operation(operator, (self.read(left, depth), self.read(right, depth)), place)
+                pair = self._operation(operator, (self.parse(left, depth), self.parse(right, depth)), place)
             result = pair if result is None else Call("and", (result, pair), place, place)
             left = right
-        return result or self.read(left, depth)
+        return result or self.parse(left, depth)
 
     def _member(self, operator: ast.cmpop, left: ast.expr, right: ast.expr, depth: int) -> Node:
         """`a in [b, c]` is `a == b or a == c`."""
@@ -354,14 +354,14 @@ class _Reader:
             hint = "as status in [1, 2]; any(a[] == b) looks into a list"
             raise ExpressionError("`in` needs a list of values", self._place(right), hint)
         place = (self._place(left)[0], self._place(right)[1])
-        value = self.read(left, depth)
-        pairs = [Call("==", (value, self.read(item, depth)), place, place) for item in right.elts]
+        value = self.parse(left, depth)
+        pairs = [Call("==", (value, self.parse(item, depth)), place, place) for item in right.elts]
         result = pairs[0]
         for pair in pairs[1:]:
             result = Call("or", (result, pair), place, place)
         return Call("not", (result,), place, place) if isinstance(operator, ast.NotIn) else result
 
-    def _operation(self, operator: ast.AST, arguments: tuple[Node, ...], place: Place) -> Node:
+    def _operation(self, operator: ast.AST, arguments: tuple[Node, ...], place: TextRange) -> Node:
         name = _OPERATORS.get(type(operator))
         if name is None:
             raise ExpressionError(
@@ -372,8 +372,8 @@ class _Reader:
         return Call(name, arguments, place, place)
 
     def _choice(self, node: ast.IfExp, depth: int) -> Node:
-        parts = (self.read(part, depth) for part in (node.test, node.body, node.orelse))
-        return Choice(*parts, at=self._place(node))
+        parts = (self.parse(part, depth) for part in (node.test, node.body, node.orelse))
+        return Ternary(*parts, span=self._place(node))
 
     def _call(self, node: ast.Call, depth: int) -> Node:
         place = self._place(node)
@@ -386,7 +386,7 @@ class _Reader:
                 "arguments are given by position", self._place(node.keywords[0].value), "drop the name"
             )
         name, at = node.func.id, self._place(node.func)
-        arguments = tuple(self.read(argument, depth) for argument in node.args)
+        arguments = tuple(self.parse(argument, depth) for argument in node.args)
         if name == "if_else" and len(arguments) == 3:  # noqa: PLR2004 - condition, then, otherwise
-            return Choice(*arguments, at=place)
+            return Ternary(*arguments, span=place)
         return Call(name, arguments, place, at)

@@ -13,23 +13,23 @@ from pydantic import ValidationError
 
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.mapping.columns import Array, DataType, pt
-from mosaico_ingest.adapters.mapping.functions.registry import nearest
+from mosaico_ingest.adapters.mapping.functions.registry import suggest
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
-from mosaico_ingest.adapters.mapping.model import Case, Recorded
+from mosaico_ingest.adapters.mapping.model import AdapterTest, RecordedMessage
 from mosaico_ingest.errors import BagError, IngestError
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, Resolver, normalize_msgtype
 
-__all__ = ["Outcome", "ReadRecorded", "message_row", "run_tests"]
+__all__ = ["CaseResult", "ReadRecorded", "message_row", "run_tests"]
 
-ReadRecorded: TypeAlias = Callable[[Recorded], "tuple[Definition, pa.StructArray]"]
+ReadRecorded: TypeAlias = Callable[[RecordedMessage], "tuple[Definition, pa.StructArray]"]
 """Reads one recorded message: its definition, and itself as one row in the ROS shape."""
 
 _RELATIVE, _ABSOLUTE = 1e-6, 1e-9
 """How far numbers may differ: float32 columns keep about seven digits."""
 
 
-class Outcome(Struct, frozen=True):
+class CaseResult(Struct, frozen=True):
     """The result of one test."""
 
     name: str
@@ -46,15 +46,15 @@ class Outcome(Struct, frozen=True):
 
 def run_tests(
     spec: MappingSpec, resolver: Resolver, *, recorded: ReadRecorded | None = None
-) -> tuple[Outcome, ...]:
+) -> tuple[CaseResult, ...]:
     """Run all tests of an adapter file; never raises for what is in it."""
-    outcomes: list[Outcome] = []
+    outcomes: list[CaseResult] = []
     for position, case in enumerate(spec.model.tests):
         try:
             problems = _run(spec, case, resolver, recorded)
         except IngestError as error:
             problems = [str(error)]
-        outcomes.append(Outcome(case.name, tuple(problems), spec.source.span(("tests", position)).line))
+        outcomes.append(CaseResult(case.name, tuple(problems), spec.source.span(("tests", position)).line))
     return tuple(outcomes)
 
 
@@ -64,14 +64,16 @@ def message_row(given: Mapping[str, Any], shape: DataType) -> tuple[dict[str, An
     return _filled(given, shape, "", problems), problems
 
 
-def _run(spec: MappingSpec, case: Case, resolver: Resolver, recorded: ReadRecorded | None) -> list[str]:
+def _run(
+    spec: MappingSpec, case: AdapterTest, resolver: Resolver, recorded: ReadRecorded | None
+) -> list[str]:
     if case.expect is None and case.rejects is None:
         return ["nothing is expected: give expect or rejects"]
     if {"bag", "topic"} <= case.given.keys():
         if recorded is None:
             return ["recorded messages cannot be read here"]
         try:
-            definition, rows = recorded(Recorded.model_validate(case.given))
+            definition, rows = recorded(RecordedMessage.model_validate(case.given))
         except ValidationError as error:
             return [f"given: {detail['loc'][-1]}: {detail['msg']}" for detail in error.errors()]
     else:
@@ -87,7 +89,7 @@ def _run(spec: MappingSpec, case: Case, resolver: Resolver, recorded: ReadRecord
     return _compare(spec, case, definition, rows)
 
 
-def _definition(spec: MappingSpec, case: Case, resolver: Resolver) -> Definition:
+def _definition(spec: MappingSpec, case: AdapterTest, resolver: Resolver) -> Definition:
     msgtype = normalize_msgtype(case.ros_type) if case.ros_type else spec.ros_types[0]
     text = spec.own_text(msgtype)
     embedded = Embedded("ros2msg", text) if text else None
@@ -101,7 +103,7 @@ def _definition(spec: MappingSpec, case: Case, resolver: Resolver) -> Definition
             raise BagError(unknown.what, where=unknown.where, hint=hint) from unknown
 
 
-def _compare(spec: MappingSpec, case: Case, definition: Definition, rows: Array) -> list[str]:
+def _compare(spec: MappingSpec, case: AdapterTest, definition: Definition, rows: Array) -> list[str]:
     adapter = spec.bind(definition, rows.type)
     adapted = adapter.adapt(rows, Envelope("", definition.root, np.zeros(len(rows), np.int64)))
     if adapted.failures:
@@ -120,7 +122,7 @@ def _filled(given: Mapping[str, Any], shape: DataType, path: str, problems: list
     names = [field.name for field in shape]
     for name in given:
         if name not in names:
-            near = nearest(str(name), names) or f"there are {', '.join(names)}"
+            near = suggest(str(name), names) or f"there are {', '.join(names)}"
             problems.append(f"given: there is no field {path}{name}; {near}")
     return {
         field.name: _value(given.get(field.name), field.type, f"{path}{field.name}", problems)
@@ -160,7 +162,7 @@ def _differences(expected: Any, got: Any, type_: DataType, path: str, problems: 
         names = [field.name for field in type_]
         for name, value in expected.items():
             if name not in names:
-                near = nearest(str(name), names) or f"there are {', '.join(names)}"
+                near = suggest(str(name), names) or f"there are {', '.join(names)}"
                 problems.append(
                     f"expect: there is no field {path.lstrip('.')}.{name}; {near}".replace(" .", " ")
                 )

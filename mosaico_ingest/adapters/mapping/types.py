@@ -10,17 +10,17 @@ from mosaico_ingest.adapters.mapping.columns import DataType, arrays, pt
 
 __all__ = [
     "INT64",
-    "Kind",
-    "Unfit",
-    "float_of",
+    "ExprType",
+    "TypeMismatch",
+    "common_type",
+    "exact_float",
+    "expr_type_of",
+    "format_type",
     "int_bounds",
     "is_list",
     "is_number",
-    "join",
-    "kind_of",
-    "listed",
+    "list_type",
     "narrowest_int",
-    "spell",
     "widest_float",
     "within",
 ]
@@ -32,7 +32,7 @@ _EXACT_INTEGERS = (2**11, 2**24, 2**53)
 """How far the integers are exact in each of the floats."""
 
 
-class Unfit(Exception):  # noqa: N818 - a condition of two types, turned into a finding by the checker
+class TypeMismatch(Exception):  # noqa: N818 - a condition of two types, turned into a finding by the checker
     """Types do not go together; `argument` is the position of the one to blame."""
 
     def __init__(self, message: str, *, argument: int | None = None, hint: str | None = None) -> None:
@@ -41,10 +41,10 @@ class Unfit(Exception):  # noqa: N818 - a condition of two types, turned into a 
         self.hint = hint
 
 
-class Kind(Struct, frozen=True):
+class ExprType(Struct, frozen=True):
     """The static type of an expression; of a computed float, `type` is the widest float field in it."""
 
-    type: DataType
+    arrow: DataType
     axes: tuple[int | None, ...] = ()
     """The lists that `[]` opened, outermost first; a number where the length is fixed."""
     bounds: Bounds | None = None
@@ -53,29 +53,29 @@ class Kind(Struct, frozen=True):
     """Where the type is a message, or lists of it: which."""
 
     @property
-    def element(self) -> Kind:
-        """The kind of one element, without the lists that were opened."""
+    def element(self) -> ExprType:
+        """The expr_type of one element, without the lists that were opened."""
         return replace(self, axes=())
 
-    def folded(self) -> Kind:
+    def close_innermost(self) -> ExprType:
         """Close the innermost list that was opened."""
-        inner = kind_of(listed(self.type, self.axes[-1]), msgtype=self.msgtype)
+        inner = expr_type_of(list_type(self.arrow, self.axes[-1]), msgtype=self.msgtype)
         return replace(inner, axes=self.axes[:-1])
 
-    def closed(self) -> Kind:
-        """Close all lists: the kind of the whole column."""
-        kind = self
-        while kind.axes:
-            kind = kind.folded()
-        return kind
+    def close_all(self) -> ExprType:
+        """Close all lists: the expr_type of the whole column."""
+        expr_type = self
+        while expr_type.axes:
+            expr_type = expr_type.close_innermost()
+        return expr_type
 
 
-def kind_of(type_: DataType, *, msgtype: str | None = None) -> Kind:
-    """Return the kind of a column of a type."""
-    return Kind(type_, bounds=int_bounds(type_), msgtype=msgtype)
+def expr_type_of(type_: DataType, *, msgtype: str | None = None) -> ExprType:
+    """Return the expr_type of a column of a type."""
+    return ExprType(type_, bounds=int_bounds(type_), msgtype=msgtype)
 
 
-def listed(type_: DataType, size: int | None) -> DataType:
+def list_type(type_: DataType, size: int | None) -> DataType:
     """Return the list type around a type."""
     return arrays.list_(type_) if size is None else arrays.list_(type_, size)
 
@@ -98,11 +98,11 @@ def is_number(type_: DataType) -> bool:
     return pt.is_integer(type_) or pt.is_floating(type_)
 
 
-def float_of(kind: Kind) -> DataType:
+def exact_float(expr_type: ExprType) -> DataType:
     """Return the narrowest float that holds every value of a number."""
-    if kind.bounds is None:
-        return kind.type
-    reach = max(abs(kind.bounds[0]), abs(kind.bounds[1]))
+    if expr_type.bounds is None:
+        return expr_type.arrow
+    reach = max(abs(expr_type.bounds[0]), abs(expr_type.bounds[1]))
     fitting = (float_ for float_, exact in zip(_FLOATS, _EXACT_INTEGERS, strict=True) if reach <= exact)
     return next(fitting, _FLOATS[-1])
 
@@ -112,45 +112,47 @@ def widest_float(*types: DataType) -> DataType:
     return max((t for t in types if pt.is_floating(t)), key=lambda t: t.bit_width, default=_FLOATS[0])
 
 
-def join(kinds: list[Kind]) -> Kind:
-    """Return the kind of a value that is one of several, lists around it ignored.
+def common_type(expr_types: list[ExprType]) -> ExprType:
+    """Return the expr_type of a value that is one of several, lists around it ignored.
 
     Raises:
         Unfit: They have nothing in common.
     """
-    first = next((kind for kind in kinds if not pt.is_null(kind.type)), kinds[0])
-    known = [kind for kind in kinds if not pt.is_null(kind.type)] or [first]
-    if all(is_number(kind.type) for kind in known):
+    first = next((expr_type for expr_type in expr_types if not pt.is_null(expr_type.arrow)), expr_types[0])
+    known = [expr_type for expr_type in expr_types if not pt.is_null(expr_type.arrow)] or [first]
+    if all(is_number(expr_type.arrow) for expr_type in known):
         return _join_numbers(known)
-    for position, kind in enumerate(kinds):
-        if not pt.is_null(kind.type) and kind.type != first.type:
-            raise Unfit(f"{spell(first)} and {spell(kind)} have no common type", argument=position)
+    for position, expr_type in enumerate(expr_types):
+        if not pt.is_null(expr_type.arrow) and expr_type.arrow != first.arrow:
+            raise TypeMismatch(
+                f"{format_type(first)} and {format_type(expr_type)} have no common type", argument=position
+            )
     return first.element
 
 
-def _join_numbers(kinds: list[Kind]) -> Kind:
-    bounds = [kind.bounds for kind in kinds if kind.bounds is not None]
-    if len(bounds) < len(kinds):
-        return Kind(widest_float(*(float_of(kind) for kind in kinds)))
+def _join_numbers(expr_types: list[ExprType]) -> ExprType:
+    bounds = [expr_type.bounds for expr_type in expr_types if expr_type.bounds is not None]
+    if len(bounds) < len(expr_types):
+        return ExprType(widest_float(*(exact_float(expr_type) for expr_type in expr_types)))
     low, high = min(low for low, _ in bounds), max(high for _, high in bounds)
     if high > INT64[1] and low < 0:
-        raise Unfit("uint64 and what may be negative have no common type", hint="cast one of them")
-    same = all(kind.type == kinds[0].type for kind in kinds)
+        raise TypeMismatch("uint64 and what may be negative have no common type", hint="cast one of them")
+    same = all(expr_type.arrow == expr_types[0].arrow for expr_type in expr_types)
     common = arrays.int64() if high <= INT64[1] else arrays.uint64()
-    return Kind(kinds[0].type if same else common, bounds=(low, high))
+    return ExprType(expr_types[0].arrow if same else common, bounds=(low, high))
 
 
-def spell(kind: Kind | DataType) -> str:
+def format_type(expr_type: ExprType | DataType) -> str:
     """Return a type in the words of the language, without the depths of a struct."""
-    if isinstance(kind, pa.DataType):
-        return _spell_type(kind)
-    closed = kind.closed()
+    if isinstance(expr_type, pa.DataType):
+        return _spell_type(expr_type)
+    closed = expr_type.close_all()
     if closed.msgtype is not None:
-        depth, type_ = 0, closed.type
+        depth, type_ = 0, closed.arrow
         while pt.is_list(type_) or pt.is_fixed_size_list(type_):
             depth, type_ = depth + 1, type_.value_type
         return f"{closed.msgtype}{'[]' * depth}"
-    return _spell_type(closed.type)
+    return _spell_type(closed.arrow)
 
 
 def _spell_type(type_: DataType) -> str:

@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from msgspec import Struct
 
-from mosaico_ingest.caching import remembered
+from mosaico_ingest.caching import cache_by_identity
 from mosaico_ingest.destinations.base import topic_schema
 from mosaico_ingest.destinations.store import files
 from mosaico_ingest.destinations.store.checksum import ContentHash, column_makers
@@ -91,7 +91,7 @@ class Columns:
         return _options(self.leaves, {leaf.parquet_path for leaf in packed})
 
 
-@remembered
+@cache_by_identity
 def columns_of(ontology: OntologyType) -> Columns:
     """Return the columns of a topic; see `Columns`."""
     return Columns(topic_schema(ontology))

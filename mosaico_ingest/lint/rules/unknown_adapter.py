@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from mosaico_ingest.adapters.adapter import UnmodeledSpec
-from mosaico_ingest.adapters.bridge import installed_adapters, what_was_meant
+from mosaico_ingest.adapters.bridge import installed_adapters, suggest_reference
 from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.job.validation import nearest
@@ -31,7 +31,7 @@ def check(job: Job) -> Iterator[Problem]:
         is_file = reference.endswith(".py")
         if is_file or not (loaded is None or reference in known or _installed(reference)):
             close = None if is_file else nearest(reference, known)
-            hint = f"did you mean {close}?" if close else what_was_meant(reference)
+            hint = f"did you mean {close}?" if close else suggest_reference(reference)
             yield Problem(f"no adapter is called {reference!r}", job.source.span(place), hint)
 
 

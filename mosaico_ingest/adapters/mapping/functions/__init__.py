@@ -4,10 +4,10 @@ Functions keep no state and must not depend on the adapter that calls them.
 """
 
 from mosaico_ingest.adapters.mapping.functions import (
-    clouds,
     lists,
     numeric,
     operators,
+    point_clouds,
     ros,
     text,
 )
@@ -46,5 +46,5 @@ __all__ = [
     "lookup",
 ]
 
-SUBJECTS = (operators, numeric, lists, text, ros, clouds)
+SUBJECTS = (operators, numeric, lists, text, ros, point_clouds)
 """Where the functions come from, in the order of the documentation."""

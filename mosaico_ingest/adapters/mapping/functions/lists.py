@@ -17,17 +17,17 @@ from mosaico_ingest.adapters.mapping.columns import (
 )
 from mosaico_ingest.adapters.mapping.functions.operators import computed, whole
 from mosaico_ingest.adapters.mapping.functions.registry import (
-    Refuse,
-    Take,
+    Parameter,
+    RejectRows,
     function,
     list_of,
 )
 from mosaico_ingest.adapters.mapping.types import (
     INT64,
-    Kind,
+    ExprType,
+    expr_type_of,
     int_bounds,
     is_number,
-    kind_of,
 )
 
 __all__ = ["BOOLEANS", "NUMBERS"]
@@ -39,15 +39,17 @@ _NEAR_OVERFLOW = 2.0**62
 """Below this a float sum of integers proves that the integer sum is exact."""
 
 
-def _count(_: Kind) -> Kind:
+def _count(_: ExprType) -> ExprType:
     return whole(0, _MOST_ELEMENTS)
 
 
-def _len_accepts(kind: Kind) -> bool:
-    return any(test(kind.type) for test in (pt.is_list, pt.is_fixed_size_list, pt.is_string, pt.is_binary))
+def _len_accepts(expr_type: ExprType) -> bool:
+    return any(
+        test(expr_type.arrow) for test in (pt.is_list, pt.is_fixed_size_list, pt.is_string, pt.is_binary)
+    )
 
 
-@function(Take("a list, text or bytes", _len_accepts), gives=_count)
+@function(Parameter("a list, text or bytes", _len_accepts), returns=_count)
 def len_(x: Array) -> Array:
     """Elements of a list, characters of text, bytes of binary."""
     if pt.is_string(x.type):
@@ -55,17 +57,17 @@ def len_(x: Array) -> Array:
     return pc.cast(pc.binary_length(x) if pt.is_binary(x.type) else pc.list_value_length(x), arrays.int64())
 
 
-def _element(kind: Kind) -> Kind:
-    return kind_of(kind.type.value_type) if not pt.is_null(kind.type) else kind
+def _element(expr_type: ExprType) -> ExprType:
+    return expr_type_of(expr_type.arrow.value_type) if not pt.is_null(expr_type.arrow) else expr_type
 
 
-def _mean_kind(kind: Kind) -> Kind:
-    return computed(_element(kind))
+def _mean_type(expr_type: ExprType) -> ExprType:
+    return computed(_element(expr_type))
 
 
-def _total(kind: Kind) -> Kind:
-    element = _element(kind)
-    return whole() if int_bounds(element.type) else computed(element)
+def _total(expr_type: ExprType) -> ExprType:
+    element = _element(expr_type)
+    return whole() if int_bounds(element.arrow) else computed(element)
 
 
 def _fold(values: NDArray[Any], axis: Axis, run: np.ufunc, empty: Any) -> NDArray[Any]:  # noqa: ANN401 - a number
@@ -98,8 +100,8 @@ def _plain(elements: Array) -> NDArray[Any]:
     return np.asarray(pc.fill_null(elements, 0)).astype(wide)
 
 
-@function(NUMBERS, gives=_total, name="sum")
-def sum_(refuse: Refuse, x: Array) -> Array:
+@function(NUMBERS, returns=_total, name="sum")
+def sum_(refuse: RejectRows, x: Array) -> Array:
     """Sum of the elements; 0 where there are none."""
     elements, axis = open_list(x)
     values = _plain(elements)
@@ -115,7 +117,7 @@ def sum_(refuse: Refuse, x: Array) -> Array:
     return arrays.array(total, mask=_absent(elements, axis))
 
 
-@function(NUMBERS, gives=_mean_kind)
+@function(NUMBERS, returns=_mean_type)
 def mean(x: Array) -> Array:
     """Mean of the elements; null where there are none."""
     elements, axis = open_list(x)
@@ -131,13 +133,13 @@ def _extreme(x: Array, run: np.ufunc) -> Array:
     return arrays.array(_fold(values, axis, run, 0), mask=mask)
 
 
-@function(NUMBERS, gives=_element)
+@function(NUMBERS, returns=_element)
 def least(x: Array) -> Array:
     """Smallest element; null where there are none."""
     return _extreme(x, np.minimum)
 
 
-@function(NUMBERS, gives=_element)
+@function(NUMBERS, returns=_element)
 def greatest(x: Array) -> Array:
     """Largest element; null where there are none."""
     return _extreme(x, np.maximum)
@@ -149,13 +151,13 @@ def _logic(x: Array, run: np.ufunc, empty: bool) -> Array:  # noqa: FBT001 - the
     return arrays.array(_fold(values, axis, run, empty), mask=_absent(elements, axis))
 
 
-@function(BOOLEANS, gives=arrays.bool_(), name="any")
+@function(BOOLEANS, returns=arrays.bool_(), name="any")
 def any_(x: Array) -> Array:
     """Whether an element is true: `any(covariance[] > 0)`; null where one is null."""
     return _logic(x, np.logical_or, empty=False)
 
 
-@function(BOOLEANS, gives=arrays.bool_(), name="all")
+@function(BOOLEANS, returns=arrays.bool_(), name="all")
 def all_(x: Array) -> Array:
     """Whether every element is true; null where one is null."""
     return _logic(x, np.logical_and, empty=True)

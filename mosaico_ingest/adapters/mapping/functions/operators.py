@@ -13,23 +13,23 @@ from mosaico_ingest.adapters.mapping.columns import (
     arrays,
     pc,
     pt,
-    true_where,
+    true_mask,
 )
 from mosaico_ingest.adapters.mapping.functions.registry import (
     ANY,
     BOOLEAN,
     FLOAT,
     NUMBER,
-    Refuse,
+    RejectRows,
     function,
-    nullified,
+    set_null,
 )
 from mosaico_ingest.adapters.mapping.types import (
     INT64,
-    Kind,
-    Unfit,
+    ExprType,
+    TypeMismatch,
+    format_type,
     is_number,
-    spell,
     widest_float,
 )
 
@@ -38,24 +38,24 @@ __all__ = ["comparable", "computed", "whole"]
 _MOST_BITS = 64
 
 
-def computed(*kinds: Kind) -> Kind:
-    """Return the kind of a float computed from numbers: as wide as the widest float field."""
-    return Kind(widest_float(*(kind.type for kind in kinds)))
+def computed(*expr_types: ExprType) -> ExprType:
+    """Return the expr_type of a float computed from numbers: as wide as the widest float field."""
+    return ExprType(widest_float(*(expr_type.arrow for expr_type in expr_types)))
 
 
-def whole(low: int = INT64[0], high: int = INT64[1]) -> Kind:
-    """Return the kind of an integer computed in 64 bits."""
-    return Kind(arrays.int64(), bounds=(max(low, INT64[0]), min(high, INT64[1])))
+def whole(low: int = INT64[0], high: int = INT64[1]) -> ExprType:
+    """Return the expr_type of an integer computed in 64 bits."""
+    return ExprType(arrays.int64(), bounds=(max(low, INT64[0]), min(high, INT64[1])))
 
 
-def _integers(kinds: tuple[Kind, ...]) -> bool:
-    return all(kind.bounds is not None or pt.is_null(kind.type) for kind in kinds)
+def _integers(expr_types: tuple[ExprType, ...]) -> bool:
+    return all(expr_type.bounds is not None or pt.is_null(expr_type.arrow) for expr_type in expr_types)
 
 
-def _spread(combine: Callable[[int, int], int]) -> Callable[[Kind, Kind], Kind]:
+def _spread(combine: Callable[[int, int], int]) -> Callable[[ExprType, ExprType], ExprType]:
     """Return the rule for an operator whose extremes are those of its operands' extremes."""
 
-    def gives(left: Kind, right: Kind) -> Kind:
+    def gives(left: ExprType, right: ExprType) -> ExprType:
         if not _integers((left, right)):
             return computed(left, right)
         ends = [combine(a, b) for a in left.bounds or (0, 0) for b in right.bounds or (0, 0)]
@@ -64,41 +64,45 @@ def _spread(combine: Callable[[int, int], int]) -> Callable[[Kind, Kind], Kind]:
     return gives
 
 
-def _sum_kind(left: Kind, right: Kind) -> Kind:
-    texts = [pt.is_string(kind.type) for kind in (left, right) if not pt.is_null(kind.type)]
+def _sum_type(left: ExprType, right: ExprType) -> ExprType:
+    texts = [pt.is_string(expr_type.arrow) for expr_type in (left, right) if not pt.is_null(expr_type.arrow)]
     if texts and all(texts):
-        return Kind(arrays.string())
-    for position, kind in enumerate((left, right)):
-        if not (is_number(kind.type) or pt.is_null(kind.type)):
-            hint = "text(x) makes a number text" if pt.is_string(kind.type) else None
-            what = f"+ takes two numbers or two texts, not {spell(left)} and {spell(right)}"
-            raise Unfit(what, argument=position, hint=hint)
+        return ExprType(arrays.string())
+    for position, expr_type in enumerate((left, right)):
+        if not (is_number(expr_type.arrow) or pt.is_null(expr_type.arrow)):
+            hint = "text(x) makes a number text" if pt.is_string(expr_type.arrow) else None
+            what = f"+ takes two numbers or two texts, not {format_type(left)} and {format_type(right)}"
+            raise TypeMismatch(what, argument=position, hint=hint)
     return _spread(operator.add)(left, right)
 
 
-def _ordered(left: Kind, right: Kind) -> Kind:
+def _ordered(left: ExprType, right: ExprType) -> ExprType:
     """Return bool, where two values can be compared."""
-    for position, kind in enumerate((left, right)):
-        if pt.is_null(kind.type):
-            raise Unfit("a comparison with null is always null", argument=position, hint="use is_null(x)")
-    if not (is_number(left.type) and is_number(right.type)) and left.type != right.type:
-        raise Unfit(f"{spell(left)} cannot be compared with {spell(right)}")
-    if pt.is_nested(left.type):
-        raise Unfit(f"{spell(left)} cannot be compared", argument=0, hint="compare its fields or elements")
-    return Kind(arrays.bool_())
+    for position, expr_type in enumerate((left, right)):
+        if pt.is_null(expr_type.arrow):
+            raise TypeMismatch(
+                "a comparison with null is always null", argument=position, hint="use is_null(x)"
+            )
+    if not (is_number(left.arrow) and is_number(right.arrow)) and left.arrow != right.arrow:
+        raise TypeMismatch(f"{format_type(left)} cannot be compared with {format_type(right)}")
+    if pt.is_nested(left.arrow):
+        raise TypeMismatch(
+            f"{format_type(left)} cannot be compared", argument=0, hint="compare its fields or elements"
+        )
+    return ExprType(arrays.bool_())
 
 
-def _to_int64(refuse: Refuse, values: Array) -> Array:
+def _to_int64(refuse: RejectRows, values: Array) -> Array:
     if values.type != arrays.uint64():
         return values if values.type == arrays.int64() else pc.cast(values, arrays.int64())
-    bad = true_where(pc.greater(values, arrays.scalar(INT64[1], arrays.uint64())))
+    bad = true_mask(pc.greater(values, arrays.scalar(INT64[1], arrays.uint64())))
     if bad.any():
         refuse(bad, "overflow", lambda i: f"{values[i]} has more than 63 bits")
-        values = nullified(values, bad)
+        values = set_null(values, bad)
     return pc.cast(values, arrays.int64())
 
 
-def numbers(refuse: Refuse, *values: Array) -> list[Array]:
+def numbers(refuse: RejectRows, *values: Array) -> list[Array]:
     """Return numbers ready to compute with: all int64, or all float64."""
     if all(pt.is_integer(v.type) for v in values):
         return [_to_int64(refuse, v) for v in values]
@@ -127,7 +131,7 @@ def _listed(values: Array, length: int) -> list[Any]:
 
 
 def _checked(
-    refuse: Refuse, sign: str, run: Callable[[Array, Array], Array], left: Array, right: Array
+    refuse: RejectRows, sign: str, run: Callable[[Array, Array], Array], left: Array, right: Array
 ) -> Array:
     """Run a checked integer operation; where it overflows, find the elements one by one."""
     try:
@@ -136,7 +140,7 @@ def _checked(
         pairs = list(zip(_listed(left, n := _length(left, right)), _listed(right, n), strict=True))
         bad = np.fromiter((_overflows(sign, a, b) for a, b in pairs), bool, n)
         refuse(bad, "overflow", lambda i: f"{pairs[i][0]} {sign} {pairs[i][1]} has more than 64 bits")
-        return run(nullified(left, bad), nullified(right, bad))
+        return run(set_null(left, bad), set_null(right, bad))
 
 
 _EXACT: dict[str, Callable[[int, int], int]] = {
@@ -155,15 +159,15 @@ def _overflows(sign: str, left: int | None, right: int | None) -> bool:
     return not INT64[0] <= _EXACT[sign](left, right) <= INT64[1]
 
 
-def _arithmetic(sign: str, name: str, refuse: Refuse, left: Array, right: Array) -> Array:
+def _arithmetic(sign: str, name: str, refuse: RejectRows, left: Array, right: Array) -> Array:
     left, right = numbers(refuse, left, right)
     if pt.is_integer(left.type):
         return _checked(refuse, sign, getattr(pc, f"{name}_checked"), left, right)
     return getattr(pc, name)(left, right)
 
 
-@function(ANY, ANY, gives=_sum_kind, name="+", scalars=True)
-def add(refuse: Refuse, left: Array, right: Array) -> Array:
+@function(ANY, ANY, returns=_sum_type, name="+", scalars=True)
+def add(refuse: RejectRows, left: Array, right: Array) -> Array:
     """Sum of numbers; texts joined."""
     if pt.is_string(left.type) or pt.is_string(right.type):
         both = (pc.cast(left, arrays.string()), pc.cast(right, arrays.string()))
@@ -171,49 +175,49 @@ def add(refuse: Refuse, left: Array, right: Array) -> Array:
     return _arithmetic("+", "add", refuse, left, right)
 
 
-@function(NUMBER, NUMBER, gives=_spread(operator.sub), name="-", scalars=True)
-def subtract(refuse: Refuse, left: Array, right: Array) -> Array:
+@function(NUMBER, NUMBER, returns=_spread(operator.sub), name="-", scalars=True)
+def subtract(refuse: RejectRows, left: Array, right: Array) -> Array:
     """Difference."""
     return _arithmetic("-", "subtract", refuse, left, right)
 
 
-@function(NUMBER, NUMBER, gives=_spread(operator.mul), name="*", scalars=True)
-def multiply(refuse: Refuse, left: Array, right: Array) -> Array:
+@function(NUMBER, NUMBER, returns=_spread(operator.mul), name="*", scalars=True)
+def multiply(refuse: RejectRows, left: Array, right: Array) -> Array:
     """Product."""
     return _arithmetic("*", "multiply", refuse, left, right)
 
 
-@function(FLOAT, FLOAT, gives=computed, name="/", scalars=True)
+@function(FLOAT, FLOAT, returns=computed, name="/", scalars=True)
 def divide(left: Array, right: Array) -> Array:
     """Quotient, always a float; by zero: inf or nan."""
     return pc.divide(left, right)
 
 
-def _floored(refuse: Refuse, sign: str, run: Any, left: Array, right: Array) -> Array:  # noqa: ANN401 - a numpy ufunc
+def _floored(refuse: RejectRows, sign: str, run: Any, left: Array, right: Array) -> Array:  # noqa: ANN401 - a numpy ufunc
     left, right = numbers(refuse, left, right)
     n = _length(left, right)
     if pt.is_integer(left.type):
-        zero = np.broadcast_to(true_where(pc.equal(right, 0)), n)
+        zero = np.broadcast_to(true_mask(pc.equal(right, 0)), n)
         lowest = pc.and_kleene(pc.equal(left, INT64[0]), pc.equal(right, -1))
-        bad = zero | (np.broadcast_to(true_where(lowest), n) & (sign == "//"))
+        bad = zero | (np.broadcast_to(true_mask(lowest), n) & (sign == "//"))
         if bad.any():
             pairs = _listed(left, n), _listed(right, n)
             refuse(bad, "division", lambda i: f"{pairs[0][i]} {sign} {pairs[1][i]} has no result")
-            right = nullified(right, bad)
+            right = set_null(right, bad)
     absent = np.broadcast_to(np.asarray(pc.or_(pc.is_null(left), pc.is_null(right))), n)
     with np.errstate(all="ignore"):
         values = run(np.asarray(pc.fill_null(left, 1)), np.asarray(pc.fill_null(right, 1)))
     return arrays.array(np.broadcast_to(values, n), mask=absent if absent.any() else None)
 
 
-def _remainder_kind(left: Kind, right: Kind) -> Kind:
+def _remainder_type(left: ExprType, right: ExprType) -> ExprType:
     if not _integers((left, right)):
         return computed(left, right)
     low, high = right.bounds or (0, 0)
     return whole(min(low + 1, 0), max(high - 1, 0))
 
 
-def _floor_kind(left: Kind, right: Kind) -> Kind:
+def _floor_type(left: ExprType, right: ExprType) -> ExprType:
     if not _integers((left, right)):
         return computed(left, right)
     reach = max(abs(end) for end in left.bounds or (0, 0))
@@ -221,25 +225,25 @@ def _floor_kind(left: Kind, right: Kind) -> Kind:
     return whole(0 if positive else -reach, reach)
 
 
-@function(NUMBER, NUMBER, gives=_floor_kind, name="//")
-def floor_divide(refuse: Refuse, left: Array, right: Array) -> Array:
+@function(NUMBER, NUMBER, returns=_floor_type, name="//")
+def floor_divide(refuse: RejectRows, left: Array, right: Array) -> Array:
     """Quotient rounded down."""
     return _floored(refuse, "//", np.floor_divide, left, right)
 
 
-@function(NUMBER, NUMBER, gives=_remainder_kind, name="%")
-def remainder(refuse: Refuse, left: Array, right: Array) -> Array:
+@function(NUMBER, NUMBER, returns=_remainder_type, name="%")
+def remainder(refuse: RejectRows, left: Array, right: Array) -> Array:
     """Remainder, with the sign of the divisor."""
     return _floored(refuse, "%", np.mod, left, right)
 
 
-def _power_kind(left: Kind, right: Kind) -> Kind:
+def _power_type(left: ExprType, right: ExprType) -> ExprType:
     natural = right.bounds is not None and right.bounds[0] >= 0
     return whole() if _integers((left, right)) and natural else computed(left, right)
 
 
-@function(NUMBER, NUMBER, gives=_power_kind, name="**", scalars=True)
-def power(refuse: Refuse, left: Array, right: Array) -> Array:
+@function(NUMBER, NUMBER, returns=_power_type, name="**", scalars=True)
+def power(refuse: RejectRows, left: Array, right: Array) -> Array:
     """Power; an integer where both are and the exponent cannot be negative."""
     natural = pt.is_unsigned_integer(right.type) or (
         isinstance(right, arrays.Int64Scalar) and right.is_valid and right.as_py() >= 0
@@ -250,23 +254,23 @@ def power(refuse: Refuse, left: Array, right: Array) -> Array:
     return pc.power(pc.cast(left, arrays.float64(), safe=False), pc.cast(right, arrays.float64(), safe=False))
 
 
-def _negative_kind(of: Kind) -> Kind:
+def _negative_type(of: ExprType) -> ExprType:
     return whole(-of.bounds[1], -of.bounds[0]) if of.bounds is not None else computed(of)
 
 
-@function(NUMBER, gives=_negative_kind)
-def negative(refuse: Refuse, x: Array) -> Array:
+@function(NUMBER, returns=_negative_type)
+def negative(refuse: RejectRows, x: Array) -> Array:
     """-x."""
     (x,) = numbers(refuse, x)
     zero = arrays.scalar(0, x.type)
     return _checked(refuse, "-", pc.subtract_checked, zero, x) if pt.is_integer(x.type) else pc.negate(x)
 
 
-def _same_kind(kind: Kind) -> Kind:
-    return kind
+def _same_type(expr_type: ExprType) -> ExprType:
+    return expr_type
 
 
-@function(NUMBER, gives=_same_kind)
+@function(NUMBER, returns=_same_type)
 def positive(x: Array) -> Array:
     """+x."""
     return x
@@ -277,7 +281,7 @@ def _add_comparison(sign: str, run: Callable[[Any, Any], Any]) -> None:
         """Compare."""
         return run(*comparable(left, right))
 
-    function(ANY, ANY, gives=_ordered, name=sign, scalars=True, sees_null=True)(compare)
+    function(ANY, ANY, returns=_ordered, name=sign, scalars=True, sees_null=True)(compare)
 
 
 for _sign, _run in (
@@ -291,19 +295,19 @@ for _sign, _run in (
     _add_comparison(_sign, _run)
 
 
-@function(BOOLEAN, BOOLEAN, gives=arrays.bool_(), name="and", sees_null=True)
+@function(BOOLEAN, BOOLEAN, returns=arrays.bool_(), name="and", sees_null=True)
 def and_(left: Array, right: Array) -> Array:
     """Both."""
     return pc.and_kleene(left, right)
 
 
-@function(BOOLEAN, BOOLEAN, gives=arrays.bool_(), name="or", sees_null=True)
+@function(BOOLEAN, BOOLEAN, returns=arrays.bool_(), name="or", sees_null=True)
 def or_(left: Array, right: Array) -> Array:
     """One or both."""
     return pc.or_kleene(left, right)
 
 
-@function(BOOLEAN, gives=arrays.bool_(), name="not")
+@function(BOOLEAN, returns=arrays.bool_(), name="not")
 def not_(x: Array) -> Array:
     """The opposite."""
     return pc.invert(x)

@@ -19,12 +19,12 @@ from mosaico_ingest.adapters.mapping.columns import (
     pt,
 )
 from mosaico_ingest.adapters.mapping.types import (
-    Kind,
-    Unfit,
+    ExprType,
+    TypeMismatch,
+    expr_type_of,
+    format_type,
     is_list,
     is_number,
-    kind_of,
-    spell,
 )
 from mosaico_ingest.errors import AdapterError
 
@@ -40,18 +40,18 @@ __all__ = [
     "TEXT",
     "TEXT_LITERAL",
     "Function",
-    "Gives",
-    "Refuse",
-    "Take",
+    "Parameter",
+    "RejectRows",
+    "ResultType",
     "function",
     "functions",
     "lookup",
-    "nearest",
-    "nullified",
+    "set_null",
+    "suggest",
 ]
 
 
-class Refuse(Protocol):
+class RejectRows(Protocol):
     """Rejects the rows of bad elements; returns only if none of them counts (its branch was not taken)."""
 
     def __call__(self, bad: Mask, rule: str, says: Callable[[int], str]) -> None:
@@ -59,33 +59,33 @@ class Refuse(Protocol):
         ...
 
 
-class Take(Struct, frozen=True):
+class Parameter(Struct, frozen=True):
     """What a parameter accepts, and how the argument is made ready for it."""
 
-    words: str
-    accepts: Callable[[Kind], bool]
+    description: str
+    accepts: Callable[[ExprType], bool]
     prepare: Callable[[Any], Any] | None = None
     literal: bool = False
     """The argument is written out in the expression, and handed over as a Python value."""
-    problem: Callable[[str], str | None] | None = None
+    check_literal: Callable[[str], str | None] | None = None
     """What is wrong with a text that is written out."""
 
-    def takes(self, kind: Kind) -> bool:
-        """Return whether an argument of a kind is accepted; null always is."""
-        return pt.is_null(kind.type) or self.accepts(kind)
+    def takes(self, expr_type: ExprType) -> bool:
+        """Return whether an argument of a expr_type is accepted; null always is."""
+        return pt.is_null(expr_type.arrow) or self.accepts(expr_type)
 
 
-Gives: TypeAlias = "Callable[..., Kind]"
+ResultType: TypeAlias = "Callable[..., ExprType]"
 
 
 class Function(Struct, frozen=True):
     """A function over whole columns: arguments are arrays of one length, or scalars where literal."""
 
     name: str
-    takes: tuple[Take, ...]
+    parameter_types: tuple[Parameter, ...]
     """The last one repeats where `variadic`."""
-    gives: Gives
-    """From the kinds of the arguments to the kind of the result; raises `Unfit`."""
+    result_type: ResultType
+    """From the expr_types of the arguments to the expr_type of the result; raises `Unfit`."""
     apply: Callable[..., Any]
     optional: int = 0
     """How many of the last parameters may be left out."""
@@ -106,17 +106,17 @@ class Function(Struct, frozen=True):
 
     def arity_problem(self, given: int) -> str | None:
         """Return what is wrong with a number of arguments."""
-        most = len(self.takes)
+        most = len(self.parameter_types)
         if given < most - self.optional or (given > most and not self.variadic):
             return f"{self.signature} takes {self._count()}, not {given}"
         return None
 
-    def take(self, position: int) -> Take:
+    def parameter(self, position: int) -> Parameter:
         """Return the parameter an argument goes to."""
-        return self.takes[min(position, len(self.takes) - 1)]
+        return self.parameter_types[min(position, len(self.parameter_types) - 1)]
 
     def _count(self) -> str:
-        most, least = len(self.takes), len(self.takes) - self.optional
+        most, least = len(self.parameter_types), len(self.parameter_types) - self.optional
         if self.variadic:
             return f"{least} arguments or more"
         words = str(most) if most == least else f"{least} to {most}"
@@ -127,8 +127,8 @@ _FUNCTIONS: dict[str, Function] = {}
 
 
 def function(
-    *takes: Take,
-    gives: Gives | DataType,
+    *takes: Parameter,
+    returns: ResultType | DataType,
     name: str | None = None,
     optional: int = 0,
     variadic: bool = False,
@@ -154,8 +154,8 @@ def function(
             raise AdapterError(f"there is already a function {spelled!r}", where=apply.__module__, hint=hint)
         _FUNCTIONS[spelled] = Function(
             name=spelled,
-            takes=takes,
-            gives=_constant(gives) if isinstance(gives, arrays.DataType) else gives,
+            parameter_types=takes,
+            result_type=_constant(returns) if isinstance(returns, arrays.DataType) else returns,
             apply=apply,
             optional=optional,
             variadic=variadic,
@@ -180,22 +180,22 @@ def lookup(name: str) -> Function | None:
     return _FUNCTIONS.get(name)
 
 
-def nearest(word: str, words: list[str]) -> str | None:
+def suggest(word: str, words: list[str]) -> str | None:
     """Return `did you mean …?` where one of the words is near."""
     close = get_close_matches(word, words, n=1)
     return f"did you mean {close[0]!r}?" if close else None
 
 
-def nullified(values: Any, bad: Mask) -> Any:  # noqa: ANN401 - an Arrow array or scalar
+def set_null(values: Any, bad: Mask) -> Any:  # noqa: ANN401 - an Arrow array or scalar
     """Return the values with those at `bad` null."""
     return pc.if_else(arrays.array(bad), arrays.scalar(None, values.type), values)
 
 
-def _constant(type_: DataType) -> Gives:
-    kind = kind_of(type_)
+def _constant(type_: DataType) -> ResultType:
+    expr_type = expr_type_of(type_)
 
-    def gives(*_: Kind) -> Kind:
-        return kind
+    def gives(*_: ExprType) -> ExprType:
+        return expr_type
 
     return gives
 
@@ -211,51 +211,56 @@ def _typed(type_: DataType) -> Callable[[Array], Array]:
     return prepare
 
 
-FLOAT = Take("a number", lambda kind: is_number(kind.type), _as_float)
-NUMBER = Take("a number", lambda kind: is_number(kind.type), _typed(arrays.int64()))
-INTEGER = Take("an integer", lambda kind: pt.is_integer(kind.type), _typed(arrays.int64()))
-BOOLEAN = Take("true or false", lambda kind: pt.is_boolean(kind.type), _typed(arrays.bool_()))
-TEXT = Take("text", lambda kind: pt.is_string(kind.type), _typed(arrays.string()))
-BINARY = Take("bytes", lambda kind: pt.is_binary(kind.type), _typed(arrays.binary()))
-LIST = Take("a list", lambda kind: is_list(kind.type))
-STRUCT = Take("a message", lambda kind: pt.is_struct(kind.type))
-ANY = Take("a value", lambda _: True)
-TEXT_LITERAL = Take("a text in quotes", lambda kind: pt.is_string(kind.type), literal=True)
+FLOAT = Parameter("a number", lambda expr_type: is_number(expr_type.arrow), _as_float)
+NUMBER = Parameter("a number", lambda expr_type: is_number(expr_type.arrow), _typed(arrays.int64()))
+INTEGER = Parameter("an integer", lambda expr_type: pt.is_integer(expr_type.arrow), _typed(arrays.int64()))
+BOOLEAN = Parameter("true or false", lambda expr_type: pt.is_boolean(expr_type.arrow), _typed(arrays.bool_()))
+TEXT = Parameter("text", lambda expr_type: pt.is_string(expr_type.arrow), _typed(arrays.string()))
+BINARY = Parameter("bytes", lambda expr_type: pt.is_binary(expr_type.arrow), _typed(arrays.binary()))
+LIST = Parameter("a list", lambda expr_type: is_list(expr_type.arrow))
+STRUCT = Parameter("a message", lambda expr_type: pt.is_struct(expr_type.arrow))
+ANY = Parameter("a value", lambda _: True)
+TEXT_LITERAL = Parameter("a text in quotes", lambda expr_type: pt.is_string(expr_type.arrow), literal=True)
 
 
-def struct_with(words: str, *choices: Mapping[str, Callable[[DataType], bool]]) -> Take:
+def struct_with(words: str, *choices: Mapping[str, Callable[[DataType], bool]]) -> Parameter:
     """Return a parameter for messages that have all the fields of one of the choices, of the right types."""
 
     def has(type_: DataType, name: str, fits: Callable[[DataType], bool]) -> bool:
         position = type_.get_field_index(name)
         return position >= 0 and fits(type_.field(position).type)
 
-    def accepts(kind: Kind) -> bool:
-        return pt.is_struct(kind.type) and any(
-            all(has(kind.type, name, fits) for name, fits in choice.items()) for choice in choices
+    def accepts(expr_type: ExprType) -> bool:
+        return pt.is_struct(expr_type.arrow) and any(
+            all(has(expr_type.arrow, name, fits) for name, fits in choice.items()) for choice in choices
         )
 
-    return Take(words, accepts)
+    return Parameter(words, accepts)
 
 
-def list_of(words: str, accepts: Callable[[DataType], bool]) -> Take:
+def list_of(words: str, accepts: Callable[[DataType], bool]) -> Parameter:
     """Return a parameter for lists whose elements are accepted."""
-    return Take(words, lambda kind: is_list(kind.type) and accepts(kind.type.value_type))
+    return Parameter(
+        words, lambda expr_type: is_list(expr_type.arrow) and accepts(expr_type.arrow.value_type)
+    )
 
 
-def check(called: Function, kinds: list[Kind]) -> Kind:
-    """Return the kind a call gives, for arguments without open lists; null where one is and that decides it.
+def check_call(called: Function, expr_types: list[ExprType]) -> ExprType:
+    """Return the expr_type a call gives, for arguments without open lists; null where one is and that decides it.
 
     Raises:
         Unfit: An argument is none that the function takes.
     """
-    for position, kind in enumerate(kinds):
-        take = called.take(position)
-        if not take.takes(kind):
-            raise Unfit(f"{called.name} takes {take.words} here, not {spell(kind)}", argument=position)
-    if not called.sees_null and any(pt.is_null(kind.type) for kind in kinds):
-        return Kind(arrays.null())
-    return called.gives(*kinds)
+    for position, expr_type in enumerate(expr_types):
+        take = called.parameter(position)
+        if not take.takes(expr_type):
+            raise TypeMismatch(
+                f"{called.name} takes {take.description} here, not {format_type(expr_type)}",
+                argument=position,
+            )
+    if not called.sees_null and any(pt.is_null(expr_type.arrow) for expr_type in expr_types):
+        return ExprType(arrays.null())
+    return called.result_type(*expr_types)
 
 
 def bad_where(array: Array, fits: Callable[[Any], bool]) -> Mask:

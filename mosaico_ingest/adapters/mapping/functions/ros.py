@@ -15,12 +15,12 @@ from mosaico_ingest.adapters.mapping.columns import (
     arrays,
     field_of,
     fixed_list,
-    nulls,
+    null_mask,
     open_list,
     pc,
     pt,
-    true_where,
-    var_list,
+    true_mask,
+    variable_list,
 )
 from mosaico_ingest.adapters.mapping.functions.lists import NUMBERS
 from mosaico_ingest.adapters.mapping.functions.operators import computed, numbers, whole
@@ -28,12 +28,12 @@ from mosaico_ingest.adapters.mapping.functions.registry import (
     FLOAT,
     INTEGER,
     TEXT,
-    Refuse,
+    RejectRows,
     function,
-    nullified,
+    set_null,
     struct_with,
 )
-from mosaico_ingest.adapters.mapping.types import Kind, is_number
+from mosaico_ingest.adapters.mapping.types import ExprType, is_number
 
 __all__ = [
     "HEADER",
@@ -68,26 +68,26 @@ def stamp_parts(t: Array) -> tuple[Array, Array]:
     return field_of(t, names[0]), field_of(t, names[1])
 
 
-def as_stamp(refuse: Refuse, t: Array) -> Array:
+def as_stamp(refuse: RejectRows, t: Array) -> Array:
     """Return `{sec, nanosec}` as the ontology's time; the fields are shared where their types agree."""
     sec, nanosec = stamp_parts(t)
-    over = true_where(pc.greater_equal(nanosec, SECOND_NS))
+    over = true_mask(pc.greater_equal(nanosec, SECOND_NS))
     if over.any():
         refuse(over, "nanosec", lambda i: f"nanosec is {nanosec[i]}; it must be below 1e9")
-        nanosec = nullified(nanosec, over)
+        nanosec = set_null(nanosec, over)
     children = [pc.cast(sec, arrays.int32()), pc.cast(nanosec, arrays.uint32())]
-    absent = nulls(t)
+    absent = null_mask(t)
     mask = None if absent is None else arrays.array(absent)
     return arrays.StructArray.from_arrays(children, fields=list(STAMP_TYPE), mask=mask)
 
 
-@function(STAMP, gives=STAMP_TYPE)
-def ros_time(refuse: Refuse, t: Array) -> Array:
+@function(STAMP, returns=STAMP_TYPE)
+def ros_time(refuse: RejectRows, t: Array) -> Array:
     """`{sec, nanosec}` as `{seconds, nanoseconds}`; nanosec of 1e9 or more rejects the row."""
     return as_stamp(refuse, t)
 
 
-@function(STAMP, gives=arrays.float64())
+@function(STAMP, returns=arrays.float64())
 def seconds(t: Array) -> Array:
     """A time or duration in s."""
     sec, nanosec = stamp_parts(t)
@@ -95,22 +95,22 @@ def seconds(t: Array) -> Array:
     return pc.add(pc.cast(sec, arrays.float64()), fraction)
 
 
-def _whole(_: Kind) -> Kind:
+def _whole(_: ExprType) -> ExprType:
     return whole()
 
 
-@function(STAMP, gives=_whole)
+@function(STAMP, returns=_whole)
 def nanoseconds(t: Array) -> Array:
     """A time or duration in ns."""
     sec, nanosec = (pc.cast(part, arrays.int64()) for part in stamp_parts(t))
     return pc.add(pc.multiply(sec, SECOND_NS), nanosec)
 
 
-@function(INTEGER, gives=STAMP_TYPE)
-def time_from_ns(refuse: Refuse, n: Array) -> Array:
+@function(INTEGER, returns=STAMP_TYPE)
+def time_from_ns(refuse: RejectRows, n: Array) -> Array:
     """Nanoseconds since the epoch as `{seconds, nanoseconds}`; more seconds than 32 bits hold reject the row."""
     (n,) = numbers(refuse, n)
-    absent = nulls(n)
+    absent = null_mask(n)
     total = np.asarray(pc.fill_null(n, 0))
     sec, nanosec = np.divmod(total, SECOND_NS)
     over = (sec < _INT32[0]) | (sec > _INT32[1])
@@ -149,7 +149,7 @@ def _quaternions(parts: tuple[NDArray[np.float64], ...], absent: NDArray[np.bool
     return arrays.StructArray.from_arrays(children, fields=list(QUATERNION_TYPE), mask=mask)
 
 
-@function(FLOAT, FLOAT, FLOAT, gives=QUATERNION_TYPE)
+@function(FLOAT, FLOAT, FLOAT, returns=QUATERNION_TYPE)
 def quaternion_from_rpy(roll: Array, pitch: Array, yaw: Array) -> Array:
     """Rotation about the fixed axes x, then y, then z."""
     absent, (r, p, y) = _halves(roll, pitch, yaw)
@@ -165,7 +165,7 @@ def quaternion_from_rpy(roll: Array, pitch: Array, yaw: Array) -> Array:
     )
 
 
-@function(FLOAT, gives=QUATERNION_TYPE)
+@function(FLOAT, returns=QUATERNION_TYPE)
 def quaternion_from_yaw(yaw: Array) -> Array:
     """Rotation in the plane, about z."""
     absent, (y,) = _halves(yaw)
@@ -173,7 +173,7 @@ def quaternion_from_yaw(yaw: Array) -> Array:
     return _quaternions((zero, zero, *_sin_cos(y)), absent)
 
 
-@function(_QUATERNION, gives=arrays.float64())
+@function(_QUATERNION, returns=arrays.float64())
 def yaw(q: Array) -> Array:
     """Heading of a quaternion: its angle about z."""
     x, y, z, w = (pc.cast(field_of(q, axis), arrays.float64()) for axis in _AXES)
@@ -188,17 +188,17 @@ HEADER_TYPE: DataType = arrays.struct(
 
 
 def _is_stamp(type_: DataType) -> bool:
-    return STAMP.accepts(Kind(type_))
+    return STAMP.accepts(ExprType(type_))
 
 
 HEADER = struct_with("a std_msgs/Header", {"stamp": _is_stamp, "frame_id": pt.is_string})
 _CODECS = {name: name for name in ("png", "jpeg", "jpg", "tiff", "h264", "hevc", "raw")} | {"h265": "hevc"}
 
 
-def as_header(refuse: Refuse, h: Array, *, collapse: bool = True) -> Array:
+def as_header(refuse: RejectRows, h: Array, *, collapse: bool = True) -> Array:
     """Return a `std_msgs/Header` as the ontology's; `collapse`: null where it says nothing."""
     stamp, frame = field_of(h, "stamp"), field_of(h, "frame_id")
-    absent = nulls(h)
+    absent = null_mask(h)
     if collapse:
         silent = _is_silent(stamp, frame)
         absent = silent if absent is None else absent | silent
@@ -211,24 +211,24 @@ def as_header(refuse: Refuse, h: Array, *, collapse: bool = True) -> Array:
 
 
 def _is_silent(stamp: Array, frame: Array) -> Mask:
-    unnamed = true_where(pc.equal(pc.binary_length(frame), 0), null=True)
+    unnamed = true_mask(pc.equal(pc.binary_length(frame), 0), null=True)
     if not unnamed.any():
         return unnamed
-    zero = [true_where(pc.equal(part, 0), null=True) for part in stamp_parts(stamp)]
+    zero = [true_mask(pc.equal(part, 0), null=True) for part in stamp_parts(stamp)]
     return unnamed & zero[0] & zero[1]
 
 
-@function(HEADER, gives=HEADER_TYPE)
-def ros_header(refuse: Refuse, h: Array) -> Array:
+@function(HEADER, returns=HEADER_TYPE)
+def ros_header(refuse: RejectRows, h: Array) -> Array:
     """A std_msgs/Header as the ontology's, ROS 1 `seq` as `sample_counter`; null where frame_id is empty and the stamp zero."""
     return as_header(refuse, h)
 
 
-def _same(kind: Kind) -> Kind:
-    return kind
+def _same(expr_type: ExprType) -> ExprType:
+    return expr_type
 
 
-@function(NUMBERS, gives=_same)
+@function(NUMBERS, returns=_same)
 def covariance(c: Array) -> Array:
     """The list, or null unless an element is > 0."""
     elements, axis = open_list(c)
@@ -239,7 +239,7 @@ def covariance(c: Array) -> Array:
         return c
     if axis.size is not None:
         return fixed_list(elements, axis.size, absent, len(c))
-    return var_list(elements, axis.offsets, absent)
+    return variable_list(elements, axis.offsets, absent)
 
 
 def _any_positive(elements: Array, axis: Axis) -> Mask:
@@ -247,7 +247,7 @@ def _any_positive(elements: Array, axis: Axis) -> Mask:
     rows = len(axis.offsets) - 1
     known = np.zeros(rows, bool)
     if axis.size is None or elements.null_count:
-        known[axis.parents[true_where(pc.greater(elements, 0))]] = True
+        known[axis.parents[true_mask(pc.greater(elements, 0))]] = True
         return known
     for column in np.asarray(elements).reshape(rows, axis.size).T:
         known |= column > 0
@@ -256,13 +256,13 @@ def _any_positive(elements: Array, axis: Axis) -> Mask:
     return known
 
 
-@function(FLOAT, gives=computed)
+@function(FLOAT, returns=computed)
 def variance(x: Array) -> Array:
     """x, or null unless it is > 0."""
     return pc.if_else(pc.greater(x, 0.0), x, arrays.scalar(None, arrays.float64()))
 
 
-@function(TEXT, gives=arrays.string())
+@function(TEXT, returns=arrays.string())
 def compressed_format(s: Array) -> Array:
     """What a CompressedImage's `format` says is inside: png jpeg jpg tiff h264 hevc; raw where it says nothing known."""
     texts = s.dictionary_encode() if not pt.is_null(s.type) else s

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from mosaico_ingest.adapters.mapping.columns import (
     Array,
     arrays,
-    nulls,
+    null_mask,
     open_list,
     pc,
     pt,
@@ -18,41 +18,43 @@ from mosaico_ingest.adapters.mapping.columns import (
 from mosaico_ingest.adapters.mapping.functions.registry import (
     TEXT,
     TEXT_LITERAL,
-    Refuse,
-    Take,
+    Parameter,
+    RejectRows,
     bad_where,
     function,
     list_of,
-    nullified,
+    set_null,
 )
-from mosaico_ingest.adapters.mapping.types import Kind, is_number
+from mosaico_ingest.adapters.mapping.types import ExprType, is_number
 
 __all__: list[str] = []
 
 
-def _is_spelled(kind: Kind) -> bool:
-    return is_number(kind.type) or pt.is_boolean(kind.type) or pt.is_string(kind.type)
+def _is_spelled(expr_type: ExprType) -> bool:
+    return is_number(expr_type.arrow) or pt.is_boolean(expr_type.arrow) or pt.is_string(expr_type.arrow)
 
 
 _OCTETS = list_of("bytes or a list of uint8", pt.is_uint8)
-_BYTES = Take(_OCTETS.words, lambda kind: pt.is_binary(kind.type) or _OCTETS.accepts(kind))
-_SPELLED = Take("a number, text, true or false", _is_spelled)
+_BYTES = Parameter(
+    _OCTETS.description, lambda expr_type: pt.is_binary(expr_type.arrow) or _OCTETS.accepts(expr_type)
+)
+_SPELLED = Parameter("a number, text, true or false", _is_spelled)
 _NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|nan)\s*")
 
 
-@function(TEXT, gives=arrays.string())
+@function(TEXT, returns=arrays.string())
 def lower(s: Array) -> Array:
     """Lower case."""
     return pc.utf8_lower(s)
 
 
-@function(TEXT, gives=arrays.string())
+@function(TEXT, returns=arrays.string())
 def upper(s: Array) -> Array:
     """Upper case."""
     return pc.utf8_upper(s)
 
 
-@function(TEXT, gives=arrays.string())
+@function(TEXT, returns=arrays.string())
 def strip(s: Array) -> Array:
     """Without white space at the ends."""
     return pc.utf8_trim_whitespace(s)
@@ -62,34 +64,34 @@ def _empty_problem(text: str) -> str | None:
     return None if text else "the text to look for is empty"
 
 
-_SOUGHT = replace(TEXT_LITERAL, words="a text in quotes, not empty,", problem=_empty_problem)
+_SOUGHT = replace(TEXT_LITERAL, description="a text in quotes, not empty,", check_literal=_empty_problem)
 
 
-@function(TEXT, _SOUGHT, TEXT_LITERAL, gives=arrays.string())
+@function(TEXT, _SOUGHT, TEXT_LITERAL, returns=arrays.string())
 def replace_(s: Array, old: str, new: str) -> Array:
     """Every occurrence replaced."""
     return pc.replace_substring(s, pattern=old, replacement=new)
 
 
-@function(TEXT, TEXT_LITERAL, gives=arrays.bool_())
+@function(TEXT, TEXT_LITERAL, returns=arrays.bool_())
 def starts_with(s: Array, start: str) -> Array:
     """Whether it begins so."""
     return pc.starts_with(s, pattern=start)
 
 
-@function(TEXT, TEXT_LITERAL, gives=arrays.bool_())
+@function(TEXT, TEXT_LITERAL, returns=arrays.bool_())
 def ends_with(s: Array, end: str) -> Array:
     """Whether it ends so."""
     return pc.ends_with(s, pattern=end)
 
 
-@function(TEXT, TEXT_LITERAL, gives=arrays.bool_())
+@function(TEXT, TEXT_LITERAL, returns=arrays.bool_())
 def contains(s: Array, part: str) -> Array:
     """Whether it occurs."""
     return pc.match_substring(s, pattern=part)
 
 
-@function(TEXT, _SOUGHT, gives=arrays.list_(arrays.string()))
+@function(TEXT, _SOUGHT, returns=arrays.list_(arrays.string()))
 def split(s: Array, separator: str) -> Array:
     """The parts between separators, a list of text."""
     return pc.split_pattern(s, pattern=separator)
@@ -109,40 +111,40 @@ def _pattern_problem(pattern: str) -> str | None:
     return None
 
 
-_PATTERN = replace(TEXT_LITERAL, words="a pattern in quotes", problem=_pattern_problem)
+_PATTERN = replace(TEXT_LITERAL, description="a pattern in quotes", check_literal=_pattern_problem)
 
 
-@function(TEXT, _PATTERN, gives=arrays.string())
+@function(TEXT, _PATTERN, returns=arrays.string())
 def extract(s: Array, pattern: str) -> Array:
     """What the pattern's first group matches, or all of it without one; null where it does not match."""
     return pc.struct_field(pc.extract_regex(s, pattern=_grouped(pattern)), [0])
 
 
-@function(_SPELLED, gives=arrays.string())
+@function(_SPELLED, returns=arrays.string())
 def text(x: Array) -> Array:
     """A number, true or false as text."""
     return pc.cast(x, arrays.string())
 
 
-@function(TEXT, gives=arrays.float64())
-def number(refuse: Refuse, s: Array) -> Array:
+@function(TEXT, returns=arrays.float64())
+def number(refuse: RejectRows, s: Array) -> Array:
     """Text as a number; text that is none rejects the row."""
     try:
         return pc.cast(pc.utf8_trim_whitespace(s), arrays.float64())
     except arrays.ArrowInvalid:
         bad = bad_where(s, lambda value: _NUMBER.fullmatch(value) is not None)
         refuse(bad, "number-syntax", lambda i: f"{s[i].as_py()!r} is no number")
-        return pc.cast(pc.utf8_trim_whitespace(nullified(s, bad)), arrays.float64())
+        return pc.cast(pc.utf8_trim_whitespace(set_null(s, bad)), arrays.float64())
 
 
-@function(_BYTES, gives=arrays.binary())
+@function(_BYTES, returns=arrays.binary())
 def bytes_(x: Array) -> Array:
     """A list of uint8, of fixed length or not, as bytes."""
     if pt.is_binary(x.type) or pt.is_null(x.type):
         return pc.cast(x, arrays.binary())
     octets, axis = open_list(x)
     data = arrays.py_buffer(np.ascontiguousarray(np.asarray(pc.fill_null(octets, 0))))
-    absent = nulls(x)
+    absent = null_mask(x)
     validity = None if absent is None else arrays.array(~absent).buffers()[1]
     offsets = arrays.py_buffer(axis.offsets.astype(np.int32))
     return arrays.Array.from_buffers(arrays.binary(), len(x), [validity, offsets, data])

@@ -17,22 +17,22 @@ from mosaico_ingest.adapters.mapping.columns import (
     arrays,
     field_of,
     fixed_list,
-    nulls,
+    null_mask,
     open_list,
     pc,
     pt,
     struct_of,
-    var_list,
+    variable_list,
 )
 from mosaico_ingest.adapters.mapping.types import is_list
 
 __all__ = [
     "CLOUD_FUNCTIONS",
-    "EACH",
+    "EACH_ELEMENT",
     "CloudField",
-    "Parts",
-    "Place",
-    "make_clouds",
+    "FieldPath",
+    "MessageBuilder",
+    "pack_clouds",
 ]
 
 CLOUD_FUNCTIONS: Mapping[str, tuple[str, int]] = {
@@ -54,7 +54,7 @@ class CloudField(Struct, frozen=True):
     """Lists, one element a point; null where the cloud has no such field."""
 
 
-def make_clouds(fields: Sequence[CloudField], rows: int) -> Array:
+def pack_clouds(fields: Sequence[CloudField], rows: int) -> Array:
     """Return what a cloud is made of, without its header, one a row."""
     opened = [(field, *open_list(field.values)) for field in fields]
     flat = [np.asarray(elements).astype(CLOUD_FUNCTIONS[field.function][0]) for field, elements, _ in opened]
@@ -118,9 +118,9 @@ _CLOUD = arrays.struct(
     ]
 )
 
-Place: TypeAlias = "tuple[str, ...]"
+FieldPath: TypeAlias = "tuple[str, ...]"
 """The names that lead to a field; `[]` stands for each element of a list."""
-EACH = "[]"
+EACH_ELEMENT = "[]"
 _ONTOLOGY_NAMES = {
     "stamp": "timestamp",
     "seq": "sample_counter",
@@ -130,7 +130,7 @@ _ONTOLOGY_NAMES = {
 """What the ontology calls the fields of a header and of a time."""
 
 
-class _Mark(Struct, frozen=True):
+class _Constraint(Struct, frozen=True):
     """A value that a field, or one element of its list, must have had in some rows; used where the field itself is not known."""
 
     index: int | None
@@ -144,76 +144,76 @@ class _Mark(Struct, frozen=True):
         return self.value[rows] if isinstance(self.value, np.ndarray) else self.value
 
 
-class Parts:
+class MessageBuilder:
     """The fields of a batch of messages, as they become known; what was put first stays, where it is not null."""
 
     def __init__(self, shape: DataType, rows: int) -> None:
         self._shape = shape
         self._rows = rows
-        self._values: dict[Place, Array] = {}
-        self._axes: dict[Place, Axis] = {}
-        self._marks: dict[Place, list[_Mark]] = defaultdict(list)
-        self.unknown: list[str] = []
+        self._values: dict[FieldPath, Array] = {}
+        self._axes: dict[FieldPath, Axis] = {}
+        self._marks: dict[FieldPath, list[_Constraint]] = defaultdict(list)
+        self.defaulted: list[str] = []
         """The fields that `build` had to make up, as `header.seq`."""
 
-    def put(self, place: Place, values: Array, axes: tuple[Axis, ...] = ()) -> None:
+    def assign(self, place: FieldPath, values: Array, axes: tuple[Axis, ...] = ()) -> None:
         """Say what a field is: one value a row, or one an element of the lists around it."""
         kind = self.type_at(place)
         if pt.is_struct(kind):
             self._put_fields(place, kind, values, axes)
         elif is_list(kind) and pt.is_struct(kind.value_type):
             elements, axis = open_list(values)
-            self.put((*place, EACH), elements, (*axes, axis))
+            self.assign((*place, EACH_ELEMENT), elements, (*axes, axis))
         else:
-            lists = [at for at, name in enumerate(place) if name == EACH]
+            lists = [at for at, name in enumerate(place) if name == EACH_ELEMENT]
             for at, axis in zip(lists, axes, strict=True):
                 self._axes.setdefault(place[:at], axis)
             known = self._values.get(place)
             self._values[place] = values if known is None else _either(known, values)
 
-    def mark(self, place: Place, index: int | None, where: Mask, value: Any) -> None:  # noqa: ANN401 - a field's value
+    def constrain(self, place: FieldPath, index: int | None, where: Mask, value: Any) -> None:  # noqa: ANN401 - a field's value
         """Say what a field, or an element of it, must have been in some rows, unless more is known of it."""
-        self._marks[place].append(_Mark(index, where, value))
+        self._marks[place].append(_Constraint(index, where, value))
 
-    def type_at(self, place: Place) -> DataType:
+    def type_at(self, place: FieldPath) -> DataType:
         """Return the type of a field of the message."""
         kind = self._shape
         for name in place:
-            kind = kind.value_type if name == EACH else kind.field(name).type
+            kind = kind.value_type if name == EACH_ELEMENT else kind.field(name).type
         return kind
 
     def build(self) -> Array:
         """Return the messages."""
-        self.unknown.clear()
+        self.defaulted.clear()
         return self._struct(self._shape, (), self._rows)
 
-    def _put_fields(self, place: Place, kind: DataType, values: Array, axes: tuple[Axis, ...]) -> None:
+    def _put_fields(self, place: FieldPath, kind: DataType, values: Array, axes: tuple[Axis, ...]) -> None:
         there = {field.name for field in values.type}
         for field in kind:
             own = field.name if field.name in there else _ONTOLOGY_NAMES.get(field.name)
             if own in there:
-                self.put((*place, field.name), field_of(values, str(own)), axes)
+                self.assign((*place, field.name), field_of(values, str(own)), axes)
 
-    def _struct(self, kind: DataType, place: Place, rows: int) -> Array:
+    def _struct(self, kind: DataType, place: FieldPath, rows: int) -> Array:
         children = [self._field(field.type, (*place, field.name), rows) for field in kind]
         return struct_of(children, kind, None, rows)
 
-    def _field(self, kind: DataType, place: Place, rows: int) -> Array:
+    def _field(self, kind: DataType, place: FieldPath, rows: int) -> Array:
         if pt.is_struct(kind):
             return self._struct(kind, place, rows)
         if place in self._axes:
             axis = self._axes[place]
-            elements = self._field(kind.value_type, (*place, EACH), int(axis.offsets[-1]))
-            plain = var_list(elements, axis.offsets, None, arrays.list_(kind.value_field))
+            elements = self._field(kind.value_type, (*place, EACH_ELEMENT), int(axis.offsets[-1]))
+            plain = variable_list(elements, axis.offsets, None, arrays.list_(kind.value_field))
             return _of_size(plain, kind) if pt.is_fixed_size_list(kind) else plain
         values = self._values.get(place)
         if values is None and place not in self._marks:
-            self.unknown.append(".".join(place).replace(f".{EACH}", EACH))
-        array = zeros(kind, rows) if values is None else filled(values, kind)
-        absent = np.ones(rows, bool) if values is None else nulls(values)
+            self.defaulted.append(".".join(place).replace(f".{EACH_ELEMENT}", EACH_ELEMENT))
+        array = zeros(kind, rows) if values is None else fill_nulls(values, kind)
+        absent = np.ones(rows, bool) if values is None else null_mask(values)
         return array if absent is None else self._marked(array, place, absent)
 
-    def _marked(self, array: Array, place: Place, absent: Mask) -> Array:
+    def _marked(self, array: Array, place: FieldPath, absent: Mask) -> Array:
         for mark in self._marks.get(place, ()):
             rows = np.flatnonzero(mark.where & absent)
             if not len(rows):
@@ -235,18 +235,18 @@ def zeros(kind: DataType, rows: int) -> Array:
     if pt.is_fixed_size_list(kind):
         return fixed_list(zeros(kind.value_type, rows * kind.list_size), kind.list_size, None, rows, kind)
     if pt.is_list(kind):
-        return var_list(zeros(kind.value_type, 0), np.zeros(rows + 1, np.int64), None, kind)
+        return variable_list(zeros(kind.value_type, 0), np.zeros(rows + 1, np.int64), None, kind)
     return arrays.repeat(_zero(kind), rows)
 
 
-def filled(values: Array, kind: DataType) -> Array:
+def fill_nulls(values: Array, kind: DataType) -> Array:
     """Return values in a field's type, the field's zero where there is none."""
     if pt.is_null(values.type):
         return zeros(kind, len(values))
     if is_list(kind):
         elements, axis = open_list(values)
-        plain = var_list(
-            filled(elements, kind.value_type), axis.offsets, None, arrays.list_(kind.value_field)
+        plain = variable_list(
+            fill_nulls(elements, kind.value_type), axis.offsets, None, arrays.list_(kind.value_field)
         )
         return _of_size(plain, kind) if pt.is_fixed_size_list(kind) else plain
     if values.type != kind:
@@ -276,7 +276,7 @@ def _of_size(array: Array, kind: DataType) -> Array:
         positions = (axis.offsets[:-1, None] + np.arange(size)).ravel()
         absent = np.repeat(~good, size)
         taken = elements.take(arrays.array(np.where(absent, 0, positions), mask=absent))
-        elements = filled(taken, kind.value_type) if not pt.is_struct(kind.value_type) else taken
+        elements = fill_nulls(taken, kind.value_type) if not pt.is_struct(kind.value_type) else taken
     return fixed_list(elements, size, None, len(array), kind)
 
 

@@ -14,14 +14,14 @@ from mosaico_ingest.adapters.mapping.columns import (
     DataType,
     arrays,
     field_of,
-    nulls,
+    null_mask,
     open_list,
     pt,
-    var_list,
+    variable_list,
 )
 from mosaico_ingest.adapters.mapping.functions.registry import (
     TEXT_LITERAL,
-    Refuse,
+    RejectRows,
     function,
     struct_with,
 )
@@ -61,8 +61,8 @@ class _Clouds:
         entries, axis = open_list(field_of(cloud, "fields"))
         self.first, self.entry_counts = axis.offsets[:-1], axis.lengths
         self.names = field_of(entries, "name").to_pylist()
-        kinds = (_plain(field_of(entries, name)) for name in ("offset", "datatype", "count"))
-        self.offsets, self.datatypes, self.counts = kinds
+        expr_types = (_plain(field_of(entries, name)) for name in ("offset", "datatype", "count"))
+        self.offsets, self.datatypes, self.counts = expr_types
 
     def alike(self) -> bool:
         """Whether all rows are laid out like the first, without padding, so that their bytes are one block."""
@@ -131,7 +131,7 @@ def _cast_to(dtype: np.dtype[Any]) -> Convert:
 
     def convert(values: Numbers) -> Numbers:
         if dtype.kind == "f":
-            with np.errstate(over="ignore"):
+            with np.errstate(over="ignore", invalid="ignore"):  # signalling NaNs stay NaN
                 return values.astype(dtype)
         limits = np.iinfo(dtype)
         fits = (values >= limits.min) & (values <= limits.max) & (values == np.trunc(values))
@@ -150,7 +150,7 @@ def _bits(values: Numbers) -> Numbers:
     return words.astype(np.uint32).view(np.float32)
 
 
-def _columns(refuse: Refuse, cloud: Array, name: str, dtype: np.dtype[Any], convert: Convert) -> Array:
+def _columns(refuse: RejectRows, cloud: Array, name: str, dtype: np.dtype[Any], convert: Convert) -> Array:
     clouds = _Clouds(cloud)
     lengths = np.zeros(len(cloud), np.int64)
     absent = np.zeros(len(cloud), bool)
@@ -164,7 +164,7 @@ def _columns(refuse: Refuse, cloud: Array, name: str, dtype: np.dtype[Any], conv
             if place is not None:
                 values = convert(_read(clouds.block(), place))
                 offsets = np.append(0, np.cumsum(clouds.heights * clouds.widths))
-                return var_list(arrays.array(values), offsets, nulls(cloud))
+                return variable_list(arrays.array(values), offsets, null_mask(cloud))
     for row in range(len(cloud)):
         try:
             place = clouds.place(row, name)
@@ -180,44 +180,44 @@ def _columns(refuse: Refuse, cloud: Array, name: str, dtype: np.dtype[Any], conv
         absent |= bad
         refuse(bad, "point-cloud", lambda row: misfits[row])
     flat = np.concatenate(parts) if parts else np.empty(0, dtype)
-    missing = nulls(cloud)
+    missing = null_mask(cloud)
     absent = absent if missing is None else absent | missing
-    return var_list(arrays.array(flat.astype(dtype)), np.append(0, np.cumsum(lengths)), absent)
+    return variable_list(arrays.array(flat.astype(dtype)), np.append(0, np.cumsum(lengths)), absent)
 
 
 def _list_of(dtype: np.dtype[Any]) -> DataType:
     return arrays.list_(arrays.from_numpy_dtype(dtype))
 
 
-@function(_CLOUD, TEXT_LITERAL, gives=_list_of(np.dtype(np.float32)))
-def points_float32(refuse: Refuse, cloud: Array, field: str) -> Array:
+@function(_CLOUD, TEXT_LITERAL, returns=_list_of(np.dtype(np.float32)))
+def points_float32(refuse: RejectRows, cloud: Array, field: str) -> Array:
     """A field of every point of a PointCloud2 as float32; null where the cloud has no such field."""
     dtype = np.dtype(np.float32)
     return _columns(refuse, cloud, field, dtype, _cast_to(dtype))
 
 
-@function(_CLOUD, TEXT_LITERAL, gives=_list_of(np.dtype(np.float64)))
-def points_float64(refuse: Refuse, cloud: Array, field: str) -> Array:
+@function(_CLOUD, TEXT_LITERAL, returns=_list_of(np.dtype(np.float64)))
+def points_float64(refuse: RejectRows, cloud: Array, field: str) -> Array:
     """The same as float64."""
     dtype = np.dtype(np.float64)
     return _columns(refuse, cloud, field, dtype, _cast_to(dtype))
 
 
-@function(_CLOUD, TEXT_LITERAL, gives=_list_of(np.dtype(np.uint8)))
-def points_uint8(refuse: Refuse, cloud: Array, field: str) -> Array:
+@function(_CLOUD, TEXT_LITERAL, returns=_list_of(np.dtype(np.uint8)))
+def points_uint8(refuse: RejectRows, cloud: Array, field: str) -> Array:
     """The same as uint8; a value that is none rejects the row."""
     dtype = np.dtype(np.uint8)
     return _columns(refuse, cloud, field, dtype, _cast_to(dtype))
 
 
-@function(_CLOUD, TEXT_LITERAL, gives=_list_of(np.dtype(np.uint16)))
-def points_uint16(refuse: Refuse, cloud: Array, field: str) -> Array:
+@function(_CLOUD, TEXT_LITERAL, returns=_list_of(np.dtype(np.uint16)))
+def points_uint16(refuse: RejectRows, cloud: Array, field: str) -> Array:
     """The same as uint16; a value that is none rejects the row."""
     dtype = np.dtype(np.uint16)
     return _columns(refuse, cloud, field, dtype, _cast_to(dtype))
 
 
-@function(_CLOUD, TEXT_LITERAL, gives=_list_of(np.dtype(np.float32)))
-def points_packed(refuse: Refuse, cloud: Array, field: str) -> Array:
+@function(_CLOUD, TEXT_LITERAL, returns=_list_of(np.dtype(np.float32)))
+def points_packed(refuse: RejectRows, cloud: Array, field: str) -> Array:
     """A packed colour of every point: its four bytes as float32, the way PCL stores rgb, also where it says uint32."""
     return _columns(refuse, cloud, field, np.dtype(np.float32), _bits)

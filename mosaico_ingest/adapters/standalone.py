@@ -26,7 +26,7 @@ from mosaico_ingest.rosbag.definitions.registry import CustomMessages, TypeResol
 
 __all__ = [
     "CatalogAdapter",
-    "KnownTypes",
+    "DefinitionFinder",
     "adapt_dict",
     "adapter_class",
     "mapping_of",
@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 
-class KnownTypes:
+class DefinitionFinder:
     """Finds definitions by type alone; satisfies `Resolver`."""
 
     def __init__(self, distro: Stores | str | None = None, custom: Iterable[CustomMessages] = ()) -> None:
