@@ -1,8 +1,10 @@
-"""The examples for job arrays do what they say: their shell lines are run, and the shards together are the whole."""
+"""The examples in configs/scale: their commands run, and every file, image and volume that they name exists."""
 
 from __future__ import annotations
 
 import os
+import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -16,61 +18,151 @@ import yaml
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.report.model import RunReport
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
 ROOT = Path(__file__).resolve().parents[2]
 SCALE = ROOT / "configs" / "scale"
 SHARDS = 2
+RECORDINGS = ("a", "b", "c")
 
 Call = tuple[list[str], dict[str, str]]
-"""A command, and the environment it is called in."""
+"""A command and its environment variables."""
 
 
-def read(name: str) -> dict[Any, Any]:
-    return yaml.safe_load((SCALE / name).read_text())
+def documents(name: str) -> list[dict[Any, Any]]:
+    return list(yaml.safe_load_all((SCALE / name).read_text()))
 
 
-def slurm(shard: int) -> Call:
-    numbers = {"SLURM_ARRAY_TASK_ID": str(shard + 1), "SLURM_ARRAY_TASK_COUNT": str(SHARDS)}
-    return ["/bin/sh", str(SCALE / "slurm.sbatch"), "job.yaml"], numbers
+def kubernetes_job() -> dict[Any, Any]:
+    return next(one for one in documents("kubernetes-job.yaml") if one["kind"] == "Job")["spec"]
 
 
-def kubernetes(shard: int) -> Call:
-    container = read("kubernetes-job.yaml")["spec"]["template"]["spec"]["containers"][0]
-    numbers = {"JOB_COMPLETION_INDEX": str(shard), "SHARDS": str(SHARDS)}
-    return [*container["command"], *container["args"]], numbers
+def container() -> dict[Any, Any]:
+    return kubernetes_job()["template"]["spec"]["containers"][0]
 
 
-def matrix(shard: int) -> Call:
-    steps = read("github-matrix.yaml")["jobs"]["ingest"]["steps"]
-    command = next(step["run"] for step in steps if "ingest run" in step.get("run", ""))
-    return ["/bin/sh", "-c", command], {"SHARD": str(shard + 1), "SHARDS": str(SHARDS)}
+def workflow_job() -> dict[Any, Any]:
+    return documents("github-matrix.yaml")[0]["jobs"]["ingest"]
+
+
+def slurm(project: Path, shard: int) -> Call:
+    variables = {"SLURM_ARRAY_TASK_ID": str(shard + 1), "SLURM_ARRAY_TASK_COUNT": str(SHARDS)}
+    return ["/bin/sh", str(project / "configs/scale/slurm.sbatch")], variables
+
+
+def kubernetes(project: Path, shard: int) -> Call:
+    variables = {
+        "JOB_COMPLETION_INDEX": str(shard),
+        "SHARDS": str(SHARDS),
+        "JOB": str(project / "configs/scale/job.yaml"),
+        "STORE": str(project / "store"),
+    }
+    return [*container()["command"], *container()["args"]], variables
+
+
+def workflow(project: Path, shard: int) -> Call:
+    command = next(step["run"] for step in workflow_job()["steps"] if "ingest run" in step.get("run", ""))
+    variables = {"SHARD": str(shard + 1), "SHARDS": str(SHARDS), "STORE": str(project / f"store-{shard}")}
+    return ["/bin/sh", "-c", command], variables
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """A checkout with three recordings in the folder `recordings`."""
+    shutil.copytree(ROOT / "configs", tmp_path / "configs")
+    (tmp_path / "recordings").mkdir()
+    for name in RECORDINGS:
+        shutil.copy(ROOT / "configs/quickstart/drive.mcap", tmp_path / "recordings" / f"{name}.mcap")
+    return tmp_path
+
+
+def environment(project: Path) -> dict[str, str]:
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    return {**os.environ, "PATH": path, "RECORDINGS": str(project / "recordings")}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("example", [slurm, kubernetes, matrix], ids=lambda example: example.__name__)
-def test_the_shards_together_are_the_whole(example: Callable[[int], Call], tmp_path: Path) -> None:
-    for name in "abc":
-        shutil.copy(ROOT / "configs" / "quickstart" / "drive.mcap", tmp_path / f"{name}.mcap")
-    (tmp_path / "job.yaml").write_text('bag: {path: "*.mcap"}\ntopics: [/imu]\ntarget: {store: store}\n')
-    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+@pytest.mark.parametrize("example", [slurm, kubernetes, workflow], ids=lambda example: str(example.__name__))
+def test_job_array_example_ingests_every_recording_once(
+    example: Callable[[Path, int], Call], project: Path
+) -> None:
     for shard in range(SHARDS):
-        command, numbers = example(shard)
-        environment = {**os.environ, "PATH": path, **numbers}
-        subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True, timeout=60)  # noqa: S603 - our own example
-    reports = [RunReport.model_validate_json(one.read_text()) for one in tmp_path.glob("run-*.json")]
-    assert sorted(one.sequence for report in reports for one in report.recordings) == list("abc")
-    assert Store.open(tmp_path / "store").names() == tuple("abc")
+        command, variables = example(project, shard)
+        subprocess.run(  # noqa: S603 - our own example
+            command,
+            cwd=project,
+            env={**environment(project), **variables},
+            check=True,
+            capture_output=True,
+            timeout=60,
+        )
+    reports = [RunReport.model_validate_json(path.read_text()) for path in project.glob("run-*.json")]
+    assert sorted(one.sequence for report in reports for one in report.recordings) == list(RECORDINGS)
+    stores = sorted(project.glob("store-*"))
+    assert len(stores) == SHARDS
+    assert sorted(name for store in stores for name in Store.open(store).names()) == list(RECORDINGS)
 
 
-def test_the_array_of_slurm_and_the_job_of_kubernetes_count_alike() -> None:
-    job = read("kubernetes-job.yaml")["spec"]
-    container = job["template"]["spec"]["containers"][0]
+@pytest.mark.slow
+def test_systemd_service_example_ingests_the_recordings_of_a_folder(project: Path) -> None:
+    service = (SCALE / "ingest-watch.service").read_text()
+    command = shlex.split(re.findall(r"^ExecStart=(.*)$", service, re.MULTILINE)[0])
+    assert command == ["/srv/ingest/.venv/bin/ingest", "watch", "/data/incoming", "job.yaml"]
+    variables = dict(re.findall(r"^Environment=(\w+)=(.*)$", service, re.MULTILINE))
+    assert variables == {"STORE": "/srv/ingest/store"}
+    shutil.copy(SCALE / "job.yaml", project)
+    subprocess.run(  # noqa: S603 - our own example
+        ["ingest", "watch", str(project / "recordings"), "job.yaml", "--once", "--rest", "0.1"],  # noqa: S607 - of this environment
+        cwd=project,
+        env={**environment(project), "STORE": str(project / "store")},
+        check=True,
+        capture_output=True,
+        timeout=60,
+    )
+    assert Store.open(project / "store").names() == RECORDINGS
+
+
+def test_slurm_and_kubernetes_examples_have_the_same_number_of_shards() -> None:
+    job = kubernetes_job()
     assert job["completionMode"] == "Indexed"
-    assert {one["name"]: one["value"] for one in container["env"]}["SHARDS"] == str(job["completions"])
+    assert {one["name"]: one["value"] for one in container()["env"]}["SHARDS"] == str(job["completions"])
     assert f"#SBATCH --array=1-{job['completions']}\n" in (SCALE / "slurm.sbatch").read_text()
 
 
-def test_the_matrix_covers_every_shard() -> None:
-    ingest = read("github-matrix.yaml")["jobs"]["ingest"]
-    shards = ingest["strategy"]["matrix"]["shard"]
+def test_workflow_example_covers_every_shard() -> None:
+    shards = workflow_job()["strategy"]["matrix"]["shard"]
     assert shards == list(range(1, len(shards) + 1))
-    assert ingest["env"]["SHARDS"] == "${{ strategy.job-total }}"
+    assert workflow_job()["env"]["SHARDS"] == "${{ strategy.job-total }}"
+
+
+def test_workflow_example_installs_the_package_of_its_checkout() -> None:
+    for job in documents("github-matrix.yaml")[0]["jobs"].values():
+        steps = job["steps"]
+        assert steps[0]["uses"].startswith("actions/checkout@")
+        assert {"run": "pip install ."} in steps
+
+
+def test_kubernetes_example_defines_its_volume_and_names_the_image_of_the_dockerfile() -> None:
+    claims = [one for one in documents("kubernetes-job.yaml") if one["kind"] == "PersistentVolumeClaim"]
+    pod = kubernetes_job()["template"]["spec"]
+    assert [one["metadata"]["name"] for one in claims] == [
+        volume["persistentVolumeClaim"]["claimName"] for volume in pod["volumes"]
+    ]
+    image = container()["image"]
+    assert f"docker build -t {image} -f configs/scale/Dockerfile ." in (SCALE / "Dockerfile").read_text()
+
+
+def test_dockerfile_example_copies_existing_files_and_all_that_the_build_needs() -> None:
+    lines = (SCALE / "Dockerfile").read_text().splitlines()
+    copies = [line.split()[1:] for line in lines if line.startswith("COPY ")]
+    sources = {source for *names, _ in copies for source in names}
+    assert all((ROOT / source).exists() for source in sources)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    build = project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
+    needed = {"pyproject.toml", project["project"]["readme"], *project["project"]["license-files"], *build}
+    assert needed <= sources
+    job = {one["name"]: one["value"] for one in container()["env"]}["JOB"]
+    assert ["configs/scale/job.yaml", job] in copies
