@@ -1,7 +1,8 @@
-"""The pages of docs/ hold: links lead somewhere, options exist, and what can be run here is run as it is written."""
+"""The pages of docs/: links lead to existing targets, options exist, and commands and programs run as written."""
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import shutil
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from typer.main import get_command
 
 from mosaico_ingest.cli.app import command_line
@@ -23,8 +25,8 @@ DOCS = sorted((ROOT / "docs").glob("*.md"))
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 TEXT = {page: page.read_text(encoding="utf-8") for page in PAGES}
 INGEST: Any = get_command(command_line())
-ELSEWHERE = ("--executor", "--otel", "--metrics", "serve", "replay", "lint .")
-"""What needs a cluster, a collector, a folder of the system, a client or rejected messages; and what reads every file there is."""
+NOT_RUN = ("--executor", "--otel", "--metrics", "serve", "replay", "lint .")
+"""Parts of commands that need a cluster, a collector, a system folder, a client or rejected messages, or that read all files."""
 EXIT_CODES = {"ingest diff job.yaml other.yaml": 1}
 
 
@@ -33,31 +35,31 @@ def label(page: Path) -> str:
 
 
 def anchors(text: str) -> set[str]:
-    """Return what the headings of a page are called in a link."""
-    prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
-    headings = re.findall(r"^#+ (.*)$", prose, re.MULTILINE)
+    """Return the link anchors of the headings of a page."""
+    without_code = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    headings = re.findall(r"^#+ (.*)$", without_code, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-def shown(page: Path) -> list[str]:
+def console_commands(page: Path) -> list[str]:
     """Return the commands of the page's console blocks, without their comments."""
     blocks = re.findall(r"```console\n(.*?)```", TEXT[page], re.DOTALL)
     lines = [line for block in blocks for line in block.splitlines()]
     return [re.sub(r"\s+# .*", "", line[2:]) for line in lines if line.startswith("$ ingest ")]
 
 
-def mentioned(page: Path) -> Iterator[str]:
-    """Yield the commands of the page, those within its sentences too."""
-    yield from shown(page)
+def all_commands(page: Path) -> Iterator[str]:
+    """Yield the commands of the page, including those within sentences."""
+    yield from console_commands(page)
     yield from re.findall(r"`(ingest [^`|…]+)`", TEXT[page])
 
 
-def prose(page: Path) -> list[str]:
+def programs(page: Path) -> list[str]:
     return re.findall(r"```python\n(.*?)```", TEXT[page], re.DOTALL)
 
 
 def manifest_keys() -> set[str]:
-    """Return every key of a manifest, as `bag.path`, from the page that is made of its model."""
+    """Return every manifest key, such as `bag.path`, from the generated reference page."""
     sections = TEXT[ROOT / "docs" / "manifest.md"].split("\n## ")[1:]
     tables = {section.splitlines()[0].strip("`"): section for section in sections}
     return {
@@ -68,7 +70,7 @@ def manifest_keys() -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=label)
-def test_every_link_leads_somewhere(page: Path) -> None:
+def test_link_leads_to_existing_file_and_heading(page: Path) -> None:
     text = re.sub(r"```.*?```|`[^`]*`", "", TEXT[page], flags=re.DOTALL)
     for target, anchor in re.findall(r"\]\((?!https?://)([^)#\s]*)#?([^)\s]*)\)", text):
         goal = (page.parent / target).resolve() if target else page
@@ -76,14 +78,14 @@ def test_every_link_leads_somewhere(page: Path) -> None:
         assert not anchor or anchor in anchors(goal.read_text(encoding="utf-8")), f"{target}#{anchor}"
 
 
-def test_every_page_is_in_the_list_of_pages() -> None:
+def test_docs_readme_lists_every_page() -> None:
     listed = set(re.findall(r"\]\(([\w-]+\.md)", TEXT[ROOT / "docs" / "README.md"]))
     assert listed == {page.name for page in DOCS} - {"README.md"}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=label)
-def test_every_option_that_is_shown_exists(page: Path) -> None:
-    for line in mentioned(page):
+def test_option_in_command_exists(page: Path) -> None:
+    for line in all_commands(page):
         words = shlex.split(line)[1:]
         command, options = INGEST, list(INGEST.params)
         while words and words[0] in getattr(command, "commands", {}):
@@ -91,13 +93,13 @@ def test_every_option_that_is_shown_exists(page: Path) -> None:
             options = list(command.params)
         if command is INGEST and words and words[0].endswith(".yaml"):
             options = list(INGEST.commands["run"].params)
-        known = {name for option in options for name in option.opts} | {"--help", "-h"}
-        assert {word for word in words if re.fullmatch(r"--?[a-z][\w-]*", word)} <= known, line
+        names = {name for option in options for name in option.opts} | {"--help", "-h"}
+        assert {word for word in words if re.fullmatch(r"--?[a-z][\w-]*", word)} <= names, line
 
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
-    """A folder with what the pages speak of: the quickstart, a recording, a job, and a sequence of it."""
+    """A folder with the files that the pages use: the quickstart and its sequence, and a recording."""
     shutil.copytree(ROOT / "configs", tmp_path / "configs")
     shutil.copy(ROOT / "configs" / "quickstart" / "drive.mcap", tmp_path)
     run("-m", "mosaico_ingest", "run", "configs/quickstart.yaml", "-q", cwd=tmp_path)
@@ -105,38 +107,38 @@ def project(tmp_path: Path) -> Path:
 
 
 def run(*arguments: str, cwd: Path, code: int = 0) -> str:
-    done = subprocess.run(  # noqa: S603 - what the page says
-        [sys.executable, *arguments], cwd=cwd, capture_output=True, text=True, check=False, timeout=60
+    finished = subprocess.run(  # noqa: S603 - commands of the pages
+        [sys.executable, *arguments], cwd=cwd, capture_output=True, text=True, check=False, timeout=120
     )
-    assert done.returncode == code, f"{arguments}: {done.stderr}"
-    return done.stdout
+    assert finished.returncode == code, f"{arguments}: {finished.stderr}"
+    return finished.stdout
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page in DOCS if shown(page)], ids=label)
-def test_the_commands_run_one_after_the_other(project: Path, page: Path) -> None:
+@pytest.mark.parametrize("page", [page for page in DOCS if console_commands(page)], ids=label)
+def test_commands_of_page_succeed_in_order(project: Path, page: Path) -> None:
     job = "version: 1\nbag: {path: drive.mcap}\nsequence: {name: drive, if_exists: replace}\n"
     (project / "job.yaml").write_text(job)
     (project / "other.yaml").write_text(f"{job}topics: [/imu]\n")
     if page.name == "plan.md":
-        (project / "job.yaml").unlink()  # made by its first command
+        (project / "job.yaml").unlink()  # its first command writes it
     else:
         run("-m", "mosaico_ingest", "run", "job.yaml", "-q", cwd=project)
-    for line in shown(page):
-        if not any(word in line for word in ELSEWHERE):
-            if " plan " in line:  # what would happen, before it has
+    for line in console_commands(page):
+        if not any(word in line for word in NOT_RUN):
+            if " plan " in line:  # the plan of a job that has not run yet
                 shutil.rmtree(project / "mosaico", ignore_errors=True)
             words = shlex.split(line.split(" > ")[0])[1:]
             run("-m", "mosaico_ingest", *words, cwd=project, code=EXIT_CODES.get(line, 0))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page in DOCS if prose(page)], ids=label)
-def test_the_programs_run_one_after_the_other(project: Path, page: Path) -> None:
-    run("-c", "\n".join(prose(page)), cwd=project)
+@pytest.mark.parametrize("page", [page for page in DOCS if programs(page)], ids=label)
+def test_programs_of_page_run_in_order(project: Path, page: Path) -> None:
+    run("-c", "\n".join(programs(page)), cwd=project)
 
 
-def test_the_page_for_movers_names_every_setting_as_it_is_called() -> None:
+def test_migration_table_names_existing_settings() -> None:
     text = TEXT[ROOT / "docs" / "migration.md"]
     table = text.split("<!-- options -->")[1].split("<!-- end of options -->")[0]
     rows = [
@@ -150,3 +152,32 @@ def test_the_page_for_movers_names_every_setting_as_it_is_called() -> None:
     assert {
         name for *_, manifest in rows for name in manifest if not name.startswith("ingest ")
     } <= manifest_keys()
+
+
+@pytest.mark.parametrize("page", [page for page in DOCS if page.name != "manifest.md"], ids=label)
+def test_page_opens_with_what_the_reader_can_do(page: Path) -> None:
+    paragraphs = TEXT[page].split("\n\n")
+    assert paragraphs[0].startswith("# ")
+    assert paragraphs[1].startswith("After reading this page, you ")
+
+
+def test_pre_commit_hook_of_the_ci_page_equals_the_published_hook() -> None:
+    text = TEXT[ROOT / "docs" / "ci.md"]
+    block = next(
+        block for block in re.findall(r"```yaml\n(.*?)```", text, re.DOTALL) if "repo: local" in block
+    )
+    hook = yaml.safe_load(block)["repos"][0]["hooks"][0]
+    (published,) = yaml.safe_load((ROOT / ".pre-commit-hooks.yaml").read_text(encoding="utf-8"))
+    same = ("id", "name", "entry", "files", "pass_filenames")
+    assert {key: hook[key] for key in same} == {key: published[key] for key in same}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["README.md", "docs/migration.md"])
+def test_program_that_uses_the_injector_passes_a_strict_type_check(tmp_path: Path, name: str) -> None:
+    pytest.importorskip("pyright", reason="pyright is not installed")
+    program = next(code for code in programs(ROOT / name) if "RosbagInjector(" in code)
+    (tmp_path / "program.py").write_text(program)
+    settings = {"typeCheckingMode": "strict", "extraPaths": [str(ROOT)], "reportMissingTypeStubs": False}
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings))
+    run("-m", "pyright", "--pythonpath", sys.executable, "--project", str(tmp_path), cwd=tmp_path)
