@@ -94,23 +94,27 @@ _TEXT = "text"
 def lint(
     paths: Annotated[
         list[str] | None,
-        typer.Argument(metavar="FILE|DIR|-", help="What to judge; a folder with all below it; - is stdin."),
+        typer.Argument(
+            metavar="FILE|DIR|-", help="What to check: files, folders with everything below, or - for stdin."
+        ),
     ] = None,
     *,
     output: Annotated[
         str, typer.Option("--format", help="text, json, sarif, github or junit.", metavar="FORMAT")
     ] = _TEXT,
-    fix: Annotated[bool, typer.Option("--fix", help="Make the changes that are safe to make.")] = False,
-    no_env: Annotated[bool, typer.Option("--no-env", help="Miss no environment variable.")] = False,
+    fix: Annotated[bool, typer.Option("--fix", help="Apply the fixes that are safe.")] = False,
+    no_env: Annotated[
+        bool, typer.Option("--no-env", help="Do not report unset environment variables.")
+    ] = False,
     explain: Annotated[
         str | None,
-        typer.Option("--explain", help="Print a rule's page; all lists the rules.", metavar="RULE"),
+        typer.Option("--explain", help="Print the page of a rule, or the list of all rules.", metavar="RULE"),
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the findings only.")] = False,
 ) -> None:
-    """Judge job manifests, adapter files and .msg files without opening a recording.
+    """Check job manifests, adapter files and .msg files without opening any recording.
 
-    Exit codes: 0 clean, 1 failure, 2 usage, 3 nothing to judge, 10 infos, 11 warnings, 12 errors; SARIF: 0 for findings.
+    Exit codes: 0 no findings, 1 failure, 2 usage, 3 nothing to lint, 10 infos, 11 warnings, 12 errors; SARIF: 0 for findings.
     """
     from mosaico_ingest.cli.process import collect_as_usual
     from mosaico_ingest.lint.engine import STDIN, lint_paths
@@ -142,20 +146,25 @@ def _print_text(report: LintReport, *, quiet: bool) -> None:
 
     console = Terminal(soft_wrap=True)
     if report.findings:
-        texts = {**texts_of(report.findings), **{judged.file: judged.text for judged in report.files}}
+        texts = {**texts_of(report.findings), **{linted.file: linted.text for linted in report.files}}
         console.print(render_findings(report.findings, texts))
     if not quiet:
         Terminal(stderr=True, soft_wrap=True).print(_summary(report), style="bold")
 
 
 def _summary(report: LintReport) -> str:
+    from mosaico_ingest.findings import a_few, one_line
     from mosaico_ingest.report.units import counted
 
+    skipped = ""
+    if report.skipped:
+        names = a_few(one_line(skip.file) for skip in report.skipped)
+        skipped = f"\n{counted(len(report.skipped), 'file')} skipped (not a manifest or an adapter): {names}"
     if not report.files:
-        return "nothing to judge: no manifest, adapter or .msg file"
-    found, fixed = len(report.findings), sum(judged.fixed for judged in report.files)
-    mended = f", {counted(fixed, 'change')} made" if fixed else ""
-    return f"{counted(len(report.files), 'file')}, {counted(found, 'finding')}{mended}"
+        return f"nothing to lint: no manifest, adapter or .msg file{skipped}"
+    fixed = sum(linted.fixed for linted in report.files)
+    fixes = f", {counted(fixed, 'change')} made" if fixed else ""
+    return f"{counted(len(report.files), 'file')}, {counted(len(report.findings), 'finding')}{fixes}{skipped}"
 
 
 def _explanation(name: str) -> str:

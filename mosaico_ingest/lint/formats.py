@@ -1,4 +1,4 @@
-"""Findings as JSON, SARIF 2.1.0, GitHub annotations and JUnit."""
+"""The output formats of lint: JSON, SARIF 2.1.0, GitHub annotations and JUnit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mosaico_ingest.findings import (
     Severity,
     Span,
 )
-from mosaico_ingest.lint.engine import Judged, LintReport
+from mosaico_ingest.lint.engine import LintedFile, LintReport
 from mosaico_ingest.lint.pages import page_of
 from mosaico_ingest.rules import RULES, Rule
 from mosaico_ingest.version import __version__
@@ -24,10 +24,11 @@ __all__ = ["FORMATS"]
 
 
 def _render_json(report: LintReport) -> str:
-    """Return `{version, files, findings}`; lines and columns start at 1, ends are one past the last character."""
+    """Return `{version, files, skipped, findings}`. Lines and columns start at 1; end columns are exclusive."""
     document = {
         "version": 1,
-        "files": [{"file": judged.file, "fixed": judged.fixed} for judged in report.files],
+        "files": [{"file": linted.file, "fixed": linted.fixed} for linted in report.files],
+        "skipped": [{"file": skipped.file, "reason": skipped.reason} for skipped in report.skipped],
         "findings": [_finding(finding) for finding in report.findings],
     }
     return json.dumps(document, indent=2, ensure_ascii=False) + "\n"
@@ -35,9 +36,9 @@ def _render_json(report: LintReport) -> str:
 
 def _finding(finding: Finding) -> dict[str, Any]:
     span = finding.span
-    place = {}
+    location = {}
     if span is not None:
-        place = {
+        location = {
             "file": span.file,
             "line": span.line,
             "column": span.column,
@@ -49,7 +50,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "severity": finding.severity.value,
         "message": finding.message,
         "help": finding.help,
-        **place,
+        **location,
         "fix": None if finding.fix is None else {"text": finding.fix.text},
     }
 
@@ -59,19 +60,19 @@ _ESCAPES = (("%", "%25"), ("\r", "%0D"), ("\n", "%0A"))
 
 
 def _render_github(report: LintReport) -> str:
-    """Return a line for each finding."""
+    """Return one workflow command per finding."""
     return "".join(f"{_line(finding)}\n" for finding in report.findings)
 
 
 def _line(finding: Finding) -> str:
-    place = ""
+    location = ""
     if finding.span is not None:
         span = finding.span
         ends = f",endLine={span.end_line}"
         ends += f",endColumn={span.end_column}" if span.line == span.end_line else ""
-        place = f"file={_property(span.file)},line={span.line},col={span.column}{ends},"
+        location = f"file={_property(span.file)},line={span.line},col={span.column}{ends},"
     text = f"{finding.message} — {finding.help}" if finding.help else finding.message
-    return f"::{_COMMANDS[finding.severity]} {place}title={_property(finding.rule)}::{_escaped(text)}"
+    return f"::{_COMMANDS[finding.severity]} {location}title={_property(finding.rule)}::{_escaped(text)}"
 
 
 def _escaped(text: str) -> str:
@@ -88,24 +89,24 @@ _NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def _render_junit(report: LintReport) -> str:
-    """Return the document; a file without findings is one case that passed."""
-    suites = "".join(_suite(judged) for judged in report.files)
+    """Return one test suite per file. A file without findings is one passed test case."""
+    suites = "".join(_suite(linted) for linted in report.files)
     return f'<?xml version="1.0" encoding="UTF-8"?>\n<testsuites>\n{suites}</testsuites>\n'
 
 
-def _suite(judged: Judged) -> str:
-    cases = "".join(_case(finding, judged.file) for finding in judged.findings)
-    count = len(judged.findings)
-    cases = cases or f"    <testcase name={_attribute(judged.file)}/>\n"
-    name = _attribute(judged.file)
+def _suite(linted: LintedFile) -> str:
+    cases = "".join(_case(finding, linted.file) for finding in linted.findings)
+    count = len(linted.findings)
+    cases = cases or f"    <testcase name={_attribute(linted.file)}/>\n"
+    name = _attribute(linted.file)
     return f'  <testsuite name={name} tests="{max(count, 1)}" failures="{count}">\n{cases}  </testsuite>\n'
 
 
 def _case(finding: Finding, file: str) -> str:
-    place = file if finding.span is None else f"{finding.span.line}:{finding.span.column}"
+    location = file if finding.span is None else f"{finding.span.line}:{finding.span.column}"
     message = _attribute(finding.message)
     failure = f"<failure type={_attribute(finding.severity.value)} message={message}>{_text(str(finding))}</failure>"
-    return f"    <testcase name={_attribute(f'{place} {finding.rule}')} classname={_attribute(file)}>{failure}</testcase>\n"
+    return f"    <testcase name={_attribute(f'{location} {finding.rule}')} classname={_attribute(file)}>{failure}</testcase>\n"
 
 
 def _attribute(text: str) -> str:
@@ -121,12 +122,12 @@ _LEVELS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.INFO: 
 
 
 def _render_sarif(report: LintReport) -> str:
-    """Return one run, with the rules that were broken and a fix where there is one."""
-    broken = {finding.rule for finding in report.findings}
+    """Return one run with the findings, their rules and their fixes."""
+    reported = {finding.rule for finding in report.findings}
     driver = {
         "name": "mosaico-ingest",
         "semanticVersion": __version__,
-        "rules": [_rule(rule) for rule in RULES.values() if rule.id in broken],
+        "rules": [_rule(rule) for rule in RULES.values() if rule.id in reported],
     }
     run = {
         "tool": {"driver": driver},
@@ -176,7 +177,7 @@ def _region(span: Span) -> dict[str, int]:
 def _fix(edit: Edit) -> dict[str, Any]:
     replacement = {"deletedRegion": _region(edit.span), "insertedContent": {"text": edit.text}}
     change = {"artifactLocation": {"uri": quote(edit.span.file)}, "replacements": [replacement]}
-    return {"description": {"text": f"write {edit.text}"}, "artifactChanges": [change]}
+    return {"description": {"text": f"replace with {edit.text}"}, "artifactChanges": [change]}
 
 
 FORMATS: dict[str, Callable[[LintReport], str]] = {
@@ -185,4 +186,4 @@ FORMATS: dict[str, Callable[[LintReport], str]] = {
     "github": _render_github,
     "junit": _render_junit,
 }
-"""Each format by the name `--format` takes."""
+"""The renderer of each `--format`."""

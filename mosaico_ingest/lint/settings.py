@@ -1,14 +1,16 @@
-"""This file is what a project says about linting, in `.ingest.yaml` or under `[tool.ingest.lint]` of pyproject.toml."""
+"""The lint settings of a project, from `.ingest.yaml` or the table `[tool.ingest.lint]` of `pyproject.toml`."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
-from msgspec import Struct
+from msgspec import Struct, field
+from msgspec.structs import replace
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mosaico_ingest.errors import ManifestError
@@ -23,19 +25,19 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-__all__ = ["NAMES", "Settings", "settings_for"]
+__all__ = ["Settings", "settings_for"]
 
-NAMES = {name: rule.id for rule in LINT_RULES.values() for name in (rule.id, rule.code)}
-"""Every code and every name of a rule, to its name."""
+_RULE_IDS = {name: rule.id for rule in LINT_RULES.values() for name in (rule.id, rule.code)}
+"""The id of each lint rule, by id and by code."""
 
 
 class _Lint(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     severity: dict[str, Literal["error", "warning", "info", "off"]] = {}
-    """How much each rule matters, by code or name."""
+    """Severities of rules, by id or code."""
     exclude: tuple[str, ...] = ()
-    """Globs of paths, seen from the settings' folder, that are not judged when a folder is."""
+    """Globs of paths, relative to the folder of the settings, that lint skips in folders."""
 
 
 class _File(BaseModel):
@@ -45,23 +47,21 @@ class _File(BaseModel):
 
 
 class Settings(Struct, frozen=True):
-    """How much each rule matters here, and which files are left alone."""
+    """The lint settings that apply to a folder."""
 
-    severities: tuple[tuple[str, Severity | None], ...] = ()
+    severities: Mapping[str, Severity | None] = field(default_factory=dict[str, "Severity | None"])
+    """Configured severities by rule id. None turns the rule off."""
     exclude: tuple[str, ...] = ()
     folder: Path = Path()
+    """The folder that contains the settings file."""
 
     def apply(self, finding: Finding) -> Finding | None:
-        """Return the finding with the severity it has here, None if the rule is off."""
-        for rule, severity in self.severities:
-            if rule == finding.rule:
-                if severity is None:
-                    return None
-                return Finding(rule, severity, finding.message, finding.span, finding.help, finding.fix)
-        return finding
+        """Return the finding with its configured severity, or None if its rule is off."""
+        severity = self.severities.get(finding.rule, finding.severity)
+        return None if severity is None else replace(finding, severity=severity)
 
     def excludes(self, path: Path) -> bool:
-        """Say whether a file is left alone when its folder is judged."""
+        """Return whether lint skips a file when it checks a folder."""
         try:
             relative = path.resolve().relative_to(self.folder.resolve()).as_posix()
         except ValueError:
@@ -70,10 +70,10 @@ class Settings(Struct, frozen=True):
 
 
 def settings_for(folder: Path) -> Settings:
-    """Return the settings of the nearest folder above that has any.
+    """Return the settings of the folder or its nearest parent that has settings.
 
     Raises:
-        ManifestError: They cannot be read; `findings` says why.
+        ManifestError: The settings cannot be read or are invalid.
     """
     return _settings(folder.resolve())
 
@@ -82,11 +82,11 @@ def settings_for(folder: Path) -> Settings:
 def _settings(folder: Path) -> Settings:
     own, project = folder / ".ingest.yaml", folder / "pyproject.toml"
     if own.is_file():
-        return _checked(load_source(read_text(own), file=str(own)), folder)
+        return _validated(load_source(read_text(own), file=str(own)), folder)
     if project.is_file():
-        lint = _lint_table(project)
-        if lint is not None:
-            return _checked(Source(str(project), read_text(project), {"lint": lint}), folder)
+        table = _lint_table(project)
+        if table is not None:
+            return _validated(Source(str(project), read_text(project), {"lint": table}), folder)
     return Settings(folder=folder) if folder == folder.parent else _settings(folder.parent)
 
 
@@ -94,10 +94,10 @@ def _lint_table(path: Path) -> Value:
     try:
         return tomllib.loads(read_text(path)).get("tool", {}).get("ingest", {}).get("lint")
     except tomllib.TOMLDecodeError as error:
-        raise ManifestError(f"is not TOML: {error}", where=str(path)) from error
+        raise ManifestError(f"the file is not valid TOML: {error}", where=str(path)) from error
 
 
-def _checked(source: Source, folder: Path) -> Settings:
+def _validated(source: Source, folder: Path) -> Settings:
     findings = list(source.findings)
     try:
         file = _File.model_validate(source.value or {})
@@ -106,19 +106,19 @@ def _checked(source: Source, folder: Path) -> Settings:
             finding for _, finding in explain(error, source=source, schema=_File.model_json_schema())
         ]
         file = _File()
-    findings += [_unknown(rule, source) for rule in file.lint.severity if rule not in NAMES]
+    findings += [_unknown_rule(rule, source) for rule in file.lint.severity if rule not in _RULE_IDS]
     if findings:
         first = findings[0]
         raise ManifestError(first.message, where=str(first.span), hint=first.help, findings=tuple(findings))
-    severities = tuple(
-        (NAMES[rule], None if severity == "off" else Severity(severity))
+    severities = {
+        _RULE_IDS[rule]: None if severity == "off" else Severity(severity)
         for rule, severity in file.lint.severity.items()
-    )
+    }
     return Settings(severities, file.lint.exclude, folder)
 
 
-def _unknown(rule: str, source: Source) -> Finding:
+def _unknown_rule(rule: str, source: Source) -> Finding:
     span = source.key_span(("lint", "severity", rule)) if source.spans else Span(source.file, 1, 1, 1, 1)
-    close = nearest(rule, NAMES)
-    hint = f"did you mean {close!r}?" if close else "`ingest lint --explain all` lists them"
-    return Finding("unknown-rule", Severity.ERROR, f"there is no rule {rule!r}", span, hint)
+    close = nearest(rule, _RULE_IDS)
+    hint = f"did you mean {close!r}?" if close else "see `ingest lint --explain all`"
+    return Finding("unknown-rule", Severity.ERROR, f"lint has no rule {rule!r}", span, hint)

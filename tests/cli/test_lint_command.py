@@ -83,6 +83,15 @@ def test_a_wrong_call_is_a_usage_error(folder: Path, arguments: list[str], words
     assert folder
 
 
+def test_skipped_files_are_counted_and_listed(folder: Path) -> None:
+    (folder / "compose.yaml").write_text("services: {}\n")
+    result = RUN.invoke(command_line(), ["lint", "."], env={"COLUMNS": "200"})
+    assert "1 file, 2 findings\n1 file skipped (not a manifest or an adapter): compose.yaml" in result.stderr
+    assert json.loads(RUN.invoke(command_line(), ["lint", ".", "--format", "json"]).stdout)["skipped"] == [
+        {"file": "compose.yaml", "reason": "not a manifest or an adapter"}
+    ]
+
+
 def test_nothing_to_judge_is_three(folder: Path) -> None:
     (folder / "job.yaml").unlink()
     assert RUN.invoke(command_line(), ["lint", "."]).exit_code == 3

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from mosaico_ingest.errors import ManifestError, NothingMatched
 from mosaico_ingest.job.manifest import load_manifest
 from mosaico_ingest.lint.engine import LintReport, lint_paths
-from mosaico_ingest.lint.settings import NAMES
 from mosaico_ingest.pipeline.compile import compile_manifest
+from mosaico_ingest.rules import LINT_RULES
 
 GOOD = "bag: {path: data/run.mcap}\n"
 TRAP = "bag: {path: data/run.mcap}\nsequence: {metadata: {a: on}}\n"
@@ -27,7 +27,7 @@ def judged(project: Path, text: str | bytes, name: str = "job.yaml", *, fix: boo
     file = project / name
     file.write_bytes(text if isinstance(text, bytes) else text.encode())
     report = lint_paths([file], env={}, fix=fix)
-    assert {finding.rule for finding in report.findings} <= set(NAMES)
+    assert {finding.rule for finding in report.findings} <= set(LINT_RULES)
     return report
 
 
@@ -114,6 +114,30 @@ def test_a_comment_silences_a_rule_on_its_line(project: Path, word: str) -> None
 def test_a_comment_alone_on_a_line_is_about_the_next(project: Path) -> None:
     text = "bag: {path: data/run.mcap}\n# ingest: ignore[yaml-boolean]\nsequence: {metadata: {a: on}}\n"
     assert rules(judged(project, text)) == []
+
+
+@pytest.mark.parametrize(
+    ("comment", "start", "end"),
+    [
+        ("# ingest: ignore", 27, 43),
+        ("# ingest: ignore-file", 27, 48),
+        ("# ingest: ignore[]", 27, 45),
+        ("# ingest: ignor[yaml-boolean]", 27, 56),
+        ("# ingest: ignore[yaml-bolean]", 44, 55),
+        ("# ingest: ignore[unmatched-pattern]", 44, 61),
+    ],
+)
+def test_ignore_comment_without_known_lint_rule_is_reported(
+    project: Path, comment: str, start: int, end: int
+) -> None:
+    (finding,) = judged(project, f"bag: {{path: data/run.mcap}}{comment}\n").findings
+    assert finding.rule == "unknown-rule"
+    assert finding.span is not None
+    assert (finding.span.column, finding.span.end_column) == (start, end)
+
+
+def test_other_comments_to_the_tool_are_no_findings(project: Path) -> None:
+    assert rules(judged(project, f"# ingest: nightly run\n{GOOD}")) == []
 
 
 def test_a_comment_for_the_file_is_about_all_of_it(project: Path) -> None:
@@ -295,7 +319,7 @@ def test_any_text_is_judged(project: Path, text: str) -> None:
 
 @pytest.mark.slow
 def test_five_hundred_manifests_are_judged_in_five_seconds(tmp_path: Path) -> None:
-    example = (Path(__file__).parents[1] / "manifest" / "test_load.py").read_text()
+    example = (Path(__file__).parents[1] / "job" / "test_load.py").read_text()
     text = example.split('FULL = """\\\n')[1].split('"""')[0]
     for number in range(500):
         (tmp_path / f"job_{number:03}.yaml").write_text(text)

@@ -11,7 +11,8 @@ import pytest
 
 import mosaico_ingest
 from mosaico_ingest.lint import pages
-from mosaico_ingest.lint.engine import Document, Kind, kind_of, lint_document
+from mosaico_ingest.lint.documents import Document, Kind, kind_of
+from mosaico_ingest.lint.engine import lint_document
 from mosaico_ingest.lint.pages import page_of, rule_index
 from mosaico_ingest.lint.rules import CHECKS
 from mosaico_ingest.lint.settings import Settings
