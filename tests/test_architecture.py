@@ -1,8 +1,10 @@
-"""The structure of the package: size of files and functions, import cycles, and module names."""
+"""The structure of the package: size of files and functions, import cycles, names and docstrings."""
 
 from __future__ import annotations
 
 import ast
+import re
+from collections.abc import Iterator
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -14,6 +16,16 @@ PACKAGE = ROOT / "mosaico_ingest"
 FILES = sorted(PACKAGE.rglob("*.py"))
 VAGUE = {"utils", "util", "helpers", "helper", "common", "misc", "manager"}
 
+GLOSSARY = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
+REPLACED = tuple(
+    term
+    for row in GLOSSARY.split("<!-- replaced terms -->")[1].split("<!-- end of")[0].splitlines()
+    for term in re.findall(r"`(\w+)`", row)
+)
+"""Terms that no name may contain, in snake case; plurals with `s` count too."""
+PENDING = frozenset({"lost", "place", "raw_batch", "room", "said", "slab", "taken", "told"})
+"""Replaced terms that some names still use."""
+
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
@@ -23,7 +35,7 @@ def tree(path: Path) -> ast.Module:
 
 
 def body_lines(function: Function) -> int:
-    """Lines from the first statement after the docstring to the last."""
+    """Return the number of lines without the signature and the docstring."""
     body = function.body
     docstring = isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant)
     first = body[1] if docstring and len(body) > 1 else body[0]
@@ -36,7 +48,7 @@ def module_name(path: Path) -> str:
 
 
 def imports_at_load_time(path: Path, modules: set[str]) -> set[str]:
-    """The package's modules that `path` imports when it is imported itself."""
+    """Return the modules of the package that a module imports at module level."""
     names = [
         f"{node.module}.{alias.name}" if f"{node.module}.{alias.name}" in modules else str(node.module)
         for node in tree(path).body
@@ -61,7 +73,7 @@ def test_functions_have_at_most_80_lines() -> None:
     assert not long
 
 
-def test_modules_do_not_import_each_other_in_cycles() -> None:
+def test_module_imports_have_no_cycle() -> None:
     modules = {module_name(path) for path in FILES}
     graph = {module_name(path): imports_at_load_time(path, modules) for path in FILES}
     assert sum(map(len, graph.values())) > len(FILES)
@@ -75,5 +87,50 @@ def test_module_names_are_specific() -> None:
     assert not [path for path in FILES if path.stem in VAGUE]
 
 
-def test_modules_have_docstrings() -> None:
+def test_modules_and_packages_have_docstrings() -> None:
     assert not [path for path in FILES if not ast.get_docstring(tree(path))]
+
+
+def test_package_docstrings_have_at_least_two_sentences() -> None:
+    packages = [path for path in FILES if path.name == "__init__.py"]
+    short = [
+        path for path in packages if len(re.findall(r"\.(?:\s|$)", ast.get_docstring(tree(path)) or "")) < 2
+    ]
+    assert not short
+
+
+def words(name: str) -> str:
+    """Return a name in snake case, between underscores."""
+    pieces = re.findall(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+", name)
+    return f"_{'_'.join(pieces).lower()}_"
+
+
+def defined_names(path: Path) -> Iterator[tuple[str, int]]:
+    """Yield the names that a module defines, with their lines: itself, classes, functions, parameters, variables, attributes."""
+    yield path.stem, 1
+    for node in ast.walk(tree(path)):
+        match node:
+            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
+                yield name, node.lineno
+            case ast.arg(arg=name):
+                yield name, node.lineno
+            case ast.Name(id=name, ctx=ast.Store()) | ast.Attribute(attr=name, ctx=ast.Store()):
+                yield name, node.lineno
+            case _:
+                pass
+
+
+def test_glossary_lists_the_terms_that_are_pending() -> None:
+    assert set(REPLACED) >= PENDING
+    assert len(REPLACED) > 10
+
+
+@pytest.mark.parametrize("term", [term for term in REPLACED if term not in PENDING])
+def test_no_name_contains_a_replaced_term(term: str) -> None:
+    uses = [
+        f"{path.relative_to(ROOT)}:{line} {name}"
+        for path in FILES
+        for name, line in defined_names(path)
+        if re.search(f"_{term}s?_", words(name))
+    ]
+    assert not uses
