@@ -161,8 +161,14 @@ def test_dockerfile_example_copies_existing_files_and_all_that_the_build_needs()
     sources = {source for *names, _ in copies for source in names}
     assert all((ROOT / source).exists() for source in sources)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    build = project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
-    needed = {"pyproject.toml", project["project"]["readme"], *project["project"]["license-files"], *build}
+    wheel = project["tool"]["hatch"]["build"]["targets"]["wheel"]
+    needed = {
+        "pyproject.toml",
+        project["project"]["readme"],
+        *project["project"]["license-files"],
+        *wheel["packages"],
+        *wheel["force-include"],
+    }
     assert needed <= sources
     job = {one["name"]: one["value"] for one in container()["env"]}["JOB"]
     assert ["configs/scale/job.yaml", job] in copies
