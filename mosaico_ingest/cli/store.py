@@ -61,8 +61,10 @@ def print_sequences(sequences: Sequence[SequenceInfo], *, as_json: bool) -> None
     console = open_console()
     console.print(table)
     for info in sequences:
-        for note in info.notes[-1:]:  # the others are in `store show`
-            console.print(Text(f"{info.name}: {note.message}", style="yellow"), soft_wrap=True)
+        if info.incomplete is not None:
+            console.print(Text(f"{info.name}: incomplete: {info.incomplete}", style="red"), soft_wrap=True)
+        elif info.notes:  # the others are in `store show`
+            console.print(Text(f"{info.name}: {info.notes[-1].message}", style="yellow"), soft_wrap=True)
 
 
 def print_sequence(info: SequenceInfo, *, as_json: bool) -> None:
@@ -191,6 +193,7 @@ def _sequence_json(info: SequenceInfo) -> dict[str, Any]:
         "stored_bytes": info.stored_bytes,
         "start_ns": info.start_ns,
         "end_ns": info.end_ns,
+        "incomplete": info.incomplete,
         "notes": [{"topic": note.topic, "message": note.message} for note in info.notes],
     }
 
@@ -254,16 +257,31 @@ def verify(
         for one in found
         if one.problem is not None
     ]
+    incomplete = {info.name: info.incomplete for info in infos if info.incomplete is not None}
     rows = sum(one.segment.rows for found in checked.values() for one in found)
     size = sum(one.segment.stored_bytes for found in checked.values() for one in found)
     if as_json:
-        print_json(json.dumps({"sequences": list(checked), "rows": rows, "bytes": size, "problems": bad}))
+        print_json(
+            json.dumps(
+                {
+                    "sequences": list(checked),
+                    "rows": rows,
+                    "bytes": size,
+                    "problems": bad,
+                    "incomplete": incomplete,
+                }
+            )
+        )
     else:
         for one in bad:
             print_line(f"{one['sequence']}{one['topic']}: {one['file']}: {one['problem']}", stderr=True)
-    if bad:
+        for name, reason in incomplete.items():
+            print_line(f"{name}: incomplete: {reason}", stderr=True)
+    if bad or incomplete:
+        what = [f"{counted(len(bad), 'file')} not as written"] if bad else []
+        what += [f"{counted(len(incomplete), 'sequence')} incomplete"] if incomplete else []
         raise VerificationError(
-            f"{counted(len(bad), 'file')} not as written",
+            ", ".join(what),
             where=store,
             hint="ingest their recordings again with if_exists: replace",
         )

@@ -29,6 +29,7 @@ __all__ = [
     "TopicWriter",
     "check_batch",
     "check_same_type",
+    "replacement_is_incomplete",
     "sequence_exists",
     "topic_schema",
 ]
@@ -58,7 +59,7 @@ class ExistingSequence(Struct, frozen=True):
 
     name: str
     complete: bool
-    """False if a run ended with an error, or if a session was never finished."""
+    """False if a run ended early with an error, or if a session was never finished."""
     sessions: tuple[ExistingSession, ...]
     topics: Mapping[str, ExistingTopic] = {}
     """By name, with the leading slash; empty if the destination does not list types."""
@@ -164,7 +165,11 @@ class Session(Protocol):
         ...
 
     def note_error(self, message: str, *, topic: str | None = None) -> None:
-        """Attach an error to the sequence, or to one of its topics, where readers of the destination see it."""
+        """Attach an error to the sequence, or to one of its topics, where readers of the destination see it.
+
+        An error of the sequence marks it as incomplete. A session with such an error cannot replace a stored sequence:
+        its commit raises, and the stored sequence stays.
+        """
         ...
 
     def stored(self) -> tuple[StoredTopic, ...]:
@@ -210,6 +215,15 @@ def sequence_exists(sequence: str) -> SequenceExists:
         where=sequence,
         hint="choose another name, or set sequence.if_exists: skip (if the content is the same), append or replace;"
         " `ingest bag` has --if-exists",
+    )
+
+
+def replacement_is_incomplete(sequence: str) -> SinkError:
+    """Return the error for a session that must not replace a stored sequence because it ended early."""
+    return SinkError(
+        "the new content is incomplete, so the stored sequence was not replaced",
+        where=sequence,
+        hint="run again to replace it",
     )
 
 

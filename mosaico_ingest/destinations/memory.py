@@ -16,6 +16,7 @@ from mosaico_ingest.destinations.base import (
     StoredTopic,
     check_batch,
     check_same_type,
+    replacement_is_incomplete,
     sequence_exists,
     topic_schema,
 )
@@ -73,6 +74,9 @@ class MemorySink:
         session = _MemorySession(MemorySequence(dict(metadata)), existing.topics if existing else {})
         yield session
         self._check_name(sequence, if_exists)
+        ended_early = any(topic is None for topic, _ in session.sequence.errors)
+        if if_exists is IfExists.REPLACE and sequence in self.sequences and ended_early:
+            raise replacement_is_incomplete(sequence)
         if existing is None:
             self.sequences[sequence] = session.sequence
         else:

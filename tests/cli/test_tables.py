@@ -102,4 +102,4 @@ def test_the_list_says_which_sequence_is_not_whole(
             if name == "torn":
                 session.note_error("the disk is full")
     store_tables.print_sequences(Store.open(tmp_path).sequences(), as_json=False)
-    assert capsys.readouterr().out.splitlines()[-1:] == ["torn: the disk is full"]
+    assert capsys.readouterr().out.splitlines()[-1:] == ["torn: incomplete: the disk is full"]

@@ -332,6 +332,26 @@ def test_a_failed_replace_keeps_the_old(keeping: Destination) -> None:
     assert keeping.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(1)]))
 
 
+def test_replace_with_incomplete_session_keeps_stored_sequence(keeping: Destination) -> None:
+    write(keeping, 1)
+    with (
+        pytest.raises(SinkError) as raised,
+        keeping.sink.open("drive", {}, if_exists=IfExists.REPLACE) as session,
+    ):
+        session.topic("/gps/fix", POINT, {}).write(points(2, 3))
+        session.note_error("stopped")
+    assert raised.value.where == "drive"
+    assert keeping.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(1)]))
+    assert list(keeping.errors("drive")) == []
+
+
+def test_replace_with_incomplete_session_creates_missing_sequence(there: Destination) -> None:
+    with there.sink.open("drive", {}, if_exists=IfExists.REPLACE) as session:
+        session.topic("/gps/fix", POINT, {}).write(points(2, 3))
+        session.note_error("stopped")
+    assert there.errors("drive") == [(None, "stopped")]
+
+
 def test_errors_are_kept_with_the_sequence(there: Destination) -> None:
     with there.sink.open("drive", {}) as session:
         session.topic("/gps/fix", POINT, {})

@@ -281,7 +281,7 @@ def test_a_writer_nobody_heard_of_for_long_does_not_commit(url: str, monkeypatch
 
 def test_a_store_of_a_later_format_is_not_touched(url: str) -> None:
     (root_of(url) / "store.json").write_bytes(b'{"format": 2}')
-    with pytest.raises(SinkError, match="the store has format 2, this version knows up to 1"):
+    with pytest.raises(SinkError, match="the store has format 2, this version supports up to 1"):
         Store.open(url)
 
 

@@ -20,7 +20,7 @@ import pyarrow as pa
 import pytest
 from disks import MEBIBYTE, read_only, small_disk
 
-from mosaico_ingest.destinations.store import Store, StoreSink
+from mosaico_ingest.destinations.store import Store, StoreSink, catalog
 from mosaico_ingest.destinations.store.catalog import FORMAT, Catalog
 from mosaico_ingest.destinations.store.errors import explained
 from mosaico_ingest.destinations.store.files import Lease, is_live
@@ -112,7 +112,7 @@ def test_files_stay_where_nobody_can_say_whether_they_were_entered(
 def test_another_programs_file_is_left_alone(tmp_path: Path) -> None:
     with closing(sqlite3.connect(tmp_path / "catalog.sqlite")) as db:
         db.execute("CREATE TABLE theirs (x)")
-    with pytest.raises(SinkError, match="no catalog of a store"):
+    with pytest.raises(SinkError, match="not the catalog of a store"):
         Store.open(tmp_path)
     (tmp_path / "catalog.sqlite").write_bytes(b"certainly not a database, but long enough to be one" * 20)
     with pytest.raises(SinkError, match="not a database"):
@@ -267,3 +267,53 @@ def test_a_lease_is_live_until_it_is_released(tmp_path: Path) -> None:
     assert is_live(path)
     lease.release()
     assert not is_live(path)
+
+
+def test_store_opened_by_many_processes_is_never_seen_uninitialized(tmp_path: Path) -> None:
+    """A process that finds the catalog while another one creates it must be able to open it."""
+    context = get_context("fork")
+    for round_number in range(8):
+        folder = tmp_path / str(round_number)
+        start, results = context.Event(), context.Queue()
+        workers = [
+            context.Process(target=_open_when_visible, args=(folder, start, results, number % 2 == 0))
+            for number in range(6)
+        ]
+        for worker in workers:
+            worker.start()
+        start.set()
+        outcomes = [results.get(timeout=60) for _ in workers]
+        for worker in workers:
+            worker.join()
+        assert outcomes == [None] * len(workers)
+        assert sorted(path.name for path in folder.iterdir()) == ["catalog.sqlite"]
+
+
+def test_catalog_under_creation_has_no_name_until_it_is_initialized(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    visible: list[bool] = []
+    use_wal = catalog._use_wal
+
+    def observe(db: sqlite3.Connection) -> None:
+        visible.append((tmp_path / "catalog.sqlite").exists())
+        use_wal(db)
+
+    monkeypatch.setattr(catalog, "_use_wal", observe)
+    Store.open(tmp_path)
+    assert visible == [False]
+    assert Store.find(tmp_path) is not None
+
+
+def _open_when_visible(folder: Path, start: Any, results: Any, create: bool) -> None:  # noqa: FBT001 - passed by a process
+    try:
+        start.wait()
+        if create:
+            Store.open(folder)
+        else:
+            while Store.find(folder) is None:
+                pass
+    except Exception as error:  # noqa: BLE001 - reported to the parent
+        results.put(repr(error))
+    else:
+        results.put(None)

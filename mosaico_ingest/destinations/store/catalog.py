@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 import sqlite3
 import time
 from collections import defaultdict
@@ -609,64 +610,97 @@ class Catalog:
 
     def _connect(self, mode: str) -> sqlite3.Connection:
         try:
-            return self._opened(f"mode={mode}")
+            return _connect(self.path, f"mode={mode}")
         except sqlite3.OperationalError:
             if mode != "ro" or not self.path.is_file() or os.access(self.path.parent, os.W_OK):
                 raise
-            return self._opened("immutable=1")  # a read-only medium has no room for the files of the WAL
-
-    def _opened(self, query: str) -> sqlite3.Connection:
-        uri = f"{self.path.absolute().as_uri()}?{query}"
-        db = sqlite3.connect(uri, uri=True, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
-        try:
-            db.row_factory = sqlite3.Row
-            db.execute("PRAGMA foreign_keys = ON")
-            db.execute("PRAGMA synchronous = FULL")
-            db.execute("SELECT count(*) FROM sqlite_master")
-        except sqlite3.Error:
-            db.close()
-            raise
-        return db
+            return _connect(self.path, "immutable=1")  # a read-only medium cannot hold the files of the WAL
 
     def _prepare(self, *, create: bool) -> None:
-        with closing(self._connect("rwc" if create else "ro")) as db:
-            if create and self._format(db) == 0:
-                _use_wal(db)
-                db.execute("BEGIN IMMEDIATE")
-                if self._format(db) == 0:  # no other process was faster
-                    for statement in _TABLES.split(";"):
-                        db.execute(statement)
-                    db.execute(f"PRAGMA application_id = {_APPLICATION}")
-                    db.execute(f"PRAGMA user_version = {FORMAT}")
-                db.execute("COMMIT")
-            found = self._format(db)
-            if create and found == FORMAT:  # a newer one is not ours to change
-                _complete(db)
-        if found > FORMAT:
+        if create and not self.path.exists():
+            self._create_atomically()
+        with closing(self._connect("rw" if create else "ro")) as db:
+            if create:
+                _initialize(db, self.path)
+            version = _format(db, self.path)
+            if create and version == FORMAT:  # a catalog of a newer format must not be changed
+                _add_missing_columns(db)
+        if version > FORMAT:
             raise SinkError(
-                f"the store has format {found}, this version knows up to {FORMAT}",
+                f"the store has format {version}, this version supports up to {FORMAT}",
                 where=str(self.path.parent),
                 hint="upgrade mosaico-ingest",
             )
-        if found == 0:
+        if version == 0:
             raise SinkError("there is no store here", where=str(self.path.parent), hint="check the path")
 
-    def _format(self, db: sqlite3.Connection) -> int:
-        version, application = (db.execute(f"PRAGMA {name}").fetchone()[0] for name in _STAMPS)
-        tables = db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
-        if application != _APPLICATION and (application or version or tables):
-            raise SinkError("the file is no catalog of a store", where=str(self.path), hint="check the path")
-        return int(version)
+    def _create_atomically(self) -> None:
+        """Create the catalog under its name only when it is initialized, so that no process sees half of it."""
+        draft = self.path.with_name(f".{self.path.name}-{secrets.token_hex(8)}")
+        try:
+            with closing(_connect(draft, "mode=rwc")) as db:
+                _initialize(db, draft)
+            try:
+                os.link(draft, self.path)
+            except FileExistsError:
+                pass  # another process created it
+            except OSError:  # the file system has no hard links
+                if not self.path.exists():
+                    draft.replace(self.path)
+        finally:
+            for file in self.path.parent.glob(f"{draft.name}*"):
+                file.unlink(missing_ok=True)
 
 
 _STAMPS = ("user_version", "application_id")
 
 
-def _complete(db: sqlite3.Connection) -> None:
-    """Add what catalogs of the same format once did without."""
+def _connect(path: Path, query: str) -> sqlite3.Connection:
+    uri = f"{path.absolute().as_uri()}?{query}"
+    db = sqlite3.connect(uri, uri=True, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
+    try:
+        db.row_factory = sqlite3.Row
+        db.execute("PRAGMA foreign_keys = ON")
+        db.execute("PRAGMA synchronous = FULL")
+        db.execute("SELECT count(*) FROM sqlite_master")
+    except sqlite3.Error:
+        db.close()
+        raise
+    return db
+
+
+def _format(db: sqlite3.Connection, path: Path) -> int:
+    """Return the format of a catalog, 0 for an empty file.
+
+    Raises:
+        SinkError: The file is another database.
+    """
+    version, application = (db.execute(f"PRAGMA {name}").fetchone()[0] for name in _STAMPS)
+    tables = db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
+    if application != _APPLICATION and (application or version or tables):
+        raise SinkError("the file is not the catalog of a store", where=str(path), hint="check the path")
+    return int(version)
+
+
+def _initialize(db: sqlite3.Connection, path: Path) -> None:
+    """Create the tables if the file is empty."""
+    if _format(db, path) != 0:
+        return
+    _use_wal(db)
+    db.execute("BEGIN IMMEDIATE")
+    if _format(db, path) == 0:  # another process may have been faster
+        for statement in _TABLES.split(";"):
+            db.execute(statement)
+        db.execute(f"PRAGMA application_id = {_APPLICATION}")
+        db.execute(f"PRAGMA user_version = {FORMAT}")
+    db.execute("COMMIT")
+
+
+def _add_missing_columns(db: sqlite3.Connection) -> None:
+    """Add the columns that earlier catalogs of the same format lack."""
     if not _has_checksums(db):
         db.execute("BEGIN IMMEDIATE")
-        if not _has_checksums(db):  # no other process was faster
+        if not _has_checksums(db):  # another process may have been faster
             db.execute("ALTER TABLE segments ADD COLUMN checksum TEXT")
         db.execute("COMMIT")
 

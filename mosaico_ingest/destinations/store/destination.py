@@ -93,7 +93,7 @@ class StoreDestination(Destination):
 def _existing(info: SequenceInfo) -> ExistingSequence:
     return ExistingSequence(
         name=info.name,
-        complete=all(note.topic is not None for note in info.notes),
+        complete=info.incomplete is None,
         sessions=tuple(ExistingSession(session.id, session.metadata) for session in info.sessions),
         topics={
             topic.name: ExistingTopic(topic.session, topic.ontology, topic.metadata) for topic in info.topics

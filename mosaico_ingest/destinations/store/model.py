@@ -101,6 +101,14 @@ class SequenceInfo(Struct, frozen=True):
     notes: tuple[Note, ...]
 
     @property
+    def incomplete(self) -> str | None:
+        """The reason why rows may be missing: the error that ended a run early, or a missing session."""
+        errors = [note.message for note in self.notes if note.topic is None]
+        if errors:
+            return errors[-1]
+        return None if self.sessions else "no session was finished"
+
+    @property
     def rows(self) -> int:
         """The number of rows of all topics."""
         return sum(topic.rows for topic in self.topics)

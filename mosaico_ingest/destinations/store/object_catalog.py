@@ -310,7 +310,7 @@ class Documents:
                 found = FORMAT
         if found > FORMAT:
             raise SinkError(
-                f"the store has format {found}, this version knows up to {FORMAT}",
+                f"the store has format {found}, this version supports up to {FORMAT}",
                 where=str(self._root),
                 hint="upgrade mosaico-ingest",
             )

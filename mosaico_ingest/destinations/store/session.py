@@ -16,7 +16,13 @@ import pyarrow as pa
 from msgspec import Struct
 
 from mosaico_ingest import protocol
-from mosaico_ingest.destinations.base import Session, StoredTopic, check_batch, check_same_type
+from mosaico_ingest.destinations.base import (
+    Session,
+    StoredTopic,
+    check_batch,
+    check_same_type,
+    replacement_is_incomplete,
+)
 from mosaico_ingest.destinations.store import catalog, files
 from mosaico_ingest.destinations.store.checksum import combined
 from mosaico_ingest.destinations.store.errors import explained
@@ -247,7 +253,10 @@ class StoreSession:
         return tuple(self._stored(name, topic) for name, topic in self._given.items())
 
     def commit(self) -> None:
-        """Finish every topic, move the segments to their places, and enter them in the catalog at once."""
+        """Finish every topic, move its segments to their final paths, and enter them in the catalog atomically."""
+        ended_early = any(note.topic is None for note in self._notes)
+        if ended_early and self._claim.if_exists is IfExists.REPLACE and self._claim.sequence_id is not None:
+            raise replacement_is_incomplete(self._claim.sequence)
         self._close_topics()
         moves = {
             segment.path: topic.folder / segment.path.name
