@@ -1,7 +1,7 @@
-"""How much smaller recordings get, and against one Parquet file a batch, as the platform keeps its chunks.
+"""Compare the size of stored sequences with the recordings and with the chunks of a Mosaico server.
 
-The chunks hold the same rows, as many at a time as the official client sends
-(about 25 MB of Arrow data), in Parquet files with zstd and pyarrow's other defaults.
+A chunk holds the rows of one upload message of the official client (about 25 MB of Arrow data) in a Parquet file
+with zstd and otherwise pyarrow's defaults.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ROW = "{:<22} {:>9} {:>9} {:>8} {:>10} {:>8} {:>7}"
 
 
 def chunks_bytes(store: Path, folder: Path) -> int:
-    """Return the size of the same rows as one Parquet file a chunk."""
+    """Return the total size of the stored rows as one Parquet file per chunk, in bytes."""
     total = 0
     for sequence in Store.open(store, create=False).sequences():
         for topic in sequence.topics:
@@ -45,26 +45,25 @@ def main() -> None:
     )
     parser.add_argument("recordings", metavar="RECORDING", nargs="+", type=Path)
     recordings = parser.parse_args().recordings
-    print(ROW.format("recording", "source MB", "store MB", "saved", "chunks MB", "ours/it", "time s"))
+    print(ROW.format("recording", "source MB", "store MB", "saving", "chunks MB", "ratio", "time s"))
     for recording in recordings:
         with tempfile.TemporaryDirectory(dir=recording.parent) as folder:
             store, report = Path(folder) / "store", Path(folder) / "report.json"
             command = [sys.executable, "-m", "mosaico_ingest", "bag", recording, "--name", "run", "-q"]
             sample = run([*command, "--store", store, "--report", report])
             source = json.loads(report.read_text())["recordings"][0]["source_bytes"]
-            ours = sum(file.stat().st_size for file in store.rglob("*.parquet"))
-            theirs = chunks_bytes(store, Path(folder))
+            store_bytes = sum(file.stat().st_size for file in store.rglob("*.parquet"))
+            server_bytes = chunks_bytes(store, Path(folder))
             shutil.rmtree(store)
-        megabytes = (f"{size / 1e6:.1f}" for size in (source, ours, theirs))
-        first, second, third = megabytes
+        source_mb, store_mb, server_mb = (f"{size / 1e6:.1f}" for size in (source, store_bytes, server_bytes))
         print(
             ROW.format(
                 recording.name,
-                first,
-                second,
-                f"{100 * (1 - ours / source):.0f} %",
-                third,
-                f"{ours / theirs:.2f}",
+                source_mb,
+                store_mb,
+                f"{100 * (1 - store_bytes / source):.0f} %",
+                server_mb,
+                f"{store_bytes / server_bytes:.2f}",
                 f"{sample.wall_s:.2f}",
             )
         )

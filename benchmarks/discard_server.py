@@ -1,6 +1,6 @@
-"""A Mosaico server that throws rows away, for timing clients: prints its port, ends when its input does.
+"""A Mosaico server that discards all rows, to measure clients: print the port, serve until standard input is closed.
 
-It answers just what the official client asks for during an upload, so the time measured is the client's own.
+It implements only the calls of an upload by the official client, so that nearly all of the measured time is the client's.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ import pyarrow as pa
 import pyarrow.flight as fl
 
 MESSAGE_BYTES = 50 << 20
-"""The platform's default limit."""
+"""The default message limit of a Mosaico server, in bytes."""
 SIZES = ("grpc_max_decode_message_size", "grpc_max_encode_message_size", "grpc_target_encode_message_size")
 
 Call: TypeAlias = Any
-Asked: TypeAlias = Any
-Sent: TypeAlias = Any
-"""What Flight hands over; its classes have no annotations."""
+Descriptor: TypeAlias = Any
+Upload: TypeAlias = Any
+"""Arguments of Flight handlers, whose classes have no annotations."""
 
 
 class DiscardServer(fl.FlightServerBase):
-    """Accepts every upload."""
+    """A server that accepts every upload and counts its rows."""
 
     def __init__(self) -> None:
         super().__init__("grpc://127.0.0.1:0")
@@ -34,7 +34,7 @@ class DiscardServer(fl.FlightServerBase):
         self.sessions: list[str] = []
 
     def do_action(self, _context: Call, action: fl.Action) -> Iterator[bytes]:
-        asked: dict[str, Any] = json.loads(action.body.to_pybytes() or b"{}")
+        request: dict[str, Any] = json.loads(action.body.to_pybytes() or b"{}")
         response: dict[str, Any] | None = None
         if action.type == "info":
             response = {
@@ -43,13 +43,13 @@ class DiscardServer(fl.FlightServerBase):
                 "config": dict.fromkeys(SIZES, MESSAGE_BYTES),
             }
         elif action.type in {"session_create", "topic_create"}:
-            own = str(uuid.uuid4())
-            response = {"uuid": own}
+            identifier = str(uuid.uuid4())
+            response = {"uuid": identifier}
             if action.type == "session_create":
-                response["locator"] = f"{asked['locator']}:{own[:8]}"
+                response["locator"] = f"{request['locator']}:{identifier[:8]}"
                 self.sessions.append(response["locator"])
             else:
-                self.topics[own] = {**asked, "rows": 0, "bytes": 0, "low": None, "high": None}
+                self.topics[identifier] = {**request, "rows": 0, "bytes": 0, "low": None, "high": None}
         elif action.type.endswith("notification_list"):
             response = {"notifications": []}
         if response is None:
@@ -57,7 +57,7 @@ class DiscardServer(fl.FlightServerBase):
         else:
             yield json.dumps({"action": action.type, "response": response}).encode()
 
-    def do_put(self, _context: Call, descriptor: Asked, reader: Sent, _writer: Call) -> None:
+    def do_put(self, _context: Call, descriptor: Descriptor, reader: Upload, _writer: Call) -> None:
         topic = self.topics[json.loads(descriptor.command)["topic_uuid"]]
         for chunk in reader:
             times = chunk.data.column("timestamp_ns").to_numpy()
@@ -67,18 +67,24 @@ class DiscardServer(fl.FlightServerBase):
                 topic["low"] = min(int(times[0]), topic["low"] or int(times[0]))
                 topic["high"] = max(int(times[-1]), topic["high"] or 0)
 
-    def get_flight_info(self, _context: Call, descriptor: Asked) -> fl.FlightInfo:
+    def get_flight_info(self, _context: Call, descriptor: Descriptor) -> fl.FlightInfo:
         locator = json.loads(descriptor.command)["resource_locator"]
         endpoints = [
-            fl.FlightEndpoint(own.encode(), [], None, json.dumps(_topic_info(topic)).encode())
-            for own, topic in self.topics.items()
+            fl.FlightEndpoint(identifier.encode(), [], None, json.dumps(_topic_info(topic)).encode())
+            for identifier, topic in self.topics.items()
             if topic["locator"].startswith(f"{locator}/")
         ]
         topics = [topic["locator"] for topic in self.topics.values()]
-        done = {"created_at_ns": 1, "completed_at_ns": 1, "locked": True, "topics": topics}
-        sessions = [{"locator": session, **done} for session in self.sessions]
-        about = {"resource_locator": locator, "created_at_ns": 1, "user_metadata": {}, "sessions": sessions}
-        return fl.FlightInfo(pa.schema([]), descriptor, endpoints, -1, -1, False, json.dumps(about).encode())  # noqa: FBT003 - pyarrow takes it by position
+        finished = {"created_at_ns": 1, "completed_at_ns": 1, "locked": True, "topics": topics}
+        sessions = [{"locator": session, **finished} for session in self.sessions]
+        description = {
+            "resource_locator": locator,
+            "created_at_ns": 1,
+            "user_metadata": {},
+            "sessions": sessions,
+        }
+        metadata = json.dumps(description).encode()
+        return fl.FlightInfo(pa.schema([]), descriptor, endpoints, -1, -1, False, metadata)  # noqa: FBT003 - pyarrow has no name for it
 
 
 def _topic_info(topic: dict[str, Any]) -> dict[str, Any]:

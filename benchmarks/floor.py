@@ -1,7 +1,7 @@
-"""What no pipeline can go below: read and inflate every chunk, then write the same rows, ready-made, in the same way.
+"""A lower bound for ingestion: read and decompress every chunk, then write prepared tables of the same rows.
 
-Usage: floor.py RECORDING STORE. STORE holds the recording's rows already; loading them is not counted, and the
-seconds it took are printed so that the caller can take them off.
+Usage: floor.py RECORDING STORE. STORE must contain the rows of the recording. The output contains the seconds that loading
+them took, so that the caller can subtract them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import zstandard
 from mosaico_ingest.destinations.store.segment import Columns, SegmentWriter
 from mosaico_ingest.destinations.store.store import Store
 
-INFLATE = {
+DECOMPRESS = {
     "": bytes,
     "none": bytes,
     "lz4": lz4.frame.decompress,
@@ -43,7 +43,7 @@ def mcap_chunks(path: Path) -> Iterator[bytes]:
             body = memoryview(file.read(length))
             (name_bytes,) = struct.unpack_from("<I", body, 28)
             name = bytes(body[32 : 32 + name_bytes]).decode()
-            yield INFLATE[name](body[40 + name_bytes :])
+            yield DECOMPRESS[name](body[40 + name_bytes :])
 
 
 def ros1_chunks(path: Path) -> Iterator[bytes]:
@@ -57,7 +57,7 @@ def ros1_chunks(path: Path) -> Iterator[bytes]:
                 continue
             name = header.partition(b"compression=")[2]
             kind = next(kind for kind in ("lz4", "none") if name.startswith(kind.encode()))
-            yield INFLATE[kind](file.read(length))
+            yield DECOMPRESS[kind](file.read(length))
 
 
 def sqlite_rows(path: Path) -> Iterator[bytes]:
@@ -68,11 +68,10 @@ def sqlite_rows(path: Path) -> Iterator[bytes]:
 READERS = {".mcap": mcap_chunks, ".bag": ros1_chunks, ".db3": sqlite_rows}
 
 
-def loaded(store: Path) -> list[list[pa.Table]]:
-    """Return the row groups of every file."""
-    opened = Store.open(store, create=False)
+def load_tables(store: Path) -> list[list[pa.Table]]:
+    """Return the row groups of every segment of a store."""
     files: list[list[pa.Table]] = []
-    for sequence in opened.sequences():
+    for sequence in Store.open(store, create=False).sequences():
         for topic in sequence.topics:
             for segment in topic.segments:
                 with pq.ParquetFile(segment.path) as file:
@@ -84,9 +83,9 @@ def loaded(store: Path) -> list[list[pa.Table]]:
 def main() -> None:
     recording, store = map(Path, sys.argv[1:])
     start = time.perf_counter()
-    files = loaded(store)
+    files = load_tables(store)
     read_from = time.perf_counter()
-    inflated = sum(map(len, READERS[recording.suffix](recording)))
+    decompressed = sum(map(len, READERS[recording.suffix](recording)))
     write_from = time.perf_counter()
     with tempfile.TemporaryDirectory(dir=store.parent) as folder:
         for number, groups in enumerate(files):
@@ -95,8 +94,8 @@ def main() -> None:
                 writer.append(group)
             writer.close()
         end = time.perf_counter()
-    took = {"load_s": read_from - start, "read_s": write_from - read_from, "write_s": end - write_from}
-    print(json.dumps({**took, "inflated_bytes": inflated}))
+    seconds = {"load_s": read_from - start, "read_s": write_from - read_from, "write_s": end - write_from}
+    print(json.dumps({**seconds, "decompressed_bytes": decompressed}))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Measures one job over five short recordings: what each takes where a process starts once for all of them.
+"""Measure one job over five short recordings, to see the time per recording without the start of a process.
 
     ./dev bench job [--runs 3] [--peer ~/sdk/bin/python] [--data FOLDER]
 
-With `--peer` also the official injector, which takes one recording a process.
+`--peer` also measures the official injector, which needs one process per recording.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ target: {store: store}
 """
 
 
-def timed(recordings: list[Path], runs: int, data: Path) -> tuple[Sample, dict[str, int]]:
-    """Return what a job over the recordings takes, and how many messages each has."""
-    with tempfile.TemporaryDirectory(dir=data) as made:
-        folder = Path(made)
+def measure_job(recordings: list[Path], runs: int, data: Path) -> tuple[Sample, dict[str, int]]:
+    """Return the figures of a job over the recordings, and the number of messages per recording."""
+    with tempfile.TemporaryDirectory(dir=data) as name:
+        folder = Path(name)
         (folder / "recordings").mkdir()
         for recording in recordings:
             (folder / "recordings" / recording.name).symlink_to(recording.resolve())
@@ -48,23 +48,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--runs", type=int, default=3, help="runs of each (3)")
-    parser.add_argument("--peer", type=Path, metavar="PYTHON", help="the Python of a venv with mosaicolabs")
-    parser.add_argument("--data", type=Path, default=HERE / "data", help="where the recordings are kept")
+    parser.add_argument("--runs", type=int, default=3, help="number of runs (default: 3)")
+    parser.add_argument(
+        "--peer", type=Path, metavar="PYTHON", help="Python of a virtual environment with mosaicolabs"
+    )
+    parser.add_argument("--data", type=Path, default=HERE / "data", help="folder of the generated recordings")
     arguments = parser.parse_args()
     recordings = [BY_NAME[name].path(arguments.data) for name in SHORT]
-    run([*INGEST, "--help"])  # so that no run compiles the sources
-    whole, counts = timed(recordings, arguments.runs, arguments.data)
+    run([*INGEST, "--help"])  # compile the sources before the first measured run
+    sample, counts = measure_job(recordings, arguments.runs, arguments.data)
     messages = sum(counts.values())
-    one = whole.wall_s / len(recordings)
+    each_s = sample.wall_s / len(recordings)
     print(
-        f"one job: {len(recordings)} recordings, {messages:,} messages, {whole.wall_s:.2f} s, {one:.2f} s each"
+        f"one job: {len(recordings)} recordings, {messages:,} messages, {sample.wall_s:.2f} s, {each_s:.2f} s each"
     )
     if arguments.peer:
         speeds = {path: peer_speed(path, arguments.runs, arguments.peer) for path in recordings}
         seconds = sum(counts[path.stem] / speed for path, speed in speeds.items())
         print(
-            f"the official injector, one process each: {seconds:.1f} s, {seconds / whole.wall_s:.0f} times as long"
+            f"official injector, one process per recording: {seconds:.1f} s, {seconds / sample.wall_s:.0f} times as long"
         )
 
 

@@ -1,4 +1,4 @@
-"""Runs a program as a whole process and says what it took: time, CPU and memory, from the system's own books."""
+"""Measurement of a complete process: time, CPU time and peak memory as the operating system reports them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from statistics import median
 
 @dataclass(frozen=True)
 class Sample:
-    """One run of a program."""
+    """The figures and the output of one run of a program."""
 
     wall_s: float
     cpu_s: float
@@ -23,7 +23,11 @@ class Sample:
 
 
 def run(command: Sequence[str | Path], environment: Mapping[str, str] | None = None) -> Sample:
-    """Run a program to its end; it must succeed."""
+    """Run a program to its end and measure it.
+
+    Raises:
+        SystemExit: The program failed.
+    """
     clean = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     with tempfile.TemporaryFile("w+") as output:
         start = time.perf_counter()

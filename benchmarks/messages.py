@@ -1,4 +1,4 @@
-"""Makes messages of every kind that is measured, the same values for the same seed."""
+"""Messages of all types in the benchmarks, with values that depend only on the seed."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 Message: TypeAlias = Any
-"""An instance of a class that rosbags makes at run time."""
+"""An instance of a class that rosbags creates at run time."""
 Values: TypeAlias = Any
-"""What a field takes, a numpy array or a plain value."""
+"""The value of a field: a numpy array or a plain value."""
 
 FRAMES = ("base_link", "camera_front", "camera_rear", "lidar_top", "imu_link", "gripper")
 JOINTS = [f"arm_joint_{number}" for number in range(12)]
@@ -18,7 +18,7 @@ STATES = ("RUNNING", "IDLE", "PLANNING", "FAULT")
 
 
 class Messages:
-    """Makes messages of one typestore; `self.short(time_ns)` is a message of that type."""
+    """A generator of messages: each method takes the time in nanoseconds and returns a message of one type."""
 
     def __init__(self, store: Stores, seed: int) -> None:
         self.store = get_typestore(store)
@@ -30,16 +30,16 @@ class Messages:
         self.sequence = 0
 
     def make(self, name: str, /, **values: Values) -> Message:
-        """Return a message; what this distro's type does not have is left out."""
+        """Return a message; values for fields that the distro's type does not have are ignored."""
         kind = self.store.types[name]
         return kind(**{key: value for key, value in values.items() if key in kind.__dataclass_fields__})
 
     def normal(self, count: int) -> Values:
         return self.random.standard_normal(count)
 
-    def text(self, least: int, most: int) -> str:
+    def text(self, shortest: int, longest: int) -> str:
         return (
-            self.random.integers(97, 123, int(self.random.integers(least, most + 1)), np.uint8)
+            self.random.integers(97, 123, int(self.random.integers(shortest, longest + 1)), np.uint8)
             .tobytes()
             .decode()
         )
@@ -158,7 +158,7 @@ class Messages:
         )
 
     def jpeg(self, time_ns: int) -> Message:
-        """Return what compresses as little as a JPEG of 150 kB does."""
+        """Return an image of about 150 kB that is as incompressible as a JPEG image."""
         data = self.random.integers(0, 256, 150_000 + int(self.random.integers(-15_000, 15_000)), np.uint8)
         data[:4], data[-2:] = (0xFF, 0xD8, 0xFF, 0xE0), (0xFF, 0xD9)
         header = self.header(time_ns, "cam")
@@ -190,7 +190,7 @@ class Messages:
         )
 
     def image(self, time_ns: int) -> Message:
-        """Return smooth colours with noise in the low bits."""
+        """Return an image of smooth colors with noise in the low bits."""
         rows, columns = np.mgrid[0:480, 0:640]
         ramp = ((columns + rows + time_ns // 10**7) % 256).astype(np.uint8)
         noise = self.random.integers(0, 8, (480, 640, 3), np.uint8)
@@ -211,8 +211,8 @@ class Messages:
         values[:, :3] = self.random.standard_normal((points, 3), np.float32) * 20
         values[:, 3] = self.random.integers(0, 256, points)
         fields = [
-            self.make("sensor_msgs/msg/PointField", name=name, offset=4 * place, datatype=7, count=1)
-            for place, name in enumerate(("x", "y", "z", "intensity"))
+            self.make("sensor_msgs/msg/PointField", name=name, offset=4 * index, datatype=7, count=1)
+            for index, name in enumerate(("x", "y", "z", "intensity"))
         ]
         return self.make(
             "sensor_msgs/msg/PointCloud2",

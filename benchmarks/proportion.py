@@ -1,9 +1,9 @@
-"""Measures what should be in proportion: a part of a recording costs that part, a question costs the same for any length.
+"""Measure whether costs are proportional: a part of a recording, adapters in Python, and commands on recordings of any length.
 
     python benchmarks/proportion.py [--runs 3] [--data FOLDER]
 
-Every figure is a whole process. Shares are of CPU time, which other programs move less than time, and without that of a
-run over a millisecond.
+Each figure describes a complete process. Shares refer to CPU time, which other load affects less than wall time, minus the
+CPU time of a run over one millisecond.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ SELECTED = {
     "mixed-sqlite-100s": "/gps/fix",
     "mixed-ros1-100s": "/gps/fix",
 }
-"""A recording and the rarest topic in it."""
-ASKED = ("telemetry-30s", "telemetry", "telemetry-1200s")
+"""The rarest topic of each recording."""
+INSPECTED = ("telemetry-30s", "telemetry", "telemetry-1200s")
 
 ADAPTERS = {
     "from the catalog": "",
@@ -54,14 +54,14 @@ class LoadAdapter(ROSAdapterBase[Floating64]):
 
 
 class Jobs:
-    """Runs manifests over one recording at a time."""
+    """Runs of manifests over one recording at a time."""
 
     def __init__(self, folder: Path, runs: int) -> None:
         self.folder = folder
         self.runs = runs
 
-    def took(self, recording: Path, *, bag: str = "", rest: str = "") -> Sample:
-        """Run a manifest; `bag` and `rest` go into it."""
+    def run_manifest(self, recording: Path, *, bag: str = "", rest: str = "") -> Sample:
+        """Return the median figures of a manifest; `bag` is inserted into its bag section, `rest` at its end."""
         job, store = self.folder / "job.yaml", self.folder / "store"
         job.write_text(
             f"version: 1\nbag: {{path: '{recording}'{bag}}}\nsequence: {{name: run}}\ntarget: {{store: '{store}'}}\n{rest}"
@@ -72,30 +72,30 @@ class Jobs:
             samples.append(run([*INGEST, job, "-q"]))
         return typical(samples)
 
-    def parts(self, name: str, recording: Path, topic: str) -> None:
-        """Print what a hundredth of the time and one rare topic cost."""
+    def print_shares(self, name: str, recording: Path, topic: str) -> None:
+        """Print the cost of 1 % of the time and of one rare topic, relative to the complete recording."""
         length = BY_NAME[name].seconds
-        start = self.took(recording, bag=window(length, 0.001 / length)).cpu_s
-        whole = self.took(recording).cpu_s - start
-        short = self.took(recording, bag=window(length, 0.01)).cpu_s - start
-        rare = self.took(recording, rest=f'topics: ["{topic}"]\n').cpu_s - start
+        start = self.run_manifest(recording, bag=window(length, 0.001 / length)).cpu_s
+        complete = self.run_manifest(recording).cpu_s - start
+        short = self.run_manifest(recording, bag=window(length, 0.01)).cpu_s - start
+        rare = self.run_manifest(recording, rest=f'topics: ["{topic}"]\n').cpu_s - start
         print(
-            f"| {name} | {start:.2f} s | {whole:.2f} s | {100 * short / whole:.1f} % | {100 * rare / whole:.0f} % |",
+            f"| {name} | {start:.2f} s | {complete:.2f} s | {100 * short / complete:.1f} % | {100 * rare / complete:.0f} % |",
             flush=True,
         )
 
-    def adapters(self, recording: Path) -> None:
-        """Print what the kinds of adapters cost over the same messages."""
+    def print_adapters(self, recording: Path) -> None:
+        """Print the time of each type of adapter for the same messages."""
         for name, methods in ADAPTERS.items():
             rest = 'topics: ["/load"]\n'
             if methods:
                 (self.folder / "load_adapter.py").write_text(ADAPTER + methods)
                 rest += "adapters: {load: ['load_adapter.py:LoadAdapter']}\n"
-            print(f"| {name} | {self.took(recording, rest=rest).wall_s:.2f} s |", flush=True)
+            print(f"| {name} | {self.run_manifest(recording, rest=rest).wall_s:.2f} s |", flush=True)
 
 
 def window(length: float, share: float) -> str:
-    """Return the manifest's `time` for a share of a recording, from its middle."""
+    """Return the key `time` of a manifest for a share of a recording, starting in its middle."""
     return f", time: {{start: +{length / 2:g}s, end: +{length / 2 + length * share:g}s}}"
 
 
@@ -111,22 +111,22 @@ def main() -> None:
     with tempfile.TemporaryDirectory(dir=data) as folder:
         jobs = Jobs(Path(folder), arguments.runs)
         print(
-            "| recording | start (CPU) | the rest (CPU) | 1 % of its time | one rare topic |\n|---|---:|---:|---:|---:|"
+            "| recording | start-up (CPU) | remainder (CPU) | 1 % of its time | one rare topic |\n|---|---:|---:|---:|---:|"
         )
         for name, topic in SELECTED.items():
-            jobs.parts(name, BY_NAME[name].path(data), topic)
-        print("\n| adapter of 300,000 numbers | time |\n|---|---:|")
-        jobs.adapters(BY_NAME["telemetry"].path(data))
+            jobs.print_shares(name, BY_NAME[name].path(data), topic)
+        print("\n| adapter of 300,000 numbers | time of the run |\n|---|---:|")
+        jobs.print_adapters(BY_NAME["telemetry"].path(data))
         print("\n| recording | `ingest inspect` | `ingest plan` |\n|---|---:|---:|")
-        for name in ASKED:
+        for name in INSPECTED:
             recording = BY_NAME[name].path(data)
-            job = Path(folder) / "ask.yaml"
+            job = Path(folder) / "inspect.yaml"
             job.write_text(f"version: 1\nbag: {{path: '{recording}'}}\n")
-            asked = [
+            seconds = [
                 typical([run([*INGEST, *rest]) for _ in range(arguments.runs)]).wall_s
                 for rest in (["inspect", recording], ["plan", job])
             ]
-            print(f"| {name} | {asked[0]:.2f} s | {asked[1]:.2f} s |", flush=True)
+            print(f"| {name} | {seconds[0]:.2f} s | {seconds[1]:.2f} s |", flush=True)
 
 
 if __name__ == "__main__":

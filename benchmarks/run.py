@@ -1,13 +1,13 @@
-"""Measures whole runs, from the recording to the committed store, against the floor and the official injector.
+"""Measure complete runs, from the recording to the committed sequence, and compare them with the floor and the official injector.
 
     ./dev bench                               all workloads, three runs each
     ./dev bench --quick                       short recordings, one run each
-    ./dev bench --long                        four and five times the length, to see what is start-up; 3 GB more
-    ./dev bench --peer ~/sdk/bin/python       also the official injector (a venv with mosaicolabs), into a server
-                                              that throws everything away
-    ./dev bench --recording drive.mcap        a recording of one's own
+    ./dev bench --long                        four to five times longer recordings, which need 3 GB more
+    ./dev bench --peer ~/sdk/bin/python       also the official injector, uploading to a server that discards all rows;
+                                              the Python of a virtual environment with mosaicolabs
+    ./dev bench --recording drive.mcap        your own recording
 
-The floor reads and inflates every chunk, then writes ready-made tables of the same rows with the same settings.
+The floor reads and decompresses every chunk, then writes prepared tables of the same rows with the same settings.
 """
 
 from __future__ import annotations
@@ -30,25 +30,24 @@ from measure import Sample, run, typical
 from workloads import BY_NAME, LONG, SHORT, WORKLOADS, Workload
 
 HERE = Path(__file__).parent
-MOST_PEAK_MB = 512
-MOST_HELP_S = 0.4
+MAX_PEAK_MIB = 512
 INGEST = (sys.executable, "-m", "mosaico_ingest")
 
 
 @dataclass(frozen=True)
 class Case:
-    """A recording, the one the official injector is timed on, and what is demanded."""
+    """A recording to measure, the recording for the official injector, and the targets."""
 
     name: str
     recording: Path
     for_peer: Path
-    least_peer: float = 0.0
-    most_floor: float = 0.0
+    min_peer_ratio: float = 0.0
+    max_floor_ratio: float = 0.0
 
 
 @dataclass(frozen=True)
 class Result:
-    """What a case took; the official injector's figure is messages a second, as it may have a shorter recording."""
+    """The figures of a case; the official injector is measured in messages per second, because its recording can be shorter."""
 
     case: Case
     messages: int
@@ -78,7 +77,7 @@ class Result:
         }
 
 
-def measured(case: Case, runs: int, peer: Path | None) -> Result:
+def measure(case: Case, runs: int, peer: Path | None) -> Result:
     with tempfile.TemporaryDirectory(dir=HERE / "data") as folder:
         store, report = Path(folder) / "store", Path(folder) / "report.json"
         samples: list[Sample] = []
@@ -110,17 +109,17 @@ def measured(case: Case, runs: int, peer: Path | None) -> Result:
 
 
 def floor_seconds(recording: Path, store: Path) -> float:
-    """Return the time of a whole process without that of loading what it writes."""
+    """Return the time of the floor without the time to load its tables."""
     sample = run([sys.executable, HERE / "floor.py", recording, store])
     return sample.wall_s - json.loads(sample.output)["load_s"]
 
 
 def peer_speed(recording: Path, runs: int, python: Path) -> float:
-    """Return the official injector's messages a second."""
+    """Return the speed of the official injector, in messages per second."""
     samples: list[Sample] = []
     rows = 0
     for _ in range(runs):
-        with discarding() as (port, counted):
+        with discard_server() as (port, counted):
             program = python.parent / "mosaicolabs.ros_injector"
             command = [program, recording, "--name", "run", "--host", "127.0.0.1", "--port", port]
             samples.append(run([*command, "--log", "ERROR"]))
@@ -129,8 +128,8 @@ def peer_speed(recording: Path, runs: int, python: Path) -> float:
 
 
 @contextmanager
-def discarding() -> Iterator[tuple[str, list[int]]]:
-    """Run the server that throws rows away; afterwards the list holds how many there were."""
+def discard_server() -> Iterator[tuple[str, list[int]]]:
+    """Run the server that discards rows; yield its port and a list to which the number of rows is added at the end."""
     server = subprocess.Popen(
         [sys.executable, HERE / "discard_server.py"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
@@ -146,18 +145,18 @@ def discarding() -> Iterator[tuple[str, list[int]]]:
 
 
 def cases(arguments: argparse.Namespace) -> list[Case]:
-    """Return what to measure; recordings that are not there are made."""
+    """Return the selected cases, and generate missing recordings."""
     if arguments.recording:
         return [Case(path.name, path, path) for path in arguments.recording]
-    chosen = [*SHORT, *WORKLOADS[3:]] if arguments.quick else LONG if arguments.long else WORKLOADS
-    wanted = [workload for workload in chosen if not arguments.only or workload.name in arguments.only]
-    return [_case(workload, arguments.data) for workload in wanted]
+    selected = [*SHORT, *WORKLOADS[3:]] if arguments.quick else LONG if arguments.long else WORKLOADS
+    workloads = [workload for workload in selected if not arguments.only or workload.name in arguments.only]
+    return [_case(workload, arguments.data) for workload in workloads]
 
 
 def _case(workload: Workload, folder: Path) -> Case:
     path = workload.path(folder)
     short = BY_NAME[workload.peer].path(folder) if workload.peer else path
-    return Case(workload.name, path, short, workload.least_peer, workload.most_floor)
+    return Case(workload.name, path, short, workload.min_peer_ratio, workload.max_floor_ratio)
 
 
 def print_result(result: Result) -> None:
@@ -165,9 +164,9 @@ def print_result(result: Result) -> None:
     floor, size = ours.wall_s / result.floor_s, case.recording.stat().st_size
     peer = result.per_s / result.peer_per_s if result.peer_per_s else 0.0
     missed = [
-        *(["floor"] if case.most_floor and floor > case.most_floor else []),
-        *(["peer"] if peer and peer < case.least_peer else []),
-        *(["memory"] if ours.peak_bytes >> 20 > MOST_PEAK_MB else []),
+        *(["floor"] if case.max_floor_ratio and floor > case.max_floor_ratio else []),
+        *(["peer"] if peer and peer < case.min_peer_ratio else []),
+        *(["memory"] if ours.peak_bytes >> 20 > MAX_PEAK_MIB else []),
     ]
     print(
         f"| {case.name} | {result.messages:,} | {size / 1e6:.0f} MB | {ours.wall_s:.2f} s | {ours.cpu_s:.2f} s "
@@ -178,12 +177,12 @@ def print_result(result: Result) -> None:
     )
 
 
-HEAD = """| workload | messages | recording | time | CPU | messages | bytes | peak | smaller by | time of the floor | speed of the peer |
+HEAD = """| workload | messages | recording | time | CPU | messages/s | throughput | peak memory | size ratio | time / floor | speed / peer |
 |---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|"""
 
 
 def start_up(folder: Path, runs: int) -> dict[str, float]:
-    """Return seconds of what should not depend on how long a recording is."""
+    """Return the seconds of commands whose time must not depend on the length of a recording."""
     long, short = BY_NAME["telemetry"].path(folder), BY_NAME["telemetry-30s"].path(folder)
     commands = {
         "ingest --help": ["--help"],
@@ -201,22 +200,24 @@ def main() -> None:
     )
     parser.add_argument("--quick", action="store_true", help="short recordings, one run each")
     parser.add_argument("--long", action="store_true", help="long recordings")
-    parser.add_argument("--runs", type=int, default=0, help="runs of each (3)")
-    parser.add_argument("--only", action="append", help="a workload's name; repeatable")
+    parser.add_argument("--runs", type=int, default=0, help="runs per workload (default: 3)")
+    parser.add_argument("--only", action="append", help="name of a workload; repeatable")
+    parser.add_argument("--recording", type=Path, action="append", help="your own recording; repeatable")
     parser.add_argument(
-        "--recording", type=Path, action="append", help="a recording of one's own; repeatable"
+        "--peer", type=Path, metavar="PYTHON", help="Python of a virtual environment with mosaicolabs"
     )
-    parser.add_argument("--peer", type=Path, metavar="PYTHON", help="the Python of a venv with mosaicolabs")
-    parser.add_argument("--data", type=Path, default=HERE / "data", help="where the recordings are kept")
-    parser.add_argument("--json", type=Path, default=HERE / "data" / "results.json", help="where figures go")
+    parser.add_argument("--data", type=Path, default=HERE / "data", help="folder of the generated recordings")
+    parser.add_argument(
+        "--json", type=Path, default=HERE / "data" / "results.json", help="file for the figures"
+    )
     arguments = parser.parse_args()
     runs = arguments.runs or (1 if arguments.quick else 3)
     (HERE / "data").mkdir(exist_ok=True)
-    run([*INGEST, "--help"])  # so that no run compiles the sources
+    run([*INGEST, "--help"])  # compile the sources before the first measured run
     print(HEAD)
     results: list[Result] = []
     for case in cases(arguments):
-        results.append(measured(case, runs, arguments.peer))
+        results.append(measure(case, runs, arguments.peer))
         print_result(results[-1])
     figures: dict[str, object] = {
         "date": datetime.now(timezone.utc).isoformat(timespec="minutes"),
@@ -230,7 +231,7 @@ def main() -> None:
     }
     if not (arguments.recording or arguments.only or arguments.long):
         figures["start_up_s"] = seconds = start_up(arguments.data, runs)
-        print(*(f"{name}: {took:.2f} s" for name, took in seconds.items()), sep="\n")
+        print(*(f"{name}: {duration:.2f} s" for name, duration in seconds.items()), sep="\n")
     arguments.json.write_text(json.dumps(figures, indent=1) + "\n")
 
 

@@ -1,8 +1,9 @@
-"""What a server costs: the same recording into `ingest serve` on this machine and into the store itself, in turns.
+"""Measure the cost of a server: ingest one recording alternately into a store and through `ingest serve`.
 
-Run it as `python benchmarks/stream.py [RECORDING] [--copies 40] [--runs 3]`. Without a recording it repeats
-`configs/quickstart/drive.mcap`'s topics in one of its own making. Prints the ratio of wall times and the peak memory
-of client and server, which must not grow with the recording.
+Usage: python benchmarks/stream.py [RECORDING] [--copies 40] [--runs 3]
+
+The default recording repeats the messages of `configs/quickstart/drive.mcap`. The output contains the ratio of the wall times
+and the peak memory of client and server, which must not grow with the recording.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ QUICKSTART = Path(__file__).resolve().parents[1] / "configs/quickstart/drive.mca
 INGEST = (sys.executable, "-m", "mosaico_ingest")
 
 
-def repeated(recording: Path, folder: Path, copies: int) -> Path:
-    """Write the recording's messages so many times, one copy after the other."""
+def write_repeated(recording: Path, folder: Path, copies: int) -> Path:
+    """Write a recording that contains the messages of another one `copies` times in succession."""
     target = folder / f"repeated_{copies}"
     with (
         AnyReader([recording]) as reader,
@@ -44,8 +45,8 @@ def repeated(recording: Path, folder: Path, copies: int) -> Path:
 
 
 @contextmanager
-def served(folder: Path) -> Generator[str, None, None]:
-    """Serve an empty store; yield the port."""
+def serve(folder: Path) -> Generator[str, None, None]:
+    """Serve an empty store and yield the port."""
     command = [*INGEST, "serve", "--store", folder, "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as server:
         assert server.stdout is not None
@@ -53,11 +54,11 @@ def served(folder: Path) -> Generator[str, None, None]:
         server.send_signal(signal.SIGTERM)
 
 
-def measured(recording: Path, folder: Path, runs: int) -> tuple[Sample, Sample]:
-    """Return what a run takes into the store, and what it takes through the server."""
+def measure(recording: Path, folder: Path, runs: int) -> tuple[Sample, Sample]:
+    """Return the median figures of runs into a store and of runs through a server."""
     direct: list[Sample] = []
     streamed: list[Sample] = []
-    with served(folder / "served") as port:
+    with serve(folder / "served") as port:
         for number in range(runs):
             command = [*INGEST, "bag", recording, "--name", f"run_{number}", "--quiet"]
             direct.append(run([*command, "--store", folder / "direct"]))
@@ -70,16 +71,18 @@ def main() -> None:
     parser.add_argument("recording", nargs="?", type=Path)
     parser.add_argument("--copies", type=int, default=40)
     parser.add_argument("--runs", type=int, default=3)
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        recording = given.recording or repeated(QUICKSTART, folder, given.copies)
-        direct, streamed = measured(recording, folder, given.runs)
+        recording = arguments.recording or write_repeated(QUICKSTART, folder, arguments.copies)
+        direct, streamed = measure(recording, folder, arguments.runs)
     ratio = streamed.wall_s / direct.wall_s
     server_peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss << 10
     print(f"store  {direct.wall_s:6.2f} s  {direct.peak_bytes >> 20:5} MiB")
-    print(f"server {streamed.wall_s:6.2f} s  {streamed.peak_bytes >> 20:5} MiB  {ratio:.2f} times the store")
-    print(f"largest process of all {server_peak >> 20} MiB")
+    print(
+        f"server {streamed.wall_s:6.2f} s  {streamed.peak_bytes >> 20:5} MiB  {ratio:.2f} times the time of the store"
+    )
+    print(f"largest process: {server_peak >> 20} MiB")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Generates the recordings that are measured: the same bytes every time, about 2 GB in `benchmarks/data`."""
+"""Recordings for the benchmarks: generated once with fixed seeds, about 2 GB in `benchmarks/data`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Make = Callable[[Messages, int], Message]
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic's name and type, how often it speaks, and for how long where that is not all the time."""
+    """A topic with its message type, its rate, and its duration if it is shorter than the recording."""
 
     name: str
     msgtype: str
@@ -76,7 +76,7 @@ def cameras(raw_seconds: float) -> tuple[Topic, ...]:
 
 @dataclass(frozen=True)
 class Workload:
-    """A recording to measure, and what is demanded of it."""
+    """A recording with the targets of its measurement."""
 
     name: str
     topics: tuple[Topic, ...]
@@ -85,32 +85,32 @@ class Workload:
     suffix: str = ".mcap"
     compression: str = "zstd"
     peer: str | None = None
-    """The shorter recording the official injector is timed on, where this one would take it minutes."""
-    least_peer: float = 0.0
-    """How many times the official injector's speed is demanded."""
-    most_floor: float = 0.0
-    """How many times the floor's time is allowed; 0: no target."""
+    """The shorter recording that the official injector ingests, if this one would take it minutes."""
+    min_peer_ratio: float = 0.0
+    """The minimum speed relative to the official injector; 0: no target."""
+    max_floor_ratio: float = 0.0
+    """The maximum time relative to the floor; 0: no target."""
 
     def path(self, folder: Path) -> Path:
-        """Return the recording, after making it where it is not there."""
+        """Return the path of the recording, and generate it if it does not exist."""
         target = folder / f"{self.name}{self.suffix}"
         if not target.exists():
             folder.mkdir(parents=True, exist_ok=True)
-            fresh = folder / f"new-{target.name}"
-            (_write_ros1 if self.suffix == ".bag" else _write_ros2)(self, fresh)
-            fresh.rename(target)
+            unfinished = folder / f"new-{target.name}"
+            (_write_ros1 if self.suffix == ".bag" else _write_ros2)(self, unfinished)
+            unfinished.rename(target)
         return target
 
 
 WORKLOADS = (
-    Workload("telemetry", TELEMETRY, 300, 1, peer="telemetry-30s", least_peer=100, most_floor=1.5),
-    Workload("cameras", cameras(20), 40, 2, peer="cameras-8s", least_peer=10, most_floor=1.5),
-    Workload("lidar", LIDAR, 60, 3, peer="lidar-6s", least_peer=8, most_floor=1.5),
-    Workload("mixed", MIXED, 20, 4, least_peer=20, most_floor=2),
-    Workload("mixed-sqlite", MIXED, 20, 4, ".db3", "none", least_peer=20, most_floor=2),
-    Workload("mixed-ros1", MIXED, 20, 4, ".bag", "none", least_peer=20, most_floor=2),
-    Workload("mixed-ros1-lz4", MIXED, 20, 4, ".bag", "lz4", least_peer=20, most_floor=2),
-    Workload("layouts", LAYOUTS, 30, 5, least_peer=20),
+    Workload("telemetry", TELEMETRY, 300, 1, peer="telemetry-30s", min_peer_ratio=100, max_floor_ratio=1.5),
+    Workload("cameras", cameras(20), 40, 2, peer="cameras-8s", min_peer_ratio=10, max_floor_ratio=1.5),
+    Workload("lidar", LIDAR, 60, 3, peer="lidar-6s", min_peer_ratio=8, max_floor_ratio=1.5),
+    Workload("mixed", MIXED, 20, 4, min_peer_ratio=20, max_floor_ratio=2),
+    Workload("mixed-sqlite", MIXED, 20, 4, ".db3", "none", min_peer_ratio=20, max_floor_ratio=2),
+    Workload("mixed-ros1", MIXED, 20, 4, ".bag", "none", min_peer_ratio=20, max_floor_ratio=2),
+    Workload("mixed-ros1-lz4", MIXED, 20, 4, ".bag", "lz4", min_peer_ratio=20, max_floor_ratio=2),
+    Workload("layouts", LAYOUTS, 30, 5, min_peer_ratio=20),
 )
 SHORT = (
     Workload("telemetry-30s", TELEMETRY, 30, 1),
@@ -118,24 +118,26 @@ SHORT = (
     Workload("lidar-6s", LIDAR, 6, 3),
 )
 LONG = (
-    Workload("telemetry-1200s", TELEMETRY, 1200, 1, peer="telemetry-30s", least_peer=100, most_floor=1.5),
-    Workload("mixed-100s", MIXED, 100, 4, peer="mixed", least_peer=20, most_floor=2),
+    Workload(
+        "telemetry-1200s", TELEMETRY, 1200, 1, peer="telemetry-30s", min_peer_ratio=100, max_floor_ratio=1.5
+    ),
+    Workload("mixed-100s", MIXED, 100, 4, peer="mixed", min_peer_ratio=20, max_floor_ratio=2),
     Workload("mixed-sqlite-100s", MIXED, 100, 4, ".db3", "none", "mixed-sqlite", 20, 2),
     Workload("mixed-ros1-100s", MIXED, 100, 4, ".bag", "none", "mixed-ros1", 20, 2),
-    Workload("layouts-150s", LAYOUTS, 150, 5, peer="layouts", least_peer=20),
+    Workload("layouts-150s", LAYOUTS, 150, 5, peer="layouts", min_peer_ratio=20),
 )
-"""The same for longer: what is left of start-up, and whether memory stays."""
+"""Longer recordings, to measure without the influence of start-up and to check that memory does not grow."""
 BY_NAME = {workload.name: workload for workload in (*WORKLOADS, *SHORT, *LONG)}
 
 
 def _schedule(workload: Workload) -> list[list[int]]:
-    """Return time and number of the topic of every message, in time."""
-    parts: list[Values] = []
+    """Return the time and the topic number of every message, in order of time."""
+    topics: list[Values] = []
     for number, topic in enumerate(workload.topics):
         count = int((topic.seconds or workload.seconds) * topic.hertz)
         times = START_NS + (np.arange(count) * (1e9 / topic.hertz)).astype(np.int64) + number * 1000
-        parts.append(np.stack([times, np.full(count, number)], axis=1))
-    events = np.concatenate(parts)
+        topics.append(np.stack([times, np.full(count, number)], axis=1))
+    events = np.concatenate(topics)
     return events[np.argsort(events[:, 0], kind="stable")].tolist()
 
 
