@@ -1,6 +1,6 @@
-"""Writes drive.mcap: ten seconds of a small robot driving a circle; the same messages each time.
+"""Write drive.mcap: ten seconds of a small robot that drives a circle. The messages are the same on every run.
 
-Run it from anywhere: `python configs/quickstart/make_recording.py [OUT.mcap]`.
+Usage: python configs/quickstart/make_recording.py [OUT.mcap]
 """
 
 from __future__ import annotations
@@ -48,29 +48,29 @@ def yaw(angle: float) -> Any:
     return make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(angle / 2), w=math.cos(angle / 2))
 
 
-def where(t_ns: int) -> tuple[float, float, float]:
-    """Return x, y in metres and the heading in radians."""
+def position(t_ns: int) -> tuple[float, float, float]:
+    """Return x and y in meters and the heading in radians."""
     angle = TURN_RATE * (t_ns - START_NS) / 1e9
     return RADIUS_M * math.cos(angle), RADIUS_M * math.sin(angle), angle + math.pi / 2
 
 
 def imu(t_ns: int, noise: np.random.Generator) -> Any:
     cov = np.diag([1e-4] * 3).ravel()
-    wobble = noise.normal(0, 0.02, 3)
+    deviation = noise.normal(0, 0.02, 3)
     return make(
         "sensor_msgs/msg/Imu",
         header=header(t_ns, "imu_link"),
-        orientation=yaw(where(t_ns)[2]),
+        orientation=yaw(position(t_ns)[2]),
         orientation_covariance=cov,
-        angular_velocity=vector(0.0, 0.0, TURN_RATE + wobble[0] * 0.1),
+        angular_velocity=vector(0.0, 0.0, TURN_RATE + deviation[0] * 0.1),
         angular_velocity_covariance=cov,
-        linear_acceleration=vector(wobble[1], RADIUS_M * TURN_RATE**2 + wobble[2], 9.81),
+        linear_acceleration=vector(deviation[1], RADIUS_M * TURN_RATE**2 + deviation[2], 9.81),
         linear_acceleration_covariance=cov,
     )
 
 
 def odometry(t_ns: int, _noise: np.random.Generator) -> Any:
-    x, y, heading = where(t_ns)
+    x, y, heading = position(t_ns)
     cov = np.diag([0.01] * 6).ravel()
     pose = make("geometry_msgs/msg/Pose", position=vector(x, y, 0.0, "Point"), orientation=yaw(heading))
     twist = make(
@@ -88,7 +88,7 @@ def odometry(t_ns: int, _noise: np.random.Generator) -> Any:
 
 
 def fix(t_ns: int, noise: np.random.Generator) -> Any:
-    x, y, _ = where(t_ns)
+    x, y, _ = position(t_ns)
     return make(
         "sensor_msgs/msg/NavSatFix",
         header=header(t_ns, "gps"),
@@ -102,32 +102,32 @@ def fix(t_ns: int, noise: np.random.Generator) -> Any:
 
 
 def transforms(t_ns: int, _noise: np.random.Generator) -> Any:
-    x, y, heading = where(t_ns)
-    move = make("geometry_msgs/msg/Transform", translation=vector(x, y, 0.0), rotation=yaw(heading))
+    x, y, heading = position(t_ns)
+    transform = make("geometry_msgs/msg/Transform", translation=vector(x, y, 0.0), rotation=yaw(heading))
     stamped = make(
         "geometry_msgs/msg/TransformStamped",
         header=header(t_ns, "odom"),
         child_frame_id="base_link",
-        transform=move,
+        transform=transform,
     )
     return make("tf2_msgs/msg/TFMessage", transforms=[stamped])
 
 
 def joints(t_ns: int, _noise: np.random.Generator) -> Any:
-    turned = 12.0 * (t_ns - START_NS) / 1e9
+    wheel_angle = 12.0 * (t_ns - START_NS) / 1e9
     return make(
         "sensor_msgs/msg/JointState",
         header=header(t_ns, ""),
         name=["left_wheel", "right_wheel"],
-        position=np.array([turned, turned * 1.1]),
+        position=np.array([wheel_angle, wheel_angle * 1.1]),
         velocity=np.array([12.0, 13.2]),
         effort=np.array([0.4, 0.5]),
     )
 
 
-def picture(t_ns: int) -> np.ndarray:
-    """Return a 64 x 48 rgb8 picture of a ball that goes round."""
-    x, y, _ = where(t_ns)
+def ball_image(t_ns: int) -> np.ndarray:
+    """Return a 64 x 48 rgb8 image of a ball that moves on a circle."""
+    x, y, _ = position(t_ns)
     rows, columns = np.mgrid[0:48, 0:64]
     distance = (columns - 32 - 4 * x) ** 2 + (rows - 24 - 3 * y) ** 2
     image = np.stack([rows * 4, columns * 3, np.full((48, 64), 90)], axis=-1).astype(np.uint8)
@@ -144,12 +144,12 @@ def image(t_ns: int, _noise: np.random.Generator) -> Any:
         encoding="rgb8",
         is_bigendian=0,
         step=192,
-        data=picture(t_ns).ravel(),
+        data=ball_image(t_ns).ravel(),
     )
 
 
 def png(pixels: np.ndarray) -> bytes:
-    """Return an rgb8 picture as PNG."""
+    """Return an rgb8 image as PNG."""
 
     def chunk(kind: bytes, body: bytes) -> bytes:
         return pack(">I", len(body)) + kind + body + pack(">I", zlib.crc32(kind + body))
@@ -166,7 +166,7 @@ def png(pixels: np.ndarray) -> bytes:
 
 
 def compressed(t_ns: int, _noise: np.random.Generator) -> Any:
-    data = np.frombuffer(png(picture(t_ns)), np.uint8)
+    data = np.frombuffer(png(ball_image(t_ns)), np.uint8)
     return make(
         "sensor_msgs/msg/CompressedImage",
         header=header(t_ns, "camera"),
@@ -218,7 +218,7 @@ def cloud(t_ns: int, noise: np.random.Generator) -> Any:
 
 
 def battery(t_ns: int, noise: np.random.Generator) -> Any:
-    left = 80 - (t_ns - START_NS) // 10**9
+    charge = 80 - (t_ns - START_NS) // 10**9
     cells = [
         make(
             "acme_msgs/msg/Cell", voltage_mv=4000 - 2 * i + int(noise.integers(0, 3)), temperature_dc=251 + i
@@ -230,7 +230,7 @@ def battery(t_ns: int, noise: np.random.Generator) -> Any:
         header=header(t_ns, "base_link"),
         voltage_mv=sum(cell.voltage_mv for cell in cells),
         current_ma=2400,
-        soc=int(left),
+        soc=int(charge),
         status=2,
         cells=cells,
         serial="PK-0042",
@@ -253,7 +253,7 @@ TOPICS: tuple[tuple[str, str, int, Maker], ...] = (
 
 
 def schedule() -> Iterator[tuple[int, int]]:
-    """Yield (log time, topic number) in order of time."""
+    """Yield the header stamp and the topic number of each message, in order of time."""
     times = [
         (START_NS + step * 10**9 // rate + 1000 * number, number)
         for number, (_, _, rate, _) in enumerate(TOPICS)
