@@ -1,17 +1,17 @@
-"""This file is the exception tree; each error knows its exit code and whether trying again may help.
+"""The exceptions of this package, each with its exit code and whether a retry may help.
 
 IngestError
-├── ManifestError        the YAML cannot become a job            exit 2
-├── NothingMatched       no bag or no topic selected             exit 3
-├── BagError             the recording cannot be read            exit 1
-│   └── DecodeError      bytes do not fit their type
-├── AdapterError         rows do not fit their ontology          exit 1
-├── SinkError            the destination refused                 exit 1
-│   ├── SequenceExists   … the name is taken
-│   └── SinkUnavailable  … and trying again may help
-├── Unreachable          a URL did not answer, or its content changed under way; again may help  exit 1
-├── VerificationError    what is stored is not what was read     exit 5
-└── Interrupted          a signal asked to stop                  exit 130
+├── ManifestError        the manifest cannot become a job                      exit code 2
+├── NothingMatched       no recording or no topic is selected                  exit code 3
+├── BagError             the recording cannot be read                          exit code 1
+│   └── DecodeError      a message does not fit its type
+├── AdapterError         an adapter is invalid or does not fit a message type  exit code 1
+├── SinkError            the destination refuses an operation                  exit code 1
+│   ├── SequenceExists   the sequence already exists
+│   └── SinkUnavailable  the destination does not respond; a retry may help
+├── Unreachable          a URL does not respond or its content changed; a retry may help  exit code 1
+├── VerificationError    the stored data differ from the recording             exit code 5
+└── Interrupted          a signal stopped the run                              exit code 130
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ __all__ = [
 
 
 class IngestError(Exception):
-    """What went wrong, where, with which value, and what to do; one line when printed."""
+    """The base class of all errors: a problem with its location and a hint. Its text is one line."""
 
     exit_code: ClassVar[int] = 1
-    """What the command exits with."""
+    """The exit code of the command."""
     retryable: ClassVar[bool] = False
-    """Whether running again may help; for whoever runs jobs from Python."""
+    """Whether running the job again may help."""
 
     def __init__(
         self,
@@ -52,38 +52,45 @@ class IngestError(Exception):
         hint: str | None = None,
         findings: tuple[Finding, ...] = (),
     ) -> None:
+        """Create the error.
+
+        Args:
+            what: The problem and the value.
+            where: The location, such as `job.yaml:3:5`, a path or a topic.
+            hint: A hint that starts with an imperative.
+            findings: The findings, if the error reports several problems.
+        """
         super().__init__(what)
         self.what = what
         self.where = where
         self.hint = hint
         self.findings = findings
-        """One for each mistake, where there can be several, with its place."""
 
     def __str__(self) -> str:
-        """Return `where: what — hint` with the parts that are known."""
+        """Return `where: what — hint`, without the parts that are None."""
         text = f"{self.where}: {self.what}" if self.where else self.what
         return one_line(f"{text} — {self.hint}" if self.hint else text)
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Keep the fields when the error crosses a process border."""
+        """Keep all attributes when the error is pickled for another process."""
         return (_rebuild, (type(self), self.what, dict(self.__dict__)))
 
 
-def _rebuild(kind: type[IngestError], what: str, fields: dict[str, object]) -> IngestError:
+def _rebuild(kind: type[IngestError], what: str, attributes: dict[str, object]) -> IngestError:
     error = kind.__new__(kind, what)
     error.args = (what,)
-    error.__dict__.update(fields)
+    error.__dict__.update(attributes)
     return error
 
 
 class ManifestError(IngestError):
-    """The YAML cannot become a job; `findings` says where, one for each mistake."""
+    """The manifest cannot become a job. `findings` has one entry per mistake."""
 
     exit_code = 2
 
 
-class NothingMatched(IngestError):  # noqa: N818 - it names what happened, as the exit code's table does
-    """No recording or no topic was selected."""
+class NothingMatched(IngestError):  # noqa: N818 - named after the condition, as in the table of exit codes
+    """No recording or no topic is selected."""
 
     exit_code = 3
 
@@ -93,46 +100,47 @@ class BagError(IngestError):
 
 
 class DecodeError(BagError):
-    """A message's bytes do not fit its type; `rule` is the short name failures are counted by."""
+    """A message does not fit its type."""
 
     def __init__(
         self, what: str, *, rule: str = "decode", where: str | None = None, hint: str | None = None
     ) -> None:
+        """Create the error; `rule` is the rule id of the rejected row."""
         super().__init__(what, where=where, hint=hint)
         self.rule = rule
 
 
 class AdapterError(IngestError):
-    """Rows do not fit their ontology, an adapter does not fit its message type, or its file is wrong (`findings`)."""
+    """An adapter or its file is invalid, or the adapter does not fit a message type."""
 
 
 class SinkError(IngestError):
-    """The destination refused."""
+    """The destination refuses an operation."""
 
 
-class SequenceExists(SinkError):  # noqa: N818 - the condition, as `NothingMatched`
-    """The sequence's name is taken and the job said to fail then."""
+class SequenceExists(SinkError):  # noqa: N818 - named after the condition
+    """The sequence already exists, and the job does not allow changing it."""
 
 
-class SinkUnavailable(SinkError):  # noqa: N818 - the condition, as `NothingMatched`
-    """The destination did not answer; trying again may help."""
+class SinkUnavailable(SinkError):  # noqa: N818 - named after the condition
+    """The destination does not respond."""
 
     retryable = True
 
 
-class Unreachable(IngestError):  # noqa: N818 - the condition, as `NothingMatched`
-    """What lies behind a URL did not answer, or changed while it was read; trying again may help."""
+class Unreachable(IngestError):  # noqa: N818 - named after the condition
+    """A URL does not respond, or its content changed while it was read."""
 
     retryable = True
 
 
 class VerificationError(IngestError):
-    """What is stored is not what was read."""
+    """The stored data differ from the recording."""
 
     exit_code = 5
 
 
-class Interrupted(IngestError):  # noqa: N818 - the condition, as `NothingMatched`
-    """A signal asked the run to stop; the session policy was applied."""
+class Interrupted(IngestError):  # noqa: N818 - named after the condition
+    """A signal stopped the run, after the session policy was applied."""
 
     exit_code = 130

@@ -1,4 +1,4 @@
-"""Findings: one diagnostic with rule id, severity, message, location and hint, from lint, plan or run."""
+"""Findings and rejected rows: diagnostics with rule id, severity, message, location and hint, and text helpers for them."""
 
 from __future__ import annotations
 
@@ -19,50 +19,15 @@ __all__ = [
     "Stage",
     "a_few",
     "encodable",
+    "has_credentials",
+    "mask_credentials",
     "offered",
     "one_line",
 ]
 
-_ESCAPED_BYTES = 0xDC00
-"""Where Python puts the bytes of a file name that it cannot decode."""
-_SURROGATES = re.compile("[\ud800-\udfff]")
-_UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-"""Control characters, line ends and what turns the direction of writing, which deceive a reader's terminal."""
-
-
-def encodable(text: str) -> str:
-    r"""Return the text with the bytes of a file name that are no UTF-8 spelled as `\xff`."""
-    return _SURROGATES.sub(_spelled, text)
-
-
-def one_line(text: str) -> str:
-    r"""Return the text with everything that does not print spelled as an escape, as `\x1b` or `\n`."""
-    return _UNPRINTABLE.sub(_spelled, text)
-
-
-def a_few(names: Iterable[str], *, most: int = 8) -> str:
-    """Return the first names in the order of letters, and how many more there are."""
-    known = sorted(names)
-    more = f" and {len(known) - most:,} more" if len(known) > most else ""
-    return f"{', '.join(known[:most])}{more}"
-
-
-def offered(names: Iterable[str], wanted: Iterable[str] = ()) -> str:
-    """Return what there is in place of what was wanted, as a hint: the nearest, then a few."""
-    known = sorted(names)
-    close = (get_close_matches(word, known, n=1, cutoff=0.5) for word in wanted if word[:1] != "!")
-    near = dict.fromkeys(name for found in close for name in found)
-    listed = f"there are {a_few(known)}" if known else "there are none"
-    return f"the nearest is {a_few(near)}; {listed}" if near else listed
-
-
-def _spelled(match: re.Match[str]) -> str:
-    byte = ord(match[0]) - _ESCAPED_BYTES
-    return f"\\x{byte:02x}" if byte in range(0x80, 0x100) else match[0].encode("unicode_escape").decode()
-
 
 class Severity(str, Enum):
-    """How much a finding matters."""
+    """The severity of a finding."""
 
     ERROR = "error"
     WARNING = "warning"
@@ -71,7 +36,7 @@ class Severity(str, Enum):
 
 @dataclass(frozen=True, slots=True, order=True)
 class Span:
-    """A stretch of text: 1-based line and column of its first character and one past its last."""
+    """A range of text. Lines and columns start at 1, and the end column is exclusive."""
 
     file: str
     line: int
@@ -80,40 +45,40 @@ class Span:
     end_column: int
 
     def __str__(self) -> str:
-        """Return `file:line:column`, which terminals make clickable."""
+        """Return `file:line:column`, which many terminals turn into a link."""
         return f"{self.file}:{self.line}:{self.column}"
 
 
 class Edit(Struct, frozen=True):
-    """A change that mends a finding: the text of `span` becomes `text`."""
+    """A fix: replace the text of `span` with `text`."""
 
     span: Span
     text: str
 
 
 class Finding(Struct, frozen=True):
-    """One thing to know: which rule, where, what, and the remedy."""
+    """One diagnostic of lint, plan or run."""
 
     rule: str
-    """The rule's name in kebab-case, as `unknown-key`."""
+    """The id of the rule, such as `unknown-key`; see `mosaico_ingest.rules`."""
     severity: Severity
     message: str
-    """What is wrong, with the value, in one line."""
+    """The problem and the value, in one line."""
     span: Span | None = None
     help: str | None = None
-    """What to do about it, in one line."""
+    """A hint that starts with an imperative, in one line."""
     fix: Edit | None = None
-    """The same as a change of the text, where it is safe to make without asking."""
+    """The fix, if it is safe to apply without asking."""
 
     def __str__(self) -> str:
         """Return the finding in one line, without the source excerpt."""
-        place = f"{self.span}: " if self.span else ""
-        text = f"{place}{self.severity.value}[{self.rule}] {self.message}"
+        location = f"{self.span}: " if self.span else ""
+        text = f"{location}{self.severity.value}[{self.rule}] {self.message}"
         return one_line(f"{text} — {self.help}" if self.help else text)
 
 
 class Stage(str, Enum):
-    """Where in the pipeline a row was lost."""
+    """The stage of the pipeline that rejected a row."""
 
     READ = "read"
     DECODE = "decode"
@@ -122,10 +87,74 @@ class Stage(str, Enum):
 
 
 class RowFailure(Struct, frozen=True):
-    """One row that could not go on: its position in the batch that was given, the rule it broke, and why."""
+    """A rejected row."""
 
     row: int
+    """The position of the row in its batch."""
     rule: str
-    """A short kebab-case name that failures can be counted by, as `cdr-length`, `nan`, `out-of-range`."""
+    """The id of the rule, such as `out-of-range`; see `mosaico_ingest.rules`."""
     reason: str
-    """What was expected and what was found, in one line."""
+    """The problem and the value, in one line."""
+
+
+_SURROGATES = re.compile("[\ud800-\udfff]")
+_FIRST_SURROGATE = 0xDC00
+"""Python decodes the undecodable byte `b` of a file name as the character with the code `0xDC00 + b`."""
+_UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+"""Control characters, line separators and direction marks, which can disguise text in a terminal."""
+
+
+def encodable(text: str) -> str:
+    r"""Return the text with the undecodable bytes of file names escaped as `\xff`."""
+    return _SURROGATES.sub(_escape, text)
+
+
+def one_line(text: str) -> str:
+    r"""Return the text with unprintable characters escaped, such as `\x1b` or `\n`, and credentials masked."""
+    return _UNPRINTABLE.sub(_escape, mask_credentials(text))
+
+
+def _escape(match: re.Match[str]) -> str:
+    byte = ord(match[0]) - _FIRST_SURROGATE
+    return f"\\x{byte:02x}" if byte in range(0x80, 0x100) else match[0].encode("unicode_escape").decode()
+
+
+_CREDENTIALS = re.compile(
+    r"(?P<user>(?<=://)[^/@\s\"']+(?=@))"
+    r"|(?P<api_key>msco_[a-z0-9]{32}_[0-9a-f]{8})"
+    r"|(?P<option>(?<=[?&])[^=&\s\"']*(?:key|password|token|secret|signature)[^=&\s\"']*=)(?P<value>[^&\s\"']+)",
+    re.IGNORECASE,
+)
+"""User names and passwords in URLs, API keys, and URL options that contain a secret."""
+_MASK = "***"
+
+
+def has_credentials(text: str) -> bool:
+    """Return whether a text contains an API key, or a URL with credentials that are not a variable."""
+    return any("${" not in (match["value"] or match[0]) for match in _CREDENTIALS.finditer(text))
+
+
+def mask_credentials(text: str, *, same_length: bool = False) -> str:
+    """Return the text with API keys and the credentials in URLs replaced by `***`, or by as many `*` as characters."""
+
+    def mask(match: re.Match[str]) -> str:
+        option = match["option"] or ""
+        return option + ("*" * (len(match[0]) - len(option)) if same_length else _MASK)
+
+    return _CREDENTIALS.sub(mask, text)
+
+
+def a_few(names: Iterable[str], *, most: int = 8) -> str:
+    """Return the first `most` names in alphabetical order, separated by commas, and the number of the others."""
+    ordered = sorted(names)
+    more = f" and {len(ordered) - most:,} more" if len(ordered) > most else ""
+    return f"{', '.join(ordered[:most])}{more}"
+
+
+def offered(names: Iterable[str], wanted: Iterable[str] = ()) -> str:
+    """Return a hint that lists the available names, and the nearest ones to the wanted words first."""
+    available = sorted(names)
+    matches = (get_close_matches(word, available, n=1, cutoff=0.5) for word in wanted if word[:1] != "!")
+    nearest = dict.fromkeys(name for match in matches for name in match)
+    listing = f"there are {a_few(available)}" if available else "there are none"
+    return f"the nearest is {a_few(nearest)}; {listing}" if nearest else listing

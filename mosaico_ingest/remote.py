@@ -32,6 +32,7 @@ __all__ = [
     "RemotePath",
     "RemoteStat",
     "as_path",
+    "check_options",
     "explained",
     "filesystem",
     "is_transient",
@@ -108,15 +109,28 @@ def filesystem(root: str, options: str) -> FileSystem:
 def _made(root: str, options: str, _process: int) -> FileSystem:
     scheme, _, bucket = root.partition("://")
     make, known = SCHEMES[scheme]
-    given = {name: values[-1] for name, values in parse_qs(options, keep_blank_values=True).items()}
-    for name in given:
+    return make(bucket, _options(root, options, known))
+
+
+def check_options(path: AnyPath) -> None:
+    """Check the options of a URL without opening a connection.
+
+    Raises:
+        IngestError: The URL has an unknown option.
+    """
+    if isinstance(path, RemotePath):
+        _options(path.root, path.options, SCHEMES[path.root.partition("://")[0]][1])
+
+
+def _options(root: str, options: str, known: tuple[str, ...]) -> dict[str, str]:
+    """Return the options of a URL. The error never contains their values, because they may be secret."""
+    values = {name: values[-1] for name, values in parse_qs(options, keep_blank_values=True).items()}
+    for name in values:
         if name not in known:
             raise IngestError(
-                f"the option {name!r} is not known",
-                where=f"{root}?{options}",
-                hint=f"known are {', '.join(known)}",
+                f"unknown URL option {name!r}", where=root, hint=f"the options are {', '.join(known)}"
             )
-    return make(bucket, given)
+    return values
 
 
 def _s3(bucket: str, given: dict[str, str]) -> FileSystem:

@@ -15,7 +15,7 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-from mosaico_ingest.findings import Finding, Severity, Span
+from mosaico_ingest.findings import Finding, Severity, Span, mask_credentials
 
 __all__ = [
     "Terminal",
@@ -79,6 +79,7 @@ _SECRET = re.compile(
     re.IGNORECASE,
 )
 _UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
+_LINE_END = re.compile(r"\r\n|\r|\n")
 _WIDTH = 160
 
 
@@ -101,23 +102,23 @@ def _finding(finding: Finding, texts: Mapping[str, str]) -> Text:
     if finding.span is not None:
         text.append(f"{finding.span}: ", style="bold")
     text.append(f"{finding.severity.value}[{finding.rule}]", style=_STYLES[finding.severity])
-    text.append(f" {finding.message}")
+    text.append(f" {mask_credentials(finding.message)}")
     gutter = 0
     if finding.span is not None and finding.span.file in texts:
         gutter = len(str(finding.span.line))
         text.append(_excerpt(finding.span, texts[finding.span.file], _STYLES[finding.severity]))
     if finding.help is not None:
         text.append(f"\n{' ' * gutter} = help: ", style="bold")
-        text.append(finding.help)
+        text.append(mask_credentials(finding.help))
     return text
 
 
 def _excerpt(span: Span, source: str, style: str) -> Text:
     """Return the line with its number, and carets under the span; nothing where there is no such line."""
-    lines = source.removeprefix("\ufeff").split("\n")
+    lines = _LINE_END.split(source.removeprefix("\ufeff"))
     if span.line > len(lines) or not lines[span.line - 1].strip():
         return Text()
-    line = _UNPRINTABLE.sub(" ", _SECRET.sub(_mask, lines[span.line - 1].rstrip("\r")))
+    line = _UNPRINTABLE.sub(" ", _SECRET.sub(_mask, mask_credentials(lines[span.line - 1], same_length=True)))
     start = min(span.column - 1, len(line))
     end = span.end_column - 1 if span.end_line == span.line else len(line)
     line, start, end = _crop(line, start, max(end, start + 1))

@@ -62,9 +62,14 @@ def _check_time(text: str) -> str:
     return text
 
 
-def _check_size(text: str) -> str:
-    parse_size(text)
+def _check_memory(text: str) -> str:
+    if parse_size(text) < _MIN_MEMORY:
+        raise ValueError(f"{text!r} is less than 1 MiB")
     return text
+
+
+_MIN_MEMORY = 1 << 20
+"""Minimum of `run.memory` in bytes."""
 
 
 def _limit_text(value: object) -> object:
@@ -115,14 +120,18 @@ TimeText = Annotated[
     Field(json_schema_extra={"pattern": r"^([+-][0-9.]+ ?(ns|us|ms|s|min|h)|[0-9]{4}-[0-9]{2}-[0-9]{2}.*)$"}),
 ]
 SizeText = Annotated[
-    Text, AfterValidator(_check_size), Field(json_schema_extra={"pattern": r"^[0-9.]+ ?[kKMGT]?i?B$"})
+    Text, AfterValidator(_check_memory), Field(json_schema_extra={"pattern": r"^[0-9.]+ ?[kKMGT]?i?B$"})
 ]
 LimitText = Annotated[
     Text,
     BeforeValidator(_limit_text),
     AfterValidator(_check_limit),
     Field(
-        json_schema_extra={"type": ["string", "integer"], "minimum": 0, "pattern": r"^[0-9]+$|^[0-9.]+ ?%$"}
+        json_schema_extra={
+            "type": ["string", "integer"],
+            "minimum": 0,
+            "pattern": r"^[0-9]+$|^0*(100(\.0*)?|[0-9]{1,2}(\.[0-9]+)?) ?%$",
+        }
     ),
 ]
 Paths = Annotated[

@@ -60,15 +60,22 @@ def parse_offset(text: str) -> int:
 
 
 def parse_limit(text: str) -> tuple[int | None, float | None]:
-    """Return the number that `100` stands for, or the share of `0.1%`; one of the two is None.
+    """Return the number of `100`, or the share between 0 and 1 of `0.1%`; the other one is None.
 
     Raises:
-        ValueError: The text is neither.
+        ValueError: The text is neither, or the share exceeds 100%.
     """
     match = _LIMIT.fullmatch(text)
     if match is None:
         raise ValueError(f"{text!r} is no limit; write a number of messages, as 100, or a share, as 0.1%")
-    return (int(match[1]), None) if match[1] else (None, float(match[2]) / 100)
+    if match[1]:
+        return int(match[1]), None
+    share = float(match[2]) / 100
+    if share > 1:
+        raise ValueError(
+            f"{text!r} is more than 100%; write a share of at most 100%, or a number of messages"
+        )
+    return None, share
 
 
 def parse_instant(text: str) -> int:

@@ -13,7 +13,7 @@ from mosaico_ingest.adapters.bridge import AdapterFinder
 from mosaico_ingest.adapters.mapping.loader import MappingSpec, load_adapter
 from mosaico_ingest.adapters.standalone import DefinitionFinder
 from mosaico_ingest.errors import AdapterError, BagError, ManifestError
-from mosaico_ingest.findings import Edit, Finding, Severity, Span
+from mosaico_ingest.findings import Edit, Finding, Severity, Span, mask_credentials
 from mosaico_ingest.job.compose import EXTENDS_KEY, bases_of, extended
 from mosaico_ingest.job.manifest import read_text
 from mosaico_ingest.job.yaml_source import load_source
@@ -122,9 +122,14 @@ def lint_paths(
 def lint_document(document: Document, *, env: Mapping[str, str] | None, settings: Settings) -> list[Finding]:
     """Return the findings of one document in text order, after comments and settings are applied."""
     findings = _apply_comments(document, list(_unfiltered_findings(document, env)))
-    adjusted = [kept for finding in findings if (kept := settings.apply(finding)) is not None]
+    adjusted = [_masked(kept) for finding in findings if (kept := settings.apply(finding)) is not None]
     start = Span(document.file, 0, 0, 0, 0)
     return sorted(adjusted, key=lambda finding: (finding.span or start, finding.rule))
+
+
+def _masked(finding: Finding) -> Finding:
+    hint = None if finding.help is None else mask_credentials(finding.help)
+    return replace(finding, message=mask_credentials(finding.message), help=hint)
 
 
 def adapter_findings(document: Document) -> Iterator[Finding]:

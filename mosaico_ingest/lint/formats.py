@@ -14,6 +14,7 @@ from mosaico_ingest.findings import (
     Finding,
     Severity,
     Span,
+    mask_credentials,
 )
 from mosaico_ingest.lint.engine import LintedFile, LintReport
 from mosaico_ingest.lint.pages import page_of
@@ -51,7 +52,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "message": finding.message,
         "help": finding.help,
         **location,
-        "fix": None if finding.fix is None else {"text": finding.fix.text},
+        "fix": None if finding.fix is None else {"text": mask_credentials(finding.fix.text)},
     }
 
 
@@ -175,9 +176,15 @@ def _region(span: Span) -> dict[str, int]:
 
 
 def _fix(edit: Edit) -> dict[str, Any]:
-    replacement = {"deletedRegion": _region(edit.span), "insertedContent": {"text": edit.text}}
+    replacement = {
+        "deletedRegion": _region(edit.span),
+        "insertedContent": {"text": mask_credentials(edit.text)},
+    }
     change = {"artifactLocation": {"uri": quote(edit.span.file)}, "replacements": [replacement]}
-    return {"description": {"text": f"replace with {edit.text}"}, "artifactChanges": [change]}
+    return {
+        "description": {"text": f"replace with {mask_credentials(edit.text)}"},
+        "artifactChanges": [change],
+    }
 
 
 FORMATS: dict[str, Callable[[LintReport], str]] = {

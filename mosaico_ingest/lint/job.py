@@ -1,4 +1,4 @@
-"""A job manifest as the rules see it: its model, key paths, topic names, paths and adapter references."""
+"""A job manifest as the checks see it: its model, its locations, topic patterns, paths and adapter references."""
 
 from __future__ import annotations
 
@@ -29,89 +29,178 @@ __all__ = [
     "Job",
     "PythonReference",
     "adapter_references",
-    "all_paths",
-    "bare",
     "covers",
     "find_module",
     "is_glob",
     "is_mapping_file",
+    "key_paths_below",
     "keyed_patterns",
-    "keys_below",
+    "load_mapping_source",
     "loaded_names",
-    "metadata_places",
+    "manifest_paths",
+    "metadata_sections",
     "python_reference",
     "read_classes",
     "read_job",
     "recording_paths",
     "topic_patterns",
-    "values_below",
+    "value_paths_below",
 ]
 
-
-def is_glob(pattern: str) -> bool:
-    """Say whether a pattern can match more than one name."""
-    return any(character in pattern for character in "*?[")
-
-
-def bare(pattern: str) -> str:
-    """Return a pattern without the `!` that makes it an exclusion."""
-    return pattern.removeprefix("!")
+_PLACEHOLDER = "missing"
+"""Stands for a missing required string, so that the rest of the manifest can be checked."""
+_MAX_REPAIRS = 50
 
 
-def covers(general: str, special: str) -> bool:
-    """Say whether surely every name that `special` matches is matched by `general` as well."""
-    if general in {"*", special}:
-        return True
-    if "[" in special:
-        return False
-    # What stands for a wildcard of `special` matches nothing in `general` but a wildcard.
-    probes = (special.replace("*", filling).replace("?", "\x00") for filling in ("", "\x00", "/\x00/\x00"))
-    return all(fnmatchcase(probe, general) for probe in probes)
+class Job(Struct, frozen=True):
+    """A manifest without the values that its model rejects; those are reported separately."""
+
+    manifest: Manifest
+    source: Source
+    folder: Path
+    """The folder that relative paths start in."""
+    file: Path | None = None
+    """The manifest's file, or None for standard input and examples."""
+
+    def span(self, *path: str | int) -> Span:
+        """Return the span of a value."""
+        return self.source.span(path)
+
+    def key_span(self, *path: str | int) -> Span:
+        """Return the span of a key."""
+        return self.source.key_span(path)
+
+    def has(self, *path: str | int) -> bool:
+        """Return whether the manifest contains a value at a key path."""
+        return path in self.source.spans
+
+    def is_expanded(self, text: str | None) -> bool:
+        """Return whether a string is present and all of its variables could be expanded."""
+        return text is not None and "${" not in text and text != _PLACEHOLDER
+
+    def resolve(self, path: str) -> Path:
+        """Return a path of the manifest relative to the current directory."""
+        return self.folder / Path(path).expanduser()
 
 
-_KEYED = (("topic_settings",), ("adapters", "override"), ("on_error", "topic"))
-_DEFAULT = ("on_error", "topic", "default")
+def read_job(
+    source: Source, *, folder: Path, env: Mapping[str, str] | None, file: Path | None = None
+) -> tuple[Job | None, tuple[Finding, ...]]:
+    """Return the job, as far as it is valid, and the findings about its text and structure."""
+    manifest, findings = check_manifest(source, env=env)
+    if manifest is None and isinstance(source.value, dict):
+        manifest = _valid_part(fill_in(source, env).value)
+    return (None if manifest is None else Job(manifest, source, folder, file)), findings
+
+
+def _valid_part(value: Value) -> Manifest | None:
+    """Remove the values that the model rejects until the rest is valid."""
+    value = deepcopy(value)
+    for _ in range(_MAX_REPAIRS):
+        manifest, errors = _validate(value)
+        if manifest is not None:
+            return manifest
+        for error in errors:
+            _repair(value, error["loc"], missing=error["type"] == "missing")
+    return None
+
+
+def _validate(value: Value) -> tuple[Manifest | None, list[ErrorDetails]]:
+    try:
+        return Manifest.model_validate_json(json.dumps(value), strict=True), []
+    except ValidationError as error:
+        return None, error.errors(include_url=False, include_context=False)
+
+
+def _repair(value: Value, location: KeyPath, *, missing: bool) -> None:
+    """Remove the value at an error's location, empty the list that contains it, or add a placeholder if it is missing."""
+    path = place_of(location, value)
+    parent = reduce(member, path if missing else path[:-1], value)
+    if missing and isinstance(parent, dict):
+        parent[location[-1]] = {"path": _PLACEHOLDER} if location == ("bag",) else _PLACEHOLDER
+    elif isinstance(parent, dict) and path:
+        del parent[path[-1]]
+    elif isinstance(parent, list):
+        parent.clear()
+
+
+_PATTERN_SECTIONS = (("topic_settings",), ("adapters", "override"), ("on_error", "topic"))
+"""The mappings whose keys are topic names and globs."""
+_DEFAULT_POLICY = ("on_error", "topic", "default")
 
 
 def topic_patterns(job: Job) -> Iterator[tuple[str, str, Span]]:
-    """Yield each name or glob of topics: the section it is in, the text, its place."""
+    """Yield the section, the text and the span of every topic name and glob."""
     for i, pattern in enumerate(job.manifest.topics):
         yield "topics", pattern, job.span("topics", i)
     yield from keyed_patterns(job)
 
 
 def keyed_patterns(job: Job) -> Iterator[tuple[str, str, Span]]:
-    """Yield each name or glob of topics that is a key, in the order that decides."""
-    for section in _KEYED:
-        keyed = job.source.at(section)
-        for key in keyed if isinstance(keyed, dict) else ():
-            if isinstance(key, str) and (*section, key) != _DEFAULT:
+    """Yield the section, the text and the span of every key that is a topic name or glob, in order of precedence."""
+    for section in _PATTERN_SECTIONS:
+        mapping = job.source.at(section)
+        for key in mapping if isinstance(mapping, dict) else ():
+            if isinstance(key, str) and (*section, key) != _DEFAULT_POLICY:
                 yield ".".join(section), key, job.key_span(*section, key)
 
 
-def metadata_places(job: Job) -> Iterator[KeyPath]:
-    """Yield where metadata is: the sequence's, and each topic setting's."""
+def is_glob(pattern: str) -> bool:
+    """Return whether a pattern can match several names."""
+    return any(character in pattern for character in "*?[")
+
+
+def covers(general: str, special: str) -> bool:
+    """Return whether `general` certainly matches every name that `special` matches."""
+    if general in {"*", special}:
+        return True
+    if "[" in special:
+        return False
+    # NUL and /NUL/NUL replace the wildcards of `special`. Only a wildcard of `general` can match them.
+    probes = (special.replace("*", filling).replace("?", "\x00") for filling in ("", "\x00", "/\x00/\x00"))
+    return all(fnmatchcase(probe, general) for probe in probes)
+
+
+def metadata_sections(job: Job) -> Iterator[KeyPath]:
+    """Yield the key paths of the sequence's metadata and of each topic's metadata."""
     yield ("sequence", "metadata")
     for topic in job.manifest.topic_settings:
         yield ("topic_settings", topic, "metadata")
 
 
+def value_paths_below(value: Value, path: KeyPath) -> Iterator[KeyPath]:
+    """Yield the key path of every scalar inside a value."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from value_paths_below(inner, (*path, key))
+    elif isinstance(value, list):
+        for i, inner in enumerate(value):
+            yield from value_paths_below(inner, (*path, i))
+    else:
+        yield path
+
+
+def key_paths_below(value: Value, path: KeyPath) -> Iterator[KeyPath]:
+    """Yield the key path of every key inside a value."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield (*path, key)
+            yield from key_paths_below(inner, (*path, key))
+    elif isinstance(value, list):
+        for i, inner in enumerate(value):
+            yield from key_paths_below(inner, (*path, i))
+
+
 def recording_paths(job: Job) -> Iterator[tuple[KeyPath, str]]:
-    """Yield each path of `bag.path` that is known, without a URL's options, with its place."""
-    path = job.manifest.bag.path
-    if isinstance(path, str):
-        if job.known(path):
-            yield ("bag", "path"), without_options(path)
-        return
-    for i, part in enumerate(path):
-        if job.known(part):
-            yield ("bag", "path", i), without_options(part)
+    """Yield the key path and the text of each expanded path in `bag.path`, without the options of URLs."""
+    for path, text in _recording_texts(job):
+        yield path, without_options(text)
 
 
-def all_paths(job: Job) -> Iterator[tuple[KeyPath, str]]:
-    """Yield every path a job names, with its place."""
+def manifest_paths(job: Job) -> Iterator[tuple[KeyPath, str]]:
+    """Yield the key path and the text of every expanded path in a manifest."""
     manifest = job.manifest
-    yield from recording_paths(job)
+    yield from _recording_texts(job)
     for i, custom in enumerate(manifest.bag.custom_msgs):
         yield ("bag", "custom_msgs", i, "path"), custom.path
     single: dict[KeyPath, str | None] = {
@@ -120,36 +209,24 @@ def all_paths(job: Job) -> Iterator[tuple[KeyPath, str]]:
         ("target", "tls_cert"): manifest.target.tls_cert,
         ("run", "report"): manifest.run.report,
     }
-    for place, path in single.items():
-        if path is not None and job.known(path):
-            yield place, path
+    if manifest.quarantine is not None and job.has("quarantine", "path"):
+        single["quarantine", "path"] = manifest.quarantine.path
+    for path, text in single.items():
+        if text is not None and job.is_expanded(text):
+            yield path, text
 
 
-def values_below(value: Value, path: KeyPath) -> Iterator[KeyPath]:
-    """Yield the path of every single value inside a value."""
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            yield from values_below(inner, (*path, key))
-    elif isinstance(value, list):
-        for i, inner in enumerate(value):
-            yield from values_below(inner, (*path, i))
+def _recording_texts(job: Job) -> Iterator[tuple[KeyPath, str]]:
+    text = job.manifest.bag.path
+    if isinstance(text, str):
+        splits: list[tuple[KeyPath, str]] = [(("bag", "path"), text)]
     else:
-        yield path
-
-
-def keys_below(value: Value, path: KeyPath) -> Iterator[KeyPath]:
-    """Yield the path of every key inside a value."""
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            yield (*path, key)
-            yield from keys_below(inner, (*path, key))
-    elif isinstance(value, list):
-        for i, inner in enumerate(value):
-            yield from keys_below(inner, (*path, i))
+        splits = [(("bag", "path", i), split) for i, split in enumerate(text)]
+    yield from ((path, split) for path, split in splits if job.is_expanded(split))
 
 
 class PythonReference(Struct, frozen=True):
-    """`module:Class` or `file.py:Class`."""
+    """A reference to a Python adapter: `module:Class` or `file.py:Class`."""
 
     module: str
     name: str
@@ -161,7 +238,7 @@ class PythonReference(Struct, frozen=True):
 
 
 def adapter_references(job: Job) -> Iterator[tuple[KeyPath, str]]:
-    """Yield every adapter a job names, with its place."""
+    """Yield the key path and the text of every adapter reference."""
     adapters = job.manifest.adapters
     for i, reference in enumerate(adapters.load):
         yield ("adapters", "load", i), reference
@@ -169,58 +246,62 @@ def adapter_references(job: Job) -> Iterator[tuple[KeyPath, str]]:
         yield ("adapters", "override", topic), reference
 
 
+def is_mapping_file(reference: str) -> bool:
+    """Return whether an adapter reference is the path of an adapter file."""
+    return reference.endswith((".yaml", ".yml"))
+
+
+def python_reference(reference: str) -> PythonReference | None:
+    """Return an adapter reference as a Python reference, or None for other references."""
+    module, colon, name = reference.rpartition(":")
+    return PythonReference(module, name) if colon and module and name else None
+
+
 def loaded_names(job: Job) -> set[str] | None:
-    """Return what the adapters of `adapters.load` are called; None if one of them cannot be read."""
+    """Return the names of the adapters in `adapters.load`, or None if one of them cannot be read."""
     names: set[str] = set()
     for reference in job.manifest.adapters.load:
         python = python_reference(reference)
-        name = python.name.rpartition(".")[2] if python is not None else _adapter_name(job.resolve(reference))
-        if name is None:
+        if python is not None:
+            names.add(python.name.rpartition(".")[2])
+            continue
+        source = load_mapping_source(job.resolve(reference))
+        name = source.at(("adapter",)) if source is not None else None
+        if not isinstance(name, str):
             return None
         names.add(name)
     return names
 
 
-def _adapter_name(file: Path) -> str | None:
+def load_mapping_source(file: Path) -> Source | None:
+    """Return the YAML of an adapter file, or None if the file cannot be read."""
     try:
-        name = load_source(read_whole(file).decode(), file=str(file)).at(("adapter",))
+        return load_source(read_whole(file).decode(), file=str(file))
     except (OSError, UnicodeDecodeError):
         return None
-    return name if isinstance(name, str) else None
-
-
-def is_mapping_file(reference: str) -> bool:
-    """Say whether a reference is the path of an adapter file."""
-    return reference.endswith((".yaml", ".yml"))
-
-
-def python_reference(reference: str) -> PythonReference | None:
-    """Return the module and the class a reference names; None for other references."""
-    module, colon, name = reference.rpartition(":")
-    return PythonReference(module, name) if colon and module and name else None
 
 
 def find_module(name: str, folder: Path) -> Path | None:
-    """Return the source file of a module, looked for where Python does and then in `folder`; None if there is none."""
-    places: list[str] | None = [*sys.path, str(folder)]
+    """Return the source file of a module on Python's module path or in `folder`, or None. Does not import the module."""
+    search_path: list[str] | None = [*sys.path, str(folder)]
     origin: str | None = None
     for i in range(name.count(".") + 1):
-        part = ".".join(name.split(".")[: i + 1])
-        spec = PathFinder.find_spec(part, places)
+        spec = PathFinder.find_spec(".".join(name.split(".")[: i + 1]), search_path)
         if spec is None:
             return None
-        origin, places = spec.origin, list(spec.submodule_search_locations or ())
+        origin, search_path = spec.origin, list(spec.submodule_search_locations or ())
     return Path(origin) if origin is not None and origin.endswith(".py") else None
 
 
 def read_classes(file: Path) -> dict[str, bool]:
-    """Return the names a Python file defines at its top, and whether each can be an adapter.
+    """Return the top-level names of a Python file, and whether each of them can be an adapter.
 
-    A class can if it has a base class or a `from_dict`; of anything else that is bound there nothing is known.
+    A class can be an adapter if it has a base class, `from_dict` or `bind`. Imported and assigned names can be adapters,
+    because their values are unknown.
 
     Raises:
-        SyntaxError: It is no Python.
-        OSError: It cannot be read.
+        SyntaxError: The file is not valid Python.
+        OSError: The file cannot be read.
     """
     names: dict[str, bool] = {}
     for node in ast.parse(read_whole(file), str(file)).body:
@@ -234,79 +315,3 @@ def read_classes(file: Path) -> dict[str, bool]:
         elif isinstance(node, ast.Assign):
             names.update({target.id: True for target in node.targets if isinstance(target, ast.Name)})
     return names
-
-
-_MISSING = "missing"
-"""Stands for a text that must be there and is not, so that the rest can be judged."""
-
-
-class Job(Struct, frozen=True):
-    """A manifest; what the model refuses is left out of it, and reported by itself."""
-
-    manifest: Manifest
-    source: Source
-    folder: Path
-    """Where its relative paths start."""
-    file: Path | None = None
-    """The file on disk, if there is one."""
-
-    def span(self, *place: str | int) -> Span:
-        """Return the place of a value."""
-        return self.source.span(place)
-
-    def key_span(self, *place: str | int) -> Span:
-        """Return the place of a key."""
-        return self.source.key_span(place)
-
-    def given(self, *place: str | int) -> bool:
-        """Say whether the manifest says something there."""
-        return place in self.source.spans
-
-    def known(self, text: str | None) -> bool:
-        """Say whether a text is there and holds no variable that could not be filled in."""
-        return text is not None and "${" not in text and text != _MISSING
-
-    def resolve(self, path: str) -> Path:
-        """Return a path as seen from here."""
-        return self.folder / Path(path).expanduser()
-
-
-def read_job(
-    source: Source, *, folder: Path, env: Mapping[str, str] | None, file: Path | None = None
-) -> tuple[Job | None, tuple[Finding, ...]]:
-    """Return the job, as much as there is of it, and what is wrong with its text and its shape."""
-    manifest, findings = check_manifest(source, env=env)
-    if manifest is None and isinstance(source.value, dict):
-        manifest = _salvage(fill_in(source, env).value)
-    return (None if manifest is None else Job(manifest, source, folder, file)), findings
-
-
-def _salvage(value: Value) -> Manifest | None:
-    """Take out what the model refuses until the rest holds together."""
-    value = deepcopy(value)
-    for _ in range(50):
-        manifest, refused = _validate(value)
-        if manifest is not None:
-            return manifest
-        for details in refused:
-            _take_out(value, details["loc"], missing=details["type"] == "missing")
-    return None
-
-
-def _validate(value: Value) -> tuple[Manifest | None, list[ErrorDetails]]:
-    try:
-        return Manifest.model_validate_json(json.dumps(value), strict=True), []
-    except ValidationError as error:
-        return None, error.errors(include_url=False, include_context=False)
-
-
-def _take_out(value: Value, location: KeyPath, *, missing: bool) -> None:
-    """Remove the value at an error's location, or put a stand-in where one is missing; of a list, remove all."""
-    place = place_of(location, value)
-    holder = reduce(member, place if missing else place[:-1], value)
-    if missing and isinstance(holder, dict):
-        holder[location[-1]] = {"path": _MISSING} if location == ("bag",) else _MISSING
-    elif isinstance(holder, dict) and place:
-        del holder[place[-1]]
-    elif isinstance(holder, list):
-        holder.clear()

@@ -1,4 +1,4 @@
-"""A `.msg` file as the rules see it, and the definitions available without a recording."""
+"""A `.msg` file as the checks see it, and the types that its fields may refer to."""
 
 from __future__ import annotations
 
@@ -14,71 +14,40 @@ from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.distros import distro_type
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
 
-__all__ = [
-    "Declaration",
-    "MessageFile",
-    "is_known",
-    "read_message",
-]
+__all__ = ["Declaration", "MessageFile", "is_defined", "read_message"]
 
 _SUFFIXES = (".msg", ".idl")
-
-
-def is_known(kind: str, path: Path | None) -> bool:
-    """Say whether a field's type is defined beside the file at `path`, in a package next to it, or by a distro."""
-    package, _, name = kind.rpartition("/")
-    if path is not None:
-        package = package.removesuffix("/msg")
-        folders = [path.parent] if not package else _package_folders(path.parent, package)
-        if any((folder / f"{name}{suffix}").is_file() for folder in folders for suffix in _SUFFIXES):
-            return True
-    return bool(package) and _in_distro(normalize_msgtype(kind))
-
-
-def _package_folders(folder: Path, package: str) -> list[Path]:
-    """Return where a package's definitions may lie, seen from the folder of another one's."""
-    bases = [folder.parent, folder.parent.parent]
-    here = [folder] if package in {folder.name, folder.parent.name} else []
-    return here + [base / package / inner for base in bases for inner in ("", "msg")]
-
-
-@cache
-def _in_distro(name: str) -> bool:
-    return any(distro_type(distro, name) is not None for distro in reversed(Stores))
-
-
 _DECLARATION = re.compile(
     r"\s*(?P<type>[A-Za-z]\w*(?:/\w+)*)(?P<bound><=\d+)?(?P<array>\[(?:<=)?\d*\])?\s+(?P<name>\w+)\s*(?P<rest>.*)"
 )
 
 
 class Declaration(Struct, frozen=True):
-    """One line: a field or a constant."""
+    """One line of a definition: a field or a constant."""
 
     type: str
     name: str
-    constant: bool
-    value: str
+    is_constant: bool
     type_span: Span
     name_span: Span
 
 
 class MessageFile(Struct, frozen=True):
-    """A definition text."""
+    """The text of a message definition."""
 
     file: str
     text: str
     declarations: tuple[Declaration, ...]
     path: Path | None = None
-    """The file on disk, if there is one."""
+    """The file that contains the text, or None."""
 
     @property
     def name(self) -> str:
-        """The type's own name: the file's, without `.msg`."""
+        """The name of the type: the file name without `.msg`."""
         return Path(self.file).stem
 
     def lines(self) -> Iterator[tuple[Span, str]]:
-        """Yield every line that is not blank, with its place."""
+        """Yield every line that is not blank, with its span."""
         for number, line in enumerate(self.text.splitlines(), 1):
             if line.strip():
                 start = len(line) - len(line.lstrip()) + 1
@@ -86,16 +55,40 @@ class MessageFile(Struct, frozen=True):
 
 
 def read_message(text: str, *, file: str, path: Path | None = None) -> MessageFile:
-    """Read a definition; never raises."""
-    matches = (
-        (number, _DECLARATION.fullmatch(_code(line))) for number, line in enumerate(text.splitlines(), 1)
-    )
-    declarations = (_declaration(match, file, number) for number, match in matches if match is not None)
+    """Return the declarations of a definition. Lines that are not declarations are skipped."""
+    declarations = [
+        _declaration(match, file, number)
+        for number, line in enumerate(text.splitlines(), 1)
+        if (match := _DECLARATION.fullmatch(_without_comment(line)))
+    ]
     return MessageFile(file, text, tuple(declarations), path)
 
 
-def _code(line: str) -> str:
-    """Return a line without its comment; a constant's text may hold a `#`."""
+def is_defined(msgtype: str, path: Path | None) -> bool:
+    """Return whether a type is defined next to the file at `path`, in a neighboring package, or in a ROS distribution."""
+    package, _, name = msgtype.rpartition("/")
+    if path is not None:
+        package = package.removesuffix("/msg")
+        folders = [path.parent] if not package else _package_folders(path.parent, package)
+        if any((folder / f"{name}{suffix}").is_file() for folder in folders for suffix in _SUFFIXES):
+            return True
+    return bool(package) and _is_in_distro(normalize_msgtype(msgtype))
+
+
+def _package_folders(folder: Path, package: str) -> list[Path]:
+    """Return the folders that may contain the definitions of a package, given the folder of some definition."""
+    own = [folder] if package in {folder.name, folder.parent.name} else []
+    parents = [folder.parent, folder.parent.parent]
+    return own + [parent / package / inner for parent in parents for inner in ("", "msg")]
+
+
+@cache
+def _is_in_distro(msgtype: str) -> bool:
+    return any(distro_type(distro, msgtype) is not None for distro in reversed(Stores))
+
+
+def _without_comment(line: str) -> str:
+    """Return a line without its comment. The value of a string constant may contain a `#`."""
     before = line.split("#", 1)[0]
     return (line if "=" in before else before).rstrip()
 
@@ -104,7 +97,6 @@ def _declaration(match: re.Match[str], file: str, number: int) -> Declaration:
     def span(group: str) -> Span:
         return Span(file, number, match.start(group) + 1, number, match.end(group) + 1)
 
-    rest = match["rest"]
-    constant = rest.startswith("=")
-    value = rest.removeprefix("=").strip()
-    return Declaration(match["type"], match["name"], constant, value, span("type"), span("name"))
+    return Declaration(
+        match["type"], match["name"], match["rest"].startswith("="), span("type"), span("name")
+    )

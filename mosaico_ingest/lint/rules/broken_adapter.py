@@ -1,4 +1,4 @@
-"""The rule `broken-adapter`: a Python adapter that cannot be used."""
+"""The check of `broken-adapter`: a Python adapter that cannot be used."""
 
 from __future__ import annotations
 
@@ -6,43 +6,38 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from mosaico_ingest.job.validation import nearest
-from mosaico_ingest.lint.job import (
-    Job,
-    adapter_references,
-    find_module,
-    python_reference,
-    read_classes,
-)
+from mosaico_ingest.lint.job import Job, adapter_references, find_module, python_reference, read_classes
 from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem for each Python adapter whose file or class is not what it must be."""
-    for place, reference in adapter_references(job):
+    """Report Python adapters whose file cannot be parsed or whose class cannot be an adapter."""
+    for path, reference in adapter_references(job):
         python = python_reference(reference)
-        if python is None or not job.known(reference):
+        if python is None or not job.is_expanded(reference):
             continue
         file = job.resolve(python.module) if python.is_file else find_module(python.module, job.folder)
-        fault = _fault(file, python.name.partition(".")[0]) if file is not None and file.is_file() else None
-        if fault is not None:
-            yield Problem(fault[0], job.source.span(place), fault[1])
+        if file is not None and file.is_file():
+            for message, hint in _problems(file, python.name.partition(".")[0]):
+                yield Problem(message, job.source.span(path), hint)
 
 
-def _fault(file: Path, name: str) -> tuple[str, str] | None:
-    """Return what is wrong with the file and what to do about it."""
+def _problems(file: Path, name: str) -> Iterator[tuple[str, str]]:
     try:
         names = read_classes(file)
     except SyntaxError as error:
-        return f"{file}:{error.lineno}: {error.msg}", "mend the file"
+        yield f"{file}:{error.lineno}: {error.msg}", "fix the Python file"
+        return
     except (OSError, ValueError) as error:
-        return f"{file} cannot be read: {error}", "mend the file"
+        yield f"{file} cannot be read: {error}", "fix the Python file"
+        return
     if name not in names:
         close = nearest(name, names)
-        known = ", ".join(known for known, fits in names.items() if fits and known[:1].isupper())
-        return f"{file} has no {name}", f"did you mean {close}?" if close else f"it has {known or 'no class'}"
-    if not names[name]:
-        return f"{name} of {file} is no adapter", "derive it from ROSAdapterBase"
-    return None
+        classes = ", ".join(name for name, usable in names.items() if usable and name[:1].isupper())
+        hint = f"did you mean {close}?" if close else f"the file defines {classes or 'no class'}"
+        yield f"{file} does not define {name}", hint
+    elif not names[name]:
+        yield f"{name} in {file} is not an adapter", "derive it from ROSAdapterBase"
 
 
 CHECK = Check("broken-adapter", job=check, reads_files=True)

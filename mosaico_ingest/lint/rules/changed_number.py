@@ -1,4 +1,4 @@
-"""The rule `changed-number`: a metadata number that loses digits."""
+"""The check of `changed-number`: a metadata number that loses digits."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ from collections.abc import Iterator
 from decimal import Decimal
 
 from mosaico_ingest.findings import Edit
-from mosaico_ingest.lint.job import Job, metadata_places, values_below
+from mosaico_ingest.lint.job import Job, metadata_sections, value_paths_below
 from mosaico_ingest.lint.rule import Check, Problem
+
+_TRAILING_ZERO = re.compile(r"[0-9]+\.[0-9]+0")
+_DECIMAL = re.compile(r"[0-9.]+")
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem for each number in metadata that loses digits."""
-    for place in metadata_places(job):
-        for path in values_below(job.source.at(place), place):
+    """Report each metadata number whose digits change when it is parsed."""
+    for section in metadata_sections(job):
+        for path in value_paths_below(job.source.at(section), section):
             value, span = job.source.at(path), job.source.span(path)
-            written = job.source.line(span)[span.column - 1 : span.end_column - 1]
-            if isinstance(value, float) and math.isfinite(value) and _loses(written, value):
-                remedy = f'for a text write "{written}"'
-                yield Problem(
-                    f"{written} is kept as the number {value}", span, remedy, Edit(span, f'"{written}"')
-                )
+            text = job.source.line(span)[span.column - 1 : span.end_column - 1]
+            if isinstance(value, float) and math.isfinite(value) and _loses_digits(text, value):
+                message = f"{text} is stored as the number {value}"
+                yield Problem(message, span, f'to store text, write "{text}"', Edit(span, f'"{text}"'))
 
 
-def _loses(written: str, value: float) -> bool:
-    zeros = re.fullmatch(r"[0-9]+\.[0-9]+0", written) is not None
-    return zeros or (
-        re.fullmatch(r"[0-9.]+", written) is not None and Decimal(written) != Decimal(repr(value))
-    )
+def _loses_digits(text: str, value: float) -> bool:
+    if _TRAILING_ZERO.fullmatch(text):
+        return True
+    return _DECIMAL.fullmatch(text) is not None and Decimal(text) != Decimal(repr(value))
 
 
 CHECK = Check("changed-number", job=check)

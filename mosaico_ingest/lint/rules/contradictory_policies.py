@@ -1,4 +1,4 @@
-"""The rule `contradictory-policies`: a topic error policy that never applies."""
+"""The check of `contradictory-policies`: a topic error policy that never applies."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem if messages raise and all topics are to go on."""
+    """Report `message: raise` together with a default topic policy that would continue."""
     policies = job.manifest.on_error
     default = policies.topic
     if isinstance(default, dict):
         default = default.get(DEFAULT_TOPIC, TopicLevelErrorPolicy.Raise)
     if policies.message is LoaderErrorPolicy.RAISE and default is not TopicLevelErrorPolicy.Raise:
-        message = f"message: raise ends the run before topic: {default.value} is asked"
-        yield Problem(message, job.span("on_error", "message"), "say log_warn, or topic: raise")
+        message = f"message: raise aborts the run before topic: {default.value} applies"
+        yield Problem(message, job.span("on_error", "message"), "set message: log_warn, or topic: raise")
 
 
 CHECK = Check("contradictory-policies", job=check)

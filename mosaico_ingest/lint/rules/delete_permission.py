@@ -1,4 +1,4 @@
-"""The rule `delete-permission`: `session: delete` with a key that may not delete."""
+"""The check of `delete-permission`: `session: delete` with a key that may not delete."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem if a server's session is to be deleted and the key is said to be one for writing."""
-    written = job.source.at(("target", "api_key"))
-    if job.manifest.on_error.session is not SessionLevelErrorPolicy.Delete or not isinstance(written, str):
+    """Report `session: delete` if the name of the API key's variable suggests write permission only."""
+    key = job.source.at(("target", "api_key"))
+    if job.manifest.on_error.session is not SessionLevelErrorPolicy.Delete or not isinstance(key, str):
         return
-    words = written.lower().replace("_", " ")
-    if "write" in words and not any(word in words for word in ("delete", "manage")):
-        message = "session: delete needs a key with delete permission, and this one is for writing"
-        yield Problem(message, job.span("on_error", "session"), "say report, or use another key")
+    words = key.lower()
+    if "write" in words and "delete" not in words and "manage" not in words:
+        message = (
+            "session: delete requires a key with delete permission, and this key seems to allow writing only"
+        )
+        yield Problem(message, job.span("on_error", "session"), "set session: report, or use another key")
 
 
 CHECK = Check("delete-permission", job=check)

@@ -1,4 +1,4 @@
-"""The rule `distro-mismatch`: a ROS distribution of the other ROS version."""
+"""The check of `distro-mismatch`: a ROS distribution of the other ROS version."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ _VERSIONS = {".bag": "ros1", ".db3": "ros2"}
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem if the suffix and the distro disagree about the ROS version."""
+    """Report a ROS distribution whose ROS version differs from the version that the recording's suffix implies."""
     distro = job.manifest.bag.ros_distro
     if distro is None or not distro.value.startswith("ros"):
         return
-    for _, path in recording_paths(job):
-        version = _VERSIONS.get(path[-4:].lower())
-        if version is not None and not distro.value.startswith(version) and not job.resolve(path).is_dir():
-            message = f"{path} is a {version.upper()} recording, {distro.value} is not"
-            yield Problem(message, job.span("bag", "ros_distro"), f"name a {version} distro, or none")
+    for _, text in recording_paths(job):
+        version = _VERSIONS.get(text[-4:].lower())
+        if version is not None and not distro.value.startswith(version) and not job.resolve(text).is_dir():
+            message = f"{text} is a {version.upper()} recording, and {distro.value} is not a {version.upper()} distribution"
+            yield Problem(
+                message, job.span("bag", "ros_distro"), f"name a {version} distribution, or remove the key"
+            )
             return
 
 

@@ -1,4 +1,4 @@
-"""The rule `distro-missing`: a `.db3` recording without a ROS distribution."""
+"""The check of `distro-missing`: a `.db3` recording without a ROS distribution."""
 
 from __future__ import annotations
 
@@ -9,17 +9,13 @@ from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem if a part is a `.db3` file and neither a distro nor definitions are named."""
-    bag = job.manifest.bag
-    if bag.ros_distro is not None or job.given("bag", "ros_distro"):
+    """Report the first `.db3` file if the manifest does not name a ROS distribution."""
+    if job.manifest.bag.ros_distro is not None or job.has("bag", "ros_distro"):
         return
-    for place, path in recording_paths(job):
-        if path.lower().endswith(".db3"):
-            yield Problem(
-                f"{path} may carry no definitions",
-                job.source.span(place),
-                "add bag.ros_distro, as ros2_humble",
-            )
+    for path, text in recording_paths(job):
+        if text.lower().endswith(".db3"):
+            message = f"{text} may not contain message definitions"
+            yield Problem(message, job.source.span(path), "add bag.ros_distro, such as ros2_humble")
             return
 
 

@@ -1,4 +1,4 @@
-"""The rule `empty-time-range`: a time range that selects nothing."""
+"""The check of `empty-time-range`: a time range that selects nothing."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem if both ends are counted from the same moment and are in the wrong order."""
+    """Report a range whose end is not later than its start, if both are relative to the same moment."""
     time = job.manifest.bag.time
     if time is None or time.start is None or time.end is None:
         return
     start, end = _moment(time.start), _moment(time.end)
     if start[0] == end[0] and start[1] >= end[1]:
-        yield Problem(
-            f"{time.end} is not later than {time.start}", job.span("bag", "time", "end"), "exchange the two"
-        )
+        message = f"the end {time.end} is not later than the start {time.start}"
+        yield Problem(message, job.span("bag", "time", "end"), "swap the two values")
 
 
 def _moment(text: str) -> tuple[str, int]:
-    """Return what a moment is counted from, and how far."""
+    """Return the reference point (`+` start, `-` end, epoch) and the distance from it in nanoseconds."""
     if text[0] in "+-":
         return text[0], parse_offset(text)
     return "epoch", parse_instant(text)

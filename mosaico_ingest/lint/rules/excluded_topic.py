@@ -1,4 +1,4 @@
-"""The rule `excluded-topic`: a setting for a topic that `topics` excludes."""
+"""The check of `excluded-topic`: a setting for a topic that `topics` excludes."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem for each key that is a topic's name and that `topics` does not select."""
+    """Report each key that is a topic name and that `topics` does not select."""
     patterns = job.manifest.topics
-    if not patterns or not all(job.known(pattern) for pattern in patterns):
+    if not patterns or not all(job.is_expanded(pattern) for pattern in patterns):
         return
     for section, name, span in keyed_patterns(job):
         if not is_glob(name) and not select(patterns, [name]).selected:
-            yield Problem(
-                f"{section} names {name!r}, which topics leaves out", span, "remove it, or add it to topics"
-            )
+            message = f"{section} configures {name!r}, which topics excludes"
+            yield Problem(message, span, "remove it, or add the topic to topics")
 
 
 CHECK = Check("excluded-topic", job=check)

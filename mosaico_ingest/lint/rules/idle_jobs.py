@@ -1,4 +1,4 @@
-"""The rule `idle-jobs`: parallel jobs for a single recording."""
+"""The check of `idle-jobs`: parallel jobs for a single recording."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ from mosaico_ingest.remote import without_options
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem if there are more jobs than one and the path is no glob."""
+    """Report `run.jobs` if the path names a single recording."""
     path = job.manifest.bag.path
-    if job.manifest.run.jobs > 1 and not (
-        isinstance(path, str) and (is_glob(without_options(path)) or not job.known(path))
-    ):
-        yield Problem("there is one recording, so one job", job.span("run", "jobs"), "remove it")
+    may_match_several = isinstance(path, str) and (
+        is_glob(without_options(path)) or not job.is_expanded(path)
+    )
+    if job.manifest.run.jobs > 1 and not may_match_several:
+        message = "a single recording cannot be ingested in parallel"
+        yield Problem(message, job.span("run", "jobs"), "remove run.jobs")
 
 
 CHECK = Check("idle-jobs", job=check)

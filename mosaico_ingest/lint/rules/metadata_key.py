@@ -1,4 +1,4 @@
-"""The rule `metadata-key`: a metadata key that is invalid or reserved."""
+"""The check of `metadata-key`: a metadata key that is invalid or reserved."""
 
 from __future__ import annotations
 
@@ -6,27 +6,25 @@ import re
 from collections.abc import Iterator
 
 from mosaico_ingest.job.values import PROVENANCE_KEY
-from mosaico_ingest.lint.job import Job, keys_below, metadata_places
+from mosaico_ingest.lint.job import Job, key_paths_below, metadata_sections
 from mosaico_ingest.lint.rule import Check, Problem
+
+_KEY = re.compile(r"[A-Za-z0-9 _-]+")
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem for each key, of a sequence's or a topic's metadata, at any depth."""
-    for place in metadata_places(job):
-        for path in keys_below(job.source.at(place), place):
+    """Report invalid metadata keys at any depth, and the reserved key of the provenance."""
+    for section in metadata_sections(job):
+        for path in key_paths_below(job.source.at(section), section):
             key = path[-1]
             if isinstance(key, str) and (not _KEY.fullmatch(key) or "--" in key):
-                remedy = "use letters, digits, blanks, _ and single -"
-                yield Problem(
-                    f"the metadata key {key!r} is refused by the platform", job.source.key_span(path), remedy
-                )
-    taken = ("sequence", "metadata", PROVENANCE_KEY)
+                message = f"the platform rejects the metadata key {key!r}"
+                hint = "use letters, digits, spaces, _ and single -"
+                yield Problem(message, job.source.key_span(path), hint)
     if PROVENANCE_KEY in job.manifest.sequence.metadata:
-        what = f"the metadata key {PROVENANCE_KEY!r} is where a run notes what the sequence was made from"
-        yield Problem(what, job.source.key_span(taken), "use another key")
-
-
-_KEY = re.compile(r"[A-Za-z0-9 _-]+")
+        message = f"the metadata key {PROVENANCE_KEY!r} is reserved for the provenance of the sequence"
+        span = job.source.key_span(("sequence", "metadata", PROVENANCE_KEY))
+        yield Problem(message, span, "use another key")
 
 
 CHECK = Check("metadata-key", job=check)

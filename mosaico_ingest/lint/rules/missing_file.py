@@ -1,4 +1,4 @@
-"""The rule `missing-file`: a file that the job needs and that does not exist."""
+"""The check of `missing-file`: a file that the job needs and that does not exist."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem for each file that does not exist."""
-    needed = {
+    """Report a metadata file or TLS certificate that does not exist."""
+    files = {
         ("sequence", "metadata_file"): job.manifest.sequence.metadata_file,
         ("target", "tls_cert"): job.manifest.target.tls_cert,
     }
-    for place, path in needed.items():
-        if path is not None and job.known(path) and not job.resolve(path).is_file():
-            remedy = "paths start at the manifest's folder"
-            yield Problem(f"there is no file {job.resolve(path)}", job.source.span(place), remedy)
+    for path, text in files.items():
+        if text is not None and job.is_expanded(text) and not job.resolve(text).is_file():
+            message = f"the file {job.resolve(text)} does not exist"
+            hint = "correct the path; it starts at the manifest's folder"
+            yield Problem(message, job.source.span(path), hint)
 
 
 CHECK = Check("missing-file", job=check, reads_files=True)

@@ -1,4 +1,4 @@
-"""The rule `missing-folder`: a report path in a folder that does not exist."""
+"""The check of `missing-folder`: a report path in a folder that does not exist."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem if the report's folder does not exist."""
+    """Report a report path whose folder does not exist."""
     report = job.manifest.run.report
-    if report is not None and job.known(report) and not job.resolve(report).parent.is_dir():
-        message = f"there is no folder {job.resolve(report).parent}"
-        yield Problem(message, job.span("run", "report"), "make it, or write the report elsewhere")
+    if report is not None and job.is_expanded(report) and not job.resolve(report).parent.is_dir():
+        message = f"the folder {job.resolve(report).parent} does not exist"
+        yield Problem(message, job.span("run", "report"), "create it, or write the report elsewhere")
 
 
 CHECK = Check("missing-folder", job=check, reads_files=True)

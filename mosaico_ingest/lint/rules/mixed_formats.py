@@ -1,4 +1,4 @@
-"""The rule `mixed-formats`: splits of one recording in different formats."""
+"""The check of `mixed-formats`: splits of one recording in different formats."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ from pathlib import Path
 from mosaico_ingest.lint.job import Job, recording_paths
 from mosaico_ingest.lint.rule import Check, Problem
 
+_SUFFIXES = frozenset({".bag", ".db3", ".mcap"})
+
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem for the first part whose suffix differs from the first one's."""
-    parts = [(place, path, Path(path).suffix.lower()) for place, path in recording_paths(job)]
-    kinds = [(place, path, suffix) for place, path, suffix in parts if suffix in {".bag", ".db3", ".mcap"}]
-    for place, path, suffix in kinds[1:]:
-        if suffix != kinds[0][2]:
-            message = f"{path} is another format than {kinds[0][1]}"
-            yield Problem(message, job.source.span(place), "make them two jobs")
+    """Report the first split whose suffix differs from the suffix of the first split."""
+    splits = [(path, text, Path(text).suffix.lower()) for path, text in recording_paths(job)]
+    splits = [split for split in splits if split[2] in _SUFFIXES]
+    for path, text, suffix in splits[1:]:
+        if suffix != splits[0][2]:
+            message = f"{text} has another format than {splits[0][1]}"
+            yield Problem(message, job.source.span(path), "write two jobs")
             return
 
 

@@ -1,4 +1,4 @@
-"""The rule `msg-constant-name`: a constant name that ROS 2 rejects."""
+"""The check of `msg-constant-name`: a constant name that ROS 2 rejects."""
 
 from __future__ import annotations
 
@@ -8,17 +8,15 @@ from collections.abc import Iterator
 from mosaico_ingest.lint.message import MessageFile
 from mosaico_ingest.lint.rule import Check, Problem
 
-_CONSTANT = re.compile(r"[A-Z](_?[A-Z0-9]+)*")
+_NAME = re.compile(r"[A-Z](_?[A-Z0-9]+)*")
 
 
 def check(message: MessageFile) -> Iterator[Problem]:
-    """Yield a problem for each constant whose name is not in that form."""
+    """Report each constant whose name is not in upper case with single underscores."""
     for declaration in message.declarations:
-        name = declaration.name
-        if declaration.constant and not _CONSTANT.fullmatch(name):
-            yield Problem(
-                f"{name!r} is no constant name of ROS 2", declaration.name_span, "WRITE_IT_LIKE_THIS"
-            )
+        if declaration.is_constant and not _NAME.fullmatch(declaration.name):
+            text = f"{declaration.name!r} is not a valid ROS 2 constant name"
+            yield Problem(text, declaration.name_span, "write it in the form UPPER_CASE")
 
 
 CHECK = Check("msg-constant-name", message=check)

@@ -1,4 +1,4 @@
-"""The rule `msg-repeated-name`: two declarations with the same name."""
+"""The check of `msg-repeated-name`: two declarations with the same name."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(message: MessageFile) -> Iterator[Problem]:
-    """Yield a problem for each name that was declared before."""
+    """Report each declaration whose name was declared before."""
     lines: dict[str, int] = {}
     for declaration in message.declarations:
         name, span = declaration.name, declaration.name_span

@@ -1,4 +1,4 @@
-"""The rule `msg-syntax`: a line of a `.msg` file that is not a declaration."""
+"""The check of `msg-syntax`: a line of a `.msg` file that is not a declaration."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from mosaico_ingest.rosbag.definitions.parser import parse_msg
 
 
 def check(message: MessageFile) -> Iterator[Problem]:
-    """Yield a problem for each line the parser of definitions refuses."""
+    """Report each line that the definition parser rejects."""
     for span, line in message.lines():
-        fault = _fault(line, message.name)
-        if fault is not None:
-            yield Problem(fault, span, "a line is `type name`, `type NAME=value` or a comment")
+        problem = _syntax_error(line, message.name)
+        if problem is not None:
+            yield Problem(problem, span, "write `type name`, `type NAME=value` or a comment")
 
 
-def _fault(line: str, name: str) -> str | None:
+def _syntax_error(line: str, name: str) -> str | None:
     try:
         parse_msg(line, name)
     except BagError as error:

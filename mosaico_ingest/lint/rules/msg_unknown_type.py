@@ -1,25 +1,32 @@
-"""The rule `msg-unknown-type`: a field whose type is not defined."""
+"""The check of `msg-unknown-type`: a field whose type is not defined."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from difflib import get_close_matches
 
-from mosaico_ingest.lint.message import MessageFile, is_known
+from mosaico_ingest.lint.message import MessageFile, is_defined
 from mosaico_ingest.lint.rule import Check, Problem
 from mosaico_ingest.rosbag.definitions.parser import PRIMITIVES
 
+_SPECIAL_TYPES = frozenset({"time", "duration", "Header"})
+
 
 def check(message: MessageFile) -> Iterator[Problem]:
-    """Yield a problem for each type that cannot be found."""
+    """Report each field whose type is not defined."""
     for declaration in message.declarations:
-        kind = declaration.type
-        if declaration.constant or kind in PRIMITIVES or kind in _SPECIAL or is_known(kind, message.path):
+        msgtype = declaration.type
+        if declaration.is_constant or msgtype in PRIMITIVES or msgtype in _SPECIAL_TYPES:
             continue
-        remedy = "put its .msg file beside this one" if "/" not in kind else "define it under bag.custom_msgs"
-        yield Problem(f"there is no type {kind!r}", declaration.type_span, remedy)
+        if not is_defined(msgtype, message.path):
+            yield Problem(f"the type {msgtype!r} is not defined", declaration.type_span, _hint(msgtype))
 
 
-_SPECIAL = {"time", "duration", "Header"}
+def _hint(msgtype: str) -> str:
+    close = get_close_matches(msgtype, PRIMITIVES, n=1, cutoff=0.7)
+    if close:
+        return f"did you mean {close[0]}?"
+    return "define it under bag.custom_msgs" if "/" in msgtype else "put its .msg file next to this one"
 
 
 CHECK = Check("msg-unknown-type", message=check)

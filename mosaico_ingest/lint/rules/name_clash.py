@@ -1,4 +1,4 @@
-"""The rule `name-clash`: two topics with the same name in the sequence."""
+"""The check of `name-clash`: two topics with the same name in the sequence."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem for each new name that is taken."""
-    taken: dict[str, str] = {}
+    """Report each `rename` to the name of another topic in `topic_settings`."""
+    topics: dict[str, str] = {}
     for topic, setting in job.manifest.topic_settings.items():
         name = (setting.rename or topic).strip("/")
-        if name in taken and (setting.rename is not None):
-            message = f"{setting.rename!r} is also the name of {taken[name]!r}"
-            yield Problem(message, job.span("topic_settings", topic, "rename"), "give each its own name")
-        taken.setdefault(name, topic)
+        if name in topics and setting.rename is not None:
+            message = f"{setting.rename!r} is also the name of {topics[name]!r}"
+            yield Problem(
+                message, job.span("topic_settings", topic, "rename"), "give each topic its own name"
+            )
+        topics.setdefault(name, topic)
 
 
 CHECK = Check("name-clash", job=check)

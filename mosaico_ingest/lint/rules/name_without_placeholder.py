@@ -1,4 +1,4 @@
-"""The rule `name-without-placeholder`: a fixed sequence name for a glob of recordings."""
+"""The check of `name-without-placeholder`: a fixed sequence name for a glob of recordings."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from mosaico_ingest.lint.job import Job, is_glob
 from mosaico_ingest.lint.rule import Check, Problem
 from mosaico_ingest.remote import without_options
 
+_VARYING = frozenset({"stem", "name", "index", "parent"})
+"""Placeholders whose value differs between recordings."""
+
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem if the path is a glob and the name the same for all."""
+    """Report a fixed sequence name if the path is a glob."""
     path, name = job.manifest.bag.path, job.manifest.sequence.name
-    varying = any(
-        placeholder.name in {"stem", "name", "index", "parent"} for placeholder in placeholders_in(name)
-    )
-    if isinstance(path, str) and is_glob(without_options(path)) and job.known(name) and not varying:
-        span = job.span("sequence", "name")
-        message = f"every recording that {path} matches would be named {name!r}"
-        yield Problem(message, span, "put {stem} or {index} into it")
+    if not isinstance(path, str) or not is_glob(without_options(path)) or not job.is_expanded(name):
+        return
+    if not any(placeholder.name in _VARYING for placeholder in placeholders_in(name)):
+        message = f"every recording that {without_options(path)} matches would be named {name!r}"
+        yield Problem(message, job.span("sequence", "name"), "add {stem} or {index} to the name")
 
 
 CHECK = Check("name-without-placeholder", job=check)

@@ -1,4 +1,4 @@
-"""The rule `overwritten-input`: a report that would overwrite an input of the job."""
+"""The check of `overwritten-input`: a report that would overwrite an input of the job."""
 
 from __future__ import annotations
 
@@ -10,16 +10,15 @@ from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem if the report is also a recording, the metadata or the manifest."""
+    """Report a report path that is also a recording, the metadata file or the manifest."""
     report = job.manifest.run.report
     if report is None:
         return
-    inputs = [path for _, path in recording_paths(job)]
-    inputs += [path for path in (job.manifest.sequence.metadata_file, job.source.file) if path is not None]
-    if normpath(report) in {normpath(path) for path in inputs}:
-        yield Problem(
-            f"{report} is read by this job", job.span("run", "report"), "write the report elsewhere"
-        )
+    inputs = [text for _, text in recording_paths(job)]
+    inputs += [text for text in (job.manifest.sequence.metadata_file, job.source.file) if text is not None]
+    if normpath(report) in {normpath(text) for text in inputs}:
+        message = f"the report would overwrite {report}, which the job reads"
+        yield Problem(message, job.span("run", "report"), "write the report elsewhere")
 
 
 CHECK = Check("overwritten-input", job=check)

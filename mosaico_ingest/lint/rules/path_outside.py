@@ -1,4 +1,4 @@
-"""The rule `path-outside`: a relative path that leaves the repository."""
+"""The check of `path-outside`: a relative path that leaves the repository."""
 
 from __future__ import annotations
 
@@ -6,19 +6,20 @@ from collections.abc import Iterator
 from os.path import normpath
 from pathlib import Path
 
-from mosaico_ingest.lint.job import Job, all_paths
+from mosaico_ingest.lint.job import Job, manifest_paths
 from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem for each relative path outside the folder that holds `.git`."""
+    """Report each relative path outside of the folder that contains `.git`."""
     root = next((folder for folder in _ancestors(job.folder) if (folder / ".git").exists()), None)
     if root is None:
         return
-    for place, path in all_paths(job):
-        resolved = Path(normpath(job.folder.resolve() / path))
-        if path.startswith("..") and root not in _ancestors(resolved):
-            yield Problem(f"{path} is outside of {root}", job.source.span(place), "use a variable: ${DATA}/…")
+    for path, text in manifest_paths(job):
+        resolved = Path(normpath(job.folder.resolve() / text))
+        if text.startswith("..") and root not in _ancestors(resolved):
+            message = f"{text} is outside of the repository {root}"
+            yield Problem(message, job.source.span(path), "use a variable: ${DATA}/…")
 
 
 def _ancestors(folder: Path) -> list[Path]:

@@ -1,28 +1,32 @@
-"""The rule `plaintext-secret`: an API key or password written into a manifest."""
+"""The check of `plaintext-secret`: an API key or password written into a manifest."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
 
-from mosaico_ingest.lint.job import Job, values_below
+from mosaico_ingest.findings import has_credentials
+from mosaico_ingest.lint.job import Job, value_paths_below
 from mosaico_ingest.lint.rule import Check, Problem
+
+_API_KEY_PATH = ("target", "api_key")
+_NONEMPTY_DEFAULT = re.compile(r"\$\{\w+:-[^}]")
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem if the key is no variable or has a default, and for every API key that stands elsewhere."""
-    remedy = "write ${MOSAICO_API_KEY} and set it in the environment"
-    for path in values_below(job.source.value, ()):
+    """Report API keys anywhere in the manifest, credentials in URLs, and an `api_key` that is not a variable."""
+    for path in value_paths_below(job.source.value, ()):
         value = job.source.at(path)
         if not isinstance(value, str):
             continue
-        is_key = path == ("target", "api_key") and ("${" not in value or _DEFAULT.search(value))
-        if is_key or _KEY.search(value):
-            yield Problem("an API key can be read here", job.source.span(path), remedy)
-
-
-_DEFAULT = re.compile(r"\$\{\w+:-[^}]")
-_KEY = re.compile(r"msco_[a-z0-9]{32}_[0-9a-f]{8}")
+        if has_credentials(value):
+            message = "the manifest contains a secret"
+        elif path == _API_KEY_PATH and ("${" not in value or _NONEMPTY_DEFAULT.search(value)):
+            message = "the manifest contains an API key"
+        else:
+            continue
+        hint = "use an environment variable, such as ${MOSAICO_API_KEY}, or the configuration of the storage client"
+        yield Problem(message, job.source.span(path), hint)
 
 
 CHECK = Check("plaintext-secret", job=check)

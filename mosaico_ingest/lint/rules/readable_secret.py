@@ -1,4 +1,4 @@
-"""The rule `readable-secret`: a secret in a file that every user can read."""
+"""The check of `readable-secret`: a secret in a file that every user can read."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem if the file with the key is readable by everyone."""
-    written = job.source.at(("target", "api_key"))
-    if not isinstance(written, str) or "${" in written or job.file is None:
+    """Report a literal API key in a file that every user can read."""
+    key = job.source.at(("target", "api_key"))
+    if not isinstance(key, str) or "${" in key or job.file is None:
         return
     mode = job.file.stat().st_mode
     if mode & stat.S_IROTH:
-        message = f"every user can read the key (mode {stat.S_IMODE(mode):o})"
-        yield Problem(message, job.key_span("target", "api_key"), f"chmod 600 {job.file}")
+        message = f"every user of this machine can read the API key (file mode {stat.S_IMODE(mode):o})"
+        yield Problem(message, job.key_span("target", "api_key"), f"run chmod 600 {job.file}")
 
 
 CHECK = Check("readable-secret", job=check, reads_files=True)

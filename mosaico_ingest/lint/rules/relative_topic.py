@@ -1,4 +1,4 @@
-"""The rule `relative-topic`: a topic name without a leading slash."""
+"""The check of `relative-topic`: a topic name without a leading slash."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem for each name or glob that starts with a letter."""
-    for place, pattern, span in topic_patterns(job):
-        bare = pattern.removeprefix("!")
-        if bare[:1].isalpha():
-            sign = pattern[: len(pattern) - len(bare)]
-            yield Problem(f"{pattern!r} in {place} has no leading slash", span, f"write {sign}/{bare}")
+    """Report each topic name or glob that starts with a letter."""
+    for section, pattern, span in topic_patterns(job):
+        name = pattern.removeprefix("!")
+        if name[:1].isalpha():
+            sign = pattern[: len(pattern) - len(name)]
+            yield Problem(f"{pattern!r} in {section} has no leading slash", span, f"write {sign}/{name}")
 
 
 CHECK = Check("relative-topic", job=check)

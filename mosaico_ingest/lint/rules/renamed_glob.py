@@ -1,4 +1,4 @@
-"""The rule `renamed-glob`: one new name for all topics that a glob matches."""
+"""The check of `renamed-glob`: one new name for all topics that a glob matches."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem for each `rename` under a glob."""
+    """Report each `rename` under a glob."""
     for topic, setting in job.manifest.topic_settings.items():
         if setting.rename is not None and is_glob(topic):
             span = job.key_span("topic_settings", topic, "rename")
-            yield Problem(
-                f"every topic that {topic!r} matches would be {setting.rename!r}", span, "name one topic"
-            )
+            message = f"all topics that {topic!r} matches would be named {setting.rename!r}"
+            yield Problem(message, span, "name a single topic instead of a glob")
 
 
 CHECK = Check("renamed-glob", job=check)

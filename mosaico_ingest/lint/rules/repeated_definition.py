@@ -1,4 +1,4 @@
-"""The rule `repeated-definition`: a message type that is defined twice."""
+"""The check of `repeated-definition`: a message type that is defined twice."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from mosaico_ingest.rosbag.definitions.registry import definition_files
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem for each entry that defines a type an earlier one has defined."""
-    first: dict[tuple[str, str | None], int] = {}
+    """Report each entry of `custom_msgs` that defines a type that an earlier entry defines for the same distribution."""
+    lines: dict[tuple[str, str | None], int] = {}
     for i, custom in enumerate(job.manifest.bag.custom_msgs):
-        files = definition_files(job.resolve(custom.path)) if job.known(custom.path) else ()
-        line = job.span("bag", "custom_msgs", i, "path").line
-        keys = [(f"{custom.package}/msg/{file.stem}", custom.store and custom.store.value) for file in files]
-        repeated = next((key for key in keys if key in first), None)
+        files = definition_files(job.resolve(custom.path)) if job.is_expanded(custom.path) else ()
+        span = job.span("bag", "custom_msgs", i, "path")
+        distro = None if custom.store is None else custom.store.value
+        types = [(f"{custom.package}/msg/{file.stem}", distro) for file in files]
+        repeated = next((type_ for type_ in types if type_ in lines), None)
         if repeated is not None:
-            message = f"{repeated[0]} is already defined by the entry of line {first[repeated]}"
-            yield Problem(message, job.span("bag", "custom_msgs", i, "path"), "keep one of the two")
-        first.update({key: line for key in keys if key not in first})
+            message = f"the entry in line {lines[repeated]} already defines {repeated[0]}"
+            yield Problem(message, span, "keep one of the two entries")
+        lines = {**dict.fromkeys(types, span.line), **lines}
 
 
 CHECK = Check("repeated-definition", job=check, reads_files=True)

@@ -1,4 +1,4 @@
-"""The rule `repeated-split`: a split that is listed twice."""
+"""The check of `repeated-split`: a split that is listed twice."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem for each part that is the same path as an earlier one."""
-    seen: dict[str, int] = {}
-    for place, path in recording_paths(job):
-        normal = normpath(path)
-        if normal in seen:
-            message = f"{path} is already named in line {seen[normal]}"
-            yield Problem(message, job.source.span(place), "remove one of the two")
-        seen.setdefault(normal, job.source.span(place).line)
+    """Report each split whose path equals the path of an earlier split."""
+    lines: dict[str, int] = {}
+    for path, text in recording_paths(job):
+        span = job.source.span(path)
+        normal = normpath(text)
+        if normal in lines:
+            message = f"{text} is already listed in line {lines[normal]}"
+            yield Problem(message, span, "remove one of the two")
+        lines.setdefault(normal, span.line)
 
 
 CHECK = Check("repeated-split", job=check)

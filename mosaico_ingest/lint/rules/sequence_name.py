@@ -1,4 +1,4 @@
-"""The rule `sequence-name`: a sequence name that the platform rejects."""
+"""The check of `sequence-name`: a sequence name that the platform rejects."""
 
 from __future__ import annotations
 
@@ -11,28 +11,26 @@ from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.rule import Check, Problem
 from mosaico_ingest.protocol import check_sequence_name
 
+_INVALID = re.compile(r"[^A-Za-z0-9_-]")
+
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem if the name, with any placeholder filled in, is refused."""
+    """Report the first character that the platform rejects, outside of placeholders."""
     name = job.manifest.sequence.name
-    if not job.known(name):
+    if not job.is_expanded(name):
         return
-    plain = name
-    for placeholder in reversed(list(placeholders_in(name))):
-        plain = (
-            plain[: placeholder.start]
-            + "x" * (placeholder.end - placeholder.start)
-            + plain[placeholder.end :]
-        )
+    literal = name
+    for placeholder in placeholders_in(name):
+        start, end = placeholder.start, placeholder.end
+        literal = literal[:start] + "x" * (end - start) + literal[end:]
     try:
-        check_sequence_name(plain)
+        check_sequence_name(literal)
     except SinkError:
-        refused = re.search(r"[^A-Za-z0-9_-]", plain)
-        start = refused.start() if refused else 0
+        match = _INVALID.search(literal)
+        start = match.start() if match else 0
         span = job.source.inner_span(("sequence", "name"), start, start + 1)
-        yield Problem(
-            f"{plain[start]!r} cannot be in the name of a sequence", span, "use letters, digits, _ and -"
-        )
+        message = f"a sequence name cannot contain {literal[start]!r}"
+        yield Problem(message, span, "use letters, digits, _ and -")
 
 
 CHECK = Check("sequence-name", job=check)

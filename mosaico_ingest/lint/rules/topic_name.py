@@ -1,4 +1,4 @@
-"""The rule `topic-name`: a new topic name that the platform rejects."""
+"""The check of `topic-name`: a new topic name that the platform rejects."""
 
 from __future__ import annotations
 
@@ -11,16 +11,15 @@ from mosaico_ingest.protocol import check_topic_name
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem for each `rename` that cannot be a topic's name."""
+    """Report each `rename` that the platform rejects as a topic name."""
     for topic, setting in job.manifest.topic_settings.items():
-        if setting.rename is None or not job.known(setting.rename):
+        if setting.rename is None or not job.is_expanded(setting.rename):
             continue
         try:
             check_topic_name(setting.rename)
         except SinkError as error:
-            yield Problem(
-                error.what, job.span("topic_settings", topic, "rename"), "use letters, digits, _ and /"
-            )
+            span = job.span("topic_settings", topic, "rename")
+            yield Problem(error.what, span, "use letters, digits, _ and /")
 
 
 CHECK = Check("topic-name", job=check)

@@ -1,4 +1,4 @@
-"""The rule `topic-pattern`: a topic pattern that cannot match any topic name."""
+"""The check of `topic-pattern`: a topic pattern that cannot match any topic name."""
 
 from __future__ import annotations
 
@@ -8,30 +8,34 @@ from collections.abc import Iterator
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.rule import Check, Problem
 
-_FAULTS = (
+_MISTAKES = (
     (
         re.compile(r"\.[*+]|\\|[$^()|]"),
         "it is a regular expression",
-        "patterns are globs: * matches anything",
+        "write a glob, in which * matches any text",
     ),
-    (re.compile(r"\s"), "there is a blank in it", "remove it"),
-    (re.compile(r"//"), "there are two slashes in a row", "remove one"),
-    (re.compile(r"(?<=.)/$"), "it ends with a slash", "remove it, or write /*"),
+    (re.compile(r"\s"), "it contains a space", "remove the space"),
+    (re.compile(r"//"), "it contains two slashes in a row", "remove one slash"),
+    (re.compile(r"(?<=.)/$"), "it ends with a slash", "remove the slash, or write /*"),
+    (
+        re.compile(r"\[(?!(?:!|(?!!))(?:\][^\]]*|[^\]]+)\]).*"),
+        "its [ is never closed",
+        "close the bracket, as in [ab], or write ? for a single character",
+    ),
 )
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem for each pattern of `topics` that is no glob of a topic name."""
+    """Report each pattern that cannot match any topic name."""
     for i, pattern in enumerate(job.manifest.topics):
-        glob = pattern.removeprefix("!")
-        if not glob:
-            yield Problem("'!' alone leaves out nothing", job.span("topics", i), 'write "!/topic"')
+        if pattern in {"", "!"}:
+            yield Problem(f"{pattern!r} excludes nothing", job.span("topics", i), 'write "!/topic"')
             continue
-        for fault, reason, remedy in _FAULTS:
-            match = fault.search(pattern)
-            if match is not None and job.known(pattern):
+        for mistake, reason, hint in _MISTAKES:
+            match = mistake.search(pattern)
+            if match is not None and job.is_expanded(pattern):
                 span = job.source.inner_span(("topics", i), match.start(), match.end())
-                yield Problem(f"{pattern!r} matches no topic: {reason}", span, remedy)
+                yield Problem(f"{pattern!r} matches no topic, because {reason}", span, hint)
                 break
 
 

@@ -1,4 +1,4 @@
-"""The rule `unknown-format`: a recording with an unknown file name extension."""
+"""The check of `unknown-format`: a recording with an unknown file name extension."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from mosaico_ingest.rosbag.formats import RECORDING_NAME
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem for each part with the suffix of something else."""
-    for place, path in recording_paths(job):
-        suffix = Path(path).suffix
-        known = RECORDING_NAME.search(path) or path.lower().endswith("metadata.yaml")
-        if suffix and not is_glob(suffix) and not known and not job.resolve(path).is_dir():
-            remedy = "recordings are .bag, .db3 and .mcap files, and rosbag2 directories"
-            yield Problem(f"{path} does not look like a recording", job.source.span(place), remedy)
+    """Report each file whose suffix is not the suffix of a recording."""
+    for path, text in recording_paths(job):
+        suffix = Path(text).suffix
+        is_recording = RECORDING_NAME.search(text) or text.lower().endswith("metadata.yaml")
+        if suffix and not is_glob(suffix) and not is_recording and not job.resolve(text).is_dir():
+            hint = "name a .bag, .db3 or .mcap file, or a rosbag2 directory"
+            yield Problem(f"{text} does not look like a recording", job.source.span(path), hint)
 
 
 CHECK = Check("unknown-format", job=check)

@@ -1,4 +1,4 @@
-"""The rule `unknown-placeholder`: an unknown placeholder in the sequence name."""
+"""The check of `unknown-placeholder`: an unknown placeholder in the sequence name."""
 
 from __future__ import annotations
 
@@ -11,18 +11,17 @@ from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem for each unknown placeholder of the name."""
+    """Report each unknown placeholder in the sequence name."""
     name = job.manifest.sequence.name
     for placeholder in placeholders_in(name):
         if placeholder.known or name[placeholder.start - 1 : placeholder.start] == "$":
             continue
         close = nearest(placeholder.name, PLACEHOLDERS)
+        suggestion = f"did you mean {{{close}}}? " if close else ""
+        allowed = ", ".join(f"{{{known}}}" for known in PLACEHOLDERS)
         span = job.source.inner_span(("sequence", "name"), placeholder.start, placeholder.end)
-        known = ", ".join(f"{{{known}}}" for known in PLACEHOLDERS)
-        hint = f"did you mean {{{close}}}? " if close else ""
-        yield Problem(
-            f"nothing stands for {name[placeholder.start : placeholder.end]}", span, f"{hint}known: {known}"
-        )
+        message = f"unknown placeholder {name[placeholder.start : placeholder.end]}"
+        yield Problem(message, span, f"{suggestion}allowed: {allowed}")
 
 
 CHECK = Check("unknown-placeholder", job=check)

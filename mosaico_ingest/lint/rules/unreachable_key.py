@@ -1,4 +1,4 @@
-"""The rule `unreachable-key`: a glob that an earlier glob hides."""
+"""The check of `unreachable-key`: a glob that an earlier glob hides."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem for each key that is a glob and is covered by a glob above it."""
-    above: list[tuple[str, str, int]] = []
+    """Report each glob that an earlier glob of the same section covers."""
+    globs: list[tuple[str, str, int]] = []
     for section, pattern, span in keyed_patterns(job):
         if not is_glob(pattern):
             continue
-        for earlier_section, earlier, line in above:
+        for earlier_section, earlier, line in globs:
             if earlier_section == section and covers(earlier, pattern):
-                message = f"{pattern!r} is never used: {earlier!r} in line {line} takes all its topics"
-                yield Problem(message, span, "put it above")
+                message = f"{pattern!r} is never used, because {earlier!r} in line {line} covers it"
+                yield Problem(message, span, "put it above that glob")
                 break
-        above.append((section, pattern, span.line))
+        globs.append((section, pattern, span.line))
 
 
 CHECK = Check("unreachable-key", job=check)

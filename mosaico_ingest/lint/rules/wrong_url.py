@@ -1,30 +1,39 @@
-"""The rule `wrong-url`: a URL that cannot be used."""
+"""The check of `wrong-url`: a URL that cannot be used."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 from mosaico_ingest.errors import IngestError
-from mosaico_ingest.lint.job import Job, all_paths
+from mosaico_ingest.findings import has_credentials
+from mosaico_ingest.lint.job import Job, manifest_paths
 from mosaico_ingest.lint.rule import Check, Problem
-from mosaico_ingest.remote import as_path, is_url
+from mosaico_ingest.remote import as_path, check_options, is_url
 
-_MAY_BE_URLS = {("bag", "path"), ("target", "store")}
+_URL_KEYS = frozenset({("bag", "path"), ("target", "store")})
+"""The key paths that accept URLs."""
+_ONE_SLASH = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/(?!/)")
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Yield a problem for each URL that is not understood, or that stands where a file must be; nobody is asked."""
-    for place, path in all_paths(job):
-        if not is_url(path):
-            continue
-        if place[:2] not in _MAY_BE_URLS:
-            message = f"{'.'.join(map(str, place))} is a URL, and only recordings and stores may be"
-            yield Problem(message, job.source.span(place), "name a file")
-            continue
-        try:
-            as_path(path)
-        except IngestError as error:
-            yield Problem(f"{error.where}: {error.what}", job.source.span(place), error.hint or "")
+    """Report URLs that are invalid, or in a place that requires a local path. No connection is opened."""
+    for path, text in manifest_paths(job):
+        if not is_url(text) or has_credentials(text):
+            continue  # `plaintext-secret` reports credentials.
+        span = job.source.span(path)
+        if path[:2] not in _URL_KEYS:
+            message = f"{'.'.join(map(str, path))} is a URL, but only recordings and stores can be URLs"
+            yield Problem(message, span, "name a local file")
+        elif _ONE_SLASH.match(text):
+            yield Problem(
+                f"{text} has one slash after its scheme", span, f"write {text.replace(':/', '://', 1)}"
+            )
+        else:
+            try:
+                check_options(as_path(text))
+            except IngestError as error:
+                yield Problem(f"{error.where}: {error.what}", span, error.hint or "")
 
 
 CHECK = Check("wrong-url", job=check)
