@@ -1,4 +1,4 @@
-"""Shared fixtures: the corpus of real recordings where it is present, and the switch for slow tests."""
+"""Shared fixtures, such as the corpus of real recordings, and the option `--slow`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import pytest
 from hypothesis import settings
 from object_store import CREDENTIALS, ObjectStore, object_store
 
-# Machines are noisy: how long an example takes says nothing about the code.
-# CI tries the same examples each time, so that it judges the change; everybody else explores.
+# Examples have no deadline, because their duration depends on the load of the machine. CI tries the same examples each time, so
+# that a failure is caused by the change; other runs try new examples.
 settings.register_profile("ci", deadline=None, derandomize=True)
 settings.register_profile("explore", deadline=None)
 settings.register_profile("long", deadline=None, max_examples=100_000)
@@ -37,9 +37,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder of reference material beside the checkout."""
+    """The folder with reference material next to the checkout."""
     if not SHARED.is_dir():
-        pytest.skip(f"the reference material is not here ({SHARED.name}/ beside the checkout)")
+        pytest.skip(f"there is no reference material (folder {SHARED.name} next to the checkout)")
     return SHARED
 
 
@@ -51,7 +51,7 @@ def corpus(shared: Path) -> Path:
 
 @pytest.fixture
 def interruptible() -> Iterator[None]:
-    """Ctrl-C raises KeyboardInterrupt, also where the tests run in the background, which ignores it."""
+    """Let Ctrl-C raise KeyboardInterrupt, also if the tests run in the background, where it is ignored by default."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -59,7 +59,7 @@ def interruptible() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def objects() -> Iterator[ObjectStore]:
-    """An S3 server with an empty bucket, and the credentials for it in the environment."""
+    """An S3 server with an empty bucket; its credentials are in the environment."""
     pytest.importorskip("moto", reason="the S3 server of the tests is not installed")
     with pytest.MonkeyPatch.context() as patch, object_store() as running:
         for name, value in CREDENTIALS.items():

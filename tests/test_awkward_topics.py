@@ -1,4 +1,4 @@
-"""Topics that other ingesters drop, garble or end a run for arrive whole, all from one recording."""
+"""Topics that other tools drop, corrupt or fail on: all of one recording are stored completely."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ AWKWARD: Mapping[str, tuple[str, str, Rows, Rows]] = {
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Store:
     folder = tmp_path_factory.mktemp("awkward")
-    made = record(
+    recording = record(
         folder / "awkward.mcap",
         [
             (topic, define(msgtype, text), 10 + at, row)
@@ -63,20 +63,19 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Store:
             for at, row in enumerate(rows)
         ],
     )
-    report = RosbagInjector(ROSInjectionConfig(made, "awkward", store=folder / "store")).run()
-    assert report is not None
+    report = RosbagInjector(ROSInjectionConfig(recording, "awkward", store=folder / "store")).run()
     assert report.totals.read == report.totals.written == sum(len(rows) for *_, rows in AWKWARD.values())
     return Store.open(folder / "store")
 
 
 @pytest.mark.parametrize("topic", AWKWARD)
-def test_every_row_arrives(stored: Store, topic: str) -> None:
+def test_awkward_topic_is_stored_with_every_row(stored: Store, topic: str) -> None:
     rows = stored.scan("awkward", topic).read_all().to_pylist()
     assert [row.pop("timestamp_ns") for row in rows] == [10 + at for at in range(len(rows))]
     assert rows == AWKWARD[topic][3]
 
 
-def test_types_of_one_short_name_keep_their_own_origin(stored: Store) -> None:
+def test_types_with_equal_short_names_keep_their_definitions(stored: Store) -> None:
     origins = [stored.topic("awkward", topic).metadata["_ros_"] for topic in ("/same", "/other_same")]
     assert [origin["msgtype"] for origin in origins] == ["a/msg/Same", "b/msg/Same"]
     assert [origin["enums"] for origin in origins] == [{"A": 1}, {"B": 2}]
@@ -89,33 +88,32 @@ def test_types_of_one_short_name_keep_their_own_origin(stored: Store) -> None:
         (("/a", "/b"), {"/b": "/a"}, "/a and /b have one name in the sequence, /a"),
         (("imu", "/imu"), {}, "imu and /imu have one name in the sequence, imu"),
     ],
-    ids=["renamed onto another", "with and without a slash"],
+    ids=["renamed to the name of another", "with and without a slash"],
 )
-def test_two_topics_of_one_name_are_both_kept_and_named(
+def test_topics_with_equal_names_in_the_sequence_are_both_stored_with_a_finding(
     tmp_path: Path, topics: tuple[str, str], rename: dict[str, str], clash: str
 ) -> None:
     number = define("std_msgs/msg/Int32", "int32 data\n")
-    made = record(tmp_path / "two.mcap", [(topic, number, 5, {"data": 1}) for topic in topics])
-    config = ROSInjectionConfig(made, "two", rename=rename, store=tmp_path / "store")
+    recording = record(tmp_path / "two.mcap", [(topic, number, 5, {"data": 1}) for topic in topics])
+    config = ROSInjectionConfig(recording, "two", rename=rename, store=tmp_path / "store")
     report = RosbagInjector(config).run()
-    assert report is not None
     assert report.totals.written == 2
     first, second = (topic.target for topic in report.topics)
     assert second.endswith(f"{topics[0].removeprefix('/')}/Int32")
     assert [finding for finding in report.findings if "name-clash" in finding] == [
         f"warning[name-clash] {clash} — the second one is stored as {second}"
     ]
-    kept = Store.open(tmp_path / "store").sequence("two").topics
-    assert [topic.rows for topic in kept] == [1, 1]
+    stored = Store.open(tmp_path / "store").sequence("two").topics
+    assert [topic.rows for topic in stored] == [1, 1]
     assert first == topics[0]
 
 
-def test_two_types_on_a_topic_are_told_once_and_only_where_it_is_taken(tmp_path: Path) -> None:
+def test_topic_with_two_types_gives_one_finding_if_selected(tmp_path: Path) -> None:
     number, text = (
         define("std_msgs/msg/Int32", "int32 data\n"),
         define("std_msgs/msg/String", "string data\n"),
     )
-    made = record(
+    recording = record(
         tmp_path / "two.mcap",
         [
             ("/two", number, 5, {"data": 1}),
@@ -123,22 +121,20 @@ def test_two_types_on_a_topic_are_told_once_and_only_where_it_is_taken(tmp_path:
             ("/one", number, 7, {"data": 2}),
         ],
     )
-    config = ROSInjectionConfig(made, "two", store=tmp_path / "store")
+    config = ROSInjectionConfig(recording, "two", store=tmp_path / "store")
     both, without = (
         RosbagInjector(one).run() for one in (config, replace(config, sequence_name="one", topics="/one"))
     )
-    assert both is not None
     assert [finding.partition("]")[0] for finding in both.findings] == ["warning[mixed-types"]
-    assert without is not None
     assert without.findings == ()
 
 
-def test_what_is_assumed_of_topics_that_are_not_taken_is_not_told(tmp_path: Path) -> None:
+def test_assumed_definition_of_excluded_topic_gives_no_finding(tmp_path: Path) -> None:
     number = define("std_msgs/msg/Int32", "int32 data\n")
     undefined = msgspec.structs.replace(define("std_msgs/msg/String", "string data\n"), text="")
-    made = record(
+    recording = record(
         tmp_path / "two.mcap", [("/one", number, 5, {"data": 1}), ("/other", undefined, 6, {"data": ""})]
     )
-    config = ROSInjectionConfig(made, "two", store=tmp_path / "store")
+    config = ROSInjectionConfig(recording, "two", store=tmp_path / "store")
     assert [finding.rule for finding in RosbagInjector(config).plan().findings] == ["assumed-definition"]
     assert RosbagInjector(replace(config, topics="/one")).plan().findings == ()

@@ -1,37 +1,37 @@
-"""What was made of an object is made once, for that object alone, and only so much of it is kept."""
+"""`cache_by_identity`: one result per object, also for equal objects, up to a maximum number of objects."""
 
 from __future__ import annotations
 
 from mosaico_ingest.caching import cache_by_identity
 
 
-class _Given:
-    """Equal to every other, as two Arrow types may be."""
+class _AlwaysEqual:
+    """An object that equals every other one, as two Arrow types can."""
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Given)
+        return isinstance(other, _AlwaysEqual)
 
     def __hash__(self) -> int:
         return 0
 
 
-def test_an_object_is_asked_once_and_an_equal_one_for_itself() -> None:
-    asked: list[_Given] = []
-    made = cache_by_identity(lambda given: asked.append(given) or len(asked))
-    one, other = _Given(), _Given()
-    assert [made(one), made(one), made(other), made(one)] == [1, 1, 2, 1]
-    assert list(map(id, asked)) == [id(one), id(other)]
+def test_cache_computes_once_per_object_also_for_equal_objects() -> None:
+    computed: list[_AlwaysEqual] = []
+    cached = cache_by_identity(lambda value: computed.append(value) or len(computed))
+    one, other = _AlwaysEqual(), _AlwaysEqual()
+    assert [cached(one), cached(one), cached(other), cached(one)] == [1, 1, 2, 1]
+    assert list(map(id, computed)) == [id(one), id(other)]
 
 
-def test_an_object_lives_while_it_is_remembered_so_its_place_is_nobody_elses() -> None:
-    made = cache_by_identity(lambda given: given)
-    assert len({id(made(_Given())) for _ in range(100)}) == 100
+def test_cache_keeps_objects_alive_so_that_ids_are_not_reused() -> None:
+    cached = cache_by_identity(lambda value: value)
+    assert len({id(cached(_AlwaysEqual())) for _ in range(100)}) == 100
 
 
-def test_the_oldest_is_forgotten() -> None:
-    asked: list[int] = []
-    made = cache_by_identity(asked.append)
-    given = list(range(10_000, 11_000))
-    for each in (*given, given[-1], given[0]):
-        made(each)
-    assert asked == [*given, given[0]]
+def test_cache_full_evicts_the_oldest_entry() -> None:
+    computed: list[int] = []
+    cached = cache_by_identity(computed.append)
+    values = list(range(10_000, 11_000))
+    for value in (*values, values[-1], values[0]):
+        cached(value)
+    assert computed == [*values, values[0]]

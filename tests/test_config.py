@@ -1,4 +1,4 @@
-"""A configuration is checked when it is made, and holds each value in its one form."""
+"""`ROSInjectionConfig`: it validates its arguments and converts each to one form."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from mosaico_ingest.job.values import (
 
 
 class MyCustomRGBDAdapter:
-    """Stands for a user's adapter."""
+    """A placeholder for an adapter of a user."""
 
 
 def config(**fields: Any) -> ROSInjectionConfig:
     return ROSInjectionConfig(**{"file_path": "a.bag", "sequence_name": "run", **fields})
 
 
-def test_the_reference_example_is_accepted() -> None:
-    made = ROSInjectionConfig(
+def test_config_accepts_the_example_of_the_reference() -> None:
+    configuration = ROSInjectionConfig(
         file_path=Path("data/session_01.db3"),
         sequence_name="test_ros_sequence",
         metadata={"driver_version": "v2.1", "weather": "sunny", "location": "test_track_A"},
@@ -45,11 +45,15 @@ def test_the_reference_example_is_accepted() -> None:
         on_error=SessionLevelErrorPolicy.Report,
         topics_on_error=TopicLevelErrorPolicy.Raise,
     )
-    assert made.paths == (Path("data/session_01.db3"),)
-    assert made.topics == ("/cam*",)
-    assert made.adapter_overrides == made.adapter_override == {"/camera/depth/points": MyCustomRGBDAdapter}
-    assert made.target == StoreTarget(Path("mosaico"))
-    assert pickle.loads(pickle.dumps(made)) == made  # noqa: S301 - our own bytes
+    assert configuration.paths == (Path("data/session_01.db3"),)
+    assert configuration.topics == ("/cam*",)
+    assert (
+        configuration.adapter_overrides
+        == configuration.adapter_override
+        == {"/camera/depth/points": MyCustomRGBDAdapter}
+    )
+    assert configuration.target == StoreTarget(Path("mosaico"))
+    assert pickle.loads(pickle.dumps(configuration)) == configuration  # noqa: S301 - our own bytes
 
 
 @pytest.mark.parametrize(
@@ -64,42 +68,42 @@ def test_the_reference_example_is_accepted() -> None:
         "serialization_formats",
     ],
 )
-def test_none_is_nothing_where_there_may_be_several(name: str) -> None:
+def test_config_none_for_a_collection_is_empty(name: str) -> None:
     assert config(**{name: None}) == config()
 
 
-def test_other_enumerations_are_taken_by_their_values() -> None:
-    class Policy(Enum):  # as the official SDK has it
+def test_config_accepts_other_enumerations_by_value() -> None:
+    class Policy(Enum):  # as in the official SDK
         Ignore = "ignore"
 
-    made = config(ros_distro=RosbagsStores.ROS2_HUMBLE, topics_on_error={"/gps": Policy.Ignore})
-    assert made.ros_distro is Stores.ROS2_HUMBLE
-    assert made.topic_policy("/gps") is TopicLevelErrorPolicy.Ignore
+    configuration = config(ros_distro=RosbagsStores.ROS2_HUMBLE, topics_on_error={"/gps": Policy.Ignore})
+    assert configuration.ros_distro is Stores.ROS2_HUMBLE
+    assert configuration.topic_policy("/gps") is TopicLevelErrorPolicy.Ignore
 
 
-def test_words_become_what_they_name() -> None:
-    made = config(
+def test_config_converts_strings_to_enumerations() -> None:
+    configuration = config(
         ros_distro="ros2_humble",
         on_error="delete",
         topics_on_error="ignore",
         messages_on_error="raise",
         topics="/imu",
     )
-    assert made.ros_distro is Stores.ROS2_HUMBLE
-    assert made.on_error is SessionLevelErrorPolicy.Delete
-    assert made.topics_on_error is TopicLevelErrorPolicy.Ignore
-    assert made.messages_on_error is LoaderErrorPolicy.RAISE
-    assert made.topics == ("/imu",)
+    assert configuration.ros_distro is Stores.ROS2_HUMBLE
+    assert configuration.on_error is SessionLevelErrorPolicy.Delete
+    assert configuration.topics_on_error is TopicLevelErrorPolicy.Ignore
+    assert configuration.messages_on_error is LoaderErrorPolicy.RAISE
+    assert configuration.topics == ("/imu",)
 
 
-def test_the_plural_spelling_of_overrides_is_the_same() -> None:
-    made = config(adapter_overrides={"/a": MyCustomRGBDAdapter})
-    assert made.adapter_override == {"/a": MyCustomRGBDAdapter}
+def test_config_adapter_overrides_is_an_alias_of_adapter_override() -> None:
+    configuration = config(adapter_overrides={"/a": MyCustomRGBDAdapter})
+    assert configuration.adapter_override == {"/a": MyCustomRGBDAdapter}
     with pytest.raises(ManifestError, match="disagree on '/a'"):
         config(adapter_overrides={"/a": MyCustomRGBDAdapter}, adapter_override={"/a": "Other"})
 
 
-def test_the_destination_follows_one_rule() -> None:
+def test_config_target_is_derived_from_store_and_host() -> None:
     assert config().target == StoreTarget(Path("mosaico"))
     assert config(store="s").target == StoreTarget(Path("s"))
     assert config(host="h").target == ServerTarget("h", 6726)
@@ -108,19 +112,19 @@ def test_the_destination_follows_one_rule() -> None:
     assert "api_key" not in repr(server)
 
 
-def test_update_if_exists_is_append() -> None:
+def test_config_update_if_exists_means_append() -> None:
     assert config(update_if_exists=True).if_exists is IfExists.APPEND
 
 
-def test_each_topic_has_its_policy() -> None:
-    made = config(topics_on_error={"default": "finalize", "/gps/*": "ignore", "/gps/fix": "raise"})
-    assert made.topic_policy("/gps/fix") is TopicLevelErrorPolicy.Raise
-    assert made.topic_policy("/gps/other") is TopicLevelErrorPolicy.Ignore
-    assert made.topic_policy("/imu") is TopicLevelErrorPolicy.Finalize
+def test_topic_policy_prefers_exact_name_then_glob_then_default() -> None:
+    configuration = config(topics_on_error={"default": "finalize", "/gps/*": "ignore", "/gps/fix": "raise"})
+    assert configuration.topic_policy("/gps/fix") is TopicLevelErrorPolicy.Raise
+    assert configuration.topic_policy("/gps/other") is TopicLevelErrorPolicy.Ignore
+    assert configuration.topic_policy("/imu") is TopicLevelErrorPolicy.Finalize
     assert config(topics_on_error={"/a": "ignore"}).topic_policy("/b") is TopicLevelErrorPolicy.Raise
 
 
-def test_the_key_is_not_shown() -> None:
+def test_config_repr_hides_the_api_key() -> None:
     assert "s3cret" not in repr(config(host="h", mosaico_api_key="s3cret"))
 
 
@@ -149,12 +153,12 @@ def test_the_key_is_not_shown() -> None:
         ({"rename": {"/a/*": "/b"}}, "rename\\['/a/\\*'\\] is for every topic of a glob"),
     ],
 )
-def test_what_cannot_be_is_refused_with_the_value(fields: dict[str, Any], message: str) -> None:
+def test_config_invalid_value_raises_with_the_value(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(IngestError, match=message):
         config(**fields)
 
 
-def test_a_relative_moment_is_counted_from_the_nearer_end() -> None:
+def test_time_bound_relative_counts_from_start_or_end() -> None:
     assert TimeBound(5, relative=True).at(100, 200) == 105
     assert TimeBound(-5, relative=True).at(100, 200) == 195
     assert TimeBound(5).at(100, 200) == 5

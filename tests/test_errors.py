@@ -1,4 +1,4 @@
-"""Errors print in one line, keep their fields across processes and know their exit codes."""
+"""Errors: their text has one line, pickling keeps their fields, and they have the documented exit codes."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ FINDING = Finding("unknown-key", Severity.ERROR, "unknown key")
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_error_survives_pickling_with_its_fields(kind: type[IngestError]) -> None:
-    error = pickle.loads(pickle.dumps(kind("it broke", where="job.yaml:1:2", hint="mend it")))  # noqa: S301 - our own bytes
+def test_error_pickled_keeps_its_fields(kind: type[IngestError]) -> None:
+    error = pickle.loads(pickle.dumps(kind("it broke", where="job.yaml:1:2", hint="fix it")))  # noqa: S301 - our own bytes
     assert type(error) is kind
-    assert str(error) == "job.yaml:1:2: it broke — mend it"
+    assert str(error) == "job.yaml:1:2: it broke — fix it"
     assert error.args == ("it broke",)
 
 
-def test_findings_survive_pickling() -> None:
-    error = pickle.loads(pickle.dumps(ManifestError("two mistakes", findings=(FINDING,))))  # noqa: S301 - our own bytes
+def test_error_pickled_keeps_its_findings() -> None:
+    error = pickle.loads(pickle.dumps(ManifestError("two problems", findings=(FINDING,))))  # noqa: S301 - our own bytes
     assert error.findings == (FINDING,)
 
 
-def test_only_what_cannot_be_reached_is_worth_another_try() -> None:
+def test_only_unavailable_and_unreachable_errors_are_retryable() -> None:
     assert [kind for kind in KINDS if kind.retryable] == [SinkUnavailable, Unreachable]
 
 
-def test_exit_codes_are_the_documented_ones() -> None:
+def test_exit_codes_equal_the_documented_ones() -> None:
     codes = {kind.__name__: kind.exit_code for kind in KINDS}
     assert codes["ManifestError"] == 2
     assert codes["NothingMatched"] == 3

@@ -1,4 +1,4 @@
-"""The package exports what it lists, and importing it is cheap."""
+"""The names of the package `mosaico_ingest`: they exist, and importing the package loads no heavy modules."""
 
 from __future__ import annotations
 
@@ -8,32 +8,33 @@ import sys
 import mosaico_ingest
 
 
-def test_every_listed_name_is_there() -> None:
+def test_every_exported_name_exists() -> None:
     for name in mosaico_ingest.__all__:
         assert getattr(mosaico_ingest, name) is not None
     assert mosaico_ingest.__all__ == sorted(mosaico_ingest.__all__)
     assert set(mosaico_ingest._WHERE) == set(mosaico_ingest.__all__) - {"APIKeyPermissionEnum", "__version__"}
 
 
-def test_permissions_go_by_the_platforms_spelling() -> None:
+def test_api_key_permissions_are_spelled_as_in_the_sdk() -> None:
     permission = mosaico_ingest.APIKeyPermissionEnum
     assert permission.Write is permission("write")
     assert permission.Delete.includes(permission.Write)
     assert len(permission) == 4
 
 
-def test_an_unknown_name_is_an_attribute_error() -> None:
+def test_unknown_name_raises_attribute_error() -> None:
     assert not hasattr(mosaico_ingest, "Nonsense")
 
 
-def test_help_imports_neither_arrow_nor_rosbags_nor_pydantic() -> None:
+def test_help_imports_no_heavy_modules() -> None:
     code = "import sys; from mosaico_ingest.cli.app import command_line; command_line(); print([m for m in HEAVY if m in sys.modules])"
     heavy = "HEAVY = ('pyarrow', 'rosbags', 'pydantic', 'numpy', 'yaml'); "
-    done = subprocess.run([sys.executable, "-c", heavy + code], capture_output=True, text=True, check=True)  # noqa: S603 - our own code
-    assert done.stdout.strip() == "[]"
+    command = [sys.executable, "-c", heavy + code]
+    finished = subprocess.run(command, capture_output=True, text=True, check=True)  # noqa: S603 - our own code
+    assert finished.stdout.strip() == "[]"
 
 
-def test_a_command_imports_no_other_command() -> None:
+def test_command_imports_no_other_command() -> None:
     code = (
         "import sys; from mosaico_ingest.cli.app import COMMANDS, GROUPS, main\n"
         "try: main(['bag', '--help'])\n"
@@ -41,5 +42,5 @@ def test_a_command_imports_no_other_command() -> None:
         "modules = {*COMMANDS.values(), *GROUPS.values()}\n"
         "print([name for name in modules if f'mosaico_ingest.cli.{name}' in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # noqa: S603 - our own code
-    assert done.stdout.splitlines()[-1] == "['run']"
+    finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # noqa: S603 - our own code
+    assert finished.stdout.splitlines()[-1] == "['run']"

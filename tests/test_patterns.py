@@ -1,4 +1,4 @@
-"""Topic patterns select as the reference describes."""
+"""Topic patterns: selection, exclusion and precedence as in the reference."""
 
 from __future__ import annotations
 
@@ -28,29 +28,29 @@ TOPICS = ("/imu", "/tf", "/cam/left", "/cam/right", "/cam/debug/left")
         (["/cam/[lr]*"], ("/cam/left", "/cam/right")),
     ],
 )
-def test_patterns_apply_in_order(patterns: list[str], expected: tuple[str, ...]) -> None:
+def test_select_applies_patterns_in_order(patterns: list[str], expected: tuple[str, ...]) -> None:
     assert select(patterns, TOPICS).selected == expected
 
 
-def test_the_pattern_that_decided_is_known() -> None:
+def test_select_returns_the_deciding_pattern_of_each_topic() -> None:
     decided = select(["/cam*", "!/cam/debug*"], TOPICS).decided_by
     assert decided == {"/imu": None, "/tf": None, "/cam/left": 0, "/cam/right": 0, "/cam/debug/left": 1}
 
 
-def test_a_pattern_that_matches_nothing_is_named() -> None:
+def test_select_returns_patterns_without_a_match() -> None:
     assert select(["/imu", "/lidar/*"], TOPICS).unused == (1,)
 
 
 @given(st.lists(st.sampled_from(["/imu", "/cam*", "!*", "!/cam*", "/tf", "!/tf", "*"])))
-def test_the_last_pattern_that_matches_decides(patterns: list[str]) -> None:
+def test_select_last_matching_pattern_decides(patterns: list[str]) -> None:
     for topic in TOPICS:
         matching = [p for p in patterns if fnmatchcase(topic, p.removeprefix("!"))]
         default = all(p.startswith("!") for p in patterns)
-        wanted = not matching[-1].startswith("!") if matching else default
-        assert (topic in select(patterns, TOPICS).selected) == wanted
+        expected = not matching[-1].startswith("!") if matching else default
+        assert (topic in select(patterns, TOPICS).selected) == expected
 
 
-def test_an_exact_name_goes_before_any_glob() -> None:
+def test_first_match_prefers_exact_name_to_globs() -> None:
     assert first_match(["/cam*", "/cam/left"], "/cam/left") == "/cam/left"
     assert first_match(["/cam*", "*"], "/cam/right") == "/cam*"
     assert first_match(["/cam*"], "/imu") is None

@@ -1,4 +1,4 @@
-"""Programs written for the SDK's bridge run here with nothing changed but what they import."""
+"""Programs written for the SDK's bridge: they run if only their imports are changed."""
 
 from __future__ import annotations
 
@@ -94,24 +94,24 @@ MY_ADAPTER = """
 
 
 def message(msgtype: str, values: Mapping[str, Any]) -> Any:
-    """Make a message, with zeros for what is not given."""
-    made: dict[str, Any] = {}
+    """Return a message; fields without a value are zero."""
+    fields: dict[str, Any] = {}
     for name, (kind, detail) in HUMBLE.fielddefs[msgtype][1]:
-        given = values.get(name)
+        value = values.get(name)
         if kind.name == "NAME":
-            made[name] = message(str(detail), given or {})
+            fields[name] = message(str(detail), value or {})
         elif kind.name == "BASE":
             zero = {"string": "", "bool": False}.get(detail[0], 0)
-            made[name] = zero if given is None else given
+            fields[name] = zero if value is None else value
         elif detail[0][0].name == "NAME":
-            made[name] = [message(str(detail[0][1]), one) for one in given or ()]
+            fields[name] = [message(str(detail[0][1]), one) for one in value or ()]
         else:
-            made[name] = np.zeros(detail[1], detail[0][1][0]) if given is None else given
-    return HUMBLE.types[msgtype](**made)
+            fields[name] = np.zeros(detail[1], detail[0][1][0]) if value is None else value
+    return HUMBLE.types[msgtype](**fields)
 
 
 def write_recording(path: Path, plugin: StoragePlugin) -> Path:
-    """Write three messages of every topic; an SQLite file holds no definitions, as Humble writes it."""
+    """Write three messages per topic; SQLite files contain no definitions, as those that Humble writes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     folder = path.with_suffix("")
     with Writer(folder, version=8, storage_plugin=plugin) as writer:
@@ -131,19 +131,19 @@ def write_recording(path: Path, plugin: StoragePlugin) -> Path:
 
 @pytest.fixture
 def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A user's folder: modules, definitions, recordings; what a program announces is forgotten afterwards."""
+    """A user's folder with modules, definitions and recordings; types and adapters that a program registers are removed at the end."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     Path("my_ontology.py").write_text(dedent(MY_ONTOLOGY))
     Path("my_adapter.py").write_text(dedent(MY_ADAPTER))
     definitions = tmp_path / "definitions"
-    for place, name in (
+    for path, name in (
         ("my_pkg/Status.msg", "my_custom_pkg/msg/Status"),
         ("Heartbeat.msg", "common_msgs/msg/SystemHeartbeat"),
         ("robot_v3/msgs/Arm.msg", "robot_v3_msgs/msg/Arm"),
     ):
-        (definitions / place).parent.mkdir(parents=True, exist_ok=True)
-        (definitions / place).write_text(CUSTOM[name])
+        (definitions / path).parent.mkdir(parents=True, exist_ok=True)
+        (definitions / path).write_text(CUSTOM[name])
     registered = dict(base._registered)
     yield tmp_path
     base._registered.clear()
@@ -156,7 +156,9 @@ def run(folder: Path, program: str) -> None:
     runpy.run_path(str(folder / "program.py"), run_name="__main__")
 
 
-def test_one_configuration_drives_a_run(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_injector_example_of_the_reference_stores_typed_topics(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_recording(project / "data" / "session_01.db3", StoragePlugin.SQLITE3)
     run(
         project,
@@ -207,7 +209,7 @@ def test_one_configuration_drives_a_run(project: Path, capsys: pytest.CaptureFix
     }
 
 
-def test_a_registered_adapter_takes_its_type(project: Path) -> None:
+def test_registered_adapter_converts_its_type(project: Path) -> None:
     write_recording(project / "run.mcap", StoragePlugin.MCAP)
     run(
         project,
@@ -235,7 +237,7 @@ def test_a_registered_adapter_takes_its_type(project: Path) -> None:
     assert rows.read_all().column("heaviest").to_pylist() == [0.5, 0.5, 0.5]
 
 
-def test_an_override_is_for_its_topic_alone(project: Path) -> None:
+def test_adapter_override_applies_to_its_topic_only(project: Path) -> None:
     write_recording(project / "sensor_data.mcap", StoragePlugin.MCAP)
     run(
         project,
@@ -262,7 +264,7 @@ def test_an_override_is_for_its_topic_alone(project: Path) -> None:
     assert tags["/lidar/rear/pointcloud"] == "PointCloud2"
 
 
-def test_types_announced_once_serve_every_later_run(project: Path) -> None:
+def test_registered_types_are_used_by_later_runs(project: Path) -> None:
     Path("setup_registry.py").write_text(
         dedent(
             """
@@ -305,7 +307,7 @@ def test_types_announced_once_serve_every_later_run(project: Path) -> None:
     )
     names = {topic.name for topic in Store.open(Path("mosaico")).sequence("mission_01").topics}
     assert {"/heartbeat", "/arm", "/gps/fix"} <= names
-    assert "/camera/status" not in names  # nobody has announced it
+    assert "/camera/status" not in names  # its type is not registered
 
 
 @pytest.mark.parametrize(
@@ -320,9 +322,9 @@ def test_types_announced_once_serve_every_later_run(project: Path) -> None:
             2,
         ),
     ],
-    ids=["basic", "with everything"],
+    ids=["basic", "all options"],
 )  # fmt: skip
-def test_the_command_line_takes_the_same_words(
+def test_bag_command_accepts_the_options_of_the_reference(
     project: Path, arguments: tuple[str, ...], topics: int
 ) -> None:
     plugin = StoragePlugin.MCAP if arguments[0].endswith("mcap") else StoragePlugin.SQLITE3
@@ -336,7 +338,7 @@ def test_the_command_line_takes_the_same_words(
     assert sequence.metadata.get("operator") == ("Alice" if "--metadata" in arguments else None)
 
 
-def test_the_command_line_lists_its_options_by_the_short_word_too(capsys: pytest.CaptureFixture[str]) -> None:
+def test_bag_command_short_help_option_lists_the_options(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as leave:
         main(["bag", "-h"])
     assert not leave.value.code

@@ -1,4 +1,4 @@
-"""One topic at work: whatever the batches, the same rows are written and every message is accounted for."""
+"""`Stream`: it writes the same rows for all batch sizes, and accounts for every message."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ CHANNEL = Channel(0, "/speed", "std_msgs/msg/Float64", Encoding.CDR, None, DEFIN
 SPEED = OntologyType("Speed", pa.struct([pa.field("data", pa.float64(), nullable=False)]))
 SERIALIZER = Serializer(DEFINITION, Encoding.CDR)
 CUT = b"\x00\x01\x00\x00\x01"
-"""A payload that ends in the middle of its number."""
+"""A payload that ends within its number."""
 
 
 class Positive:
-    """An adapter that takes only numbers from 0 up."""
+    """An adapter that rejects negative numbers."""
 
     name = "Positive"
     ros_types = ("std_msgs/msg/Float64",)
@@ -98,7 +98,7 @@ def run(
     every: int = 1,
     refuse: bool = False,
 ) -> tuple[Session, Collector, Exception | None]:
-    """Feed messages in batches of `size`; None is a payload that cannot be decoded."""
+    """Feed messages in batches of `size`; None stands for a payload that cannot be decoded."""
     collector, session = Collector(), Session(refuse=refuse)
     expected = Expected("/speed", "/speed", CHANNEL.msgtype, "Positive", "Speed", "", None)
     collector(RunStarted("s", "d", (), 0, (expected,)))
@@ -130,25 +130,25 @@ MESSAGES = st.lists(st.sampled_from([1.0, 2.0, -1.0, None]), max_size=20)
     st.sampled_from(list(LoaderErrorPolicy)),
     st.integers(1, 3),
 )
-def test_the_size_of_batches_changes_nothing(
+def test_stream_result_does_not_depend_on_batch_size(
     values: list[float | None], topic: TopicLevelErrorPolicy, message: LoaderErrorPolicy, every: int
 ) -> None:
-    whole = run(values, topic=topic, message=message, every=every)
+    single = run(values, topic=topic, message=message, every=every)
     for size in (1, 3):
-        split = run(values, size=size, topic=topic, message=message, every=every)
-        assert split[0].values == whole[0].values
-        assert counts(split[1]) == counts(whole[1])
-        assert str(split[2]) == str(whole[2])
+        several = run(values, size=size, topic=topic, message=message, every=every)
+        assert several[0].values == single[0].values
+        assert counts(several[1]) == counts(single[1])
+        assert str(several[2]) == str(single[2])
 
 
-def test_ignore_loses_only_the_bad_message() -> None:
+def test_stream_policy_ignore_rejects_only_the_bad_message() -> None:
     session, collector, error = run([1.0, -1.0, 2.0])
     assert error is None
     assert session.values == [1.0, 2.0]
     assert counts(collector) == (3, 2, 0, 1)
 
 
-def test_finalize_keeps_the_rows_before_and_accounts_for_those_after() -> None:
+def test_stream_policy_finalize_keeps_earlier_rows_and_rejects_later_ones() -> None:
     session, collector, error = run([1.0, -1.0, 2.0, 3.0], topic=TopicLevelErrorPolicy.Finalize)
     assert error is None
     assert session.values == [1.0]
@@ -156,7 +156,7 @@ def test_finalize_keeps_the_rows_before_and_accounts_for_those_after() -> None:
     assert rules == {"negative": 1, "topic-closed": 2}
 
 
-def test_raise_writes_what_came_before_and_names_the_message() -> None:
+def test_stream_policy_raise_keeps_earlier_rows_and_names_the_offset() -> None:
     session, collector, error = run([1.0, -1.0, 2.0], topic=TopicLevelErrorPolicy.Raise)
     assert isinstance(error, AdapterError)
     assert "offset 10" in str(error)
@@ -165,7 +165,7 @@ def test_raise_writes_what_came_before_and_names_the_message() -> None:
     assert session.notes
 
 
-def test_bytes_that_do_not_fit_follow_the_message_policy() -> None:
+def test_stream_undecodable_message_follows_the_message_policy() -> None:
     session, collector, error = run([1.0, None, 2.0], topic=TopicLevelErrorPolicy.Raise)
     assert error is None
     assert session.values == [1.0, 2.0]
@@ -176,14 +176,14 @@ def test_bytes_that_do_not_fit_follow_the_message_policy() -> None:
 
 
 @pytest.mark.parametrize("every", [1, 2, 3])
-def test_sampling_keeps_the_first_of_each_group(every: int) -> None:
+def test_stream_every_keeps_the_first_message_of_each_group(every: int) -> None:
     values = [float(value) for value in range(10)]
     session, collector, _ = run(values, size=4, every=every)
     assert session.values == values[::every]
     assert counts(collector)[2] == 10 - len(values[::every])
 
 
-def test_a_topic_the_destination_refuses_is_given_up_or_ends_the_run() -> None:
+def test_stream_topic_refused_by_destination_follows_the_topic_policy() -> None:
     session, collector, error = run([1.0, 2.0, 3.0], size=2, refuse=True)
     assert error is None
     assert session.values == []

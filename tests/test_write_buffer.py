@@ -1,4 +1,4 @@
-"""The write buffer keeps order, bounds its bytes and hands errors back."""
+"""`WriteBuffer`: it keeps the order of batches, limits its bytes, and passes errors of the writer on."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def threads() -> list[str]:
     return [thread.name for thread in threading.enumerate() if thread.name.startswith("mosaico-ingest")]
 
 
-def test_batches_are_written_in_order_and_all_of_them() -> None:
+def test_buffer_writes_all_batches_in_order() -> None:
     writer = Writer()
     with WriteBuffer(max_bytes=100) as buffer:
         for value in range(50):
@@ -45,7 +45,7 @@ def test_batches_are_written_in_order_and_all_of_them() -> None:
     assert not threads()
 
 
-def test_a_batch_larger_than_the_buffer_goes_through_alone() -> None:
+def test_buffer_writes_batch_larger_than_its_limit() -> None:
     writer = Writer()
     with WriteBuffer(max_bytes=1) as buffer:
         for value in range(3):
@@ -53,7 +53,7 @@ def test_a_batch_larger_than_the_buffer_goes_through_alone() -> None:
     assert writer.seen == [0, 1, 2]
 
 
-def test_an_error_of_the_writer_reaches_whoever_puts_or_leaves() -> None:
+def test_buffer_raises_error_of_the_writer() -> None:
     writer = Writer(fail_on=3)
     with pytest.raises(SinkError, match="disk full"), WriteBuffer(max_bytes=100) as buffer:
         for value in range(1000):
@@ -62,7 +62,7 @@ def test_an_error_of_the_writer_reaches_whoever_puts_or_leaves() -> None:
     assert not threads()
 
 
-def test_rows_accepted_before_an_error_outside_are_still_written() -> None:
+def test_buffer_writes_accepted_batches_after_an_error_of_the_caller() -> None:
     writer = Writer(delay_s=0.001)
     with pytest.raises(KeyError), WriteBuffer(max_bytes=10_000) as buffer:
         for value in range(10):
@@ -81,21 +81,21 @@ def test_put_waits_while_the_buffer_is_full() -> None:
     assert len(writer.seen) == 6
 
 
-def test_an_interrupt_waits_for_a_stuck_writer_only_so_long(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupt_waits_for_a_stuck_writer_up_to_the_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mosaico_ingest.pipeline.write_buffer._INTERRUPTED_S", 0.1)
     writer = Writer(delay_s=0.5)
-    begin = time.monotonic()
+    start = time.monotonic()
     with pytest.raises(KeyboardInterrupt), WriteBuffer(max_bytes=1000) as buffer:
         for value in range(3):
             buffer.put(writer, batch(value))
         raise KeyboardInterrupt
-    assert time.monotonic() - begin < 0.45
+    assert time.monotonic() - start < 0.45
     buffer._thread.join()
     assert writer.seen == [0]
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_an_interrupt_at_the_end_leaves_nothing_that_was_taken_unwritten() -> None:
+def test_interrupt_while_closing_writes_all_accepted_batches() -> None:
     writer = Writer(delay_s=0.2)
     main = threading.main_thread().ident
     assert main is not None
@@ -109,7 +109,7 @@ def test_an_interrupt_at_the_end_leaves_nothing_that_was_taken_unwritten() -> No
     assert not threads()
 
 
-def test_small_batches_are_written_together() -> None:
+def test_buffer_delays_small_batches() -> None:
     writer = Writer()
     with WriteBuffer(max_bytes=1 << 30) as buffer:
         for value in range(5):
@@ -119,16 +119,16 @@ def test_small_batches_are_written_together() -> None:
     assert writer.seen == [0, 1, 2, 3, 4]
 
 
-def test_who_waits_for_room_wakes_the_writer_first() -> None:
+def test_put_on_full_buffer_wakes_the_writer() -> None:
     writer = Writer()
-    almost = batch(0, 100_000)  # 0.8 MB, too little to wake the writer for
+    almost = batch(0, 100_000)  # 0.8 MB, below the size that wakes the writer
     with WriteBuffer(max_bytes=1 << 20) as buffer:
         buffer.put(writer, almost)
         buffer.put(writer, almost)
     assert writer.seen == [0, 0]
 
 
-def test_little_is_written_without_a_thread() -> None:
+def test_buffer_writes_small_amounts_without_a_thread() -> None:
     writer = Writer()
     with WriteBuffer(max_bytes=1 << 30) as buffer:
         buffer.put(writer, batch(1))
@@ -136,12 +136,12 @@ def test_little_is_written_without_a_thread() -> None:
     assert writer.seen == [1]
 
 
-def test_an_error_without_a_thread_reaches_whoever_leaves() -> None:
+def test_buffer_without_a_thread_raises_error_of_the_writer() -> None:
     with pytest.raises(SinkError, match="disk full"), WriteBuffer(max_bytes=1 << 30) as buffer:
         buffer.put(Writer(fail_on=1), batch(1))
 
 
-def test_an_interrupt_while_the_rest_is_written_is_not_hidden_by_an_earlier_error() -> None:
+def test_interrupt_while_writing_the_rest_is_raised_despite_an_earlier_error() -> None:
     interrupted = Mock(write=Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt), WriteBuffer(max_bytes=1 << 30) as buffer:
         buffer.put(interrupted, batch(1))

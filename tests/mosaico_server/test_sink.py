@@ -283,7 +283,7 @@ class TestFaults:
 
     @pytest.mark.parametrize("action", ["sequence_create", "session_finalize"])
     def test_a_lost_answer_is_looked_up_before_asking_again(self, server: Mosaicod, action: str) -> None:
-        server.faults.lose_answer[action] = 1
+        server.faults.lose_response[action] = 1
         write(server, 1, 2)
         assert server.topics["seq/n"].state == "final"
         assert server.calls.count(action) == 1
@@ -300,7 +300,7 @@ class TestFaults:
         assert server.calls.count("info") == 3
 
     def test_a_slow_server_is_given_up(self, server: Mosaicod) -> None:
-        server.faults.answer_after_s = 0.5
+        server.faults.response_delay_s = 0.5
         begin = time.monotonic()
         with (
             pytest.raises(SinkUnavailable, match="no answer to info in time"),
@@ -328,10 +328,10 @@ class TestFaults:
         assert caught.value.retryable
         assert "an unfinished session of seq may stay on the server" in str(caught.value)
 
-    def test_a_line_mended_in_time_goes_on(self, server: Mosaicod) -> None:
+    def test_upload_continues_after_the_connection_is_restored(self, server: Mosaicod) -> None:
         proxy = Proxy(server.port)
         proxy.cut()
-        threading.Timer(0.5, proxy.mend).start()
+        threading.Timer(0.5, proxy.restore).start()
         with connect(target(proxy)) as client:
             assert client.find("seq") is None
         proxy.cut()

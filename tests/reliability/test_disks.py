@@ -72,7 +72,7 @@ def test_a_full_disk_is_said_leaves_the_old_and_the_next_run_completes_it(
     assert ran("run", "-q", job)[0] == 0
     (job.parent / "drive.db3").unlink()
     write_bag({"/speed": noise})
-    with filled(disk, left_bytes=300_000):
+    with filled(disk, free_bytes=300_000):
         code, said = ran("run", "-q", job)
         assert code == 1
         assert "No space left" in the_error(said)
@@ -92,7 +92,7 @@ def test_a_first_run_that_found_no_room_leaves_nothing_that_can_be_seen(
     store = disk / "store"
     job = write_job(target={"store": str(store)})
     write_bag({"/speed": noise})
-    with filled(disk, left_bytes=left_bytes):
+    with filled(disk, free_bytes=left_bytes):
         code, said = ran("run", "-q", job)
         assert code == 1
         assert str(disk) in the_error(said)
@@ -158,7 +158,7 @@ def test_a_temporary_folder_without_room_is_said(
     packed.write_bytes(zstandard.compress(write_bag({"/speed": noise}).read_bytes()))
     custom = [{"package": "own_msgs", "path": "definitions"}]
     job = write_job(bag={"path": packed.name, "custom_msgs": custom})
-    with filled(disk, left_bytes=100_000):
+    with filled(disk, free_bytes=100_000):
         code, said = ran("run", "-q", job, TMPDIR=str(disk))
         assert code == 1
         assert "cannot be decompressed" in the_error(said)

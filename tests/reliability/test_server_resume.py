@@ -214,7 +214,7 @@ class Forgetful(Proxy):
         self.cut()
         self.word = None
         if self._mended:
-            self.mend()
+            self.restore()
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Disks that are small or may only be read, for the superuser too; tests are skipped where none can be had."""
+"""Small and read-only file systems, also for the superuser; a test is skipped if it cannot mount one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MEBIBYTE = 1 << 20
 
 @contextmanager
 def small_disk(folder: Path, size_bytes: int = MEBIBYTE) -> Generator[Path, None, None]:
-    """Make `folder` a file system of this size."""
+    """Mount a file system of this size at `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
     _mount("-t", "tmpfs", "-o", f"size={size_bytes}", "tmpfs", str(folder))
     try:
@@ -27,7 +27,7 @@ def small_disk(folder: Path, size_bytes: int = MEBIBYTE) -> Generator[Path, None
 
 @contextmanager
 def read_only(folder: Path) -> Generator[None, None, None]:
-    """Let nothing be written below `folder`; permissions do not stop the superuser, a mount does."""
+    """Make `folder` read-only; for the superuser with a mount, because permissions do not apply."""
     if os.geteuid():
         folder.chmod(0o500)
         try:
@@ -44,10 +44,10 @@ def read_only(folder: Path) -> Generator[None, None, None]:
 
 
 @contextmanager
-def filled(folder: Path, *, left_bytes: int = 0) -> Generator[None, None, None]:
-    """Take the space of a small disk, but for so many bytes."""
+def filled(folder: Path, *, free_bytes: int = 0) -> Generator[None, None, None]:
+    """Fill a small disk until `free_bytes` are free."""
     ballast = folder / "ballast"
-    ballast.write_bytes(bytes(max(shutil.disk_usage(folder).free - left_bytes, 0)))
+    ballast.write_bytes(bytes(max(shutil.disk_usage(folder).free - free_bytes, 0)))
     try:
         yield
     finally:
@@ -57,14 +57,14 @@ def filled(folder: Path, *, left_bytes: int = 0) -> Generator[None, None, None]:
 def _mount(*arguments: str) -> None:
     mount = shutil.which("mount")
     if mount is None:
-        pytest.skip("there is no mount command")
-    done = subprocess.run([mount, *arguments], capture_output=True, check=False, text=True)  # noqa: S603 - a system command, our arguments
-    if done.returncode:
-        pytest.skip(f"nothing may be mounted here: {done.stderr.strip()}")
+        pytest.skip("the command mount does not exist")
+    finished = subprocess.run([mount, *arguments], capture_output=True, check=False, text=True)  # noqa: S603 - a system command with our arguments
+    if finished.returncode:
+        pytest.skip(f"mount failed: {finished.stderr.strip()}")
 
 
 def _unmount(folder: Path) -> None:
-    """Unmount even where a process that was killed still has something open."""
+    """Unmount a file system, also if a killed process still has files open."""
     umount = shutil.which("umount")
     assert umount is not None
     subprocess.run([umount, "-l", str(folder)], check=True)  # noqa: S603 - as above

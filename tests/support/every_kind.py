@@ -1,4 +1,4 @@
-"""A message with a field of every kind that an expression can meet."""
+"""A message type with a field of every type that an expression can use."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["every_kind"]
 def every_kind(
     *inner: tuple[str, pa.DataType], more: tuple[tuple[str, pa.DataType], ...] = ()
 ) -> pa.StructType:
-    """Return its type; `inner` are further fields of the messages inside it, `more` of itself."""
+    """Return the type; `inner` are additional fields of the nested message, `more` of the message itself."""
     nested = pa.struct([("v", pa.int16()), ("t", pa.string()), ("n", pa.list_(pa.float32())), *inner])
     return pa.struct(
         [

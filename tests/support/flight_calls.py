@@ -1,4 +1,4 @@
-"""A Flight client that says what goes over the wire and nothing else."""
+"""A minimal Flight client that sends requests and returns responses unchanged."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Client", "descriptor_of", "refused"]
 
 
 class Client:
-    """Calls a server, with an API key or without."""
+    """A client of a server, with or without an API key."""
 
     def __init__(self, server: Server, key: str | None = None, **options: Any) -> None:
         self.flight = fl.connect(server.location, **options)
@@ -29,12 +29,12 @@ class Client:
     def __exit__(self, *_: object) -> None:
         self.flight.close()
 
-    def call(self, name: str, **question: Any) -> Any:
-        action = fl.Action(name, json.dumps(question).encode())
-        answer = b"".join(result.body.to_pybytes() for result in self.flight.do_action(action, self.options))
-        told = json.loads(answer)
-        assert told["action"] == name
-        return told["response"]
+    def call(self, name: str, **body: Any) -> Any:
+        action = fl.Action(name, json.dumps(body).encode())
+        data = b"".join(result.body.to_pybytes() for result in self.flight.do_action(action, self.options))
+        response = json.loads(data)
+        assert response["action"] == name
+        return response["response"]
 
     def put(self, locator: str, uuid: str, *batches: pa.RecordBatch, schema: pa.Schema | None = None) -> None:
         descriptor = descriptor_of(resource_locator=locator, topic_uuid=uuid)
@@ -75,8 +75,8 @@ def descriptor_of(**command: Any) -> fl.FlightDescriptor:
     return fl.FlightDescriptor.for_command(json.dumps(command).encode())
 
 
-class refused:  # noqa: N801 - reads as a statement, as pytest.raises
-    """Expect a call to be refused with a status and, maybe, a word of explanation."""
+class refused:  # noqa: N801 - used like pytest.raises
+    """Expect a call to fail with a condition and, optionally, a word in the message."""
 
     def __init__(self, condition: Condition, word: str = "") -> None:
         self.condition = condition

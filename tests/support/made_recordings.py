@@ -1,4 +1,4 @@
-"""Recordings made of definitions and values."""
+"""Recordings written from definitions and values."""
 
 from __future__ import annotations
 

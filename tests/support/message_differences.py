@@ -1,4 +1,4 @@
-"""How the messages of two recordings differ, field by field."""
+"""Comparison of the messages of two recordings, field by field."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from mosaico_ingest.rosbag.loader import ROSLoader
 
 
 def messages_of(path: Path, **options: Any) -> dict[str, list[tuple[int, dict[str, Any]]]]:
-    """Return time and content of each topic's messages; those that cannot be read are left out."""
-    found: dict[str, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
+    """Return log time and content of the messages of each topic; unreadable messages are skipped."""
+    messages_by_topic: dict[str, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
     with ROSLoader(path, error_policy="ignore", **options) as loader:
         for message in loader:
-            found[message.topic].append((message.bag_timestamp_ns, message.data))
-    return dict(found)
+            messages_by_topic[message.topic].append((message.bag_timestamp_ns, message.data))
+    return dict(messages_by_topic)
 
 
 def differing(left: Any, right: Any, at: str = "") -> Iterator[str]:
-    """Yield the fields in which two messages differ, as `header.stamp`, `poses[].position`."""
+    """Yield the fields in which two messages differ, such as `header.stamp` or `poses[].position`."""
     if isinstance(left, dict) and isinstance(right, dict):
         for name in left.keys() | right.keys():
             yield from differing(left.get(name), right.get(name), f"{at}.{name}" if at else name)
@@ -37,14 +37,14 @@ def differing(left: Any, right: Any, at: str = "") -> Iterator[str]:
 
 
 def differences(source: Path, written: Path, **options: Any) -> dict[str, set[str]]:
-    """Return by topic the fields that differ in any message; `(count)` or `(time)` where the messages do."""
+    """Return the differing fields per topic; `(count)` and `(time)` if numbers or log times of messages differ."""
     before, after = messages_of(source, **options), messages_of(written)
-    found: dict[str, set[str]] = {}
+    fields_by_topic: dict[str, set[str]] = {}
     for topic, messages in before.items():
         others = after.get(topic, [])
-        wrong = set() if len(messages) == len(others) else {"(count)"}
+        fields = set() if len(messages) == len(others) else {"(count)"}
         for (time, one), (other_time, other) in zip(messages, others, strict=False):
-            wrong |= set(differing(one, other)) | ({"(time)"} if time != other_time else set())
-        if wrong:
-            found[topic] = wrong
-    return found
+            fields |= set(differing(one, other)) | ({"(time)"} if time != other_time else set())
+        if fields:
+            fields_by_topic[topic] = fields
+    return fields_by_topic

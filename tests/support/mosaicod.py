@@ -1,4 +1,4 @@
-"""A small Mosaico server for tests, written from the protocol and not from the client: strict, in memory, with faults."""
+"""A small Mosaico server for tests: in memory, strict, with injected faults, and written from the protocol, not from our client."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PERMISSIONS = ["read", "write", "delete", "manage"]
 
 
 def make_key(name: str) -> str:
-    """Return a key in the platform's format, the same for the same name."""
+    """Return an API key in the format of Mosaico that depends only on the name."""
     secret = f"{name:x<32}"
     return f"msco_{secret}_{zlib.crc32(secret.encode()):08x}"
 
@@ -79,20 +79,20 @@ class Session:
 
 @dataclass
 class Faults:
-    """What goes wrong; every one is off at first."""
+    """Faults to inject; none by default."""
 
     refuse: dict[str, list[Exception]] = field(default_factory=dict)
-    """Raised by an action of that name, one a call."""
-    lose_answer: dict[str, int] = field(default_factory=dict)
-    """The action is done, and then answered by `unavailable`, so many times."""
+    """Errors per action; each call raises the next one."""
+    lose_response: dict[str, int] = field(default_factory=dict)
+    """The number of calls per action that are executed but return `unavailable`."""
     before_batch: Callable[[str, int], None] = lambda _topic, _number: None
     version: str = "0.7.0"
-    """Servers before 0.7 do not know `info`, and do not count."""
-    answer_after_s: float = 0.0
+    """Servers before 0.7 do not support `info` and return no counts."""
+    response_delay_s: float = 0.0
 
 
 class Mosaicod(fl.FlightServerBase):
-    """The server. `keys` maps an API key to its permission; empty: everyone may do everything."""
+    """The server. `keys` maps API keys to permissions; if empty, all calls are allowed."""
 
     def __init__(
         self, location: str = "grpc://127.0.0.1:0", *, message_bytes: int = 52428800, **options: Any
@@ -113,15 +113,15 @@ class Mosaicod(fl.FlightServerBase):
         self.calls.append(action.type)
         self.bodies.append((action.type, body))
         self._check_permission(context, action.type)
-        time.sleep(self.faults.answer_after_s)
+        time.sleep(self.faults.response_delay_s)
         if self.faults.refuse.get(action.type):
             raise self.faults.refuse[action.type].pop(0)
-        answer = getattr(self, f"_{action.type}", None)
-        if answer is None or (action.type == "info" and self.faults.version < "0.7"):
+        handler = getattr(self, f"_{action.type}", None)
+        if handler is None or (action.type == "info" and self.faults.version < "0.7"):
             raise pa.ArrowInvalid(f"unknown action {action.type}")
-        response = answer(**body)
-        if self.faults.lose_answer.get(action.type):
-            self.faults.lose_answer[action.type] -= 1
+        response = handler(**body)
+        if self.faults.lose_response.get(action.type):
+            self.faults.lose_response[action.type] -= 1
             raise fl.FlightUnavailableError("connection reset")
         yield json.dumps({"action": action.type, "response": response}).encode()
 
@@ -184,11 +184,13 @@ class Mosaicod(fl.FlightServerBase):
         session.final = True
 
     def _session_delete(self, locator: str) -> None:
-        found = [session for session in self.sessions.values() if session.locator == locator]
-        if not found:
+        sessions = [session for session in self.sessions.values() if session.locator == locator]
+        if not sessions:
             raise pa.ArrowKeyError(f"session {locator} not found")
-        del self.sessions[found[0].uuid]
-        self.topics = {name: topic for name, topic in self.topics.items() if topic.session != found[0].uuid}
+        del self.sessions[sessions[0].uuid]
+        self.topics = {
+            name: topic for name, topic in self.topics.items() if topic.session != sessions[0].uuid
+        }
 
     def _topic_delete(self, locator: str) -> None:
         self.topics.pop(locator)
@@ -261,14 +263,14 @@ class Mosaicod(fl.FlightServerBase):
             for key, session in self.sessions.items()
             if session.sequence == sequence
         ]
-        about = {
+        description = {
             "resource_locator": sequence,
             "created_at_ns": 1,
             "user_metadata": self.sequences[sequence],
             "sessions": sessions,
         }
         return fl.FlightInfo(
-            pa.schema([]), descriptor, endpoints, -1, -1, app_metadata=json.dumps(about).encode()
+            pa.schema([]), descriptor, endpoints, -1, -1, app_metadata=json.dumps(description).encode()
         )
 
     def do_get(self, context: fl.ServerCallContext, ticket: fl.Ticket) -> fl.RecordBatchStream:
@@ -312,7 +314,7 @@ class _KeyFactory(fl.ServerMiddlewareFactory):
 
 @contextmanager
 def running(server: Mosaicod) -> Iterator[Mosaicod]:
-    """Serve on a thread until the block ends."""
+    """Serve in a thread until the block ends."""
     thread = threading.Thread(target=server.serve, daemon=True)
     thread.start()
     try:
@@ -323,7 +325,7 @@ def running(server: Mosaicod) -> Iterator[Mosaicod]:
 
 
 class Proxy:
-    """A line to a server that can be cut and mended."""
+    """A TCP proxy to a server whose connections can be cut and restored."""
 
     def __init__(self, port: int) -> None:
         self._target = port
@@ -336,7 +338,7 @@ class Proxy:
         threading.Thread(target=self._accept, args=(self._listener,), daemon=True).start()
 
     def cut(self) -> None:
-        """Close every connection, and refuse new ones."""
+        """Close all connections and refuse new ones."""
         self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
         for end in self._pairs:
@@ -344,8 +346,8 @@ class Proxy:
                 end.shutdown(socket.SHUT_RDWR)
         self._pairs.clear()
 
-    def mend(self) -> None:
-        """Take connections again."""
+    def restore(self) -> None:
+        """Accept connections again."""
         self._listen(self.port)
 
     def _accept(self, listener: socket.socket) -> None:

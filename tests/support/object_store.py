@@ -1,4 +1,4 @@
-"""An S3 server in a process of its own, which counts what it is asked, and can be told to be gone."""
+"""An S3 server in its own process that counts requests and can be stopped on request."""
 
 from __future__ import annotations
 
@@ -29,47 +29,49 @@ Wsgi = Callable[[Mapping[str, Any], Callable[..., Any]], Iterable[bytes]]
 
 @dataclass(frozen=True)
 class Counts:
-    """What the server did since it was last asked."""
+    """The activity of the server since the last query."""
 
     requests: list[str]
-    """Each as method and path."""
+    """Method and path of each request."""
     sent_bytes: int
 
 
 @dataclass
 class ObjectStore:
-    """A running server; what it does is counted until `counts` is asked for."""
+    """A running server that counts requests until `counts` is called."""
 
     process: subprocess.Popen[str]
     port: int
 
     def url(self, key: str) -> str:
-        """Return the URL of an object, with what it takes to reach this server."""
+        """Return the URL of an object with the options for this server."""
         return f"s3://{BUCKET}/{key}?endpoint_override=127.0.0.1:{self.port}&scheme=http&region=us-east-1"
 
     def counts(self) -> Counts:
-        """Return what was asked since the last time, and forget it."""
+        """Return the counts since the last call, and reset them."""
         return Counts(**self._control("counts"))
 
     def fail_after(self, requests: int, *, containing: str = "") -> None:
-        """Let the server die after so many more requests whose line has this text."""
+        """Let the server exit after `requests` more requests whose line contains a text."""
         self._control(f"fail?{requests}&{quote(containing)}")
 
     def kill(self) -> None:
         self.process.kill()
         self.process.wait(10)
 
-    def _control(self, what: str) -> Any:
-        with urllib.request.urlopen(f"http://127.0.0.1:{self.port}{CONTROL}{what}", timeout=10) as answer:
-            return json.load(answer)
+    def _control(self, command: str) -> Any:
+        with urllib.request.urlopen(
+            f"http://127.0.0.1:{self.port}{CONTROL}{command}", timeout=10
+        ) as response:
+            return json.load(response)
 
 
 @contextmanager
 def object_store() -> Iterator[ObjectStore]:
-    """Run a server with one empty bucket."""
+    """Run a server with an empty bucket."""
     command = [sys.executable, "-W", "ignore", str(Path(__file__))]
     environment = {**os.environ, **CREDENTIALS}
-    with subprocess.Popen(  # noqa: S603 - this very file
+    with subprocess.Popen(  # noqa: S603 - this file
         command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment
     ) as process:
         try:
@@ -87,9 +89,9 @@ def _make_bucket(running: ObjectStore) -> None:
     deadline = time.monotonic() + START_S
     while True:
         try:
-            with urllib.request.urlopen(request, timeout=10):  # noqa: S310 - the same
+            with urllib.request.urlopen(request, timeout=10):  # noqa: S310 - our own server
                 return
-        except OSError:  # noqa: PERF203 - it may not listen yet
+        except OSError:  # noqa: PERF203 - the server may not listen yet
             if time.monotonic() > deadline:
                 raise
             time.sleep(0.1)
@@ -97,12 +99,12 @@ def _make_bucket(running: ObjectStore) -> None:
 
 @dataclass
 class _Counting:
-    """Stands in front of the server."""
+    """WSGI middleware that counts requests and can exit."""
 
     app: Wsgi
-    asked: list[str] = field(default_factory=list[str])
+    requests: list[str] = field(default_factory=list[str])
     sent: int = 0
-    dies: tuple[int, str] | None = None
+    exit_after: tuple[int, str] | None = None
 
     def __call__(self, environ: Mapping[str, Any], start: Callable[..., Any]) -> Iterable[bytes]:
         path, query = environ["PATH_INFO"], environ.get("QUERY_STRING", "")
@@ -110,11 +112,11 @@ class _Counting:
             start("200 OK", [("Content-Type", "application/json")])
             return [self._control(path.removeprefix(CONTROL), query).encode()]
         line = f"{environ['REQUEST_METHOD']} {path}{'?' if query else ''}{query}"
-        self.asked.append(line)
-        if self.dies and self.dies[1] in line:
-            if self.dies[0] <= 0:
+        self.requests.append(line)
+        if self.exit_after and self.exit_after[1] in line:
+            if self.exit_after[0] <= 0:
                 os._exit(1)
-            self.dies = (self.dies[0] - 1, self.dies[1])
+            self.exit_after = (self.exit_after[0] - 1, self.exit_after[1])
         return self._counted(self.app(environ, start))
 
     def _counted(self, pieces: Iterable[bytes]) -> Iterator[bytes]:
@@ -122,19 +124,19 @@ class _Counting:
             self.sent += len(piece)
             yield piece
 
-    def _control(self, what: str, query: str) -> str:
-        if what == "fail":
+    def _control(self, command: str, query: str) -> str:
+        if command == "fail":
             count, _, text = query.partition("&")
-            self.dies = (int(count), unquote(text))
+            self.exit_after = (int(count), unquote(text))
             return "{}"
-        said = json.dumps({"requests": self.asked, "sent_bytes": self.sent})
-        self.asked, self.sent = [], 0
-        return said
+        counts = json.dumps({"requests": self.requests, "sent_bytes": self.sent})
+        self.requests, self.sent = [], 0
+        return counts
 
 
 def _serve() -> None:
-    from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app  # noqa: PLC0415 - only the server has it
-    from werkzeug.serving import make_server  # noqa: PLC0415 - the same
+    from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app  # noqa: PLC0415 - only the server process needs it
+    from werkzeug.serving import make_server  # noqa: PLC0415 - as above
 
     app = _Counting(DomainDispatcherApplication(create_backend_app))
     server = make_server("127.0.0.1", 0, app, threaded=True)

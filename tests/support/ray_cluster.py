@@ -1,4 +1,4 @@
-"""A Ray cluster of two nodes on this machine, that tells nobody of it."""
+"""A Ray cluster with two nodes on this machine, without usage statistics."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from unittest.mock import patch
 import ray
 from ray.cluster_utils import Cluster
 
-_ALONE = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
+_ENVIRONMENT = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
 _NODE: dict[str, Any] = {"num_cpus": 1, "memory": 2 << 30, "object_store_memory": 80 << 20}
 
 
 @contextmanager
 def two_nodes() -> Generator[Cluster]:
-    """Start a head and another node, one CPU each; stop both in the end."""
-    with patch.dict(os.environ, _ALONE):
+    """Start a head node and another node with one CPU each; stop both at the end."""
+    with patch.dict(os.environ, _ENVIRONMENT):
         cluster = Cluster(initialize_head=True, head_node_args={**_NODE, "include_dashboard": False})
         try:
             cluster.add_node(**_NODE)
