@@ -50,6 +50,8 @@ __all__ = [
 ]
 
 _MAPPING_SUFFIXES = frozenset({".yaml", ".yml"})
+_ADAPTER_KEY = re.compile(r"^adapter:\s*['\"]?(?P<name>\w+)['\"]?\s*(#|$)", re.MULTILINE)
+"""The name of the adapter in an adapter file, found without parsing the file."""
 
 
 def adapter_spec(adapter: object, base_dir: Path) -> AdapterSpec:
@@ -115,10 +117,19 @@ class AdapterFinder(Struct, frozen=True):
         """Return the adapter of that name, None where there is none."""
         if name in BY_NAME:
             return BY_NAME[name]
-        said = re.compile(rf"^adapter:\s*['\"]?{re.escape(name)}['\"]?\s*(#|$)", re.MULTILINE)
-        files = sorted(path for path in self.folder.iterdir() if path.suffix in _MAPPING_SUFFIXES)
-        found = next((path for path in files if said.search(_text_of(path))), None)
-        return None if found is None else _load_mapping(found)
+        for path in self._files():
+            match = _ADAPTER_KEY.search(_text_of(path))
+            if match and match["name"] == name:
+                return _load_mapping(path)
+        return None
+
+    def names(self) -> Iterable[str]:
+        """Return the names of the built-in adapters and of those in the folder."""
+        found = (_ADAPTER_KEY.search(_text_of(path)) for path in self._files())
+        return [*BY_NAME, *(match["name"] for match in found if match)]
+
+    def _files(self) -> list[Path]:
+        return sorted(path for path in self.folder.iterdir() if path.suffix in _MAPPING_SUFFIXES)
 
 
 def _text_of(path: Path) -> str:

@@ -6,6 +6,7 @@ What the files say is also in `catalog.json`: reading that takes a twentieth of 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -64,9 +65,17 @@ def _mapping(read: dict[str, Any]) -> dict[Any, Any]:
     return dict(read[""]) if "" in read else read
 
 
-def find_builtin(name: str) -> Builtin | None:
-    """Return a built-in adapter by its name, for the mappings that use it."""
-    return BY_NAME.get(name)
+class _BuiltinLookup(Struct, frozen=True):
+    """Finds built-in adapters by name, for the mappings that use them."""
+
+    def __call__(self, name: str) -> Builtin | None:
+        return BY_NAME.get(name)
+
+    def names(self) -> Iterable[str]:
+        return BY_NAME
+
+
+find_builtin = _BuiltinLookup()
 
 
 BUILTIN: tuple[Builtin, ...] = (

@@ -109,9 +109,9 @@ def run(typed: TypedExpression, rows: Any) -> None:
             assert len(result) == len(rows)
             for target in TARGETS:
                 check_fit(typed, result, target, evaluation)
-        except RowsRejected as refused:
+        except RowsRejected as rejected:
             good = np.ones(len(rows), bool)
-            good[list(refused.refusals)] = False
+            good[list(rejected.rejections)] = False
             remaining = rows.filter(pa.array(good))
         else:
             return

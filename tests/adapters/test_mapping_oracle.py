@@ -387,9 +387,9 @@ def over_columns(typed: TypedExpression, rows: list[dict[str, Any]]) -> dict[int
         envelope = Envelope("", "", np.zeros(len(array), np.int64))
         try:
             column = Evaluation(array, envelope).evaluate(typed)
-        except RowsRejected as refused:
+        except RowsRejected as rejected:
             good = np.ones(len(array), bool)
-            good[list(refused.refusals)] = False
+            good[list(rejected.rejections)] = False
             array, index = array.filter(pa.array(good)), index[good]
             continue
         values = column.close_all(len(array))

@@ -45,31 +45,31 @@ __all__ = [
 
 
 class NullColumn(Struct, frozen=True):
-    """Nothing: null in every row."""
+    """Null in every row."""
 
     rows: NullRows
 
 
 class ExpressionSource(Struct, frozen=True):
-    """An expression."""
+    """The values of an expression."""
 
     expression: TypedExpression
 
 
 class MapLookup(Struct, frozen=True):
-    """A value looked up in a table."""
+    """The values of an expression, replaced according to a table (`map`)."""
 
     operand: TypedExpression
     keys: Any
-    """The values looked for, an Arrow array."""
+    """An Arrow array of the values to replace."""
     values: Any
-    """What each becomes, an Arrow array."""
+    """An Arrow array of the replacements."""
     otherwise: TypedExpression | None
-    """For a value that is not there; None: the row is rejected."""
+    """Replaces values that are not in the table; None rejects their rows."""
 
 
 class NestedAdapter(Struct, frozen=True):
-    """What another adapter makes of a nested message."""
+    """The records that another adapter makes of nested messages (`use`)."""
 
     operand: TypedExpression
     adapter: Adapter
@@ -78,9 +78,10 @@ class NestedAdapter(Struct, frozen=True):
 
 
 class StructSource(Struct, frozen=True):
-    """A struct, field by field; with `of`, names are read inside it."""
+    """A struct with one plan per field (`fields`)."""
 
     operand: TypedExpression | None
+    """The nested message in which names are looked up (`of`)."""
     fields: tuple[ColumnPlan, ...]
 
 
@@ -88,133 +89,142 @@ ColumnSource: TypeAlias = "NullColumn | ExpressionSource | MapLookup | NestedAda
 
 
 class ColumnPlan(Struct, frozen=True):
-    """One column of the ontology and where it comes from."""
+    """One column of the record, or a field of a struct column, and the source of its values."""
 
     path: str
-    """Its name with those around it, as `pose.position`."""
+    """The column's path, such as `pose.position`."""
     name: str
     type: DataType
     nullable: bool
     source: ColumnSource
     overrides: tuple[ColumnPlan, ...] = ()
-    """Fields of the struct that come from elsewhere (`with`)."""
+    """Fields of the struct that have another source (`with`)."""
     when: TypedExpression | None = None
+    """The column is null in rows where this condition is not true."""
 
 
-def evaluate_struct(evaluation: Evaluation, fields: tuple[ColumnPlan, ...], type_: DataType) -> Array:
-    """Return a struct of all the fields, one value a row.
-
-    Raises:
-        RowsRefused: Some rows do not fit.
-    """
-    return struct_of([evaluate_column(evaluation, field) for field in fields], type_, None, len(evaluation))
-
-
-def evaluate_column(evaluation: Evaluation, field: ColumnPlan) -> Array:
-    """Return one column in its exact type, one value a row.
+def evaluate_column(evaluation: Evaluation, plan: ColumnPlan) -> Array:
+    """Return one column in its exact type, one value per row.
 
     Raises:
-        RowsRefused: Some rows do not fit.
+        RowsRejected: Some rows do not fit.
     """
-    if field.when is None:
-        array = _fill(evaluation, field)
+    if plan.when is None:
+        values = _evaluate(evaluation, plan)
     else:
-        condition = evaluation.mask(field.when)
+        condition = evaluation.mask(plan.when)
         with evaluation.within(Column(arrays.array(condition))):
-            array = _fill(evaluation, field)
-        array = null_where(array, ~condition)
-    if field.nullable:
-        return array
-    evaluation.target = field.path
-    return refuse_nulls(array, None, evaluation.rejecter((), field.path))
+            values = _evaluate(evaluation, plan)
+        values = null_where(values, ~condition)
+    if plan.nullable:
+        return values
+    evaluation.target = plan.path
+    return refuse_nulls(values, None, evaluation.rejecter((), plan.path))
 
 
-def _fill(evaluation: Evaluation, field: ColumnPlan) -> Array:
-    evaluation.target = field.path
-    source = field.source
-    if isinstance(source, ExpressionSource) and not field.overrides:
-        column = evaluation.evaluate(source.expression)
-        types = _types(field.type, column.axes)
-        values = _converted(evaluation, column, types[-1], source.expression.text)
-    elif isinstance(source, NullColumn):
-        return source.rows.of(len(evaluation))
-    else:
-        column = _base(evaluation, field)
-        types = _types(field.type, column.axes)
-        values = _replaced(evaluation, field, column, types[-1])
+def evaluate_struct(evaluation: Evaluation, plans: tuple[ColumnPlan, ...], type_: DataType) -> Array:
+    """Return a struct column with one field per plan, one value per row.
+
+    Raises:
+        RowsRejected: Some rows do not fit.
+    """
+    return struct_of([evaluate_column(evaluation, plan) for plan in plans], type_, None, len(evaluation))
+
+
+def _evaluate(evaluation: Evaluation, plan: ColumnPlan) -> Array:
+    evaluation.target = plan.path
+    column = _evaluate_source(evaluation, plan)
+    types = _nested_types(plan.type, column.axes)
+    values = _with_overrides(evaluation, plan, column, types[-1])
     for axis, type_ in zip(reversed(column.axes), reversed(types[:-1]), strict=True):
-        values = _closed(axis, values, type_, evaluation.rejecter(column.axes[:-1], field.path))
+        values = _close_list(axis, values, type_, evaluation.rejecter(column.axes[:-1], plan.path))
     return values
 
 
-def _types(target: DataType, axes: tuple[Axis, ...]) -> list[DataType]:
-    """Return the type of the column and of the elements of each list opened, outermost first."""
+def _evaluate_source(evaluation: Evaluation, plan: ColumnPlan) -> Column:
+    """Return the values of a plan's source in the type of the innermost elements, before `with`."""
+    source = plan.source
+    match source:
+        case NullColumn():
+            return Column(source.rows.of(len(evaluation)))
+        case ExpressionSource():
+            column = evaluation.evaluate(source.expression)
+            return _converted(evaluation, column, plan.type, source.expression.text)
+        case MapLookup():
+            column = _look_up(evaluation, source)
+            return _converted(evaluation, column, plan.type, source.operand.text)
+        case NestedAdapter():
+            column = evaluation.evaluate(source.operand)
+            return _nested(
+                evaluation, column, plan.type, _adapt(evaluation, source, column), source.operand.text
+            )
+        case StructSource():
+            if source.operand is None:
+                return Column(evaluate_struct(evaluation, source.fields, plan.type))
+            column = evaluation.evaluate(source.operand)
+            element = _nested_types(plan.type, column.axes)[-1]
+
+            def evaluate_fields(rows: Array, positions: Mask) -> Array:
+                inner = Evaluation(rows, _envelope_of(evaluation.envelope, column.axes, positions))
+                return evaluate_struct(inner, source.fields, element)
+
+            return _nested(evaluation, column, plan.type, evaluate_fields, None)
+
+
+def _converted(evaluation: Evaluation, column: Column, target: DataType, text: str) -> Column:
+    element = _nested_types(target, column.axes)[-1]
+    values = column.array(evaluation.count(column.axes))
+    return Column(convert(values, element, evaluation.rejecter(column.axes, text)), column.axes)
+
+
+def _nested_types(target: DataType, axes: tuple[Axis, ...]) -> list[DataType]:
+    """Return the type of the column, followed by the element types of its open lists, outermost first."""
     types = [target]
     for _ in axes:
         types.append(types[-1].value_type)
     return types
 
 
-def _closed(axis: Axis, values: Array, type_: DataType, refuse: RejectRows) -> Array:
-    same = axis.size is None and not hasattr(type_, "list_size")
-    if same or axis.size == getattr(type_, "list_size", None):
+def _close_list(axis: Axis, values: Array, type_: DataType, refuse: RejectRows) -> Array:
+    if axis.size == getattr(type_, "list_size", None):
         return axis.close(values, type_)
     return convert(axis.close(values), type_, refuse)
 
 
-def _converted(evaluation: Evaluation, column: Column, target: DataType, text: str) -> Array:
-    count = len(column.axes[-1].parents) if column.axes else len(evaluation)
-    return convert(column.array(count), target, evaluation.rejecter(column.axes, text))
+def _nested(
+    evaluation: Evaluation,
+    column: Column,
+    target: DataType,
+    run: Callable[[Array, Any], Array],
+    text: str | None,
+) -> Column:
+    """Run an inner evaluation over the messages of a column that are not null.
+
+    Messages that are rejected are excluded, unless their rejection rejects the outer row.
+    """
+    messages, refuse = column.array(0), evaluation.rejecter(column.axes, text)
+    absent = null_mask(messages)
+    selected = np.ones(len(messages), bool) if absent is None else ~absent
+    while True:
+        positions = np.flatnonzero(selected)
+        try:
+            result = run(messages if selected.all() else messages.filter(arrays.array(selected)), positions)
+            break
+        except RowsRejected as error:
+            rejections = {int(positions[row]): rejection for row, rejection in error.rejections.items()}
+            _reject_by_rule(rejections, len(messages), refuse)
+            selected[list(rejections)] = False
+    result = convert(result, _nested_types(target, column.axes)[-1], refuse)
+    if not selected.all():
+        indices = np.full(len(messages), -1, np.int64)
+        indices[positions] = np.arange(len(positions))
+        result = result.take(arrays.array(np.maximum(indices, 0), mask=indices < 0))
+    return Column(result, column.axes)
 
 
-def _base(evaluation: Evaluation, field: ColumnPlan) -> Column:
-    """Return the values before `with`, already in the element's type."""
-    source = field.source
-    match source:
-        case NullColumn():
-            return Column(source.rows.of(len(evaluation)))
-        case ExpressionSource():
-            column = evaluation.evaluate(source.expression)
-            element = _types(field.type, column.axes)[-1]
-            return Column(_converted(evaluation, column, element, source.expression.text), column.axes)
-        case MapLookup():
-            column = _looked_up(evaluation, source)
-            element = _types(field.type, column.axes)[-1]
-            return Column(_converted(evaluation, column, element, source.operand.text), column.axes)
-        case NestedAdapter():
-            column = evaluation.evaluate(source.operand)
-            refuse = evaluation.rejecter(column.axes, source.operand.text)
-            run = _adapting(evaluation, source, column)
-            return Column(
-                _over_valid(column.array(0), _types(field.type, column.axes)[-1], run, refuse), column.axes
-            )
-        case StructSource():
-            return _by_fields(evaluation, field, source)
-
-
-def _by_fields(evaluation: Evaluation, field: ColumnPlan, source: StructSource) -> Column:
-    if source.operand is None:
-        return Column(evaluate_struct(evaluation, source.fields, field.type))
-    column = evaluation.evaluate(source.operand)
-    element = _types(field.type, column.axes)[-1]
-
+def _adapt(evaluation: Evaluation, source: NestedAdapter, column: Column) -> Callable[[Array, Any], Array]:
     def run(rows: Array, positions: Mask) -> Array:
-        inner = Evaluation(rows, _envelope(evaluation.envelope, column.axes, positions))
-        return evaluate_struct(inner, source.fields, element)
-
-    refuse = evaluation.rejecter(column.axes, None)
-    return Column(_over_valid(column.array(0), element, run, refuse), column.axes)
-
-
-def _envelope(envelope: Envelope, axes: tuple[Axis, ...], rows: Any) -> Envelope:  # noqa: ANN401 - row positions
-    for axis in reversed(axes):
-        rows = axis.parents[rows]
-    return replace(envelope, log_times=envelope.log_times[rows])
-
-
-def _adapting(evaluation: Evaluation, source: NestedAdapter, column: Column) -> Callable[[Array, Any], Array]:
-    def run(rows: Array, positions: Mask) -> Array:
-        envelope = _envelope(evaluation.envelope, column.axes, positions)
+        envelope = _envelope_of(evaluation.envelope, column.axes, positions)
         adapted = source.adapter.adapt(rows, replace(envelope, msgtype=source.msgtype))
         if adapted.failures:
             raise RowsRejected({f.row: (f.rule, f"{source.name}: {f.reason}") for f in adapted.failures})
@@ -223,64 +233,48 @@ def _adapting(evaluation: Evaluation, source: NestedAdapter, column: Column) -> 
     return run
 
 
-def _over_valid(
-    rows: Array, type_: DataType, run: Callable[[Array, Any], Array], refuse: RejectRows
-) -> Array:
-    """Run over the rows that are not null, and leave out those that are refused but do not count."""
-    absent = null_mask(rows)
-    good = np.ones(len(rows), bool) if absent is None else ~absent
-    while True:
-        positions = np.flatnonzero(good)
-        try:
-            result = run(rows if good.all() else rows.filter(arrays.array(good)), positions)
-            break
-        except RowsRejected as refused:
-            said = {int(positions[row]): why for row, why in refused.refusals.items()}
-            _refuse_each(said, len(rows), refuse)
-            good[list(said)] = False
-    result = convert(result, type_, refuse)
-    if good.all():
-        return result
-    where = np.full(len(rows), -1, np.int64)
-    where[positions] = np.arange(len(positions))
-    return result.take(arrays.array(np.maximum(where, 0), mask=where < 0))
+def _envelope_of(envelope: Envelope, axes: tuple[Axis, ...], positions: Any) -> Envelope:  # noqa: ANN401 - a numpy array
+    """Return the envelope of elements: each has the log time of its row."""
+    for axis in reversed(axes):
+        positions = axis.parents[positions]
+    return replace(envelope, log_times=envelope.log_times[positions])
 
 
-def _refuse_each(said: dict[int, Rejection], count: int, refuse: RejectRows) -> None:
-    """Hand on refusals of elements, those of one rule together."""
-    for rule in dict.fromkeys(rule for rule, _ in said.values()):
+def _reject_by_rule(rejections: dict[int, Rejection], count: int, refuse: RejectRows) -> None:
+    """Reject elements, with one call per rule."""
+    for rule in dict.fromkeys(rule for rule, _ in rejections.values()):
         bad = np.zeros(count, bool)
-        bad[[row for row, (own, _) in said.items() if own == rule]] = True
-        refuse(bad, rule, lambda i: said[i][1])
+        bad[[row for row, (own, _) in rejections.items() if own == rule]] = True
+        refuse(bad, rule, lambda i: rejections[i][1])
 
 
-def _looked_up(evaluation: Evaluation, source: MapLookup) -> Column:
+def _look_up(evaluation: Evaluation, source: MapLookup) -> Column:
     column = evaluation.evaluate(source.operand)
-    count = len(column.axes[-1].parents) if column.axes else len(evaluation)
+    count = evaluation.count(column.axes)
     values = column.array(count)
     index = pc.index_in(values, value_set=pc.cast(source.keys, values.type))
-    found = source.values.take(index)
+    replaced = source.values.take(index)
     unknown = np.asarray(pc.and_(pc.is_null(index), pc.is_valid(values)))
     if not unknown.any():
-        return Column(found, column.axes)
+        return Column(replaced, column.axes)
     if source.otherwise is None:
-        known = ", ".join(str(key) for key in source.keys.to_pylist())
+        keys = ", ".join(str(key) for key in source.keys.to_pylist())
         refuse = evaluation.rejecter(column.axes, source.operand.text)
-        refuse(unknown, "unmapped", lambda i: f"{values[i].as_py()!r} is not in the map ({known})")
-        return Column(found, column.axes)
+        refuse(unknown, "unmapped", lambda i: f"{values[i].as_py()!r} is not in the map ({keys})")
+        return Column(replaced, column.axes)
     with evaluation.within(Column(arrays.array(unknown), column.axes)):
-        rest = evaluation.evaluate(source.otherwise).broadcast_to(column.axes).array(count)
-    found, rest = promote(found, rest)
-    return Column(pc.if_else(arrays.array(unknown), rest, found), column.axes)
+        default = evaluation.evaluate(source.otherwise).broadcast_to(column.axes).array(count)
+    replaced, default = promote(replaced, default)
+    return Column(pc.if_else(arrays.array(unknown), default, replaced), column.axes)
 
 
-def _replaced(evaluation: Evaluation, field: ColumnPlan, column: Column, type_: DataType) -> Array:
-    """Return the struct with the fields of `with` in place."""
+def _with_overrides(evaluation: Evaluation, plan: ColumnPlan, column: Column, type_: DataType) -> Array:
+    """Return the values of a column, with the fields of `with` replaced."""
     struct = column.values
-    if not field.overrides:
+    if not plan.overrides:
         return struct
     children = [struct.field(i) for i in range(type_.num_fields)]
-    for replaced in field.overrides:
-        value = Column(evaluate_column(evaluation, replaced)).broadcast_to(column.axes).array(0)
-        children[type_.get_field_index(replaced.name)] = value
+    for override in plan.overrides:
+        value = Column(evaluate_column(evaluation, override)).broadcast_to(column.axes).array(0)
+        children[type_.get_field_index(override.name)] = value
     return struct_of(children, type_, null_mask(struct), len(struct))

@@ -1,4 +1,4 @@
-"""Intermediate columns of an expression: flat values plus the lists that contain them."""
+"""The values of an expression: flat Arrow arrays, with the offsets of the lists that are open."""
 
 from __future__ import annotations
 
@@ -34,31 +34,34 @@ __all__ = [
 ]
 
 Array: TypeAlias = Any
-"""A `pyarrow.Array` of whatever type the checker found."""
+"""A `pyarrow.Array`; its type follows from the expression."""
 Scalar: TypeAlias = Any
 DataType: TypeAlias = Any
 pc: Any = pyarrow.compute
 pt: Any = pyarrow.types
 arrays: Any = pa
-"""pyarrow itself, for the constructors whose stubs are narrower than they are."""
+"""pyarrow without its stubs, which are narrower than the constructors."""
 
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Axis:
-    """How n rows are made of elements; offsets begin at 0, a null row has no elements (fixed: has, unused)."""
+    """One level of lists: how consecutive elements form n rows.
+
+    Offsets start at 0. A null row has no elements, except in fixed-size lists, where its elements exist and are unused.
+    """
 
     offsets: NDArray[np.int64]
-    """Shape (n + 1,)."""
+    """Start of each row's elements and the end of the last, shape (n + 1,)."""
     null: Mask | None
     """True where the list itself is null, shape (n,)."""
     size: int | None
-    """The length of every row, where it is fixed."""
+    """The length of every row of a fixed-size list."""
 
     @property
     def lengths(self) -> NDArray[np.int64]:
-        """Elements of each row, shape (n,)."""
+        """The number of elements of each row, shape (n,)."""
         return np.diff(self.offsets)
 
     @property
@@ -67,11 +70,11 @@ class Axis:
         return np.repeat(np.arange(len(self.offsets) - 1), self.lengths)
 
     def matches(self, other: Axis) -> bool:
-        """Return whether elements of both stand side by side."""
+        """Return whether both axes divide their elements in the same way."""
         return self is other or np.array_equal(self.offsets, other.offsets)
 
     def close(self, values: Array, type_: DataType = None) -> Array:
-        """Return the list column of the elements `values`; shares their memory."""
+        """Build the list column of the elements `values`, without copying them."""
         size = self.size if type_ is None or pt.is_fixed_size_list(type_) else None
         if size is not None:
             return fixed_list(values, size, self.null, len(self.offsets) - 1, type_)
@@ -80,30 +83,30 @@ class Axis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Column:
-    """Values of the innermost elements; without axes, one a row. A literal stays a scalar."""
+    """The values of the innermost elements, or one value per row without axes. A literal stays an Arrow scalar."""
 
     values: Array | Scalar
     axes: tuple[Axis, ...] = ()
 
     def array(self, rows: int) -> Array:
-        """Return the values as an array of one a row (only without axes) or one an element."""
+        """Return the values as an array; a literal is repeated `rows` times."""
         if isinstance(self.values, pa.Scalar):
             return repeat(self.values, rows)
         return self.values
 
     def close_all(self, rows: int) -> Array:
-        """Return the column with its lists closed, one value a row."""
+        """Return one value per row, with all lists closed."""
         values = self.array(rows)
         for axis in reversed(self.axes):
             values = axis.close(values)
         return values
 
     def close_innermost(self) -> Column:
-        """Close the innermost list."""
+        """Return the column after its innermost list is closed."""
         return Column(self.axes[-1].close(self.array(0)), self.axes[:-1])
 
     def broadcast_to(self, axes: tuple[Axis, ...]) -> Column:
-        """Repeat the values for the elements of further axes; literals stay as they are."""
+        """Repeat the values for the elements of further axes; literals stay scalars."""
         values = self.values
         if isinstance(values, pa.Array):
             for axis in axes[len(self.axes) :]:
@@ -112,17 +115,17 @@ class Column:
 
 
 def repeat(scalar: Scalar, length: int) -> Array:
-    """Return an array of one value."""
+    """Return an array that holds one scalar `length` times."""
     return arrays.repeat(scalar, length) if scalar.is_valid else arrays.nulls(length, scalar.type)
 
 
 def null_mask(array: Array) -> Mask | None:
-    """Return where an array is null, or None where it never is."""
+    """Return where an array is null, or None if it has no nulls."""
     return np.asarray(array.is_null()) if array.null_count else None
 
 
 def true_mask(values: Array | Scalar, *, null: bool = False) -> Mask:
-    """Return where a boolean column is true; nulls count as `null`; of a scalar, shape (1,)."""
+    """Return where a boolean column is true, with nulls counted as `null`; shape (1,) for a scalar."""
     if isinstance(values, pa.Scalar):
         return np.array([values.as_py() if values.is_valid else null])
     known = pc.fill_null(values, null) if values.null_count else values
@@ -133,13 +136,13 @@ def true_mask(values: Array | Scalar, *, null: bool = False) -> Mask:
 
 
 def field_of(rows: Array, name: str) -> Array:
-    """Return a field of every row, null where the row is; shares memory where no row is null."""
+    """Return a field of every row, null where the row is null; shares memory unless a row is null."""
     position = rows.type.get_field_index(name)
     return pc.struct_field(rows, [position]) if rows.null_count else rows.field(position)
 
 
 def open_list(array: Array) -> tuple[Array, Axis]:
-    """Return the elements of a list column and how they make up its rows."""
+    """Return the elements of a list column and the axis that divides them into rows."""
     null = null_mask(array)
     if pt.is_fixed_size_list(array.type):
         size = array.type.list_size
@@ -153,14 +156,14 @@ def open_list(array: Array) -> tuple[Array, Axis]:
 def variable_list(
     values: Array, offsets: NDArray[np.int64], null: Mask | None, type_: DataType = None
 ) -> Array:
-    """Return a list column over `values`."""
+    """Build a list column over `values`."""
     mask = None if null is None else arrays.array(null)
     starts = arrays.array(offsets.astype(np.int32))
     return arrays.ListArray.from_arrays(starts, values, type=type_ or arrays.list_(values.type), mask=mask)
 
 
 def fixed_list(values: Array, size: int, null: Mask | None, rows: int, type_: DataType = None) -> Array:
-    """Return a fixed-size list column over `values`."""
+    """Build a fixed-size list column over `values`."""
     type_ = type_ or arrays.list_(values.type, size)
     if size == 0:
         return arrays.array([[]] * rows, type_)
@@ -169,7 +172,7 @@ def fixed_list(values: Array, size: int, null: Mask | None, rows: int, type_: Da
 
 
 def struct_of(children: list[Array], type_: DataType, null: Mask | None, rows: int) -> Array:
-    """Return a struct column; a type without fields keeps its number of rows."""
+    """Build a struct column; `rows` is the length of a struct without fields."""
     if not children:
         return arrays.array([{}] * rows, type_)
     mask = None if null is None or not null.any() else arrays.array(null)
@@ -177,7 +180,7 @@ def struct_of(children: list[Array], type_: DataType, null: Mask | None, rows: i
 
 
 def null_where(array: Array, mask: Mask) -> Array:
-    """Return the array with further rows null; what they held stays below, so that nothing is copied."""
+    """Return the array with nulls where `mask` is true; struct fields keep their values, so nothing is copied."""
     if not mask.any():
         return array
     known = null_mask(array)
@@ -189,7 +192,7 @@ def null_where(array: Array, mask: Mask) -> Array:
 
 
 def promote(*values: Array) -> list[Array]:
-    """Return arrays or scalars in a type that holds them all; the checker made sure that there is one."""
+    """Cast arrays or scalars to a common type; the checker guarantees that there is one."""
     known = [v.type for v in values if not pt.is_null(v.type)]
     if not known:
         return list(values)

@@ -1,4 +1,4 @@
-"""This file computes typed expressions over all rows of a batch at once."""
+"""Evaluate typed expressions over the rows of a batch."""
 
 from __future__ import annotations
 
@@ -45,28 +45,28 @@ __all__ = ["Evaluation", "Rejection", "RowsRejected"]
 
 
 Rejection: TypeAlias = tuple[str, str]
-"""The rule a row broke, and why."""
+"""The rule that a row violates, and the reason."""
 
 
-class RowsRejected(Exception):  # noqa: N818 - a signal: go on without these rows
-    """Rows that do not fit; the caller evaluates the others again, without them."""
+class RowsRejected(Exception):  # noqa: N818 - control flow: the caller retries without these rows
+    """Some rows are invalid; the caller evaluates the batch again without them."""
 
-    def __init__(self, refusals: dict[int, Rejection]) -> None:
-        super().__init__(f"{len(refusals)} rows")
-        self.refusals = refusals
+    def __init__(self, rejections: dict[int, Rejection]) -> None:
+        super().__init__(f"{len(rejections)} rows")
+        self.rejections = rejections
 
 
 class Evaluation:
-    """The values of expressions over one batch; each is computed once."""
+    """The values of expressions over one batch; equal expressions are computed once."""
 
     def __init__(self, rows: Array, envelope: Envelope) -> None:
         self.rows = rows
         self.envelope = envelope
         self.target = ""
-        """The field being filled, for messages."""
+        """The path of the column being evaluated, for messages."""
         self._cache: dict[TypedExpression, Column] = {}
         self._branch_conditions: list[Column] = []
-        """Conditions of the branches being evaluated: only rows where all hold count."""
+        """Conditions of the branches being evaluated; only rows that fulfill all of them can be rejected."""
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -76,25 +76,29 @@ class Evaluation:
         """Return the values of an expression.
 
         Raises:
-            RowsRefused: Some rows do not fit it.
+            RowsRejected: The expression has no value for some rows.
         """
-        known = self._cache.get(typed)
-        if known is None:
-            known = self._compute(typed)
+        column = self._cache.get(typed)
+        if column is None:
+            column = self._compute(typed)
             if (
                 not self._branch_conditions
-            ):  # inside a branch, values of the rows that do not take it may be missing
-                self._cache[typed] = known
-        return known
+            ):  # Inside a branch, rows that do not take it may have invalid values.
+                self._cache[typed] = column
+        return column
+
+    def count(self, axes: tuple[Axis, ...]) -> int:
+        """Return the number of values below some axes; without axes, the number of rows."""
+        return len(axes[-1].parents) if axes else len(self)
 
     def mask(self, typed: TypedExpression) -> Mask:
-        """Return where a condition without open lists holds."""
+        """Return where a condition without open lists is true; null counts as false."""
         values = self.evaluate(typed).array(len(self))
         return true_mask(pc.cast(values, arrays.bool_()))
 
     @contextmanager
     def within(self, condition: Column) -> Generator[None]:
-        """Let only rows that take a branch reject themselves."""
+        """Restrict rejections to the rows where `condition` is true."""
         self._branch_conditions.append(condition)
         try:
             yield
@@ -102,29 +106,32 @@ class Evaluation:
             self._branch_conditions.pop()
 
     def rejecter(self, axes: tuple[Axis, ...], text: str | None) -> RejectRows:
-        """Return a way to reject the rows that elements belong to; without `text`, reasons stand as they are."""
+        """Return a callback that rejects the rows of invalid elements; `text` is the expression to name in the reason.
+
+        Without `text`, the reasons are used unchanged, because an inner evaluation has completed them.
+        """
         target = self.target
 
         def refuse(bad: Mask, rule: str, says: Callable[[int], str]) -> None:
-            count = len(axes[-1].parents) if axes else len(self)
-            single = len(bad) != count
-            live = self._live(np.broadcast_to(bad, count), axes)
-            if not live.any():
+            count = self.count(axes)
+            is_literal = len(bad) != count
+            rejected = self._in_taken_branches(np.broadcast_to(bad, count), axes)
+            if not rejected.any():
                 return
-            what = "" if text is None else f"{target}: " if text == target else f"{target}: `{text}`: "
-            refusals: dict[int, Rejection] = {}
-            positions = np.flatnonzero(live)
+            prefix = "" if text is None else f"{target}: " if text == target else f"{target}: `{text}`: "
+            rejections: dict[int, Rejection] = {}
+            positions = np.flatnonzero(rejected)
             rows = positions
             for axis in reversed(axes):
                 rows = axis.parents[rows]
             for row, position in zip(rows.tolist(), positions.tolist(), strict=True):
-                if row not in refusals:
-                    refusals[row] = (rule, what + says(0 if single else position))
-            raise RowsRejected(refusals)
+                if row not in rejections:
+                    rejections[row] = (rule, prefix + says(0 if is_literal else position))
+            raise RowsRejected(rejections)
 
         return refuse
 
-    def _live(self, bad: Mask, axes: tuple[Axis, ...]) -> Mask:
+    def _in_taken_branches(self, bad: Mask, axes: tuple[Axis, ...]) -> Mask:
         for condition in self._branch_conditions:
             if len(condition.axes) <= len(axes) and all(map(Axis.matches, condition.axes, axes)):
                 values = condition.broadcast_to(axes).array(len(bad))
@@ -138,83 +145,84 @@ class Evaluation:
             case Constant():
                 return Column(_scalar(typed))
             case FunctionCall():
-                return self._apply(typed)
+                return self._call(typed)
             case MakeList():
                 return self._list(typed)
             case Conditional():
-                return self._choice(typed)
+                return self._conditional(typed)
             case _:
-                return self._derived(typed, self.evaluate(typed.operand))
+                return self._unary(typed, self.evaluate(typed.operand))
 
-    def _derived(self, typed: FieldAccess | OpenList | CloseList | ElementAt | Cast, of: Column) -> Column:
-        """Return what is made of one other column."""
+    def _unary(self, typed: FieldAccess | OpenList | CloseList | ElementAt | Cast, operand: Column) -> Column:
+        """Evaluate a node with one operand."""
         match typed:
             case FieldAccess():
-                return Column(field_of(of.array(len(self)), typed.name), of.axes)
+                return Column(field_of(operand.array(len(self)), typed.name), operand.axes)
             case OpenList():
-                elements, axis = open_list(of.array(len(self)))
-                return Column(elements, (*of.axes, axis))
+                elements, axis = open_list(operand.array(len(self)))
+                return Column(elements, (*operand.axes, axis))
             case CloseList():
-                return of.close_innermost()
+                return operand.close_innermost()
             case ElementAt():
-                return Column(_items(of.array(len(self)), typed.index), of.axes)
+                return Column(_element_at(operand.array(len(self)), typed.index), operand.axes)
             case Cast():
-                return _like(of, to_number(_array(of), typed.target, self.rejecter(of.axes, typed.text)))
+                return _like(
+                    operand,
+                    to_number(_as_array(operand), typed.target, self.rejecter(operand.axes, typed.text)),
+                )
 
     def _aligned(self, columns: list[Column], text: str) -> tuple[list[Column], tuple[Axis, ...]]:
-        """Return the columns over the same elements; lists side by side must be of equal length."""
+        """Broadcast columns to the same axes; rows whose lists differ in length are rejected."""
         axes = max((column.axes for column in columns), key=len, default=())
         for column in columns:
             for axis, other in zip(column.axes, axes, strict=False):
                 if not axis.matches(other):
-                    self._refuse_lengths(column.axes, axes, text)
+                    self._reject_lengths(column.axes, axes, text)
         return [column.broadcast_to(axes) for column in columns], axes
 
-    def _refuse_lengths(self, left: tuple[Axis, ...], right: tuple[Axis, ...], text: str) -> None:
+    def _reject_lengths(self, left: tuple[Axis, ...], right: tuple[Axis, ...], text: str) -> None:
         depth = next(i for i, (a, b) in enumerate(zip(left, right, strict=False)) if not a.matches(b))
         a, b = left[depth].lengths, right[depth].lengths
-        taken, self._branch_conditions = (
-            self._branch_conditions,
-            [],
-        )  # in branches that are not taken, too, the elements would be misaligned
+        # Misaligned elements invalidate the complete column, so branches that are not taken count here, too.
+        conditions, self._branch_conditions = self._branch_conditions, []
         try:
             refuse = self.rejecter(left[:depth], text)
             refuse(a != b, "list-length", lambda i: f"lists of {a[i]} and {b[i]} elements")
         finally:
-            self._branch_conditions = taken
+            self._branch_conditions = conditions
 
-    def _apply(self, typed: FunctionCall) -> Column:
+    def _call(self, typed: FunctionCall) -> Column:
         function = typed.function
         columns = [self.evaluate(argument) for argument in typed.arguments]
         columns, axes = self._aligned(columns, typed.text)
-        count = len(axes[-1].parents) if axes else len(self)
-        literal = all(isinstance(column.values, pa.Scalar) for column in columns)
-        values: list[Array] = []
+        count = self.count(axes)
+        all_literals = all(isinstance(column.values, pa.Scalar) for column in columns)
+        arguments: list[Array] = []
         for position, (column, argument) in enumerate(zip(columns, typed.arguments, strict=True)):
-            take = function.parameter(position)
-            if take.literal and isinstance(argument, Constant):
-                values.append(argument.value)
+            parameter = function.parameter(position)
+            if parameter.literal and isinstance(argument, Constant):
+                arguments.append(argument.value)
                 continue
             value = column.values
-            if isinstance(value, pa.Scalar) and (not function.scalars or (literal and position == 0)):
-                value = repeat(value, 1 if literal else count)
-            values.append(value if take.prepare is None else take.prepare(value))
+            if isinstance(value, pa.Scalar) and (not function.scalars or (all_literals and position == 0)):
+                value = repeat(value, 1 if all_literals else count)
+            arguments.append(value if parameter.prepare is None else parameter.prepare(value))
         if function.refuses:
-            values.insert(0, self.rejecter(axes, typed.text))
-        result = function.apply(*values)
-        return Column(result[0]) if literal else Column(result, axes)
+            arguments.insert(0, self.rejecter(axes, typed.text))
+        result = function.apply(*arguments)
+        return Column(result[0]) if all_literals else Column(result, axes)
 
     def _list(self, typed: MakeList) -> Column:
         if not typed.items:
             return Column(arrays.array([[]] * len(self), typed.type.arrow))
         columns, axes = self._aligned([self.evaluate(item) for item in typed.items], typed.text)
-        count = len(axes[-1].parents) if axes else len(self)
+        count = self.count(axes)
         items = promote(*(column.array(count) for column in columns))
         order = np.arange(count * len(items)).reshape(len(items), count).T.ravel()
         elements = arrays.concat_arrays(items).take(arrays.array(order))
         return Column(fixed_list(elements, len(items), None, count), axes)
 
-    def _choice(self, typed: Conditional) -> Column:
+    def _conditional(self, typed: Conditional) -> Column:
         condition = self.evaluate(typed.condition)
         if pt.is_null(condition.values.type):
             condition = Column(arrays.scalar(None, arrays.bool_()))
@@ -226,27 +234,30 @@ class Evaluation:
         chosen = columns[0].values
         branches = promote(columns[1].values, columns[2].values)
         if isinstance(chosen, pa.BooleanArray) and not chosen.null_count:
-            taken = {0: branches[1], len(chosen): branches[0]}.get(chosen.true_count)
-            if isinstance(taken, pa.Array):
-                return Column(taken, axes)
+            only = {0: branches[1], len(chosen): branches[0]}.get(chosen.true_count)
+            if isinstance(only, pa.Array):
+                return Column(only, axes)
         return Column(pc.if_else(chosen, *branches), axes)
 
 
 def _scalar(typed: Constant) -> Array:
+    """Return a literal as an Arrow scalar; floats are computed in 64 bits, whatever their type says."""
     if pt.is_floating(typed.type.arrow):
         return arrays.scalar(typed.value, arrays.float64())
     return arrays.scalar(typed.value, typed.type.arrow)
 
 
-def _array(column: Column) -> Array:
+def _as_array(column: Column) -> Array:
     return repeat(column.values, 1) if isinstance(column.values, pa.Scalar) else column.values
 
 
 def _like(column: Column, values: Array) -> Column:
+    """Return values of the shape of a column: a scalar if the column is one."""
     return Column(values[0] if isinstance(column.values, pa.Scalar) else values, column.axes)
 
 
-def _items(lists: Array, index: int) -> Array:
+def _element_at(lists: Array, index: int) -> Array:
+    """Return one element of every list, null if the list is too short."""
     elements, axis = open_list(lists)
     starts, ends = axis.offsets[:-1], axis.offsets[1:]
     positions = starts + index if index >= 0 else ends + index

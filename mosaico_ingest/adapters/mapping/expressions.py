@@ -1,4 +1,4 @@
-"""This file is an expression with every name resolved and every type known, as data one can print and compare."""
+"""Typed expressions: every name is resolved and every type known, before any row is read."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ __all__ = [
 
 
 class Constant(ExpressionNode, frozen=True, eq=False):
-    """The same value for every row."""
+    """A value that is the same for every row."""
 
     value: LiteralValue
     type: ExprType
@@ -39,7 +39,7 @@ class Constant(ExpressionNode, frozen=True, eq=False):
 
 
 class MessageRef(ExpressionNode, frozen=True, eq=False):
-    """The message itself."""
+    """The message in which names are looked up."""
 
     type: ExprType
     text: str = "self"
@@ -55,7 +55,7 @@ class FieldAccess(ExpressionNode, frozen=True, eq=False):
 
 
 class OpenList(ExpressionNode, frozen=True, eq=False):
-    """A list, opened."""
+    """The elements of a list (`operand[]`): operations on them apply to each element."""
 
     operand: TypedExpression
     type: ExprType
@@ -63,7 +63,7 @@ class OpenList(ExpressionNode, frozen=True, eq=False):
 
 
 class CloseList(ExpressionNode, frozen=True, eq=False):
-    """The innermost open list, closed for a function that takes it whole."""
+    """A list rebuilt from its elements, because a function takes the list instead of one element."""
 
     operand: TypedExpression
     type: ExprType
@@ -71,7 +71,7 @@ class CloseList(ExpressionNode, frozen=True, eq=False):
 
 
 class ElementAt(ExpressionNode, frozen=True, eq=False):
-    """One element of a list."""
+    """One element of a list, null if the list is too short."""
 
     operand: TypedExpression
     index: int
@@ -80,7 +80,7 @@ class ElementAt(ExpressionNode, frozen=True, eq=False):
 
 
 class MakeList(ExpressionNode, frozen=True, eq=False):
-    """Values side by side."""
+    """A fixed-size list of values."""
 
     items: tuple[TypedExpression, ...]
     type: ExprType
@@ -88,7 +88,7 @@ class MakeList(ExpressionNode, frozen=True, eq=False):
 
 
 class Cast(ExpressionNode, frozen=True, eq=False):
-    """A number in a type it may not fit."""
+    """A number in another type, checked for every row."""
 
     operand: TypedExpression
     target: DataType
@@ -97,7 +97,7 @@ class Cast(ExpressionNode, frozen=True, eq=False):
 
 
 class FunctionCall(ExpressionNode, frozen=True, eq=False):
-    """A function of other values."""
+    """A function or operator applied to its arguments."""
 
     name: str
     function: Function
@@ -107,7 +107,7 @@ class FunctionCall(ExpressionNode, frozen=True, eq=False):
 
 
 class Conditional(ExpressionNode, frozen=True, eq=False):
-    """One of two values."""
+    """One of two values, chosen for each row."""
 
     condition: TypedExpression
     then: TypedExpression
@@ -117,10 +117,10 @@ class Conditional(ExpressionNode, frozen=True, eq=False):
 
 
 class AnalyzedExpression(Struct, frozen=True):
-    """An expression as written and as understood; `typed` is None where there is no message to type it by."""
+    """An expression of the file; `typed` is None while no message definition is known."""
 
     path: KeyPath
-    """Where in the file."""
+    """The key path of the expression in the file."""
     text: str
     node: Node
     typed: TypedExpression | None

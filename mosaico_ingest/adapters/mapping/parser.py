@@ -1,8 +1,13 @@
-"""This file reads the text of an expression into a small tree; it is parsed as Python and never run as Python."""
+"""Parse the text of an expression into a syntax tree.
+
+Python's own parser reads the text, so the syntax is Python's with one addition: `a[]` stands for every element of `a`.
+The result is translated to the node classes below; nothing is ever executed as Python.
+"""
 
 from __future__ import annotations
 
 import ast
+import re
 import warnings
 from collections.abc import Callable
 from typing import TypeAlias, cast
@@ -32,7 +37,7 @@ MAX_DEPTH = 60
 
 LiteralValue: TypeAlias = "bool | int | float | str | None"
 TextRange: TypeAlias = tuple[int, int]
-"""First character and one past the last, within the expression's text."""
+"""Start and end (exclusive) within the expression's text, in characters."""
 
 
 _NOT_COMPARED = frozenset({"span", "name_span", "type", "text", "function"})
@@ -40,19 +45,19 @@ _NOT_COMPARED = frozenset({"span", "name_span", "type", "text", "function"})
 
 
 class ExpressionError(Exception):
-    """The text is not an expression of this language; `place` says which part, `help` what to write."""
+    """The text is not a valid expression; `span` is the offending part, `hint` the remedy."""
 
-    def __init__(self, message: str, place: TextRange, hint: str | None = None) -> None:
+    def __init__(self, message: str, span: TextRange, hint: str | None = None) -> None:
         super().__init__(message)
-        self.span = place
+        self.span = span
         self.hint = hint
 
 
 class ExpressionNode(Struct, frozen=True, eq=False):
-    """A node of an expression; positions, texts and derived types do not take part in comparisons."""
+    """A node of an expression; comparisons ignore positions, texts and derived types."""
 
     def __eq__(self, other: object) -> bool:
-        """Return whether both nodes are of one class and have equal content."""
+        """Return whether both nodes have the same class and equal content."""
         return type(self) is type(other) and self._content() == cast("ExpressionNode", other)._content()
 
     def __hash__(self) -> int:
@@ -64,21 +69,21 @@ class ExpressionNode(Struct, frozen=True, eq=False):
 
 
 class Literal(ExpressionNode, frozen=True, eq=False):
-    """A number, text, `true`, `false` or `null`."""
+    """A number, a text, `true`, `false` or `null`."""
 
     value: LiteralValue
     span: TextRange
 
 
 class Name(ExpressionNode, frozen=True, eq=False):
-    """A field or constant of the message."""
+    """The name of a field or constant of the message."""
 
     name: str
     span: TextRange
 
 
 class Attribute(ExpressionNode, frozen=True, eq=False):
-    """`of.name`."""
+    """`base.name`."""
 
     base: Node
     name: str
@@ -87,14 +92,14 @@ class Attribute(ExpressionNode, frozen=True, eq=False):
 
 
 class EachElement(ExpressionNode, frozen=True, eq=False):
-    """`of[]`: every element of a list."""
+    """`base[]`: every element of a list."""
 
     base: Node
     span: TextRange
 
 
 class Subscript(ExpressionNode, frozen=True, eq=False):
-    """`of[index]`."""
+    """`base[index]`."""
 
     base: Node
     index: int
@@ -109,7 +114,7 @@ class ListLiteral(ExpressionNode, frozen=True, eq=False):
 
 
 class Call(ExpressionNode, frozen=True, eq=False):
-    """A function or an operator, by its name (`sqrt`, `+`, `==`)."""
+    """A function or operator by name (`sqrt`, `+`, `==`)."""
 
     name: str
     arguments: tuple[Node, ...]
@@ -151,34 +156,56 @@ _OPERATORS: dict[type[ast.AST], str] = {
 }
 
 
+_PYTHON_ONLY: dict[type[ast.AST], str] = {
+    ast.BitAnd: "`and`",
+    ast.BitOr: "`or`",
+    ast.Invert: "`not`",
+    ast.BitXor: "`**` for a power, `!=` for an exclusive or",
+    ast.Is: "is_null(x) for null, `==` for other values",
+    ast.IsNot: "not is_null(x) for null, `!=` for other values",
+}
+_REPLACEMENTS = {
+    "&&": "write `and`",
+    "||": "write `or`",
+    "!": "write `not`",
+    "===": "write `==`",
+    "!==": "write `!=`",
+    "=": "write `==` to compare",
+    "?": "write `a if condition else b`",
+}
+"""Operators of C and JavaScript, which Python's parser rejects, and what to write instead."""
+_FOREIGN_OPERATOR = re.compile(r"&&|\|\||[!=]==|\?|!(?!=)|(?<![=!<>*/%+-])=(?!=)")
+_QUOTED = re.compile(r"'(?:\\.|[^'\\])*'|\"(?:\\.|[^\"\\])*\"")
+
+
 def parse(text: str) -> Node:
-    """Read an expression.
+    """Parse an expression.
 
     Raises:
-        ExpressionError: It is none; the place is the offending part.
+        ExpressionError: The text is not a valid expression.
     """
     if len(text) > MAX_CHARACTERS:
         raise ExpressionError(
             f"the expression has {len(text)} characters; {MAX_CHARACTERS} are allowed", (0, 1)
         )
-    code, moved = _rewrite_empty_brackets(text.replace("\n", " "))
+    code, inserted = _rewrite_empty_brackets(text.replace("\n", " "))
     lead = len(code) - len(code.lstrip())
     code = code[lead:]
     if not code:
         raise ExpressionError("the expression is empty", (0, 1), "write a field's name, or null")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # '\d' in a pattern is meant as it stands
+            warnings.simplefilter("ignore")  # Python warns about '\d', which regular expressions contain
             tree = ast.parse(code, mode="eval")
     except SyntaxError as error:
-        raise _syntax_error(error, text, moved, lead) from None
+        raise _syntax_error(error, text, inserted, lead) from None
     except (ValueError, MemoryError, RecursionError):
-        raise ExpressionError("the expression cannot be read: it nests too deeply", (0, len(text))) from None
-    return _Parser(code, text, moved, lead).parse(tree.body, 0)
+        raise ExpressionError("the expression is nested too deeply", (0, len(text))) from None
+    return _Parser(code, text, inserted, lead).translate(tree.body, 0)
 
 
 def children(node: Node) -> tuple[Node, ...]:
-    """Return the nodes directly below."""
+    """Return the direct children of a node."""
     match node:
         case Attribute() | EachElement() | Subscript():
             return (node.base,)
@@ -193,9 +220,9 @@ def children(node: Node) -> tuple[Node, ...]:
 
 
 def _rewrite_empty_brackets(text: str) -> tuple[str, list[int]]:
-    """Spell `a[]` as `a[:]`, which Python can read; return where characters were put in."""
+    """Rewrite `a[]` as `a[:]`, which Python can parse; return the positions of the inserted characters."""
     out: list[str] = []
-    moved: list[int] = []
+    inserted: list[int] = []
     quote = ""
     for index, character in enumerate(text):
         if quote:
@@ -205,35 +232,41 @@ def _rewrite_empty_brackets(text: str) -> tuple[str, list[int]]:
         elif character == "]" and text[index - 1 : index] == "[":
             before = text[: index - 1].rstrip()[-1:]
             if before.isalnum() or before in {"_", "]", ")"}:
-                moved.append(len(out))
+                inserted.append(len(out))
                 out.append(":")
         out.append(character)
-    return "".join(out), moved
+    return "".join(out), inserted
 
 
-def _syntax_error(error: SyntaxError, text: str, moved: list[int], lead: int) -> ExpressionError:
+def _syntax_error(error: SyntaxError, text: str, inserted: list[int], lead: int) -> ExpressionError:
+    foreign = _FOREIGN_OPERATOR.search(_QUOTED.sub(lambda match: "'" * len(match[0]), text))
+    if foreign is not None:
+        return ExpressionError(
+            f"`{foreign[0]}` is not an operator of the language", foreign.span(), _REPLACEMENTS[foreign[0]]
+        )
     last = max(len(text) - 1, 0)
-    at = min(_original(error.offset - 1 + lead, moved), last) if error.offset else last
+    start = min(_original(error.offset - 1 + lead, inserted), last) if error.offset else last
     return ExpressionError(
         f"this is not an expression ({error.msg})",
-        (at, at + 1),
-        "text needs quotes of its own, a field named like a Python keyword is self['from']",
+        (start, start + 1),
+        "put literal text in quotes; write a field named like a Python keyword as self['from']",
     )
 
 
-def _original(position: int, moved: list[int]) -> int:
-    return position - sum(1 for put_in in moved if put_in < position)
+def _original(position: int, inserted: list[int]) -> int:
+    """Return a position in the text the user wrote, for a position after `_rewrite_empty_brackets`."""
+    return position - sum(1 for index in inserted if index < position)
 
 
 class _Parser:
-    """Turns Python's tree into ours, refusing what the language does not have."""
+    """Translates Python's syntax tree and rejects constructs that the language does not have."""
 
-    def __init__(self, code: str, text: str, moved: list[int], lead: int) -> None:
+    def __init__(self, code: str, text: str, inserted: list[int], lead: int) -> None:
         self._bytes = code.encode()
         self._text = text
-        self._moved = moved
+        self._inserted = inserted
         self._lead = lead
-        self._readers: dict[type[ast.expr], Callable[..., Node]] = {
+        self._translators: dict[type[ast.expr], Callable[..., Node]] = {
             ast.Constant: self._constant,
             ast.Name: self._name,
             ast.Attribute: self._attribute,
@@ -247,146 +280,155 @@ class _Parser:
             ast.Call: self._call,
         }
 
-    def parse(self, node: ast.expr, depth: int) -> Node:
-        """Read one node and all below."""
-        reader = self._readers.get(type(node))
-        if reader is None:
+    def translate(self, node: ast.expr, depth: int) -> Node:
+        """Translate one node with its children."""
+        translator = self._translators.get(type(node))
+        if translator is None:
             raise ExpressionError(
                 f"`{self._source(node)}` is not part of the language",
-                self._place(node),
-                "use operators, comparisons, `x if c else y` and the listed functions",
+                self._span(node),
+                "use operators, comparisons, `x if c else y` and the functions of the language",
             )
         if depth > MAX_DEPTH:
-            raise ExpressionError(f"more than {MAX_DEPTH} levels of nesting", self._place(node))
-        return reader(node, depth + 1)
+            raise ExpressionError(f"more than {MAX_DEPTH} levels of nesting", self._span(node))
+        return translator(node, depth + 1)
 
-    def _place(self, node: ast.expr) -> TextRange:
+    def _span(self, node: ast.expr) -> TextRange:
         end = len(self._bytes) if node.end_col_offset is None else node.end_col_offset
         return (self._position(node.col_offset), self._position(end))
 
     def _position(self, byte: int) -> int:
-        # ast counts UTF-8 bytes; what was read is one line
-        return _original(len(self._bytes[:byte].decode()) + self._lead, self._moved)
+        # ast counts UTF-8 bytes within the line.
+        return _original(len(self._bytes[:byte].decode()) + self._lead, self._inserted)
 
     def _source(self, node: ast.expr) -> str:
-        start, end = self._place(node)
+        start, end = self._span(node)
         return self._text[start:end]
 
     def _constant(self, node: ast.Constant, _: int) -> Node:
         if node.value is not None and not isinstance(node.value, (bool, int, float, str)):
             raise ExpressionError(
-                f"`{self._source(node)}` is no value of the language",
-                self._place(node),
-                "write a number, text in quotes, true, false or null",
+                f"`{self._source(node)}` is not a value of the language",
+                self._span(node),
+                "write a number, a text in quotes, true, false or null",
             )
         if isinstance(node.value, int) and not -(2**63) <= node.value < 2**64:
-            raise ExpressionError(f"{node.value} has more than 64 bits", self._place(node))
-        return Literal(node.value, self._place(node))
+            raise ExpressionError(f"{node.value} has more than 64 bits", self._span(node))
+        return Literal(node.value, self._span(node))
 
     def _name(self, node: ast.Name, _: int) -> Node:
         if node.id in _WORDS:
-            return Literal(_WORDS[node.id], self._place(node))
-        return Name(node.id, self._place(node))
+            return Literal(_WORDS[node.id], self._span(node))
+        return Name(node.id, self._span(node))
 
     def _attribute(self, node: ast.Attribute, depth: int) -> Node:
-        start, end = self._place(node)
-        return Attribute(self.parse(node.value, depth), node.attr, (start, end), (end - len(node.attr), end))
+        start, end = self._span(node)
+        return Attribute(
+            self.translate(node.value, depth), node.attr, (start, end), (end - len(node.attr), end)
+        )
 
     def _subscript(self, node: ast.Subscript, depth: int) -> Node:
-        of = self.parse(node.value, depth)
-        place = self._place(node)
+        base = self.translate(node.value, depth)
+        span = self._span(node)
         match node.slice:
             case ast.Slice(lower=None, upper=None, step=None):
-                return EachElement(of, place)
+                return EachElement(base, span)
             case ast.Constant(value=str() as name):
-                return Attribute(of, name, place, self._place(node.slice))
+                return Attribute(base, name, span, self._span(node.slice))
             case ast.Constant(value=int() as index) if not isinstance(index, bool):
-                return Subscript(of, index, place)
+                return Subscript(base, index, span)
             case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() as index)):
-                return Subscript(of, -index, place)
+                return Subscript(base, -index, span)
             case _:
                 raise ExpressionError(
-                    "an index is a number",
-                    self._place(node.slice),
+                    "an index must be a number",
+                    self._span(node.slice),
                     "write a[] for each element, a[0] for the first, a[-1] for the last",
                 )
 
     def _list(self, node: ast.List, depth: int) -> Node:
-        return ListLiteral(tuple(self.parse(item, depth) for item in node.elts), self._place(node))
+        return ListLiteral(tuple(self.translate(item, depth) for item in node.elts), self._span(node))
 
     def _unary(self, node: ast.UnaryOp, depth: int) -> Node:
-        place = self._place(node)
-        operand = self.parse(node.operand, depth)
+        span = self._span(node)
+        operand = self.translate(node.operand, depth)
         if isinstance(node.op, ast.USub) and isinstance(operand, Literal):
             value = operand.value
             if isinstance(value, (int, float)) and not isinstance(value, bool):
-                return Literal(-value, place)
-        return self._operation(node.op, (operand,), place)
+                return Literal(-value, span)
+        return self._operation(node.op, (operand,), span)
 
     def _binary(self, node: ast.BinOp, depth: int) -> Node:
         return self._operation(
-            node.op, (self.parse(node.left, depth), self.parse(node.right, depth)), self._place(node)
+            node.op, (self.translate(node.left, depth), self.translate(node.right, depth)), self._span(node)
         )
 
     def _logic(self, node: ast.BoolOp, depth: int) -> Node:
-        place = self._place(node)
-        result = self.parse(node.values[0], depth)
+        span = self._span(node)
+        result = self.translate(node.values[0], depth)
         for value in node.values[1:]:
-            result = self._operation(node.op, (result, self.parse(value, depth)), place)
+            result = self._operation(node.op, (result, self.translate(value, depth)), span)
         return result
 
     def _compare(self, node: ast.Compare, depth: int) -> Node:
-        """`a < b < c` is `a < b and b < c`."""
-        place = self._place(node)
+        """Translate `a < b < c` to `a < b and b < c`."""
+        span = self._span(node)
         left, result = node.left, None
         for operator, right in zip(node.ops, node.comparators, strict=True):
             if isinstance(operator, (ast.In, ast.NotIn)):
                 pair = self._member(operator, left, right, depth)
             else:
-                pair = self._operation(operator, (self.parse(left, depth), self.parse(right, depth)), place)
-            result = pair if result is None else Call("and", (result, pair), place, place)
+                pair = self._operation(
+                    operator, (self.translate(left, depth), self.translate(right, depth)), span
+                )
+            result = pair if result is None else Call("and", (result, pair), span, span)
             left = right
-        return result or self.parse(left, depth)
+        return result or self.translate(left, depth)
 
     def _member(self, operator: ast.cmpop, left: ast.expr, right: ast.expr, depth: int) -> Node:
-        """`a in [b, c]` is `a == b or a == c`."""
+        """Translate `a in [b, c]` to `a == b or a == c`."""
         if not isinstance(right, ast.List) or not right.elts:
-            hint = "as status in [1, 2]; any(a[] == b) looks into a list"
-            raise ExpressionError("`in` needs a list of values", self._place(right), hint)
-        place = (self._place(left)[0], self._place(right)[1])
-        value = self.parse(left, depth)
-        pairs = [Call("==", (value, self.parse(item, depth)), place, place) for item in right.elts]
+            hint = "write x in [1, 2], or any(list[] == x) to search a list"
+            raise ExpressionError("`in` needs a list of values", self._span(right), hint)
+        span = (self._span(left)[0], self._span(right)[1])
+        value = self.translate(left, depth)
+        pairs = [Call("==", (value, self.translate(item, depth)), span, span) for item in right.elts]
         result = pairs[0]
         for pair in pairs[1:]:
-            result = Call("or", (result, pair), place, place)
-        return Call("not", (result,), place, place) if isinstance(operator, ast.NotIn) else result
+            result = Call("or", (result, pair), span, span)
+        return Call("not", (result,), span, span) if isinstance(operator, ast.NotIn) else result
 
-    def _operation(self, operator: ast.AST, arguments: tuple[Node, ...], place: TextRange) -> Node:
+    def _operation(self, operator: ast.AST, arguments: tuple[Node, ...], span: TextRange) -> Node:
         name = _OPERATORS.get(type(operator))
         if name is None:
+            instead = _PYTHON_ONLY.get(type(operator))
             raise ExpressionError(
                 "this operator is not part of the language",
-                place,
-                "there are + - * / // % ** == != < <= > >= in and or not; is_null(x) for null",
+                span,
+                f"write {instead}"
+                if instead
+                else "use + - * / // % ** == != < <= > >= in and or not; is_null(x) tests for null",
             )
-        return Call(name, arguments, place, place)
+        return Call(name, arguments, span, span)
 
     def _choice(self, node: ast.IfExp, depth: int) -> Node:
-        parts = (self.parse(part, depth) for part in (node.test, node.body, node.orelse))
-        return Ternary(*parts, span=self._place(node))
+        parts = (self.translate(part, depth) for part in (node.test, node.body, node.orelse))
+        return Ternary(*parts, span=self._span(node))
 
     def _call(self, node: ast.Call, depth: int) -> Node:
-        place = self._place(node)
+        span = self._span(node)
         if not isinstance(node.func, ast.Name):
             raise ExpressionError(
-                "only a function can be called", self._place(node.func), "write len(x), not x.len()"
+                "only functions can be called", self._span(node.func), "write len(x), not x.len()"
             )
         if node.keywords:
             raise ExpressionError(
-                "arguments are given by position", self._place(node.keywords[0].value), "drop the name"
+                "functions take positional arguments only",
+                self._span(node.keywords[0].value),
+                "remove the name",
             )
-        name, at = node.func.id, self._place(node.func)
-        arguments = tuple(self.parse(argument, depth) for argument in node.args)
+        name, name_span = node.func.id, self._span(node.func)
+        arguments = tuple(self.translate(argument, depth) for argument in node.args)
         if name == "if_else" and len(arguments) == 3:  # noqa: PLR2004 - condition, then, otherwise
-            return Ternary(*arguments, span=place)
-        return Call(name, arguments, place, at)
+            return Ternary(*arguments, span=span)
+        return Call(name, arguments, span, name_span)
