@@ -1,4 +1,4 @@
-"""This file makes `python -m mosaico_ingest` the `ingest` command."""
+"""The `ingest` command as `python -m mosaico_ingest`."""
 
 from mosaico_ingest.cli.app import main
 

@@ -1,9 +1,10 @@
-"""The `ingest` command: its subcommands, and the conversion of errors to exit codes."""
+"""The `ingest` command: its subcommands, and the exit codes of errors."""
 
 from __future__ import annotations
 
 import io
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
@@ -13,8 +14,9 @@ from typing import Annotated
 
 import typer
 
-from mosaico_ingest.cli.process import collect_rarely
+from mosaico_ingest.cli.process import defer_garbage_collection
 from mosaico_ingest.errors import IngestError, Interrupted
+from mosaico_ingest.findings import one_line
 from mosaico_ingest.version import __version__
 
 __all__ = ["command_line", "main"]
@@ -24,28 +26,56 @@ COMMANDS = {
     "verify": "store", "replay": "run", "export": "export", "lint": "lint", "serve": "serve", "watch": "watch",
     "status": "watch", "report": "report", "schema": "lint",
 }  # fmt: skip
-"""Each command is the function of its name in this module of `cli`; in the order `--help` lists them."""
+"""The module in `cli` that defines each command, in the order of `--help`."""
 GROUPS = {"adapters": "adapters", "store": "store", "keys": "serve"}
-"""Each command group is the Typer application `<name>_app` in this module of `cli`."""
+"""The module in `cli` that defines each command group, as the Typer application `<name>_app`."""
+NAMES = (*COMMANDS, *GROUPS)
+RECORDING_SUFFIXES = (".bag", ".db3", ".mcap", ".zstd")
+MANIFEST_SUFFIXES = (".yaml", ".yml")
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(f"mosaico-ingest {__version__}")
-        raise typer.Exit
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line and exit with the documented code."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in words
+    defer_garbage_collection()
+    # OpenBLAS, which NumPy loads, starts a thread for each core. They take 40 ms of CPU, and no code here uses them.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # file names need not be valid text
+    try:
+        _invoke(_add_command([word for word in words if word != "--debug"]))
+    except IngestError as error:
+        if debug:
+            raise
+        _print_error(error)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        if debug:
+            raise
+        sys.exit(Interrupted.exit_code)
+    except BrokenPipeError:
+        # The reader of the output is gone, as in `ingest inspect x | head`, which is not an error.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+    except OSError as error:  # such as a full disk or a file without write permission
+        if debug:
+            raise
+        _print_error(IngestError(error.strerror or str(error), where=error.filename and str(error.filename)))
+        sys.exit(IngestError.exit_code)
 
 
-def root(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
-    ] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
-) -> None:
-    """Turn ROS recordings into typed, queryable sequences. `ingest job.yaml` runs a job."""
+def _invoke(words: list[str]) -> None:
+    try:
+        command_line(words[:1] if words and words[0] in NAMES else NAMES)(words, prog_name="ingest")
+    except SystemExit as error:
+        if isinstance(error.__context__, BrokenPipeError):  # typer exits with 1 in this case
+            raise error.__context__ from None
+        raise
 
 
-def command_line(names: Sequence[str] = (*COMMANDS, *GROUPS)) -> typer.Typer:
-    """Return the command line with these commands: typer takes 27 ms to take all of them apart, whichever is called."""
+def command_line(names: Sequence[str] = NAMES) -> typer.Typer:
+    """Return the command line with these commands. All of them take 27 ms to import and inspect."""
     app = typer.Typer(
         name="ingest",
         callback=root,
@@ -63,75 +93,49 @@ def command_line(names: Sequence[str] = (*COMMANDS, *GROUPS)) -> typer.Typer:
     return app
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line and exit with the documented code."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    debug = "--debug" in given
-    collect_rarely()
-    # numpy's OpenBLAS starts a thread for each core, and idle ones spin: 40 ms of CPU, and nothing here multiplies matrices.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # as standard error is: a file may have any name
-    try:
-        _run(_with_command([argument for argument in given if argument != "--debug"]))
-    except IngestError as error:
-        if debug:
-            raise
-        _complain(error)
-        sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        if debug:
-            raise
-        sys.exit(Interrupted.exit_code)
-    except BrokenPipeError:
-        # The reader of our output has gone, as in `ingest inspect x | head`: that is no error of ours.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
-    except OSError as error:  # a full disk, a file that may not be written: no mistake of ours
-        if debug:
-            raise
-        _complain(IngestError(error.strerror or str(error), where=error.filename and str(error.filename)))
-        sys.exit(IngestError.exit_code)
+def _print_version(value: bool) -> None:
+    if value:
+        typer.echo(f"mosaico-ingest {__version__}")
+        raise typer.Exit
 
 
-def _run(asked: list[str]) -> None:
-    named = asked[:1] if asked and asked[0] in {*COMMANDS, *GROUPS} else (*COMMANDS, *GROUPS)
-    try:
-        command_line(named)(asked, prog_name="ingest")
-    except SystemExit as leave:
-        if isinstance(leave.__context__, BrokenPipeError):  # typer leaves with 1 then
-            raise leave.__context__ from None
-        raise
+def root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Print the traceback of an error.")] = False,
+) -> None:
+    """Turn ROS recordings into typed, queryable sequences. `ingest job.yaml` runs a job."""
 
 
-def _with_command(arguments: list[str]) -> list[str]:
-    """Put `run` before a manifest that is given alone, and say what is meant by an unknown word."""
-    known = (*COMMANDS, *GROUPS)
-    first = next((argument for argument in arguments if not argument.startswith("-")), None)
-    if first is None or first in known:
-        return arguments
-    suffixes = (".yaml", ".yml")
-    is_value = first != arguments[0] and any(argument.endswith(suffixes) for argument in arguments)
-    if first.endswith(suffixes) or is_value:
-        return ["run", *arguments]
-    if first.endswith((".bag", ".db3", ".mcap", ".zstd")) or Path(first).is_dir():
-        from shlex import quote
-
-        bag = quote(first)
-        hint = f"`ingest bag {bag} --name NAME` ingests it, `ingest init {bag}` drafts a manifest"
-        typer.echo(f"error: {first} is no manifest — {hint}", err=True)
-        sys.exit(2)
+def _add_command(words: list[str]) -> list[str]:
+    """Return the words with `run` before a manifest; exit with a hint if the first word is unknown."""
+    first = next((word for word in words if not word.startswith("-")), None)
+    if first is None or first in NAMES:
+        return words
+    is_option_value = first != words[0] and any(word.endswith(MANIFEST_SUFFIXES) for word in words)
+    if first.endswith(MANIFEST_SUFFIXES) or is_option_value:
+        return ["run", *words]
+    if first.endswith(RECORDING_SUFFIXES) or Path(first).is_dir():
+        bag = shlex.quote(first)
+        hint = f"ingest it with `ingest bag {bag}`, or draft a manifest with `ingest init {bag}`"
+        raise _usage_error(f"{first} is a recording, not a manifest", hint)
     if "/" in first or Path(first).exists():
-        return ["run", *arguments]
-    near = get_close_matches(first, known, n=1)
-    hint = (
-        f"did you mean `ingest {near[0]}`?" if near else "see `ingest --help`; a job is given as a .yaml file"
+        return ["run", *words]
+    close = get_close_matches(first, NAMES, n=1)
+    raise _usage_error(
+        f"{first!r} is neither a command nor a manifest",
+        f"did you mean `ingest {close[0]}`?" if close else "see `ingest --help`",
     )
-    typer.echo(f"error: no command or manifest {first!r} — {hint}", err=True)
-    sys.exit(2)
 
 
-def _complain(error: IngestError) -> None:
+def _usage_error(problem: str, hint: str) -> SystemExit:
+    """Print the problem, and return the exception that exits with the code for wrong usage."""
+    typer.echo(f"error: {one_line(problem)} — {one_line(hint)}", err=True)
+    return SystemExit(2)
+
+
+def _print_error(error: IngestError) -> None:
     from mosaico_ingest.cli.console import print_error
 
     print_error(str(error), error.findings)

@@ -1,124 +1,188 @@
-"""The terminal: escaped output, findings with their source lines, and errors."""
+"""Terminal output: escaped lines, tables, JSON, findings with their source lines, and errors."""
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import sys
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
+from rich.style import StyleType
 from rich.table import Table
 from rich.text import Text
 
-from mosaico_ingest.findings import Finding, Severity, Span, mask_credentials
+from mosaico_ingest.findings import Finding, Severity, Span, mask_credentials, one_line
 
 __all__ = [
+    "STANDARD_OUTPUT",
+    "PlainTable",
     "Terminal",
-    "plain_table",
     "print_error",
+    "print_json",
     "print_line",
+    "read_sources",
     "render_findings",
-    "texts_of",
+    "write_output",
 ]
 
-_CONTROLLING = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-_WIDE = 240
-"""Columns of output that goes to a file or a pipe, where nothing needs to be folded."""
+STANDARD_OUTPUT = Path("-")
+"""The path that output options accept for standard output."""
+FILE_WIDTH = 240
+"""Columns of output that goes to a file or a pipe, where long lines do no harm."""
+EXCERPT_WIDTH = 160
+"""Columns of a source line below a finding."""
+SEVERITY_STYLES = {
+    Severity.ERROR: "bold red",
+    Severity.WARNING: "bold yellow",
+    Severity.INFO: "bold cyan",
+}
+
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+_UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
+_LINE_END = re.compile(r"\r\n|\r|\n")
+_SECRET = re.compile(
+    r"((?:api_?key|password|token|secret)[\"']?\s*[:=]\s*[\"']?|(?=msco_))([^\s\"'$,}][^\s\"',}]*)",
+    re.IGNORECASE,
+)
 
 
 class Terminal(Console):
-    """Prints text as it is: no markup, no emoji names, and a visible sign in place of each control character."""
+    """A console that prints text literally: no markup, no emoji names, visible control characters."""
 
     def __init__(self, *, stderr: bool = False, soft_wrap: bool = False) -> None:
         stream = sys.stderr if stderr else sys.stdout
-        width = None if stream is not None and stream.isatty() else _WIDE  # None where it was closed
+        # The stream is None if the process was started with it closed.
+        width = None if stream is not None and stream.isatty() else FILE_WIDTH
         super().__init__(
             stderr=stderr, soft_wrap=soft_wrap, width=width, markup=False, emoji=False, highlight=False
         )
 
     def on_broken_pipe(self) -> None:
-        """Go on in silence where the reader has gone, as in `ingest job.yaml | head`: what is done, and its exit code, count."""
+        """Discard further output if the reader is gone, so that the run and its exit code are unaffected."""
         self.quiet = True
         os.dup2(os.open(os.devnull, os.O_WRONLY), (sys.stderr if self.stderr else sys.stdout).fileno())
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        """Render as every console does, then take the controls out of the text."""
+        """Render as rich does, and replace the control characters of the text."""
         for segment in super().render(renderable, options):
             yield (
-                segment if segment.control else Segment(_CONTROLLING.sub(_sign, segment.text), segment.style)
+                segment
+                if segment.control
+                else Segment(_CONTROL.sub(_control_picture, segment.text), segment.style)
             )
 
 
-def plain_table(*names: str, numbers: Collection[str] = ()) -> Table:
-    """Return a table without lines whose columns fold what is long, except those of `numbers`."""
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for name in names:
-        number = name in numbers
-        table.add_column(name, justify="right" if number else "left", overflow="fold", no_wrap=number)
-    return table
+class PlainTable(Table):
+    """A table without borders. Text cells are single lines, with control characters escaped.
+
+    Columns in `numbers` are right-aligned and never wrapped. Other columns fold long text, or end in an
+    ellipsis if `ellipsis` is set.
+    """
+
+    def __init__(self, *names: str, numbers: Collection[str] = (), ellipsis: bool = False) -> None:
+        super().__init__(box=None, pad_edge=False, header_style="dim")
+        for name in names:
+            number = name in numbers
+            self.add_column(
+                name,
+                justify="right" if number else "left",
+                overflow="ellipsis" if ellipsis else "fold",
+                no_wrap=number,
+            )
+
+    def add_row(
+        self,
+        *renderables: RenderableType | None,
+        style: StyleType | None = None,
+        end_section: bool = False,
+    ) -> None:
+        """Add a row; a line break inside a name must not look like a line of our own."""
+        cells = (Text(one_line(cell)) if isinstance(cell, str) else cell for cell in renderables)
+        super().add_row(*cells, style=style, end_section=end_section)
 
 
-def print_line(line: str, *, stderr: bool = False) -> None:
-    """Print a line that may hold what a recording, a manifest or a file name says."""
-    Terminal(stderr=stderr, soft_wrap=True).print(Text(line))
+def print_line(line: str, *, style: str = "", stderr: bool = False) -> None:
+    """Print one line, escaping line breaks and control characters of names and reasons."""
+    Terminal(stderr=stderr, soft_wrap=True).print(Text(one_line(line), style=style))
 
 
-def _sign(match: re.Match[str]) -> str:
-    code = ord(match[0])
-    return chr(0x2400 + code) if code < 0x20 else "\ufffd"  # noqa: PLR2004 - Unicode has a picture of each C0 control
+def print_json(value: object, *, default: Callable[[Any], object] = str) -> None:
+    """Print a value as indented JSON; `default` converts members that JSON cannot represent."""
+    sys.stdout.write(json.dumps(value, indent=2, ensure_ascii=False, default=default) + "\n")
 
 
-_STYLES = {Severity.ERROR: "bold red", Severity.WARNING: "bold yellow", Severity.INFO: "bold cyan"}
-_SECRET = re.compile(
-    r"((?:api_?key|password|token|secret)[\"']?\s*[:=]\s*[\"']?|(?=msco_))([^\s\"'$,}][^\s\"',}]*)",
-    re.IGNORECASE,
-)
-_UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
-_LINE_END = re.compile(r"\r\n|\r|\n")
-_WIDTH = 160
+def write_output(path: Path, text: str, *, announce: bool = False) -> None:
+    """Write the text of an output option: to a file, or to standard output if the path is `-`.
+
+    With `announce`, print the name of the file to standard error.
+
+    Raises:
+        SinkError: The file cannot be written.
+    """
+    from mosaico_ingest.textfile import write_whole
+
+    if path == STANDARD_OUTPUT:
+        sys.stdout.write(text)
+        return
+    write_whole(path, text)
+    if announce:
+        print_line(f"wrote {path}", stderr=True)
 
 
-def render_findings(findings: Iterable[Finding], texts: Mapping[str, str]) -> Text:
-    """Return the findings with their source lines; `texts` holds what is known of the files, by name."""
-    return Text("\n\n").join(_finding(finding, texts) for finding in findings)
+def print_error(error: str, findings: Sequence[Finding]) -> None:
+    """Print an error to standard error: its findings if it has any, otherwise its message."""
+    console = Terminal(stderr=True, soft_wrap=True)
+    if findings:
+        console.print(render_findings(findings, read_sources(findings)))
+    else:
+        console.print(Text.assemble(("error: ", "bold red"), one_line(error)))
 
 
-def texts_of(findings: Iterable[Finding]) -> dict[str, str]:
-    """Read the files that findings point into; what cannot be read is left out."""
-    texts: dict[str, str] = {}
+def read_sources(findings: Iterable[Finding]) -> dict[str, str]:
+    """Return the text of the files that findings point into, by file name, without unreadable files."""
+    sources: dict[str, str] = {}
     for file in {finding.span.file for finding in findings if finding.span is not None}:
         with suppress(OSError):
-            texts[file] = Path(file).read_text(encoding="utf-8", errors="replace")
-    return texts
+            sources[file] = Path(file).read_text(encoding="utf-8", errors="replace")
+    return sources
 
 
-def _finding(finding: Finding, texts: Mapping[str, str]) -> Text:
+def render_findings(findings: Iterable[Finding], sources: Mapping[str, str]) -> Text:
+    """Return the findings with excerpts of `sources`, the texts of the files by name."""
+    return Text("\n\n").join(_render_finding(finding, sources) for finding in findings)
+
+
+def _render_finding(finding: Finding, sources: Mapping[str, str]) -> Text:
+    style = SEVERITY_STYLES[finding.severity]
     text = Text()
     if finding.span is not None:
-        text.append(f"{finding.span}: ", style="bold")
-    text.append(f"{finding.severity.value}[{finding.rule}]", style=_STYLES[finding.severity])
-    text.append(f" {mask_credentials(finding.message)}")
+        text.append(one_line(f"{finding.span}: "), style="bold")
+    text.append(f"{finding.severity.value}[{finding.rule}]", style=style)
+    text.append(one_line(f" {mask_credentials(finding.message)}"))
     gutter = 0
-    if finding.span is not None and finding.span.file in texts:
+    if finding.span is not None and finding.span.file in sources:
         gutter = len(str(finding.span.line))
-        text.append(_excerpt(finding.span, texts[finding.span.file], _STYLES[finding.severity]))
+        text.append(_excerpt(finding.span, sources[finding.span.file], style))
     if finding.help is not None:
         text.append(f"\n{' ' * gutter} = help: ", style="bold")
-        text.append(mask_credentials(finding.help))
+        text.append(one_line(mask_credentials(finding.help)))
     return text
 
 
 def _excerpt(span: Span, source: str, style: str) -> Text:
-    """Return the line with its number, and carets under the span; nothing where there is no such line."""
+    """Return the numbered source line with carets under the span, or nothing if the line is empty."""
     lines = _LINE_END.split(source.removeprefix("\ufeff"))
     if span.line > len(lines) or not lines[span.line - 1].strip():
         return Text()
-    line = _UNPRINTABLE.sub(" ", _SECRET.sub(_mask, mask_credentials(lines[span.line - 1], same_length=True)))
+    line = mask_credentials(lines[span.line - 1], same_length=True)
+    line = _UNPRINTABLE.sub(" ", _SECRET.sub(_mask, line))
     start = min(span.column - 1, len(line))
     end = span.end_column - 1 if span.end_line == span.line else len(line)
     line, start, end = _crop(line, start, max(end, start + 1))
@@ -130,22 +194,18 @@ def _excerpt(span: Span, source: str, style: str) -> Text:
 
 
 def _crop(line: str, start: int, end: int) -> tuple[str, int, int]:
-    """Cut a long line down to what surrounds the span."""
-    if len(line) <= _WIDTH:
+    """Return the part of a long line that surrounds the span, and the span's columns in it."""
+    if len(line) <= EXCERPT_WIDTH:
         return line, start, end
-    left = max(0, min(start - _WIDTH // 4, len(line) - _WIDTH))
-    shown = line[left : left + _WIDTH]
-    return shown, start - left, min(end - left, len(shown))
+    offset = max(0, min(start - EXCERPT_WIDTH // 4, len(line) - EXCERPT_WIDTH))
+    excerpt = line[offset : offset + EXCERPT_WIDTH]
+    return excerpt, start - offset, min(end - offset, len(excerpt))
 
 
 def _mask(match: re.Match[str]) -> str:
     return match[1] + "*" * len(match[2])
 
 
-def print_error(error: str, findings: Sequence[Finding]) -> None:
-    """Print to standard error."""
-    console = Terminal(stderr=True, soft_wrap=True)
-    if findings:
-        console.print(render_findings(findings, texts_of(findings)))
-    else:
-        console.print(Text.assemble(("error: ", "bold red"), error))
+def _control_picture(match: re.Match[str]) -> str:
+    code = ord(match[0])
+    return chr(0x2400 + code) if code < 0x20 else "\ufffd"  # noqa: PLR2004 - Unicode has a picture of each C0 control

@@ -1,4 +1,4 @@
-"""This file is `ingest export`: a stored sequence back as a recording."""
+"""`ingest export`."""
 
 from __future__ import annotations
 
@@ -12,44 +12,52 @@ if TYPE_CHECKING:
 
 __all__ = ["export"]
 
-NOT_ALL = 4
-"""The exit code where something was left out, or would not come out the same."""
+INCOMPLETE = 4
+"""Exit code if a topic was excluded, or if ingesting the file would not give the same rows."""
 
 
 def export(
-    sequence: Annotated[str, typer.Argument(metavar="SEQUENCE", help="The sequence to write.")],
+    sequence: Annotated[str, typer.Argument(metavar="SEQUENCE", help="The sequence to export.")],
     *,
     to: Annotated[
         Path,
-        typer.Option("--to", help="The recording: .mcap, .db3 (ROS 2) or .bag (ROS 1).", metavar="FILE"),
+        typer.Option(
+            "--to", help="The recording to write: .mcap, .db3 (ROS 2) or .bag (ROS 1).", metavar="FILE"
+        ),
     ],
     store: Annotated[
-        str, typer.Option("--store", help="The store's folder or URL.", metavar="DIR|URL")
+        str, typer.Option("--store", help="Folder or URL of the store.", metavar="DIR|URL")
     ] = "mosaico",
     topics: Annotated[
         list[str] | None,
-        typer.Option("--topics", "-t", help="Topic or glob; a leading ! leaves out. Repeatable."),
+        typer.Option(
+            "--topics",
+            "-t",
+            help="Topic name or glob, such as /cam/*; !GLOB excludes. Repeatable.",
+            metavar="GLOB",
+        ),
     ] = None,
     start: Annotated[
-        str | None, typer.Option("--start", help="Instant, or +10s after the first message.")
+        str | None,
+        typer.Option("--start", help="First instant, or +10s after the first message.", metavar="TIME"),
     ] = None,
     end: Annotated[
-        str | None, typer.Option("--end", help="Instant, or -10s before the last message; not included.")
+        str | None,
+        typer.Option(
+            "--end", help="End, exclusive: an instant, or -10s before the last message.", metavar="TIME"
+        ),
     ] = None,
     adapter: Annotated[
         list[str] | None,
-        typer.Option(
-            "--adapter", help="An adapter of your own that made the rows. Repeatable.", metavar="REF"
-        ),
+        typer.Option("--adapter", help="Custom adapter that created the rows. Repeatable.", metavar="REF"),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", "-f", help="Replace the file if it is there.")] = False,
+    force: Annotated[bool, typer.Option("--force", "-f", help="Replace an existing file.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Write a sequence back as a recording, with its messages' own definitions.
+    """Export a sequence as a recording with the original message definitions.
 
-    Exits with 4 where a topic was left out, or would not give the same rows if the file were ingested.
+    Exit codes: 0 complete, 4 a topic was excluded or would not give the same rows if the file were ingested.
     """
-    from mosaico_ingest.cli.report import print_json
     from mosaico_ingest.destinations.store import Store
     from mosaico_ingest.export import export_sequence
 
@@ -60,21 +68,21 @@ def export(
         sequence,
         to,
         topics=topics or (),
-        start_ns=_instant("--start", start, info.start_ns, info.end_ns),
-        end_ns=_instant("--end", end, info.start_ns, info.end_ns),
+        start_ns=_instant_ns("--start", start, info.start_ns, info.end_ns),
+        end_ns=_instant_ns("--end", end, info.start_ns, info.end_ns),
         adapters=adapter or (),
         replace=force,
     )
     if as_json:
-        print_json(report.model_dump_json(indent=2))
+        typer.echo(report.model_dump_json(indent=2))
     else:
-        _print(report)
+        _print_export(report)
     if not report.faithful:
-        raise typer.Exit(NOT_ALL)
+        raise typer.Exit(INCOMPLETE)
 
 
-def _instant(option: str, text: str | None, first_ns: int | None, last_ns: int | None) -> int | None:
-    """Return ns since the epoch; an offset counts from the first message, a negative one from the last."""
+def _instant_ns(option: str, text: str | None, first_ns: int | None, last_ns: int | None) -> int | None:
+    """Return ns since the epoch; `+` counts from the first message, `-` back from the last."""
     from mosaico_ingest.job.units import parse_instant, parse_offset
 
     if text is None:
@@ -82,40 +90,37 @@ def _instant(option: str, text: str | None, first_ns: int | None, last_ns: int |
     try:
         if not text.startswith(("+", "-")):
             return parse_instant(text)
-        offset = parse_offset(text)
+        offset_ns = parse_offset(text)
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint=option) from None
-    return ((last_ns if offset < 0 else first_ns) or 0) + offset
+    return ((last_ns if offset_ns < 0 else first_ns) or 0) + offset_ns
 
 
-def _print(report: ExportReport) -> None:
-    from rich.text import Text
+def _print_export(report: ExportReport) -> None:
+    from mosaico_ingest.cli.console import PlainTable, Terminal, print_line
+    from mosaico_ingest.report.units import bytes_text, count_text, counted
 
-    from mosaico_ingest.cli.console import plain_table
-    from mosaico_ingest.cli.report import open_console
-    from mosaico_ingest.report.units import bytes_text, count_text
-
-    console = open_console()
-    table = plain_table("topic", "type", "adapter", "messages", numbers={"messages"})
+    table = PlainTable("topic", "type", "adapter", "messages", numbers={"messages"})
     for topic in report.topics:
         if not topic.excluded:
             table.add_row(topic.topic, topic.msgtype, topic.adapter, count_text(topic.messages))
-    console.print(table)
+    Terminal().print(table)
     for topic in report.topics:
-        for line in _remarks(topic):
-            console.print(Text(f"{topic.topic}: {line}", style="yellow"), soft_wrap=True)
-    said = "" if report.faithful else "; not all of it would come out the same if it were ingested"
-    line = f"{report.path}: {count_text(report.messages)} messages, {bytes_text(report.bytes)}{said}"
-    console.print(Text(line, style="green" if report.faithful else "yellow"), soft_wrap=True)
+        for difference in _differences(topic):
+            print_line(f"{topic.topic}: {difference}", style="yellow")
+    warning = "" if report.faithful else "; some rows would differ if the file were ingested"
+    line = f"{report.path}: {counted(report.messages, 'message')}, {bytes_text(report.bytes)}{warning}"
+    print_line(line, style="green" if report.faithful else "yellow")
 
 
-def _remarks(topic: TopicExport) -> list[str]:
-    """Say in words what the messages lack."""
-    lines = [f"left out: {topic.excluded}"] if topic.excluded else []
-    lines += [f"{column} cannot be undone ({how})" for column, how in topic.not_undone.items()]
+def _differences(topic: TopicExport) -> list[str]:
+    """Return how the exported messages differ from the original ones."""
+    lines = [f"excluded: {topic.excluded}"] if topic.excluded else []
+    lines += [f"{column} cannot be inverted ({reason})" for column, reason in topic.not_undone.items()]
     if topic.unknown:
         lines.append(f"not in the store, written as zero or empty: {', '.join(topic.unknown)}")
     lines += [
-        f"{column} would come out otherwise in {count:,} messages" for column, count in topic.changed.items()
+        f"{column} would differ in {count:,} messages after ingestion"
+        for column, count in topic.changed.items()
     ]
     return lines

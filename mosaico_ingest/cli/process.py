@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import signal
 import sys
@@ -18,99 +17,102 @@ if TYPE_CHECKING:
     from mosaico_ingest.job.config import ROSInjectionConfig
 
 __all__ = [
-    "collect_as_usual",
-    "collect_rarely",
-    "end_on_signals",
-    "forgo_pandas",
-    "interrupt_on_terminate",
-    "share_heaps",
+    "collect_garbage_as_usual",
+    "defer_garbage_collection",
+    "exit_on_signals",
+    "hide_pandas",
+    "interrupt_on_sigterm",
+    "limit_heaps",
 ]
 
+DEFAULT_THRESHOLD = gc.get_threshold()
+IMPORT_THRESHOLD = 500_000
+"""Allocations between two collections during start-up: more than all imports make."""
+M_ARENA_MAX = -8
+"""glibc's parameter for the maximum number of heaps."""
 
-def interrupt_on_terminate() -> None:
-    """Treat SIGTERM as Ctrl-C, so that the session policy applies to both."""
+
+def interrupt_on_sigterm() -> None:
+    """Treat SIGTERM like Ctrl-C, so that the session policy applies to both."""
     signal.signal(signal.SIGTERM, _interrupt)
-
-
-def end_on_signals() -> None:
-    """Let a signal end the process without a word: all is done, and what it would raise now only a traceback could say."""
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _interrupt(_signal: int, _frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-_USUAL = gc.get_threshold()
-_RARELY = 500_000
-"""Objects made between two collections, more than all imports make: what an import makes is never garbage."""
+def exit_on_signals() -> None:
+    """Let SIGTERM and SIGINT end the process without a traceback, once all work is done."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def collect_rarely() -> None:
-    """Put collections off while modules are imported: they took an eighth of the start-up."""
-    gc.set_threshold(_RARELY, *_USUAL[1:])
+def defer_garbage_collection() -> None:
+    """Collect garbage rarely during start-up: imports produce none, and looking for it took 12 % of the time."""
+    gc.set_threshold(IMPORT_THRESHOLD, *DEFAULT_THRESHOLD[1:])
 
 
-def collect_as_usual() -> None:
-    """Collect as usual once all is imported, and never look at that again: at the exit alone it took 70 ms."""
+def collect_garbage_as_usual() -> None:
+    """Restore the default thresholds, and exclude all imported objects from collection.
+
+    Without the exclusion, the collection at exit alone takes 70 ms.
+    """
     gc.freeze()
-    gc.set_threshold(*_USUAL)
+    gc.set_threshold(*DEFAULT_THRESHOLD)
 
 
-class _Absent:
-    """Finds no pandas, and leaves every other module to those who look after it."""
+def hide_pandas(configs: Sequence[ROSInjectionConfig] = ()) -> None:
+    """Make pyarrow conclude that pandas is absent, unless Python adapters run, which may return series.
+
+    pyarrow imports pandas with the first array, which takes longer than a short run. Programs can still import
+    pandas afterwards; only pyarrow no longer recognizes its objects inside lists.
+    """
+    if "pandas" in sys.modules or any(map(_uses_python_adapters, configs)) or _has_installed_adapters():
+        return
+    import numpy as np
+    import pyarrow as pa
+
+    sys.meta_path.insert(0, _NoPandas)
+    try:
+        pa.array(np.zeros(1))
+        pa.array([0])
+    finally:
+        sys.meta_path.remove(_NoPandas)
+
+
+class _NoPandas:
+    """An import hook that hides pandas and leaves every other module to the next hook."""
 
     @staticmethod
-    def find_spec(name: str, *_where: object) -> ModuleSpec | None:
+    def find_spec(name: str, *_arguments: object) -> ModuleSpec | None:
         if name == "pandas":
             raise ModuleNotFoundError(name)
         return None
 
 
-def forgo_pandas(configs: Sequence[ROSInjectionConfig] = ()) -> None:
-    """Make pyarrow conclude that there is no pandas, unless adapters in Python run: they may pass series.
-
-    Whoever imports pandas later gets it; only pyarrow no longer recognises its objects inside lists.
-    """
-    if "pandas" in sys.modules or any(map(_runs_python, configs)) or _adapters_installed():
-        return
-    import numpy as np
-    import pyarrow as pa
-
-    sys.meta_path.insert(0, _Absent)
-    try:
-        pa.array(np.zeros(1))
-        pa.array([0])
-    finally:
-        sys.meta_path.remove(_Absent)
-
-
-def _runs_python(config: ROSInjectionConfig) -> bool:
+def _uses_python_adapters(config: ROSInjectionConfig) -> bool:
     references = (*config.adapters, *config.adapter_override.values())
     return any(not str(reference).endswith((".yaml", ".yml")) for reference in references)
 
 
-def _adapters_installed() -> bool:
+def _has_installed_adapters() -> bool:
     from mosaico_ingest.adapters.bridge import installed_adapters
 
     try:
         return bool(installed_adapters())
     except AdapterError:
-        return True  # using them says what is wrong
+        return True  # the run reports the error when it uses them
 
 
-_M_ARENA_MAX = -8
-"""glibc's name for the number of heaps."""
+def limit_heaps(count: int = 2) -> None:
+    """Let all threads share a few heaps, so that a server's short-lived threads do not keep one each.
 
-
-def share_heaps(count: int = 2) -> None:
-    """Let all threads allocate from a few heaps: a server's many short-lived threads each keep one otherwise.
-
-    Elsewhere than on glibc only Arrow's part is done.
+    On other C libraries than glibc, only the memory pool of Arrow changes.
     """
+    import ctypes
+
     import pyarrow as pa
 
     pa.set_memory_pool(pa.system_memory_pool())
     with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, count)
+        ctypes.CDLL(None).mallopt(M_ARENA_MAX, count)

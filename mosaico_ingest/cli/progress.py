@@ -1,28 +1,29 @@
-"""Progress of a run: a live table in a terminal, occasional lines elsewhere."""
+"""Progress of a run on standard error: a live table in a terminal, text lines elsewhere, or JSON lines."""
 
 from __future__ import annotations
 
+import sys
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.progress_bar import ProgressBar
-from rich.table import Table
 from rich.text import Text
 
-from mosaico_ingest.cli.console import Terminal, plain_table
+from mosaico_ingest.cli.console import PlainTable, Terminal
+from mosaico_ingest.cli.logs import json_line
 from mosaico_ingest.errors import IngestError
+from mosaico_ingest.findings import one_line
 from mosaico_ingest.report.events import (
     BatchObserver,
     Event,
     Expected,
     Noted,
-    Observer,
     Rejected,
     RunFinished,
     RunStarted,
@@ -30,87 +31,113 @@ from mosaico_ingest.report.events import (
     TopicProgress,
     Unreadable,
 )
-from mosaico_ingest.report.units import (
-    bytes_text,
-    count_text,
-    counted,
-    seconds_text,
-)
+from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text
 
 if TYPE_CHECKING:
     from mosaico_ingest.job.config import ROSInjectionConfig
     from mosaico_ingest.remote import AnyPath
 
 __all__ = [
-    "BatchBoard",
-    "BatchLines",
+    "JsonLines",
+    "LiveTable",
     "Tally",
-    "Underway",
-    "display",
-    "print_nothing",
-    "sizes_of",
-    "unreadable_text",
+    "TextLines",
+    "headline",
+    "live_display",
+    "recording_sizes",
 ]
 
-_FAILED = {RunStatus.FAILED, RunStatus.INTERRUPTED}
-_MOST_LOOKED_AT = 10_000
-"""Recordings; the sizes of more are not worth the wait on a slow file system."""
-_SURE_S = 3.0
-"""Before that, what is left is a guess."""
+LINE_INTERVAL_S = 5.0
+"""Seconds between two lines about the progress of the run."""
+MAX_ROWS = 30
+"""Topics in the live table; the busiest come first."""
+MAX_SIZED_RECORDINGS = 10_000
+"""Recordings above which sizes are not determined, because that takes too long on a slow file system."""
+MIN_ESTIMATE_S = 3.0
+"""Seconds before the remaining time is estimated; earlier estimates are unreliable."""
 
 
 @dataclass(slots=True)
-class Underway:
-    """A recording in work."""
+class TopicTally:
+    """The messages of one topic so far."""
+
+    expected: Expected
+    read: int = 0
+    written: int = 0
+    rejected: int = 0
+
+
+@dataclass(slots=True)
+class RecordingTally:
+    """The messages of one active recording so far."""
 
     start: RunStarted
-    promised: int
-    read: int = 0
-    rejected: int = 0
+    topics: dict[str, TopicTally]
+    """By name in the sequence, without excluded topics."""
     payload_bytes: int = 0
 
     @property
+    def promised(self) -> int:
+        """Messages that the recording's index promises; 0 if it has no index."""
+        return sum(topic.expected.count or 0 for topic in self.topics.values())
+
+    @property
+    def read(self) -> int:
+        """Messages read."""
+        return sum(topic.read for topic in self.topics.values())
+
+    @property
+    def rejected(self) -> int:
+        """Messages rejected."""
+        return sum(topic.rejected for topic in self.topics.values())
+
+    @property
     def share(self) -> float:
-        """How much of it is read, from 0 to 1."""
+        """Share of the messages that is read, from 0 to 1."""
         return min(self.read / self.promised, 1.0) if self.promised else 0.0
 
 
 @dataclass(slots=True)
 class Tally:
-    """What is known of a batch of recordings of these sizes in bytes; events come in, totals are looked at."""
+    """Progress of a batch of recordings, summed up from events."""
 
     sizes: Sequence[int]
-    began: float = field(default_factory=time.monotonic)
-    at_work: dict[int, Underway] = field(default_factory=dict[int, Underway])
-    done: int = 0
+    """Bytes of each recording, by position in the batch."""
+    started: float = field(default_factory=time.monotonic)
+    active: dict[int, RecordingTally] = field(default_factory=dict[int, RecordingTally])
+    """Recordings that have started and not finished, by position in the batch."""
+    finished: int = 0
     failed: int = 0
     _read: int = 0
     _rejected: int = 0
     _payload_bytes: int = 0
-    _done_bytes: int = 0
+    _finished_bytes: int = 0
     _unread_bytes: int = 0
+    """Bytes of recordings that finished without reading: skipped, or failed immediately."""
 
     def add(self, position: int, event: Event) -> None:
-        """Take one event of the recording at this position."""
+        """Add one event of the recording at this position."""
         match event:
             case RunStarted():
-                promised = sum(topic.count or 0 for topic in event.topics if not topic.excluded)
-                self.at_work[position] = Underway(event, promised)
+                topics = {topic.target: TopicTally(topic) for topic in event.topics if not topic.excluded}
+                self.active[position] = RecordingTally(event, topics)
             case TopicProgress():
-                self.at_work[position].read += event.read
-                self.at_work[position].payload_bytes += event.payload_bytes
+                recording = self.active[position]
+                recording.topics[event.target].read += event.read
+                recording.topics[event.target].written += event.written
+                recording.payload_bytes += event.payload_bytes
             case Rejected():
-                self.at_work[position].rejected += event.count
+                self.active[position].topics[event.target].rejected += event.count
             case RunFinished():
                 self._finish(position, event)
             case _:
                 pass
 
     def _finish(self, position: int, event: RunFinished) -> None:
-        self.done += 1
-        self.failed += event.status in _FAILED
-        self._done_bytes += self.sizes[position]
-        recording = self.at_work.pop(position, None)
+        self.finished += 1
+        self.failed += event.status in {RunStatus.FAILED, RunStatus.INTERRUPTED}
+        self._finished_bytes += self.sizes[position]
+        recording = self.active.pop(position, None)
         if recording is None or not recording.read:
             self._unread_bytes += self.sizes[position]
         else:
@@ -120,51 +147,56 @@ class Tally:
 
     @property
     def recordings(self) -> int:
-        """How many there are in all."""
+        """Number of recordings in the batch."""
         return len(self.sizes)
 
     @property
     def read(self) -> int:
-        """Messages read so far."""
-        return self._read + sum(one.read for one in self.at_work.values())
+        """Messages read."""
+        return self._read + sum(recording.read for recording in self.active.values())
 
     @property
     def rejected(self) -> int:
-        """Messages rejected so far."""
-        return self._rejected + sum(one.rejected for one in self.at_work.values())
+        """Messages rejected."""
+        return self._rejected + sum(recording.rejected for recording in self.active.values())
 
     @property
     def payload_bytes(self) -> int:
-        """Bytes of the messages read so far."""
-        return self._payload_bytes + sum(one.payload_bytes for one in self.at_work.values())
+        """Bytes of the messages read."""
+        return self._payload_bytes + sum(recording.payload_bytes for recording in self.active.values())
 
     @property
     def elapsed_s(self) -> float:
-        """Seconds since it began, never 0."""
-        return max(time.monotonic() - self.began, 1e-9)
+        """Seconds since the start, never 0."""
+        return max(time.monotonic() - self.started, 1e-9)
 
     @property
     def share(self) -> float:
-        """How much of the batch is done, from 0 to 1, by size."""
-        return min(self._bytes() / max(sum(self.sizes), 1), 1.0)
+        """Share of the batch that is read, from 0 to 1, weighted by size."""
+        return min(self._read_bytes() / max(sum(self.sizes), 1), 1.0)
 
     @property
-    def left_s(self) -> float | None:
-        """Seconds to go at the speed so far, None before there is one; what was skipped, or failed at once, says nothing of it."""
-        worked = self._bytes() - self._unread_bytes
-        left = sum(self.sizes) - self._bytes()
-        known = worked > 0 and left > 0 and self.elapsed_s >= _SURE_S
-        return self.elapsed_s * left / worked if known else None
+    def remaining_s(self) -> float | None:
+        """Estimated seconds until the end, or None if there is no estimate yet.
 
-    def _bytes(self) -> float:
-        parts = (self.sizes[position] * one.share for position, one in self.at_work.items())
-        return self._done_bytes + sum(parts)
+        Recordings that were skipped or failed immediately do not count towards the speed.
+        """
+        read_bytes = self._read_bytes() - self._unread_bytes
+        remaining_bytes = sum(self.sizes) - self._read_bytes()
+        if read_bytes <= 0 or remaining_bytes <= 0 or self.elapsed_s < MIN_ESTIMATE_S:
+            return None
+        return self.elapsed_s * remaining_bytes / read_bytes
+
+    def _read_bytes(self) -> float:
+        return self._finished_bytes + sum(
+            self.sizes[position] * recording.share for position, recording in self.active.items()
+        )
 
 
-def sizes_of(configs: Sequence[ROSInjectionConfig]) -> list[int]:
-    """Return how large each recording is, in bytes; where that is not known of all, they count alike."""
+def recording_sizes(configs: Sequence[ROSInjectionConfig]) -> list[int]:
+    """Return the size of each recording in bytes, or 1 for each if a size is unknown."""
     sizes: list[int] = []
-    if len(configs) <= _MOST_LOOKED_AT:
+    if len(configs) <= MAX_SIZED_RECORDINGS:
         with suppress(OSError, IngestError, ValueError):
             sizes.extend(max(1, sum(map(_size, config.paths))) for config in configs)
     return sizes if len(sizes) == len(configs) else [1] * len(configs)
@@ -174,98 +206,220 @@ def _size(path: AnyPath) -> int:
     if isinstance(path, Path):
         return sum(_size(part) for part in path.iterdir()) if path.is_dir() else path.stat().st_size
     if path.listed is None:
-        raise ValueError("nobody has listed it, and asking for each takes long")
+        raise ValueError("the size is unknown, and a request for each recording takes too long")
     return path.listed.st_size
 
 
-LINE_EVERY_S = 5.0
+def headline(tally: Tally) -> str:
+    """Return one line with the totals, the rates and the remaining time."""
+    alone = tally.recordings == 1
+    parts: list[str] = []
+    if not alone:
+        parts += [f"{tally.finished} of {counted(tally.recordings, 'recording')}"]
+        parts += [f"{tally.failed} failed"] if tally.failed else []
+    if tally.read:
+        promised = sum(recording.promised for recording in tally.active.values()) if alone else 0
+        share = f"{count_text(tally.read)} of " if promised else ""
+        parts += [f"{share}{counted(promised or tally.read, 'message')}"]
+        parts += [f"{count_text(tally.rejected)} rejected"] if tally.rejected else []
+        rate = count_text(round(tally.read / tally.elapsed_s))
+        parts += [f"{rate} msg/s, {bytes_text(tally.payload_bytes / tally.elapsed_s)}/s"]
+    parts += [f"{seconds_text(tally.remaining_s)} left"] if tally.remaining_s is not None else []
+    name = next((f"{recording.start.sequence}: " for recording in tally.active.values()), "")
+    return one_line(f"{name if alone else ''}{', '.join(parts)}")
 
 
-class BatchLines:
-    """An observer that prints a line for each recording that ends, and one on the whole every few seconds."""
+@contextmanager
+def live_display(tally: Tally) -> Generator[BatchObserver]:
+    """Yield the observer that shows a batch on standard error: live in a terminal, as lines elsewhere."""
+    console = Terminal(stderr=True)
+    if not console.is_terminal:
+        yield TextLines(console, tally)
+        return
+    table = LiveTable(tally)
+    with Live(get_renderable=table.render, console=console, refresh_per_second=8, transient=True) as live:
+        table.print = live.console.print
+        yield table
+
+
+class TextLines:
+    """An observer that prints a line when something happens, and the progress every few seconds."""
 
     def __init__(self, console: Console, tally: Tally) -> None:
         self._console = console
-        self._batch = tally
-        self._next = time.monotonic() + LINE_EVERY_S
+        self._tally = tally
+        self._next = time.monotonic() + LINE_INTERVAL_S
 
     def __call__(self, position: int, event: Event) -> None:
-        """Take one event."""
-        recording = self._batch.at_work.get(position)
-        self._batch.add(position, event)
-        name = recording.start.sequence if recording else f"recording {position + 1}"
+        """Add one event."""
+        recording = self._tally.active.get(position)
+        self._tally.add(position, event)
+        alone = self._tally.recordings == 1
         match event:
-            case Noted():
-                self._print(f"{name}: note: {event.finding}")
-            case Unreadable():
-                self._print(f"{name}: {unreadable_text(event)}")
-            case RunFinished():
-                self._print(f"{name}: {_ending(recording, event)}")
+            case RunStarted() if alone and event.topics:
+                self._print(_start_text(event))
+            case RunFinished() if not alone:
+                self._print(f"{_prefix(self._tally, position, recording)}{_finish_text(recording, event)}")
+            case Noted() | Unreadable():
+                self._print(f"{_prefix(self._tally, position, recording)}{_event_text(event)}")
             case _:
                 pass
-        if time.monotonic() >= self._next:
-            self._print(headline(self._batch))
-            self._next = time.monotonic() + LINE_EVERY_S
+        if time.monotonic() >= self._next and not (alone and isinstance(event, RunFinished)):
+            self._print(headline(self._tally))
+            self._next = time.monotonic() + LINE_INTERVAL_S
 
     def _print(self, line: str) -> None:
-        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+        self._console.print(one_line(line), markup=False, highlight=False, soft_wrap=True)
 
 
-class BatchBoard:
-    """An observer that keeps a table of the recordings in work; rich asks it for the picture."""
+class LiveTable:
+    """An observer that renders a table: of the topics of a single recording, or of the active recordings."""
 
     def __init__(self, tally: Tally) -> None:
-        self._batch = tally
-        self.say = print_nothing
+        self._tally = tally
+        self.print: Callable[[Text], None] = lambda _line: None
+        """Prints a line above the table, once the display runs."""
 
     def __call__(self, position: int, event: Event) -> None:
-        """Take one event."""
-        recording = self._batch.at_work.get(position)
-        self._batch.add(position, event)
-        name = recording.start.sequence if recording else f"recording {position + 1}"
+        """Add one event."""
+        recording = self._tally.active.get(position)
+        self._tally.add(position, event)
+        prefix = _prefix(self._tally, position, recording)
         match event:
             case Noted():
-                self.say(Text(f"{name}: note: {event.finding}", style="yellow"))
+                self._print(f"{prefix}{_event_text(event)}", "yellow")
             case Unreadable():
-                self.say(Text(f"{name}: {unreadable_text(event)}", style="red"))
-            case RunFinished() if event.error is not None:
-                self.say(Text(f"{name}: {_ending(recording, event)}", style="red"))
+                self._print(f"{prefix}{_event_text(event)}", "red")
+            case RunFinished() if event.error is not None and self._tally.recordings > 1:
+                self._print(f"{prefix}{_finish_text(recording, event)}", "red")
             case _:
                 pass
 
+    def _print(self, line: str, style: str) -> None:
+        self.print(Text(one_line(line), style=style))
+
     def render(self) -> RenderableType:
-        """Return the picture."""
-        batch = self._batch
-        table = plain_table()
-        table.add_column("recording", overflow="ellipsis")
-        for column in ("read", "of", "rejected"):
-            table.add_column(column, justify="right", no_wrap=True)
-        for one in tuple(batch.at_work.values()):
-            promised = count_text(one.promised) if one.promised else "?"
-            table.add_row(one.start.sequence, count_text(one.read), promised, count_text(one.rejected))
-        bar = ProgressBar(total=1.0, completed=batch.share, width=40)
-        rows: list[RenderableType] = [table] if batch.at_work else []
-        return Group(*rows, Text(headline(batch), style="bold"), bar)
+        """Return the table, the totals and a progress bar; nothing once a single recording has finished."""
+        tally = self._tally
+        active = tuple(tally.active.values())
+        alone = tally.recordings == 1
+        if alone and not active:
+            return Text("")
+        tables = [_topic_table(active[0]) if alone else _recording_table(active)] if active else []
+        bar = ProgressBar(total=1.0, completed=tally.share, width=40)
+        return Group(*tables, Text(headline(tally), style="bold"), bar)
 
 
-def headline(batch: Tally) -> str:
-    """Return the totals, the rates and the time left as a line."""
-    parts = [f"{batch.done} of {batch.recordings} recordings"]
-    parts += [f"{batch.failed} failed"] if batch.failed else []
-    if batch.read:
-        parts += [counted(batch.read, "message")]
-        parts += [f"{count_text(batch.rejected)} rejected"] if batch.rejected else []
-        rate = count_text(round(batch.read / batch.elapsed_s))
-        parts += [f"{rate} msg/s, {bytes_text(batch.payload_bytes / batch.elapsed_s)}/s"]
-    parts += [f"{seconds_text(batch.left_s)} left"] if batch.left_s is not None else []
-    return ", ".join(parts)
+class JsonLines:
+    """An observer that writes JSON lines: started, progress, note, unreadable and finished."""
+
+    def __init__(self, tally: Tally) -> None:
+        self._tally = tally
+        self._next = time.monotonic() + LINE_INTERVAL_S
+
+    def __call__(self, position: int, event: Event) -> None:
+        """Add one event."""
+        previous = self._tally.active.get(position)
+        self._tally.add(position, event)
+        recording = self._tally.active.get(position, previous)
+        match event:
+            case RunStarted():
+                values = {"files": event.files, "source_bytes": event.source_bytes}
+                self._write(position, recording, "started", values)
+            case TopicProgress() if recording is not None and time.monotonic() >= self._next:
+                self._next = time.monotonic() + LINE_INTERVAL_S
+                self._write(
+                    position, recording, "progress", {"read": recording.read, "batch": self._totals()}
+                )
+            case Noted():
+                self._write(position, recording, "note", {"message": str(event.finding)})
+            case Unreadable():
+                values = {"topic": event.target, "count": event.count, "message": event.reason}
+                self._write(position, recording, "unreadable", values)
+            case RunFinished():
+                counts = {
+                    "read": recording.read if recording else 0,
+                    "rejected": recording.rejected if recording else 0,
+                }
+                values = {"status": event.status.value, "error": event.error, **counts}
+                self._write(position, recording, "finished", values)
+            case _:
+                pass
+
+    def _totals(self) -> dict[str, Any]:
+        """Return the progress of the batch; `remaining_s` is null without an estimate."""
+        tally = self._tally
+        return {
+            "recordings": tally.recordings,
+            "finished": tally.finished,
+            "failed": tally.failed,
+            "active": [recording.start.sequence for recording in tally.active.values()],
+            "read": tally.read,
+            "rejected": tally.rejected,
+            "payload_bytes": tally.payload_bytes,
+            "elapsed_s": round(tally.elapsed_s, 3),
+            "remaining_s": None if tally.remaining_s is None else round(tally.remaining_s, 3),
+        }
+
+    def _write(
+        self, position: int, recording: RecordingTally | None, event: str, values: dict[str, Any]
+    ) -> None:
+        sequence = recording.start.sequence if recording else None
+        sys.stderr.write(json_line(event, recording=position, sequence=sequence, **values) + "\n")
 
 
-def print_nothing(*_: object) -> None:
-    """Stand in until the live display runs."""
+def _topic_table(recording: RecordingTally) -> PlainTable:
+    names = ("topic", "ontology", "read", "written", "rejected")
+    table = PlainTable(*names, numbers={"read", "written", "rejected"}, ellipsis=True)
+    topics = sorted(recording.topics.values(), key=lambda topic: -topic.read)
+    for topic in topics[:MAX_ROWS]:
+        table.add_row(
+            topic.expected.target,
+            topic.expected.ontology,
+            count_text(topic.read),
+            count_text(topic.written),
+            Text(count_text(topic.rejected), style="red" if topic.rejected else "dim"),
+        )
+    if len(topics) > MAX_ROWS:
+        table.add_row(f"… and {len(topics) - MAX_ROWS} more", "", "", "", "")
+    return table
 
 
-def _ending(recording: Underway | None, event: RunFinished) -> str:
+def _recording_table(recordings: Sequence[RecordingTally]) -> PlainTable:
+    names = ("recording", "read", "of", "rejected")
+    table = PlainTable(*names, numbers={"read", "of", "rejected"}, ellipsis=True)
+    for recording in recordings:
+        promised = count_text(recording.promised) if recording.promised else "?"
+        rejected = count_text(recording.rejected)
+        table.add_row(recording.start.sequence, count_text(recording.read), promised, rejected)
+    return table
+
+
+def _prefix(tally: Tally, position: int, recording: RecordingTally | None) -> str:
+    """Return the name of a recording for lines about a batch, and nothing for a single recording."""
+    if tally.recordings == 1:
+        return ""
+    return f"{recording.start.sequence}: " if recording else f"recording {position + 1}: "
+
+
+def _start_text(start: RunStarted) -> str:
+    selected = sum(not topic.excluded for topic in start.topics)
+    source = f"{', '.join(start.files)} ({bytes_text(start.source_bytes)})"
+    return f"{start.sequence}: {counted(selected, 'topic')} from {source} to {start.destination}"
+
+
+def _event_text(event: Noted | Unreadable) -> str:
+    """Return the text of a finding, or the count, topic, offset and reason of an unreadable range."""
+    if isinstance(event, Noted):
+        return f"note: {event.finding}"
+    count = counted(event.count, "message") if event.count else ""
+    topic = f"of {event.target}" if count and event.target else event.target or ""
+    offset = "" if event.offset is None else f"at {event.offset}"
+    location = " ".join(part for part in (count, topic, offset) if part)
+    return f"unreadable: {location}: {event.reason}" if location else f"unreadable: {event.reason}"
+
+
+def _finish_text(recording: RecordingTally | None, event: RunFinished) -> str:
     if event.error is not None:
         return f"{event.status.value}: {event.error}"
     if event.status is RunStatus.SKIPPED:
@@ -273,180 +427,3 @@ def _ending(recording: Underway | None, event: RunFinished) -> str:
     read = recording.read if recording else 0
     rejected = f", {count_text(recording.rejected)} rejected" if recording and recording.rejected else ""
     return f"{event.status.value}, {counted(read, 'message')}{rejected}"
-
-
-def unreadable_text(event: Unreadable) -> str:
-    """Return what could not be read, as far as that can be told: how much, of which topic, where, and why."""
-    what = counted(event.count, "message") if event.count else ""
-    of = f"of {event.target}" if what and event.target else event.target or ""
-    at = "" if event.offset is None else f"at {event.offset}"
-    place = " ".join(part for part in (what, of, at) if part)
-    return f"unreadable: {place}: {event.reason}" if place else f"unreadable: {event.reason}"
-
-
-PLAIN_EVERY_S = 5.0
-MAX_ROWS = 30
-"""Topics shown at once; the busiest come first."""
-
-
-@contextmanager
-def display(tally: Tally) -> Generator[BatchObserver]:
-    """Yield the observer that draws one recording or a batch of them, on standard error."""
-    console = Terminal(stderr=True)
-    if not console.is_terminal:
-        lines = BatchLines(console, tally) if tally.recordings > 1 else _Lines(console)
-        yield lines if isinstance(lines, BatchLines) else _alone(lines)
-        return
-    board = BatchBoard(tally) if tally.recordings > 1 else _Board()
-    with Live(get_renderable=board.render, console=console, refresh_per_second=8, transient=True) as live:
-        board.say = live.console.print
-        yield board if isinstance(board, BatchBoard) else _alone(board)
-
-
-def _alone(observe: Observer) -> BatchObserver:
-    """Return the observer of a batch of one."""
-
-    def tell(_position: int, event: Event) -> None:
-        observe(event)
-
-    return tell
-
-
-@dataclass(slots=True)
-class _Count:
-    expected: Expected
-    read: int = 0
-    written: int = 0
-    rejected: int = 0
-
-
-@dataclass(slots=True)
-class _Tally:
-    """What both displays know of the recording in work."""
-
-    start: RunStarted | None = None
-    began: float = 0.0
-    topics: dict[str, _Count] = field(default_factory=dict[str, _Count])
-    payload_bytes: int = 0
-
-    def add(self, event: Event) -> None:
-        match event:
-            case RunStarted():
-                self.start, self.began, self.payload_bytes = event, time.monotonic(), 0
-                self.topics = {t.target: _Count(t) for t in event.topics if not t.excluded}
-            case TopicProgress():
-                count = self.topics[event.target]
-                count.read += event.read
-                count.written += event.written
-                self.payload_bytes += event.payload_bytes
-            case Rejected():
-                self.topics[event.target].rejected += event.count
-            case _:
-                pass
-
-    @property
-    def elapsed_s(self) -> float:
-        return max(time.monotonic() - self.began, 1e-9)
-
-    def sums(self) -> tuple[int, int, int, int]:
-        """Return messages read, written, rejected and promised."""
-        counts = self.topics.values()
-        return (
-            sum(c.read for c in counts),
-            sum(c.written for c in counts),
-            sum(c.rejected for c in counts),
-            sum(c.expected.count or 0 for c in counts),
-        )
-
-    def headline(self) -> str:
-        read, _, rejected, promised = self.sums()
-        share = f" of {count_text(promised)}" if promised else ""
-        lost = f", {count_text(rejected)} rejected" if rejected else ""
-        rate = f"{count_text(round(read / self.elapsed_s))} msg/s, {bytes_text(self.payload_bytes / self.elapsed_s)}/s"
-        name = self.start.sequence if self.start else ""
-        return f"{name}: {count_text(read)}{share} messages{lost} ({rate})"
-
-
-class _Lines:
-    """An observer that prints a line when a recording begins, and every few seconds while it goes on."""
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._tally = _Tally()
-        self._next = 0.0
-
-    def __call__(self, event: Event) -> None:
-        self._tally.add(event)
-        now = time.monotonic()
-        match event:
-            case RunStarted() if event.topics:
-                self._print(_begins(event))
-                self._next = now + PLAIN_EVERY_S
-            case Noted():
-                self._print(f"note: {event.finding}")
-            case Unreadable():
-                self._print(unreadable_text(event))
-            case TopicProgress() if now >= self._next:
-                self._print(self._tally.headline())
-                self._next = now + PLAIN_EVERY_S
-            case _:
-                pass
-
-    def _print(self, line: str) -> None:
-        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
-
-
-class _Board:
-    """An observer that keeps a table of topics; rich asks it for the picture."""
-
-    def __init__(self) -> None:
-        self._tally = _Tally()
-        self._done = False
-        self.say = print_nothing
-
-    def __call__(self, event: Event) -> None:
-        self._tally.add(event)
-        match event:
-            case RunStarted():
-                self._done = False
-            case RunFinished():
-                self._done = True
-            case Noted():
-                self.say(Text(f"note: {event.finding}", style="yellow"))
-            case Unreadable():
-                self.say(Text(unreadable_text(event), style="red"))
-            case _:
-                pass
-
-    def render(self) -> RenderableType:
-        if self._tally.start is None or self._done:
-            return Text("")
-        read, _, _, promised = self._tally.sums()
-        bar = ProgressBar(total=max(promised, 1), completed=min(read, promised), width=40)
-        return Group(self._table(), Text(self._tally.headline(), style="bold"), bar)
-
-    def _table(self) -> Table:
-        table = plain_table()
-        table.add_column("topic", overflow="ellipsis")
-        table.add_column("ontology", style="cyan", overflow="ellipsis")
-        for column in ("read", "written", "rejected"):
-            table.add_column(column, justify="right", no_wrap=True)
-        counts = sorted(self._tally.topics.values(), key=lambda count: -count.read)
-        for count in counts[:MAX_ROWS]:
-            rejected = Text(count_text(count.rejected), style="red" if count.rejected else "dim")
-            table.add_row(
-                count.expected.target,
-                count.expected.ontology,
-                count_text(count.read),
-                count_text(count.written),
-                rejected,
-            )
-        if len(counts) > MAX_ROWS:
-            table.add_row(f"… and {len(counts) - MAX_ROWS} more", "", "", "", "")
-        return table
-
-
-def _begins(start: RunStarted) -> str:
-    taken = sum(not topic.excluded for topic in start.topics)
-    size = bytes_text(start.source_bytes)
-    return f"{start.sequence}: {counted(taken, 'topic')} from {', '.join(start.files)} ({size}) to {start.destination}"

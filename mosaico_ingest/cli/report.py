@@ -1,24 +1,25 @@
-"""`ingest report` and `inspect`, and their tables."""
+"""`ingest report` and `inspect`."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 from rich.text import Text
 
-from mosaico_ingest.cli.console import Terminal, plain_table
+from mosaico_ingest.cli.console import PlainTable, Terminal, print_line, write_output
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.units import (
     bytes_text,
     count_text,
     counted,
+    rate_text,
     seconds_text,
+    stored_text,
     time_text,
+    written_text,
 )
 
 if TYPE_CHECKING:
@@ -27,243 +28,234 @@ if TYPE_CHECKING:
 
 __all__ = [
     "inspect",
-    "open_console",
     "print_inspection",
-    "print_json",
     "print_report",
     "report",
 ]
 
-COLUMNS = ("read", "written", "rejected", "rate", "payload", "stored")
-ROOMY = 100
-"""Columns of a terminal that has room for all of them."""
-MANY = 3
-"""More recordings than that get a line each instead of a table each."""
-MOST_REASONS = 20
-"""Lines of a batch that say why messages were rejected."""
-STATUS_STYLE = {RunStatus.COMPLETED: "green", RunStatus.REJECTED: "yellow", RunStatus.SKIPPED: "dim"}
-
-
-def open_console() -> Console:
-    """Return standard output as wide as it is, or wide enough where it is no terminal."""
-    return Terminal()
-
-
-def print_json(text: str) -> None:
-    """Write JSON to standard output as it is."""
-    sys.stdout.write(text + "\n")
-
-
-def print_inspection(found: Inspection, *, as_json: bool) -> None:
-    """Print what a recording holds."""
-    if as_json:
-        print_json(found.model_dump_json(indent=2))
-        return
-    console = open_console()
-    span = ""
-    if found.duration_s is not None:
-        span = f", {time_text(found.start_ns)} .. {time_text(found.end_ns)} UTC ({seconds_text(found.duration_s)})"
-    messages = "? messages" if found.messages is None else counted(found.messages, "message")
-    console.print(Text(f"{', '.join(found.files)}", style="bold"))
-    console.print(f"{found.container}, {bytes_text(found.size_bytes)}, {messages}{span}", soft_wrap=True)
-    names = ("topic", "type", "messages", "rate", "definition", "becomes", "adapter")
-    table = plain_table(*names, numbers={"messages", "rate"})
-    for topic in found.topics:
-        count = "?" if topic.count is None else count_text(topic.count)
-        rate = "" if topic.rate_hz is None else f"{topic.rate_hz:.1f} Hz"
-        style = None if topic.ontology else "yellow"
-        table.add_row(
-            topic.topic,
-            topic.msgtype,
-            count,
-            rate,
-            topic.definition,
-            topic.ontology or "-",
-            topic.adapter,
-            style=style,
-        )
-    console.print(table if found.topics else "no topics")
-    for topic in found.topics:
-        if topic.problem and not any(topic.problem in finding for finding in found.findings):
-            console.print(Text(f"{topic.topic}: {topic.problem}", style="yellow"), soft_wrap=True)
-    for finding in found.findings:
-        console.print(Text(f"note: {finding}", style="yellow"), soft_wrap=True)
-
-
-def print_report(report: RunReport) -> None:
-    """Print what was done."""
-    console = open_console()
-    if len(report.recordings) > MANY:
-        _print_batch(report, console)
-        return
-    for recording in report.recordings:
-        _print_recording(recording, console)
-
-
-def _print_batch(report: RunReport, console: Console) -> None:
-    """Print a line for each recording, and the sums."""
-    table = plain_table("sequence")
-    table.add_column("status", no_wrap=True)
-    for column in ("topics", "read", "written", "rejected", "stored", "time"):
-        table.add_column(column, justify="right", no_wrap=True)
-    for one in report.recordings:
-        totals, taken = one.totals, sum(t.status is not TopicStatus.EXCLUDED for t in one.topics)
-        counts = (taken, totals.read, totals.written, totals.rejected)
-        style = STATUS_STYLE.get(one.status, "red")
-        table.add_row(
-            one.sequence,
-            Text(one.status.value, style=style),
-            *map(count_text, counts),
-            bytes_text(totals.stored_bytes),
-            seconds_text(one.duration_s),
-        )
-    console.print(table)
-    reasons = [f"{one.sequence}: {line}" for one in report.recordings for line in _rejections(one)]
-    for line in reasons[:MOST_REASONS]:
-        console.print(Text(line, style="yellow"), soft_wrap=True)
-    if len(reasons) > MOST_REASONS:
-        more = counted(len(reasons) - MOST_REASONS, "more reason")
-        console.print(Text(f"… and {more}, which --report FILE keeps", style="yellow"), soft_wrap=True)
-    style = "green" if report.exit_code in {0, 4} else "red"
-    console.print(Text(report.headline, style=style), soft_wrap=True)
-
-
-def _print_recording(report: Report, console: Console) -> None:
-    if report.status is RunStatus.SKIPPED:
-        console.print(f"{report.sequence}: skipped, the same content is there already", highlight=False)
-    if report.status is RunStatus.SKIPPED or not report.topics:
-        return
-    if report.status is RunStatus.FAILED and not report.totals.read:
-        return  # the error says it all
-    columns = COLUMNS if console.width >= ROOMY else tuple(c for c in COLUMNS if c not in {"rate", "payload"})
-    table = plain_table("topic")
-    table.add_column("ontology", style="cyan", overflow="fold")
-    for column in columns:
-        table.add_column(column, justify="right", no_wrap=True)
-    for topic in report.topics:
-        if topic.status is not TopicStatus.EXCLUDED:
-            cells = _cells(topic)
-            table.add_row(topic.target, topic.ontology, *(cells[column] for column in columns))
-    console.print(table)
-    _print_excluded(report, console)
-    for line in _rejections(report):
-        console.print(Text(line, style="yellow"), soft_wrap=True)
-    _print_totals(report, console)
-
-
-def _rejections(report: Report) -> Iterator[str]:
-    """Yield how many messages of each topic were rejected, and why."""
-    for topic in report.topics:
-        for one in topic.rejections:
-            yield f"{topic.target}: {count_text(one.count)} rejected [{one.rule}]: {one.reason}"
-
-
-def _cells(topic: TopicReport) -> dict[str, str | Text]:
-    return {
-        "read": count_text(topic.read),
-        "written": count_text(topic.written),
-        "rejected": Text(count_text(topic.rejected), style="red" if topic.rejected else "dim"),
-        "rate": "" if topic.rate_hz is None else f"{topic.rate_hz:.1f} Hz",
-        "payload": bytes_text(topic.payload_bytes),
-        "stored": bytes_text(topic.stored_bytes),
-    }
-
-
-def _print_excluded(report: Report, console: Console) -> None:
-    """Print the topics that were not read, those with the same reason together."""
-    reasons: dict[str, list[str]] = {}
-    for topic in report.topics:
-        if topic.status is TopicStatus.EXCLUDED:
-            reasons.setdefault(topic.why, []).append(topic.topic)
-    for why, topics in reasons.items():
-        console.print(Text(f"left out {', '.join(topics)}: {why}", style="dim"), soft_wrap=True)
-
-
-def _sizes(report: Report) -> str:
-    """Compare what is stored with the source where all of it was taken, else with the messages read."""
-    stored = report.totals.stored_bytes
-    taken = [topic for topic in report.topics if topic.status is not TopicStatus.EXCLUDED]
-    promised = sum(topic.promised or 0 for topic in taken)
-    partial = len(taken) < len(report.topics) or report.totals.read < promised
-    before = report.totals.payload_bytes if partial else report.source_bytes
-    what = " of messages" if partial else ""
-    change = f", {stored / before:.0%}" if before else ""
-    return f"{bytes_text(before)}{what} stored in {bytes_text(stored)}{change}"
-
-
-def _print_totals(report: Report, console: Console) -> None:
-    totals = report.totals
-    parts = [f"{count_text(totals.written)} of {count_text(totals.read)} messages written"]
-    if totals.rejected:
-        parts.append(f"{count_text(totals.rejected)} rejected")
-    if report.unreadable_ranges:
-        lost = sum(item.count or 0 for item in report.unreadable_ranges)
-        parts.append(f"{count_text(lost)} unreadable" if lost else "some unreadable")
-    if totals.downsampled:
-        parts.append(f"{count_text(totals.downsampled)} sampled away")
-    if totals.stored_bytes:
-        parts.append(_sizes(report))
-    rate = totals.read / report.duration_s if report.duration_s else 0
-    parts.append(f"{seconds_text(report.duration_s)}, {count_text(round(rate))} msg/s")
-    style = STATUS_STYLE.get(report.status, "red")
-    console.print(
-        Text(f"{report.sequence} in {report.destination}: {', '.join(parts)}", style=style), soft_wrap=True
-    )
+WIDE = 100
+"""Terminal columns from which all columns of a report's table fit."""
+MAX_TABLES = 3
+"""Recordings above which each gets one row in a common table instead of a table of its topics."""
+MAX_REASONS = 20
+"""Reasons of rejections printed for a batch."""
+STATUS_STYLES = {
+    RunStatus.COMPLETED: "green",
+    RunStatus.REJECTED: "yellow",
+    RunStatus.SKIPPED: "dim",
+    RunStatus.FAILED: "red",
+    RunStatus.INTERRUPTED: "red",
+}
 
 
 def inspect(
     path: Annotated[
-        str, typer.Argument(metavar="BAG", help="A recording: a file, a rosbag2 directory, or a URL.")
+        str, typer.Argument(metavar="BAG", help="A .bag, .db3 or .mcap file, a rosbag2 directory, or a URL.")
     ],
     ros_distro: Annotated[
-        str | None, typer.Option("--ros-distro", help="As ros2_humble; for recordings without definitions.")
+        str | None,
+        typer.Option(
+            "--ros-distro",
+            help="Distro of recordings without definitions, such as ros2_humble.",
+            metavar="DISTRO",
+        ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """List topics, types, counts, rates, time span, definitions and the adapter each topic would get."""
+    """List a recording's topics with type, count, rate, definition and adapter, without reading messages."""
     from mosaico_ingest import api
-    from mosaico_ingest.cli.process import collect_as_usual, forgo_pandas
+    from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas
 
-    collect_as_usual()
-    forgo_pandas()
-    print_inspection(api.inspect_recording(path, ros_distro=ros_distro), as_json=as_json)
+    collect_garbage_as_usual()
+    hide_pandas()
+    inspection = api.inspect_recording(path, ros_distro=ros_distro)
+    if as_json:
+        typer.echo(inspection.model_dump_json(indent=2))
+    else:
+        print_inspection(inspection)
+
+
+def print_inspection(inspection: Inspection) -> None:
+    """Print the files, the topics and the findings of a recording."""
+    span = ""
+    if inspection.duration_s is not None:
+        start, end = time_text(inspection.start_ns), time_text(inspection.end_ns)
+        span = f", {start} .. {end} UTC ({seconds_text(inspection.duration_s)})"
+    messages = "? messages" if inspection.messages is None else counted(inspection.messages, "message")
+    print_line(", ".join(inspection.files), style="bold")
+    print_line(f"{inspection.container}, {bytes_text(inspection.size_bytes)}, {messages}{span}")
+    names = ("topic", "type", "messages", "rate", "definition", "becomes", "adapter")
+    table = PlainTable(*names, numbers={"messages", "rate"})
+    for topic in inspection.topics:
+        table.add_row(
+            topic.topic,
+            topic.msgtype,
+            "?" if topic.count is None else count_text(topic.count),
+            rate_text(topic.rate_hz),
+            topic.definition,
+            topic.ontology or "-",
+            topic.adapter,
+            style=None if topic.ontology else "yellow",
+        )
+    Terminal().print(table if inspection.topics else "no topics")
+    for topic in inspection.topics:
+        if topic.problem and not any(topic.problem in finding for finding in inspection.findings):
+            print_line(f"{topic.topic}: {topic.problem}", style="yellow")
+    for finding in inspection.findings:
+        print_line(f"note: {finding}", style="yellow")
 
 
 def report(
     paths: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN.json", help="What `ingest run --report RUN.json` wrote; several add up."),
+        typer.Argument(
+            metavar="RUN.json", help="Report files of `ingest run --report`; several are combined."
+        ),
     ],
     *,
     html: Annotated[
-        Path | None, typer.Option("--html", metavar="FILE", help="Write one page that needs nothing else.")
+        Path | None,
+        typer.Option("--html", metavar="FILE", help="Write a self-contained page; - writes it to stdout."),
     ] = None,
     markdown: Annotated[
-        Path | None, typer.Option("--markdown", metavar="FILE", help="Write a summary for a CI job's page.")
+        Path | None,
+        typer.Option(
+            "--markdown", metavar="FILE", help="Write a summary for a CI job; - writes it to stdout."
+        ),
     ] = None,
 ) -> None:
-    """Show a report: as tables here, as a page, as Markdown."""
-    from mosaico_ingest.cli.console import print_line
+    """Show report files as tables, as an HTML page, or as a Markdown summary."""
     from mosaico_ingest.report.html import html_page
     from mosaico_ingest.report.markdown import markdown_summary
     from mosaico_ingest.report.model import read_report
-    from mosaico_ingest.textfile import write_whole
 
-    parts = [read_report(path) for path in paths]
-    found = parts[0].model_copy(
+    reports = [read_report(path) for path in paths]
+    combined = reports[0].model_copy(
         update={
-            "manifests": tuple(dict.fromkeys(one for part in parts for one in part.manifests)),
-            "recordings": tuple(one for part in parts for one in part.recordings),
+            "manifests": tuple(dict.fromkeys(used for one in reports for used in one.manifests)),
+            "recordings": tuple(recording for one in reports for recording in one.recordings),
         }
     )
     if html is not None:
-        write_whole(html, html_page(found, html.parent))
-        typer.echo(f"wrote {html}", err=True)
+        write_output(html, html_page(combined, html.parent), announce=True)
     if markdown is not None:
-        write_whole(markdown, markdown_summary(found))
-        typer.echo(f"wrote {markdown}", err=True)
+        write_output(markdown, markdown_summary(combined), announce=True)
     if html is None and markdown is None:
-        print_report(found)
-        for one in found.recordings:
-            if one.error is not None:
-                print_line(f"error: {one.error}")
+        print_report(combined)
+        for recording in combined.recordings:
+            if recording.error is not None:
+                print_line(f"error: {recording.error}")
+
+
+def print_report(report: RunReport, *, stderr: bool = False) -> None:
+    """Print a table of topics for each recording, or a table of recordings if there are many."""
+    if len(report.recordings) > MAX_TABLES:
+        _print_batch(report, stderr=stderr)
+        return
+    for recording in report.recordings:
+        _print_recording(recording, stderr=stderr)
+
+
+def _print_batch(report: RunReport, *, stderr: bool) -> None:
+    names = ("sequence", "status", "topics", "read", "written", "rejected", "stored", "time")
+    table = PlainTable(*names, numbers=set(names[1:]))
+    table.columns[1].justify = "left"
+    for recording in report.recordings:
+        totals = recording.totals
+        table.add_row(
+            recording.sequence,
+            Text(recording.status.value, style=STATUS_STYLES[recording.status]),
+            count_text(sum(topic.status is not TopicStatus.EXCLUDED for topic in recording.topics)),
+            count_text(totals.read),
+            count_text(totals.written),
+            count_text(totals.rejected),
+            bytes_text(totals.stored_bytes),
+            seconds_text(recording.duration_s),
+        )
+    Terminal(stderr=stderr).print(table)
+    reasons = [
+        f"{recording.sequence}: {reason}"
+        for recording in report.recordings
+        for reason in _rejections(recording)
+    ]
+    for reason in reasons[:MAX_REASONS]:
+        print_line(reason, style="yellow", stderr=stderr)
+    if len(reasons) > MAX_REASONS:
+        more = counted(len(reasons) - MAX_REASONS, "more reason")
+        print_line(f"… and {more}; --report FILE writes all of them", style="yellow", stderr=stderr)
+    print_line(report.headline, style="green" if report.exit_code in {0, 4} else "red", stderr=stderr)
+
+
+def _print_recording(report: Report, *, stderr: bool) -> None:
+    if report.status is RunStatus.SKIPPED:
+        print_line(f"{report.sequence}: skipped, it already has the same content", stderr=stderr)
+        return
+    if not report.topics or (report.status is RunStatus.FAILED and not report.totals.read):
+        return  # the error that follows is sufficient
+    console = Terminal(stderr=stderr)
+    names = ("topic", "ontology", "read", "written", "rejected", "rate", "payload", "stored")
+    if console.width < WIDE:
+        names = tuple(name for name in names if name not in {"rate", "payload"})
+    table = PlainTable(*names, numbers=set(names[2:]))
+    for topic in report.topics:
+        if topic.status is not TopicStatus.EXCLUDED:
+            cells = _topic_cells(topic)
+            table.add_row(*(cells[name] for name in names))
+    console.print(table)
+    _print_excluded(report, stderr=stderr)
+    for reason in _rejections(report):
+        print_line(reason, style="yellow", stderr=stderr)
+    line = f"{report.sequence} in {report.destination}: {', '.join(_totals(report))}"
+    print_line(line, style=STATUS_STYLES[report.status], stderr=stderr)
+
+
+def _topic_cells(topic: TopicReport) -> dict[str, str | Text]:
+    return {
+        "topic": topic.target,
+        "ontology": topic.ontology,
+        "read": count_text(topic.read),
+        "written": count_text(topic.written),
+        "rejected": Text(count_text(topic.rejected), style="red" if topic.rejected else "dim"),
+        "rate": rate_text(topic.rate_hz),
+        "payload": bytes_text(topic.payload_bytes),
+        "stored": bytes_text(topic.stored_bytes),
+    }
+
+
+def _print_excluded(report: Report, *, stderr: bool) -> None:
+    """Print the excluded topics, one line for each reason."""
+    reasons: dict[str, list[str]] = {}
+    for topic in report.topics:
+        if topic.status is TopicStatus.EXCLUDED:
+            reasons.setdefault(topic.why, []).append(topic.topic)
+    for reason, topics in reasons.items():
+        print_line(f"excluded {', '.join(topics)}: {reason}", style="dim", stderr=stderr)
+
+
+def _rejections(report: Report) -> Iterator[str]:
+    """Yield a line for each topic and reason of rejected messages."""
+    for topic in report.topics:
+        for rejection in topic.rejections:
+            count = count_text(rejection.count)
+            yield f"{topic.target}: {count} rejected [{rejection.rule}]: {rejection.reason}"
+
+
+def _totals(report: Report) -> Iterator[str]:
+    totals = report.totals
+    yield written_text(report)
+    if totals.rejected:
+        yield f"{count_text(totals.rejected)} rejected"
+    if report.unreadable_ranges:
+        unreadable = sum(item.count or 0 for item in report.unreadable_ranges)
+        yield f"{count_text(unreadable)} unreadable" if unreadable else "some unreadable"
+    if totals.downsampled:
+        yield f"{count_text(totals.downsampled)} downsampled"
+    if totals.stored_bytes:
+        # Only a complete recording can be compared with the size of its files.
+        selected = [topic for topic in report.topics if topic.status is not TopicStatus.EXCLUDED]
+        is_part = len(selected) < len(report.topics) or totals.read < sum(t.promised or 0 for t in selected)
+        size = totals.payload_bytes if is_part else report.source_bytes
+        source = f"{bytes_text(size)} of messages" if is_part else bytes_text(size)
+        yield f"{source} {stored_text(size, totals.stored_bytes)}"
+    rate = totals.read / report.duration_s if report.duration_s else 0
+    yield f"{seconds_text(report.duration_s)}, {count_text(round(rate))} msg/s"

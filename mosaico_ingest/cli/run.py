@@ -1,26 +1,25 @@
-"""`ingest run`, `bag` and `replay`."""
+"""`ingest run`, `bag` and `replay`, and the function that runs configurations for all three."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from mosaico_ingest.cli.logs import JsonLines, LogFormat, LogOption, set_up_logging
-from mosaico_ingest.cli.process import collect_as_usual, interrupt_on_terminate
+from mosaico_ingest.cli.logs import LogFormat, LogOption, set_up_logging
+from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas, interrupt_on_sigterm
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.report.events import BatchObserver, Event, RunFinished, ignore_batch
 
 if TYPE_CHECKING:
     from mosaico_ingest.executors.in_process import Executor
-    from mosaico_ingest.findings import Finding
     from mosaico_ingest.job.config import ROSInjectionConfig
     from mosaico_ingest.report.model import RunReport, UsedManifest
 
@@ -29,152 +28,129 @@ __all__ = [
     "replay",
     "run",
     "run_configs",
+    "send_telemetry",
     "take_shard",
-    "telemetry",
 ]
 
 T = TypeVar("T")
 
+SUCCESSFUL = {0, 4}
+"""Exit codes of runs that wrote every message that could be written."""
+REPLAY_NOTES = {
+    "STORED": "its messages are already in the sequence",
+    "FORGOTTEN": "the run that quarantined it did not commit its sequence; ingest the recording again",
+}
+"""Why a file of quarantined messages is not replayed."""
 
-def take_shard(items: Sequence[T], shard: str) -> list[T]:
-    """Return every n-th item from the i-th on, for a shard written `i/n` with i from 1.
-
-    Raises:
-        ManifestError: It is written otherwise.
-    """
-    first, _, count = shard.partition("/")
-    if not (first.isdecimal() and count.isdecimal() and 1 <= int(first) <= int(count)):
-        raise ManifestError(
-            f"--shard is {shard!r}", hint="write the shard and how many there are, as 1/8 .. 8/8"
-        )
-    return list(items[int(first) - 1 :: int(count)])
-
-
-@contextmanager
-def telemetry(wanted: bool) -> Generator[BatchObserver]:
-    """Yield the observer that sends metrics and traces, each unless the environment says `none`.
-
-    Raises:
-        IngestError: OpenTelemetry is not installed.
-    """
-    if not wanted:
-        yield ignore_batch
-        return
-    from mosaico_ingest.report.telemetry import Telemetry
-
-    sender = Telemetry(metrics=_is_on("OTEL_METRICS_EXPORTER"), traces=_is_on("OTEL_TRACES_EXPORTER"))
-    try:
-        yield sender
-    finally:
-        sender.close()
+ReportOption = Annotated[
+    Path | None,
+    typer.Option("--report", metavar="FILE", help="Write the report as JSON; - writes it to stdout."),
+]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 
 
-def _is_on(variable: str) -> bool:
-    return os.environ.get(variable, "") != "none"
+class ExecutorName(str, Enum):
+    """Where recordings are ingested."""
+
+    LOCAL = "local"
+    RAY = "ray"
 
 
-P = ParamSpec("P")
-
-
-def run_configs(
-    configs: Sequence[ROSInjectionConfig],
+def run(
+    manifests: Annotated[
+        list[Path] | None, typer.Argument(metavar="JOB.yaml", help="Job manifests, run in this order.")
+    ] = None,
     *,
-    report: Path | None,
-    quiet: bool,
-    log: str | None,
-    jobs: int | None = None,
-    executor: Executor | None = None,
-    log_format: LogFormat = LogFormat.TEXT,
-    manifests: Sequence[UsedManifest] = (),
-    watching: BatchObserver = ignore_batch,
-    finished: Callable[[RunReport], None] = lambda _result: None,
+    plan: Annotated[
+        Path | None,
+        typer.Option(
+            "--plan", help="Run this plan; fail if manifest or recordings have changed.", metavar="FILE"
+        ),
+    ] = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            "--jobs", "-j", min=1, max=1024, help="Recordings ingested in parallel; overrides run.jobs."
+        ),
+    ] = None,
+    executor: Annotated[
+        ExecutorName, typer.Option("--executor", help="Ingest on this machine, or on a Ray cluster.")
+    ] = ExecutorName.LOCAL,
+    address: Annotated[
+        str | None,
+        typer.Option(
+            "--address",
+            help="Address of the Ray cluster: auto or HOST:PORT. If omitted, Ray starts on this machine.",
+            metavar="ADDRESS",
+        ),
+    ] = None,
+    shard: Annotated[
+        str | None,
+        typer.Option(
+            "--shard", metavar="I/N", help="Ingest only the I-th of N equal shares of the recordings."
+        ),
+    ] = None,
+    report: ReportOption = None,
+    metrics: Annotated[
+        Path | None,
+        typer.Option(
+            "--metrics",
+            help="Write totals for the textfile collector of Prometheus; - writes them to stdout.",
+            metavar="FILE",
+        ),
+    ] = None,
+    otel: Annotated[
+        bool,
+        typer.Option("--otel", help="Send metrics and traces, as configured by the OTEL_... variables."),
+    ] = False,
+    quiet: QuietOption = False,
+    log: LogOption = None,
+    log_format: Annotated[
+        LogFormat, typer.Option("--log-format", help="Write progress and log records as text or JSON lines.")
+    ] = LogFormat.TEXT,
 ) -> None:
-    """Run the configurations, several at a time where asked for; exit with the report's code unless it is 0."""
+    """Ingest the recordings of job manifests, or exactly the decisions of a plan."""
     from mosaico_ingest import api
-    from mosaico_ingest.report.model import write_report
+    from mosaico_ingest.cli.console import STANDARD_OUTPUT, print_line, write_output
+    from mosaico_ingest.report.metrics import prometheus_text
+    from mosaico_ingest.report.units import counted
     from mosaico_ingest.textfile import check_file
 
-    level = log or (configs[0].log_level if configs else "INFO")
-    prepare = partial(set_up_logging, level, log_format)
-    prepare()
-    interrupt_on_terminate()
-    collect_as_usual()
-    failures: list[RunFinished] = []
-    targets = {path for path in (report, *map(_report_path, configs)) if path is not None}
-    for target in targets:
-        check_file(target)
+    if bool(manifests) == (plan is not None):
+        raise typer.BadParameter("give manifests, or a plan with --plan", param_hint="JOB.yaml")
+    if address is not None and executor is not ExecutorName.RAY:
+        raise typer.BadParameter("needs --executor ray", param_hint="--address")
+    configs = [config for manifest in manifests or () for config in api.compile_job(manifest)]
+    used_manifests = [api.used_manifest(manifest) for manifest in manifests or ()]
+    if plan is not None:
+        configs += api.compile_plan(plan)
+        sources = sorted({config.where for config in configs if config.where})
+        used_manifests = [api.used_manifest(Path(source)) for source in sources]
+    if shard is not None:
+        total, configs = len(configs), take_shard(configs, shard)
+        if not configs and not quiet and log_format is LogFormat.TEXT:
+            print_line(f"shard {shard} is empty: the job has {counted(total, 'recording')}", stderr=True)
+    if metrics is not None and metrics != STANDARD_OUTPUT:
+        check_file(metrics)
 
-    def tell(position: int, event: Event) -> None:
-        if isinstance(event, RunFinished) and event.error is not None:
-            failures.append(event)
-        watching(position, event)
-        observe(position, event)
+    def write_metrics(result: RunReport) -> None:
+        if metrics is not None:
+            write_output(metrics, prometheus_text(result))
 
-    as_json = log_format is LogFormat.JSON
-    with _display(configs, as_json=as_json, quiet=quiet) as observe:
-        chosen = executor or _executor(configs, jobs, prepare)
-        result = api.run(configs, executor=chosen, observe=tell, manifests=manifests)
-    unwritten = [
-        *_refusal(finished, result),
-        *(one for target in targets for one in _refusal(write_report, result, target)),
-    ]
-    if not quiet and not as_json:
-        from mosaico_ingest.cli.report import print_report
-
-        print_report(result)
-    errors = [] if as_json else [(failure.error or "", failure.findings) for failure in failures]
-    errors += [(str(error), error.findings) for error in unwritten]
-    if errors:
-        _print_errors(errors)
-    code = SinkError.exit_code if unwritten and result.exit_code in {0, 4} else result.exit_code
-    if code:
-        raise typer.Exit(code)
-
-
-def _display(
-    configs: Sequence[ROSInjectionConfig], *, as_json: bool, quiet: bool
-) -> AbstractContextManager[BatchObserver]:
-    """Return what shows the run while it goes; what draws is slow to import, and only people want it drawn."""
-    if quiet and not as_json:
-        return nullcontext(ignore_batch)
-    from mosaico_ingest.cli.progress import Tally, display, sizes_of
-
-    tally = Tally(sizes_of(configs) if len(configs) > 1 else [1] * len(configs))
-    if as_json:
-        return nullcontext(JsonLines(tally))
-    return display(tally)
-
-
-def _refusal(write: Callable[P, None], *given: P.args, **named: P.kwargs) -> Iterator[SinkError]:
-    """Yield what keeps a file from being written: it costs that file, not what else there is to say of the run."""
-    try:
-        write(*given, **named)
-    except SinkError as error:
-        yield error
-
-
-def _print_errors(errors: Iterable[tuple[str, Sequence[Finding]]]) -> None:
-    from mosaico_ingest.cli.console import print_error
-
-    for error, findings in errors:
-        print_error(error, findings)
-
-
-def _executor(
-    configs: Sequence[ROSInjectionConfig], jobs: int | None, prepare: Callable[[], None]
-) -> Executor:
-    wanted = min(jobs or configs[0].jobs, len(configs)) if configs else 1
-    if wanted == 1:
-        from mosaico_ingest.executors.in_process import Inline
-
-        return Inline()
-    from mosaico_ingest.executors.processes import Processes
-
-    return Processes(wanted, prepare=prepare)
-
-
-def _report_path(config: ROSInjectionConfig) -> Path | None:
-    return None if config.report_path is None else Path(config.report_path)
+    hide_pandas(configs)
+    with send_telemetry(otel) as telemetry:
+        run_configs(
+            configs,
+            report=report,
+            quiet=quiet,
+            log=log,
+            jobs=jobs,
+            executor=_ray_executor(address, jobs) if executor is ExecutorName.RAY else None,
+            log_format=log_format,
+            manifests=used_manifests,
+            observe=telemetry,
+            on_finish=write_metrics,
+        )
 
 
 def bag(
@@ -185,54 +161,61 @@ def bag(
     name: Annotated[str, typer.Option("--name", "-n", help="Name of the sequence.")],
     topics: Annotated[
         list[str] | None,
-        typer.Option("--topics", "-t", help="Topic pattern, as /cam/*; !/cam/debug* takes away. Repeatable."),
+        typer.Option(
+            "--topics", "-t", help="Topic name or glob, such as /cam/*; !GLOB excludes. Repeatable."
+        ),
     ] = None,
     more_topics: Annotated[
-        list[str] | None, typer.Argument(metavar="TOPIC", help="More patterns, after --topics.")
+        list[str] | None, typer.Argument(metavar="TOPIC", help="More topics, after those of --topics.")
     ] = None,
     metadata: Annotated[
         str | None,
-        typer.Option("--metadata", help="A JSON object, or the file that holds one.", metavar="JSON|FILE"),
+        typer.Option(
+            "--metadata", help="Metadata of the sequence: a JSON object, or a JSON file.", metavar="JSON|FILE"
+        ),
     ] = None,
     ros_distro: Annotated[
-        str | None, typer.Option("--ros-distro", help="As ros2_humble; for recordings without definitions.")
+        str | None,
+        typer.Option("--ros-distro", help="Distro of recordings without definitions, such as ros2_humble."),
     ] = None,
-    host: Annotated[str | None, typer.Option("--host", help="A Mosaico server instead of the store.")] = None,
-    port: Annotated[int, typer.Option("--port", help="The server's port.")] = 6726,
+    host: Annotated[
+        str | None,
+        typer.Option("--host", help="Host of a Mosaico server to write to, instead of the store."),
+    ] = None,
+    port: Annotated[int, typer.Option("--port", help="Port of the server.")] = 6726,
     api_key: Annotated[
         str | None,
-        typer.Option("--api-key", envvar="MOSAICO_API_KEY", help="Its API key.", show_envvar=True),
+        typer.Option("--api-key", envvar="MOSAICO_API_KEY", help="API key for the server.", show_envvar=True),
     ] = None,
     tls_cert: Annotated[
         Path | None,
-        typer.Option("--tls-cert", metavar="FILE", help="CA certificate the server is checked against, PEM."),
+        typer.Option("--tls-cert", metavar="FILE", help="CA certificate of the server, in PEM format."),
     ] = None,
     store: Annotated[
         str | None,
-        typer.Option("--store", help="The store to write to.", metavar="DIR|URL", show_default="mosaico"),
+        typer.Option(
+            "--store", help="Folder or URL of the store.", metavar="DIR|URL", show_default="mosaico"
+        ),
     ] = None,
     if_exists: Annotated[
         IfExists,
-        typer.Option("--if-exists", help="Where the sequence is there; skip needs the same content."),
+        typer.Option("--if-exists", help="Action if the sequence exists; skip needs the same content."),
     ] = IfExists.FAIL,
-    report: Annotated[
-        Path | None, typer.Option("--report", metavar="FILE", help="Write the report as JSON.")
-    ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
+    report: ReportOption = None,
+    quiet: QuietOption = False,
     log: Annotated[
         str | None,
         typer.Option(
             "--log",
             "-l",
-            help="DEBUG, INFO, WARNING, ERROR or CRITICAL.",
+            help="Log level: DEBUG, INFO, WARNING, ERROR or CRITICAL.",
             metavar="LEVEL",
             show_default="INFO",
         ),
     ] = None,
 ) -> None:
-    """Ingest one recording, without a manifest."""
+    """Ingest one recording without a manifest."""
     from mosaico_ingest import api
-    from mosaico_ingest.cli.process import forgo_pandas
 
     config = api.quick_config(
         path,
@@ -247,157 +230,195 @@ def bag(
         store=store,
         if_exists=if_exists,
     )
-    forgo_pandas([config])
+    hide_pandas([config])
     run_configs([config], report=report, quiet=quiet, log=log)
-
-
-_DONE = {0, 4}
-"""Exit codes of runs that took what could be taken."""
-_SAYS = {
-    "STORED": "its messages are in the sequence already",
-    "FORGOTTEN": "the run that kept it is not part of its sequence; ingest the recording for what it holds",
-}
 
 
 def replay(
     folder: Annotated[
-        Path, typer.Argument(metavar="QUARANTINE", help="The folder rejected messages lie in.")
+        Path, typer.Argument(metavar="QUARANTINE", help="Quarantine folder with rejected messages.")
     ],
     manifest: Annotated[
-        Path, typer.Option("--manifest", "-m", help="The mended manifest of the job.", metavar="JOB.yaml")
+        Path, typer.Option("--manifest", "-m", help="The fixed manifest of the job.", metavar="JOB.yaml")
     ],
-    report: Annotated[
-        Path | None, typer.Option("--report", help="Write the report of this call as JSON.", metavar="FILE")
-    ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
+    report: ReportOption = None,
+    quiet: QuietOption = False,
     log: LogOption = None,
 ) -> None:
-    """Add quarantined messages to the sequences they belong to; what fails again stays in the quarantine."""
+    """Add quarantined messages to their sequences; messages that are rejected again stay in the quarantine."""
     from mosaico_ingest import api
     from mosaico_ingest.cli.console import print_line
     from mosaico_ingest.errors import NothingMatched
     from mosaico_ingest.services.replay import Whereabouts, alone, replays
 
-    def mark(result: RunReport) -> None:
-        for replay, recording in zip(waiting, result.recordings, strict=False):
-            if recording.exit_code in _DONE:
-                replay.kept.mark_replayed()
+    def mark_replayed(result: RunReport) -> None:
+        for entry, recording in zip(waiting, result.recordings, strict=False):
+            if recording.exit_code in SUCCESSFUL:
+                entry.kept.mark_replayed()
 
     configs = api.compile_job(manifest)
     with alone(folder):
-        found = replays(folder, configs)
-        for replay in found:
-            if replay.whereabouts is Whereabouts.STORED:
-                replay.kept.mark_replayed()
-            if replay.whereabouts is not Whereabouts.WAITING and not quiet:
-                print_line(f"{replay.kept.messages.name}: {_SAYS[replay.whereabouts.name]}", stderr=True)
-        waiting = [replay for replay in found if replay.whereabouts is Whereabouts.WAITING]
-        if all(replay.whereabouts is Whereabouts.FORGOTTEN for replay in found):
-            raise NothingMatched("there is nothing to replay", where=str(folder), hint=_SAYS["FORGOTTEN"])
+        entries = replays(folder, configs)
+        for entry in entries:
+            if entry.whereabouts is Whereabouts.STORED:
+                entry.kept.mark_replayed()
+            if entry.whereabouts is not Whereabouts.WAITING and not quiet:
+                note = REPLAY_NOTES[entry.whereabouts.name]
+                print_line(f"{entry.kept.messages.name}: {note}", stderr=True)
+        waiting = [entry for entry in entries if entry.whereabouts is Whereabouts.WAITING]
+        if all(entry.whereabouts is Whereabouts.FORGOTTEN for entry in entries):
+            raise NothingMatched(
+                "no message can be replayed", where=str(folder), hint=REPLAY_NOTES["FORGOTTEN"]
+            )
         run_configs(
-            [replay.config for replay in waiting], report=report, quiet=quiet, log=log, jobs=1, finished=mark
-        )
-
-
-class Place(str, Enum):
-    """Where recordings are ingested."""
-
-    LOCAL = "local"
-    RAY = "ray"
-
-
-def run(
-    manifests: Annotated[
-        list[Path] | None, typer.Argument(metavar="JOB.yaml", help="Job manifests, run in order.")
-    ] = None,
-    *,
-    plan: Annotated[
-        Path | None,
-        typer.Option(
-            "--plan", help="Run exactly this plan, or nothing where it no longer fits.", metavar="FILE"
-        ),
-    ] = None,
-    jobs: Annotated[
-        int | None,
-        typer.Option(
-            "--jobs", "-j", min=1, max=1024, help="Recordings ingested at a time; overrides run.jobs."
-        ),
-    ] = None,
-    executor: Annotated[
-        Place, typer.Option("--executor", help="Where recordings are ingested: on this machine, or on Ray.")
-    ] = Place.LOCAL,
-    address: Annotated[
-        str | None,
-        typer.Option(
-            "--address",
-            help="The Ray cluster, as auto or host:6379; without it Ray is started here.",
-            metavar="ADDRESS",
-        ),
-    ] = None,
-    shard: Annotated[
-        str | None,
-        typer.Option("--shard", metavar="I/N", help="Only this share of the recordings, as 1/8 .. 8/8."),
-    ] = None,
-    report: Annotated[
-        Path | None, typer.Option("--report", help="Write the report of this call as JSON.", metavar="FILE")
-    ] = None,
-    metrics: Annotated[
-        Path | None,
-        typer.Option("--metrics", help="Write the sums for Prometheus' textfile collector.", metavar="FILE"),
-    ] = None,
-    otel: Annotated[
-        bool, typer.Option("--otel", help="Send metrics and traces where the OTEL_... variables say.")
-    ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
-    log: LogOption = None,
-    log_format: Annotated[
-        LogFormat, typer.Option("--log-format", help="What is said while it runs: for people, or JSON lines.")
-    ] = LogFormat.TEXT,
-) -> None:
-    """Ingest what the manifests name."""
-    from mosaico_ingest import api
-    from mosaico_ingest.cli.process import forgo_pandas
-    from mosaico_ingest.report.metrics import prometheus_text
-    from mosaico_ingest.report.units import counted
-    from mosaico_ingest.textfile import check_file, write_whole
-
-    if bool(manifests) == (plan is not None):
-        raise typer.BadParameter("name manifests, or a plan with --plan", param_hint="JOB.yaml")
-    configs = [config for manifest in manifests or () for config in api.compile_job(manifest)]
-    used = [api.used_manifest(manifest) for manifest in manifests or ()]
-    if plan is not None:
-        configs += api.compile_plan(plan)
-        used = [api.used_manifest(Path(name)) for name in sorted({c.where for c in configs if c.where})]
-    if shard is not None:
-        every, configs = len(configs), take_shard(configs, shard)
-        if not configs and not quiet and log_format is LogFormat.TEXT:
-            typer.echo(f"shard {shard} has none of {counted(every, 'recording')}", err=True)
-    if metrics is not None:
-        check_file(metrics)
-    if address is not None and executor is not Place.RAY:
-        raise typer.BadParameter("is for --executor ray", param_hint="--address")
-
-    def finish(result: RunReport) -> None:
-        if metrics is not None:
-            write_whole(metrics, prometheus_text(result))
-
-    forgo_pandas(configs)
-    with telemetry(otel) as watching:
-        run_configs(
-            configs,
+            [entry.config for entry in waiting],
             report=report,
             quiet=quiet,
             log=log,
-            jobs=jobs,
-            executor=_on_ray(address, jobs) if executor is Place.RAY else None,
-            log_format=log_format,
-            manifests=used,
-            watching=watching,
-            finished=finish,
+            jobs=1,
+            on_finish=mark_replayed,
         )
 
 
-def _on_ray(address: str | None, jobs: int | None) -> Executor:
+def run_configs(
+    configs: Sequence[ROSInjectionConfig],
+    *,
+    report: Path | None,
+    quiet: bool,
+    log: str | None,
+    jobs: int | None = None,
+    executor: Executor | None = None,
+    log_format: LogFormat = LogFormat.TEXT,
+    manifests: Sequence[UsedManifest] = (),
+    observe: BatchObserver = ignore_batch,
+    on_finish: Callable[[RunReport], None] = lambda _report: None,
+) -> None:
+    """Run the configurations with a progress display, write reports, print the result, and exit with its code.
+
+    `on_finish` receives the report after the run. If it or a report file cannot be written, the others still are.
+
+    Raises:
+        typer.Exit: The exit code is not 0.
+    """
+    from mosaico_ingest import api
+    from mosaico_ingest.cli.console import STANDARD_OUTPUT, print_error
+    from mosaico_ingest.textfile import check_file
+
+    as_json = log_format is LogFormat.JSON
+    prepare = partial(set_up_logging, log or (configs[0].log_level if configs else "INFO"), log_format)
+    prepare()
+    interrupt_on_sigterm()
+    collect_garbage_as_usual()
+    report_files = {path for path in (report, *map(_report_path, configs)) if path is not None}
+    for file in report_files - {STANDARD_OUTPUT}:
+        check_file(file)
+    failures: list[RunFinished] = []
+
+    with _display(configs, as_json=as_json, quiet=quiet) as show:
+
+        def observe_all(position: int, event: Event) -> None:
+            if isinstance(event, RunFinished) and event.error is not None:
+                failures.append(event)
+            observe(position, event)
+            show(position, event)
+
+        chosen = executor or _local_executor(configs, jobs, prepare)
+        result = api.run(configs, executor=chosen, observe=observe_all, manifests=manifests)
+    write_errors = list(_write_results(result, report_files, on_finish))
+    if not quiet and not as_json:
+        from mosaico_ingest.cli.report import print_report
+
+        print_report(result, stderr=STANDARD_OUTPUT in report_files)
+    if not as_json:
+        for failure in failures:
+            print_error(failure.error or "", failure.findings)
+    for error in write_errors:
+        print_error(str(error), error.findings)
+    code = SinkError.exit_code if write_errors and result.exit_code in SUCCESSFUL else result.exit_code
+    if code:
+        raise typer.Exit(code)
+
+
+def _display(
+    configs: Sequence[ROSInjectionConfig], *, as_json: bool, quiet: bool
+) -> AbstractContextManager[BatchObserver]:
+    """Return the progress display. It is imported only if it is used, because rich is slow to import."""
+    if quiet and not as_json:
+        return nullcontext(ignore_batch)
+    from mosaico_ingest.cli.progress import JsonLines, Tally, live_display, recording_sizes
+
+    tally = Tally(recording_sizes(configs) if len(configs) > 1 else [1] * len(configs))
+    return nullcontext(JsonLines(tally)) if as_json else live_display(tally)
+
+
+def _write_results(
+    result: RunReport, report_files: set[Path], on_finish: Callable[[RunReport], None]
+) -> Iterator[SinkError]:
+    """Call `on_finish` and write the report files; yield the errors."""
+    from mosaico_ingest.cli.console import write_output
+
+    text = result.model_dump_json(indent=2) + "\n"
+    for write in (partial(on_finish, result), *(partial(write_output, file, text) for file in report_files)):
+        try:
+            write()
+        except SinkError as error:  # noqa: PERF203 - a file that cannot be written must not affect the others
+            yield error
+
+
+def _report_path(config: ROSInjectionConfig) -> Path | None:
+    return None if config.report_path is None else Path(config.report_path)
+
+
+def _local_executor(
+    configs: Sequence[ROSInjectionConfig], jobs: int | None, prepare: Callable[[], None]
+) -> Executor:
+    count = min(jobs or configs[0].jobs, len(configs)) if configs else 1
+    if count == 1:
+        from mosaico_ingest.executors.in_process import Inline
+
+        return Inline()
+    from mosaico_ingest.executors.processes import Processes
+
+    return Processes(count, prepare=prepare)
+
+
+def _ray_executor(address: str | None, jobs: int | None) -> Executor:
     from mosaico_ingest.executors.ray import Ray
 
     return Ray(address, jobs)
+
+
+def take_shard(items: Sequence[T], shard: str) -> list[T]:
+    """Return every N-th item, starting with the I-th, for a shard `I/N` with I from 1 to N.
+
+    Raises:
+        ManifestError: The shard has another form.
+    """
+    first, _, count = shard.partition("/")
+    if not (first.isdecimal() and count.isdecimal() and 1 <= int(first) <= int(count)):
+        raise ManifestError(
+            f"--shard is {shard!r}", hint="write the number of the shard and of all shards, from 1/8 to 8/8"
+        )
+    return list(items[int(first) - 1 :: int(count)])
+
+
+@contextmanager
+def send_telemetry(enabled: bool) -> Generator[BatchObserver]:
+    """Yield the observer that sends metrics and traces, except those whose exporter variable is `none`.
+
+    Raises:
+        IngestError: OpenTelemetry is not installed.
+    """
+    if not enabled:
+        yield ignore_batch
+        return
+    from mosaico_ingest.report.telemetry import Telemetry
+
+    telemetry = Telemetry(
+        metrics=os.environ.get("OTEL_METRICS_EXPORTER") != "none",
+        traces=os.environ.get("OTEL_TRACES_EXPORTER") != "none",
+    )
+    try:
+        yield telemetry
+    finally:
+        telemetry.close()

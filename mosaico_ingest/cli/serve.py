@@ -11,20 +11,28 @@ from typing import Annotated
 
 import typer
 
+from mosaico_ingest.errors import ManifestError
+
 __all__ = [
-    "check_keys",
+    "check_key_file",
     "keys_app",
     "serve",
 ]
 
-keys_app = typer.Typer(no_args_is_help=True, help="Make and list the API keys of `ingest serve`.")
+DEFAULT_KEY_FILE = Path("api_keys.json")
+LOOPBACK = {"127.0.0.1", "::1", "[::1]", "localhost"}
+GRACE_S = 0.5
+"""Seconds that open calls get to finish at shutdown."""
 
-KeysFile = Annotated[Path, typer.Option("--api-keys", metavar="FILE", help="The file of keys.")]
-DEFAULT = Path("api_keys.json")
+keys_app = typer.Typer(no_args_is_help=True, help="Create and list the API keys of `ingest serve`.")
+
+KeyFileOption = Annotated[
+    Path, typer.Option("--api-keys", metavar="FILE", help="Key file, which contains hashes only.")
+]
 
 
 class Permission(str, Enum):
-    """What a key may do; each includes the ones before it."""
+    """Permissions of a key; each includes the previous ones."""
 
     READ = "read"
     WRITE = "write"
@@ -32,121 +40,145 @@ class Permission(str, Enum):
     MANAGE = "manage"
 
 
-@keys_app.command()
-def new(
-    permission: Annotated[Permission, typer.Option("--permission", help="Each includes the ones before it.")],
-    api_keys: KeysFile = DEFAULT,
-    description: Annotated[str, typer.Option("--description", help="Who or what the key is for.")] = "",
-    expires: Annotated[
-        str | None,
-        typer.Option("--expires", metavar="TIME", help="As 2027-01-01T00:00:00Z; never without it."),
-    ] = None,
-) -> None:
-    """Make a key and print it: this is the only time it can be seen."""
-    from mosaico_ingest.protocol.messages import Permission as Granted
-    from mosaico_ingest.serve import Keyring
-
-    until = _instant(expires) if expires else None
-    key = Keyring(api_keys).add(Granted(permission.value), description=description, expires=until)
-    typer.echo(key)
-    typer.echo(
-        f"{permission.value} permission, kept as a hash in {api_keys}; a server reads it when it starts",
-        err=True,
-    )
-
-
-@keys_app.command("ls")
-def list_keys(api_keys: KeysFile = DEFAULT) -> None:
-    """List the keys: what they may do and until when; the keys themselves are not kept."""
-    from mosaico_ingest.serve import Keyring
-
-    check_keys(api_keys)
-    now = datetime.now(timezone.utc)
-    for key in Keyring(api_keys).keys:
-        until = key.expires.isoformat() if key.expires else "never"
-        ends = "expired" if key.expires and key.expires <= now else "expires"
-        typer.echo(f"{key.sha256[:12]}  {key.permission.value:6}  {ends} {until}  {key.description}".rstrip())
-
-
-def check_keys(file: Path) -> None:
-    """Refuse a file of keys that is not there: a key ring without keys is hardly meant."""
-    from mosaico_ingest.errors import ManifestError
-
-    if not file.exists():
-        raise ManifestError(
-            "there is no such file of keys", where=str(file), hint="make one: ingest keys new"
-        )
-
-
-def _instant(text: str) -> datetime:
-    from mosaico_ingest.errors import ManifestError
-
-    form = "write it as 2027-01-01T00:00:00Z"
-    try:
-        instant = datetime.fromisoformat(text.replace("Z", "+00:00"))
-    except ValueError as error:
-        raise ManifestError(f"--expires {text!r} is no time", hint=form) from error
-    if instant.tzinfo is None:
-        raise ManifestError(f"--expires {text!r} has no time zone", hint=form)
-    if instant <= datetime.now(timezone.utc):
-        raise ManifestError(f"--expires {text!r} has passed", hint="name a time to come")
-    return instant
-
-
-LOOPBACK = {"127.0.0.1", "::1", "[::1]", "localhost"}
-GRACE_S = 0.5
-
-
 def serve(
-    store: Annotated[Path, typer.Option("--store", metavar="DIR", help="The store's folder.")] = Path(
+    store: Annotated[Path, typer.Option("--store", metavar="DIR", help="Folder of the store.")] = Path(
         "mosaico"
     ),
-    host: Annotated[str, typer.Option("--host", help="The address to listen on.")] = "127.0.0.1",
+    host: Annotated[str, typer.Option("--host", metavar="HOST", help="Address to listen on.")] = "127.0.0.1",
     *,
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0 takes a free one.")] = 6726,
+    port: Annotated[
+        int,
+        typer.Option("--port", min=0, max=65535, metavar="PORT", help="Port to listen on; 0 chooses one."),
+    ] = 6726,
     api_keys: Annotated[
         Path | None,
-        typer.Option("--api-keys", metavar="FILE", help="Who may do what; see `ingest keys new`."),
+        typer.Option(
+            "--api-keys",
+            metavar="FILE",
+            help="Key file, see `ingest keys new`. If omitted, all is permitted.",
+        ),
     ] = None,
-    tls_cert: Annotated[Path | None, typer.Option("--tls-cert", help="The certificate to show, PEM.")] = None,
-    tls_key: Annotated[Path | None, typer.Option("--tls-key", help="Its private key, PEM.")] = None,
+    tls_cert: Annotated[
+        Path | None,
+        typer.Option("--tls-cert", metavar="FILE", help="Certificate of the server, in PEM format."),
+    ] = None,
+    tls_key: Annotated[
+        Path | None,
+        typer.Option("--tls-key", metavar="FILE", help="Private key of the certificate, in PEM format."),
+    ] = None,
     idle_minutes: Annotated[
         float,
-        typer.Option("--idle-minutes", min=0.01, help="A session is discarded after so long without a word."),
+        typer.Option(
+            "--idle-minutes",
+            min=0.01,
+            metavar="MINUTES",
+            help="Discard sessions that are idle for this long.",
+        ),
     ] = 60,
 ) -> None:
-    """Let clients of the platform list, read, query and write the store; until it is interrupted."""
+    """Serve the store to Mosaico clients until interrupted. Clients can list, read, query and write."""
     from mosaico_ingest.cli.process import (
-        collect_as_usual,
-        end_on_signals,
-        interrupt_on_terminate,
-        share_heaps,
+        collect_garbage_as_usual,
+        exit_on_signals,
+        interrupt_on_sigterm,
+        limit_heaps,
     )
-    from mosaico_ingest.errors import ManifestError
     from mosaico_ingest.serve import Keyring, Tls
-    from mosaico_ingest.serve import serve as start
+    from mosaico_ingest.serve import serve as start_server
 
     if (tls_cert is None) != (tls_key is None):
-        raise ManifestError("--tls-cert and --tls-key go together", hint="give both, or neither")
+        raise ManifestError("--tls-cert and --tls-key need each other", hint="give both, or neither")
     if api_keys is not None:
-        check_keys(api_keys)
+        check_key_file(api_keys)
     tls = Tls(tls_cert, tls_key) if tls_cert is not None and tls_key is not None else None
-    keys = Keyring(api_keys) if api_keys is not None else None
-    interrupt_on_terminate()
-    collect_as_usual()
-    share_heaps()
-    server = start(store, host, port, keys=keys, tls=tls, idle_s=idle_minutes * 60)
+    keyring = Keyring(api_keys) if api_keys is not None else None
+    interrupt_on_sigterm()
+    collect_garbage_as_usual()
+    limit_heaps()
+    server = start_server(store, host, port, keys=keyring, tls=tls, idle_s=idle_minutes * 60)
     try:
         typer.echo(f"serving {store} at {server.location}")
-        if keys is None:
-            reach = "who can reach this machine" if host not in LOOPBACK else "on this machine"
-            typer.echo(f"warning: without --api-keys everybody {reach} may read, write and delete", err=True)
+        if keyring is None:
+            who = "on this machine" if host in LOOPBACK else "who can reach this machine"
+            typer.echo(f"warning: without --api-keys, everyone {who} can read, write and delete", err=True)
         server.wait()
     except KeyboardInterrupt:
         typer.echo("stopping")
-    done = server.shutdown(grace_s=GRACE_S)
-    end_on_signals()
-    if not done:
-        typer.echo("a client's call was still open; what it had not finalized is discarded", err=True)
+    all_closed = server.shutdown(grace_s=GRACE_S)
+    exit_on_signals()
+    if not all_closed:
+        typer.echo("a call was still open; its unfinished uploads are discarded", err=True)
         sys.stdout.flush()
-        os._exit(0)  # the thread of that call would keep the process for as long as the client likes
+        os._exit(0)  # the thread of that call would keep the process alive for as long as the client likes
+
+
+@keys_app.command()
+def new(
+    permission: Annotated[
+        Permission,
+        typer.Option("--permission", help="Permission of the key; each includes the previous ones."),
+    ],
+    api_keys: KeyFileOption = DEFAULT_KEY_FILE,
+    description: Annotated[
+        str, typer.Option("--description", metavar="TEXT", help="Owner or purpose of the key.")
+    ] = "",
+    expires: Annotated[
+        str | None,
+        typer.Option(
+            "--expires",
+            metavar="TIME",
+            help="Expiry time, such as 2027-01-01T00:00:00Z.",
+            show_default="never",
+        ),
+    ] = None,
+) -> None:
+    """Create a key and print it. The key cannot be displayed again."""
+    from mosaico_ingest.protocol.messages import Permission as StoredPermission
+    from mosaico_ingest.serve import Keyring
+
+    expiry = _expiry(expires) if expires else None
+    key = Keyring(api_keys).add(StoredPermission(permission.value), description=description, expires=expiry)
+    typer.echo(key)
+    typer.echo(f"added the hash of a key with {permission.value} permission to {api_keys}", err=True)
+
+
+@keys_app.command("ls")
+def list_keys(api_keys: KeyFileOption = DEFAULT_KEY_FILE) -> None:
+    """List the keys with start of hash, permission, expiry and description."""
+    from mosaico_ingest.cli.console import print_line
+    from mosaico_ingest.serve import Keyring
+
+    check_key_file(api_keys)
+    now = datetime.now(timezone.utc)
+    for key in Keyring(api_keys).keys:
+        expiry = key.expires.isoformat() if key.expires else "never"
+        verb = "expired" if key.expires and key.expires <= now else "expires"
+        line = f"{key.sha256[:12]}  {key.permission.value:6}  {verb} {expiry}  {key.description}"
+        print_line(line.rstrip())
+
+
+def check_key_file(file: Path) -> None:
+    """Raise unless the key file exists.
+
+    Raises:
+        ManifestError: The file does not exist, so that every call would be refused.
+    """
+    if not file.exists():
+        raise ManifestError(
+            "the key file does not exist",
+            where=str(file),
+            hint=f"create it: ingest keys new --permission read --api-keys {file}",
+        )
+
+
+def _expiry(text: str) -> datetime:
+    hint = "write a future time such as 2027-01-01T00:00:00Z"
+    try:
+        expiry = datetime.fromisoformat(text.replace("Z", "+00:00"))
+    except ValueError as error:
+        raise ManifestError(f"--expires {text!r} is not a time", hint=hint) from error
+    if expiry.tzinfo is None:
+        raise ManifestError(f"--expires {text!r} has no time zone", hint=hint)
+    if expiry <= datetime.now(timezone.utc):
+        raise ManifestError(f"--expires {text!r} is in the past", hint=hint)
+    return expiry

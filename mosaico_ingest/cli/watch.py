@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections import Counter
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-if TYPE_CHECKING:  # imported for real when the command runs, so that --help starts fast
+if TYPE_CHECKING:
     from mosaico_ingest.job.config import ROSInjectionConfig
     from mosaico_ingest.report.model import Report
+    from mosaico_ingest.services.status import RecordingStatus
     from mosaico_ingest.services.watch import Arrivals
 
 __all__ = [
@@ -18,125 +21,156 @@ __all__ = [
     "watch",
 ]
 
-STYLES = {"done": "green", "new": "cyan", "changed": "yellow", "failed": "red", "unreadable": "red"}
+STATUS_STYLES = {"done": "green", "new": "cyan", "changed": "yellow", "failed": "red", "unreadable": "red"}
 
 
 def status(
     manifests: Annotated[list[Path], typer.Argument(metavar="JOB.yaml", help="Job manifests.")],
     *,
-    check: Annotated[bool, typer.Option("--check", help="Exit 1 unless every recording is done.")] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Exit with 1 unless every recording is done.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Say of every recording whether its sequence is there, whole and of the same content; writes nothing."""
-    import json
-    from collections import Counter
-
+    """Show the status of each recording: done, new, changed, failed or unreadable. Read-only."""
     from msgspec import to_builtins
-    from rich.text import Text
 
     from mosaico_ingest import api
-    from mosaico_ingest.cli.console import plain_table
-    from mosaico_ingest.cli.report import open_console, print_json
+    from mosaico_ingest.cli.console import print_json
 
-    found = [one for manifest in manifests for one in api.job_status(manifest)]
+    recordings = [recording for manifest in manifests for recording in api.job_status(manifest)]
     if as_json:
-        print_json(json.dumps([to_builtins(one) for one in found], indent=2))
+        print_json([to_builtins(recording) for recording in recordings])
     else:
-        table = plain_table("sequence", "status", "recording")
-        for one in found:
-            style = STYLES[one.standing.value]
-            files = ", ".join(one.files)
-            known = one.why.startswith(files)  # an error says where it is from
-            said = one.why if known else f"{files}: {one.why}" if one.why else files
-            table.add_row(one.sequence, Text(one.standing.value, style=style), Text(said))
-        console = open_console()
-        console.print(table)
-        counts = Counter(one.standing.value for one in found)
-        console.print(", ".join(f"{count} {name}" for name, count in counts.items()), soft_wrap=True)
-    if check and any(one.standing.value != "done" for one in found):
+        _print_status(recordings)
+    if check and any(recording.standing.value != "done" for recording in recordings):
         raise typer.Exit(1)
 
 
-Again = Callable[[Path], str]
-"""Gives a recording that failed another turn, and says when that is."""
+def _print_status(recordings: list[RecordingStatus]) -> None:
+    from rich.text import Text
+
+    from mosaico_ingest.cli.console import PlainTable, Terminal, print_line
+
+    table = PlainTable("sequence", "status", "recording")
+    for recording in recordings:
+        standing = recording.standing.value
+        files = ", ".join(recording.files)
+        reason = recording.why.removeprefix(f"{files}: ")  # an error already starts with its location
+        table.add_row(
+            recording.sequence,
+            Text(standing, style=STATUS_STYLES[standing]),
+            f"{files}: {reason}" if reason else files,
+        )
+    Terminal().print(table)
+    counts = Counter(recording.standing.value for recording in recordings)
+    print_line(", ".join(f"{count} {standing}" for standing, count in counts.items()))
 
 
 def watch(
     folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="Where recordings arrive.", exists=True, file_okay=False)
+        Path,
+        typer.Argument(
+            metavar="DIR", help="Folder in which recordings arrive.", exists=True, file_okay=False
+        ),
     ],
     manifest: Annotated[
-        Path, typer.Argument(metavar="JOB.yaml", help="What is done with each; its bag.path is not used.")
+        Path,
+        typer.Argument(metavar="JOB.yaml", help="Job manifest for each recording; bag.path is not used."),
     ],
     *,
     rest: Annotated[
-        float, typer.Option("--rest", min=0.0, help="Seconds without a change after which a file is whole.")
+        float,
+        typer.Option(
+            "--rest",
+            min=0.0,
+            metavar="SECONDS",
+            help="Time without a change after which a recording is complete.",
+        ),
     ] = 10.0,
-    every: Annotated[float, typer.Option("--every", min=0.05, help="Seconds between two looks.")] = 2.0,
-    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Recordings ingested at a time.")] = 1,
+    every: Annotated[
+        float,
+        typer.Option("--every", min=0.05, metavar="SECONDS", help="Time between two checks of the folder."),
+    ] = 2.0,
+    jobs: Annotated[
+        int, typer.Option("--jobs", "-j", min=1, metavar="N", help="Recordings ingested in parallel.")
+    ] = 1,
     once: Annotated[
         bool,
         typer.Option(
-            "--once", help="Ingest what is there and comes to rest, then leave with the exit code of a run."
+            "--once", help="Ingest the current recordings once they are complete, then exit like a run."
         ),
     ] = False,
     log: Annotated[
-        str, typer.Option("--log", "-l", help="DEBUG, INFO, WARNING, ERROR or CRITICAL.", metavar="LEVEL")
+        str,
+        typer.Option(
+            "--log",
+            "-l",
+            metavar="LEVEL",
+            help="Log level: DEBUG, INFO, WARNING, ERROR or CRITICAL.",
+        ),
     ] = "WARNING",
 ) -> None:
-    """Ingest what arrives in a folder, until it is interrupted; what is in the destination already is left alone."""
-    import time
-    from functools import partial
+    """Ingest recordings that arrive in a folder, until interrupted.
 
+    Sequences that are already stored with the same content are skipped.
+    """
     from mosaico_ingest.cli.logs import set_up_logging
-    from mosaico_ingest.cli.process import collect_as_usual, interrupt_on_terminate
+    from mosaico_ingest.cli.process import collect_garbage_as_usual, interrupt_on_sigterm
     from mosaico_ingest.job.manifest import load_manifests
     from mosaico_ingest.report.model import gravest
     from mosaico_ingest.services.watch import Arrivals
 
     set_up_logging(log)
-    interrupt_on_terminate()
-    collect_as_usual()
+    interrupt_on_sigterm()
+    collect_garbage_as_usual()
     arrivals = Arrivals(folder, rest)
-    load_manifests(manifest)  # a mistake is said now, not with the first recording
-    _say(f"watching {folder}")
-    again = _never if once else partial(_again, arrivals)
+    load_manifests(manifest)  # report mistakes now, not with the first recording
+    _print(f"watching {folder}")
     codes: list[int] = []
-    leave_at = time.monotonic() + rest + every if once else float("inf")
+    deadline = time.monotonic() + rest + every if once else float("inf")
     try:
         while True:
-            settled = arrivals.settled(time.monotonic())
-            if settled and not _ingest(manifest, settled, jobs, again, codes):
+            complete = arrivals.settled(time.monotonic())
+            if complete and not _ingest(manifest, complete, jobs, None if once else arrivals, codes):
                 break
-            if not settled and time.monotonic() > leave_at:
+            if not complete and time.monotonic() > deadline:
                 break
             time.sleep(every)
     except KeyboardInterrupt:
         pass
-    _say("stopped watching")
+    _print("stopped watching")
     code = gravest(codes) if once else 0
     if code:
         raise typer.Exit(code)
 
 
-def _ingest(manifest: Path, settled: tuple[Path, ...], jobs: int, again: Again, codes: list[int]) -> bool:
-    """Ingest recordings, say a line about each and note its exit code; return whether to go on."""
+def _ingest(
+    manifest: Path, paths: tuple[Path, ...], jobs: int, arrivals: Arrivals | None, codes: list[int]
+) -> bool:
+    """Ingest recordings, print a line about each, and add its exit code to `codes`.
+
+    `arrivals` schedules another attempt of a recording that failed. Return False if the run was interrupted.
+    """
     from mosaico_ingest.executors.processes import Processes
     from mosaico_ingest.report.events import RunStatus, ignore_batch
 
-    work = [(path, config) for path in settled for config in _configs(manifest, path, again, codes)]
-    # Even one recording goes to a process of its own: what kills it does not end the watch.
+    work = [(path, config) for path in paths for config in _configs(manifest, path, arrivals, codes)]
+    # Even a single recording runs in a worker process, so that a crash does not end the watch.
     reports = Processes(jobs).map([config for _, config in work], ignore_batch)
-    going_on = True
+    interrupted = False
     for (path, _), report in zip(work, reports, strict=False):
-        going_on = going_on and report.status is not RunStatus.INTERRUPTED
+        interrupted = interrupted or report.status is RunStatus.INTERRUPTED
         codes.append(report.exit_code)
         failed = report.exit_code not in {0, 4}
-        _say(f"{path}: {_outcome(report)}{again(path) if failed and going_on else ''}")
-    return going_on
+        retry = _retry_text(arrivals, path) if failed and not interrupted else ""
+        _print(f"{path}: {_outcome_text(report)}{retry}")
+    return not interrupted
 
 
-def _configs(manifest: Path, path: Path, again: Again, codes: list[int]) -> tuple[ROSInjectionConfig, ...]:
+def _configs(
+    manifest: Path, path: Path, arrivals: Arrivals | None, codes: list[int]
+) -> tuple[ROSInjectionConfig, ...]:
     from mosaico_ingest import api
     from mosaico_ingest.errors import IngestError
 
@@ -144,34 +178,27 @@ def _configs(manifest: Path, path: Path, again: Again, codes: list[int]) -> tupl
         return api.compile_recording(manifest, path)
     except IngestError as error:
         codes.append(error.exit_code)
-        _say(f"{path}: failed: {error}{again(path)}")
+        _print(f"{path}: failed: {error}{_retry_text(arrivals, path)}")
         return ()
 
 
-def _outcome(report: Report) -> str:
-    from mosaico_ingest.report.units import count_text, seconds_text
+def _outcome_text(report: Report) -> str:
+    from mosaico_ingest.report.units import count_text, counted, seconds_text
 
-    done = f"{report.status.value} as {report.sequence}"
+    outcome = f"{report.status.value} as {report.sequence}"
     if report.error is not None:
-        return f"{done}: {report.error}"
+        return f"{outcome}: {report.error}"
     totals = report.totals
     rejected = f", {count_text(totals.rejected)} rejected" if totals.rejected else ""
-    return f"{done}, {count_text(totals.written)} messages{rejected}, {seconds_text(report.duration_s)}"
+    return f"{outcome}, {counted(totals.written, 'message')}{rejected}, {seconds_text(report.duration_s)}"
 
 
-def _again(arrivals: Arrivals, path: Path) -> str:
-    import time
-
-    return f"; tried again in {arrivals.again(path, time.monotonic()):.0f} s"
-
-
-def _never(_path: Path) -> str:
-    return ""
+def _retry_text(arrivals: Arrivals | None, path: Path) -> str:
+    """Schedule another attempt, unless the watch runs once, and return when it is due."""
+    return "" if arrivals is None else f"; next attempt in {arrivals.again(path, time.monotonic()):.0f} s"
 
 
-def _say(line: str) -> None:
-    from datetime import datetime, timezone
-
+def _print(line: str) -> None:
     from mosaico_ingest.cli.console import print_line
 
     print_line(f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ} {line}")

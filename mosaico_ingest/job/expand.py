@@ -121,7 +121,7 @@ class Expanded(Struct, frozen=True):
 
 
 def expand_manifest(path: File) -> tuple[Expanded, ...]:
-    """Return every job of a manifest; no variable of the environment is filled in.
+    """Return every job of a manifest, with environment variables in place and secrets masked.
 
     Raises:
         ManifestError: The manifest has mistakes; `findings` has one entry for each.
@@ -133,7 +133,7 @@ def expand_manifest(path: File) -> tuple[Expanded, ...]:
         findings.update(dict.fromkeys(check_manifest(source, env=None, cell=cell)[1]))
     if findings:
         raise refusal(tuple(findings), str(path))
-    return tuple(Expanded(source, cell, stand_alone(source, cell)) for cell in cells)
+    return tuple(Expanded(source, cell, _without_secrets(stand_alone(source, cell))) for cell in cells)
 
 
 MASK = "***"
@@ -156,13 +156,17 @@ def manifest_text(path: File) -> str:
     value = source.value
     if isinstance(value, dict):
         value = {key: inner for key, inner in value.items() if key != EXTENDS_KEY}
-    hidden = frozenset(name for text in _secrets(value) for name in _VARIABLE.findall(text))
 
     def remark(place: KeyPath) -> str | None:
         span = source.span(place)
         return None if span.file == source.file else f"{span.file}:{span.line}"
 
-    return to_yaml(_masked(value, hidden), remark)
+    return to_yaml(_without_secrets(value), remark)
+
+
+def _without_secrets(value: Value) -> Value:
+    hidden = frozenset(name for text in _secrets(value) for name in _VARIABLE.findall(text))
+    return _masked(value, hidden)
 
 
 def _secrets(value: Value) -> Iterator[str]:

@@ -31,7 +31,7 @@ from mosaico_ingest.job.values import (
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote import AnyPath, RemotePath
 from mosaico_ingest.rosbag.definitions.model import Resolver
-from mosaico_ingest.textfile import read_whole, write_whole
+from mosaico_ingest.textfile import read_whole
 
 __all__ = [
     "DEFAULT_MEMORY_BYTES",
@@ -56,7 +56,6 @@ __all__ = [
     "notes",
     "plan_schema",
     "read_plan",
-    "write_plan",
 ]
 
 DEFAULT_MEMORY_BYTES = 256 * 1024 * 1024
@@ -328,16 +327,6 @@ def read_plan(path: Path) -> PlanDocument:
         place = ".".join(map(str, first["loc"]))
         said = f"{place}: {first['msg']}" if place else first["msg"]
         raise ManifestError(f"this is no plan: {said}", where=str(path), hint=hint) from error
-
-
-def write_plan(document: PlanDocument, path: Path) -> None:
-    """Write a plan file, whole or not at all.
-
-    Raises:
-        ManifestError: It is a folder.
-        SinkError: It cannot be written.
-    """
-    write_whole(path, document.model_dump_json(indent=2) + "\n")
 
 
 def decisions(plan: Plan, *, folder: Path) -> Decisions:

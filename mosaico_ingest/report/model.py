@@ -18,7 +18,6 @@ from mosaico_ingest.findings import Stage
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.timing import TimelineReport
 from mosaico_ingest.report.units import count_text, counted
-from mosaico_ingest.textfile import write_whole
 
 __all__ = [
     "Rejection",
@@ -34,7 +33,6 @@ __all__ = [
     "read_report",
     "replay_command",
     "report_schema",
-    "write_report",
 ]
 
 _GRAVEST_FIRST = (130, 5, 1, 2, 3, 4)
@@ -263,15 +261,6 @@ def folder_link(one: Report, page_folder: Path) -> str | None:
         return None
     folder = os.path.relpath(Path(one.quarantine).absolute().parent, page_folder.absolute())
     return quote(Path(folder).as_posix().encode("utf-8", "surrogateescape")) + "/"
-
-
-def write_report(report: RunReport, path: Path) -> None:
-    """Write the report as JSON, whole or not at all.
-
-    Raises:
-        SinkError: The file cannot be written.
-    """
-    write_whole(path, report.model_dump_json(indent=2) + "\n")
 
 
 def read_report(path: Path) -> RunReport:

@@ -1,16 +1,30 @@
-"""This file writes numbers for people."""
+"""Numbers, sizes and times as text for people."""
 
 from __future__ import annotations
 
 from datetime import datetime, timezone
+from typing import TYPE_CHECKING
 
-__all__ = ["bytes_text", "count_text", "counted", "seconds_text", "time_text"]
+if TYPE_CHECKING:  # pydantic is slow to import
+    from mosaico_ingest.report.model import Report
+
+__all__ = [
+    "bytes_text",
+    "count_text",
+    "counted",
+    "percent_text",
+    "rate_text",
+    "seconds_text",
+    "stored_text",
+    "time_text",
+    "written_text",
+]
 
 _STEP = 1000.0
 
 
 def bytes_text(size: float) -> str:
-    """Return a size with a decimal unit, as `1.5 MB`."""
+    """Return a size with a decimal unit, such as `1.5 MB`."""
     for unit in ("B", "kB", "MB", "GB"):
         if abs(size) < _STEP:
             return f"{size:.0f} {unit}" if unit == "B" else f"{size:.1f} {unit}"
@@ -19,17 +33,27 @@ def bytes_text(size: float) -> str:
 
 
 def count_text(count: int) -> str:
-    """Return a count with thin groups, as `12,345`."""
+    """Return a count with separators, such as `12,345`."""
     return f"{count:,}"
 
 
 def counted(count: int, noun: str) -> str:
-    """Return a count with what is counted, as `1 topic` or `12 topics`."""
+    """Return a count with its noun, such as `1 topic` or `12 topics`."""
     return f"{count_text(count)} {noun}{'' if count == 1 else 's'}"
 
 
+def percent_text(share: float) -> str:
+    """Return a share as a percentage, such as `17 %`."""
+    return f"{share * 100:.0f} %"
+
+
+def rate_text(rate_hz: float | None) -> str:
+    """Return a rate, such as `100.0 Hz`; empty if the rate is unknown."""
+    return "" if rate_hz is None else f"{rate_hz:.1f} Hz"
+
+
 def seconds_text(seconds: float) -> str:
-    """Return a duration, as `0.42 s` or `1:02:03`."""
+    """Return a duration, such as `0.42 s` or `1:02:03`."""
     if seconds < 60:  # noqa: PLR2004 - a minute
         return f"{seconds:.2f} s"
     minutes, rest = divmod(round(seconds), 60)
@@ -38,11 +62,26 @@ def seconds_text(seconds: float) -> str:
 
 
 def time_text(instant_ns: int | None) -> str:
-    """Return an instant in UTC, as `2026-01-01 00:00:00.000`."""
+    """Return an instant in UTC, such as `2026-01-01 00:00:00.000`; `-` if there is none."""
     if instant_ns is None:
         return "-"
     try:
-        at = datetime.fromtimestamp(instant_ns // 10**9, tz=timezone.utc)
+        instant = datetime.fromtimestamp(instant_ns // 10**9, tz=timezone.utc)
     except (OverflowError, ValueError, OSError):
         return f"{instant_ns} ns"
-    return f"{at:%Y-%m-%d %H:%M:%S}.{instant_ns % 10**9 // 10**6:03}"
+    return f"{instant:%Y-%m-%d %H:%M:%S}.{instant_ns % 10**9 // 10**6:03}"
+
+
+def stored_text(source_bytes: int, stored_bytes: int) -> str:
+    """Return the stored size and its share of the source, such as `stored in 28.4 kB (17 %)`."""
+    share = f" ({percent_text(stored_bytes / source_bytes)})" if source_bytes else ""
+    return f"stored in {bytes_text(stored_bytes)}{share}"
+
+
+def written_text(report: Report) -> str:
+    """Return how many messages were written, out of those read or, if the run stopped early, of the recording."""
+    written, read = report.totals.written, report.totals.read
+    promised = sum(topic.promised or 0 for topic in report.topics if topic.status.value != "excluded")
+    if report.status.value in {"failed", "interrupted"} and promised > read:
+        return f"{counted(written, 'message')} written before the run stopped, of {count_text(promised)}"
+    return f"{count_text(written)} of {counted(read, 'message')} written"

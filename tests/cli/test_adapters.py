@@ -121,7 +121,7 @@ def test_fields_of_the_message_that_are_left_out_are_named(ingest: Ingest) -> No
     assert "left out" not in out
     text = PACK.read_text().replace("  current: -current_ma / 1000\n", "").replace("current: -0.5, ", "")
     Path("less.yaml").write_text(text)
-    assert "left out of the message: current_ma" in ingest("explain", "less.yaml", "--msg-dir", MESSAGES)[1]
+    assert "fields without a column: current_ma" in ingest("explain", "less.yaml", "--msg-dir", MESSAGES)[1]
 
 
 def test_every_topic_of_a_job_says_which_adapter_and_why(ingest: Ingest) -> None:

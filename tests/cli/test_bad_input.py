@@ -286,13 +286,17 @@ def test_a_recording_in_place_of_a_manifest_is_answered_with_what_takes_it(inges
 
 
 def test_a_shard_without_a_recording_says_so(ingest: Ingest, tmp_path: Path) -> None:
-    assert ingest(job(tmp_path, GOOD), "--shard", "2/2") == (0, "", "shard 2/2 has none of 1 recording\n")
+    assert ingest(job(tmp_path, GOOD), "--shard", "2/2") == (
+        0,
+        "",
+        "shard 2/2 is empty: the job has 1 recording\n",
+    )
 
 
 def test_keys_that_are_not_there_or_have_expired_are_said(ingest: Ingest, tmp_path: Path) -> None:
     assert ingest("keys", "ls")[0] == 2
     new = ("keys", "new", "--permission", "read", "--expires")
-    assert "has passed" in ingest(*new, "2020-01-01T00:00:00Z")[2]
+    assert "is in the past" in ingest(*new, "2020-01-01T00:00:00Z")[2]
     assert "has no time zone" in ingest(*new, "2999-01-01")[2]
     assert ingest(*new, "2999-01-01T00:00:00Z")[0] == 0
     assert "expires 2999" in ingest("keys", "ls")[1]

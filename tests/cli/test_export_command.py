@@ -68,7 +68,7 @@ def test_what_is_left_out_is_said_and_is_exit_code_4(folder: Path) -> None:
     assert ingest(folder, "run", "job.yaml", "--quiet").returncode == 0
     done = ingest(folder, "export", "quickstart_drive", "--to", "c.mcap")
     assert done.returncode == 4
-    assert "/battery: left out: no adapter known makes BatteryState" in done.stdout
+    assert "/battery: excluded: no adapter known makes BatteryState" in done.stdout
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,6 @@ def test_a_short_option_means_the_same_in_every_command() -> None:
                 assert meaning.setdefault(short, long) == long, name
 
 
-@pytest.mark.parametrize(("command", "said"), [("init", "(print it)"), ("bag", "(mosaico)")])
+@pytest.mark.parametrize(("command", "said"), [("init", "(stdout)"), ("bag", "(mosaico)")])
 def test_what_happens_without_an_option_is_said(command: str, said: str) -> None:
     assert said in CliRunner().invoke(command_line(), [command, "--help"], env={"COLUMNS": "150"}).output

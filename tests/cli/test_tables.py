@@ -1,40 +1,36 @@
-"""A narrow terminal folds names and cuts no number; a batch says why messages were rejected."""
+"""Tables of reports, plans, inspections and sequences: no number is truncated, and all reasons are stated."""
 
 from __future__ import annotations
 
-import io
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 from mosaico_ingest import api
-from mosaico_ingest.cli import plan as plan_tables
-from mosaico_ingest.cli import report as tables
-from mosaico_ingest.cli import store as store_tables
+from mosaico_ingest.cli import plan as plan_command
+from mosaico_ingest.cli import report as report_command
+from mosaico_ingest.cli import store as store_command
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.findings import Stage
 from mosaico_ingest.ontology.registry import ontology_type
+from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.model import Rejection, RunReport
+from mosaico_ingest.report.units import written_text
 
 JOB = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
 DRIVE = JOB.parent / "quickstart" / "drive.mcap"
 
 
 @pytest.fixture
-def console(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Console:
-    """Return a terminal of 60 columns, whose text is in `file`."""
+def narrow(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Print to 60 columns."""
     monkeypatch.chdir(tmp_path)
-    narrow = Console(file=io.StringIO(), width=60)
-    for module in (tables, plan_tables):
-        monkeypatch.setattr(module, "open_console", lambda: narrow)
-    return narrow
+    monkeypatch.setattr("mosaico_ingest.cli.console.FILE_WIDTH", 60)
 
 
-def numbers(console: Console) -> set[str]:
-    assert isinstance(console.file, io.StringIO)
-    text = console.file.getvalue()
+def words(capsys: pytest.CaptureFixture[str]) -> set[str]:
+    text = capsys.readouterr().out
     assert "…" not in text
     return set(text.split())
 
@@ -44,22 +40,27 @@ def run_quickstart(folder: Path) -> RunReport:
     return api.run([replace(config, store=folder / "store")])
 
 
-def test_of_a_run(console: Console, tmp_path: Path) -> None:
-    tables.print_report(run_quickstart(tmp_path))
-    assert {"1,000", "308.2", "500", "rejected", "written"} <= numbers(console)
+@pytest.mark.usefixtures("narrow")
+def test_print_report_narrow_terminal_keeps_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report_command.print_report(run_quickstart(tmp_path))
+    assert {"1,000", "308.2", "500", "rejected", "written"} <= words(capsys)
 
 
-def test_of_an_inspection(console: Console) -> None:
-    tables.print_inspection(api.inspect_recording(DRIVE), as_json=False)
-    assert {"1,000", "100.0", "messages"} <= numbers(console)
+@pytest.mark.usefixtures("narrow")
+def test_print_inspection_narrow_terminal_keeps_numbers(capsys: pytest.CaptureFixture[str]) -> None:
+    report_command.print_inspection(api.inspect_recording(DRIVE))
+    assert {"1,000", "100.0", "messages"} <= words(capsys)
 
 
-def test_of_a_plan(console: Console) -> None:
-    plan_tables.print_plan(api.plan_job(JOB), folder=JOB.parent)
-    assert {"1,000", "messages"} <= numbers(console)
+@pytest.mark.usefixtures("narrow")
+def test_print_plan_narrow_terminal_keeps_numbers(capsys: pytest.CaptureFixture[str]) -> None:
+    plan_command.print_plan(api.plan_job(JOB), folder=JOB.parent)
+    assert {"1,000", "messages"} <= words(capsys)
 
 
-def test_a_batch_says_why_messages_were_rejected_up_to_a_point(
+def test_print_report_batch_limits_number_of_reasons(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = run_quickstart(tmp_path)
@@ -74,25 +75,25 @@ def test_a_batch_says_why_messages_were_rejected_up_to_a_point(
     )
     imu = drive.topics[0].model_copy(update={"rejections": (why,)})
     bad = drive.model_copy(update={"topics": (imu,)})
-    tables.print_report(run.model_copy(update={"recordings": (bad,) * 25}))
-    said = capsys.readouterr().out
-    assert said.count("quickstart_drive: /imu: 3 rejected [truncated]: 4 bytes needed\n") == 20
-    assert "… and 5 more reasons, which --report FILE keeps\n" in said
+    report_command.print_report(run.model_copy(update={"recordings": (bad,) * 25}))
+    output = capsys.readouterr().out
+    assert output.count("quickstart_drive: /imu: 3 rejected [truncated]: 4 bytes needed\n") == 20
+    assert "… and 5 more reasons; --report FILE writes all of them\n" in output
 
 
-def test_what_is_stored_of_a_part_is_held_against_that_part(
+def test_print_report_part_of_recording_compares_stored_size_with_messages(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "job.yaml").write_text(f"bag: {{path: {DRIVE}, time: {{end: +1s}}}}\n")
-    tables.print_report(api.run(api.compile_job(tmp_path / "job.yaml")))
+    report_command.print_report(api.run(api.compile_job(tmp_path / "job.yaml")))
     assert " of messages stored in " in capsys.readouterr().out
     (tmp_path / "job.yaml").write_text(f"bag: {{path: {DRIVE}}}\nsequence: {{name: all}}\n")
-    tables.print_report(api.run(api.compile_job(tmp_path / "job.yaml")))
+    report_command.print_report(api.run(api.compile_job(tmp_path / "job.yaml")))
     assert " messages written, 497.3 kB stored in " in capsys.readouterr().out
 
 
-def test_the_list_says_which_sequence_is_not_whole(
+def test_print_sequences_incomplete_sequence_prints_its_note(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sink = StoreSink(Store.open(tmp_path))
@@ -101,5 +102,33 @@ def test_the_list_says_which_sequence_is_not_whole(
             session.topic("/t", ontology_type("String"), {})
             if name == "torn":
                 session.note_error("the disk is full")
-    store_tables.print_sequences(Store.open(tmp_path).sequences(), as_json=False)
+    store_command.print_sequences(Store.open(tmp_path).sequences())
     assert capsys.readouterr().out.splitlines()[-1:] == ["torn: incomplete: the disk is full"]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (None, "-"),
+        (True, "true"),
+        (0.5, "0.5"),
+        (b"abc", "<3 bytes>"),
+        ([1.0, 2.0], "[1.0, 2.0]"),
+        (list(range(1000)), "[0, 1, 2, 3, 4, 5, …] (1000 values)"),
+        ({"x": 1, "y": None}, "{x: 1, y: -}"),
+        ([{"name": "a", "size": 4}] * 9, "[{name: a, size: 4}, …] (9 values)"),
+        ("a" * 30, "aaaaaaaaaaaaaaaaaaaa… (30 characters)"),
+    ],
+)
+def test_value_text_long_value_states_omitted_count(value: object, text: str) -> None:
+    assert store_command.value_text(value, 20) == text
+
+
+def test_written_text_interrupted_run_states_messages_of_recording(tmp_path: Path) -> None:
+    (drive,) = run_quickstart(tmp_path).recordings
+    assert written_text(drive) == f"{drive.totals.written:,} of {drive.totals.read:,} messages written"
+    topics = tuple(topic.model_copy(update={"read": 1, "written": 1}) for topic in drive.topics)
+    stopped = drive.model_copy(update={"status": RunStatus.INTERRUPTED, "topics": topics})
+    promised = sum(topic.promised or 0 for topic in topics if topic.status is not TopicStatus.EXCLUDED)
+    written = stopped.totals.written
+    assert written_text(stopped) == f"{written} messages written before the run stopped, of {promised:,}"

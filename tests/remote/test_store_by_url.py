@@ -132,7 +132,7 @@ def test_every_command_takes_the_url(recording: Path, url: str, tmp_path: Path) 
     assert json.loads(run("store", "ls", "--store", store, "--json"))[0]["rows"] == 2000
     run("run", job(tmp_path, source.url, store, "replace"))
     assert json.loads(run("store", "ls", "--store", store, "--json"))[0]["rows"] == 1000
-    assert "all as written" in run("verify", "--store", store)
+    assert "all complete and intact" in run("verify", "--store", store)
     assert "s3://bucket" in run("store", "show", "drive/b/c", "--store", store)
     run("export", "drive", "--store", store, "--to", "again.mcap")
     assert (tmp_path / "again.mcap").is_file()

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mosaico_ingest.cli.console import write_output
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.findings import Finding, Severity, Stage
 from mosaico_ingest.report.collect import Collector
@@ -23,7 +24,7 @@ from mosaico_ingest.report.events import (
     TopicStatus,
     Unreadable,
 )
-from mosaico_ingest.report.model import Report, RunReport, write_report
+from mosaico_ingest.report.model import Report, RunReport
 
 IMU = Expected("/imu", "/sensors/imu", "sensor_msgs/msg/Imu", "IMUAdapter", "IMU", "built-in", 10)
 LEFT = Expected("/debug", "/debug", "std_msgs/msg/String", "", "", "left out", None, excluded=True)
@@ -122,7 +123,7 @@ def test_the_exit_code_is_that_which_asks_most_of_whoever_reads_it(codes: list[i
 
 def test_a_written_report_reads_back_the_same(tmp_path: Path) -> None:
     report = RunReport(tool="t", recordings=(recording(RunStatus.COMPLETED, 0),))
-    write_report(report, tmp_path / "deep" / "report.json")
+    write_output(tmp_path / "deep" / "report.json", report.model_dump_json())
     assert RunReport.model_validate_json((tmp_path / "deep" / "report.json").read_text()) == report
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["report.json"]
 
@@ -130,4 +131,4 @@ def test_a_written_report_reads_back_the_same(tmp_path: Path) -> None:
 def test_a_report_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(SinkError, match="report"):
-        write_report(RunReport(tool="t", recordings=()), tmp_path / "file" / "report.json")
+        write_output(tmp_path / "file" / "report.json", "{}")
