@@ -38,7 +38,7 @@ SUCCESSFUL = {0, 4}
 """Exit codes of runs that wrote every message that could be written."""
 REPLAY_NOTES = {
     "STORED": "its messages are already in the sequence",
-    "FORGOTTEN": "the run that quarantined it did not commit its sequence; ingest the recording again",
+    "FORGOTTEN": "the sequence does not contain the run that quarantined it; ingest the recording again",
 }
 """Why a file of quarantined messages is not replayed."""
 

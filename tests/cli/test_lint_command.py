@@ -44,7 +44,7 @@ def test_the_text_is_for_people(folder: Path) -> None:
 def test_a_fix_leaves_nothing_to_say(folder: Path) -> None:
     result = RUN.invoke(command_line(), ["lint", "--fix", "job.yaml"])
     assert (result.exit_code, result.stdout) == (0, "")
-    assert "1 file, 0 findings, 2 fixes applied" in result.stderr
+    assert "1 file, 0 findings, 2 changes made" in result.stderr
     assert '"!/cam/*"' in (folder / "job.yaml").read_text()
 
 
