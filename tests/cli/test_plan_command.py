@@ -74,7 +74,9 @@ def test_what_the_manifest_names_and_the_recording_lacks_is_pointed_at(ingest: I
         file.write("topic_settings: {/gps/fixx: {every: 2}}\n")
     code, said = ingest("plan", JOB)
     assert code == 0
-    assert f"{location('/imuu')}: warning[unmatched-pattern] topics: '/imuu' matches none of 10 topics" in said
+    assert (
+        f"{location('/imuu')}: warning[unmatched-pattern] topics: '/imuu' matches none of 10 topics" in said
+    )
     assert "the nearest is /imu" in said
     assert "on_error.topic: '/kamera/*' matches none" in said
     assert "topic_settings: '/gps/fixx' matches none of 10 topics — the nearest is /gps/fix" in said
