@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import subprocess
@@ -58,7 +59,9 @@ def test_a_rosbag2_directory_is_one_recording_once_its_metadata_is_there(tmp_pat
     assert arrivals.settled(1) == (folder,)
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells who has a file open")
+@pytest.mark.skipif(
+    not hasattr(fcntl, "F_SETLEASE"), reason="only Linux reports files that are open for writing"
+)
 def test_a_file_that_is_open_for_writing_is_not_at_rest(tmp_path: Path) -> None:
     file = tmp_path / "a.mcap"
     arrivals = Arrivals(tmp_path, rest_s=0)
