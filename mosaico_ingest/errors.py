@@ -4,7 +4,8 @@ IngestError
 ├── ManifestError        the manifest cannot become a job                      exit code 2
 ├── NothingMatched       no recording or no topic is selected                  exit code 3
 ├── BagError             the recording cannot be read                          exit code 1
-│   └── DecodeError      a message does not fit its type
+│   ├── DecodeError      a message does not fit its type
+│   └── DefinitionError  a message definition of the job is invalid            exit code 2
 ├── AdapterError         an adapter is invalid or does not fit a message type  exit code 1
 ├── SinkError            the destination refuses an operation                  exit code 1
 │   ├── SequenceExists   the sequence already exists
@@ -24,6 +25,7 @@ __all__ = [
     "AdapterError",
     "BagError",
     "DecodeError",
+    "DefinitionError",
     "IngestError",
     "Interrupted",
     "ManifestError",
@@ -108,6 +110,12 @@ class DecodeError(BagError):
         """Create the error; `rule` is the rule id of the rejected row."""
         super().__init__(what, where=where, hint=hint)
         self.rule = rule
+
+
+class DefinitionError(BagError):
+    """A message definition that the job provides is invalid. `findings` has the location in its file."""
+
+    exit_code = 2
 
 
 class AdapterError(IngestError):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
+from os.path import normpath
 from pathlib import Path
 
 from msgspec import Struct
@@ -25,6 +26,7 @@ from mosaico_ingest.lint.rules import CHECKS
 from mosaico_ingest.lint.settings import Settings, settings_for
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
+from mosaico_ingest.rosbag.definitions.registry import definition_files
 from mosaico_ingest.textfile import read_whole
 
 __all__ = [
@@ -261,12 +263,32 @@ def _job_findings(document: Document, env: Mapping[str, str] | None) -> Iterator
     if job is not None:
         spans = {finding.span for finding in findings}
         yield from (item for item in _check_job(job, example=document.example) if item.span not in spans)
+        if not document.example:
+            yield from _definition_findings(job)
 
 
 def _check_job(job: Job, *, example: bool) -> Iterator[Finding]:
     for check in CHECKS:
         if check.job is not None and not (example and check.reads_files):
             yield from map(check.finding, check.job(job))
+
+
+def _definition_findings(job: Job) -> Iterator[Finding]:
+    """Yield the errors in the `.msg` files of `custom_msgs`."""
+    for custom in job.manifest.bag.custom_msgs:
+        files = definition_files(job.resolve(custom.path)) if job.is_expanded(custom.path) else []
+        for file in files:
+            path = Path(normpath(file))
+            if path.suffix == ".msg":
+                findings = _message_findings(_message_in(path))
+                yield from (finding for finding in findings if finding.severity is Severity.ERROR)
+
+
+def _message_in(path: Path) -> MessageFile:
+    try:
+        return read_message(read_text(path).removeprefix("\ufeff"), file=str(path), path=path)
+    except ManifestError:
+        return MessageFile(str(path), "", ())
 
 
 def _message_findings(message: MessageFile) -> Iterator[Finding]:

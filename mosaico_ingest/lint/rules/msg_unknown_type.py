@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from difflib import get_close_matches
 
 from mosaico_ingest.lint.message import MessageFile, is_defined
 from mosaico_ingest.lint.rule import Check, Problem
 from mosaico_ingest.rosbag.definitions.parser import PRIMITIVES
+from mosaico_ingest.rosbag.definitions.registry import suggest_type
 
 _SPECIAL_TYPES = frozenset({"time", "duration", "Header"})
 
@@ -19,14 +19,9 @@ def check(message: MessageFile) -> Iterator[Problem]:
         if declaration.is_constant or msgtype in PRIMITIVES or msgtype in _SPECIAL_TYPES:
             continue
         if not is_defined(msgtype, message.path):
-            yield Problem(f"the type {msgtype!r} is not defined", declaration.type_span, _hint(msgtype))
-
-
-def _hint(msgtype: str) -> str:
-    close = get_close_matches(msgtype, PRIMITIVES, n=1, cutoff=0.7)
-    if close:
-        return f"did you mean {close[0]}?"
-    return "define it under bag.custom_msgs" if "/" in msgtype else "put its .msg file next to this one"
+            yield Problem(
+                f"the type {msgtype!r} is not defined", declaration.type_span, suggest_type(msgtype)
+            )
 
 
 CHECK = Check("msg-unknown-type", message=check)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import re
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from difflib import get_close_matches
 from enum import Enum
@@ -11,8 +12,8 @@ from typing import Any, ClassVar
 
 from msgspec import Struct
 
-from mosaico_ingest.errors import BagError
-from mosaico_ingest.findings import Finding, Severity
+from mosaico_ingest.errors import BagError, DefinitionError
+from mosaico_ingest.findings import Finding, Severity, Span
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.distros import (
     BEFORE_IRON,
@@ -32,7 +33,7 @@ from mosaico_ingest.rosbag.definitions.model import (
     Source,
     normalize_msgtype,
 )
-from mosaico_ingest.rosbag.definitions.parser import flatten, read_types
+from mosaico_ingest.rosbag.definitions.parser import PRIMITIVES, flatten, read_types
 from mosaico_ingest.textfile import read_whole
 
 __all__ = [
@@ -44,6 +45,7 @@ __all__ = [
     "directory_types",
     "register_source",
     "store_of",
+    "suggest_type",
 ]
 
 _SUFFIXES = (".msg", ".idl")
@@ -55,6 +57,8 @@ class Registered(Struct, frozen=True):
     msgtype: str
     text: str
     types: Mapping[str, MessageType]
+    file: Path | None = None
+    """The `.msg` or `.idl` file that contains the text, or None."""
 
 
 class ROSTypeRegistry:
@@ -140,10 +144,61 @@ def register_source(msg_type: str, source: Path | str) -> Registered:
     if name.count("/") != 2:  # noqa: PLR2004 - pkg/msg/Name
         raise BagError(f"{msg_type!r} is no message type", hint="write it as pkg/msg/Name")
     text, where = (source, f"definition of {name}") if _is_text(source) else _read(Path(source))
-    types = dict(read_types(str(text), name, where=where))
+    file = None if _is_text(source) else Path(source)
+    try:
+        types = dict(read_types(str(text), name, where=where))
+    except BagError as error:
+        raise error if file is None else _syntax_error(error, file) from error
     if name not in types:
         raise BagError(f"the text does not define {name}", where=where, hint=f"it defines {', '.join(types)}")
-    return Registered(name, str(text), types)
+    return Registered(name, str(text), types, file)
+
+
+def _syntax_error(error: BagError, file: Path) -> BagError:
+    """Return the error with a finding at its line of a definition file."""
+    line = (error.where or "").rpartition(":")[2]
+    if not line.isdigit():
+        return error
+    span = Span(str(file), int(line), 1, int(line), 1)
+    finding = Finding("msg-syntax", Severity.ERROR, error.what, span, error.hint)
+    return DefinitionError(error.what, where=str(span), hint=error.hint, findings=(finding,))
+
+
+def _check_local_types(own: Sequence[Registered], known: Container[str]) -> None:
+    """Check that every field type without a package, which can only be in the same package, is defined.
+
+    Raises:
+        DefinitionError: A type is not defined; names the file and the line.
+    """
+    for entry in own:
+        package = entry.msgtype.partition("/")[0]
+        names = (
+            (field.name, field.type)
+            for message in entry.types.values()
+            for field in message.fields
+            if field.is_message and "/" not in field.type and field.type != "Header"
+        )
+        for name, msgtype in names:
+            if entry.file is not None and f"{package}/msg/{msgtype}" not in known:
+                raise _unknown_type(entry, entry.file, name, msgtype)
+
+
+def _unknown_type(entry: Registered, file: Path, name: str, msgtype: str) -> DefinitionError:
+    declaration = re.compile(rf"\s*(?P<type>{re.escape(msgtype)})\b.*\s{re.escape(name)}\b")
+    matches = enumerate(map(declaration.match, entry.text.splitlines()), 1)
+    line, column = next(((line, found.start("type") + 1) for line, found in matches if found), (1, 1))
+    span = Span(str(file), line, column, line, column + len(msgtype))
+    message, hint = f"the type {msgtype!r} is not defined", suggest_type(msgtype)
+    finding = Finding("msg-unknown-type", Severity.ERROR, message, span, hint)
+    return DefinitionError(message, where=str(span), hint=hint, findings=(finding,))
+
+
+def suggest_type(msgtype: str) -> str:
+    """Return a hint for a field type that is not defined."""
+    near = get_close_matches(msgtype, PRIMITIVES, n=1, cutoff=0.7)
+    if near:
+        return f"did you mean {near[0]}?"
+    return "define it under bag.custom_msgs" if "/" in msgtype else "put its .msg file next to this one"
 
 
 def _is_text(source: Path | str) -> bool:
@@ -242,6 +297,7 @@ class TypeResolver:
         own += [register_source(name, source) for name, source in (types or {}).items()]
         self._custom = _by_name(own)
         self._registered = _by_name(registry.entries(self.distro).values())
+        _check_local_types(own, {*self._custom, *self._registered, *self._other_distros})
         self._resolved = dict[tuple[str, Embedded | None, int], Definition]()
         self._assumed = dict[str, str]()
         self._replaced = dict[str, str]()
