@@ -19,8 +19,7 @@ from rosbags.typesys import get_typestore
 
 from mosaico_ingest.decode.decoder import ColumnarDecoder, Decoded, RowwiseDecoder
 from mosaico_ingest.job.values import Stores
-from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
-from mosaico_ingest.rosbag.definitions.model import Definition
+from mosaico_ingest.rosbag.blocks import Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.serialization import Serializer
 
@@ -224,13 +223,12 @@ CASES: tuple[tuple[str, int, Make, float], ...] = (
 """Type and what is special, messages, how one is made, and how many times rosbags' speed it has to reach (0: no target)."""
 
 
-def joined(payloads: list[bytes], definition: Definition) -> RawBatch:
+def joined(payloads: list[bytes]) -> MessageBlock:
     """Return a batch in one buffer, with the 31 bytes of an MCAP record's header between payloads."""
     lengths = np.array(list(map(len, payloads)), np.int64)
     data = np.frombuffer(b"".join(bytes(31) + payload for payload in payloads), np.uint8)
-    channel = Channel(1, "/topic", definition.root, Encoding.CDR, len(payloads), definition)
     number = np.arange(len(payloads), dtype=np.int64)
-    return RawBatch(channel, number, data, np.cumsum(lengths + 31) - lengths, lengths, number)
+    return MessageBlock(0, number, data, np.cumsum(lengths + 31) - lengths, lengths, number)
 
 
 def seconds(work: Callable[[], object], repeats: int) -> float:
@@ -262,7 +260,7 @@ def main() -> None:
         payloads = [
             serializer.from_dict(make(number)) for number in range(max(1, int(full * arguments.scale)))
         ]
-        batch, count = joined(payloads, definition), len(payloads)
+        batch, count = joined(payloads), len(payloads)
         columnar, rowwise = (
             ColumnarDecoder(definition, Encoding.CDR),
             RowwiseDecoder(definition, Encoding.CDR),

@@ -26,7 +26,7 @@ with atheris.instrument_imports(include=["mosaico_ingest"]) if atheris else null
     from mosaico_ingest.job.yaml_source import load_source
     from mosaico_ingest.protocol.messages import ACTIONS, JSON, Malformed
     from mosaico_ingest.rosbag import sqlite
-    from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
+    from mosaico_ingest.rosbag.blocks import Connection, Encoding, MessageBlock
     from mosaico_ingest.rosbag.definitions.model import Embedded
     from mosaico_ingest.rosbag.definitions.registry import TypeResolver
     from mosaico_ingest.rosbag.discovery import read_metadata
@@ -49,10 +49,11 @@ def recording(data: bytes) -> None:
         path = Path(folder, "recording")
         path.write_bytes(data)
         with suppress(IngestError), open_recording(path, resolve=_RESOLVER) as opened:
-            for batch in opened.batches():
-                if batch.channel.definition is not None and batch.channel.encoding is not Encoding.OTHER:
+            for batch in opened.message_blocks():
+                connection = opened.connections[batch.connection]
+                if connection.definition is not None and connection.encoding is not Encoding.OTHER:
                     with suppress(IngestError):
-                        decoder_for(batch.channel).decode(batch)
+                        decoder_for(connection).decode(batch)
 
 
 def definition(data: bytes) -> None:
@@ -63,10 +64,10 @@ def definition(data: bytes) -> None:
     ros1 = encoding == "ros1msg"
     with suppress(IngestError):
         found = _RESOLVER.resolve("pkg/msg/Fuzzed", embedded, ros_version=1 if ros1 else 2)
-        channel = Channel(0, "/fuzzed", found.root, Encoding.ROS1 if ros1 else Encoding.CDR, 1, found)
+        connection = Connection(0, "/fuzzed", found.root, Encoding.ROS1 if ros1 else Encoding.CDR, 1, found)
         one = np.array([0], np.int64)
         buffer = np.frombuffer(payload, np.uint8)
-        decoded = decoder_for(channel).decode(RawBatch(channel, one, buffer, one, one + len(payload), one))
+        decoded = decoder_for(connection).decode(MessageBlock(0, one, buffer, one, one + len(payload), one))
         decoded.rows.validate(full=True)
 
 

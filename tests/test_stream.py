@@ -21,12 +21,12 @@ from mosaico_ingest.pipeline.topic import Stream
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.report.collect import Collector
 from mosaico_ingest.report.events import Expected, RunStarted
-from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
+from mosaico_ingest.rosbag.blocks import Connection, Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.serialization import Serializer
 
 DEFINITION = TypeResolver("ros2_humble").resolve("std_msgs/msg/Float64", None, ros_version=2)
-CHANNEL = Channel(0, "/speed", "std_msgs/msg/Float64", Encoding.CDR, None, DEFINITION)
+CONNECTION = Connection(0, "/speed", "std_msgs/msg/Float64", Encoding.CDR, None, DEFINITION)
 SPEED = OntologyType("Speed", pa.struct([pa.field("data", pa.float64(), nullable=False)]))
 SERIALIZER = Serializer(DEFINITION, Encoding.CDR)
 CUT = b"\x00\x01\x00\x00\x01"
@@ -78,11 +78,13 @@ class Session:
         return [value for batch in self.batches for value in batch.column(1).to_pylist()]
 
 
-def raw(payloads: list[bytes], first_ns: int) -> RawBatch:
+def raw(payloads: list[bytes], first_ns: int) -> MessageBlock:
     lengths = np.array([len(payload) for payload in payloads], np.int64)
     starts = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64)
     times = first_ns + np.arange(len(payloads), dtype=np.int64)
-    return RawBatch(CHANNEL, times, np.frombuffer(b"".join(payloads), np.uint8), starts, lengths, times * 10)
+    return MessageBlock(
+        CONNECTION.id, times, np.frombuffer(b"".join(payloads), np.uint8), starts, lengths, times * 10
+    )
 
 
 def payload(value: float | None) -> bytes:
@@ -100,11 +102,13 @@ def run(
 ) -> tuple[Session, Collector, Exception | None]:
     """Feed messages in batches of `size`; None stands for a payload that cannot be decoded."""
     collector, session = Collector(), Session(refuse=refuse)
-    expected = Expected("/speed", "/speed", CHANNEL.msgtype, "Positive", "Speed", "", None)
+    expected = Expected("/speed", "/speed", CONNECTION.msgtype, "Positive", "Speed", "", None)
     collector(RunStarted("s", "d", (), 0, (expected,)))
-    plan = TopicPlan("/speed", "/speed", CHANNEL.msgtype, (0,), Positive(), "", SPEED, None, {}, topic, every)
+    plan = TopicPlan(
+        "/speed", "/speed", CONNECTION.msgtype, (0,), Positive(), "", SPEED, None, {}, topic, every
+    )
     stream = Stream(plan, message, session, collector)
-    stream.bind(CHANNEL)
+    stream.bind(CONNECTION)
     error = None
     try:
         with WriteBuffer(max_bytes=1 << 20) as buffer:

@@ -18,7 +18,7 @@ from mosaico_ingest.decode.lockstep import locate
 from mosaico_ingest.decode.spans import Frame, Int64s, array_of, bytes_at
 from mosaico_ingest.errors import DecodeError
 from mosaico_ingest.findings import RowFailure
-from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
+from mosaico_ingest.rosbag.blocks import Connection, Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
 from mosaico_ingest.rosbag.serialization import Deserializer
@@ -46,14 +46,14 @@ class Decoded(Struct, frozen=True):
 
 
 class Decoder(Protocol):
-    """Decodes batches of one channel; any bytes give rows or failures, never an exception."""
+    """Decodes batches of one connection; any bytes give rows or failures, never an exception."""
 
     @property
     def shape(self) -> pa.StructType:
         """The ROS shape: the type of `Decoded.rows`."""
         ...
 
-    def decode(self, batch: RawBatch) -> Decoded:
+    def decode(self, batch: MessageBlock) -> Decoded:
         """Decode all messages of the batch."""
         ...
 
@@ -74,7 +74,7 @@ class RowwiseDecoder:
         """The ROS shape."""
         return self._shape
 
-    def decode(self, batch: RawBatch) -> Decoded:
+    def decode(self, batch: MessageBlock) -> Decoded:
         """Decode all messages of the batch."""
         values: list[dict[str, Any]] = []
         index: list[int] = []
@@ -108,6 +108,7 @@ class ColumnarDecoder:
     """
 
     def __init__(self, definition: Definition, encoding: Encoding) -> None:
+        self._definition = definition
         self._rowwise = RowwiseDecoder(definition, encoding)
         self._layout = compile_layout(definition, encoding)
 
@@ -116,7 +117,7 @@ class ColumnarDecoder:
         """The ROS shape."""
         return self._rowwise.shape
 
-    def decode(self, batch: RawBatch) -> Decoded:
+    def decode(self, batch: MessageBlock) -> Decoded:
         """Decode all messages of the batch.
 
         Raises:
@@ -135,7 +136,7 @@ class ColumnarDecoder:
             parts.append(self._by_rows(batch, np.flatnonzero(left)))
         return _merge(parts)
 
-    def _in_two(self, batch: RawBatch, total: int) -> Decoded:
+    def _in_two(self, batch: MessageBlock, total: int) -> Decoded:
         """Decode a batch too large for the offsets of a column, half of its bytes after the other."""
         if len(batch) == 1:
             reason = f"{total} bytes, a message can have {_LARGEST}"
@@ -150,14 +151,14 @@ class ColumnarDecoder:
             raise DecodeError(
                 f"a batch of {total} bytes, a column holds {_LARGEST}",
                 rule="batch-size",
-                where=batch.channel.topic,
+                where=self._definition.root,
                 hint="read smaller batches",
             ) from error
         index = np.concatenate([first.index, second.index + edges[1]])
         later = (replace(failure, row=failure.row + edges[1]) for failure in second.failures)
         return Decoded(rows, index, (*first.failures, *later), first.padded + second.padded)
 
-    def _by_order(self, batch: RawBatch) -> list[tuple[str, Int64s]]:
+    def _by_order(self, batch: MessageBlock) -> list[tuple[str, Int64s]]:
         """Return the positions of the messages of each byte order, without those of none."""
         if self._layout.encoding is Encoding.ROS1:
             return [("<", np.arange(len(batch)))] if len(batch) else []
@@ -166,7 +167,7 @@ class ColumnarDecoder:
         groups = [(order, rows[(first == 0) & (second == kind)]) for order, kind in _ORDERS.items()]
         return [(order, members) for order, members in groups if len(members)]
 
-    def _by_columns(self, batch: RawBatch, order: str, rows: Int64s) -> Decoded:
+    def _by_columns(self, batch: MessageBlock, order: str, rows: Int64s) -> Decoded:
         """Decode those of some messages, all of one byte order, that can be vouched for."""
         skip = _HEADER if self._layout.encoding is Encoding.CDR else 0
         starts, lengths = batch.starts[rows], batch.lengths[rows]
@@ -178,7 +179,7 @@ class ColumnarDecoder:
             values, _ = build_columns(self._layout, self.shape, frame, located)
         return Decoded(values, rows[located.rows], (), int((located.tails > PADDING).sum()))
 
-    def _by_rows(self, batch: RawBatch, rows: Int64s) -> Decoded:
+    def _by_rows(self, batch: MessageBlock, rows: Int64s) -> Decoded:
         """Decode some messages one by one."""
         decoded = self._rowwise.decode(batch.rows(rows))
         failures = tuple(replace(failure, row=int(rows[failure.row])) for failure in decoded.failures)
@@ -197,25 +198,25 @@ def _merge(parts: list[Decoded]) -> Decoded:
     return Decoded(rows, index[order], failures, padded)
 
 
-def decoder_for(channel: Channel) -> Decoder:
-    """Return the decoder of a channel's messages.
+def decoder_for(connection: Connection) -> Decoder:
+    """Return the decoder of a connection's messages.
 
     Raises:
-        DecodeError: The channel is not in a ROS encoding, has no definition, or one without an Arrow shape.
+        DecodeError: The connection is not in a ROS encoding, has no definition, or one without an Arrow shape.
     """
-    if channel.encoding is Encoding.OTHER:
+    if connection.encoding is Encoding.OTHER:
         raise DecodeError(
-            f"the messages are not in a ROS encoding ({channel.attributes.get('encoding', 'unknown')})",
+            f"the messages are not in a ROS encoding ({connection.attributes.get('encoding', 'unknown')})",
             rule="encoding",
-            where=channel.topic,
+            where=connection.topic,
         )
-    if channel.definition is None:
+    if connection.definition is None:
         raise DecodeError(
-            f"no definition of {channel.msgtype}: {channel.problem or 'the recording has none'}",
+            f"no definition of {connection.msgtype}: {connection.problem or 'the recording has none'}",
             rule="definition",
-            where=channel.topic,
+            where=connection.topic,
         )
-    return _decoder(_Known(channel.definition), channel.encoding)
+    return _decoder(_Known(connection.definition), connection.encoding)
 
 
 class _Known(Struct, frozen=True):

@@ -10,7 +10,7 @@ import pyarrow as pa
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from mosaico_ingest.rosbag.compression import room
+from mosaico_ingest.rosbag.compression import allocate
 
 __all__ = [
     "Array",
@@ -192,7 +192,7 @@ def spans(data: Bytes, at: Int64s, sizes: Int64s) -> Bytes:
 
 
 def _copied(data: Bytes, at: Int64s, ends: Int64s, total: int) -> Bytes:
-    out = room(total)
+    out = allocate(total)
     pos = 0
     for start, end in zip(at.tolist(), ends.tolist(), strict=True):
         out[pos : pos + end - start] = data[start:end]

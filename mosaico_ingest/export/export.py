@@ -275,9 +275,11 @@ def export_sequence(
             raise NothingMatched(
                 f"none of {len(left)} topics can be written", where=sequence, hint=_first(left)
             )
-        streams = [_stream(store, channel, restorer, start_ns, end_ns) for channel, restorer in restorers]
-        for log_ns, channel, payload in heapq.merge(*streams, key=lambda message: message[0]):
-            writer.write(channel, log_ns, payload)
+        streams = [
+            _stream(store, connection, restorer, start_ns, end_ns) for connection, restorer in restorers
+        ]
+        for log_ns, connection, payload in heapq.merge(*streams, key=lambda message: message[0]):
+            writer.write(connection, log_ns, payload)
         if not any(restorer.messages for _, restorer in restorers):
             raise NothingMatched(
                 "there is no message to write", where=sequence, hint="look at --start and --end"
@@ -303,7 +305,7 @@ def _prepare(
     suffix: str,
     writer: RecordingWriter,
 ) -> tuple[int, Restorer] | TopicExport:
-    """Open the channel of a topic, or say why it cannot be."""
+    """Open the connection of a topic, or say why it cannot be."""
     origin = origin_of(info)
     if origin is None:
         return _left(info, "", "its metadata does not say which messages it was made of")
@@ -311,7 +313,7 @@ def _prepare(
     version = version_of(origin, others, ROS_VERSIONS[suffix])
     try:
         restorer = restorer_for(info, origin.definition(version), specs)
-        return writer.channel(info.name, restorer.definition), restorer
+        return writer.add_connection(info.name, restorer.definition), restorer
     except (AdapterError, BagError) as error:
         return _left(info, origin.msgtype, f"{error.what} — {error.hint}" if error.hint else error.what)
 
@@ -325,9 +327,9 @@ def _first(left: Sequence[TopicExport]) -> str:
 
 
 def _stream(
-    store: Store, channel: int, restorer: Restorer, start_ns: int | None, end_ns: int | None
+    store: Store, connection: int, restorer: Restorer, start_ns: int | None, end_ns: int | None
 ) -> Iterator[tuple[int, int, bytes]]:
     info = restorer.info
     with store.scan(info.sequence, info.name, start_ns=start_ns, end_ns=end_ns) as reader:
         for log_ns, payload in restorer.read(iter(reader)):
-            yield log_ns, channel, payload
+            yield log_ns, connection, payload

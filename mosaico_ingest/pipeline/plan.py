@@ -62,14 +62,14 @@ DEFAULT_MEMORY_BYTES = 256 * 1024 * 1024
 
 
 class TopicPlan(Struct, frozen=True):
-    """One stream: the channels it is made of, what it becomes, and why."""
+    """One stream: the connections it is made of, what it becomes, and why."""
 
     topic: str
     """Its name in the recording."""
     target: str
     """Its name in the sequence."""
     msgtype: str
-    channels: tuple[int, ...]
+    connections: tuple[int, ...]
     adapter: AdapterSpec
     why: str
     """Which rule chose the adapter."""

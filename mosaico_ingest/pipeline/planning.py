@@ -40,7 +40,7 @@ from mosaico_ingest.pipeline.plan import (
     check_digest,
 )
 from mosaico_ingest.protocol import check_topic_name
-from mosaico_ingest.rosbag.blocks import Channel, Encoding
+from mosaico_ingest.rosbag.blocks import Connection, Encoding
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
@@ -57,51 +57,57 @@ T = TypeVar("T")
 
 
 def decide(
-    config: ROSInjectionConfig, channel: Channel, selection: Selection, bridge: ROSBridge, source_file: str
+    config: ROSInjectionConfig,
+    connection: Connection,
+    selection: Selection,
+    bridge: ROSBridge,
+    source_file: str,
 ) -> TopicPlan | ExcludedTopic:
-    """Return the plan for one channel, or why it is left out.
+    """Return the plan for one connection, or why it is left out.
 
     Raises:
         AdapterError: An override does not fit, or the type has no adapter and the job says to fail then.
         BagError: Nobody defines the type, and unreadable messages shall end the run.
     """
-    if channel.topic not in selection.selected:
-        return _not_selected(config, channel, selection)
-    if channel.encoding is Encoding.OTHER:
-        encoding = channel.attributes.get("encoding", "unknown")
-        return _excluded(channel, channel.problem or f"not a ROS encoding: {encoding}")
-    if channel.definition is None:
-        return _lost(config, channel, channel.problem or f"no definition of {channel.msgtype} is known")
-    found = bridge.resolve(channel.topic, channel.msgtype)
+    if connection.topic not in selection.selected:
+        return _not_selected(config, connection, selection)
+    if connection.encoding is Encoding.OTHER:
+        encoding = connection.attributes.get("encoding", "unknown")
+        return _excluded(connection, connection.problem or f"not a ROS encoding: {encoding}")
+    if connection.definition is None:
+        return _lost(
+            config, connection, connection.problem or f"no definition of {connection.msgtype} is known"
+        )
+    found = bridge.resolve(connection.topic, connection.msgtype)
     if found.unmodeled and config.unmodeled is not Unmodeled.KEEP:
         if config.unmodeled is Unmodeled.FAIL:
             raise AdapterError(
-                f"no adapter takes {channel.msgtype}",
-                where=channel.topic,
+                f"no adapter takes {connection.msgtype}",
+                where=connection.topic,
                 hint="name one in adapters.override, or set adapters.unmodeled to keep or skip",
             )
         place = config.places.get(("adapters", "unmodeled"))
         return _excluded(
-            channel, f"no adapter takes {channel.msgtype}, and adapters.unmodeled is skip", place
+            connection, f"no adapter takes {connection.msgtype}, and adapters.unmodeled is skip", place
         )
-    bound = found.spec.bind(channel.definition, ros_shape(channel.definition))
+    bound = found.spec.bind(connection.definition, ros_shape(connection.definition))
     metadata = {
-        **_setting(config.topic_metadata, channel.topic, {}),
-        **ros_metadata(channel.definition, source_file),
+        **_setting(config.topic_metadata, connection.topic, {}),
+        **ros_metadata(connection.definition, source_file),
     }
     return TopicPlan(
-        topic=channel.topic,
-        target=config.rename.get(channel.topic, channel.topic),
-        msgtype=channel.msgtype,
-        channels=(channel.id,),
+        topic=connection.topic,
+        target=config.rename.get(connection.topic, connection.topic),
+        msgtype=connection.msgtype,
+        connections=(connection.id,),
         adapter=found.spec,
         why=found.why,
         ontology=bound.ontology,
-        count=channel.count,
+        count=connection.count,
         metadata=metadata,
-        on_error=config.topic_policy(channel.topic),
-        every=_setting(config.every, channel.topic, 1),
-        definitions=(_definition(channel.definition),),
+        on_error=config.topic_policy(connection.topic),
+        every=_setting(config.every, connection.topic, 1),
+        definitions=(_definition(connection.definition),),
     )
 
 
@@ -110,7 +116,7 @@ def _definition(definition: Definition) -> str:
 
 
 def merge(taken: list[TopicPlan], more: TopicPlan) -> Finding | None:
-    """Add a channel's plan: to the stream with the same topic and columns, else as a stream of its own."""
+    """Add a connection's plan: to the stream with the same topic and columns, else as a stream of its own."""
     same_name = [plan for plan in taken if _bare(plan.target) == _bare(more.target)]
     for position, plan in enumerate(taken):
         same = plan.target == more.target and plan.msgtype == more.msgtype and plan.ontology == more.ontology
@@ -118,7 +124,7 @@ def merge(taken: list[TopicPlan], more: TopicPlan) -> Finding | None:
             count = None if plan.count is None or more.count is None else plan.count + more.count
             taken[position] = replace(
                 plan,
-                channels=(*plan.channels, *more.channels),
+                connections=(*plan.connections, *more.connections),
                 count=count,
                 definitions=tuple(dict.fromkeys((*plan.definitions, *more.definitions))),
             )
@@ -157,22 +163,22 @@ def _free_name(plan: TopicPlan, used: set[str]) -> str:
     return next(name for name in candidates if _bare(name) not in used)
 
 
-def _excluded(channel: Channel, why: str, place: Span | None = None) -> ExcludedTopic:
-    return ExcludedTopic(channel.topic, channel.msgtype, channel.count, why, place)
+def _excluded(connection: Connection, why: str, place: Span | None = None) -> ExcludedTopic:
+    return ExcludedTopic(connection.topic, connection.msgtype, connection.count, why, place)
 
 
-def _lost(config: ROSInjectionConfig, channel: Channel, why: str) -> ExcludedTopic:
-    if channel.count != 0 and config.messages_on_error is LoaderErrorPolicy.RAISE:
-        raise BagError(why, where=channel.topic)
-    return replace(_excluded(channel, why), undefined=channel.count != 0)
+def _lost(config: ROSInjectionConfig, connection: Connection, why: str) -> ExcludedTopic:
+    if connection.count != 0 and config.messages_on_error is LoaderErrorPolicy.RAISE:
+        raise BagError(why, where=connection.topic)
+    return replace(_excluded(connection, why), undefined=connection.count != 0)
 
 
-def _not_selected(config: ROSInjectionConfig, channel: Channel, selection: Selection) -> ExcludedTopic:
-    position = selection.decided_by[channel.topic]
+def _not_selected(config: ROSInjectionConfig, connection: Connection, selection: Selection) -> ExcludedTopic:
+    position = selection.decided_by[connection.topic]
     if position is None:
-        return _excluded(channel, "no pattern of `topics` matches it", config.places.get(("topics",)))
+        return _excluded(connection, "no pattern of `topics` matches it", config.places.get(("topics",)))
     why = f"left out by {(config.topics or ())[position]!r} in `topics`"
-    return _excluded(channel, why, config.places.get(("topics", position)))
+    return _excluded(connection, why, config.places.get(("topics", position)))
 
 
 class _Known(Struct, frozen=True):
@@ -284,17 +290,17 @@ def resolve(
             every mistake of every topic.
         IngestError: The configuration is for one plan only, and this is another.
     """
-    topics = tuple(dict.fromkeys(channel.topic for channel in recording.channels))
+    topics = tuple(dict.fromkeys(connection.topic for connection in recording.connections))
     selection = select(config.topics or (), topics)
     findings = [*_known(recording, resolver, selection), *_findings(config, selection, topics)]
     taken: list[TopicPlan] = []
     left: list[ExcludedTopic] = []
     misfits: list[tuple[str, AdapterError]] = []
-    for channel in recording.channels:
+    for connection in recording.connections:
         try:
-            outcome = decide(config, channel, selection, bridge, encodable(recording.files[0].name))
+            outcome = decide(config, connection, selection, bridge, encodable(recording.files[0].name))
         except AdapterError as error:
-            misfits.append((channel.topic, error))
+            misfits.append((connection.topic, error))
             continue
         if isinstance(outcome, ExcludedTopic):
             left.append(outcome)
@@ -324,7 +330,7 @@ def resolve(
         read_from_ns=read_from_ns,
         read_until_ns=read_until_ns,
         quarantine=config.quarantine,
-        missing=recording.missing,
+        missing=recording.missing_files,
         family=config.family or config.sequence_name,
         memory_bytes=config.memory_bytes or DEFAULT_MEMORY_BYTES,
         attempt=config.attempt,
@@ -338,9 +344,9 @@ def resolve(
 def _known(recording: Recording, resolver: TypeResolver, selection: Selection) -> Iterator[Finding]:
     """Yield what is odd about the recording and the types that are taken; `merge` tells of two types on a topic."""
     yield from (finding for finding in recording.findings if finding.rule != "mixed-types")
-    taken = [channel for channel in recording.channels if channel.topic in selection.selected]
+    taken = [connection for connection in recording.connections if connection.topic in selection.selected]
     yield from resolver.findings_about(
-        {name for channel in taken if channel.definition for name in channel.definition.types}
+        {name for connection in taken if connection.definition for name in connection.definition.types}
     )
 
 

@@ -38,7 +38,7 @@ from mosaico_ingest.pipeline.topic import Stream
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.protocol import check_topic_name
 from mosaico_ingest.report.events import Event, Rejected
-from mosaico_ingest.rosbag.blocks import RawBatch
+from mosaico_ingest.rosbag.blocks import MessageBlock
 from mosaico_ingest.rosbag.recording import Recording
 from mosaico_ingest.version import __version__
 
@@ -132,10 +132,12 @@ def try_messages(plan: Plan, recording: Recording) -> tuple[Sample, ...]:
     """Decode and adapt the first messages of every topic of the plan; nothing is written."""
     with MemorySink().open(plan.sequence, plan.metadata) as session:
         trials = tuple(_trial(topic, recording, session) for topic in plan.topics)
-        by_channel = {channel: trial for trial in trials for channel in trial.stream.plan.channels}
+        by_connection = {
+            connection: trial for trial in trials for connection in trial.stream.plan.connections
+        }
         with WriteBuffer(max_bytes=_MEMORY_BYTES) as buffer:
-            for batch in _first(plan, recording, by_channel):
-                by_channel[batch.channel.id].stream.feed(batch, buffer)
+            for batch in _first(plan, recording, by_connection):
+                by_connection[batch.connection].stream.feed(batch, buffer)
     stored = {topic.topic: topic for topic in session.stored()}
     return tuple(trial.sample(stored.get(trial.stream.plan.target)) for trial in trials)
 
@@ -177,27 +179,29 @@ def _trial(topic: TopicPlan, recording: Recording, session: Session) -> _Trial:
     tally = _Tally()
     patient = replace(topic, on_error=TopicLevelErrorPolicy.Ignore)
     stream = Stream(patient, LoaderErrorPolicy.IGNORE, session, tally)
-    channels = {channel.id: channel for channel in recording.channels}
-    for channel in topic.channels:
-        stream.bind(channels[channel])
+    connections = {connection.id: connection for connection in recording.connections}
+    for connection in topic.connections:
+        stream.bind(connections[connection])
     return _Trial(stream, tally)
 
 
-def _first(plan: Plan, recording: Recording, trials: dict[int, _Trial]) -> Iterator[RawBatch]:
+def _first(plan: Plan, recording: Recording, trials: dict[int, _Trial]) -> Iterator[MessageBlock]:
     """Yield batches until every topic has enough; then, of those that had none, what the index knows of."""
     yield from _look(plan, recording, trials, enough=MESSAGES)
     absent = {
-        channel: trial
-        for channel, trial in trials.items()
+        connection: trial
+        for connection, trial in trials.items()
         if not trial.stream.seen and trial.stream.plan.count
     }
     if absent:
         yield from _look(plan, recording, absent, enough=1)
 
 
-def _look(plan: Plan, recording: Recording, trials: dict[int, _Trial], *, enough: int) -> Iterator[RawBatch]:
+def _look(
+    plan: Plan, recording: Recording, trials: dict[int, _Trial], *, enough: int
+) -> Iterator[MessageBlock]:
     left_bytes, until = _LOOK_BYTES, time.monotonic() + _LOOK_S
-    batches = recording.batches(
+    batches = recording.message_blocks(
         tuple(trials),
         start_ns=plan.read_from_ns,
         end_ns=plan.read_until_ns,
@@ -206,7 +210,7 @@ def _look(plan: Plan, recording: Recording, trials: dict[int, _Trial], *, enough
     )
     for batch in batches:
         left_bytes -= int(batch.lengths.sum())
-        if trials[batch.channel.id].stream.seen < enough:
+        if trials[batch.connection].stream.seen < enough:
             yield batch
         if all(trial.stream.seen >= enough for trial in trials.values()):
             return

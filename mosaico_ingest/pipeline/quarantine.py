@@ -23,7 +23,7 @@ from mosaico_ingest.errors import BagError, NothingMatched, SinkError
 from mosaico_ingest.findings import RowFailure, Stage
 from mosaico_ingest.job.config import QuarantineSettings
 from mosaico_ingest.job.values import Limit
-from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
+from mosaico_ingest.rosbag.blocks import Connection, Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.model import Definition, Source, short_msgtype
 from mosaico_ingest.rosbag.formats import MCAP
 from mosaico_ingest.rosbag.mcap.records import (
@@ -62,7 +62,7 @@ class McapFile:
             OSError: It cannot be created, or is there already.
         """
         self._file: BinaryIO = path.open("xb")
-        self._channels: dict[int, bytes] = {}
+        self._connections: dict[int, bytes] = {}
         self._schemas: dict[int, bytes] = {}
         self._counts: dict[int, int] = {}
         self._span: tuple[int, int] | None = None
@@ -77,11 +77,11 @@ class McapFile:
     ) -> None:
         self.close()
 
-    def write(self, channel: Channel, log_time_ns: int, payload: bytes) -> None:
+    def write(self, connection: Connection, log_time_ns: int, payload: bytes) -> None:
         """Append one message; OSError where the disk refuses it."""
-        number = channel.id
-        if number not in self._channels:
-            self._open(channel)
+        number = connection.id
+        if number not in self._connections:
+            self._open(connection)
         count = self._counts[number] = self._counts.get(number, 0) + 1
         head = _MESSAGE_HEAD.pack(number + 1, count, log_time_ns, log_time_ns)
         self._put(Op.MESSAGE, head + payload)
@@ -94,31 +94,31 @@ class McapFile:
             return
         self._put(Op.DATA_END, struct.pack("<I", 0))
         start = self._file.tell()
-        summary = b"".join((*self._schemas.values(), *self._channels.values(), self._statistics()))
+        summary = b"".join((*self._schemas.values(), *self._connections.values(), self._statistics()))
         self._file.write(summary)
         footer = RECORD.pack(Op.FOOTER, 20) + struct.pack("<QQ", start, 0)
         crc = zlib.crc32(summary + footer)
         self._file.write(footer + struct.pack("<I", crc) + MCAP)
         self._file.close()
 
-    def _open(self, channel: Channel) -> None:
-        number = channel.id + 1
-        ros1 = channel.encoding is Encoding.ROS1
-        known = channel.definition
+    def _open(self, connection: Connection) -> None:
+        number = connection.id + 1
+        ros1 = connection.encoding is Encoding.ROS1
+        known = connection.definition
         embedded = known is not None and known.source is Source.BAG
-        schema = struct.pack("<H", number) + text_bytes(_schema_name(channel, known))
+        schema = struct.pack("<H", number) + text_bytes(_schema_name(connection, known))
         schema += text_bytes("ros1msg" if ros1 else "ros2msg") + text_bytes(
             known.text if known and embedded else ""
         )
-        kept = {key: value for key, value in channel.attributes.items() if key == "offered_qos_profiles"}
+        kept = {key: value for key, value in connection.attributes.items() if key == "offered_qos_profiles"}
         body = (
             struct.pack("<HH", number, number)
-            + text_bytes(channel.topic)
-            + text_bytes(channel.encoding.value)
+            + text_bytes(connection.topic)
+            + text_bytes(connection.encoding.value)
         )
-        self._schemas[channel.id] = record_bytes(Op.SCHEMA, schema)
-        self._channels[channel.id] = record_bytes(Op.CHANNEL, body + texts_bytes(kept))
-        self._file.write(self._schemas[channel.id] + self._channels[channel.id])
+        self._schemas[connection.id] = record_bytes(Op.SCHEMA, schema)
+        self._connections[connection.id] = record_bytes(Op.CHANNEL, body + texts_bytes(kept))
+        self._file.write(self._schemas[connection.id] + self._connections[connection.id])
 
     def _statistics(self) -> bytes:
         low, high = self._span or (0, 0)
@@ -127,7 +127,7 @@ class McapFile:
             "<QHIIIIQQI",
             sum(self._counts.values()),
             len(self._schemas),
-            len(self._channels),
+            len(self._connections),
             0,
             0,
             0,
@@ -141,9 +141,9 @@ class McapFile:
         self._file.write(record_bytes(kind, body))
 
 
-def _schema_name(channel: Channel, known: Definition | None) -> str:
-    name = known.root if known is not None else channel.msgtype
-    return short_msgtype(name) if channel.encoding is Encoding.ROS1 else name
+def _schema_name(connection: Connection, known: Definition | None) -> str:
+    name = known.root if known is not None else connection.msgtype
+    return short_msgtype(name) if connection.encoding is Encoding.ROS1 else name
 
 
 class Kept(Struct, frozen=True):
@@ -213,7 +213,8 @@ class Quarantine:
 
     def take(
         self,
-        batch: RawBatch,
+        connection: Connection,
+        batch: MessageBlock,
         failure: RowFailure,
         *,
         stage: Stage,
@@ -236,8 +237,10 @@ class Quarantine:
         with self._explained():
             messages, index = self._files or self._create()
             row = failure.row
-            messages.write(batch.channel, int(batch.log_times[row]), batch.payload(row))
-            index.write(json.dumps(self._entry(batch, failure, stage, target), ensure_ascii=False) + "\n")
+            messages.write(connection, int(batch.log_times[row]), batch.payload(row))
+            index.write(
+                json.dumps(self._entry(connection, batch, failure, stage, target), ensure_ascii=False) + "\n"
+            )
         self._of_topic[target] += 1
         self.kept += 1
         return True
@@ -282,15 +285,14 @@ class Quarantine:
         return self._files
 
     def _entry(
-        self, batch: RawBatch, failure: RowFailure, stage: Stage, target: str
+        self, connection: Connection, batch: MessageBlock, failure: RowFailure, stage: Stage, target: str
     ) -> dict[str, str | int | None]:
-        channel = batch.channel
-        text = channel.definition.text if channel.definition else None
+        text = connection.definition.text if connection.definition else None
         return {
             "sequence": self._sequence,
-            "topic": channel.topic,
+            "topic": connection.topic,
             "target": target,
-            "msgtype": channel.msgtype,
+            "msgtype": connection.msgtype,
             "definition": None if text is None else hashlib.sha256(text.encode()).hexdigest()[:16],
             "log_time_ns": int(batch.log_times[failure.row]),
             "offset": int(batch.offsets[failure.row]),

@@ -166,12 +166,12 @@ def _open_streams(
     quarantine: Quarantine | None,
     watch: Stopwatch,
 ) -> tuple[Stream, ...]:
-    channels = {channel.id: channel for channel in recording.channels}
+    connections = {connection.id: connection for connection in recording.connections}
     streams: list[Stream] = []
     for topic in plan.topics:
         stream = Stream(topic, plan.on_message_error, session, observe, quarantine=quarantine, watch=watch)
-        for channel_id in topic.channels:
-            stream.bind(channels[channel_id])
+        for connection_id in topic.connections:
+            stream.bind(connections[connection_id])
         streams.append(stream)
     return tuple(streams)
 
@@ -180,11 +180,11 @@ def _pump(
     plan: Plan, recording: Recording, streams: tuple[Stream, ...], observe: Observer, watch: Stopwatch
 ) -> None:
     """Move every batch of the recording through its stream, writing on a thread of its own."""
-    by_channel = {channel: stream for stream in streams for channel in stream.plan.channels}
+    by_connection = {connection: stream for stream in streams for connection in stream.plan.connections}
     said = frozenset(recording.unreadable)  # by a finding of the recording itself
     buffer = WriteBuffer(max_bytes=plan.memory_bytes // 4)
     try:
-        _feed(plan, recording, by_channel, buffer, watch)
+        _feed(plan, recording, by_connection, buffer, watch)
     finally:
         watch.lap(Step.WAIT)
         watch.add(Step.WRITE, buffer.busy_s)
@@ -192,7 +192,7 @@ def _pump(
         if stream.padded:
             observe(Noted(_padded(stream)))
     for item in recording.unreadable:
-        stream = by_channel.get(item.connection) if item.connection is not None else None
+        stream = by_connection.get(item.connection) if item.connection is not None else None
         if item.count == 0 and item in said:
             continue
         if item.count == 0:
@@ -220,7 +220,7 @@ def _feed(
     plan: Plan, recording: Recording, streams: Mapping[int, Stream], buffer: WriteBuffer, watch: Stopwatch
 ) -> None:
     with buffer:
-        batches = recording.batches(
+        batches = recording.message_blocks(
             tuple(streams),
             start_ns=plan.read_from_ns,
             end_ns=plan.read_until_ns,
@@ -229,7 +229,7 @@ def _feed(
         watch.lap(Step.PREPARE)
         for batch in batches:
             watch.lap(Step.READ)
-            streams[batch.channel.id].feed(batch, buffer)
+            streams[batch.connection].feed(batch, buffer)
             watch.lap(Step.ADAPT)
         watch.lap(Step.READ)
 
@@ -254,7 +254,7 @@ def _missing(plan: Plan, recording: Recording, streams: tuple[Stream, ...], obse
     wrong: list[str] = []
     for stream in streams:
         target, promised = stream.plan.target, stream.plan.count
-        found = stream.seen + sum(known[channel] for channel in stream.plan.channels)
+        found = stream.seen + sum(known[connection] for connection in stream.plan.connections)
         if promised is None or promised == found:
             continue
         says = f"{target}: the index promises {promised} messages, {stream.seen} were read"

@@ -36,7 +36,7 @@ from mosaico_ingest.report.events import (
     TopicStatus,
 )
 from mosaico_ingest.report.timing import Step, Stopwatch, Timeline
-from mosaico_ingest.rosbag.blocks import Channel, RawBatch
+from mosaico_ingest.rosbag.blocks import Connection, MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 
 __all__ = ["Stream"]
@@ -61,7 +61,7 @@ class _Translated(Struct, frozen=True):
 
 @dataclass(slots=True)
 class Stream:
-    """A topic's adapters by channel, its writer once there are rows, and its sums.
+    """A topic's adapters by connection, its writer once there are rows, and its sums.
 
     A message that breaks a policy of `raise` or `finalize` ends the stream there: rows before it are
     written, whatever the size of the batches.
@@ -87,25 +87,29 @@ class Stream:
     """How many messages failed before the first good one."""
     timeline: Timeline = field(default_factory=Timeline)
     watch: Stopwatch = field(default_factory=Stopwatch)
+    _connections: dict[int, Connection] = field(default_factory=dict[int, Connection])
     _decoders: dict[int, Decoder] = field(default_factory=dict[int, Decoder])
     _adapters: dict[int, Adapter] = field(default_factory=dict[int, Adapter])
     _writer: TopicWriter | None = None
     _configuration: dict[str, Any] | None = None
     """What the adapter says of the topic, from its first message."""
 
-    def bind(self, channel: Channel) -> None:
-        """Make the decoder and the adapter of one channel.
+    def bind(self, connection: Connection) -> None:
+        """Make the decoder and the adapter of one connection.
 
         Raises:
-            BagError: The channel has no definition.
+            BagError: The connection has no definition.
             AdapterError: The adapter does not fit it.
         """
-        if channel.definition is None:
-            raise BagError(channel.problem or "no definition of its type is known", where=channel.topic)
-        self._decoders[channel.id] = decoder_for(channel)
-        self._adapters[channel.id] = self.plan.adapter.bind(channel.definition, ros_shape(channel.definition))
+        if connection.definition is None:
+            raise BagError(connection.problem or "no definition of its type is known", where=connection.topic)
+        self._connections[connection.id] = connection
+        self._decoders[connection.id] = decoder_for(connection)
+        self._adapters[connection.id] = self.plan.adapter.bind(
+            connection.definition, ros_shape(connection.definition)
+        )
 
-    def feed(self, batch: RawBatch, buffer: WriteBuffer) -> None:
+    def feed(self, batch: MessageBlock, buffer: WriteBuffer) -> None:
         """Take a batch all the way; account for every message of it.
 
         Raises:
@@ -128,19 +132,19 @@ class Stream:
         if fatal is not None:
             self._end(fatal, batch, end)
 
-    def _translate(self, batch: RawBatch) -> _Translated:
+    def _translate(self, batch: MessageBlock) -> _Translated:
         positions = np.arange(len(batch), dtype=np.int64)
         taken = (positions + self.seen) % self.plan.every == 0
         self.seen += len(batch)
         keep = positions[taken]
         sampled = batch if taken.all() else batch.rows(keep)
-        decoded = self._decoders[batch.channel.id].decode(sampled)
+        decoded = self._decoders[batch.connection].decode(sampled)
         self.watch.lap(Step.DECODE)
         self.padded += decoded.padded
         lost = [_Lost(Stage.DECODE, replace(f, row=int(keep[f.row]))) for f in decoded.failures]
         index = keep[decoded.index]
         envelope = Envelope(self.plan.topic, self.plan.msgtype, batch.log_times[index])
-        adapter = self._adapters[batch.channel.id]
+        adapter = self._adapters[batch.connection]
         try:
             if self._configuration is None and len(decoded.rows):
                 self._configuration = adapter.topic_metadata(decoded.rows[0])
@@ -153,7 +157,7 @@ class Stream:
         lost.sort(key=lambda one: one.failure.row)
         return _Translated(adapted.rows, times, index[adapted.index], tuple(lost), positions[~taken])
 
-    def _judge(self, batch: RawBatch, done: _Translated) -> tuple[_Lost | None, set[int]]:
+    def _judge(self, batch: MessageBlock, done: _Translated) -> tuple[_Lost | None, set[int]]:
         """Quarantine lost messages in their order; return the one that ends the topic, and the rows that were quarantined."""
         quarantined: set[int] = set()
         first_good = int(done.index[0]) if len(done.index) else len(batch)
@@ -169,8 +173,9 @@ class Stream:
                 return replace(lost, failure=replace(lost.failure, reason=reason)), quarantined
         return None, quarantined
 
-    def _try_quarantine(self, batch: RawBatch, lost: _Lost) -> bool:
+    def _try_quarantine(self, batch: MessageBlock, lost: _Lost) -> bool:
         return self.quarantine is not None and self.quarantine.take(
+            self._connections[batch.connection],
             batch,
             lost.failure,
             stage=lost.stage,
@@ -192,7 +197,7 @@ class Stream:
             return True
         return self.plan.on_error is TopicLevelErrorPolicy.Raise
 
-    def _end(self, fatal: _Lost, batch: RawBatch, end: int) -> None:
+    def _end(self, fatal: _Lost, batch: MessageBlock, end: int) -> None:
         """Apply the policy a lost message has triggered."""
         kind = DecodeError if fatal.stage is Stage.DECODE else AdapterError
         offset = int(batch.offsets[fatal.failure.row])
@@ -204,13 +209,13 @@ class Stream:
         self.status = TopicStatus.FINALIZED
         self._count_rest(batch, end)
 
-    def _count_rest(self, batch: RawBatch, end: int) -> None:
+    def _count_rest(self, batch: MessageBlock, end: int) -> None:
         rest = batch.lengths[end:]
         if len(rest):
             self.observe(TopicProgress(self.plan.target, read=len(rest), payload_bytes=int(rest.sum())))
             self._reject_rest(batch, end)
 
-    def _reject_rest(self, batch: RawBatch, start: int) -> None:
+    def _reject_rest(self, batch: MessageBlock, start: int) -> None:
         self.observe(
             Rejected(
                 self.plan.target,
@@ -224,7 +229,7 @@ class Stream:
         )
 
     def _write(
-        self, rows: pa.RecordBatch, batch: RawBatch, index: NDArray[np.int64], buffer: WriteBuffer
+        self, rows: pa.RecordBatch, batch: MessageBlock, index: NDArray[np.int64], buffer: WriteBuffer
     ) -> None:
         if self._writer is None:
             try:
@@ -247,7 +252,7 @@ class Stream:
         self.watch.lap(Step.WAIT)
 
     def _refused(
-        self, error: IngestError, rows: pa.RecordBatch, batch: RawBatch, index: NDArray[np.int64]
+        self, error: IngestError, rows: pa.RecordBatch, batch: MessageBlock, index: NDArray[np.int64]
     ) -> None:
         """Give the topic up, or the run, as its policy says."""
         self.status, self.error = TopicStatus.FAILED, str(error)
@@ -266,7 +271,7 @@ class Stream:
         if self.plan.on_error is TopicLevelErrorPolicy.Raise:
             raise error
 
-    def _count(self, batch: RawBatch, end: int, *, downsampled: int = 0) -> None:
+    def _count(self, batch: MessageBlock, end: int, *, downsampled: int = 0) -> None:
         self.observe(
             TopicProgress(
                 self.plan.target,
@@ -276,7 +281,7 @@ class Stream:
             )
         )
 
-    def _reject(self, batch: RawBatch, lost: Iterable[_Lost], quarantined: set[int]) -> None:
+    def _reject(self, batch: MessageBlock, lost: Iterable[_Lost], quarantined: set[int]) -> None:
         """Say what was lost, once for each rule, with the first message as the example."""
         groups: dict[tuple[Stage, str], list[RowFailure]] = {}
         for one in lost:

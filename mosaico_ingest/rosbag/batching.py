@@ -1,11 +1,18 @@
-"""Message blocks of several files merged by time and coalesced into large batches."""
+"""Merge the read tasks of several splits by time, prefetch them, and coalesce small message blocks.
+
+The steps between the container readers and `Recording.message_blocks`:
+
+1. `merge_by_time` orders the tasks of all splits by their start time.
+2. `Prefetcher` runs the tasks in a background thread.
+3. `BlockCoalescer` joins the small blocks of each connection until they are worth decoding, sorted by log time.
+"""
 
 from __future__ import annotations
 
 import heapq
 import queue
 import threading
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -15,28 +22,71 @@ from typing import Generic, TypeVar
 import numpy as np
 from msgspec import Struct
 
-from mosaico_ingest.rosbag.blocks import EARLIEST_NS, LATEST_NS, Block, Channel, RawBatch, Slab, in_time, pack
+from mosaico_ingest.rosbag.blocks import (
+    EARLIEST_NS,
+    LATEST_NS,
+    MessageBlock,
+    ReadTask,
+    pack,
+    sort_by_time,
+)
 
-__all__ = [
-    "Gather",
-    "Prefetched",
-    "Turn",
-    "compact",
-    "in_turn",
-]
+__all__ = ["BlockCoalescer", "MergedTask", "Prefetcher", "copy_if_small", "merge_by_time"]
 
 T = TypeVar("T")
-_LOOK_SECONDS = 0.1
+_STOP_POLL_SECONDS = 0.1
+"""Interval in which a blocked prefetch thread checks whether it has been stopped."""
+_FIRST_BYTES, BLOCK_BYTES = 2 << 20, 8 << 20
+"""Target payload size of a connection's first block; it doubles with each block up to the second value.
+
+The first block is small, so that the following stages start early."""
+_VIEW_BYTES = 16 << 10
+"""Blocks whose average message is larger are not copied: they remain views of the buffer that was read."""
+_ROW_BYTES = 32
+"""Memory per message beside its payload: log time, start, length and offset."""
+
+
+class MergedTask(Struct, frozen=True):
+    """A read task, the number of its split, and a lower bound for the start times of all later tasks."""
+
+    split: int
+    task: ReadTask
+    next_ns: int
+
+
+def merge_by_time(
+    splits: Iterable[tuple[int | None, Callable[[], Iterator[ReadTask]]]],
+) -> Generator[MergedTask, None, None]:
+    """Yield the tasks of all splits by `start_ns`.
+
+    Each split is its first log time (None if unknown) and a function that returns its tasks. The function is not
+    called before tasks of that time are due.
+    """
+    heap: list[tuple[int, int, ReadTask | None, Iterator[ReadTask]]] = []
+    for number, (start_ns, tasks) in enumerate(splits):
+        first = EARLIEST_NS if start_ns is None else start_ns
+        heapq.heappush(heap, (first, number, None, _deferred(tasks)))
+    while heap:
+        _, number, task, rest = heapq.heappop(heap)
+        following = next(rest, None)
+        if following is not None:
+            heapq.heappush(heap, (following.start_ns, number, following, rest))
+        if task is not None:
+            yield MergedTask(number, task, heap[0][0] if heap else LATEST_NS)
+
+
+def _deferred(tasks: Callable[[], Iterator[ReadTask]]) -> Iterator[ReadTask]:
+    yield from tasks()
 
 
 class _End(Struct, frozen=True):
     error: BaseException | None
 
 
-class Prefetched(Generic[T]):
-    """An iterator over `source`, of which `ahead` items are made before they are asked for.
+class Prefetcher(Generic[T]):
+    """An iterator over `source` that computes up to `ahead` items in advance, in a thread.
 
-    The source runs in one thread, which has ended when the context is left; its errors are raised here.
+    Errors of the source are raised in the consumer. The thread has ended when the context is left.
     """
 
     def __init__(self, source: Generator[T, None, None], *, ahead: int = 1) -> None:
@@ -56,7 +106,7 @@ class Prefetched(Generic[T]):
         """Stop the thread and wait for it."""
         self._stop.set()
         with suppress(queue.Empty):
-            self._items.get_nowait()  # the thread may be waiting for room
+            self._items.get_nowait()  # unblock the thread if the queue is full
         self._worker.join()
 
     def _consume(self) -> Iterator[T]:
@@ -72,182 +122,148 @@ class Prefetched(Generic[T]):
                 for value in self._source:
                     if not self._put((value,)):
                         return
-        except BaseException as err:  # noqa: BLE001 - the border of the thread; raised again where it is consumed
+        except BaseException as err:  # noqa: BLE001 - the consumer raises it again
             error = err
         self._put(_End(error))
 
     def _put(self, item: tuple[T] | _End) -> bool:
         while not self._stop.is_set():
             try:
-                self._items.put(item, timeout=_LOOK_SECONDS)
+                self._items.put(item, timeout=_STOP_POLL_SECONDS)
             except queue.Full:
                 continue
             return True
         return False
 
 
-class Turn(Struct, frozen=True):
-    """One block, the part it is of, and the time no later block goes behind."""
-
-    part: int
-    block: Block
-    next_ns: int
-
-
-def in_turn(parts: Iterable[tuple[int | None, Callable[[], Iterator[Block]]]]) -> Generator[Turn, None, None]:
-    """Yield the blocks of all parts by `start_ns`; a part is its first time and what gives its blocks."""
-    heap: list[tuple[int, int, Block | None, Iterator[Block]]] = []
-    for number, (start_ns, blocks) in enumerate(parts):
-        first = EARLIEST_NS if start_ns is None else start_ns
-        heapq.heappush(heap, (first, number, None, _late(blocks)))
-    while heap:
-        _, number, block, rest = heapq.heappop(heap)
-        following = next(rest, None)
-        if following is not None:
-            heapq.heappush(heap, (following.start_ns, number, following, rest))
-        if block is not None:
-            yield Turn(number, block, heap[0][0] if heap else LATEST_NS)
-
-
-def _late(blocks: Callable[[], Iterator[Block]]) -> Iterator[Block]:
-    yield from blocks()
-
-
-_FIRST_BYTES, BATCH_BYTES = 2 << 20, 8 << 20
-"""A channel's first batch ends at about this many bytes of payload, each other at twice as many, up to the latter.
-
-So the stages that follow begin while little has been read."""
-_BIG_BYTES = 16 << 10
-"""Messages larger than this on average are not copied: the batch points into the block they came in."""
-_ROW_BYTES = 32
-"""What a message costs beside its payload."""
-
-
 @dataclass(slots=True)
-class _Waiting:
-    """What a channel has so far."""
+class _Pending:
+    """The blocks of one connection that have not been yielded yet."""
 
-    slabs: list[Slab] = field(default_factory=list[Slab])
+    blocks: list[MessageBlock] = field(default_factory=list[MessageBlock])
     rows: int = 0
-    held_bytes: int = 0
-    most_bytes: int = _FIRST_BYTES
+    memory_bytes: int = 0
+    target_bytes: int = _FIRST_BYTES
 
-    def add(self, slab: Slab) -> None:
-        self.slabs.append(slab)
-        self.rows += len(slab)
-        self.held_bytes += len(slab.data) + len(slab) * _ROW_BYTES
+    def add(self, block: MessageBlock) -> None:
+        self.blocks.append(block)
+        self.rows += len(block)
+        self.memory_bytes += len(block.data) + len(block) * _ROW_BYTES
 
 
-class Gather:
-    """Holds messages back until there are many, or until memory is short; the fullest channel goes first."""
+class BlockCoalescer:
+    """Joins the blocks of each connection into larger ones, sorted by log time.
 
-    def __init__(self, channels: Mapping[int, Channel], *, rows: int, memory_bytes: int) -> None:
-        self._channels = channels
-        self._rows = rows
+    A connection is flushed when it has enough rows or bytes. If all connections together exceed the memory limit,
+    the one with the most bytes is flushed first.
+    """
+
+    def __init__(self, *, max_rows: int, memory_bytes: int) -> None:
+        self._max_rows = max_rows
         self._memory_bytes = memory_bytes
-        self._waiting: dict[int, _Waiting] = {}
+        self._pending: dict[int, _Pending] = {}
 
-    def add(self, channel: int, slab: Slab, floor_ns: int) -> Iterator[RawBatch]:
-        """Take `compact` messages; none that come later, these included, is older than `floor_ns`."""
-        waiting = self._waiting.setdefault(channel, _Waiting())
-        if waiting.slabs and self._is_full(waiting, len(slab), slab.payload_bytes):
-            yield from self._flush(channel, floor_ns)
-        self._waiting[channel].add(slab)
+    def add(self, block: MessageBlock, floor_ns: int) -> Iterator[MessageBlock]:
+        """Add a block that `copy_if_small` returned; no later message, including this block, is older than `floor_ns`."""
+        pending = self._pending.setdefault(block.connection, _Pending())
+        if pending.blocks and self._is_full(pending, len(block), block.payload_bytes):
+            yield from self._flush(block.connection, floor_ns)
+        self._pending[block.connection].add(block)
 
-    def settle(self, floor_ns: int) -> Iterator[RawBatch]:
-        """Give what should not wait: full channels, blocks held whole, and the fullest while memory is short.
+    def flush_ready(self, floor_ns: int) -> Iterator[MessageBlock]:
+        """Yield full connections and views, and the largest connections while memory is short.
 
-        No message that comes later is older than `floor_ns`; younger ones wait, unless memory forbids.
+        No later message is older than `floor_ns`. Younger messages stay pending, unless memory is short.
         """
-        for channel, waiting in self._waiting.items():
-            if waiting.slabs and (_is_view(waiting.slabs[-1]) or self._is_full(waiting)):
-                yield from self._flush(channel, floor_ns)
-        while self._held() > self._memory_bytes:
-            fullest = max(self._waiting, key=lambda channel: self._waiting[channel].held_bytes)
-            before = self._waiting[fullest].held_bytes
-            yield from self._flush(fullest, floor_ns)
-            if self._waiting[fullest].held_bytes > before // 2:
-                yield from self._flush(fullest, LATEST_NS)
+        for connection, pending in self._pending.items():
+            if pending.blocks and (_is_view(pending.blocks[-1]) or self._is_full(pending)):
+                yield from self._flush(connection, floor_ns)
+        while sum(pending.memory_bytes for pending in self._pending.values()) > self._memory_bytes:
+            largest = max(self._pending, key=lambda connection: self._pending[connection].memory_bytes)
+            before = self._pending[largest].memory_bytes
+            yield from self._flush(largest, floor_ns)
+            if self._pending[largest].memory_bytes > before // 2:
+                yield from self._flush(largest, LATEST_NS)
 
-    def rest(self) -> Iterator[RawBatch]:
-        """Give everything."""
-        for channel in self._waiting:
-            yield from self._flush(channel, LATEST_NS)
+    def flush_all(self) -> Iterator[MessageBlock]:
+        """Yield all pending messages."""
+        for connection in self._pending:
+            yield from self._flush(connection, LATEST_NS)
 
-    def _held(self) -> int:
-        return sum(waiting.held_bytes for waiting in self._waiting.values())
+    def _is_full(self, pending: _Pending, more_rows: int = 1, more_bytes: int = 0) -> bool:
+        return (
+            pending.rows + more_rows > self._max_rows
+            or pending.memory_bytes + more_bytes > pending.target_bytes
+        )
 
-    def _is_full(self, waiting: _Waiting, rows: int = 1, payload_bytes: int = 0) -> bool:
-        return waiting.rows + rows > self._rows or waiting.held_bytes + payload_bytes > waiting.most_bytes
-
-    def _flush(self, channel: int, floor_ns: int) -> Iterator[RawBatch]:
-        """Give the messages up to `floor_ns`, keep the others."""
-        before = self._waiting[channel]
-        slabs = before.slabs
-        waiting = self._waiting[channel] = _Waiting(most_bytes=min(2 * before.most_bytes, BATCH_BYTES))
-        if slabs and not any(_is_view(slab) for slab in slabs):
-            slabs = [_joined(slabs)]
-        ready: list[Slab] = []
-        for slab in map(in_time, slabs):
-            count = int(np.searchsorted(slab.log_times, floor_ns, side="right"))
+    def _flush(self, connection: int, floor_ns: int) -> Iterator[MessageBlock]:
+        """Yield the messages up to `floor_ns` in order; the others stay pending."""
+        previous = self._pending[connection]
+        pending = _Pending(target_bytes=min(2 * previous.target_bytes, BLOCK_BYTES))
+        self._pending[connection] = pending
+        blocks = previous.blocks
+        if blocks and not any(_is_view(block) for block in blocks):
+            blocks = [_join(blocks)]
+        ready: list[MessageBlock] = []
+        for block in map(sort_by_time, blocks):
+            count = int(np.searchsorted(block.log_times, floor_ns, side="right"))
             if count:
-                ready.append(slab.rows(slice(0, count)))
-            if count < len(slab):
-                waiting.add(slab if not count else compact(slab.rows(slice(count, None))))
-        for group in _groups(_ordered(ready)):
-            yield from self._batches(self._channels[channel], group)
+                ready.append(block.rows(slice(0, count)))
+            if count < len(block):
+                pending.add(block if not count else copy_if_small(block.rows(slice(count, None))))
+        for block in _join_small(_in_time_order(ready)):
+            yield from self._split_evenly(block)
 
-    def _batches(self, channel: Channel, slab: Slab) -> Iterator[RawBatch]:
-        """Cut into batches of the allowed size, as equal as can be."""
-        parts = min(len(slab), max(-(-len(slab) // self._rows), -(-slab.payload_bytes // BATCH_BYTES)))
-        for begin, end in pairwise(len(slab) * part // parts for part in range(parts + 1)):
-            rows = slab.rows(slice(begin, end))
-            yield RawBatch(channel, rows.log_times, rows.data, rows.starts, rows.lengths, rows.offsets)
-
-
-def compact(slab: Slab) -> Slab:
-    """Return the messages in a buffer of their own, unless they are too big to be worth a copy."""
-    return slab if _is_view(slab) else pack(slab)
+    def _split_evenly(self, block: MessageBlock) -> Iterator[MessageBlock]:
+        """Yield pieces of nearly equal length that respect the row and byte limits."""
+        by_rows, by_bytes = -(-len(block) // self._max_rows), -(-block.payload_bytes // BLOCK_BYTES)
+        pieces = min(len(block), max(by_rows, by_bytes))
+        for start, end in pairwise(len(block) * piece // pieces for piece in range(pieces + 1)):
+            yield block.rows(slice(start, end))
 
 
-def _is_view(slab: Slab) -> bool:
-    """Return whether the slab's buffer is that of the block it came in."""
-    return slab.payload_bytes > _BIG_BYTES * len(slab)
+def copy_if_small(block: MessageBlock) -> MessageBlock:
+    """Return a compact copy of the block, unless its messages are so large that copying costs more than it saves."""
+    return block if _is_view(block) else pack(block)
 
 
-def _ordered(slabs: Sequence[Slab]) -> list[Slab]:
-    """Return the slabs one after the other in time; where they interleave, as one."""
-    ordered = sorted(slabs, key=lambda slab: int(slab.log_times[0]))
-    pairs = pairwise(ordered)
-    if all(one.log_times[-1] <= other.log_times[0] for one, other in pairs):
+def _is_view(block: MessageBlock) -> bool:
+    """Return whether the block shares the buffer that was read from the file."""
+    return block.payload_bytes > _VIEW_BYTES * len(block)
+
+
+def _in_time_order(blocks: Sequence[MessageBlock]) -> list[MessageBlock]:
+    """Return the blocks in time order; join them into one if their time ranges overlap."""
+    ordered = sorted(blocks, key=lambda block: int(block.log_times[0]))
+    if all(first.log_times[-1] <= second.log_times[0] for first, second in pairwise(ordered)):
         return ordered
-    return [in_time(_joined([pack(slab) for slab in slabs]))]
+    return [sort_by_time(_join([pack(block) for block in blocks]))]
 
 
-def _groups(slabs: Sequence[Slab]) -> Iterator[Slab]:
-    """Join neighbours, except those that are views of a block."""
-    small: list[Slab] = []
-    for slab in slabs:
-        if _is_view(slab):
+def _join_small(blocks: Sequence[MessageBlock]) -> Iterator[MessageBlock]:
+    """Join consecutive blocks, except views."""
+    small: list[MessageBlock] = []
+    for block in blocks:
+        if _is_view(block):
             if small:
-                yield _joined(small)
+                yield _join(small)
                 small = []
-            yield slab
+            yield block
         else:
-            small.append(slab)
+            small.append(block)
     if small:
-        yield _joined(small)
+        yield _join(small)
 
 
-def _joined(slabs: Sequence[Slab]) -> Slab:
-    if len(slabs) == 1:
-        return slabs[0]
-    bases = np.cumsum([0, *(len(slab.data) for slab in slabs[:-1])])
-    return Slab(
-        slabs[0].key,
-        np.concatenate([slab.log_times for slab in slabs]),
-        np.concatenate([slab.data for slab in slabs]),
-        np.concatenate([slab.starts + base for slab, base in zip(slabs, bases.tolist(), strict=True)]),
-        np.concatenate([slab.lengths for slab in slabs]),
-        np.concatenate([slab.offsets for slab in slabs]),
+def _join(blocks: Sequence[MessageBlock]) -> MessageBlock:
+    if len(blocks) == 1:
+        return blocks[0]
+    bases = np.cumsum([0, *(len(block.data) for block in blocks[:-1])])
+    return MessageBlock(
+        blocks[0].connection,
+        np.concatenate([block.log_times for block in blocks]),
+        np.concatenate([block.data for block in blocks]),
+        np.concatenate([block.starts + base for block, base in zip(blocks, bases.tolist(), strict=True)]),
+        np.concatenate([block.lengths for block in blocks]),
+        np.concatenate([block.offsets for block in blocks]),
     )

@@ -1,4 +1,9 @@
-"""Message blocks: messages read together, as one contiguous buffer plus offsets, lengths and log times."""
+"""Message blocks and the contracts between container readers and `Recording`.
+
+A container reader (`SplitReader`) lists the connections of its file and yields `ReadTask`s. Each task reads some bytes
+of the file and returns a `ReadResult`: message blocks, and the ranges of the file that it could not read. `Recording`
+merges the tasks of all splits by time, and yields `MessageBlock`s whose connection ids are valid in the recording.
+"""
 
 from __future__ import annotations
 
@@ -17,68 +22,117 @@ from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
 
 __all__ = [
     "EARLIEST_NS",
-    "FIRST_BYTES",
+    "FIRST_GROUP_BYTES",
     "LATEST_NS",
-    "Block",
     "Bytes",
-    "Channel",
+    "Connection",
     "Encoding",
-    "Loaded",
-    "Part",
+    "Int64s",
+    "MessageBlock",
     "ROSHeader",
     "ROSMessage",
-    "RawBatch",
-    "Slab",
-    "Stream",
+    "ReadRequest",
+    "ReadResult",
+    "ReadTask",
+    "SplitConnection",
+    "SplitReader",
     "UnreadableRange",
-    "Want",
-    "by_key",
-    "in_groups",
-    "in_time",
-    "keep",
-    "keep_each",
-    "orphans",
+    "add_selected",
+    "add_selected_rows",
+    "fixed_slices",
+    "group_by_bytes",
     "pack",
-    "stretches",
+    "rows_by_connection",
+    "sort_by_time",
+    "undescribed_connections",
 ]
 
 EARLIEST_NS, LATEST_NS = -(2**63), 2**63 - 1
-"""The first and last time stamps there are; the last is in the year 2262."""
-FIRST_BYTES, MOST_PIECES = 2 << 20, 64
-"""Up to how many bytes at first, and how many chunks are read at once.
+"""The range of int64 nanosecond timestamps; the latest is in the year 2262."""
+FIRST_GROUP_BYTES, MAX_GROUP_LENGTH = 2 << 20, 64
+"""Bytes of the first group that `group_by_bytes` yields, and the maximum number of items per group.
 
-What is done once a block is done less often with larger ones; the first is small, so that the next stage begins early."""
+Large groups amortize the fixed cost of a read; the first one is small, so that the next stage starts early."""
+_FEW_ROWS_PER_LENGTH = 8
+"""With fewer messages per distinct length on average, `pack` gathers words instead of copying length by length."""
+_MIN_WORD_BYTES, _MAX_WORD_BYTES = 4, 64
+"""Range of the word size in which `pack` gathers payloads: it needs one index per word instead of one per byte."""
+
+Bytes = NDArray[np.uint8]
+Int64s = NDArray[np.int64]
 T = TypeVar("T")
 
 
-class Stream(Struct, frozen=True):
-    """One connection as its file describes it."""
+class Encoding(str, Enum):
+    """The serialization of a payload."""
 
-    key: int
-    """Unique within the part."""
+    CDR = "cdr"
+    """ROS 2: a 4-byte encapsulation header, then aligned little- or big-endian fields."""
+    ROS1 = "ros1"
+    """ROS 1: packed little-endian fields."""
+    OTHER = "other"
+    """Any other encoding (protobuf, JSON, …): listed, never decoded."""
+
+
+class Connection(Struct, frozen=True):
+    """A connection of a recording: messages of one type and encoding on one topic, merged over all splits.
+
+    A topic has several connections if its messages differ in type, definition or encoding.
+    """
+
+    id: int
+    """Index in `Recording.connections`."""
     topic: str
     msgtype: str
-    """As the file spells it."""
+    """`pkg/msg/Name`, also for ROS 1 and for names in older notations."""
+    encoding: Encoding
+    count: int | None
+    """Number of messages according to the index; None if there is no index."""
+    definition: Definition | None
+    """None if no definition was found; `problem` then gives the reason."""
+    problem: str | None = None
+    latched: bool = False
+    attributes: dict[str, str] = field(default_factory=dict[str, str])
+    """Other properties that the container stores: QoS profiles, caller id, MD5 sum, name of the raw encoding."""
+
+
+class SplitConnection(Struct, frozen=True):
+    """A connection as one split describes it, before its definition is resolved."""
+
+    id: int
+    """Unique within the split."""
+    topic: str
+    msgtype: str
+    """In the notation of the file."""
     encoding: Encoding
     ros_version: int
     embedded: Embedded | None
     count: int | None
-    """How many messages the index promises."""
+    """Number of messages according to the index; None if there is no index."""
     latched: bool = False
     attributes: dict[str, str] = field(default_factory=dict[str, str])
 
 
-class Slab(Struct, frozen=True):
-    """n messages inside one buffer, of one stream; every start and length has been checked against the buffer."""
+class MessageBlock(Struct, frozen=True):
+    """n messages of one connection: a contiguous buffer plus offsets, lengths and log times.
 
-    key: int
-    log_times: NDArray[np.int64]
-    data: NDArray[np.uint8]
-    starts: NDArray[np.int64]
-    lengths: NDArray[np.int64]
-    offsets: NDArray[np.int64]
+    Every start and length has been checked against the buffer.
+    """
+
+    connection: int
+    """Id of the connection: within the split while a reader builds the block, within the recording afterwards."""
+    log_times: Int64s
+    """Nanoseconds since the epoch, shape (n,)."""
+    data: Bytes
+    """The buffer; it may contain bytes that belong to no message of the block."""
+    starts: Int64s
+    """Index in `data` of the first byte of each payload, shape (n,)."""
+    lengths: Int64s
+    """Bytes of each payload, shape (n,)."""
+    offsets: Int64s
+    """Position in the source, for diagnostics: file offset of the record or chunk, or row id; shape (n,)."""
     payload_bytes: int = -1
-    """The sum of the lengths, which is asked for often."""
+    """Sum of the lengths."""
 
     def __post_init__(self) -> None:
         force_setattr(self, "payload_bytes", int(self.lengths.sum()))
@@ -87,320 +141,97 @@ class Slab(Struct, frozen=True):
         """Return the number of messages."""
         return len(self.log_times)
 
-    def rows(self, choice: NDArray[np.int64] | NDArray[np.bool_] | slice, *, key: int | None = None) -> Slab:
-        """Return some of the messages, over the same buffer; `key` names their stream where this slab has several."""
-        return Slab(
-            self.key if key is None else key,
-            self.log_times[choice],
+    def rows(
+        self, selection: Int64s | NDArray[np.bool_] | slice, *, connection: int | None = None
+    ) -> MessageBlock:
+        """Return the selected messages over the same buffer, by default with the same connection."""
+        return MessageBlock(
+            self.connection if connection is None else connection,
+            self.log_times[selection],
             self.data,
-            self.starts[choice],
-            self.lengths[choice],
-            self.offsets[choice],
+            self.starts[selection],
+            self.lengths[selection],
+            self.offsets[selection],
         )
+
+    def payload(self, row: int) -> bytes:
+        """Return a copy of the bytes of one message."""
+        start = int(self.starts[row])
+        return self.data[start : start + int(self.lengths[row])].tobytes()
 
 
 class UnreadableRange(Struct, frozen=True):
-    """Bytes of a recording from which messages could not be read, and why."""
+    """A range of a recording from which messages could not be read, or only in an alternative way."""
 
     offset: int
-    """File offset of the record or chunk, or the row id."""
+    """File offset of the record or chunk, or row id."""
     reason: str
-    """What was expected and what is there, in one line."""
+    """The expectation that the file violates, in one line."""
     connection: int | None = None
-    """The connection the messages belong to, None if unknown: its key in the file or, once `file` is set, its id."""
+    """Id of the messages' connection; None if unknown."""
     count: int | None = None
-    """Number of unreadable messages; None if unknown, 0 if all of them were read in another way."""
+    """Number of unreadable messages; None if unknown, 0 if all messages could be read in an alternative way."""
     file: str = ""
-    """The file; empty until the range becomes part of a recording."""
+    """Path of the file; `Recording` fills it in."""
 
 
-def orphans(counts: Mapping[int, int] | None, known: Collection[int]) -> list[UnreadableRange]:
-    """Return the messages whose stream the file does not describe."""
-    strangers = {key: count for key, count in (counts or {}).items() if count and key not in known}
-    return [
-        UnreadableRange(
-            0, f"{count} messages of connection {key}, which the file does not describe", count=count
-        )
-        for key, count in strangers.items()
-    ]
+class ReadRequest(Struct, frozen=True):
+    """The messages to read from a split: those of some connections, with start_ns <= log time < end_ns."""
 
-
-class Loaded(Struct, frozen=True):
-    """What one block gave."""
-
-    slabs: list[Slab]
-    unreadable: list[UnreadableRange]
-
-
-class Block(Struct, frozen=True):
-    """A piece of a file that is read at once; none of its messages is older than `start_ns`."""
-
-    start_ns: int
-    load: Callable[[], Loaded]
-
-
-def in_groups(
-    pieces: Iterable[T], size: Callable[[T], int], block_bytes: int, *, most: int = MOST_PIECES
-) -> Iterator[list[T]]:
-    """Yield neighbours together, up to `most`; of bytes few at first, then twice as many each time, up to `block_bytes`.
-
-    What came before an error of `pieces` is given before it is raised.
-    """
-    group: list[T] = []
-    held_bytes, most_bytes = 0, min(FIRST_BYTES, block_bytes)
-    try:
-        for piece in pieces:
-            piece_bytes = size(piece)
-            held_bytes += piece_bytes
-            if group and (held_bytes > most_bytes or len(group) == most):
-                yield group
-                group, held_bytes = [], piece_bytes
-                most_bytes = min(2 * most_bytes, block_bytes)
-            group.append(piece)
-    except Exception:
-        if group:
-            yield group
-        raise
-    if group:
-        yield group
-
-
-class Want(Struct, frozen=True):
-    """Which messages to read: streams by key, and times from `start_ns` up to, not including, `end_ns`."""
-
-    keys: Collection[int]
+    connections: Collection[int]
     start_ns: int
     end_ns: int
     block_bytes: int
-    """About how many bytes to read at once."""
+    """Approximate number of bytes to read per task."""
 
     def overlaps(self, first_ns: int, last_ns: int) -> bool:
-        """Return whether anything between the two times, both inclusive, may be wanted."""
+        """Return whether a log time between the two, both inclusive, may be requested."""
         return first_ns < self.end_ns and last_ns >= self.start_ns
 
 
-class Part(Protocol):
-    """One open file of a recording."""
+class ReadResult(Struct, frozen=True):
+    """The blocks that a task read, and the ranges that it could not read."""
+
+    blocks: list[MessageBlock]
+    unreadable: list[UnreadableRange]
+
+
+class ReadTask(Struct, frozen=True):
+    """A deferred read of one part of a file; none of its messages is older than `start_ns`."""
+
+    start_ns: int
+    load: Callable[[], ReadResult]
+
+
+class SplitReader(Protocol):
+    """The reader of one split: an open file of a recording."""
 
     path: AnyPath
-    """The file as it was named, not a copy that had to be made."""
+    """The path that the caller named, even if a temporary copy is read."""
     container: str
-    streams: tuple[Stream, ...]
+    """Name of the container format, see `formats.CONTAINERS`."""
+    connections: tuple[SplitConnection, ...]
     message_count: int | None
-    """How many messages the index promises."""
+    """Number of messages according to the index; None if there is no index."""
     start_ns: int | None
     end_ns: int | None
-    """The last message's time, inclusive."""
+    """Log time of the last message, inclusive."""
     unreadable: list[UnreadableRange]
-    """What was found broken while opening."""
+    """Damage detected while opening the file."""
     notes: list[str]
-    """What else is worth saying about the file, one line each."""
+    """Other remarks about the file, one line each."""
 
-    def blocks(self, want: Want) -> Iterator[Block]:
-        """Yield what holds wanted messages, by ascending `start_ns`."""
+    def read_tasks(self, request: ReadRequest) -> Iterator[ReadTask]:
+        """Yield tasks that together read all requested messages, by ascending `start_ns`."""
         ...
 
     def check_unchanged(self) -> None:
-        """Raise where the file has changed since it was opened; called once all of it was read."""
+        """Raise if the file has changed since it was opened; called after the last read."""
         ...
 
     def close(self) -> None:
         """Close the file."""
         ...
-
-
-_FEW_ROWS = 8
-"""With fewer rows to a length on average, one index for every byte is cheaper than one step for every length."""
-_SMALLEST_WORD, _LARGEST_WORD = 4, 64
-"""Messages of many lengths are gathered in words, so that an index is needed for each word and not for each byte."""
-
-Bytes = NDArray[np.uint8]
-Longs = NDArray[np.int64]
-
-
-def stretches(data: Bytes, starts: Longs, size: int) -> Bytes:
-    """Return the `size` bytes from each start on, shape (len(starts), size); the caller checked the bounds."""
-    windows = np.ndarray((len(data) - size + 1, size), np.uint8, data, strides=(1, 1))
-    return windows[starts]
-
-
-def by_key(keys: NDArray[np.integer]) -> Iterator[tuple[int, Longs]]:
-    """Yield each key with the rows that have it, in their order."""
-    order = np.argsort(keys, kind="stable")
-    ranked = keys[order]
-    edges = np.flatnonzero(np.diff(ranked)) + 1
-    for rows in np.split(order, edges) if len(order) else []:
-        yield int(keys[rows[0]]), rows
-
-
-def keep(slab: Slab, want: Want, loaded: Loaded) -> None:
-    """Add the messages within the wanted time."""
-    slab = _wanted(slab, want, loaded.unreadable)
-    if len(slab):
-        loaded.slabs.append(slab)
-
-
-def keep_each(whole: Slab, streams: Iterable[tuple[int, Longs | slice]], want: Want, loaded: Loaded) -> None:
-    """Add the messages within the wanted time, stream by stream: its key, and its rows of the whole."""
-    if _is_inside(whole, want):
-        slabs = [whole.rows(rows, key=key) for key, rows in streams]
-        loaded.slabs.extend(slab for slab in slabs if len(slab))
-        return
-    for key, rows in streams:
-        keep(whole.rows(rows, key=key), want, loaded)
-
-
-def _is_inside(slab: Slab, want: Want) -> bool:
-    if not len(slab):
-        return True
-    first, last = int(slab.log_times.min()), int(slab.log_times.max())
-    return max(want.start_ns, 0) <= first and last < want.end_ns
-
-
-def _wanted(slab: Slab, want: Want, unreadable: list[UnreadableRange]) -> Slab:
-    """Return the messages within the wanted time; those after 2262 are noted as lost."""
-    if _is_inside(slab, want):
-        return slab
-    times = slab.log_times
-    broken = times < 0  # unsigned in the file
-    if bool(broken.any()):
-        offset = int(slab.offsets[int(broken.argmax())])
-        reason = f"recorded at {int(times.view(np.uint64).max())} ns, which is after the year 2262"
-        unreadable.append(UnreadableRange(offset, reason, connection=slab.key, count=int(broken.sum())))
-    keep_rows = ~broken & (times >= want.start_ns)
-    if want.end_ns <= LATEST_NS:
-        keep_rows &= times < want.end_ns
-    return slab.rows(keep_rows)
-
-
-def in_time(slab: Slab) -> Slab:
-    """Return the messages by log time; those of the same time stay in their order."""
-    times = slab.log_times
-    if len(times) < 2 or bool((times[1:] >= times[:-1]).all()):  # noqa: PLR2004 - one message is in order
-        return slab
-    return slab.rows(np.argsort(times, kind="stable"))
-
-
-def pack(slab: Slab) -> Slab:
-    """Return the same messages in a buffer of their own, equal lengths side by side, or each filled up to whole words."""
-    lengths = slab.lengths
-    shortest, longest = int(lengths.min()), int(lengths.max())
-    if shortest == longest:
-        data = stretches(slab.data, slab.starts, shortest).reshape(-1)
-        return _with(slab, data, np.arange(len(slab), dtype=np.int64) * shortest)
-    kinds = np.unique(lengths)
-    if len(kinds) * _FEW_ROWS > len(lengths):
-        return _with(slab, *_gather(slab))
-    starts = np.empty(len(slab), np.int64)
-    pieces: list[Bytes] = []
-    end = 0
-    for length in kinds.tolist():
-        rows = np.flatnonzero(lengths == length)
-        starts[rows] = end + np.arange(len(rows), dtype=np.int64) * length
-        pieces.append(stretches(slab.data, slab.starts[rows], length).reshape(-1))
-        end += len(rows) * length
-    return _with(slab, np.concatenate(pieces), starts)
-
-
-def _with(slab: Slab, data: Bytes, starts: Longs) -> Slab:
-    times, lengths, offsets = map(_own, (slab.log_times, slab.lengths, slab.offsets))
-    return Slab(slab.key, times, data, starts, lengths, offsets)
-
-
-def _own(values: Longs) -> Longs:
-    """Return a copy of a view: messages of a rare topic wait long, and a view keeps the whole buffer alive."""
-    return values if values.base is None else values.copy()
-
-
-def _gather(slab: Slab) -> tuple[Bytes, Longs]:
-    """Return the payloads one after the other, in whole words, and where each begins."""
-    data, size = slab.data, _word_bytes(slab)
-    words = -(-slab.lengths // size)
-    ends = np.cumsum(words)
-    starts = (ends - words) * size
-    index = np.repeat(slab.starts - starts, words)
-    index += np.arange(0, len(index) * size, size)
-    room = len(data) - size
-    index[index > room] = 0  # the last words of the last messages, see below
-    out = np.ndarray(room + 1, f"V{size}", data, strides=1)[index].view(np.uint8)
-    for row in np.flatnonzero(slab.starts + words * size > len(data)).tolist():
-        start, length = int(slab.starts[row]), int(slab.lengths[row])
-        out[starts[row] : starts[row] + length] = data[start : start + length]
-    return out, starts
-
-
-def _word_bytes(slab: Slab) -> int:
-    """Return a power of two of which an average message has four to eight, or 1 where the buffer has not even one."""
-    if len(slab.data) < _LARGEST_WORD:
-        return 1
-    average = slab.payload_bytes // len(slab)
-    return min(max(1 << max(average.bit_length() - 3, 0), _SMALLEST_WORD), _LARGEST_WORD)
-
-
-class Encoding(str, Enum):
-    """How a payload is serialised."""
-
-    CDR = "cdr"
-    """ROS 2: a 4-byte encapsulation header, then aligned little- or big-endian fields."""
-    ROS1 = "ros1"
-    """ROS 1: packed little-endian fields."""
-    OTHER = "other"
-    """Not a ROS encoding (protobuf, json, …): named, never decoded."""
-
-
-class Channel(Struct, frozen=True):
-    """Messages of one type on one topic, written the same way; a topic may have several."""
-
-    id: int
-    """Unique within the recording, whatever its parts."""
-    topic: str
-    msgtype: str
-    """`pkg/msg/Name`, also for ROS 1 and for old names."""
-    encoding: Encoding
-    count: int | None
-    """How many messages the index promises; None where there is no index."""
-    definition: Definition | None
-    """None where no definition could be found; `problem` then says why."""
-    problem: str | None = None
-    latched: bool = False
-    attributes: dict[str, str] = field(default_factory=dict[str, str])
-    """What else the recording says: QoS profiles, caller id, md5, raw encoding name."""
-
-
-class RawBatch(Struct, frozen=True):
-    """n messages of one channel in log-time order, their payloads inside one buffer."""
-
-    channel: Channel
-    log_times: NDArray[np.int64]
-    """When each was recorded, ns since the epoch, shape (n,)."""
-    data: NDArray[np.uint8]
-    """The buffer; may hold more than the payloads."""
-    starts: NDArray[np.int64]
-    """Where each payload begins in `data`, shape (n,)."""
-    lengths: NDArray[np.int64]
-    """How many bytes each payload has, shape (n,)."""
-    offsets: NDArray[np.int64]
-    """Where each lies in the source, for messages about it: file offset of its record or chunk, or row id; shape (n,)."""
-
-    def __len__(self) -> int:
-        """Return the number of messages."""
-        return len(self.log_times)
-
-    def rows(self, choice: NDArray[np.int64] | slice) -> RawBatch:
-        """Return some of the messages, over the same buffer."""
-        return RawBatch(
-            self.channel,
-            self.log_times[choice],
-            self.data,
-            self.starts[choice],
-            self.lengths[choice],
-            self.offsets[choice],
-        )
-
-    def payload(self, row: int) -> bytes:
-        """Return the bytes of one message."""
-        start = int(self.starts[row])
-        return self.data[start : start + int(self.lengths[row])].tobytes()
 
 
 class ROSHeader(Struct, frozen=True):
@@ -410,20 +241,20 @@ class ROSHeader(Struct, frozen=True):
     """`stamp` in nanoseconds."""
     frame_id: str
     seq: int | None = None
-    """Only ROS 1 has one."""
+    """Sequence number; None in ROS 2."""
 
 
 @dataclass(frozen=True)
 class ROSMessage:
-    """One message: when it was recorded, where, of which type, and its fields by name."""
+    """One decoded message: log time, topic, type and fields by name."""
 
     bag_timestamp_ns: int
-    """When it was recorded, ns since the epoch."""
+    """Log time, nanoseconds since the epoch."""
     topic: str
     msg_type: str
     """`pkg/msg/Name`."""
     data: dict[str, Any]
-    """Nested messages are dictionaries, arrays are lists, `uint8[]` and its like `bytes`."""
+    """Nested messages are dictionaries, arrays are lists, `uint8[]`, `byte[]` and `char[]` are `bytes`."""
 
     @property
     def timestamp_ns(self) -> int:
@@ -432,7 +263,7 @@ class ROSMessage:
 
     @property
     def header(self) -> ROSHeader | None:
-        """The message's header; None where it has none, or a field of that name which is something else."""
+        """The message's header; None if the message has no field `header` of type `std_msgs/Header`."""
         match self.data.get("header"):
             case {"stamp": {"sec": int(sec), "nanosec": int(nanosec)}, "frame_id": str(frame_id)} as header:
                 seq = header.get("seq")
@@ -441,3 +272,176 @@ class ROSMessage:
                 )
             case _:
                 return None
+
+
+def undescribed_connections(
+    counts: Mapping[int, int] | None, described: Collection[int]
+) -> list[UnreadableRange]:
+    """Return an unreadable range for each connection that has messages, but no description in the file."""
+    return [
+        UnreadableRange(
+            0, f"{count} messages of connection {connection}, which the file does not describe", count=count
+        )
+        for connection, count in (counts or {}).items()
+        if count and connection not in described
+    ]
+
+
+def group_by_bytes(
+    items: Iterable[T], size: Callable[[T], int], group_bytes: int, *, max_length: int = MAX_GROUP_LENGTH
+) -> Iterator[list[T]]:
+    """Yield groups of consecutive items, limited in length and in bytes.
+
+    The byte limit starts at `FIRST_GROUP_BYTES` and doubles with each group up to `group_bytes`. If `items` raises,
+    the items before the error are yielded first.
+    """
+    group: list[T] = []
+    total_bytes, limit_bytes = 0, min(FIRST_GROUP_BYTES, group_bytes)
+    try:
+        for item in items:
+            item_bytes = size(item)
+            total_bytes += item_bytes
+            if group and (total_bytes > limit_bytes or len(group) == max_length):
+                yield group
+                group, total_bytes = [], item_bytes
+                limit_bytes = min(2 * limit_bytes, group_bytes)
+            group.append(item)
+    except Exception:
+        if group:
+            yield group
+        raise
+    if group:
+        yield group
+
+
+def fixed_slices(data: Bytes, starts: Int64s, size: int) -> Bytes:
+    """Return a copy of `data[start : start + size]` for each start, shape (len(starts), size).
+
+    The caller has checked that every slice lies inside the buffer.
+    """
+    windows = np.ndarray((len(data) - size + 1, size), np.uint8, data, strides=(1, 1))
+    return windows[starts]
+
+
+def rows_by_connection(connections: NDArray[np.integer]) -> Iterator[tuple[int, Int64s]]:
+    """Yield each connection id with the indices at which it occurs, ascending."""
+    order = np.argsort(connections, kind="stable")
+    edges = np.flatnonzero(np.diff(connections[order])) + 1
+    for rows in np.split(order, edges) if len(order) else []:
+        yield int(connections[rows[0]]), rows
+
+
+def add_selected(block: MessageBlock, request: ReadRequest, result: ReadResult) -> None:
+    """Add the messages within the requested time range to `result`."""
+    block = _in_time_range(block, request, result.unreadable)
+    if len(block):
+        result.blocks.append(block)
+
+
+def add_selected_rows(
+    block: MessageBlock,
+    rows_of: Iterable[tuple[int, Int64s | slice]],
+    request: ReadRequest,
+    result: ReadResult,
+) -> None:
+    """Split a block by connection, and add the messages within the requested time range to `result`."""
+    if _is_in_time_range(block, request):
+        blocks = [block.rows(rows, connection=connection) for connection, rows in rows_of]
+        result.blocks.extend(block for block in blocks if len(block))
+        return
+    for connection, rows in rows_of:
+        add_selected(block.rows(rows, connection=connection), request, result)
+
+
+def _is_in_time_range(block: MessageBlock, request: ReadRequest) -> bool:
+    if not len(block):
+        return True
+    first, last = int(block.log_times.min()), int(block.log_times.max())
+    return max(request.start_ns, 0) <= first and last < request.end_ns
+
+
+def _in_time_range(
+    block: MessageBlock, request: ReadRequest, unreadable: list[UnreadableRange]
+) -> MessageBlock:
+    """Return the messages within the requested range; report log times beyond 2262 as unreadable."""
+    if _is_in_time_range(block, request):
+        return block
+    times = block.log_times
+    overflowed = times < 0  # the file stores unsigned integers
+    if bool(overflowed.any()):
+        offset = int(block.offsets[int(overflowed.argmax())])
+        reason = f"log time {int(times.view(np.uint64).max())} ns is after the year 2262"
+        unreadable.append(
+            UnreadableRange(offset, reason, connection=block.connection, count=int(overflowed.sum()))
+        )
+    selected = ~overflowed & (times >= request.start_ns)
+    if request.end_ns <= LATEST_NS:
+        selected &= times < request.end_ns
+    return block.rows(selected)
+
+
+def sort_by_time(block: MessageBlock) -> MessageBlock:
+    """Return the messages sorted by log time; the sort is stable."""
+    times = block.log_times
+    if bool((times[1:] >= times[:-1]).all()):
+        return block
+    return block.rows(np.argsort(times, kind="stable"))
+
+
+def pack(block: MessageBlock) -> MessageBlock:
+    """Return a copy of the messages that does not refer to the original buffers.
+
+    Payloads of equal length are adjacent. If there are many different lengths, payloads are padded to whole words.
+    """
+    lengths = block.lengths
+    shortest, longest = int(lengths.min()), int(lengths.max())
+    if shortest == longest:
+        data = fixed_slices(block.data, block.starts, shortest).reshape(-1)
+        return _with_data(block, data, np.arange(len(block), dtype=np.int64) * shortest)
+    distinct_lengths = np.unique(lengths)
+    if len(distinct_lengths) * _FEW_ROWS_PER_LENGTH > len(lengths):
+        return _with_data(block, *_gather_words(block))
+    starts = np.empty(len(block), np.int64)
+    copies: list[Bytes] = []
+    end = 0
+    for length in distinct_lengths.tolist():
+        rows = np.flatnonzero(lengths == length)
+        starts[rows] = end + np.arange(len(rows), dtype=np.int64) * length
+        copies.append(fixed_slices(block.data, block.starts[rows], length).reshape(-1))
+        end += len(rows) * length
+    return _with_data(block, np.concatenate(copies), starts)
+
+
+def _with_data(block: MessageBlock, data: Bytes, starts: Int64s) -> MessageBlock:
+    times, lengths, offsets = map(_without_base, (block.log_times, block.lengths, block.offsets))
+    return MessageBlock(block.connection, times, data, starts, lengths, offsets)
+
+
+def _without_base(values: Int64s) -> Int64s:
+    """Copy a view: it would keep its base array alive while messages of a rare topic wait to fill a block."""
+    return values if values.base is None else values.copy()
+
+
+def _gather_words(block: MessageBlock) -> tuple[Bytes, Int64s]:
+    """Return the payloads one after the other, each padded to whole words, and the start of each."""
+    data, size = block.data, _word_bytes(block)
+    words = -(-block.lengths // size)
+    ends = np.cumsum(words)
+    starts = (ends - words) * size
+    index = np.repeat(block.starts - starts, words)
+    index += np.arange(0, len(index) * size, size)
+    last = len(data) - size
+    index[index > last] = 0  # words that reach beyond the buffer; the loop below copies their payloads
+    packed = np.ndarray(last + 1, f"V{size}", data, strides=1)[index].view(np.uint8)
+    for row in np.flatnonzero(block.starts + words * size > len(data)).tolist():
+        start, length = int(block.starts[row]), int(block.lengths[row])
+        packed[starts[row] : starts[row] + length] = data[start : start + length]
+    return packed, starts
+
+
+def _word_bytes(block: MessageBlock) -> int:
+    """Return a power of two such that an average payload has four to eight words; 1 for a tiny buffer."""
+    if len(block.data) < _MAX_WORD_BYTES:
+        return 1
+    average = block.payload_bytes // len(block)
+    return min(max(1 << max(average.bit_length() - 3, 0), _MIN_WORD_BYTES), _MAX_WORD_BYTES)

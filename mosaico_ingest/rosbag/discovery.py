@@ -17,9 +17,9 @@ from mosaico_ingest.textfile import read_whole
 
 __all__ = [
     "FILE_NAME",
-    "Found",
     "Metadata",
-    "TopicHint",
+    "MetadataTopic",
+    "RecordingFiles",
     "discover",
     "read_metadata",
 ]
@@ -28,7 +28,7 @@ FILE_NAME = "metadata.yaml"
 _LIMIT_BYTES = 16 << 20
 
 
-class TopicHint(Struct, frozen=True):
+class MetadataTopic(Struct, frozen=True):
     """What the metadata say of a topic."""
 
     topic: str
@@ -45,7 +45,7 @@ class Metadata(Struct, frozen=True):
     path: AnyPath
     files: tuple[str, ...]
     message_count: int
-    topics: tuple[TopicHint, ...]
+    topics: tuple[MetadataTopic, ...]
     distro: str
 
 
@@ -77,10 +77,10 @@ def read_metadata(path: AnyPath) -> Metadata:
         raise BagError(f"not of the shape of rosbag2's metadata: {err}", where=str(path)) from err
 
 
-def _topic(entry: dict[str, Any]) -> TopicHint:
+def _topic(entry: dict[str, Any]) -> MetadataTopic:
     about = entry.get("topic_metadata") or entry["topic_and_type"]
     qos = about.get("offered_qos_profiles")
-    return TopicHint(
+    return MetadataTopic(
         _text(about["name"]),
         _text(about["type"]),
         int(entry.get("message_count") or 0),
@@ -100,7 +100,7 @@ _SUFFIX = ".zstd"
 _NAMED = (".bag", ".db3", ".mcap")
 
 
-class Found(Struct, frozen=True):
+class RecordingFiles(Struct, frozen=True):
     """The files of one recording, the metadata that describe all of them, and what is odd about either."""
 
     files: tuple[AnyPath, ...]
@@ -110,7 +110,7 @@ class Found(Struct, frozen=True):
     """Parts that the metadata list beside others that are there."""
 
 
-def discover(paths: Sequence[AnyPath]) -> Found:
+def discover(paths: Sequence[AnyPath]) -> RecordingFiles:
     """Return the files that `paths` stand for, each once.
 
     Raises:
@@ -122,10 +122,10 @@ def discover(paths: Sequence[AnyPath]) -> Found:
     files = tuple(dict.fromkeys(file for one in found for file in one.files))
     findings = tuple(finding for one in found for finding in one.findings)
     missing = tuple(file for one in found for file in one.missing)
-    return Found(files, found[0].metadata if len(found) == 1 else None, findings, missing)
+    return RecordingFiles(files, found[0].metadata if len(found) == 1 else None, findings, missing)
 
 
-def _one(path: AnyPath) -> Found:
+def _one(path: AnyPath) -> RecordingFiles:
     if not path.exists():
         raise BagError("does not exist", where=str(path), hint="check the path")
     if path.is_dir():
@@ -135,30 +135,30 @@ def _one(path: AnyPath) -> Found:
     return _file(path)
 
 
-def _file(path: AnyPath) -> Found:
+def _file(path: AnyPath) -> RecordingFiles:
     """A file is itself; the metadata beside it count where they speak of this file alone."""
     beside = path.parent / FILE_NAME
     if not beside.is_file():
-        return Found((path,), None, ())
+        return RecordingFiles((path,), None, ())
     try:
         metadata = read_metadata(beside)
     except BagError as err:
-        return Found((path,), None, (_unreadable(err),))
+        return RecordingFiles((path,), None, (_unreadable(err),))
     names = [Path(name).name for name in metadata.files]
     if not {path.name, path.name.removesuffix(_SUFFIX)} & set(names):
-        return Found((path,), None, ())
+        return RecordingFiles((path,), None, ())
     if len(names) == 1:
-        return Found((path,), metadata, ())
+        return RecordingFiles((path,), metadata, ())
     part = Finding(
         "single-split",
         Severity.INFO,
         f"{path.name} is one of the {len(names)} parts that {beside} lists",
         help=f"name {path.parent} to read all of them",
     )
-    return Found((path,), None, (part,))
+    return RecordingFiles((path,), None, (part,))
 
 
-def _directory(path: AnyPath) -> Found:
+def _directory(path: AnyPath) -> RecordingFiles:
     listing = path / FILE_NAME
     findings: tuple[Finding, ...] = ()
     if listing.is_file():
@@ -176,10 +176,10 @@ def _directory(path: AnyPath) -> Found:
             where=str(path),
             hint="name a .bag, .db3 or .mcap file, or a directory with a metadata.yaml",
         )
-    return Found(tuple(files), None, findings)
+    return RecordingFiles(tuple(files), None, findings)
 
 
-def _listed(metadata: Metadata) -> Found:
+def _listed(metadata: Metadata) -> RecordingFiles:
     folder = metadata.path.parent
     files: list[AnyPath] = []
     missing: list[str] = []
@@ -207,7 +207,7 @@ def _listed(metadata: Metadata) -> Found:
         )
         for name in missing
     )
-    return Found(tuple(files), metadata, findings, gone)
+    return RecordingFiles(tuple(files), metadata, findings, gone)
 
 
 def _recordings(folder: AnyPath) -> list[AnyPath]:
@@ -240,7 +240,9 @@ def _candidates(folder: AnyPath, name: str) -> Iterator[AnyPath]:
 
 def _natural(path: AnyPath) -> list[tuple[int, str]]:
     """Sort `part_10` behind `part_9`."""
-    return [(int(piece), "") if piece.isdecimal() else (-1, piece) for piece in re.split(r"(\d+)", path.name)]
+    return [
+        (int(extent), "") if extent.isdecimal() else (-1, extent) for extent in re.split(r"(\d+)", path.name)
+    ]
 
 
 def _unreadable(err: BagError) -> Finding:

@@ -1,13 +1,14 @@
-"""This file reads a recording message by message, as dictionaries, in the order they were recorded."""
+"""The messages of a recording as dictionaries, in log-time order."""
 
 from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from types import TracebackType
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from typing_extensions import Self
@@ -16,16 +17,10 @@ from mosaico_ingest.errors import BagError, DecodeError, NothingMatched
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.patterns import select
 from mosaico_ingest.job.values import LoaderErrorPolicy, Stores
-from mosaico_ingest.remote import as_path
-from mosaico_ingest.rosbag.blocks import (
-    Channel,
-    Encoding,
-    RawBatch,
-    ROSMessage,
-    UnreadableRange,
-)
+from mosaico_ingest.remote import RemotePath, as_path
+from mosaico_ingest.rosbag.blocks import Connection, Encoding, MessageBlock, ROSMessage, UnreadableRange
 from mosaico_ingest.rosbag.definitions.registry import CustomMessages, TypeResolver
-from mosaico_ingest.rosbag.recording import Recording, open_recording, span, windows
+from mosaico_ingest.rosbag.recording import Recording, open_recording, time_bounds, time_slices
 from mosaico_ingest.rosbag.serialization import Deserializer
 
 __all__ = ["ROSLoader"]
@@ -33,11 +28,22 @@ __all__ = ["ROSLoader"]
 _LOG = logging.getLogger("mosaico_ingest.rosbag")
 
 
-class ROSLoader:
-    """A recording's messages under a list of topic patterns; iterate it, once or again, and close it.
+class _Source(Protocol):
+    """The operations of a reader that `ROSLoader` needs."""
 
-    A message whose bytes do not fit its type is left out and counted in `rejected`; the policy says whether it is
-    also logged or raised. What the container lost is in `unreadable` after an iteration.
+    connections: tuple[Connection, ...]
+
+    def close(self) -> None: ...
+    def time_bounds(self) -> tuple[int, int]: ...
+    def payloads(self, connection_ids: Collection[int]) -> Iterator[tuple[int, int, bytes]]: ...
+    def deserializer(self, connection: Connection) -> Callable[[bytes], dict[str, Any]] | None: ...
+
+
+class ROSLoader:
+    """The messages of a recording on selected topics. Iterate it, once or several times, and close it.
+
+    Messages that do not match their definition are skipped and counted in `rejected`; the error policy decides whether
+    they are also logged, or raised. Damage of the files is listed in `unreadable` after an iteration.
     """
 
     def __init__(
@@ -50,24 +56,35 @@ class ROSLoader:
         *,
         ros_distro: Stores | str | None = None,
         custom_msgs: Sequence[CustomMessages] = (),
+        reader: Literal["native", "rosbags"] = "native",
     ) -> None:
-        """Open a file, a directory, or the parts of one recording; `custom_types` gives a text or file per type.
+        """Open a file, a directory, or the splits of one recording.
+
+        `custom_types` maps message types to their definition: the text, or a path. `reader` selects this package's
+        reader, which also reads damaged and remote recordings, or that of the rosbags library.
 
         Raises:
-            BagError: It cannot be opened, or a definition cannot be read.
+            BagError: The recording cannot be opened, or a definition cannot be read.
             NothingMatched: The patterns select no topic.
         """
         self._policy = LoaderErrorPolicy(error_policy)
         self._resolver = TypeResolver(ros_distro or typestore_name, custom_msgs, types=custom_types)
-        paths = [file_path] if isinstance(file_path, (str, Path)) else list(file_path)
-        self._recording: Recording = open_recording([as_path(path) for path in paths], resolve=self._resolver)
+        paths = [as_path(path) for path in ([file_path] if isinstance(file_path, (str, Path)) else file_path)]
+        self._recording: Recording | None = None
+        if reader == "rosbags":
+            self._source = _open_with_rosbags(paths, self._resolver)
+        elif reader == "native":
+            self._recording = open_recording(paths, resolve=self._resolver)
+            self._source = _NativeSource(self._recording)
+        else:
+            raise BagError(f"unknown reader {reader!r}", hint="use 'native' or 'rosbags'")
         try:
-            self._channels = _selected(self._recording, topics)
+            self._connections = _select_connections(self._source.connections, topics)
         except NothingMatched:
-            self._recording.close()
+            self.close()
             raise
         self.rejected = Counter[str]()
-        """How many messages of each topic the last iteration left out."""
+        """Number of messages that the last iteration skipped, by topic."""
 
     def __enter__(self) -> Self:
         return self
@@ -79,119 +96,155 @@ class ROSLoader:
 
     def close(self) -> None:
         """Close the files."""
-        self._recording.close()
+        self._source.close()
 
     @property
     def topics(self) -> list[str]:
-        """The selected topics, by name."""
-        return sorted({channel.topic for channel in self._channels.values()})
+        """The selected topics, sorted."""
+        return sorted({connection.topic for connection in self._connections.values()})
 
     @property
     def msg_types(self) -> list[str]:
-        """The types on the selected topics, by name."""
-        return sorted({channel.msgtype for channel in self._channels.values()})
+        """The types on the selected topics, sorted."""
+        return sorted({connection.msgtype for connection in self._connections.values()})
 
     @property
     def duration(self) -> int:
-        """Time from the first to the last message of the recording, ns; an unindexed one is read for it."""
-        first, last = span(self._recording)
+        """Nanoseconds between the first and last message; a recording without index is read to determine it."""
+        first, last = self._source.time_bounds()
         return last - first
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is odd about the recording and its definitions."""
-        return (*self._recording.findings, *self._resolver.findings)
+        """Findings about the recording and its definitions."""
+        return (*(self._recording.findings if self._recording else ()), *self._resolver.findings)
 
     @property
     def unreadable(self) -> tuple[UnreadableRange, ...]:
-        """What of the recording could not be read, found so far."""
-        return self._recording.unreadable
+        """The unreadable ranges found so far; always empty with the reader of rosbags."""
+        return self._recording.unreadable if self._recording else ()
 
     def msg_count(self, topic: str | None = None) -> int:
-        """Return how many messages a selected topic has, or all of them; an unindexed recording is read for it.
+        """Return the number of messages of a selected topic, or of all; a recording without index is read to count.
 
         Raises:
-            NothingMatched: The topic is not among the selected.
+            NothingMatched: The topic is not selected.
         """
-        channels = [channel for channel in self._channels.values() if topic in {None, channel.topic}]
-        if not channels:
-            raise _nothing(f"the topic {topic!r} is not selected", [str(topic)], self.topics)
-        counts = [channel.count for channel in channels]
+        connections = [one for one in self._connections.values() if topic in {None, one.topic}]
+        if not connections:
+            raise _nothing_matched(f"the topic {topic!r} is not selected", [str(topic)], self.topics)
+        counts = [connection.count for connection in connections]
         if None in counts:
-            return sum(len(batch) for batch in self._recording.batches([channel.id for channel in channels]))
+            return sum(1 for _ in self._source.payloads([connection.id for connection in connections]))
         return sum(count for count in counts if count is not None)
 
     def __iter__(self) -> Iterator[ROSMessage]:
         """Yield the messages by log time.
 
         Raises:
-            BagError: The recording itself is unreadable, or, under `raise`, a message or a topic's definition is.
+            BagError: The recording is unreadable; or, with the policy `raise`, a message or a definition is.
         """
         self.rejected.clear()
-        readers = dict(self._readers())
-        unreadable = self._channels.keys() - readers
-        for batches in windows(self._recording, self._channels):
-            for batch in batches:
-                if batch.channel.id in unreadable:
-                    self.rejected[batch.channel.topic] += len(batch)
-            yield from self._messages([batch for batch in batches if batch.channel.id in readers], readers)
+        deserializers = {key: self._deserializer(one) for key, one in self._connections.items()}
+        for log_ns, connection_id, payload in self._source.payloads(self._connections):
+            connection, deserialize = self._connections[connection_id], deserializers[connection_id]
+            if deserialize is None:
+                self.rejected[connection.topic] += 1
+                continue
+            try:
+                data = deserialize(payload)
+            except DecodeError as error:
+                self._reject(connection, log_ns, error)
+                continue
+            yield ROSMessage(log_ns, connection.topic, connection.msgtype, data)
         if self._policy is LoaderErrorPolicy.LOG_WARN:
             for topic, count in self.rejected.items():
                 _LOG.warning("%s: %d messages could not be read", topic, count)
 
-    def _readers(self) -> Iterator[tuple[int, Deserializer]]:
-        for channel in self._channels.values():
-            if channel.definition and channel.encoding is not Encoding.OTHER:
-                yield channel.id, Deserializer(channel.definition, channel.encoding)
-            else:
-                self._complain(channel.topic, channel.problem or "it is not in a ROS encoding")
-
-    def _complain(self, topic: str, problem: str) -> None:
-        if self._policy is LoaderErrorPolicy.RAISE:
-            raise BagError(problem, where=topic)
-        if self._policy is LoaderErrorPolicy.LOG_WARN:
-            _LOG.warning("%s: %s", topic, problem)
-
-    def _messages(self, batches: list[RawBatch], readers: Mapping[int, Deserializer]) -> Iterator[ROSMessage]:
-        if not batches:
-            return
-        times = np.concatenate([batch.log_times for batch in batches])
-        owners = np.repeat(np.arange(len(batches)), [len(batch) for batch in batches])
-        rows = np.concatenate([np.arange(len(batch)) for batch in batches])
-        for position in np.argsort(times, kind="stable"):
-            batch, row = batches[owners[position]], int(rows[position])
-            message = self._message(batch, row, readers[batch.channel.id])
-            if message:
-                yield message
-
-    def _message(self, batch: RawBatch, row: int, reader: Deserializer) -> ROSMessage | None:
-        channel = batch.channel
-        try:
-            data = reader.to_dict(batch.payload(row))
-        except DecodeError as error:
+    def _deserializer(self, connection: Connection) -> Callable[[bytes], dict[str, Any]] | None:
+        deserialize = self._source.deserializer(connection)
+        if deserialize is None:
+            problem = connection.problem or "its encoding is not a ROS serialization"
             if self._policy is LoaderErrorPolicy.RAISE:
-                place = f"{channel.topic} at {int(batch.log_times[row])} ns"
-                raise DecodeError(error.what, rule=error.rule, where=place, hint=error.hint) from None
-            if not self.rejected[channel.topic] and self._policy is LoaderErrorPolicy.LOG_WARN:
-                _LOG.warning("%s: %s", channel.topic, error)
-            self.rejected[channel.topic] += 1
+                raise BagError(problem, where=connection.topic)
+            if self._policy is LoaderErrorPolicy.LOG_WARN:
+                _LOG.warning("%s: %s", connection.topic, problem)
+        return deserialize
+
+    def _reject(self, connection: Connection, log_ns: int, error: DecodeError) -> None:
+        """Raise or count a message that cannot be decoded; log the first of each topic."""
+        if self._policy is LoaderErrorPolicy.RAISE:
+            where = f"{connection.topic} at {log_ns} ns"
+            raise DecodeError(error.what, rule=error.rule, where=where, hint=error.hint) from None
+        if not self.rejected[connection.topic] and self._policy is LoaderErrorPolicy.LOG_WARN:
+            _LOG.warning("%s: %s", connection.topic, error)
+        self.rejected[connection.topic] += 1
+
+
+class _NativeSource:
+    """A `Recording` as the source of a loader."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self.connections = recording.connections
+
+    def close(self) -> None:
+        self._recording.close()
+
+    def time_bounds(self) -> tuple[int, int]:
+        return time_bounds(self._recording)
+
+    def payloads(self, connection_ids: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
+        for blocks in time_slices(self._recording, connection_ids):
+            yield from _by_log_time(blocks)
+
+    def deserializer(self, connection: Connection) -> Callable[[bytes], dict[str, Any]] | None:
+        if connection.definition is None or connection.encoding is Encoding.OTHER:
             return None
-        return ROSMessage(int(batch.log_times[row]), channel.topic, channel.msgtype, data)
+        return Deserializer(connection.definition, connection.encoding).to_dict
 
 
-def _selected(recording: Recording, topics: str | Sequence[str] | None) -> dict[int, Channel]:
-    patterns = [topics] if isinstance(topics, str) else list(topics or ())
-    names = sorted({channel.topic for channel in recording.channels})
-    chosen = set(select(patterns, names).selected)
-    if not chosen:
-        what = f"no topic matches {', '.join(patterns)}" if patterns else "the recording has no topic"
-        raise _nothing(what, patterns, names)
-    return {channel.id: channel for channel in recording.channels if channel.topic in chosen}
+def _by_log_time(blocks: list[MessageBlock]) -> Iterator[tuple[int, int, bytes]]:
+    if not blocks:
+        return
+    times = np.concatenate([block.log_times for block in blocks])
+    owners = np.repeat(np.arange(len(blocks)), [len(block) for block in blocks])
+    rows = np.concatenate([np.arange(len(block)) for block in blocks])
+    for position in np.argsort(times, kind="stable"):
+        block, row = blocks[owners[position]], int(rows[position])
+        yield int(times[position]), block.connection, block.payload(row)
 
 
-def _nothing(what: str, wanted: Sequence[str], names: Sequence[str]) -> NothingMatched:
-    near = dict.fromkeys(
-        name for pattern in wanted for name in get_close_matches(pattern.lstrip("!"), names, n=3)
+def _open_with_rosbags(paths: Sequence[Path | RemotePath], resolver: TypeResolver) -> _Source:
+    from mosaico_ingest.rosbag.rosbags_reader import (  # noqa: PLC0415 - the native reader does not need it
+        RosbagsRecording,
     )
-    shown = list(near) or list(names)[:5]
-    return NothingMatched(what, hint=f"nearest: {', '.join(shown)}" if shown else None)
+
+    local = [path for path in paths if isinstance(path, Path)]
+    if len(local) < len(paths):
+        raise BagError(
+            "rosbags reads local files only",
+            where=str(paths[0]),
+            hint="download the recording, or use the native reader",
+        )
+    return RosbagsRecording(local, resolver.distro, resolver.custom_texts)
+
+
+def _select_connections(
+    connections: Sequence[Connection], topics: str | Sequence[str] | None
+) -> dict[int, Connection]:
+    patterns = [topics] if isinstance(topics, str) else list(topics or ())
+    names = sorted({connection.topic for connection in connections})
+    selected = set(select(patterns, names).selected)
+    if not selected:
+        what = f"no topic matches {', '.join(patterns)}" if patterns else "the recording has no topics"
+        raise _nothing_matched(what, patterns, names)
+    return {connection.id: connection for connection in connections if connection.topic in selected}
+
+
+def _nothing_matched(what: str, patterns: Sequence[str], names: Sequence[str]) -> NothingMatched:
+    near = dict.fromkeys(
+        name for pattern in patterns for name in get_close_matches(pattern.lstrip("!"), names, n=3)
+    )
+    suggestions = list(near) or list(names)[:5]
+    return NothingMatched(what, hint=f"nearest: {', '.join(suggestions)}" if suggestions else None)

@@ -1,4 +1,4 @@
-"""A recording: one or several files as one set of connections, with their findings."""
+"""A recording: one or several files as one set of connections, and its messages as blocks in time order."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import weakref
 from collections import defaultdict
 from collections.abc import Collection, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -20,22 +19,27 @@ from typing_extensions import Self
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.remote import AnyPath, RemotePath
-from mosaico_ingest.rosbag.batching import Gather, Prefetched, Turn, compact, in_turn
+from mosaico_ingest.rosbag.batching import (
+    BlockCoalescer,
+    MergedTask,
+    Prefetcher,
+    copy_if_small,
+    merge_by_time,
+)
 from mosaico_ingest.rosbag.blocks import (
     EARLIEST_NS,
     LATEST_NS,
-    Block,
-    Channel,
+    Connection,
     Encoding,
-    Loaded,
-    Part,
-    RawBatch,
-    Slab,
-    Stream,
+    MessageBlock,
+    ReadRequest,
+    ReadResult,
+    ReadTask,
+    SplitConnection,
+    SplitReader,
     UnreadableRange,
-    Want,
 )
-from mosaico_ingest.rosbag.compression import inflate_messages
+from mosaico_ingest.rosbag.compression import MAX_CHUNK_BYTES, decompress_messages
 from mosaico_ingest.rosbag.definitions.hashes import definition_difference
 from mosaico_ingest.rosbag.definitions.model import (
     Definition,
@@ -44,312 +48,115 @@ from mosaico_ingest.rosbag.definitions.model import (
     Source,
     normalize_msgtype,
 )
-from mosaico_ingest.rosbag.discovery import Found, Metadata, TopicHint, discover
-from mosaico_ingest.rosbag.opening import open_part
+from mosaico_ingest.rosbag.discovery import Metadata, MetadataTopic, RecordingFiles, discover
+from mosaico_ingest.rosbag.opening import open_split
 
 __all__ = [
-    "ChannelTable",
+    "ConnectionTable",
     "Recording",
-    "compare",
     "open_recording",
-    "span",
-    "windows",
+    "recording_findings",
+    "time_bounds",
+    "time_slices",
 ]
 
-
-def compare(
-    parts: Sequence[Part],
-    channels: Sequence[Channel],
-    unreadable: Sequence[UnreadableRange],
-    metadata: Metadata | None,
-) -> tuple[Finding, ...]:
-    """Return what a reader of this recording should know, most of it harmless."""
-    hints = _metadata(channels, metadata) if metadata else ()
-    return (*_parts(parts), *_unreadable(unreadable), *_channels(channels), *hints)
-
-
-def _parts(parts: Sequence[Part]) -> Iterator[Finding]:
-    for part in parts:
-        for note in part.notes:
-            yield Finding("container-note", Severity.INFO, f"{part.path}: {note}")
+_SMALL_RECORDING_BYTES = 1 << 20
+"""Up to this size, reading the recording takes less time than starting a prefetch thread."""
+_PREFETCH_CPUS = 3
+"""Minimum number of CPUs for a prefetch thread: decoding and writing already use one thread each."""
+_BLOCKS_IN_MEMORY = 4
+"""The memory limit divided by the size of one read, without prefetching; prefetching doubles it."""
+_MAX_ROWS = 1 << 16
+_MEMORY_BYTES = 64 << 20
+_SLICE_BYTES, _MAX_SLICE_BYTES, _MAX_SLICES = 32 << 20, 256 << 20, 10_000
+"""Target and maximum payload size of a time slice, and the maximum number of slices before halving."""
 
 
-def _unreadable(unreadable: Sequence[UnreadableRange]) -> Iterator[Finding]:
-    for item in unreadable:
-        yield Finding(
-            "unreadable-range",
-            Severity.WARNING,
-            f"{item.file}: at {item.offset}: {item.reason}",
-        )
+def open_recording(
+    paths: AnyPath | Sequence[AnyPath], *, resolve: Resolver, max_chunk_bytes: int = MAX_CHUNK_BYTES
+) -> Recording:
+    """Open a recording: a file, a directory, a `metadata.yaml`, or several splits.
 
-
-def _channels(channels: Sequence[Channel]) -> Iterator[Finding]:
-    types: dict[str, set[str]] = defaultdict(set)
-    for channel in channels:
-        types[channel.topic].add(channel.msgtype)
-        if channel.encoding is Encoding.OTHER:
-            yield Finding(
-                "skipped-encoding", Severity.WARNING, f"{channel.topic} is skipped: {channel.problem}"
-            )
-    for topic, names in types.items():
-        if len(names) > 1:
-            listed = ", ".join(sorted(names))
-            yield Finding(
-                "mixed-types", Severity.WARNING, f"{topic} has messages of {len(names)} types: {listed}"
-            )
-
-
-def _metadata(channels: Sequence[Channel], metadata: Metadata) -> Iterator[Finding]:
-    stored: dict[str, list[Channel]] = defaultdict(list)
-    for channel in channels:
-        stored[channel.topic].append(channel)
-    for hint in metadata.topics:
-        for difference in _differences(hint, stored.pop(hint.topic, [])):
-            yield _differs(metadata, f"{hint.topic}: {difference}")
-    for topic, found in stored.items():
-        if any(channel.count != 0 for channel in found):
-            yield _differs(metadata, f"{topic} is not in the metadata")
-
-
-def _differences(hint: TopicHint, channels: Sequence[Channel]) -> Iterator[str]:
-    if not channels:
-        if hint.count:
-            yield f"{hint.count} messages in the metadata, no such topic in the storage"
-        return
-    names = {channel.msgtype for channel in channels}
-    if {name.replace("/msg/", "/") for name in names} != {hint.msgtype.replace("/msg/", "/")}:
-        yield f"type {hint.msgtype} in the metadata, {', '.join(sorted(names))} in the storage"
-    counts = [channel.count for channel in channels]
-    total = sum(count or 0 for count in counts)
-    if None not in counts and total != hint.count:
-        yield f"{hint.count} messages in the metadata, {total} in the storage"
-    first = channels[0].attributes
-    if hint.qos and first.get("offered_qos_profiles", hint.qos).strip() != hint.qos.strip():
-        yield "the QoS in the metadata is not that in the storage"
-    encoding = first.get("encoding", "")
-    if hint.serialization_format and encoding and hint.serialization_format != encoding:
-        yield f"serialisation {hint.serialization_format} in the metadata, {encoding} in the storage"
-
-
-def _differs(metadata: Metadata, difference: str) -> Finding:
-    return Finding(
-        "metadata-differs",
-        Severity.INFO,
-        f"{metadata.path}: {difference}",
-        help="the storage decides what is read",
-    )
-
-
-@dataclass(slots=True)
-class _Types:
-    """Asks the resolver once for each type and text."""
-
-    resolver: Resolver
-    known: dict[tuple[str, Embedded | None, int], Definition | str] = field(
-        default_factory=dict[tuple[str, "Embedded | None", int], "Definition | str"]
-    )
-
-    def of(self, stream: Stream) -> Definition | str:
-        """Return the stream's definition, or why there is none."""
-        if stream.encoding is Encoding.OTHER:
-            return (
-                f"its messages are {stream.attributes.get('encoding', '')!r}, which is no ROS serialisation"
-            )
-        asked = (stream.msgtype, stream.embedded, stream.ros_version)
-        if asked not in self.known:
-            self.known[asked] = self._resolve(stream)
-        found = self.known[asked]
-        if isinstance(found, str) or found.source in {Source.BAG, Source.CUSTOM}:
-            return found
-        other = definition_difference(found, stream.attributes)
-        remedy = "give the right one with custom_msgs"
-        return f"another definition of {found.root} is known: {other} — {remedy}" if other else found
-
-    def _resolve(self, stream: Stream) -> Definition | str:
-        try:
-            return self.resolver.resolve(stream.msgtype, stream.embedded, ros_version=stream.ros_version)
-        except BagError as err:
-            return str(err)
-
-
-class ChannelTable:
-    """The channels of a recording, and which streams of which part they are made of."""
-
-    def __init__(self, parts: Sequence[Part], resolver: Resolver) -> None:
-        self._ids: dict[tuple[int, int], int] = {}
-        self._found: list[Channel] = []
-        self._of_topic: dict[str, list[int]] = defaultdict(list)
-        types = _Types(resolver)
-        for number, part in enumerate(parts):
-            for stream in part.streams:
-                self._ids[number, stream.key] = self._place(_channel(stream, types.of(stream)))
-        self.channels: tuple[Channel, ...] = tuple(self._found)
-
-    def channel_id(self, part: int, key: int) -> int:
-        """Return the channel that a part's stream belongs to."""
-        return self._ids[part, key]
-
-    def keys(self, part: int, channels: Collection[int]) -> frozenset[int]:
-        """Return the streams of a part that make up the channels."""
-        return frozenset(
-            key for (number, key), channel in self._ids.items() if number == part and channel in channels
-        )
-
-    def _place(self, channel: Channel) -> int:
-        """Add to the channel that is written the same way, or open a new one."""
-        for known in (self._found[number] for number in self._of_topic[channel.topic]):
-            if _same(known, channel):
-                count = None if known.count is None or channel.count is None else known.count + channel.count
-                latched = known.latched or channel.latched
-                self._found[known.id] = replace(known, count=count, latched=latched)
-                return known.id
-        self._of_topic[channel.topic].append(len(self._found))
-        self._found.append(replace(channel, id=len(self._found)))
-        return len(self._found) - 1
-
-
-def _channel(stream: Stream, definition: Definition | str) -> Channel:
-    is_known = isinstance(definition, Definition)
-    return Channel(
-        id=-1,
-        topic=stream.topic,
-        msgtype=definition.root if isinstance(definition, Definition) else normalize_msgtype(stream.msgtype),
-        encoding=stream.encoding,
-        count=stream.count,
-        definition=definition if isinstance(definition, Definition) else None,
-        problem=None if is_known else str(definition),
-        latched=stream.latched or _is_transient_local(stream),
-        attributes=stream.attributes,
-    )
-
-
-def _is_transient_local(stream: Stream) -> bool:
-    """Return whether late subscribers get old messages too: what ROS 1 called latched."""
-    return (
-        re.search(r"durability:\s*(1|transient_local)\b", stream.attributes.get("offered_qos_profiles", ""))
-        is not None
-    )
-
-
-def _same(one: Channel, other: Channel) -> bool:
-    """Return whether two are written the same way; comments in a definition make no difference."""
-    if (one.topic, one.msgtype, one.encoding, one.problem) != (
-        other.topic,
-        other.msgtype,
-        other.encoding,
-        other.problem,
-    ):
-        return False
-    a, b = one.definition, other.definition
-    if a is None or b is None:
-        return a is b
-    return a is b or (a.ros_version == b.ros_version and a.types == b.types)
-
-
-_SMALL_BYTES = 1 << 20
-"""A recording up to this is read in less time than a thread takes to start."""
-_THREADS = 3
-"""Reading ahead is the third, beside decoding and writing: with fewer processors they are in each other's way."""
-_BLOCKS = 4
-"""As many blocks fit into the memory, or twice as many where one is read while another is at work."""
-
-ROWS = 1 << 16
-MEMORY_BYTES = 64 << 20
-
-
-def open_recording(paths: AnyPath | Sequence[AnyPath], *, resolve: Resolver) -> Recording:
-    """Open a recording: a file, a directory, a `metadata.yaml`, or several of them as one.
+    Chunks that declare a decompressed size of more than `max_chunk_bytes` become unreadable ranges.
 
     Raises:
-        BagError: A path does not exist, is empty, is no recording, or is damaged beyond reading.
+        BagError: A path does not exist, or no file of the recording can be opened.
     """
-    found = discover([paths] if isinstance(paths, Path | RemotePath) else list(paths))
+    files = discover([paths] if isinstance(paths, Path | RemotePath) else list(paths))
     stack = ExitStack()
     try:
-        parts, unreadable = _open_parts(found.files, stack)
-        return Recording(parts, unreadable, found, resolve, stack)
+        splits, unreadable = _open_splits(files.files, stack, max_chunk_bytes)
+        return Recording(splits, unreadable, files, resolve, stack)
     except BaseException:
         stack.close()
         raise
 
 
-def _open_parts(files: Sequence[AnyPath], stack: ExitStack) -> tuple[list[Part], list[UnreadableRange]]:
-    """Open every file; one of several that cannot be opened is a item, as a recorder that crashed leaves such."""
-    parts: list[Part] = []
-    failed: list[BagError] = []
+def _open_splits(
+    files: Sequence[AnyPath], stack: ExitStack, max_chunk_bytes: int
+) -> tuple[list[SplitReader], list[UnreadableRange]]:
+    """Open all splits. A crashed recorder leaves damaged splits, so those become unreadable ranges if others open."""
+    splits: list[SplitReader] = []
+    errors: list[BagError] = []
     for file in files:
         try:
-            parts.append(open_part(file, stack))
-        except BagError as err:  # noqa: PERF203 - each file may fail for itself
-            failed.append(err)
-    if not parts:
-        raise _none_opened(failed)
-    kinds = sorted({part.container for part in parts})
-    if len(kinds) > 1:
+            splits.append(open_split(file, stack, max_chunk_bytes=max_chunk_bytes))
+        except BagError as err:  # noqa: PERF203 - each split may fail independently
+            errors.append(err)
+    if not splits:
+        first = errors[0]
+        if len(errors) == 1:
+            raise first
+        what = f"{first.what}; the other {len(errors) - 1} splits cannot be opened either"
+        raise BagError(what, where=first.where, hint=first.hint)
+    containers = sorted({split.container for split in splits})
+    if len(containers) > 1:
         raise BagError(
-            f"the parts of one recording are of different formats: {', '.join(kinds)}",
+            f"the splits have different formats: {', '.join(containers)}",
             where=str(files[0].parent),
-            hint="name the files of one format",
+            hint="name only files of one format",
         )
-    return parts, [
-        UnreadableRange(0, f"this part cannot be opened: {err.what}", file=err.where or "") for err in failed
+    return splits, [
+        UnreadableRange(0, f"this split cannot be opened: {err.what}", file=err.where or "") for err in errors
     ]
 
 
-def _none_opened(failed: Sequence[BagError]) -> BagError:
-    first = failed[0]
-    if len(failed) == 1:
-        return first
-    what = f"{first.what}; nor can any of the {len(failed) - 1} other parts be opened"
-    return BagError(what, where=first.where, hint=first.hint)
-
-
-class _Step(Struct, frozen=True):
-    """What one block gave, ready to be gathered."""
-
-    part: int
-    slabs: list[Slab]
-    unreadable: list[UnreadableRange]
-    start_ns: int
-    next_ns: int
-
-
 class Recording:
-    """What is in a recording, and its messages in batches; a context manager, usable at once."""
+    """A recording's connections, its findings, and its messages as blocks. A context manager."""
 
     def __init__(
         self,
-        parts: Sequence[Part],
+        splits: Sequence[SplitReader],
         unreadable: Sequence[UnreadableRange],
-        found: Found,
+        files: RecordingFiles,
         resolver: Resolver,
         stack: ExitStack,
     ) -> None:
-        self._parts = parts
+        self._splits = splits
         self._stack = stack
-        self._table = ChannelTable(parts, resolver)
-        self._running: weakref.WeakSet[Generator[RawBatch, None, None]] = weakref.WeakSet()
+        self._table = ConnectionTable(splits, resolver)
+        self._iterators: weakref.WeakSet[Generator[MessageBlock, None, None]] = weakref.WeakSet()
         self._unreadable: dict[UnreadableRange, None] = dict.fromkeys(unreadable)
-        self.files: tuple[AnyPath, ...] = found.files
-        self.missing: tuple[AnyPath, ...] = found.missing
-        """Parts that are not there, though the metadata list them; they are among the unreadable too."""
-        self.container: str = parts[0].container
+        self.files: tuple[AnyPath, ...] = files.files
+        self.missing_files: tuple[AnyPath, ...] = files.missing
+        """Splits that the metadata lists and that do not exist; each is an unreadable range as well."""
+        self.container: str = splits[0].container
         """`mcap`, `sqlite3` or `ros1`."""
-        self.size_bytes: int = sum(file.stat().st_size for file in found.files)
-        self.channels: tuple[Channel, ...] = self._table.channels
-        self.start_ns: int | None = min((p.start_ns for p in parts if p.start_ns is not None), default=None)
-        self.end_ns: int | None = max((p.end_ns for p in parts if p.end_ns is not None), default=None)
-        """The last message's time, inclusive."""
-        counts = [part.message_count for part in parts]
+        self.size_bytes: int = sum(file.stat().st_size for file in files.files)
+        self.connections: tuple[Connection, ...] = self._table.connections
+        self.start_ns: int | None = min((s.start_ns for s in splits if s.start_ns is not None), default=None)
+        self.end_ns: int | None = max((s.end_ns for s in splits if s.end_ns is not None), default=None)
+        """Log time of the last message, inclusive."""
+        counts = [split.message_count for split in splits]
         self.message_count: int | None = None if None in counts else sum(count or 0 for count in counts)
-        for number, part in enumerate(parts):
-            self._note(number, part.unreadable)
-        oddities = compare(parts, self.channels, self.unreadable, found.metadata)
+        for number, split in enumerate(splits):
+            self._report(number, split.unreadable)
+        findings = recording_findings(splits, self.connections, self.unreadable, files.metadata)
         self._unreadable |= dict.fromkeys(
-            UnreadableRange(0, "this part is not there", file=str(file)) for file in found.missing
+            UnreadableRange(0, "this split does not exist", file=str(file)) for file in files.missing
         )
-        self.findings: tuple[Finding, ...] = (*found.findings, *oddities)
-        """What to know before reading; what reading itself finds broken is in `unreadable`."""
+        self.findings: tuple[Finding, ...] = (*files.findings, *findings)
+        """Findings from opening the recording; damage found while reading is in `unreadable` only."""
 
     def __enter__(self) -> Self:
         """Return the recording."""
@@ -358,156 +165,341 @@ class Recording:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close it."""
+        """Close the recording."""
         self.close()
 
     def close(self) -> None:
-        """Stop what is being read, close the files and remove temporary ones; twice does no harm."""
-        for running in list(self._running):
-            running.close()
+        """Stop all iterations, close the files and remove temporary copies. Closing twice is harmless."""
+        for iterator in list(self._iterators):
+            iterator.close()
         self._stack.close()
 
     @property
     def unreadable(self) -> tuple[UnreadableRange, ...]:
-        """What could not be read: found when opening, and by every iteration so far."""
+        """The ranges that could not be read: found while opening the files, and by every iteration so far."""
         return tuple(self._unreadable)
 
-    def batches(
+    def message_blocks(
         self,
-        channel_ids: Collection[int] | None = None,
+        connection_ids: Collection[int] | None = None,
         *,
         start_ns: int | None = None,
         end_ns: int | None = None,
-        rows: int = ROWS,
-        memory_bytes: int = MEMORY_BYTES,
-    ) -> Iterator[RawBatch]:
-        """Yield the messages of some channels (None: all) from `start_ns` up to, not including, `end_ns`.
+        max_rows: int = _MAX_ROWS,
+        memory_bytes: int = _MEMORY_BYTES,
+    ) -> Iterator[MessageBlock]:
+        """Yield the messages of some connections (default: all) with start_ns <= log time < end_ns.
 
-        The batches of a channel follow each other in log time, unless its messages are so much out of order that
-        sorting them would take more than about `memory_bytes`. A batch has at most `rows` messages.
-        What cannot be read is left out and listed in `unreadable`.
+        The blocks of a connection are in log-time order, unless sorting its messages would take more than about
+        `memory_bytes`. A block has at most `max_rows` messages. Unreadable ranges are skipped and added to
+        `unreadable`.
         """
-        ids = (
-            frozenset(channel.id for channel in self.channels)
-            if channel_ids is None
-            else frozenset(channel_ids)
-        )
-        low = EARLIEST_NS if start_ns is None else start_ns
-        high = LATEST_NS + 1 if end_ns is None else end_ns
-        ahead = self.size_bytes > _SMALL_BYTES and pa.cpu_count() >= _THREADS
-        block_bytes = memory_bytes // (2 * _BLOCKS if ahead else _BLOCKS)
-        wants = [
-            Want(self._table.keys(number, ids), low, high, block_bytes) for number in range(len(self._parts))
-        ]
-        gather = Gather(
-            {channel.id: channel for channel in self.channels}, rows=rows, memory_bytes=memory_bytes
-        )
-        running = self._gathered(wants, gather, ahead=ahead)
-        self._running.add(running)
-        return running
+        ids = frozenset(range(len(self.connections))) if connection_ids is None else frozenset(connection_ids)
+        first = EARLIEST_NS if start_ns is None else start_ns
+        end = LATEST_NS + 1 if end_ns is None else end_ns
+        prefetch = self.size_bytes > _SMALL_RECORDING_BYTES and pa.cpu_count() >= _PREFETCH_CPUS
+        block_bytes = memory_bytes // (2 * _BLOCKS_IN_MEMORY if prefetch else _BLOCKS_IN_MEMORY)
+        requests = {
+            number: ReadRequest(keys, first, end, block_bytes)
+            for number in range(len(self._splits))
+            if (keys := self._table.split_connections(number, ids))
+        }
+        coalescer = BlockCoalescer(max_rows=max_rows, memory_bytes=memory_bytes)
+        iterator = self._coalesced(requests, coalescer, prefetch=prefetch)
+        self._iterators.add(iterator)
+        return iterator
 
-    def _gathered(
-        self, wants: Sequence[Want], gather: Gather, *, ahead: bool
-    ) -> Generator[RawBatch, None, None]:
-        blocks = self._steps(wants)
-        with Prefetched(blocks) if ahead else closing(blocks) as steps:
-            for step in steps:
-                self._note(step.part, step.unreadable)
-                for slab in step.slabs:
-                    yield from gather.add(self._table.channel_id(step.part, slab.key), slab, step.start_ns)
-                yield from gather.settle(step.next_ns)
-            yield from gather.rest()
+    def _coalesced(
+        self, requests: dict[int, ReadRequest], coalescer: BlockCoalescer, *, prefetch: bool
+    ) -> Generator[MessageBlock, None, None]:
+        source = self._loaded(requests)
+        with Prefetcher(source) if prefetch else closing(source) as loaded_tasks:
+            for loaded in loaded_tasks:
+                self._report(loaded.split, loaded.unreadable)
+                for block in loaded.blocks:
+                    yield from coalescer.add(block, loaded.start_ns)
+                yield from coalescer.flush_ready(loaded.next_ns)
+            yield from coalescer.flush_all()
 
-    def _steps(self, wants: Sequence[Want]) -> Generator[_Step, None, None]:
-        """Load block after block; runs in a thread of its own where that pays."""
-        sources = [
-            (part.start_ns, partial(_blocks, part, want))
-            for part, want in zip(self._parts, wants, strict=True)
-            if want.keys
+    def _loaded(self, requests: dict[int, ReadRequest]) -> Generator[_LoadedTask, None, None]:
+        """Load task after task; runs in the prefetch thread if there is one."""
+        numbers = list(requests)
+        tasks = [
+            (self._splits[number].start_ns, partial(_read_tasks, self._splits[number], request))
+            for number, request in requests.items()
         ]
-        numbers = [number for number, want in enumerate(wants) if want.keys]
-        for turn in in_turn(sources):
-            yield self._step(numbers[turn.part], turn)
+        for merged in merge_by_time(tasks):
+            yield self._load(numbers[merged.split], merged)
         for number in numbers:
-            self._parts[number].check_unchanged()
+            self._splits[number].check_unchanged()
 
-    def _step(self, number: int, turn: Turn) -> _Step:
+    def _load(self, split: int, merged: MergedTask) -> _LoadedTask:
         try:
-            loaded = turn.block.load()
+            result = merged.task.load()
         except BagError as err:
-            return _Step(number, [], [UnreadableRange(0, err.what)], turn.block.start_ns, turn.next_ns)
-        slabs = [self._plain(number, slab, loaded.unreadable) for slab in loaded.slabs]
-        compacted = [compact(slab) for slab in slabs if len(slab)]
-        return _Step(number, compacted, loaded.unreadable, turn.block.start_ns, turn.next_ns)
+            result = ReadResult([], [UnreadableRange(0, err.what)])
+        blocks: list[MessageBlock] = []
+        for block in result.blocks:
+            connection = self.connections[self._table.connection_id(split, block.connection)]
+            messages = (
+                decompress_messages(block, result.unreadable)
+                if connection.encoding is Encoding.CDR
+                else block
+            )
+            if len(messages):
+                blocks.append(replace(copy_if_small(messages), connection=connection.id))
+        return _LoadedTask(split, blocks, result.unreadable, merged.task.start_ns, merged.next_ns)
 
-    def _plain(self, number: int, slab: Slab, unreadable: list[UnreadableRange]) -> Slab:
-        channel = self.channels[self._table.channel_id(number, slab.key)]
-        return inflate_messages(slab, unreadable) if channel.encoding is Encoding.CDR else slab
-
-    def _note(self, number: int, unreadable: Sequence[UnreadableRange]) -> None:
-        """Add ranges of a file to those of the recording."""
-        file = str(self._parts[number].path)
-        for item in unreadable:
-            connection = None if item.connection is None else self._table.channel_id(number, item.connection)
-            self._unreadable[replace(item, connection=connection, file=file)] = None
+    def _report(self, split: int, unreadable: Sequence[UnreadableRange]) -> None:
+        """Add unreadable ranges of a split, with its path and the recording's connection ids."""
+        file = str(self._splits[split].path)
+        for gap in unreadable:
+            connection = None if gap.connection is None else self._table.connection_id(split, gap.connection)
+            self._unreadable[replace(gap, file=file, connection=connection)] = None
 
 
-def _blocks(part: Part, want: Want) -> Iterator[Block]:
-    """Yield the blocks of a part; where it can tell of no more, that is a item and not the end of the recording."""
+class _LoadedTask(Struct, frozen=True):
+    """The result of one task, ready to be coalesced; its connection ids are those of the recording."""
+
+    split: int
+    blocks: list[MessageBlock]
+    unreadable: list[UnreadableRange]
+    start_ns: int
+    next_ns: int
+
+
+def _read_tasks(split: SplitReader, request: ReadRequest) -> Iterator[ReadTask]:
+    """Yield the tasks of a split; if it fails, its remainder is unreadable and the other splits are still read."""
     try:
-        yield from part.blocks(want)
+        yield from split.read_tasks(request)
     except BagError as err:
-        item = UnreadableRange(0, err.what)
-        yield Block(LATEST_NS, lambda: Loaded([], [item]))
+        gap = UnreadableRange(0, err.what)
+        yield ReadTask(LATEST_NS, lambda: ReadResult([], [gap]))
 
 
-_USUAL_BYTES = 32 << 20
-_MAX_BYTES = 256 << 20
-_MAX_PIECES = 10_000
+class ConnectionTable:
+    """The connections of a recording, and the connections of each split that they consist of."""
+
+    def __init__(self, splits: Sequence[SplitReader], resolver: Resolver) -> None:
+        self._ids: dict[tuple[int, int], int] = {}
+        self._merged: list[Connection] = []
+        self._of_topic: dict[str, list[int]] = defaultdict(list)
+        definitions = _DefinitionCache(resolver)
+        for number, split in enumerate(splits):
+            for connection in split.connections:
+                definition = definitions.resolve(connection)
+                self._ids[number, connection.id] = self._merge(_resolved(connection, definition))
+        self.connections: tuple[Connection, ...] = tuple(self._merged)
+
+    def connection_id(self, split: int, split_connection: int) -> int:
+        """Return the id of the connection that a split's connection belongs to."""
+        return self._ids[split, split_connection]
+
+    def split_connections(self, split: int, connections: Collection[int]) -> frozenset[int]:
+        """Return the ids within a split of some of the recording's connections."""
+        return frozenset(
+            key for (number, key), merged in self._ids.items() if number == split and merged in connections
+        )
+
+    def _merge(self, connection: Connection) -> int:
+        """Merge the connection into an equal one of another split, or add it; return the id."""
+        for merged in (self._merged[number] for number in self._of_topic[connection.topic]):
+            if _are_equal(merged, connection):
+                counts = (merged.count, connection.count)
+                count = None if None in counts else sum(count or 0 for count in counts)
+                latched = merged.latched or connection.latched
+                self._merged[merged.id] = replace(merged, count=count, latched=latched)
+                return merged.id
+        number = len(self._merged)
+        self._of_topic[connection.topic].append(number)
+        self._merged.append(replace(connection, id=number))
+        return number
 
 
-def span(recording: Recording) -> tuple[int, int]:
-    """Return the log times of the first and the last message; without an index the recording is read for them."""
+class _DefinitionCache:
+    """Caches the resolver's answers per type and embedded text."""
+
+    def __init__(self, resolver: Resolver) -> None:
+        self._resolver = resolver
+        self._cache: dict[tuple[str, Embedded | None, int], Definition | str] = {}
+
+    def resolve(self, connection: SplitConnection) -> Definition | str:
+        """Return the connection's definition, or the reason why there is none."""
+        if connection.encoding is Encoding.OTHER:
+            encoding = connection.attributes.get("encoding", "")
+            return f"its encoding is {encoding!r}, which is not a ROS serialization"
+        key = (connection.msgtype, connection.embedded, connection.ros_version)
+        if key not in self._cache:
+            try:
+                self._cache[key] = self._resolver.resolve(
+                    connection.msgtype, connection.embedded, ros_version=connection.ros_version
+                )
+            except BagError as err:
+                self._cache[key] = str(err)
+        definition = self._cache[key]
+        if isinstance(definition, str) or definition.source in {Source.BAG, Source.CUSTOM}:
+            return definition
+        difference = definition_difference(definition, connection.attributes)
+        if difference is None:
+            return definition
+        remedy = "provide the definition with custom_msgs"
+        return f"the known definition of {definition.root} differs from the recorded one: {difference} — {remedy}"
+
+
+def _resolved(connection: SplitConnection, definition: Definition | str) -> Connection:
+    is_resolved = isinstance(definition, Definition)
+    return Connection(
+        id=-1,
+        topic=connection.topic,
+        msgtype=definition.root if is_resolved else normalize_msgtype(connection.msgtype),
+        encoding=connection.encoding,
+        count=connection.count,
+        definition=definition if is_resolved else None,
+        problem=None if is_resolved else definition,
+        latched=connection.latched or _is_transient_local(connection),
+        attributes=connection.attributes,
+    )
+
+
+def _is_transient_local(connection: SplitConnection) -> bool:
+    """Return whether late subscribers receive old messages too, which ROS 1 calls latched."""
+    profiles = connection.attributes.get("offered_qos_profiles", "")
+    return re.search(r"durability:\s*(1|transient_local)\b", profiles) is not None
+
+
+def _are_equal(first: Connection, second: Connection) -> bool:
+    """Return whether messages of both connections have the same topic, type, encoding and fields."""
+    if (first.topic, first.msgtype, first.encoding, first.problem) != (
+        second.topic,
+        second.msgtype,
+        second.encoding,
+        second.problem,
+    ):
+        return False
+    a, b = first.definition, second.definition
+    if a is None or b is None:
+        return a is b
+    return a is b or (a.ros_version == b.ros_version and a.types == b.types)
+
+
+def recording_findings(
+    splits: Sequence[SplitReader],
+    connections: Sequence[Connection],
+    unreadable: Sequence[UnreadableRange],
+    metadata: Metadata | None,
+) -> tuple[Finding, ...]:
+    """Return the findings of an opened recording: notes, damage, connections, differences from its metadata."""
+    findings = [
+        Finding("container-note", Severity.INFO, f"{split.path}: {note}")
+        for split in splits
+        for note in split.notes
+    ]
+    findings += (
+        Finding("unreadable-range", Severity.WARNING, f"{gap.file}: at {gap.offset}: {gap.reason}")
+        for gap in unreadable
+    )
+    findings += _connection_findings(connections)
+    if metadata:
+        findings += (
+            Finding(
+                "metadata-differs",
+                Severity.INFO,
+                f"{metadata.path}: {difference}",
+                help="the messages in the files take precedence over the metadata",
+            )
+            for difference in _metadata_differences(connections, metadata)
+        )
+    return tuple(findings)
+
+
+def _connection_findings(connections: Sequence[Connection]) -> Iterator[Finding]:
+    types: dict[str, set[str]] = defaultdict(set)
+    for connection in connections:
+        types[connection.topic].add(connection.msgtype)
+        if connection.encoding is Encoding.OTHER:
+            message = f"{connection.topic} is skipped: {connection.problem}"
+            yield Finding("skipped-encoding", Severity.WARNING, message)
+    for topic, names in types.items():
+        if len(names) > 1:
+            message = f"{topic} has messages of {len(names)} types: {', '.join(sorted(names))}"
+            yield Finding("mixed-types", Severity.WARNING, message)
+
+
+def _metadata_differences(connections: Sequence[Connection], metadata: Metadata) -> Iterator[str]:
+    stored: dict[str, list[Connection]] = defaultdict(list)
+    for connection in connections:
+        stored[connection.topic].append(connection)
+    for topic in metadata.topics:
+        for difference in _topic_differences(topic, stored.pop(topic.topic, [])):
+            yield f"{topic.topic}: {difference}"
+    for topic, unlisted in stored.items():
+        if any(connection.count != 0 for connection in unlisted):
+            yield f"{topic} is not in the metadata"
+
+
+def _topic_differences(topic: MetadataTopic, connections: Sequence[Connection]) -> Iterator[str]:
+    if not connections:
+        if topic.count:
+            yield f"{topic.count} messages in the metadata, no such topic in the files"
+        return
+    types = {connection.msgtype for connection in connections}
+    if {name.replace("/msg/", "/") for name in types} != {topic.msgtype.replace("/msg/", "/")}:
+        yield f"type {topic.msgtype} in the metadata, {', '.join(sorted(types))} in the files"
+    counts = [connection.count for connection in connections]
+    total = sum(count or 0 for count in counts)
+    if None not in counts and total != topic.count:
+        yield f"{topic.count} messages in the metadata, {total} in the files"
+    attributes = connections[0].attributes
+    if topic.qos and attributes.get("offered_qos_profiles", topic.qos).strip() != topic.qos.strip():
+        yield "the QoS profiles in the metadata differ from those in the files"
+    encoding = attributes.get("encoding", "")
+    if topic.serialization_format and encoding and topic.serialization_format != encoding:
+        yield f"serialization {topic.serialization_format} in the metadata, {encoding} in the files"
+
+
+def time_bounds(recording: Recording) -> tuple[int, int]:
+    """Return the log times of the first and last message; read the recording if it has no index."""
     if recording.start_ns is not None and recording.end_ns is not None:
         return recording.start_ns, recording.end_ns
-    times = [(int(batch.log_times.min()), int(batch.log_times.max())) for batch in recording.batches()]
-    return min((low for low, _ in times), default=0), max((high for _, high in times), default=0)
+    times = [(int(block.log_times.min()), int(block.log_times.max())) for block in recording.message_blocks()]
+    return min((first for first, _ in times), default=0), max((last for _, last in times), default=0)
 
 
-def windows(
-    recording: Recording, channel_ids: Collection[int], *, max_bytes: int = _MAX_BYTES
-) -> Iterator[list[RawBatch]]:
-    """Yield all batches of each stretch of time, in order; one with more than `max_bytes` is halved.
+def time_slices(
+    recording: Recording, connection_ids: Collection[int], *, max_bytes: int = _MAX_SLICE_BYTES
+) -> Iterator[list[MessageBlock]]:
+    """Yield all blocks of one time slice after the other; halve slices of more than `max_bytes`.
 
-    The first and the last stretch are open: an index may be wrong about the ends.
+    The first and the last slice have no outer bound, because an index may be wrong about the time range.
     """
-    first, last = span(recording)
-    step = max((last - first) // min(recording.size_bytes // _USUAL_BYTES + 1, _MAX_PIECES) + 1, 1)
+    first, last = time_bounds(recording)
+    step = max((last - first) // min(recording.size_bytes // _SLICE_BYTES + 1, _MAX_SLICES) + 1, 1)
     inner = range(first + step, last + 1, step)
-    waiting = list(zip((None, *inner), (*inner, None), strict=True))[::-1]
-    while waiting:
-        low, high = waiting.pop()
-        start, end = first if low is None else low, last + 1 if high is None else high
-        batches = _read(recording, channel_ids, low, high, max_bytes if end - start > 1 else None)
-        if batches is None:
+    slices = list(zip((None, *inner), (*inner, None), strict=True))[::-1]
+    while slices:
+        start_ns, end_ns = slices.pop()
+        start, end = first if start_ns is None else start_ns, last + 1 if end_ns is None else end_ns
+        limit = max_bytes if end - start > 1 else None
+        blocks = _read_slice(recording, connection_ids, start_ns, end_ns, limit)
+        if blocks is None:
             middle = start + (end - start) // 2
-            waiting += [(middle, high), (low, middle)]
+            slices += [(middle, end_ns), (start_ns, middle)]
         else:
-            yield batches
+            yield blocks
 
 
-def _read(
+def _read_slice(
     recording: Recording,
-    channel_ids: Collection[int],
-    low: int | None,
-    high: int | None,
+    connection_ids: Collection[int],
+    start_ns: int | None,
+    end_ns: int | None,
     max_bytes: int | None,
-) -> list[RawBatch] | None:
-    """Return the batches of a stretch, None where they are more than `max_bytes`."""
-    found, size = list[RawBatch](), 0
-    for batch in recording.batches(channel_ids, start_ns=low, end_ns=high):
-        found.append(batch)
-        size += int(batch.lengths.sum())
+) -> list[MessageBlock] | None:
+    """Return the blocks of a slice, or None if they have more than `max_bytes` of payload."""
+    blocks, size = list[MessageBlock](), 0
+    for block in recording.message_blocks(connection_ids, start_ns=start_ns, end_ns=end_ns):
+        blocks.append(block)
+        size += block.payload_bytes
         if max_bytes is not None and size > max_bytes:
             return None
-    return found
+    return blocks

@@ -1,4 +1,4 @@
-"""This file finds the next chunk or message behind bytes that are no records, in files whose own index is lost."""
+"""Resynchronization: find the next chunk or message after bytes that are not valid records."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from mosaico_ingest.rosbag.mcap import records as mcap_records
 from mosaico_ingest.rosbag.ros1 import records as ros1_records
 from mosaico_ingest.rosbag.source import Source, Window
 
-__all__ = ["next_mcap_chunk", "next_ros1_chunk", "next_ros1_message"]
+__all__ = ["find_mcap_chunk", "find_ros1_chunk", "find_ros1_message"]
 
 _STEP_BYTES = 1 << 20
 _OVERLAP_BYTES = 1 << 10
-"""More than what is recognised at once."""
-_HEAD_BYTES = 256
-"""More than the fixed part of any chunk record."""
+"""Overlap of two steps; more than any pattern spans."""
+_MCAP_HEAD_BYTES = 256
+"""Bytes to read for the head of an MCAP chunk record; more than it can take."""
 
 
 class _Ros1Kind(Struct, frozen=True):
-    """How the records of a kind are recognised."""
+    """The features by which a kind of ROS 1 record is recognized."""
 
     op: int
     fields: frozenset[bytes]
-    before: int
-    """How far before its `op=` a header may begin."""
+    max_before: int
+    """Maximum distance from the start of the header to its field `op=`, in bytes."""
 
 
 _ROS1_CHUNK = _Ros1Kind(ros1_records.Op.CHUNK, frozenset({b"compression", b"size"}), 128)
@@ -38,86 +38,88 @@ _ROS1_MESSAGE = _Ros1Kind(
 )
 
 
-def next_mcap_chunk(source: Source, at: int, stop: int) -> int | None:
-    """Return where the next whole MCAP chunk begins, between `at` and `stop`."""
+def find_mcap_chunk(source: Source, start: int, stop: int) -> int | None:
+    """Return the offset of the next complete MCAP chunk between `start` and `stop`, None if there is none."""
 
-    def is_chunk(place: int) -> bool:
-        data = source.read_some(place, _HEAD_BYTES)
+    def is_chunk(offset: int) -> bool:
+        data = source.read_some(offset, _MCAP_HEAD_BYTES)
         try:
             head = mcap_records.chunk_head(data)
         except BagError:
             return False
         _, length = mcap_records.RECORD.unpack_from(data)
         end = mcap_records.RECORD.size + length
-        return head.end == end and place + end <= stop and head.compression in {"", "zstd", "lz4"}
+        return head.end == end and offset + end <= stop and head.compression in {"", "zstd", "lz4"}
 
-    return _search(source, at, stop, _mcap_candidates, is_chunk)
-
-
-def next_ros1_chunk(source: Source, at: int, stop: int) -> int | None:
-    """Return where the next whole chunk of a ROS 1 bag begins, between `at` and `stop`."""
-    return _search(source, at, stop, _candidates(_ROS1_CHUNK), _has(source, stop, _ROS1_CHUNK))
+    return _search(source, start, stop, _mcap_candidates, is_chunk)
 
 
-def next_ros1_message(source: Source, at: int, stop: int) -> int | None:
-    """Return where the next whole message of a bag of version 1.2 begins, between `at` and `stop`."""
-    return _search(source, at, stop, _candidates(_ROS1_MESSAGE), _has(source, stop, _ROS1_MESSAGE))
+def find_ros1_chunk(source: Source, start: int, stop: int) -> int | None:
+    """Return the offset of the next complete chunk of a ROS 1 bag, None if there is none."""
+    return _search(source, start, stop, _ros1_candidates(_ROS1_CHUNK), _is_ros1(source, stop, _ROS1_CHUNK))
 
 
-def _has(source: Source, stop: int, kind: _Ros1Kind) -> Callable[[int], bool]:
-    """Return what says whether a whole record of a kind begins somewhere."""
+def find_ros1_message(source: Source, start: int, stop: int) -> int | None:
+    """Return the offset of the next complete message of a bag of version 1.2, None if there is none."""
+    return _search(
+        source, start, stop, _ros1_candidates(_ROS1_MESSAGE), _is_ros1(source, stop, _ROS1_MESSAGE)
+    )
+
+
+def _is_ros1(source: Source, stop: int, kind: _Ros1Kind) -> Callable[[int], bool]:
+    """Return a predicate: whether a complete record of the kind starts at an offset."""
     window = Window(source)
 
-    def fits(place: int) -> bool:
+    def is_record(offset: int) -> bool:
         try:
-            record = ros1_records.record_at(window, place, stop)
+            record = ros1_records.record_at(window, offset, stop)
         except BagError:
             return False
         return record.op == kind.op and kind.fields <= record.header.keys()
 
-    return fits
+    return is_record
 
 
 def _search(
     source: Source,
-    at: int,
+    start: int,
     stop: int,
     candidates: Callable[[bytes], Iterator[int]],
-    fits: Callable[[int], bool],
+    is_record: Callable[[int], bool],
 ) -> int | None:
-    while at < stop:
-        data = source.read_some(at, min(_STEP_BYTES, stop - at))
-        for place in candidates(data):
-            if fits(at + place):
-                return at + place
+    while start < stop:
+        data = source.read_some(start, min(_STEP_BYTES, stop - start))
+        for candidate in candidates(data):
+            if is_record(start + candidate):
+                return start + candidate
         if len(data) < _STEP_BYTES:
             return None
-        at += _STEP_BYTES - _OVERLAP_BYTES
+        start += _STEP_BYTES - _OVERLAP_BYTES
     return None
 
 
 def _mcap_candidates(data: bytes) -> Iterator[int]:
-    """Yield where the kind, a length below 2**40 and a short compression name stand as in a chunk record."""
+    """Yield positions with the kind of a chunk, a length below 2**40 and a short name of the compression."""
     view = np.frombuffer(data, np.uint8)
     count = max(len(view) - 41, 0)
-    zeros = [view[place : place + count] == 0 for place in (6, 7, 8, 38, 39, 40)]
+    zeros = [view[position : position + count] == 0 for position in (6, 7, 8, 38, 39, 40)]
     likely = np.logical_and.reduce(
         [view[:count] == mcap_records.Op.CHUNK, view[37 : 37 + count] <= len("zstd"), *zeros]
     )
     yield from np.flatnonzero(likely).tolist()
 
 
-def _candidates(kind: _Ros1Kind) -> Callable[[bytes], Iterator[int]]:
-    """Return what yields where a record header begins that reaches over the field `op=` of a kind."""
+def _ros1_candidates(kind: _Ros1Kind) -> Callable[[bytes], Iterator[int]]:
+    """Return a function that yields the positions of record headers that contain the field `op=` of the kind."""
     field = re.compile(re.escape(b"\x04\x00\x00\x00op=" + bytes([kind.op])))
 
     def candidates(data: bytes) -> Iterator[int]:
-        tried = 0
-        for found in field.finditer(data):
-            for begin in range(max(found.start() - kind.before, tried), found.start() - 3):
-                (size,) = struct.unpack_from("<I", data, begin)
-                if found.end() - begin - 4 <= size <= 2 * kind.before:
-                    yield begin
-            tried = max(found.start() - 3, tried)
+        next_start = 0
+        for match in field.finditer(data):
+            for start in range(max(match.start() - kind.max_before, next_start), match.start() - 3):
+                (size,) = struct.unpack_from("<I", data, start)
+                if match.end() - start - 4 <= size <= 2 * kind.max_before:
+                    yield start
+            next_start = max(match.start() - 3, next_start)
 
     return candidates

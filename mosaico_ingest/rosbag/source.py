@@ -17,73 +17,73 @@ from msgspec import Struct
 
 from mosaico_ingest.errors import BagError, Unreachable
 from mosaico_ingest.remote import AnyPath, RemotePath, reaching
-from mosaico_ingest.rosbag.compression import room
+from mosaico_ingest.rosbag.compression import allocate
 
 __all__ = [
     "Fields",
     "FileSource",
+    "ReadBuffer",
     "RemoteSource",
     "Source",
-    "Stretches",
     "Window",
     "check_inside",
-    "fetch",
+    "download",
 ]
 
 _WINDOW_BYTES = 1 << 16
 
 
 class Source(Protocol):
-    """What containers read from, by position."""
+    """A file with random access: the interface that container readers use."""
 
     @property
     def path(self) -> AnyPath:
-        """The file as it was named, not a copy that had to be made."""
+        """The path that the caller named, even if a temporary copy is read."""
         ...
 
     @property
     def size(self) -> int:
-        """Its length in bytes."""
+        """Length in bytes."""
         ...
 
     @property
     def notes(self) -> list[str]:
-        """What is worth saying about how it is read."""
+        """Remarks about how the file is read."""
         ...
 
     def read(self, offset: int, size: int) -> bytes:
-        """Return `size` bytes from `offset` on; BagError where there are fewer."""
+        """Return `size` bytes from `offset`; raise BagError if the file ends before."""
         ...
 
     def read_some(self, offset: int, size: int) -> bytes:
-        """Return up to `size` bytes from `offset` on, fewer only where the file ends."""
+        """Return up to `size` bytes from `offset`; fewer only at the end of the file."""
         ...
 
     def read_into(self, target: memoryview, offset: int) -> None:
-        """Fill `target` with the bytes from `offset` on; BagError where there are fewer."""
+        """Fill `target` with the bytes from `offset`; raise BagError if the file ends before."""
         ...
 
-    def prefetch(self, stretches: Iterable[tuple[int, int]]) -> None:
-        """Announce what will be read next, in this order, each as its first byte and the one behind its last."""
+    def prefetch(self, ranges: Iterable[tuple[int, int]]) -> None:
+        """Announce the ranges (start, end) that will be read next, in this order."""
         ...
 
     def fetch_whole(self) -> None:
-        """Prepare for all of it being read in small steps."""
+        """Prepare for reading the complete file in small steps."""
         ...
 
     def check_unchanged(self) -> None:
-        """Raise where it has changed since it was opened; called once all of it was read."""
+        """Raise if the file has changed since it was opened; called after the last read."""
         ...
 
     def close(self) -> None:
-        """Close it; closing twice does no harm."""
+        """Close the file. Closing twice is harmless."""
         ...
 
 
 class FileSource:
-    """A file opened for reading by position.
+    """A local file.
 
-    Not a memory map: a file that is cut off while it is read must end in an error, not in a signal.
+    It is read with `pread`, not with a memory map: truncating the file during a read must raise an error, not a signal.
     """
 
     def __init__(self, path: Path, name: AnyPath | None = None) -> None:
@@ -96,97 +96,97 @@ class FileSource:
             raise BagError(f"cannot be opened: {err.strerror}", where=str(path)) from err
 
     def read(self, offset: int, size: int) -> bytes:
-        """Return `size` bytes from `offset` on.
+        """Return `size` bytes from `offset`.
 
         Raises:
-            BagError: The file ends before that, or the disk refuses.
+            BagError: The file ends before, or the operating system reports an error.
         """
         check_inside(self, offset, size)
         data = self.read_some(offset, size)
-        self._check_found(len(data), offset, size)
+        self._check_length(len(data), offset, size)
         return data
 
     def read_into(self, target: memoryview, offset: int) -> None:
-        """Fill `target` with the bytes from `offset` on.
+        """Fill `target` with the bytes from `offset`.
 
         Raises:
-            BagError: The file ends before that, or the disk refuses.
+            BagError: The file ends before, or the operating system reports an error.
         """
         check_inside(self, offset, len(target))
-        found = 0
+        filled = 0
         try:
-            while found < len(target) and (more := os.preadv(self._fd, [target[found:]], offset + found)):
-                found += more
+            while filled < len(target) and (more := os.preadv(self._fd, [target[filled:]], offset + filled)):
+                filled += more
         except OSError as err:
-            raise self._refused(offset, err) from err
-        self._check_found(found, offset, len(target))
+            raise self._read_error(offset, err) from err
+        self._check_length(filled, offset, len(target))
 
     def read_some(self, offset: int, size: int) -> bytes:
-        """Return up to `size` bytes from `offset` on, fewer only where the file ends.
+        """Return up to `size` bytes from `offset`; fewer only at the end of the file.
 
         Raises:
-            BagError: The disk refuses.
+            BagError: The operating system reports an error.
         """
         try:
             data = os.pread(self._fd, size, offset)
             while len(data) < size and (more := os.pread(self._fd, size - len(data), offset + len(data))):
                 data += more
         except OSError as err:
-            raise self._refused(offset, err) from err
+            raise self._read_error(offset, err) from err
         return data
 
-    def _refused(self, offset: int, err: OSError) -> BagError:
+    def _read_error(self, offset: int, err: OSError) -> BagError:
         return BagError(f"cannot be read at {offset}: {err.strerror}", where=str(self.path))
 
-    def _check_found(self, found: int, offset: int, size: int) -> None:
-        if found < size:
+    def _check_length(self, length: int, offset: int, size: int) -> None:
+        if length < size:
             raise BagError(
-                f"{size} bytes expected at {offset}, {found} found: the file became shorter",
+                f"{size} bytes expected at {offset}, {length} read: the file was truncated",
                 where=str(self.path),
             )
 
-    def prefetch(self, stretches: Iterable[tuple[int, int]]) -> None:
-        """Do nothing: the system reads ahead by itself."""
+    def prefetch(self, ranges: Iterable[tuple[int, int]]) -> None:
+        """Do nothing: the operating system reads ahead."""
 
     def fetch_whole(self) -> None:
-        """Do nothing: it is here."""
+        """Do nothing: the file is local."""
 
     def check_unchanged(self) -> None:
-        """Do nothing: an open file stays what it is, unless it is written to."""
+        """Do nothing: an open local file cannot be replaced."""
 
     def close(self) -> None:
-        """Close the file; once is enough, twice does no harm."""
+        """Close the file. Closing twice is harmless."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
 
 
-class Stretches:
-    """Reads stretches of a file into one buffer, one behind the other."""
+class ReadBuffer:
+    """Reads several ranges of a file into one buffer, one after the other."""
 
-    def __init__(self, source: Source, stretches: Iterable[tuple[int, int]]) -> None:
-        """Make room for those that lie in the file; each is its first byte and the one behind its last."""
-        inside = (stop - start for start, stop in stretches if 0 <= start <= stop <= source.size)
-        self.data = room(sum(inside))
-        """What was read, and room for the rest."""
+    def __init__(self, source: Source, ranges: Iterable[tuple[int, int]]) -> None:
+        """Allocate space for the ranges (start, end) that are inside the file."""
+        inside = (stop - start for start, stop in ranges if 0 <= start <= stop <= source.size)
+        self.data = allocate(sum(inside))
+        """The bytes read so far, followed by unused space."""
         self._source = source
         self._used = 0
 
     def read(self, start: int, stop: int) -> slice:
-        """Read one of the stretches and return where in `data` it lies.
+        """Read one of the ranges and return its position in `data`.
 
         Raises:
-            BagError: The file ends before that, or the disk refuses.
+            BagError: The file ends before, or the operating system reports an error.
         """
         check_inside(self._source, start, stop - start)
-        at = slice(self._used, self._used + stop - start)
-        self._source.read_into(self.data[at].data, start)
-        self._used = at.stop
-        return at
+        position = slice(self._used, self._used + stop - start)
+        self._source.read_into(self.data[position].data, start)
+        self._used = position.stop
+        return position
 
 
 def check_inside(source: Source, offset: int, size: int) -> None:
-    """Raise where a stretch does not lie in the file."""
+    """Raise BagError if a range is not inside the file."""
     if offset < 0 or size < 0 or offset + size > source.size:
         raise BagError(
             f"{size} bytes expected at {offset}, the file ends at {source.size}", where=str(source.path)
@@ -194,27 +194,27 @@ def check_inside(source: Source, offset: int, size: int) -> None:
 
 
 class Window:
-    """Looks at a file in small steps forward, reading it in large ones."""
+    """A read buffer for small forward steps through a file."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
         self._data = b""
-        self._at = 0
+        self._offset = 0
 
     def peek(self, offset: int, size: int) -> bytes:
-        """Return up to `size` bytes from `offset` on, fewer at the end of the file."""
-        begin = offset - self._at
-        if begin < 0 or begin + size > len(self._data):
-            left = max(self._source.size - offset, 0)
-            self._data = self._source.read_some(offset, min(max(size, _WINDOW_BYTES), left))
-            self._at, begin = offset, 0
-        return self._data[begin : begin + size]
+        """Return up to `size` bytes from `offset`; fewer at the end of the file."""
+        start = offset - self._offset
+        if start < 0 or start + size > len(self._data):
+            available = max(self._source.size - offset, 0)
+            self._data = self._source.read_some(offset, min(max(size, _WINDOW_BYTES), available))
+            self._offset, start = offset, 0
+        return self._data[start : start + size]
 
 
 class Fields:
-    """Takes little-endian values off a record's bytes, one after the other.
+    """Reads little-endian values from the bytes of a record, one after the other.
 
-    Every method raises BagError where the record ends too early.
+    Every method raises BagError if the record ends before the value.
     """
 
     __slots__ = ("_data", "_end", "_pos")
@@ -226,13 +226,13 @@ class Fields:
 
     @property
     def left(self) -> int:
-        """How many bytes have not been taken."""
+        """Number of remaining bytes."""
         return self._end - self._pos
 
     def take(self, size: int) -> bytes:
         """Return the next `size` bytes."""
         if size > self.left:
-            raise BagError(f"a field of {size} bytes in a record with {self.left} left")
+            raise BagError(f"a field of {size} bytes in a record with {self.left} bytes left")
         self._pos += size
         return bytes(self._data[self._pos - size : self._pos])
 
@@ -249,39 +249,39 @@ class Fields:
         return int.from_bytes(self.take(8), "little")
 
     def text(self) -> str:
-        """Return a string behind its 32-bit length; bytes that are no UTF-8 become U+FFFD."""
+        """Return a string that follows its 32-bit length; invalid UTF-8 becomes U+FFFD."""
         return self.take(self.u32()).decode("utf-8", "replace")
 
     def texts(self) -> dict[str, str]:
-        """Return a map of strings behind its length in bytes."""
+        """Return a map of strings that follows its length in bytes."""
         inner = Fields(self.take(self.u32()))
-        found: dict[str, str] = {}
+        texts: dict[str, str] = {}
         while inner.left:
             name = inner.text()
-            found[name] = inner.text()
-        return found
+            texts[name] = inner.text()
+        return texts
 
     def pairs(self, code: str) -> list[tuple[int, int]]:
-        """Return a map of numbers behind its length in bytes; `code` is the entry as `struct` spells it."""
+        """Return a map of numbers that follows its length in bytes; `code` is the `struct` format of an entry."""
         data = self.take(self.u32())
         layout = struct.Struct(code)
         if len(data) % layout.size:
-            raise BagError(f"a map of {len(data)} bytes, which is no multiple of {layout.size}")
+            raise BagError(f"a map of {len(data)} bytes, which is not a multiple of {layout.size}")
         return [(int(a), int(b)) for a, b in layout.iter_unpack(data)]
 
 
-_LOOK_BYTES = 256 << 10
-"""What is asked for where less is needed: a request costs more than its first bytes."""
-_LOOKS = 8
-_FIRST_BYTES, _REQUEST_BYTES = 1 << 20, 8 << 20
-"""How much is asked for at once: little at first, as the reader may stop soon, then twice as much each time."""
-_GAP_BYTES = 512 << 10
-"""What lies between two stretches and is fetched with them rather than asked for around."""
-_REQUESTS = 4
-"""How many requests are under way at a time; with their answers they hold at most 32 MiB."""
+_PAGE_BYTES = 256 << 10
+"""Minimum size of a request that was not announced; the round trip dominates the cost of small requests."""
+_CACHED_PAGES = 8
+_FIRST_REQUEST_BYTES, _REQUEST_BYTES = 1 << 20, 8 << 20
+"""Size of the first prefetch request, and maximum size; requests double, because the reader may stop early."""
+_MAX_GAP_BYTES = 512 << 10
+"""Maximum gap between two ranges that are fetched with one request."""
+_CONCURRENT_REQUESTS = 4
+"""Maximum number of concurrent requests; their responses take at most 32 MiB."""
 
 
-class _Stretch(Struct, frozen=True):
+class _Range(Struct, frozen=True):
     start: int
     data: bytes
 
@@ -293,18 +293,18 @@ class _Stretch(Struct, frozen=True):
 
 
 class RemoteSource:
-    """An object opened for reading by position; it must not change until it has been read.
+    """A remote file. It must not change while it is open.
 
-    Every method that reads raises `Unreachable` where its store does not answer, or where the object is another now.
+    Every method that reads raises `Unreachable` if the server does not respond or the file has been replaced.
     """
 
     def __init__(self, path: RemotePath) -> None:
         self.path = path
         self.notes: list[str] = []
-        self._near: FileSource | None = None
+        self._copy: FileSource | None = None
         self._folder: tempfile.TemporaryDirectory[str] | None = None
-        self._ahead: _Ahead | None = None
-        self._looks: deque[_Stretch] = deque(maxlen=_LOOKS)
+        self._prefetcher: _Prefetcher | None = None
+        self._pages: deque[_Range] = deque(maxlen=_CACHED_PAGES)
         try:
             self._file = path.open_input()
             with reaching(str(path)):
@@ -314,153 +314,152 @@ class RemoteSource:
             raise BagError(f"cannot be opened: {err.strerror}", where=str(path)) from err
 
     def read(self, offset: int, size: int) -> bytes:
-        """Return `size` bytes from `offset` on; see `FileSource.read`."""
+        """Return `size` bytes from `offset`; see `FileSource.read`."""
         check_inside(self, offset, size)
         return self.read_some(offset, size)
 
     def read_into(self, target: memoryview, offset: int) -> None:
-        """Fill `target` with the bytes from `offset` on; see `FileSource.read_into`."""
-        if self._near is not None:
-            self._near.read_into(target, offset)
+        """Fill `target` with the bytes from `offset`; see `FileSource.read_into`."""
+        if self._copy is not None:
+            self._copy.read_into(target, offset)
         else:
             target[:] = self.read(offset, len(target))
 
     def read_some(self, offset: int, size: int) -> bytes:
-        """Return up to `size` bytes from `offset` on, fewer only where the file ends."""
-        if self._near is not None:
-            return self._near.read_some(offset, size)
+        """Return up to `size` bytes from `offset`; fewer only at the end of the file."""
+        if self._copy is not None:
+            return self._copy.read_some(offset, size)
         stop = min(offset + size, self.size)
         if offset >= stop:
             return b""
-        expected = self._ahead.take(offset, stop) if self._ahead else None
-        return self._look(offset, stop) if expected is None else expected
+        prefetched = self._prefetcher.take(offset, stop) if self._prefetcher else None
+        return self._read_page(offset, stop) if prefetched is None else prefetched
 
-    def prefetch(self, stretches: Iterable[tuple[int, int]]) -> None:
-        """Begin to fetch what will be read next, in this order; each stretch is its first byte and the one behind."""
-        self._forget()
-        if self._near is None:
-            self._ahead = _Ahead(self._fetch, _requests(iter(stretches)))
+    def prefetch(self, ranges: Iterable[tuple[int, int]]) -> None:
+        """Start to fetch the ranges (start, end) that will be read next, in this order."""
+        self._stop_prefetching()
+        if self._copy is None:
+            self._prefetcher = _Prefetcher(self._fetch, _requests(iter(ranges)))
 
     def fetch_whole(self) -> None:
-        """Fetch the whole object to a temporary folder, for many small reads; `close` removes it."""
-        if self._near is None:
+        """Download the complete file to a temporary folder, for many small reads; `close` removes it."""
+        if self._copy is None:
             self._folder = tempfile.TemporaryDirectory(prefix="mosaico-")
-            self._near = FileSource(_save(self, Path(self._folder.name)), self.path)
-            self.notes.append(f"it has no index, so all of its {self.size} bytes were fetched first")
+            self._copy = FileSource(_save(self, Path(self._folder.name)), self.path)
+            self.notes.append(f"it has no index, so all {self.size} bytes were downloaded")
 
     def check_unchanged(self) -> None:
-        """Raise where the object is no longer the one that was opened."""
-        self._forget()
+        """Raise Unreachable if the file is no longer the one that was opened."""
+        self._stop_prefetching()
         self._check_version()
 
     def _check_version(self) -> None:
         if self.path.version() != self._version:
             raise Unreachable(
-                "the recording changed while it was read", where=str(self.path), hint="run again"
+                "the recording changed while it was being read", where=str(self.path), hint="run again"
             )
 
     def close(self) -> None:
-        """Close the object, and remove what was fetched; closing twice does no harm."""
-        self._forget()
+        """Close the file and remove the local copy. Closing twice is harmless."""
+        self._stop_prefetching()
         self._file.close()
-        if self._near is not None and self._folder is not None:
-            self._near.close()
+        if self._copy is not None and self._folder is not None:
+            self._copy.close()
             self._folder.cleanup()
 
-    def _forget(self) -> None:
-        if self._ahead is not None:
-            self._ahead.close()
-            self._ahead = None
+    def _stop_prefetching(self) -> None:
+        if self._prefetcher is not None:
+            self._prefetcher.close()
+            self._prefetcher = None
 
-    def _look(self, start: int, stop: int) -> bytes:
-        """Return a stretch that was not prefetched; some of what lies around it is kept."""
-        for known in self._looks:
-            if known.has(start, stop):
-                return known.cut(start, stop)
-        first = max(0, min(start, self.size - _LOOK_BYTES))
-        data = self._fetch(first, max(stop, min(first + _LOOK_BYTES, self.size)))
-        found = _Stretch(first, data)
-        if len(data) <= _LOOK_BYTES:
-            self._looks.append(found)
-        return found.cut(start, stop)
+    def _read_page(self, start: int, stop: int) -> bytes:
+        """Return a range that was not prefetched; cache the bytes around it."""
+        for page in self._pages:
+            if page.has(start, stop):
+                return page.cut(start, stop)
+        first = max(0, min(start, self.size - _PAGE_BYTES))
+        page = _Range(first, self._fetch(first, max(stop, min(first + _PAGE_BYTES, self.size))))
+        if len(page.data) <= _PAGE_BYTES:
+            self._pages.append(page)
+        return page.cut(start, stop)
 
     def _fetch(self, start: int, stop: int) -> bytes:
         try:
             with reaching(str(self.path)):
-                data = self._file.read_at(stop - start, start)  # pyright: ignore[reportCallIssue] - the stubs leave the arguments out
+                data = self._file.read_at(stop - start, start)  # pyright: ignore[reportCallIssue] - the stubs lack the arguments
         except Unreachable:
             raise
         except Exception:
-            self._check_version()  # a store says of an object that was replaced that there is no such range
+            self._check_version()  # for a replaced object, a store reports an invalid range
             raise
         if len(data) != stop - start:
             self._check_version()
             raise BagError(
-                f"{stop - start} bytes expected at {start}, {len(data)} sent", where=str(self.path)
+                f"{stop - start} bytes expected at {start}, {len(data)} received", where=str(self.path)
             )
         return data
 
 
-class _Ahead:
-    """Fetches stretches before they are asked for, in order; no more at a time than the reader has shown to need."""
+class _Prefetcher:
+    """Fetches announced ranges in order before they are read; concurrency grows as the reader consumes them."""
 
-    def __init__(self, fetch: Callable[[int, int], bytes], wanted: Iterator[tuple[int, int]]) -> None:
+    def __init__(self, fetch: Callable[[int, int], bytes], ranges: Iterator[tuple[int, int]]) -> None:
         self._fetch = fetch
-        self._wanted = wanted
-        self._under_way: deque[tuple[int, int, Future[bytes]]] = deque()
+        self._ranges = ranges
+        self._requests: deque[tuple[int, int, Future[bytes]]] = deque()
         self._allowed = 1
-        self._pool = ThreadPoolExecutor(_REQUESTS, thread_name_prefix="mosaico-fetch")
+        self._pool = ThreadPoolExecutor(_CONCURRENT_REQUESTS, thread_name_prefix="mosaico-fetch")
         self._lock = threading.Lock()
         self._fill()
 
     def take(self, start: int, stop: int) -> bytes | None:
-        """Return a stretch that was announced, None for any other."""
+        """Return a range if it was announced, else None."""
         with self._lock:
-            place = next((i for i, (a, b, _) in enumerate(self._under_way) if a <= start and stop <= b), None)
-            if place is None:
+            index = next((i for i, (a, b, _) in enumerate(self._requests) if a <= start and stop <= b), None)
+            if index is None:
                 return None
-            for _ in range(place):
-                self._under_way.popleft()
-            if place:
-                self._allowed = min(self._allowed + 1, _REQUESTS)
+            for _ in range(index):
+                self._requests.popleft()
+            if index:
+                self._allowed = min(self._allowed + 1, _CONCURRENT_REQUESTS)
             self._fill()
-            first, _, fetched = self._under_way[0]
-        return fetched.result()[start - first : stop - first]
+            first, _, response = self._requests[0]
+        return response.result()[start - first : stop - first]
 
     def close(self) -> None:
-        """Give up what has not been asked for yet."""
+        """Cancel the requests that have not started, and wait for the others."""
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _fill(self) -> None:
-        while len(self._under_way) < self._allowed:
-            following = next(self._wanted, None)
+        while len(self._requests) < self._allowed:
+            following = next(self._ranges, None)
             if following is None:
                 return
-            self._under_way.append((*following, self._pool.submit(self._fetch, *following)))
+            self._requests.append((*following, self._pool.submit(self._fetch, *following)))
 
 
-def _requests(stretches: Iterator[tuple[int, int]]) -> Iterator[tuple[int, int]]:
-    """Join neighbours to requests of a good size."""
-    limit = _FIRST_BYTES
-    begun: tuple[int, int] | None = None
-    for start, stop in stretches:
-        if begun and 0 <= start - begun[1] <= _GAP_BYTES and stop - begun[0] <= limit:
-            begun = (begun[0], stop)
+def _requests(ranges: Iterator[tuple[int, int]]) -> Iterator[tuple[int, int]]:
+    """Merge neighboring ranges into requests."""
+    limit = _FIRST_REQUEST_BYTES
+    request: tuple[int, int] | None = None
+    for start, stop in ranges:
+        if request and 0 <= start - request[1] <= _MAX_GAP_BYTES and stop - request[0] <= limit:
+            request = (request[0], stop)
             continue
-        if begun:
-            yield begun
+        if request:
+            yield request
             limit = min(2 * limit, _REQUEST_BYTES)
-        begun = (start, stop)
-    if begun:
-        yield begun
+        request = (start, stop)
+    if request:
+        yield request
 
 
-def fetch(path: RemotePath, folder: Path) -> Path:
-    """Copy an object into a folder, checking first that it fits.
+def download(path: RemotePath, folder: Path) -> Path:
+    """Download a remote file into a folder, after checking that it fits.
 
     Raises:
-        BagError: There is no such object, or not enough room.
-        Unreachable: Its store does not answer, or it changed meanwhile.
+        BagError: The file does not exist, or the disk has not enough space.
+        Unreachable: The server does not respond, or the file changed meanwhile.
     """
     source = RemoteSource(path)
     try:
@@ -476,7 +475,7 @@ def _save(source: RemoteSource, folder: Path) -> Path:
     hint = "point TMPDIR at a larger disk"
     if source.size > free:
         raise BagError(
-            f"{source.size} bytes are to be fetched to {folder}, and {free} are free",
+            f"{source.size} bytes must be downloaded to {folder}, and only {free} are free",
             where=str(source.path),
             hint=hint,
         )
@@ -489,6 +488,6 @@ def _save(source: RemoteSource, folder: Path) -> Path:
                 file.write(source.read_some(start, stop - start))
     except OSError as err:
         raise BagError(
-            f"cannot be fetched to {folder}: {err.strerror}", where=str(source.path), hint=hint
+            f"cannot be downloaded to {folder}: {err.strerror}", where=str(source.path), hint=hint
         ) from err
     return target

@@ -21,16 +21,16 @@ from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.rosbag.blocks import (
     EARLIEST_NS,
     LATEST_NS,
-    Block,
     Encoding,
-    Loaded,
-    Slab,
-    Stream,
+    MessageBlock,
+    ReadRequest,
+    ReadResult,
+    ReadTask,
+    SplitConnection,
     UnreadableRange,
-    Want,
-    by_key,
-    in_groups,
-    orphans,
+    group_by_bytes,
+    rows_by_connection,
+    undescribed_connections,
 )
 from mosaico_ingest.rosbag.definitions.model import Embedded
 
@@ -38,7 +38,7 @@ __all__ = [
     "BROKEN",
     "Row",
     "Salvage",
-    "SqlitePart",
+    "SqliteReader",
 ]
 
 BROKEN = (sqlite3.Error, UnicodeDecodeError)
@@ -53,7 +53,7 @@ _LAST_ROWID = 2**63 - 1
 class Salvage:
     """Rows by row id instead of by time; what had to be stepped over is in `unreadable`."""
 
-    connection: sqlite3.Connection
+    database: sqlite3.Connection
     unreadable: list[UnreadableRange] = field(default_factory=list[UnreadableRange])
 
     def rows(self) -> Iterator[Row]:
@@ -81,7 +81,7 @@ class Salvage:
             "SELECT rowid, topic_id, timestamp, data FROM messages NOT INDEXED "
             "WHERE rowid >= ? ORDER BY rowid LIMIT ?"
         )
-        yield from self.connection.execute(query, (rowid, limit))
+        yield from self.database.execute(query, (rowid, limit))
 
     def _next_row(self, broken: int) -> Row | None:
         """Return the first row from `broken` on that can be read, None without any: by doubling steps, then halving."""
@@ -134,7 +134,7 @@ class _Columns(Struct, frozen=True):
     has_definitions: bool
 
 
-class SqlitePart:
+class SqliteReader:
     """One `.db3` file."""
 
     container = "sqlite3"
@@ -145,12 +145,14 @@ class SqlitePart:
         self.notes: list[str] = []
         self._stack = ExitStack()
         try:
-            self._connection = _open(path, self._stack, self.notes)
-            self._columns = _columns(self._connection)
+            self._database = _open(path, self._stack, self.notes)
+            self._columns = _columns(self._database)
             self._counts = self._read_counts()
-            self.streams: tuple[Stream, ...] = self._read_streams()
+            self.connections: tuple[SplitConnection, ...] = self._read_connections()
             self.message_count: int | None = None if self._counts is None else sum(self._counts.values())
-            self.unreadable.extend(orphans(self._counts, {stream.key for stream in self.streams}))
+            self.unreadable.extend(
+                undescribed_connections(self._counts, {connection.id for connection in self.connections})
+            )
             self.start_ns, self.end_ns = self._read_bounds()
         except (*BROKEN, OSError, TypeError, ValueError) as err:
             self._stack.close()
@@ -159,34 +161,36 @@ class SqlitePart:
             self._stack.close()
             raise
 
-    def blocks(self, want: Want) -> Iterator[Block]:
+    def read_tasks(self, request: ReadRequest) -> Iterator[ReadTask]:
         """Yield pages of rows by time stamp; where a page of the file is damaged, what can still be found."""
-        keys = ",".join(str(int(key)) for key in want.keys)
+        keys = ",".join(str(int(key)) for key in request.connections)
         query = (
             "SELECT rowid, topic_id, timestamp, data FROM messages "  # noqa: S608 - the keys are numbers
             f"WHERE topic_id IN ({keys}) AND timestamp BETWEEN ? AND ? ORDER BY timestamp"
         )
-        bounds = (max(want.start_ns, EARLIEST_NS), min(want.end_ns - 1, LATEST_NS))
+        bounds = (max(request.start_ns, EARLIEST_NS), min(request.end_ns - 1, LATEST_NS))
         done = _Done(bounds[0], set())
         try:
-            for page in _pages(self._connection.execute(query, bounds), want):
+            for page in _pages(self._database.execute(query, bounds), request):
                 done = done.after(page)
-                yield Block(int(page[0][2]), partial(_load, page))
+                yield ReadTask(int(page[0][2]), partial(_load, page))
         except BROKEN as err:
-            yield from self._salvaged(want, done, str(err))
+            yield from self._salvaged(request, done, str(err))
 
-    def _salvaged(self, want: Want, done: _Done, reason: str) -> Iterator[Block]:
+    def _salvaged(self, request: ReadRequest, done: _Done, reason: str) -> Iterator[ReadTask]:
         """Yield the rows that reading by time did not reach, in whatever order they are."""
-        salvage = Salvage(self._connection)
+        salvage = Salvage(self._database)
         wanted = (
-            row for row in salvage.rows() if row[1] in want.keys and row[2] < want.end_ns and done.leaves(row)
+            row
+            for row in salvage.rows()
+            if row[1] in request.connections and row[2] < request.end_ns and done.leaves(row)
         )
-        for page in _pages(wanted, want):
-            yield Block(done.time_ns, partial(_load, page))
+        for page in _pages(wanted, request):
+            yield ReadTask(done.time_ns, partial(_load, page))
         unreadable = salvage.unreadable or [
             UnreadableRange(0, f"{reason}; every row could be read in another way", count=0)
         ]
-        yield Block(done.time_ns, lambda: Loaded([], unreadable))
+        yield ReadTask(done.time_ns, lambda: ReadResult([], unreadable))
 
     def check_unchanged(self) -> None:
         """Do nothing; see `FileSource.check_unchanged`."""
@@ -195,7 +199,7 @@ class SqlitePart:
         """Close the file, and remove the copy, if there had to be one."""
         self._stack.close()
 
-    def _read_streams(self) -> tuple[Stream, ...]:
+    def _read_connections(self) -> tuple[SplitConnection, ...]:
         definitions = self._read_definitions()
         names = [
             "id",
@@ -206,12 +210,12 @@ class SqlitePart:
             "type_description_hash",
         ]
         present = [name for name in names if name in self._columns.topics]
-        rows = self._connection.execute(f"SELECT {','.join(present)} FROM topics ORDER BY id")  # noqa: S608 - constants
+        rows = self._database.execute(f"SELECT {','.join(present)} FROM topics ORDER BY id")  # noqa: S608 - constants
         return tuple(_stream(dict(zip(present, row, strict=True)), self._counts, definitions) for row in rows)
 
     def _read_counts(self) -> dict[int, int] | None:
         try:
-            return dict(self._connection.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
+            return dict(self._database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
         except BROKEN as err:
             self.notes.append(f"the messages cannot be counted: {err}")
             return None
@@ -222,12 +226,12 @@ class SqlitePart:
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions ORDER BY id DESC"
         return {
             str(name): Embedded(str(encoding), _text(text))
-            for name, encoding, text in self._connection.execute(query)
+            for name, encoding, text in self._database.execute(query)
         }
 
     def _read_bounds(self) -> tuple[int | None, int | None]:
         try:
-            return self._connection.execute("SELECT min(timestamp), max(timestamp) FROM messages").fetchone()
+            return self._database.execute("SELECT min(timestamp), max(timestamp) FROM messages").fetchone()
         except BROKEN as err:
             self.notes.append(f"the first and last time stamps cannot be read: {err}")
             return None, None
@@ -246,10 +250,10 @@ def _open(path: Path, stack: ExitStack, notes: list[str]) -> sqlite3.Connection:
     if pending:
         notes.append(f"{pending[0].name} holds changes; they were replayed on a copy")
     uri = f"{path.absolute().as_uri()}?{'mode=rw' if pending else 'mode=ro&immutable=1'}"
-    connection = sqlite3.connect(uri, uri=True, check_same_thread=False)
-    stack.callback(connection.close)
-    connection.text_factory = _text
-    return connection
+    database = sqlite3.connect(uri, uri=True, check_same_thread=False)
+    stack.callback(database.close)
+    database.text_factory = _text
+    return database
 
 
 def _whole_pages(path: Path) -> int:
@@ -269,38 +273,40 @@ def _text(value: object) -> str:
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
-def _tables(connection: sqlite3.Connection) -> set[str]:
+def _tables(database: sqlite3.Connection) -> set[str]:
     """Return the names of the tables, also of a file that was cut off."""
     query = "SELECT name FROM sqlite_master WHERE type = 'table'"
     try:
-        return {str(name) for (name,) in connection.execute(query)}
+        return {str(name) for (name,) in database.execute(query)}
     except BROKEN:
         # With this SQLite opens files shorter than their header says; nothing is ever written here.
-        connection.execute("PRAGMA writable_schema = ON")
-        return {str(name) for (name,) in connection.execute(query)}
+        database.execute("PRAGMA writable_schema = ON")
+        return {str(name) for (name,) in database.execute(query)}
 
 
-def _columns(connection: sqlite3.Connection) -> _Columns:
-    tables = _tables(connection)
+def _columns(database: sqlite3.Connection) -> _Columns:
+    tables = _tables(database)
     if not {"topics", "messages"} <= tables:
         raise BagError(
             f"a SQLite file without the tables of a recording; it has {', '.join(sorted(tables)) or 'none'}"
         )
-    topics = frozenset(str(row[1]) for row in connection.execute("PRAGMA table_info(topics)"))
-    messages = {str(row[1]) for row in connection.execute("PRAGMA table_info(messages)")}
+    topics = frozenset(str(row[1]) for row in database.execute("PRAGMA table_info(topics)"))
+    messages = {str(row[1]) for row in database.execute("PRAGMA table_info(messages)")}
     missing = ({"id", "name", "type"} - topics) | ({"topic_id", "timestamp", "data"} - messages)
     if missing:
         raise BagError(f"a SQLite file whose tables lack the columns {', '.join(sorted(missing))}")
     return _Columns(topics, "message_definitions" in tables)
 
 
-def _stream(row: dict[str, Any], counts: dict[int, int] | None, definitions: dict[str, Embedded]) -> Stream:
+def _stream(
+    row: dict[str, Any], counts: dict[int, int] | None, definitions: dict[str, Embedded]
+) -> SplitConnection:
     encoding = str(row.get("serialization_format", "cdr"))
     attributes = {"encoding": encoding}
     for name in ("offered_qos_profiles", "type_description_hash"):
         if row.get(name):
             attributes[name] = str(row[name])
-    return Stream(
+    return SplitConnection(
         int(row["id"]),
         str(row["name"]),
         str(row["type"]),
@@ -312,16 +318,16 @@ def _stream(row: dict[str, Any], counts: dict[int, int] | None, definitions: dic
     )
 
 
-def _pages(rows: Iterator[Row], want: Want) -> Iterator[list[Row]]:
+def _pages(rows: Iterator[Row], request: ReadRequest) -> Iterator[list[Row]]:
     """Yield rows in lists of the size of a block; one is read at a time, as its size is known only then."""
-    return in_groups(rows, _data_bytes, want.block_bytes, most=_PAGE_ROWS)
+    return group_by_bytes(rows, _data_bytes, request.block_bytes, max_length=_PAGE_ROWS)
 
 
 def _data_bytes(row: Row) -> int:
     return len(row[3]) if isinstance(row[3], bytes) else 0
 
 
-def _load(page: list[Row]) -> Loaded:
+def _load(page: list[Row]) -> ReadResult:
     """Return a page's rows by topic; SQLite keeps any value in any column, so the types are looked at."""
     good = [row for row in page if [type(value) for value in row] == _ROW_TYPES]
     unreadable = [
@@ -330,13 +336,13 @@ def _load(page: list[Row]) -> Loaded:
         if len(good) < len(page) and [type(value) for value in row] != _ROW_TYPES
     ]
     if not good:
-        return Loaded([], unreadable)
+        return ReadResult([], unreadable)
     ids, topics, times, blobs = zip(*good, strict=True)
     data = np.frombuffer(b"".join(blobs), np.uint8)
     lengths = np.fromiter(map(len, blobs), np.int64, len(blobs))
     starts = np.cumsum(lengths) - lengths
     all_times, all_ids = np.array(times, np.int64), np.array(ids, np.int64)
     keys = np.array(topics, np.int64)
-    whole = Slab(-1, all_times, data, starts, lengths, all_ids)
-    slabs = [whole.rows(rows, key=key) for key, rows in by_key(keys)]
-    return Loaded(slabs, unreadable)
+    whole = MessageBlock(-1, all_times, data, starts, lengths, all_ids)
+    blocks = [whole.rows(rows, connection=key) for key, rows in rows_by_connection(keys)]
+    return ReadResult(blocks, unreadable)

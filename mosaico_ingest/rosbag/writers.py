@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Protocol
 
 import zstandard
-from rosbags.interfaces import Connection
+from rosbags.interfaces import Connection as RosbagsConnection
 from rosbags.rosbag1 import Writer as Rosbag1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2
@@ -45,7 +45,7 @@ __all__ = [
 class RecordingWriter(Protocol):
     """Takes messages by log time; those of ROS 1 definitions in ROS 1's encoding, others as little-endian CDR."""
 
-    def channel(self, topic: str, definition: Definition) -> int:
+    def add_connection(self, topic: str, definition: Definition) -> int:
         """Open a channel and return its number.
 
         Raises:
@@ -100,7 +100,7 @@ class McapWriter:
         self._file.write(MCAP)
         self._began = False
 
-    def channel(self, topic: str, definition: Definition) -> int:
+    def add_connection(self, topic: str, definition: Definition) -> int:
         """Open a channel; two definitions of one type are two schemas."""
         if len(self._versions) == _MAX_CHANNELS:
             raise BagError(f"MCAP has room for {_MAX_CHANNELS} channels", where=topic)
@@ -230,10 +230,10 @@ class SqliteWriter:
         folder.parent.mkdir()
         self._bag = Rosbag2(folder, version=9, storage_plugin=StoragePlugin.SQLITE3)
         self._bag.open()
-        self._connections: list[Connection] = []
+        self._connections: list[RosbagsConnection] = []
         self._texts: dict[str, str] = {}
 
-    def channel(self, topic: str, definition: Definition) -> int:
+    def add_connection(self, topic: str, definition: Definition) -> int:
         """Open a channel; a `.db3` file holds one definition of a type, and none of ROS 1."""
         if definition.ros_version == 1:
             raise BagError(f"{definition.root} is of ROS 1", where=topic, hint="write .mcap or .bag")
@@ -269,9 +269,9 @@ class Ros1Writer:
         self._bag = Rosbag1(path)
         self._bag.set_compression(Rosbag1.CompressionFormat.LZ4)
         self._bag.open()
-        self._connections: list[Connection] = []
+        self._connections: list[RosbagsConnection] = []
 
-    def channel(self, topic: str, definition: Definition) -> int:
+    def add_connection(self, topic: str, definition: Definition) -> int:
         """Open a channel; a bag holds no definitions of ROS 2."""
         if definition.ros_version != 1:
             raise BagError(f"{definition.root} is of ROS 2", where=topic, hint="write .mcap or .db3")

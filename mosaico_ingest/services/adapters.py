@@ -28,7 +28,7 @@ from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.manifest import load_manifest
 from mosaico_ingest.pipeline.compile import compile_manifest
 from mosaico_ingest.pipeline.run import make_plan
-from mosaico_ingest.rosbag.blocks import Channel, RawBatch
+from mosaico_ingest.rosbag.blocks import Connection, MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import (
     Definition,
@@ -67,7 +67,7 @@ def definition_in(path: Path, msgtype: str, *, resolve: Resolver) -> Definition:
         NothingMatched: No topic has that type.
     """
     with open_recording(path, resolve=resolve) as recording:
-        return _definition(_channels(recording, msgtype=msgtype)[0])
+        return _definition(_connections(recording, msgtype=msgtype)[0])
 
 
 def message_in(
@@ -80,11 +80,13 @@ def message_in(
         NothingMatched: There is no such topic.
     """
     with open_recording(path, resolve=resolve) as recording:
-        channels = _channels(recording, topic=topic)
+        connections = _connections(recording, topic=topic)
         before = 0
-        for batch in recording.batches([channel.id for channel in channels], rows=_ROWS):
+        ids = [connection.id for connection in connections]
+        for batch in recording.message_blocks(ids, max_rows=_ROWS):
             if index < before + len(batch):
-                return _definition(batch.channel), _row(batch, index - before)
+                connection = recording.connections[batch.connection]
+                return _definition(connection), _row(connection, batch, index - before)
             before += len(batch)
     raise BagError(
         f"{topic} has {before} messages, there is none at index {index}",
@@ -93,14 +95,16 @@ def message_in(
     )
 
 
-def _channels(recording: Recording, *, topic: str | None = None, msgtype: str | None = None) -> list[Channel]:
+def _connections(
+    recording: Recording, *, topic: str | None = None, msgtype: str | None = None
+) -> list[Connection]:
     found = [
-        one for one in recording.channels if topic in {None, one.topic} and msgtype in {None, one.msgtype}
+        one for one in recording.connections if topic in {None, one.topic} and msgtype in {None, one.msgtype}
     ]
     if found:
         return found
     wanted = topic or msgtype or ""
-    known = sorted({one.topic if topic else one.msgtype for one in recording.channels})
+    known = sorted({one.topic if topic else one.msgtype for one in recording.connections})
     near = get_close_matches(wanted, known, n=1)
     raise NothingMatched(
         f"no topic {'is called' if topic else 'has the type'} {wanted}",
@@ -109,25 +113,20 @@ def _channels(recording: Recording, *, topic: str | None = None, msgtype: str | 
     )
 
 
-def _definition(channel: Channel) -> Definition:
-    if channel.definition is None:
-        raise BagError(channel.problem or f"no definition of {channel.msgtype} is known", where=channel.topic)
-    return channel.definition
+def _definition(connection: Connection) -> Definition:
+    if connection.definition is None:
+        raise BagError(
+            connection.problem or f"no definition of {connection.msgtype} is known", where=connection.topic
+        )
+    return connection.definition
 
 
-def _row(batch: RawBatch, row: int) -> pa.StructArray:
-    one = np.array([row])
-    alone = replace(
-        batch,
-        log_times=batch.log_times[one],
-        starts=batch.starts[one],
-        lengths=batch.lengths[one],
-        offsets=batch.offsets[one],
-    )
-    decoded = decoder_for(batch.channel).decode(alone)
+def _row(connection: Connection, batch: MessageBlock, row: int) -> pa.StructArray:
+    alone = batch.rows(np.array([row]))
+    decoded = decoder_for(connection).decode(alone)
     if decoded.failures:
         failure = decoded.failures[0]
-        raise DecodeError(failure.reason, rule=failure.rule, where=batch.channel.topic)
+        raise DecodeError(failure.reason, rule=failure.rule, where=connection.topic)
     return decoded.rows
 
 

@@ -131,7 +131,7 @@ def _adapters(found: Inspection) -> Iterator[str]:
 
 
 def _merged(topics: Sequence[InspectedTopic]) -> list[InspectedTopic]:
-    """Return one entry for each topic, of several channels one that can be ingested."""
+    """Return one entry for each topic, of several connections one that can be ingested."""
     best: dict[str, InspectedTopic] = {}
     for topic in topics:
         known = best.get(topic.topic)

@@ -10,7 +10,7 @@ from mosaico_ingest.job.patterns import select
 from mosaico_ingest.pipeline.plan import ExcludedTopic
 from mosaico_ingest.pipeline.planning import decide
 from mosaico_ingest.pipeline.run import open_for
-from mosaico_ingest.rosbag.blocks import Channel
+from mosaico_ingest.rosbag.blocks import Connection
 
 __all__ = [
     "InspectedTopic",
@@ -70,7 +70,7 @@ def inspect(config: ROSInjectionConfig) -> Inspection:
         duration_ns = None
         if recording.start_ns is not None and recording.end_ns is not None:
             duration_ns = recording.end_ns - recording.start_ns
-        topics = [_topic(config, channel, bridge, duration_ns) for channel in recording.channels]
+        topics = [_topic(config, connection, bridge, duration_ns) for connection in recording.connections]
         return Inspection(
             files=tuple(str(path) for path in recording.files),
             container=recording.container,
@@ -84,22 +84,22 @@ def inspect(config: ROSInjectionConfig) -> Inspection:
 
 
 def _topic(
-    config: ROSInjectionConfig, channel: Channel, bridge: ROSBridge, duration_ns: int | None
+    config: ROSInjectionConfig, connection: Connection, bridge: ROSBridge, duration_ns: int | None
 ) -> InspectedTopic:
     try:
-        outcome = decide(config, channel, select((), [channel.topic]), bridge, "")
+        outcome = decide(config, connection, select((), [connection.topic]), bridge, "")
     except AdapterError as error:
-        outcome = ExcludedTopic(channel.topic, channel.msgtype, channel.count, str(error))
+        outcome = ExcludedTopic(connection.topic, connection.msgtype, connection.count, str(error))
     rate = None
-    if channel.count and channel.count > 1 and duration_ns:
-        rate = (channel.count - 1) / (duration_ns / 1e9)
-    source = channel.definition.source.value if channel.definition else "none"
+    if connection.count and connection.count > 1 and duration_ns:
+        rate = (connection.count - 1) / (duration_ns / 1e9)
+    source = connection.definition.source.value if connection.definition else "none"
     left = isinstance(outcome, ExcludedTopic)
     return InspectedTopic(
-        topic=channel.topic,
-        msgtype=channel.msgtype,
-        encoding=channel.encoding.value,
-        count=channel.count,
+        topic=connection.topic,
+        msgtype=connection.msgtype,
+        encoding=connection.encoding.value,
+        count=connection.count,
         rate_hz=rate,
         definition=source,
         adapter="" if left else outcome.adapter.name,

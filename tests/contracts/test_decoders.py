@@ -10,7 +10,7 @@ import pytest
 
 from mosaico_ingest.decode.decoder import ColumnarDecoder, Decoder, RowwiseDecoder
 from mosaico_ingest.job.values import Stores
-from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
+from mosaico_ingest.rosbag.blocks import Connection, Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
@@ -49,13 +49,13 @@ def joint_state(encoding: Encoding, number: int) -> dict[str, object]:
     }
 
 
-def batch_of(payloads: list[bytes], encoding: Encoding) -> RawBatch:
+def batch_of(payloads: list[bytes], encoding: Encoding) -> MessageBlock:
     lengths = np.array([len(payload) for payload in payloads], np.int64)
     definition = CASES[encoding]
-    channel = Channel(7, "/joints", definition.root, encoding, len(payloads), definition)
+    channel = Connection(7, "/joints", definition.root, encoding, len(payloads), definition)
     number = np.arange(len(payloads), dtype=np.int64)
     data = np.frombuffer(b"".join(payloads), np.uint8)
-    return RawBatch(channel, number, data, np.cumsum(lengths) - lengths, lengths, number)
+    return MessageBlock(channel.id, number, data, np.cumsum(lengths) - lengths, lengths, number)
 
 
 def payloads_of(encoding: Encoding, count: int) -> list[bytes]:

@@ -36,7 +36,7 @@ def test_every_message_of_the_corpus_is_read(corpus: Path) -> None:
         expected = MORE_THAN_KNOWN.get(name, int(entry["messages"]))
         try:
             with open_recording(corpus / name, resolve=BlindResolver()) as recording:
-                found = sum(len(batch) for batch in recording.batches())
+                found = sum(len(batch) for batch in recording.message_blocks())
                 if found != expected or recording.message_count not in {None, found}:
                     wrong.append(
                         f"{name}: {found} read, {recording.message_count} promised, {expected} known"

@@ -11,19 +11,18 @@ import pytest
 
 from mosaico_ingest.decode import decoder as columnar
 from mosaico_ingest.decode.decoder import ColumnarDecoder, Decoded, RowwiseDecoder
-from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
+from mosaico_ingest.rosbag.blocks import Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.model import Definition
 
 
-def make_batch(payloads: Sequence[bytes], definition: Definition, encoding: Encoding) -> RawBatch:
+def make_batch(payloads: Sequence[bytes]) -> MessageBlock:
     """Lay the payloads into one buffer, with other bytes before, between and after them."""
     lengths = np.array([len(payload) for payload in payloads], np.int64)
     gaps = 3 + np.arange(len(payloads)) % 5
     starts = np.cumsum(lengths + gaps) - lengths
     data = b"".join(b"\xff" * int(gap) + payload for gap, payload in zip(gaps, payloads, strict=True))
-    channel = Channel(1, "/topic", definition.root, encoding, len(payloads), definition)
     number = np.arange(len(payloads), dtype=np.int64)
-    return RawBatch(channel, number, np.frombuffer(data, np.uint8), starts, lengths, number)
+    return MessageBlock(0, number, np.frombuffer(data, np.uint8), starts, lengths, number)
 
 
 def bits(array: pa.Array) -> Any:
@@ -60,7 +59,7 @@ def small_batches_by_columns() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def batch_of() -> Callable[[Sequence[bytes], Definition, Encoding], RawBatch]:
+def batch_of() -> Callable[[Sequence[bytes]], MessageBlock]:
     return make_batch
 
 
@@ -74,7 +73,7 @@ def assert_agree() -> Callable[[Sequence[bytes], Definition, Encoding], Decoded]
     """Decode the payloads both ways, compare, and return what the row-wise decoder says."""
 
     def check(payloads: Sequence[bytes], definition: Definition, encoding: Encoding) -> Decoded:
-        batch = make_batch(payloads, definition, encoding)
+        batch = make_batch(payloads)
         slow = RowwiseDecoder(definition, encoding).decode(batch)
         check_same(ColumnarDecoder(definition, encoding).decode(batch), slow)
         return slow

@@ -17,7 +17,7 @@ from mosaico_ingest.decode.layout import compile_layout
 from mosaico_ingest.decode.lockstep import locate, locate_lockstep
 from mosaico_ingest.decode.spans import Frame, Located, Place
 from mosaico_ingest.decode.walk import locate_stepwise
-from mosaico_ingest.rosbag.blocks import Encoding, RawBatch
+from mosaico_ingest.rosbag.blocks import Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.model import (
     Container,
     Definition,
@@ -27,7 +27,7 @@ from mosaico_ingest.rosbag.definitions.model import (
 )
 from mosaico_ingest.rosbag.serialization import Serializer
 
-BatchOf = Callable[[Sequence[bytes], Definition, Encoding], RawBatch]
+BatchOf = Callable[[Sequence[bytes]], MessageBlock]
 AssertAgree = Callable[[Sequence[bytes], Definition, Encoding], Decoded]
 
 RELAXED = settings(deadline=None, suppress_health_check=list(HealthCheck), max_examples=120)
@@ -168,7 +168,7 @@ def test_every_way_of_walking_finds_the_same_places(
     definition, encoding, payloads = case
     payloads = [data.draw(damaged(payload)) for payload in payloads]
     layout = compile_layout(definition, encoding)
-    batch = batch_of(payloads, definition, encoding)
+    batch = batch_of(payloads)
     skip = 4 if encoding is Encoding.CDR else 0
     rows = np.flatnonzero(batch.lengths >= skip)
     origins = batch.starts[rows] + skip

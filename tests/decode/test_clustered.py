@@ -7,7 +7,7 @@ import numpy as np
 from mosaico_ingest.decode.layout import compile_layout
 from mosaico_ingest.decode.spans import Frame, Located
 from mosaico_ingest.decode.walk import locate_clustered
-from mosaico_ingest.rosbag.blocks import Encoding, RawBatch
+from mosaico_ingest.rosbag.blocks import Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.model import (
     Container,
     Definition,
@@ -17,7 +17,7 @@ from mosaico_ingest.rosbag.definitions.model import (
 )
 from mosaico_ingest.rosbag.serialization import Serializer
 
-BatchOf = Callable[[Sequence[bytes], Definition, Encoding], RawBatch]
+BatchOf = Callable[[Sequence[bytes]], MessageBlock]
 
 NAMES = Definition(
     "test/msg/Names",
@@ -34,7 +34,7 @@ NAMES = Definition(
 
 def clusters_of(batch_of: BatchOf, values: Sequence[Sequence[str]]) -> list[Located]:
     serializer = Serializer(NAMES, Encoding.CDR)
-    batch = batch_of([serializer.from_dict({"names": names}) for names in values], NAMES, Encoding.CDR)
+    batch = batch_of([serializer.from_dict({"names": names}) for names in values])
     frame = Frame(batch.data, "<", batch.starts + 4, batch.starts + batch.lengths)
     return locate_clustered(compile_layout(NAMES, Encoding.CDR), frame)
 

@@ -12,7 +12,7 @@ from mosaico_ingest.decode import decoder as columnar
 from mosaico_ingest.decode.decoder import ColumnarDecoder, Decoded, decoder_for
 from mosaico_ingest.errors import DecodeError
 from mosaico_ingest.job.values import Stores
-from mosaico_ingest.rosbag.blocks import Channel, Encoding, RawBatch
+from mosaico_ingest.rosbag.blocks import Connection, Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.model import (
     Container,
     Definition,
@@ -23,7 +23,7 @@ from mosaico_ingest.rosbag.definitions.model import (
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.serialization import Serializer
 
-BatchOf = Callable[[Sequence[bytes], Definition, Encoding], RawBatch]
+BatchOf = Callable[[Sequence[bytes]], MessageBlock]
 AssertAgree = Callable[[Sequence[bytes], Definition, Encoding], Decoded]
 
 HUMBLE = TypeResolver(Stores.ROS2_HUMBLE)
@@ -127,9 +127,7 @@ def test_an_empty_batch_has_no_rows(assert_agree: AssertAgree) -> None:
 
 
 def test_payloads_may_lie_in_the_buffer_in_any_order(batch_of: BatchOf) -> None:
-    batch = batch_of(
-        [text(bytes([97 + number] * (number % 5))) for number in range(26)], STRING, Encoding.CDR
-    )
+    batch = batch_of([text(bytes([97 + number] * (number % 5))) for number in range(26)])
     mixed = np.random.default_rng(3).permutation(26)
     shuffled = replace(batch, starts=batch.starts[mixed], lengths=batch.lengths[mixed])
     decoder = ColumnarDecoder(STRING, Encoding.CDR)
@@ -140,7 +138,7 @@ def test_payloads_may_lie_in_the_buffer_in_any_order(batch_of: BatchOf) -> None:
 def test_a_single_blob_is_not_copied(batch_of: BatchOf) -> None:
     blob = np.random.default_rng(2).bytes(100_000)
     value = {"header": {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "c"}, "format": "jpeg", "data": blob}
-    batch = batch_of([Serializer(IMAGE, Encoding.CDR).from_dict(value)], IMAGE, Encoding.CDR)
+    batch = batch_of([Serializer(IMAGE, Encoding.CDR).from_dict(value)])
     data = ColumnarDecoder(IMAGE, Encoding.CDR).decode(batch).rows.field("data")
     assert data[0].as_py() == blob
     assert np.shares_memory(np.frombuffer(data.buffers()[2], np.uint8), batch.data)
@@ -152,15 +150,15 @@ def test_parts_that_fit_no_column_together_ask_for_smaller_batches(
     def overflow(_: object) -> None:
         raise pa.ArrowInvalid("offset overflow while concatenating arrays")
 
-    batch = batch_of([text(b"a" * 20)] * 12, STRING, Encoding.CDR)
+    batch = batch_of([text(b"a" * 20)] * 12)
     monkeypatch.setattr(columnar, "_LARGEST", 200)
     monkeypatch.setattr(columnar.pa, "concat_arrays", overflow)
     with pytest.raises(DecodeError, match="read smaller batches"):
         ColumnarDecoder(STRING, Encoding.CDR).decode(batch)
 
 
-def channel(encoding: Encoding, definition: Definition | None) -> Channel:
-    return Channel(
+def connection(encoding: Encoding, definition: Definition | None) -> Connection:
+    return Connection(
         1,
         "/t",
         "a/msg/B",
@@ -172,12 +170,12 @@ def channel(encoding: Encoding, definition: Definition | None) -> Channel:
     )
 
 
-def test_a_channel_that_cannot_be_decoded_says_why() -> None:
+def test_a_connection_that_cannot_be_decoded_says_why() -> None:
     with pytest.raises(DecodeError, match=r"/t: the messages are not in a ROS encoding \(json\)"):
-        decoder_for(channel(Encoding.OTHER, STRING))
+        decoder_for(connection(Encoding.OTHER, STRING))
     with pytest.raises(DecodeError, match="/t: no definition of a/msg/B: no text"):
-        decoder_for(channel(Encoding.CDR, None))
-    assert decoder_for(channel(Encoding.CDR, STRING)).shape.names == ["data"]
+        decoder_for(connection(Encoding.CDR, None))
+    assert decoder_for(connection(Encoding.CDR, STRING)).shape.names == ["data"]
 
 
 @pytest.mark.parametrize("largest", [40, 64, 100, 10_000])
@@ -186,7 +184,7 @@ def test_a_batch_too_large_for_a_column_is_decoded_in_parts(
 ) -> None:
     payloads = [text(b"x" * (number % 30)) for number in range(200)]
     payloads[60] = payloads[120] = LITTLE
-    batch = batch_of(payloads, STRING, Encoding.CDR)
+    batch = batch_of(payloads)
     whole = ColumnarDecoder(STRING, Encoding.CDR).decode(batch)
     monkeypatch.setattr(columnar, "_LARGEST", largest)
     parts = ColumnarDecoder(STRING, Encoding.CDR).decode(batch)
@@ -199,7 +197,7 @@ def test_a_batch_too_large_for_a_column_is_decoded_in_parts(
 def test_a_message_too_large_for_a_column_costs_its_row(
     batch_of: BatchOf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    batch = batch_of([text(b"ab"), text(b"x" * 500), text(b"cd")], STRING, Encoding.CDR)
+    batch = batch_of([text(b"ab"), text(b"x" * 500), text(b"cd")])
     monkeypatch.setattr(columnar, "_LARGEST", 200)
     decoded = ColumnarDecoder(STRING, Encoding.CDR).decode(batch)
     assert decoded.rows.field("data").to_pylist() == ["ab", "cd"]

@@ -14,7 +14,7 @@ from mosaico_ingest.decode.decoder import Decoded
 from mosaico_ingest.decode.layout import compile_layout
 from mosaico_ingest.decode.lockstep import locate_lockstep
 from mosaico_ingest.decode.spans import Frame
-from mosaico_ingest.rosbag.blocks import Encoding, RawBatch
+from mosaico_ingest.rosbag.blocks import Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.model import (
     Container,
     Definition,
@@ -24,7 +24,7 @@ from mosaico_ingest.rosbag.definitions.model import (
 )
 from mosaico_ingest.rosbag.serialization import Serializer
 
-BatchOf = Callable[[Sequence[bytes], Definition, Encoding], RawBatch]
+BatchOf = Callable[[Sequence[bytes]], MessageBlock]
 AssertAgree = Callable[[Sequence[bytes], Definition, Encoding], Decoded]
 
 
@@ -110,7 +110,7 @@ def test_long_sequences_of_equal_elements_take_few_steps(
     walk = lockstep._Walk.body
     monkeypatch.setattr(lockstep._Walk, "body", lambda *given: steps.append(1) or walk(*given))
     payloads = [payload([stop("map", [])] * (500 + number), encoding) for number in range(messages)]
-    batch = batch_of(payloads, ROUTES, encoding)
+    batch = batch_of(payloads)
     skip = 4 if encoding is Encoding.CDR else 0
     frame = Frame(batch.data, "<", batch.starts + skip, batch.starts + batch.lengths)
     located = locate_lockstep(compile_layout(ROUTES, encoding), frame)

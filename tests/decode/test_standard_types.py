@@ -14,7 +14,7 @@ from rosbags.typesys import get_typestore
 from mosaico_ingest.decode.decoder import Decoded, RowwiseDecoder, decoder_for
 from mosaico_ingest.errors import DecodeError, IngestError
 from mosaico_ingest.job.values import Stores
-from mosaico_ingest.rosbag.blocks import Encoding, RawBatch
+from mosaico_ingest.rosbag.blocks import Connection, Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.model import Container, Definition, Field
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.recording import open_recording
@@ -73,13 +73,14 @@ def test_every_standard_type_decodes_the_same_both_ways(
         assert not assert_agree([*payloads, *payloads[:1] * 20], definition, encoding).failures
 
 
-def batches_of(corpus: Path) -> Iterator[RawBatch]:
+def batches_of(corpus: Path) -> Iterator[tuple[Connection, MessageBlock]]:
     """Yield the batches of every recording that opens, those of one-message rows as large as row-wise can bear."""
     for line in (corpus / "INDEX.tsv").read_text().splitlines()[1:]:
         path = corpus / line.split("\t")[0]
         try:
             with open_recording(path, resolve=TypeResolver(Stores.ROS2_HUMBLE)) as recording:
-                yield from recording.batches()
+                for batch in recording.message_blocks():
+                    yield recording.connections[batch.connection], batch
         except IngestError:
             continue
 
@@ -89,14 +90,14 @@ def test_every_message_of_the_real_recordings_decodes_the_same_both_ways(
     corpus: Path, assert_same: AssertSame
 ) -> None:
     messages = 0
-    for batch in batches_of(corpus):
+    for connection, batch in batches_of(corpus):
         try:
-            decoder = decoder_for(batch.channel)
+            decoder = decoder_for(connection)
         except DecodeError:
             continue
-        if batch.channel.definition is None or batch.lengths.sum() > LARGEST_ROWWISE:
+        if connection.definition is None or batch.lengths.sum() > LARGEST_ROWWISE:
             continue
-        slow = RowwiseDecoder(batch.channel.definition, batch.channel.encoding).decode(batch)
+        slow = RowwiseDecoder(connection.definition, connection.encoding).decode(batch)
         assert_same(decoder.decode(batch), slow)
         messages += len(batch)
     assert messages > 100_000

@@ -68,10 +68,10 @@ def test_one_bad_part_is_said_and_costs_itself(
     code, out, err = ingest("inspect", "parts")
     assert code == 0
     assert "part_1.db3" in out + err
-    assert "this part cannot be opened" in " ".join((out + err).split())
+    assert "this split cannot be opened" in " ".join((out + err).split())
     code, out, err = ingest("bag", "parts", "--name", "drive", "--store", "store")
     assert code == 4
-    assert "this part cannot be opened" in " ".join((out + err).split())
+    assert "this split cannot be opened" in " ".join((out + err).split())
     rows = Store.open(tmp_path / "store").scan("drive", "/std/speed").read_all()
     assert sorted(rows["data"].to_pylist()) == [0, 1, 4, 5]
 

@@ -27,8 +27,8 @@ def kept(folder: Path) -> list[dict[str, object]]:
         own = [("own_msgs", folder.parent / "definitions", None)]
         with open_recording(index.with_suffix(".mcap"), resolve=TypeResolver(None, own)) as recording:
             found = {
-                (batch.channel.topic, int(time), int(length))
-                for batch in recording.batches()
+                (recording.connections[batch.connection].topic, int(time), int(length))
+                for batch in recording.message_blocks()
                 for time, length in zip(batch.log_times, batch.lengths, strict=True)
             }
             assert recording.message_count == len(lines)

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import zstandard
 from made_recordings import define, record
+from mosaico_ingest.job.model import SessionLevelErrorPolicy
 from object_store import Counts, ObjectStore, object_store
 
 from mosaico_ingest import api
@@ -18,7 +19,6 @@ from mosaico_ingest.errors import BagError, NothingMatched, Unreachable
 from mosaico_ingest.findings import Severity
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.manifest import load_manifest
-from mosaico_ingest.job.values import SessionLevelErrorPolicy
 from mosaico_ingest.pipeline.compile import compile_manifest, find_recordings
 from mosaico_ingest.remote import AnyPath, RemotePath, as_path
 from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry, TypeResolver
@@ -52,10 +52,13 @@ def opened(*paths: AnyPath) -> Recording:
 def messages(recording: Recording) -> list[tuple[str, int, bytes]]:
     """Return topic, time and payload of each message, in the order of time within its topic."""
     found: list[tuple[str, int, bytes]] = []
-    for batch in recording.batches():
+    for batch in recording.message_blocks():
         ends = (batch.starts + batch.lengths).tolist()
         places = zip(batch.log_times.tolist(), batch.starts.tolist(), ends, strict=True)
-        found += [(batch.channel.topic, at, batch.data[start:end].tobytes()) for at, start, end in places]
+        found += [
+            (recording.connections[batch.connection].topic, at, batch.data[start:end].tobytes())
+            for at, start, end in places
+        ]
     return sorted(found)
 
 
@@ -116,7 +119,7 @@ def test_what_can_only_be_read_as_a_whole_is_fetched_and_removed(
     packed = tmp_path / f"{small.name}.zstd"
     packed.write_bytes(zstandard.compress(small.read_bytes()))
     path = put(objects, packed, f"packed/{packed.name}")
-    room = tmp_path / "room"
+    room = tmp_path / "allocate"
     room.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(room))
     with opened(small) as here, opened(path) as there:
@@ -146,9 +149,7 @@ def test_one_without_its_index_is_fetched_and_read_record_by_record(
     path = put(objects, cut, f"cut/{cut.name}")
     with opened(cut) as here, opened(path) as there:
         assert messages(there) == messages(here)
-        assert [unreadable_range.reason for unreadable_range in there.unreadable] == [
-            unreadable_range.reason for unreadable_range in here.unreadable
-        ]
+        assert [loss.reason for loss in there.unreadable] == [loss.reason for loss in here.unreadable]
         assert any("it has no index" in one.message for one in there.findings)
 
 
@@ -167,9 +168,9 @@ def test_a_selection_takes_a_small_part(objects: ObjectStore, large: Path, selec
     window = (START_NS + 50 * SECOND_NS, START_NS + 51 * SECOND_NS)
     with opened(path) as there:
         if selection == "time":
-            batches = there.batches(start_ns=window[0], end_ns=window[1])
+            batches = there.message_blocks(start_ns=window[0], end_ns=window[1])
         else:
-            batches = there.batches([one.id for one in there.channels if one.topic == "/rare"])
+            batches = there.message_blocks([one.id for one in there.connections if one.topic == "/rare"])
         assert sum(map(len, batches)) == (5 if selection == "time" else 10)
     asked = objects.counts()
     assert asked.sent_bytes < large.stat().st_size * 0.2
@@ -179,7 +180,7 @@ def test_a_selection_takes_a_small_part(objects: ObjectStore, large: Path, selec
 def test_reading_all_of_it_takes_few_requests(objects: ObjectStore, large: Path) -> None:
     path = put(objects, large, "large/large.mcap")
     with opened(path) as there:
-        assert sum(map(len, there.batches())) == 510
+        assert sum(map(len, there.message_blocks())) == 510
     asked = objects.counts()
     gets = [line for line in asked.requests if line.startswith("GET")]
     assert len(gets) <= 20
@@ -189,7 +190,7 @@ def test_reading_all_of_it_takes_few_requests(objects: ObjectStore, large: Path)
 def test_a_reader_that_stops_leaves_no_thread(objects: ObjectStore, large: Path) -> None:
     path = put(objects, large, "large/large.mcap")
     with opened(path) as there:
-        next(there.batches())
+        next(there.message_blocks())
     asked: Counts = objects.counts()
     assert asked.sent_bytes < large.stat().st_size * 0.8
 
@@ -235,7 +236,7 @@ def test_a_rosbag2_directory_is_read_by_its_metadata(objects: ObjectStore, tmp_p
     put(objects, tmp_path / "metadata.yaml", "rosbag2/x/metadata.yaml")
     with opened(remote(objects, "rosbag2/x")) as there:
         assert [file.name for file in there.files] == ["x_0.mcap"]
-        assert any(one.rule == "missing-split" for one in there.findings)
+        assert any(one.rule == "missing-part" for one in there.findings)
 
 
 def test_what_is_not_there_is_said(objects: ObjectStore) -> None:
@@ -250,7 +251,7 @@ def test_a_recording_that_changes_while_it_is_read_is_an_error(objects: ObjectSt
     with opened(path) as there:
         path.write_bytes(small.read_bytes()[:-1] + b"!")
         with pytest.raises(Unreachable, match="changed while it was read"):
-            list(there.batches())
+            list(there.message_blocks())
 
 
 def test_a_server_that_goes_away_is_an_error_and_no_loss(
@@ -269,10 +270,10 @@ def test_a_server_that_goes_away_is_an_error_and_no_loss(
     assert Store.open(store).names() == ()
 
 
-def test_provenance_knows_a_recording_by_what_its_store_says(
+def test_the_ledger_knows_a_recording_by_what_its_store_says(
     objects: ObjectStore, small: Path, tmp_path: Path
 ) -> None:
-    path = put(objects, small, f"provenance/{small.name}")
+    path = put(objects, small, f"ledger/{small.name}")
     job = tmp_path / "job.yaml"
     job.write_text(
         f'bag: {{path: "{path.url}", ros_distro: ros2_humble}}\n'
@@ -289,6 +290,6 @@ def test_provenance_knows_a_recording_by_what_its_store_says(
     objects.counts()
     assert standing() == "done"
     if small.suffix != ".db3":  # that one is fetched to be looked into
-        assert sum(line.startswith("GET /bucket/provenance") for line in objects.counts().requests) <= 4
+        assert sum(line.startswith("GET /bucket/ledger") for line in objects.counts().requests) <= 4
     path.write_bytes(small.read_bytes() + b"\n")
     assert standing() in {"changed", "unreadable"}

@@ -225,14 +225,14 @@ def received(recording: Recording, **selection: object) -> list[Sent]:
     """Return all messages by time, and check on the way what every batch promises."""
     found: list[Sent] = []
     last: dict[int, int] = {}
-    for batch in recording.batches(**selection):  # type: ignore[arg-type]  # the tests name what batches() takes
+    for batch in recording.message_blocks(**selection):  # type: ignore[arg-type]  # the tests name what batches() takes
         assert len(batch)
         assert batch.starts.min() >= 0
         assert (batch.starts + batch.lengths <= len(batch.data)).all()
         assert (batch.log_times[1:] >= batch.log_times[:-1]).all()
-        assert last.get(batch.channel.id, 0) <= batch.log_times[0]
-        last[batch.channel.id] = int(batch.log_times[-1])
-        channel = batch.channel
+        assert last.get(batch.connection, 0) <= batch.log_times[0]
+        last[batch.connection] = int(batch.log_times[-1])
+        channel = recording.connections[batch.connection]
         found += [
             Sent(channel.topic, channel.msgtype, int(time), batch.payload(row))
             for row, time in enumerate(batch.log_times)

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.compression import (
-    Packed,
-    inflate,
-    inflate_all,
-    inflate_file,
-    inflate_message,
-    inflate_some,
+    CompressedChunk,
+    decompress,
+    decompress_chunks,
+    decompress_file,
+    decompress_message,
+    decompress_partially,
 )
 
 PACK: dict[str, Callable[[bytes], bytes]] = {
@@ -36,67 +36,67 @@ _BETWEEN = b"between"
 
 
 @pytest.mark.parametrize("name", PACK)
-def test_what_was_compressed_comes_back(name: str) -> None:
-    assert bytes(inflate(PACK[name](DATA), name, len(DATA))) == DATA
-    assert inflate_some(PACK[name](DATA), name, len(DATA)) == DATA
+def test_decompress_intact_chunk_returns_original(name: str) -> None:
+    assert bytes(decompress(PACK[name](DATA), name, len(DATA))) == DATA
+    assert decompress_partially(PACK[name](DATA), name, len(DATA)).tobytes() == DATA
 
 
 @pytest.mark.parametrize("name", PACK)
 @pytest.mark.parametrize("size", [0, 10, len(DATA) - 1, len(DATA) + 1, 1 << 50])
-def test_another_size_than_announced_is_an_error(name: str, size: int) -> None:
+def test_decompress_wrong_announced_size_raises(name: str, size: int) -> None:
     with pytest.raises(BagError, match="announce"):
-        inflate(PACK[name](DATA), name, size)
+        decompress(PACK[name](DATA), name, size)
 
 
 @pytest.mark.parametrize("name", ["zstd", "lz4", "bz2"])
-def test_damage_is_an_error_and_what_comes_before_a_cut_can_be_had(name: str) -> None:
+def test_decompress_damaged_chunk_raises_and_partial_returns_prefix(name: str) -> None:
     packed = PACK[name](DATA)
     with pytest.raises(BagError):
-        inflate(packed[:4] + b"\xff" * (len(packed) - 4), name, len(DATA))
+        decompress(packed[:4] + b"\xff" * (len(packed) - 4), name, len(DATA))
     with pytest.raises(BagError):
-        inflate(packed[: len(packed) // 2], name, len(DATA))
-    assert DATA.startswith(inflate_some(packed[: len(packed) // 2], name, len(DATA)))
+        decompress(packed[: len(packed) // 2], name, len(DATA))
+    assert DATA.startswith(decompress_partially(packed[: len(packed) // 2], name, len(DATA)).tobytes())
 
 
-def test_a_bomb_is_noticed_on_the_way() -> None:
+def test_decompress_more_than_announced_raises() -> None:
     bomb = zstandard.compress(bytes(64 << 20))
-    with pytest.raises(BagError, match="more found"):
-        inflate(bomb, "zstd", 1 << 20)
+    with pytest.raises(BagError, match="1048576 bytes announced"):
+        decompress(bomb, "zstd", 1 << 20)
     with pytest.raises(BagError, match="more than 1000 bytes"):
-        inflate_message(bomb, 1000)
-    assert len(inflate_some(bomb, "zstd", 1 << 20)) == 1 << 20
+        decompress_message(bomb, 1000)
+    assert len(decompress_partially(bomb, "zstd", 1 << 20)) == 1 << 20
 
 
-def test_an_unknown_compression_is_named() -> None:
+def test_decompress_unknown_compression_raises() -> None:
     with pytest.raises(BagError, match="compression 'snappy' is unknown; known are none, zstd, lz4, bz2"):
-        inflate(b"x", "snappy", 1)
+        decompress(b"x", "snappy", 1)
 
 
-def test_a_file_of_several_frames_is_one_file(tmp_path: Path) -> None:
+def test_decompress_file_several_frames_concatenates_them(tmp_path: Path) -> None:
     packed, plain = tmp_path / "a.zstd", tmp_path / "a"
     packed.write_bytes(zstandard.compress(DATA) + zstandard.compress(b"more"))
-    assert inflate_file(packed, plain) is None
+    assert decompress_file(packed, plain) is None
     assert plain.read_bytes() == DATA + b"more"
     packed.write_bytes(packed.read_bytes()[:-8])
-    assert inflate_file(packed, plain) == "the zstd file is cut off"
+    assert decompress_file(packed, plain) == "the zstd file is truncated"
     packed.write_bytes(zstandard.compress(DATA)[:4] + b"\xff" * 5000)
-    assert str(inflate_file(packed, plain)).startswith("damaged zstd file")
+    assert str(decompress_file(packed, plain)).startswith("damaged zstd file")
 
 
-def _packed(chunks: Sequence[tuple[str, bytes, int]]) -> tuple[NDArray[np.uint8], list[Packed]]:
+def _packed(chunks: Sequence[tuple[str, bytes, int]]) -> tuple[NDArray[np.uint8], list[CompressedChunk]]:
     """Return bytes that hold the chunks, each after something else, and where they lie in them."""
-    data, packed = b"", list[Packed]()
+    data, packed = b"", list[CompressedChunk]()
     for name, held, size in chunks:
         begin = len(data) + len(_BETWEEN)
         data += _BETWEEN + held
-        packed.append(Packed(begin, len(data), name, size))
+        packed.append(CompressedChunk(begin, len(data), name, size))
     return np.frombuffer(data, np.uint8), packed
 
 
-def _inflate_all(chunks: Sequence[tuple[str, bytes, int]]) -> tuple[list[bytes], dict[int, BagError]]:
-    found = inflate_all(*_packed(chunks))
-    held = [found.data[begin:end].tobytes() for begin, end in found.places]
-    return held, found.failures
+def _decompress_all(chunks: Sequence[tuple[str, bytes, int]]) -> tuple[list[bytes], dict[int, BagError]]:
+    found = decompress_chunks(*_packed(chunks))
+    held = [found.data[begin:end].tobytes() for begin, end in found.bounds]
+    return held, found.errors
 
 
 @given(
@@ -104,25 +104,25 @@ def _inflate_all(chunks: Sequence[tuple[str, bytes, int]]) -> tuple[list[bytes],
     more=st.integers(0, 3),
     one=st.none() | st.sampled_from(sorted(PACK)),
 )
-def test_chunks_inflated_together_are_what_each_alone_is(
+def test_decompress_chunks_several_equal_individual_results(
     chunks: list[tuple[str, bytes]], more: int, one: str | None
 ) -> None:
     given = [(one or name, data * (1 + more)) for name, data in chunks]
-    found, failures = _inflate_all([(name, PACK[name](data), len(data)) for name, data in given])
+    found, failures = _decompress_all([(name, PACK[name](data), len(data)) for name, data in given])
     assert not failures
     assert found == [data for _, data in given]
 
 
-def test_chunks_that_are_not_compressed_are_not_copied() -> None:
+def test_decompress_chunks_plain_returns_same_buffer() -> None:
     data, packed = _packed([("", b"one", 3), ("none", b"other", 5)])
-    assert inflate_all(data, packed).data is data
+    assert decompress_chunks(data, packed).data is data
 
 
 @pytest.mark.parametrize("name", PACK)
 @pytest.mark.parametrize("size", [0, 10, len(DATA) - 1, len(DATA) + 1, 1 << 50, (1 << 64) - 1])
-def test_one_broken_chunk_costs_no_other(name: str, size: int) -> None:
+def test_decompress_chunks_one_damaged_returns_others(name: str, size: int) -> None:
     chunks = [(b"before", 6), (DATA, size), (b"after", 5)]
-    found, failures = _inflate_all([(name, PACK[name](data), announced) for data, announced in chunks])
+    found, failures = _decompress_all([(name, PACK[name](data), announced) for data, announced in chunks])
     assert list(failures) == [1]
     assert "announced" in failures[1].what
     assert (found[0], found[2]) == (b"before", b"after")
@@ -130,6 +130,6 @@ def test_one_broken_chunk_costs_no_other(name: str, size: int) -> None:
 
 @pytest.mark.parametrize("cut", [1, 5, 1000])
 @pytest.mark.parametrize("name", ["zstd", "lz4"])
-def test_a_chunk_cut_off_among_others_is_an_error(name: str, cut: int) -> None:
+def test_decompress_chunks_one_truncated_returns_others(name: str, cut: int) -> None:
     whole = PACK[name](DATA)
-    assert list(_inflate_all([(name, held, len(DATA)) for held in (whole, whole[:-cut])])[1]) == [1]
+    assert list(_decompress_all([(name, held, len(DATA)) for held in (whole, whole[:-cut])])[1]) == [1]

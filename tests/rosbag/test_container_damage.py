@@ -48,11 +48,11 @@ def test_any_damage_gives_batches_losses_or_a_bag_error(
         content[at : at + len(patch)] = patch
     if data.draw(st.booleans()):
         del content[data.draw(place) :]
-    file = tmp_path / "damaged"
+    file = tmp_path / "unreadable-range"
     file.write_bytes(content)
     try:
         with open_recording(file, resolve=recordings.blind) as recording:
-            for batch in recording.batches():
+            for batch in recording.message_blocks():
                 assert batch.starts.min() >= 0
                 assert (batch.starts + batch.lengths <= len(batch.data)).all()
             assert isinstance(recording.unreadable, tuple)
@@ -88,12 +88,12 @@ def test_a_broken_chunk_costs_its_messages_and_no_others(tmp_path: Path, recordi
     path.write_bytes(content)
     with open_recording(path, resolve=recordings.blind) as recording:
         assert recordings.received(recording) == sorted(messages[:20] + messages[40:])
-        assert sum(unreadable_range.count or 0 for unreadable_range in recording.unreadable) == 20
-        assert all("checksum" in unreadable_range.reason for unreadable_range in recording.unreadable)
+        assert sum(loss.count or 0 for loss in recording.unreadable) == 20
+        assert all("checksum" in loss.reason for loss in recording.unreadable)
         lost = {
-            recording.channels[unreadable_range.connection].topic
-            for unreadable_range in recording.unreadable
-            if unreadable_range.connection is not None
+            recording.connections[loss.connection].topic
+            for loss in recording.unreadable
+            if loss.connection is not None
         }
         assert lost == {message.topic for message in messages[20:40]}
 
@@ -107,7 +107,7 @@ def test_an_index_that_lies_is_not_believed(tmp_path: Path, recordings: Any) -> 
     path.write_bytes(content)
     with open_recording(path, resolve=recordings.blind) as recording:
         assert recordings.received(recording) == sorted(messages)
-        assert [unreadable_range.count for unreadable_range in recording.unreadable] == [0]
+        assert [loss.count for loss in recording.unreadable] == [0]
 
 
 def test_a_bag_without_index_is_read_record_by_record(tmp_path: Path, recordings: Any) -> None:
@@ -120,7 +120,7 @@ def test_a_bag_without_index_is_read_record_by_record(tmp_path: Path, recordings
     with open_recording(path, resolve=recordings.blind) as recording:
         assert recordings.received(recording) == sorted(messages)
         assert recording.message_count == len(messages)
-        assert [unreadable_range.count for unreadable_range in recording.unreadable] == [0]
+        assert [loss.count for loss in recording.unreadable] == [0]
         assert "unreadable-range" in [finding.rule for finding in recording.findings]
 
 
@@ -132,7 +132,7 @@ def test_a_lying_length_word_allocates_nothing(tmp_path: Path, recordings: Any) 
     path.write_bytes(content)
     with open_recording(path, resolve=recordings.blind) as recording:
         assert recordings.received(recording) == []
-        assert sum(unreadable_range.count or 0 for unreadable_range in recording.unreadable) == 20
+        assert sum(loss.count or 0 for loss in recording.unreadable) == 20
         assert "1099511627776 bytes announced" in recording.unreadable[0].reason
 
 
@@ -145,10 +145,14 @@ def test_damaged_database_pages_are_stepped_over(tmp_path: Path, recordings: Any
     content[middle : middle + 4096] = b"\xa5" * 4096
     path.write_bytes(content)
     with open_recording(path, resolve=recordings.blind) as recording:
-        found = list(recording.batches())
+        found = list(recording.message_blocks())
         assert 550 < sum(len(batch) for batch in found) < 600
-        assert any("rows are missing" in unreadable_range.reason for unreadable_range in recording.unreadable)
-        read = {(batch.channel.topic, batch.payload(row)) for batch in found for row in range(len(batch))}
+        assert any("rows are missing" in loss.reason for loss in recording.unreadable)
+        read = {
+            (recording.connections[batch.connection].topic, batch.payload(row))
+            for batch in found
+            for row in range(len(batch))
+        }
     assert read <= {(message.topic, message.payload) for message in messages}
 
 
@@ -164,7 +168,7 @@ def test_a_database_that_is_cut_off_gives_the_rows_that_are_left(
         found = recordings.received(recording)
         assert set(found) < set(messages)
         assert len(found) > (share - 0.1) * len(messages)
-        assert any("rows are missing" in unreadable_range.reason for unreadable_range in recording.unreadable)
+        assert any("rows are missing" in loss.reason for loss in recording.unreadable)
 
 
 def test_changes_still_in_the_log_are_read_and_nothing_is_written(tmp_path: Path, recordings: Any) -> None:
@@ -216,10 +220,7 @@ def test_a_row_that_makes_no_sense_costs_a_row(
     with open_recording(folder, resolve=recordings.blind) as recording:
         assert len(recordings.received(recording)) == 39
         assert recording.message_count == 40
-        assert [
-            (unreadable_range.count, reason in unreadable_range.reason)
-            for unreadable_range in recording.unreadable
-        ] == [(1, True)]
+        assert [(loss.count, reason in loss.reason) for loss in recording.unreadable] == [(1, True)]
 
 
 def test_a_message_that_does_not_decompress_costs_a_message(tmp_path: Path, recordings: Any) -> None:
@@ -229,7 +230,7 @@ def test_a_message_that_does_not_decompress_costs_a_message(tmp_path: Path, reco
     path = recordings.mcap(tmp_path / "i", packed)
     with open_recording(path, resolve=recordings.blind) as recording:
         assert recordings.received(recording) == sorted(messages[:7] + messages[8:])
-        assert [unreadable_range.count for unreadable_range in recording.unreadable] == [1]
+        assert [loss.count for loss in recording.unreadable] == [1]
 
 
 def test_times_after_2262_are_lost_messages(tmp_path: Path, recordings: Any) -> None:
@@ -238,10 +239,7 @@ def test_times_after_2262_are_lost_messages(tmp_path: Path, recordings: Any) -> 
     path = recordings.mcap(tmp_path / "j", [*messages[:29], late], summary=False)
     with open_recording(path, resolve=recordings.blind) as recording:
         assert recordings.received(recording) == sorted(messages[:29])
-        assert [
-            (unreadable_range.count, "2262" in unreadable_range.reason)
-            for unreadable_range in recording.unreadable
-        ] == [(1, True)]
+        assert [(loss.count, "2262" in loss.reason) for loss in recording.unreadable] == [(1, True)]
 
 
 @pytest.mark.parametrize("kind", ["mcap zstd", "mcap lz4", "mcap plain", "ros1", "ros1 lz4"])

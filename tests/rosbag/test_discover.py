@@ -79,10 +79,9 @@ def test_a_part_that_is_missing_is_a_finding_and_a_loss(split: Path, recordings:
         assert len(recordings.received(recording)) == 60
         assert "missing-split" in [finding.rule for finding in recording.findings]
         assert any("part_9.mcap" in finding.message for finding in recording.findings)
-        assert [
-            (Path(unreadable_range.file).name, unreadable_range.count)
-            for unreadable_range in recording.unreadable
-        ] == [("part_9.mcap", None)]
+        assert [(Path(loss.file).name, loss.count) for loss in recording.unreadable] == [
+            ("part_9.mcap", None)
+        ]
 
 
 def test_one_part_alone_says_that_there_are_others(split: Path, recordings: Any) -> None:
@@ -194,12 +193,12 @@ def test_a_part_that_cannot_be_opened_is_a_loss_and_a_finding(split: Path, recor
     with open_recording(split, resolve=recordings.blind) as recording:
         assert len(recordings.received(recording)) == 60
         assert "unreadable-range" in [finding.rule for finding in recording.findings]
-        assert [unreadable_range.reason for unreadable_range in recording.unreadable] == [
-            "this part cannot be opened: the file is empty"
+        assert [loss.reason for loss in recording.unreadable] == [
+            "this split cannot be opened: the file is empty"
         ]
     for file in split.glob("*.mcap"):
         file.write_bytes(b"")
-    with pytest.raises(BagError, match="the file is empty; nor can any of the 2 other parts be opened"):
+    with pytest.raises(BagError, match="the file is empty; the other 2 splits cannot be opened either"):
         open_recording(split, resolve=recordings.blind)
 
 
@@ -210,9 +209,7 @@ def test_a_damaged_part_counts_without_metadata_too(split: Path, recordings: Any
     (split / "notes.txt").write_bytes(b"not mine")
     with open_recording(split, resolve=recordings.blind) as recording:
         assert len(recordings.received(recording)) == 60
-        assert {Path(unreadable_range.file).name for unreadable_range in recording.unreadable} == {
-            "part_9.mcap"
-        }
+        assert {Path(loss.file).name for loss in recording.unreadable} == {"part_9.mcap"}
     for number in (8, 10):
         (split / f"part_{number}.mcap").write_bytes(content)
     with pytest.raises(BagError, match=r"part_8\.mcap"):

@@ -18,7 +18,7 @@ from mosaico_ingest.rosbag.blocks import Encoding, ROSHeader, ROSMessage
 from mosaico_ingest.rosbag.definitions.model import Embedded
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.loader import ROSLoader
-from mosaico_ingest.rosbag.recording import open_recording, windows
+from mosaico_ingest.rosbag.recording import open_recording, time_slices
 from mosaico_ingest.rosbag.serialization import Deserializer, Serializer
 
 IMU, STRING, POINT = "sensor_msgs/msg/Imu", "std_msgs/msg/String", "geometry_msgs/msg/PointStamped"
@@ -84,8 +84,8 @@ def test_the_header_is_read_where_there_is_one(bag: Path) -> None:
 @pytest.mark.parametrize("max_bytes", [1, 50, 200])
 def test_stretches_too_large_to_hold_are_halved(bag: Path, max_bytes: int) -> None:
     with open_recording(bag, resolve=TypeResolver()) as recording:
-        ids = [channel.id for channel in recording.channels]
-        stretches = [batches for batches in windows(recording, ids, max_bytes=max_bytes) if batches]
+        ids = [connection.id for connection in recording.connections]
+        stretches = [batches for batches in time_slices(recording, ids, max_bytes=max_bytes) if batches]
         times = [[int(t) for batch in batches for t in batch.log_times] for batches in stretches]
         assert len(stretches) > 5
         assert sum(map(len, times)) == 31

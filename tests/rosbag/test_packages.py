@@ -115,17 +115,17 @@ def test_a_definition_of_another_hash_is_not_used(tmp_path: Path) -> None:
     other = f"RIHS01_{'0' * 64}"
     for name in ("example_interfaces/msg/String", "std_msgs/msg/String"):
         path = recorded(tmp_path / f"{name.partition('/')[0]}.db3", name, other)
-        (channel,) = opened(path, TypeResolver(Stores.ROS2_JAZZY)).channels
+        (channel,) = opened(path, TypeResolver(Stores.ROS2_JAZZY)).connections
         assert channel.definition is None
         assert channel.problem
         assert f"another definition of {name} is known: the recording's is {other}" in channel.problem
-        (channel,) = opened(path, TypeResolver(types={name: "string data"})).channels
+        (channel,) = opened(path, TypeResolver(types={name: "string data"})).connections
         assert channel.definition, "what the job says about its own recording is believed"
 
 
 def test_one_of_the_same_hash_is(tmp_path: Path) -> None:
     path = recorded(tmp_path / "a.db3", "test_msgs/msg/Strings", STRINGS)
-    (channel,) = opened(path, TypeResolver()).channels
+    (channel,) = opened(path, TypeResolver()).connections
     assert channel.definition
     assert channel.definition.source is Source.PACKAGE
 
@@ -133,7 +133,7 @@ def test_one_of_the_same_hash_is(tmp_path: Path) -> None:
 def test_events_of_a_service_are_read_by_the_definition_of_the_service(tmp_path: Path) -> None:
     service = (("mine/srv/Add", "int64 a\n---\nint64 sum\n"),)
     path = recorded(tmp_path / "a.db3", "mine/srv/Add_Event", definitions=service)
-    (channel,) = opened(path, TypeResolver()).channels
+    (channel,) = opened(path, TypeResolver()).connections
     assert channel.definition
     assert [field.name for field in channel.definition.message.fields] == ["info", "request", "response"]
 

@@ -79,8 +79,8 @@ def test_a_ros1_bag_reads_as_rosbags_reads_it(tmp_path: Path, recordings: Any, c
         assert recording.container == "ros1"
         assert recordings.received(recording) == expected
         assert recording.unreadable == ()
-        assert {channel.encoding for channel in recording.channels} == {Encoding.ROS1}
-        assert sum(channel.count or 0 for channel in recording.channels) == len(expected)
+        assert {channel.encoding for channel in recording.connections} == {Encoding.ROS1}
+        assert sum(channel.count or 0 for channel in recording.connections) == len(expected)
 
 
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3", "ros1"])
@@ -93,9 +93,9 @@ def test_channels_and_times_can_be_selected(tmp_path: Path, recordings: Any, kin
         recordings.rosbag2(path, messages, storage=kind)
     start, end = messages[60].time_ns, messages[200].time_ns
     with open_recording(path, resolve=recordings.blind) as recording:
-        ids = [channel.id for channel in recording.channels if channel.topic in {"/imu", "/chatter"}]
-        found = recordings.received(recording, channel_ids=ids, start_ns=start, end_ns=end)
-        assert recordings.received(recording, channel_ids=[]) == []
+        ids = [channel.id for channel in recording.connections if channel.topic in {"/imu", "/chatter"}]
+        found = recordings.received(recording, connection_ids=ids, start_ns=start, end_ns=end)
+        assert recordings.received(recording, connection_ids=[]) == []
     wanted = [m for m in messages if m.topic in {"/imu", "/chatter"} and start <= m.time_ns < end]
     assert found == sorted(wanted)
 
@@ -106,7 +106,7 @@ def test_parts_are_one_sequence_in_time(tmp_path: Path, recordings: Any) -> None
     with open_recording(paths, resolve=recordings.blind) as recording:
         assert recordings.received(recording) == sorted(messages)
         assert recording.files == tuple(paths)
-        assert len(recording.channels) == 4
+        assert len(recording.connections) == 4
         assert recording.message_count == len(messages)
 
 
@@ -117,7 +117,7 @@ def test_memory_bounds_what_is_held_and_nothing_is_lost(
     messages = recordings.sent(big=True)
     recordings.rosbag2(tmp_path / "e", messages, storage=storage)
     with open_recording(tmp_path / "e", resolve=recordings.blind) as recording:
-        batches = list(recording.batches(rows=20, memory_bytes=1 << 20))
+        batches = list(recording.message_blocks(max_rows=20, memory_bytes=1 << 20))
     assert max(len(batch) for batch in batches) <= 20
     assert sum(len(batch) for batch in batches) == len(messages)
 
@@ -128,18 +128,18 @@ def test_chunks_that_overlap_in_time_come_out_in_time_order(tmp_path: Path, reco
     path = recordings.mcap(tmp_path / "f.mcap", shuffled, chunk_messages=17)
     with open_recording(path, resolve=recordings.blind) as recording:
         assert recordings.received(recording) == sorted(messages)
-        assert recordings.received(recording, rows=5) == sorted(messages)
+        assert recordings.received(recording, max_rows=5) == sorted(messages)
 
 
 def test_small_messages_are_coalesced_and_large_ones_are_not_copied(tmp_path: Path, recordings: Any) -> None:
     messages = recordings.sent(2000, big=True)
     path = recordings.mcap(tmp_path / "g.mcap", messages, chunk_messages=100)
     with open_recording(path, resolve=recordings.blind) as recording:
-        batches = list(recording.batches())
-    small = [batch for batch in batches if batch.channel.topic == "/imu"]
+        batches = list(recording.message_blocks())
+    small = [batch for batch in batches if recording.connections[batch.connection].topic == "/imu"]
     assert len(small) == 1
     assert len(small[0].data) == int(small[0].lengths.sum())
-    image = next(batch for batch in batches if batch.channel.topic == "/image")
+    image = next(batch for batch in batches if recording.connections[batch.connection].topic == "/image")
     assert len(image.data) > int(image.lengths.sum())
 
 
@@ -150,7 +150,7 @@ def test_a_topic_of_two_types_is_two_channels_and_a_finding(tmp_path: Path, reco
     two = [message._replace(msgtype="std_msgs/msg/Empty") for message in one]
     paths = [recordings.mcap(tmp_path / "1.mcap", one), recordings.mcap(tmp_path / "2.mcap", two)]
     with open_recording(paths, resolve=recordings.easy) as recording:
-        assert [channel.msgtype for channel in recording.channels] == [
+        assert [channel.msgtype for channel in recording.connections] == [
             "std_msgs/msg/String",
             "std_msgs/msg/Empty",
         ]
@@ -160,14 +160,14 @@ def test_a_topic_of_two_types_is_two_channels_and_a_finding(tmp_path: Path, reco
 def test_a_channel_without_definition_says_why(tmp_path: Path, recordings: Any) -> None:
     path = recordings.mcap(tmp_path / "h.mcap", recordings.sent(10))
     with open_recording(path, resolve=recordings.blind) as recording:
-        assert all(channel.definition is None for channel in recording.channels)
-        assert all("is not known" in str(channel.problem) for channel in recording.channels)
+        assert all(channel.definition is None for channel in recording.connections)
+        assert all("is not known" in str(channel.problem) for channel in recording.connections)
 
 
 def test_other_encodings_are_named_and_can_still_be_had(tmp_path: Path, recordings: Any) -> None:
     path = recordings.mcap(tmp_path / "i.mcap", recordings.sent(10), encoding="protobuf")
     with open_recording(path, resolve=recordings.easy) as recording:
-        assert {channel.encoding for channel in recording.channels} == {Encoding.OTHER}
+        assert {channel.encoding for channel in recording.connections} == {Encoding.OTHER}
         assert {finding.rule for finding in recording.findings} == {"skipped-encoding"}
         assert len(recordings.received(recording)) == 10
 
@@ -182,7 +182,7 @@ def test_reading_ahead_is_for_where_a_processor_is_left_and_leaves_no_thread(
     )
     before = threading.active_count()
     recording = open_recording(path, resolve=recordings.blind)
-    running = recording.batches()
+    running = recording.message_blocks()
     next(running)
     assert threading.active_count() == before + threads
     recording.close()
@@ -202,7 +202,7 @@ def test_a_file_that_shrinks_while_it_is_read_costs_only_its_end(
         found = recordings.received(recording)
         assert found
         assert set(found) < set(messages)
-        assert any("shorter" in unreadable_range.reason for unreadable_range in recording.unreadable)
+        assert any("truncated" in loss.reason for loss in recording.unreadable)
 
 
 def test_parts_of_different_formats_are_refused(tmp_path: Path, recordings: Any) -> None:
@@ -218,7 +218,7 @@ def test_offsets_say_where_a_message_lies(tmp_path: Path, recordings: Any) -> No
     path = recordings.mcap(tmp_path / "m.mcap", recordings.sent(), chunked=False)
     content = path.read_bytes()
     with open_recording(path, resolve=recordings.blind) as recording:
-        for batch in recording.batches():
+        for batch in recording.message_blocks():
             assert all(content[offset] == 5 for offset in batch.offsets.tolist())
             assert batch.offsets.dtype == np.int64
 
@@ -261,4 +261,4 @@ def test_a_topic_that_keeps_its_last_message_is_latched(tmp_path: Path, recordin
         writer.execute("UPDATE topics SET offered_qos_profiles = '- durability: 1' WHERE name = '/imu'")
     writer.close()
     with open_recording(folder, resolve=recordings.blind) as recording:
-        assert {channel.topic for channel in recording.channels if channel.latched} == {"/imu"}
+        assert {channel.topic for channel in recording.connections if channel.latched} == {"/imu"}

@@ -105,8 +105,8 @@ def test_topics_and_times_are_selected(tmp_path: Path, recordings: Any) -> None:
     path.write_bytes(bag(messages))
     middle = messages[150].time_ns
     with open_recording(path, resolve=recordings.blind) as recording:
-        (imu,) = [channel.id for channel in recording.channels if channel.topic == "/imu"]
-        found = recordings.received(recording, channel_ids=[imu], start_ns=middle)
+        (imu,) = [channel.id for channel in recording.connections if channel.topic == "/imu"]
+        found = recordings.received(recording, connection_ids=[imu], start_ns=middle)
     assert found == sorted(sent for sent in messages if sent.topic == "/imu" and sent.time_ns >= middle)
 
 
@@ -125,7 +125,7 @@ def test_the_definition_is_the_recordings(tmp_path: Path) -> None:
     assert first.data == {"header": {"seq": 5, "stamp": stamp, "frame_id": "map"}, "x": 0.5}
     assert second.data == first.data
     with open_recording(path, resolve=TypeResolver()) as recording:
-        assert {channel.topic: channel.latched for channel in recording.channels} == {
+        assert {channel.topic: channel.latched for channel in recording.connections} == {
             "/old": True,
             "/same_type": False,
         }
@@ -140,9 +140,9 @@ def test_without_a_definition_the_distros_is_taken_if_the_hash_is_its_own(tmp_pa
         + message("/wrong", "std_msgs/String", 10**18, b"\2\0\0\0hi", md5=wrong)
     )
     with open_recording(path, resolve=TypeResolver()) as recording:
-        known = {channel.topic: channel.problem for channel in recording.channels}
+        known = {channel.topic: channel.problem for channel in recording.connections}
     assert known["/right"] is None
-    assert "another definition of std_msgs/msg/String is known" in (known["/wrong"] or "")
+    assert "the known definition of std_msgs/msg/String differs" in (known["/wrong"] or "")
 
 
 @pytest.mark.slow
@@ -160,7 +160,7 @@ def test_a_bag_cut_off_at_any_byte_gives_what_is_left_and_says_so(
         with open_recording(path, resolve=recordings.blind) as recording:
             assert recordings.received(recording) == sorted(texts[: sum(end <= size for end in ends)])
             if indexed:
-                assert any("cut off" in unreadable_range.reason for unreadable_range in recording.unreadable)
+                assert any("cut off" in loss.reason for loss in recording.unreadable)
 
 
 def test_a_bag_that_was_not_closed_says_so_and_misses_nothing(
@@ -172,9 +172,7 @@ def test_a_bag_that_was_not_closed_says_so_and_misses_nothing(
     path.write_bytes(content[:end].replace(b"index_pos=" + struct.pack("<Q", end), b"index_pos=" + bytes(8)))
     with open_recording(path, resolve=recordings.blind) as recording:
         assert recordings.received(recording) == sorted(texts)
-        assert [
-            (unreadable_range.count, unreadable_range.reason) for unreadable_range in recording.unreadable
-        ] == [(0, "the bag was not closed")]
+        assert [(loss.count, loss.reason) for loss in recording.unreadable] == [(0, "the bag was not closed")]
 
 
 def test_damage_costs_what_it_destroys(tmp_path: Path, recordings: Any, texts: list[Any]) -> None:

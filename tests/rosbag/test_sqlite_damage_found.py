@@ -11,6 +11,6 @@ DAMAGED = Path(__file__).parent / "data" / "damaged_rowids.db3"
 
 def test_salvage_comes_to_an_end_where_a_damaged_page_gives_rows_out_of_order() -> None:
     with open_recording(DAMAGED, resolve=TypeResolver()) as recording:
-        read = sum(len(batch) for batch in recording.batches())
+        read = sum(len(batch) for batch in recording.message_blocks())
         assert read < 1000
         assert len(recording.findings) < 100

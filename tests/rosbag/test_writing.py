@@ -20,10 +20,10 @@ BLOB = define("acme_msgs/msg/Blob", "uint8[] data\n")
 
 def write_many(path: Path, *, payloads: int, size: int) -> None:
     with open_writer(path) as writer:
-        first = writer.channel("/a", BLOB)
+        first = writer.add_connection("/a", BLOB)
         for number in range(payloads):
             writer.write(first, number * 10, number.to_bytes(4, "little") + bytes(size))
-        second = writer.channel("/b", TEXT)
+        second = writer.add_connection("/b", TEXT)
         writer.write(second, 5, b"late")
 
 
@@ -32,15 +32,15 @@ def test_messages_in_many_chunks_are_found_by_the_index(tmp_path: Path, suffix: 
     path = tmp_path / f"out{suffix}"
     write_many(path, payloads=90, size=100_000)
     with open_recording([path], resolve=TypeResolver()) as recording:
-        counts = {channel.topic: channel.count for channel in recording.channels}
+        counts = {channel.topic: channel.count for channel in recording.connections}
         assert counts == {"/a": 90, "/b": 1}
         assert (recording.start_ns, recording.end_ns) == (0, 890)
-        found = {channel.topic: channel.id for channel in recording.channels}
-        batches = list(recording.batches((found["/a"],), start_ns=300, end_ns=500))
+        found = {channel.topic: channel.id for channel in recording.connections}
+        batches = list(recording.message_blocks((found["/a"],), start_ns=300, end_ns=500))
         times = np.concatenate([batch.log_times for batch in batches])
         assert times.tolist() == list(range(300, 500, 10))
         assert batches[0].payload(0)[:4] == (30).to_bytes(4, "little")
-        late = next(iter(recording.batches((found["/b"],))))
+        late = next(iter(recording.message_blocks((found["/b"],))))
         assert late.payload(0) == b"late"
         assert not recording.unreadable
 
@@ -49,13 +49,13 @@ def test_two_definitions_of_one_type_are_two_schemas_in_mcap_and_refused_in_db3(
     other = define("std_msgs/msg/String", "string data\nint8 more\n")
     with open_writer(tmp_path / "out.mcap") as writer:
         for topic, definition in (("/a", TEXT), ("/b", other), ("/c", TEXT)):
-            writer.write(writer.channel(topic, definition), 0, b"\0\1\0\0")
+            writer.write(writer.add_connection(topic, definition), 0, b"\0\1\0\0")
     with open_recording([tmp_path / "out.mcap"], resolve=TypeResolver()) as recording:
-        texts = {c.topic: c.definition.text for c in recording.channels if c.definition}
+        texts = {c.topic: c.definition.text for c in recording.connections if c.definition}
     assert texts == {"/a": TEXT.text, "/b": other.text, "/c": TEXT.text}
     with pytest.raises(BagError, match="another definition"), open_writer(tmp_path / "out.db3") as writer:
-        writer.channel("/a", TEXT)
-        writer.channel("/b", other)
+        writer.add_connection("/a", TEXT)
+        writer.add_connection("/b", other)
     assert [path.name for path in tmp_path.iterdir()] == ["out.mcap"]
 
 
@@ -83,6 +83,6 @@ def test_a_database_that_cannot_be_written_is_one_line(
 
 def test_a_recording_without_a_message_can_be_read(tmp_path: Path) -> None:
     with open_writer(tmp_path / "out.mcap") as writer:
-        writer.channel("/a", TEXT)
+        writer.add_connection("/a", TEXT)
     with open_recording([tmp_path / "out.mcap"], resolve=TypeResolver()) as recording:
-        assert [channel.count for channel in recording.channels] == [0]
+        assert [channel.count for channel in recording.connections] == [0]

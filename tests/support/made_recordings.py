@@ -28,7 +28,7 @@ def record(path: Path, messages: Iterable[Message]) -> Path:
         for topic, definition, log_ns, values in messages:
             key = (topic, definition.text)
             if key not in channels:
-                channels[key] = writer.channel(topic, definition)
+                channels[key] = writer.add_connection(topic, definition)
             encoding = Encoding.ROS1 if definition.ros_version == 1 else Encoding.CDR
             writer.write(channels[key], log_ns, Serializer(definition, encoding).from_dict(values))
     return path

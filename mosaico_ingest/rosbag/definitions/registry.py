@@ -295,6 +295,8 @@ class TypeResolver:
             else:
                 own += entries
         own += [register_source(name, source) for name, source in (types or {}).items()]
+        self.custom_texts: Mapping[str, str] = {entry.msgtype: entry.text for entry in own}
+        """The run's own definitions by type, as text."""
         self._custom = _by_name(own)
         self._registered = _by_name(registry.entries(self.distro).values())
         _check_local_types(own, {*self._custom, *self._registered, *self._other_distros})

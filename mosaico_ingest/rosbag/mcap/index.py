@@ -1,4 +1,4 @@
-"""This file finds out what is where in an MCAP file: by its summary, or by walking over its records."""
+"""The index of an MCAP file: from its summary, or from a walk over its records."""
 
 from __future__ import annotations
 
@@ -12,47 +12,50 @@ from msgspec.structs import replace
 
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.blocks import LATEST_NS, UnreadableRange
-from mosaico_ingest.rosbag.compression import inflate_some
+from mosaico_ingest.rosbag.compression import MAX_CHUNK_BYTES, decompress_partially
 from mosaico_ingest.rosbag.formats import MCAP
 from mosaico_ingest.rosbag.mcap.records import (
     RECORD,
-    McapChannel,
+    ChannelRecord,
     Op,
-    Schema,
+    SchemaRecord,
     channel_of,
     chunk_head,
     records_in,
     schema_of,
 )
-from mosaico_ingest.rosbag.recovery import next_mcap_chunk
+from mosaico_ingest.rosbag.recovery import find_mcap_chunk
 from mosaico_ingest.rosbag.source import Fields, Source, Window
 
-__all__ = ["McapIndex", "Piece", "read_index", "read_pieces"]
+__all__ = ["Extent", "McapIndex", "read_extents", "read_index"]
 
 _FOOTER_BYTES = RECORD.size + 20
 _INDEX_ENTRY_BYTES = 16
+_CHUNK_HEAD_BYTES = 1 << 12
+"""Bytes to read for the fields of a chunk record before its data; more than they can take."""
 _RUN_BYTES = 4 << 20
-"""How much of the messages outside chunks is read at once."""
+"""Maximum size of an extent of messages outside chunks."""
 _MESSAGE = struct.Struct("<HIQ")
 
 
-class Piece(Struct, frozen=True):
-    """Records that are read at once: a chunk with the message indexes behind it, or messages outside chunks."""
+class Extent(Struct, frozen=True):
+    """A range of the file that is read together: a chunk with its message indexes, or messages outside chunks."""
 
     offset: int
     stop: int
+    """Offset of the first byte after the extent."""
     start_ns: int
     end_ns: int
     indexes: bytes = b""
-    """Channel (u16) and file offset (u64) of each message index; empty where there is none."""
+    """Channel (u16) and file offset (u64) of each message index; empty if there are none."""
     size: int = 0
-    """Bytes of a chunk's data, as its index announces them; 0 where there is none."""
+    """Decompressed size of the chunk according to its index, in bytes; 0 if unknown."""
     is_chunk: bool = True
-    is_cut: bool = False
+    is_truncated: bool = False
 
-    def has_any(self, keys: Collection[int]) -> bool:
-        """Return whether there may be messages of these channels."""
-        return not self.indexes or any(key in keys for key, _ in self.index_offsets())
+    def has_any(self, channels: Collection[int]) -> bool:
+        """Return whether the extent may have messages of one of the channels."""
+        return not self.indexes or any(key in channels for key, _ in self.index_offsets())
 
     def index_offsets(self) -> list[tuple[int, int]]:
         """Return channel and file offset of each message index."""
@@ -61,95 +64,95 @@ class Piece(Struct, frozen=True):
 
 @dataclass(slots=True)
 class McapIndex:
-    """What is where."""
+    """Schemas, channels and extents of a file."""
 
-    schemas: dict[int, Schema] = field(default_factory=dict[int, Schema])
-    channels: dict[int, McapChannel] = field(default_factory=dict[int, McapChannel])
-    pieces: list[Piece] = field(default_factory=list[Piece])
+    schemas: dict[int, SchemaRecord] = field(default_factory=dict[int, SchemaRecord])
+    channels: dict[int, ChannelRecord] = field(default_factory=dict[int, ChannelRecord])
+    extents: list[Extent] = field(default_factory=list[Extent])
     counts: dict[int, int] | None = None
-    """Messages by channel, where the file or a walk could tell."""
+    """Messages by channel; None if neither the summary nor a walk could determine them."""
     start_ns: int | None = None
     end_ns: int | None = None
     data_end: int = 0
-    """Where the summary, or what cannot be read, begins."""
+    """Offset of the summary, or of the first byte that cannot be read."""
     unreadable: list[UnreadableRange] = field(default_factory=list[UnreadableRange])
-    walked: bool = False
-    """Whether every record was looked at, and not only the summary."""
+    is_walked: bool = False
+    """Whether the index comes from a walk over all records rather than from the summary."""
 
 
-def read_index(source: Source) -> McapIndex:
-    """Return what the summary says, or, where it is missing, incomplete or damaged, what a walk finds."""
+def read_index(source: Source, max_chunk_bytes: int = MAX_CHUNK_BYTES) -> McapIndex:
+    """Return the index from the summary, or from a walk if the summary is missing, incomplete or damaged."""
+    problem = None
     try:
-        index = _summary(source)
+        index = _read_summary(source)
     except BagError as err:
         index, problem = None, str(err)
-    else:
-        problem = None
     if index is not None:
         return index
     index = McapIndex(data_end=source.size)
     if problem:
-        index.unreadable.append(
-            UnreadableRange(source.size, f"{problem}; the file was read record by record", count=0)
-        )
+        reason = f"{problem}; the file was read record by record"
+        index.unreadable.append(UnreadableRange(source.size, reason, count=0))
     source.fetch_whole()
-    _Walk(source, index).over(len(MCAP), source.size)
+    _Walk(source, index, max_chunk_bytes).over(len(MCAP), source.size)
     return index
 
 
-def read_pieces(source: Source, index: McapIndex) -> tuple[list[Piece], list[UnreadableRange]]:
-    """Return all pieces by time, also those that the summary does not name, and what is broken between its chunks."""
-    known = sorted(index.pieces, key=lambda piece: piece.offset)
-    found = McapIndex()
-    at = len(MCAP)
-    if not index.walked:
-        walk = _Walk(source, found)
-        for piece in known:
-            if piece.offset > at:
-                walk.over(at, piece.offset)
-            at = max(at, piece.stop)
-        walk.over(at, index.data_end)
-    return sorted(known + found.pieces, key=lambda piece: piece.start_ns), found.unreadable
+def read_extents(
+    source: Source, index: McapIndex, max_chunk_bytes: int = MAX_CHUNK_BYTES
+) -> tuple[list[Extent], list[UnreadableRange]]:
+    """Return all extents by time, including those that the summary does not list, and damage between chunks."""
+    listed = sorted(index.extents, key=lambda extent: extent.offset)
+    unlisted = McapIndex()
+    position = len(MCAP)
+    if not index.is_walked:
+        walk = _Walk(source, unlisted, max_chunk_bytes)
+        for extent in listed:
+            if extent.offset > position:
+                walk.over(position, extent.offset)
+            position = max(position, extent.stop)
+        walk.over(position, index.data_end)
+    return sorted(listed + unlisted.extents, key=lambda extent: extent.start_ns), unlisted.unreadable
 
 
-def _summary(source: Source) -> McapIndex | None:
+def _read_summary(source: Source) -> McapIndex | None:
     tail_at = source.size - _FOOTER_BYTES - len(MCAP)
     if tail_at < len(MCAP):
         raise BagError("the file ends without a footer")
     tail = source.read(tail_at, _FOOTER_BYTES + len(MCAP))
     if tail[0] != Op.FOOTER or tail[-len(MCAP) :] != MCAP:
         raise BagError("the file ends without a footer")
-    begin, _, crc = struct.unpack_from("<QQI", tail, RECORD.size)
-    if not begin:
+    start, _, crc = struct.unpack_from("<QQI", tail, RECORD.size)
+    if not start:
         return None
-    if not len(MCAP) <= begin <= tail_at:
-        raise BagError(f"the footer puts the summary at {begin}, outside the file")
-    data = source.read(begin, tail_at - begin)
+    if not len(MCAP) <= start <= tail_at:
+        raise BagError(f"the footer puts the summary at {start}, outside the file")
+    data = source.read(start, tail_at - start)
     if crc and zlib.crc32(tail[: RECORD.size + 16], zlib.crc32(data)) != crc:
-        raise BagError("the summary does not have the checksum that the footer gives it")
-    return _from_summary(data, begin)
+        raise BagError("the checksum of the summary differs from that in the footer")
+    return _parse_summary(data, start)
 
 
-def _from_summary(data: bytes, begin: int) -> McapIndex | None:
-    """Return the summary's content, or None where it does not say all that is needed."""
-    index = McapIndex(data_end=begin)
+def _parse_summary(data: bytes, data_end: int) -> McapIndex | None:
+    """Return the content of the summary, or None if records that the reader needs are missing."""
+    index = McapIndex(data_end=data_end)
     chunk_count: int | None = None
     for op, start, end in records_in(data):
         fields = Fields(data, start, end)
         if op == Op.CHUNK_INDEX:
-            index.pieces.append(_indexed_chunk(fields, begin))
+            index.extents.append(_indexed_chunk(fields, data_end))
         elif op == Op.STATISTICS:
-            chunk_count = _statistics(fields, index)
+            chunk_count = _add_statistics(fields, index)
         else:
-            _describe(op, fields, index)
+            _add_description(op, fields, index)
     counts = index.counts
-    if counts is None or chunk_count != len(index.pieces) or not index.channels.keys() >= counts.keys():
+    if counts is None or chunk_count != len(index.extents) or not index.channels.keys() >= counts.keys():
         return None
     return index
 
 
-def _describe(op: int, fields: Fields, index: McapIndex) -> None:
-    """Take note of a schema or channel record; others say nothing about what messages are."""
+def _add_description(op: int, fields: Fields, index: McapIndex) -> None:
+    """Add a schema or channel record to the index; ignore others."""
     if op == Op.SCHEMA:
         key, schema = schema_of(fields)
         index.schemas[key] = schema
@@ -158,17 +161,18 @@ def _describe(op: int, fields: Fields, index: McapIndex) -> None:
         index.channels[key] = channel
 
 
-def _indexed_chunk(fields: Fields, data_end: int) -> Piece:
+def _indexed_chunk(fields: Fields, data_end: int) -> Extent:
     start_ns, end_ns, offset, length = fields.u64(), fields.u64(), fields.u64(), fields.u64()
     indexes = fields.take(fields.u32())
     stop = offset + length + fields.u64()
     if stop > data_end or len(indexes) % 10:
         raise BagError(f"the chunk index at {offset} does not fit the file")
-    fields.take(fields.u32() + 8)  # how it is compressed, and to how many bytes: the chunk says so too
-    return Piece(offset, stop, start_ns, end_ns, indexes, fields.u64())
+    fields.take(fields.u32() + 8)  # compression and compressed size, which the chunk record has too
+    return Extent(offset, stop, start_ns, end_ns, indexes, fields.u64())
 
 
-def _statistics(fields: Fields, index: McapIndex) -> int:
+def _add_statistics(fields: Fields, index: McapIndex) -> int:
+    """Add counts and times to the index; return the number of chunks."""
     total = fields.u64()
     fields.take(2 + 4 + 4 + 4)
     chunks = fields.u32()
@@ -177,159 +181,162 @@ def _statistics(fields: Fields, index: McapIndex) -> int:
     if max(start_ns, end_ns) > LATEST_NS:
         raise BagError(f"messages from {start_ns} to {end_ns} ns, which is after the year 2262")
     if total != sum(index.counts.values()):
-        raise BagError(f"{total} messages in all, {sum(index.counts.values())} by channel")
+        raise BagError(f"{total} messages in total, {sum(index.counts.values())} by channel")
     if total:
         index.start_ns, index.end_ns = start_ns, end_ns
     return chunks
 
 
 class _Walk:
-    """Goes from record to record and writes down what is there."""
+    """Visits record after record and adds it to an index."""
 
-    def __init__(self, source: Source, index: McapIndex) -> None:
+    def __init__(self, source: Source, index: McapIndex, max_chunk_bytes: int) -> None:
         self._source = source
         self._window = Window(source)
         self._index = index
-        self._run: Piece | None = None
+        self._max_chunk_bytes = max_chunk_bytes
+        self._run: Extent | None = None
+        """The messages outside chunks that directly precede the current record."""
         self._counts: dict[int, int] | None = {}
-        index.walked = True
+        index.is_walked = True
 
-    def over(self, at: int, stop: int) -> None:
-        """Look at every record from `at` to `stop`; where one does not fit, go on at the next chunk."""
-        while at < stop:
-            head = self._window.peek(at, RECORD.size)
+    def over(self, start: int, stop: int) -> None:
+        """Visit every record from `start` to `stop`; after an invalid record, continue with the next chunk."""
+        position = start
+        while position < stop:
+            head = self._window.peek(position, RECORD.size)
             op, length = RECORD.unpack(head) if len(head) == RECORD.size else (0, 0)
-            end = at + RECORD.size + length
+            end = position + RECORD.size + length
             if op in (Op.DATA_END, Op.FOOTER) and end <= stop:
                 break
             if op == 0 or end > stop:
-                resumed = next_mcap_chunk(self._source, at + 1, stop)
-                self._doubt_last_chunk(at)
-                self._stray(op, at, end, stop if resumed is None else resumed)
-                at = stop if resumed is None else resumed
+                next_chunk = find_mcap_chunk(self._source, position + 1, stop)
+                resume_at = stop if next_chunk is None else next_chunk
+                self._distrust_last_chunk(position)
+                self._add_invalid(op, position, end, resume_at)
+                position = resume_at
                 continue
-            self._record(op, at, end)
-            at = end
+            self._add_record(op, position, end)
+            position = end
         else:
-            self._doubt_last_chunk(at)
+            self._distrust_last_chunk(position)
         self._finish_run()
-        self._index.data_end = at
-        self._summarise()
+        self._index.data_end = position
+        self._add_totals()
 
-    def _record(self, op: int, at: int, end: int) -> None:
+    def _add_record(self, op: int, start: int, end: int) -> None:
         if op == Op.MESSAGE:
-            self._message(at, end)
+            self._add_message(start, end)
             return
         self._finish_run()
         if op == Op.CHUNK:
-            self._chunk(at, end)
+            self._add_chunk(start, end)
         elif op == Op.MESSAGE_INDEX:
-            self._message_index(at, end)
+            self._add_message_index(start, end)
         elif op in (Op.SCHEMA, Op.CHANNEL):
-            start = at + RECORD.size
+            content = start + RECORD.size
             try:
-                _describe(op, Fields(self._source.read(start, end - start)), self._index)
+                _add_description(op, Fields(self._source.read(content, end - content)), self._index)
             except BagError as err:
-                self._index.unreadable.append(
-                    UnreadableRange(at, f"a damaged record of kind {op}: {err.what}")
-                )
+                self._add_unreadable(start, f"a damaged record of kind {op}: {err.what}")
 
-    def _stray(self, op: int, at: int, end: int, stop: int) -> None:
-        """Say what does not fit; a chunk that is cut off may still hold messages."""
+    def _add_unreadable(self, offset: int, reason: str) -> None:
+        self._index.unreadable.append(UnreadableRange(offset, reason))
+
+    def _add_invalid(self, op: int, start: int, end: int, stop: int) -> None:
+        """Add an unreadable range, or a truncated chunk, which may still contain messages."""
+        self._counts = None
         if op == Op.CHUNK:
             try:
-                head = chunk_head(self._source.read(at, min(stop - at, 1 << 12)))
+                head = chunk_head(self._source.read(start, min(stop - start, _CHUNK_HEAD_BYTES)))
             except BagError:
                 head = None
             if head is not None:
-                piece = Piece(at, stop, head.start_ns, head.end_ns, is_cut=True)
-                self._index.pieces.append(piece)
-                self._counts = None
-                self._learn(piece)
+                extent = Extent(start, stop, head.start_ns, head.end_ns, is_truncated=True)
+                self._index.extents.append(extent)
+                self._add_chunk_descriptions(extent)
                 return
-        found = f"a record of kind {op} with {end - at} bytes" if op else "no record"
-        self._index.unreadable.append(
-            UnreadableRange(at, f"{found} where {stop - at} bytes are left; they are not read")
-        )
-        self._counts = None
+        record = f"a record of kind {op} with {end - start} bytes" if op else "no record"
+        self._add_unreadable(start, f"{record} where {stop - start} bytes are left; they are not read")
 
-    def _doubt_last_chunk(self, at: int) -> None:
-        """Forget the message indexes that end at `at`, where the file may have been cut off: some may be missing."""
-        pieces = self._index.pieces
-        if pieces and pieces[-1].stop == at and pieces[-1].is_chunk:
-            pieces[-1] = replace(pieces[-1], indexes=b"")
+    def _distrust_last_chunk(self, position: int) -> None:
+        """Drop the message indexes before `position`: where a file is truncated, some of them may be missing."""
+        extents = self._index.extents
+        if extents and extents[-1].stop == position and extents[-1].is_chunk:
+            extents[-1] = replace(extents[-1], indexes=b"")
             self._counts = None
-            self._learn(pieces[-1])
+            self._add_chunk_descriptions(extents[-1])
 
-    def _message(self, at: int, end: int) -> None:
-        fixed = self._window.peek(at + RECORD.size, _MESSAGE.size)
-        if min(len(fixed), end - at - RECORD.size) < _MESSAGE.size:
+    def _add_message(self, start: int, end: int) -> None:
+        fields = self._window.peek(start + RECORD.size, _MESSAGE.size)
+        if min(len(fields), end - start - RECORD.size) < _MESSAGE.size:
             self._finish_run()
-            self._index.unreadable.append(
-                UnreadableRange(at, f"a message record of {end - at} bytes, too few for its fields")
-            )
+            self._add_unreadable(start, f"a message record of {end - start} bytes, too few for its fields")
             return
-        channel, _, time_ns = _MESSAGE.unpack(fixed)
+        channel, _, time_ns = _MESSAGE.unpack(fields)
         if self._counts is not None:
             self._counts[channel] = self._counts.get(channel, 0) + 1
         run = self._run
         if run is not None and end - run.offset > _RUN_BYTES:
             self._finish_run()
             run = None
-        start_ns, end_ns = (
-            (min(run.start_ns, time_ns), max(run.end_ns, time_ns)) if run else (time_ns, time_ns)
-        )
-        self._run = Piece(run.offset if run else at, end, start_ns, end_ns, is_chunk=False)
+        if run is None:
+            self._run = Extent(start, end, time_ns, time_ns, is_chunk=False)
+        else:
+            first_ns, last_ns = min(run.start_ns, time_ns), max(run.end_ns, time_ns)
+            self._run = replace(run, stop=end, start_ns=first_ns, end_ns=last_ns)
 
     def _finish_run(self) -> None:
         if self._run is not None:
-            self._index.pieces.append(self._run)
+            self._index.extents.append(self._run)
             self._run = None
 
-    def _chunk(self, at: int, end: int) -> None:
+    def _add_chunk(self, start: int, end: int) -> None:
         try:
-            head = chunk_head(self._source.read(at, min(end - at, 1 << 12)))
+            head = chunk_head(self._source.read(start, min(end - start, _CHUNK_HEAD_BYTES)))
         except BagError as err:
-            self._index.unreadable.append(UnreadableRange(at, f"a damaged chunk record: {err.what}"))
+            self._add_unreadable(start, f"a damaged chunk record: {err.what}")
             return
-        piece = Piece(at, end, head.start_ns, head.end_ns, size=head.size)
-        self._index.pieces.append(piece)
+        extent = Extent(start, end, head.start_ns, head.end_ns, size=head.size)
+        self._index.extents.append(extent)
         following = self._window.peek(end, 1)
         if following != bytes([Op.MESSAGE_INDEX]) and head.size:
             self._counts = None
-            self._learn(piece)
+            self._add_chunk_descriptions(extent)
 
-    def _message_index(self, at: int, end: int) -> None:
-        """Add a message index to the chunk before it."""
-        pieces = self._index.pieces
-        fixed = self._window.peek(at + RECORD.size, 6)
-        if not pieces or pieces[-1].stop != at or end - at < RECORD.size + 6:
+    def _add_message_index(self, start: int, end: int) -> None:
+        """Add a message index to the chunk that precedes it."""
+        extents = self._index.extents
+        fields = self._window.peek(start + RECORD.size, 6)
+        if not extents or extents[-1].stop != start or end - start < RECORD.size + 6:
             return
-        channel, size = struct.unpack("<HI", fixed)
+        channel, size = struct.unpack("<HI", fields)
         if self._counts is not None:
             self._counts[channel] = self._counts.get(channel, 0) + size // _INDEX_ENTRY_BYTES
-        last = pieces[-1]
-        entry = struct.pack("<HQ", channel, at)
-        pieces[-1] = replace(last, stop=end, indexes=last.indexes + entry)
+        chunk = extents[-1]
+        entry = struct.pack("<HQ", channel, start)
+        extents[-1] = replace(chunk, stop=end, indexes=chunk.indexes + entry)
         if channel not in self._index.channels:
-            self._learn(last)
+            self._add_chunk_descriptions(chunk)
 
-    def _learn(self, piece: Piece) -> None:
-        """Take note of the schemas and channels inside a chunk."""
+    def _add_chunk_descriptions(self, extent: Extent) -> None:
+        """Add the schemas and channels inside a chunk; reading its messages reports any damage."""
         try:
-            data = self._source.read(piece.offset, piece.stop - piece.offset)
+            data = self._source.read(extent.offset, extent.stop - extent.offset)
             head = chunk_head(data)
-            records = inflate_some(data[head.begin : head.end], head.compression, head.size)
+            compressed = memoryview(data)[head.start : head.end]
+            records = decompress_partially(
+                compressed, head.compression, head.size, limit=self._max_chunk_bytes
+            ).data
             for op, start, end in records_in(records):
-                _describe(op, Fields(records, start, end), self._index)
+                _add_description(op, Fields(records, start, end), self._index)
         except BagError:
-            return  # reading the chunk will say what is wrong with it
+            return
 
-    def _summarise(self) -> None:
+    def _add_totals(self) -> None:
         index = self._index
-        counted = self._counts
-        index.counts = index.counts or counted
-        filled = [piece for piece in index.pieces if piece.end_ns]
-        if filled:
-            index.start_ns = min(piece.start_ns for piece in filled)
-            index.end_ns = max(piece.end_ns for piece in filled)
+        index.counts = index.counts or self._counts
+        timed = [extent for extent in index.extents if extent.end_ns]
+        if timed:
+            index.start_ns = min(extent.start_ns for extent in timed)
+            index.end_ns = max(extent.end_ns for extent in timed)

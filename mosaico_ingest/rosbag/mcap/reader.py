@@ -1,4 +1,8 @@
-"""This file reads MCAP: messages are found through the message indexes, as arrays, or record by record."""
+"""The reader of MCAP files.
+
+Messages of a chunk are located through its message indexes, with array operations over all chunks that are read
+together. A chunk whose indexes are missing or wrong is scanned record by record.
+"""
 
 from __future__ import annotations
 
@@ -17,43 +21,45 @@ from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.blocks import (
     EARLIEST_NS,
     LATEST_NS,
-    Block,
     Bytes,
     Encoding,
-    Loaded,
-    Slab,
-    Stream,
+    Int64s,
+    MessageBlock,
+    ReadRequest,
+    ReadResult,
+    ReadTask,
+    SplitConnection,
     UnreadableRange,
-    Want,
-    by_key,
-    in_groups,
-    keep_each,
-    orphans,
-    stretches,
+    add_selected_rows,
+    fixed_slices,
+    group_by_bytes,
+    rows_by_connection,
+    undescribed_connections,
 )
-from mosaico_ingest.rosbag.compression import Packed, inflate_all, inflate_some
+from mosaico_ingest.rosbag.compression import (
+    MAX_CHUNK_BYTES,
+    CompressedChunk,
+    decompress_chunks,
+    decompress_partially,
+    decompression_groups,
+)
 from mosaico_ingest.rosbag.definitions.model import Embedded
-from mosaico_ingest.rosbag.mcap.index import (
-    McapIndex,
-    Piece,
-    read_index,
-    read_pieces,
-)
+from mosaico_ingest.rosbag.mcap.index import Extent, McapIndex, read_extents, read_index
 from mosaico_ingest.rosbag.mcap.records import (
     RECORD,
+    ChannelRecord,
     ChunkHead,
-    McapChannel,
     Op,
-    Schema,
+    SchemaRecord,
     chunk_head,
 )
-from mosaico_ingest.rosbag.source import Source, Stretches
+from mosaico_ingest.rosbag.source import ReadBuffer, Source
 
-__all__ = ["McapPart"]
+__all__ = ["McapReader"]
 
 _ENCODINGS = {"cdr": Encoding.CDR, "ros1": Encoding.ROS1}
-_ENTRY = np.dtype([("time", "<i8"), ("offset", "<u8")])
-_HEAD = np.dtype(
+_INDEX_ENTRY = np.dtype([("time", "<i8"), ("offset", "<u8")])
+_MESSAGE_HEAD = np.dtype(
     [
         ("op", "u1"),
         ("length", "<u8"),
@@ -63,65 +69,70 @@ _HEAD = np.dtype(
         ("published", "<i8"),
     ]
 )
-_FIXED_BYTES = _HEAD.itemsize - RECORD.size
-"""How much of a message record's length is not payload."""
+_FIXED_BYTES = _MESSAGE_HEAD.itemsize - RECORD.size
+"""The part of a message record's length that is not payload."""
 
 
 class _Chunk(Struct, frozen=True):
-    """A piece as it was read, and its data."""
+    """The records of an extent, decompressed."""
 
-    piece: Piece
+    extent: Extent
     raw: memoryview
-    records: Bytes
-    """What all chunks that were read together hold."""
-    begin: int
+    """The extent as it is in the file: the chunk record and the message indexes after it."""
+    buffer: Bytes
+    """The buffer that holds the records of all chunks decompressed together."""
+    start: int
     end: int
 
     @property
-    def data(self) -> Bytes:
-        """What this one holds."""
-        return self.records[self.begin : self.end]
+    def records(self) -> Bytes:
+        """The records of this chunk."""
+        return self.buffer[self.start : self.end]
 
 
-class McapPart:
-    """One MCAP file, with or without summary, indexes, chunks, profile or end."""
+class McapReader:
+    """The reader of one MCAP file, which may lack its summary, indexes, chunks, profile or end."""
 
     container = "mcap"
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: Source, max_chunk_bytes: int = MAX_CHUNK_BYTES) -> None:
         self.path = source.path
         self._source = source
+        self._max_chunk_bytes = max_chunk_bytes
         try:
-            self._index = read_index(self._source)
+            self._index = read_index(source, max_chunk_bytes)
         except BaseException:
             self._source.close()
             raise
         index = self._index
-        self.streams: tuple[Stream, ...] = tuple(
-            _stream(key, channel, index) for key, channel in sorted(index.channels.items())
+        self.connections: tuple[SplitConnection, ...] = tuple(
+            _connection(key, channel, index) for key, channel in sorted(index.channels.items())
         )
         self.start_ns: int | None = index.start_ns
         self.end_ns: int | None = index.end_ns
         self.message_count: int | None = sum(index.counts.values()) if index.counts is not None else None
-        self.unreadable: list[UnreadableRange] = [*index.unreadable, *orphans(index.counts, index.channels)]
-        self.notes: list[str] = source.notes
-        self._pieces: tuple[list[Piece], list[UnreadableRange]] | None = None
-
-    def blocks(self, want: Want) -> Iterator[Block]:
-        """Yield the chunks, and the stretches between chunks, that may hold wanted messages."""
-        if self._pieces is None:
-            self._pieces = read_pieces(self._source, self._index)
-        pieces, unreadable = self._pieces
-        if unreadable:
-            yield Block(EARLIEST_NS, lambda: Loaded([], list(unreadable)))
-        wanted = [
-            piece
-            for piece in pieces
-            if want.overlaps(piece.start_ns, piece.end_ns) and piece.has_any(want.keys)
+        self.unreadable: list[UnreadableRange] = [
+            *index.unreadable,
+            *undescribed_connections(index.counts, index.channels),
         ]
-        self._source.prefetch((piece.offset, piece.stop) for piece in wanted)
-        for group in in_groups(wanted, _inflated_bytes, want.block_bytes):
-            yield Block(min(group[0].start_ns, LATEST_NS), partial(self._load, group, want))
+        self.notes: list[str] = source.notes
+        self._extents: tuple[list[Extent], list[UnreadableRange]] | None = None
+
+    def read_tasks(self, request: ReadRequest) -> Iterator[ReadTask]:
+        """Yield tasks for the chunks, and the messages between chunks, that may contain requested messages."""
+        if self._extents is None:
+            self._extents = read_extents(self._source, self._index, self._max_chunk_bytes)
+        extents, unreadable = self._extents
+        if unreadable:
+            yield ReadTask(EARLIEST_NS, lambda: ReadResult([], list(unreadable)))
+        requested = [
+            extent
+            for extent in extents
+            if request.overlaps(extent.start_ns, extent.end_ns) and extent.has_any(request.connections)
+        ]
+        self._source.prefetch((extent.offset, extent.stop) for extent in requested)
+        for group in group_by_bytes(requested, _decompressed_bytes, request.block_bytes):
+            yield ReadTask(min(group[0].start_ns, LATEST_NS), partial(self._load, group, request))
 
     def check_unchanged(self) -> None:
         """See `Source.check_unchanged`."""
@@ -131,83 +142,96 @@ class McapPart:
         """Close the file."""
         self._source.close()
 
-    def _load(self, pieces: Sequence[Piece], want: Want) -> Loaded:
-        loaded = Loaded([], [])
-        chunks = self._chunks(pieces, want, loaded)
-        indexed = [chunk for chunk in chunks if chunk.piece.indexes]
-        if indexed:
-            self._by_index(indexed, want, loaded)
-        for chunk in chunks:
-            if not chunk.piece.indexes:
-                self._scan(chunk, want, loaded)
-        return loaded
+    def _load(self, extents: Sequence[Extent], request: ReadRequest) -> ReadResult:
+        result = ReadResult([], [])
+        for chunks in self._read_chunks(extents, request, result):
+            indexed = [chunk for chunk in chunks if chunk.extent.indexes]
+            if indexed:
+                self._add_indexed(indexed, request, result)
+            for chunk in chunks:
+                if not chunk.extent.indexes:
+                    self._add_scanned(chunk, request, result)
+        return result
 
-    def _chunks(self, pieces: Sequence[Piece], want: Want, loaded: Loaded) -> list[_Chunk]:
-        """Read and inflate; what is whole lies in one buffer, what is broken is among the unreadable."""
-        found: list[_Chunk] = []
-        packed: list[tuple[Piece, memoryview, ChunkHead, Packed]] = []
-        stretches = Stretches(self._source, ((piece.offset, piece.stop) for piece in pieces))
-        for piece in pieces:
+    def _read_chunks(
+        self, extents: Sequence[Extent], request: ReadRequest, result: ReadResult
+    ) -> Iterator[list[_Chunk]]:
+        """Read and decompress extents; the indexed chunks of each list share one buffer."""
+        compressed: list[tuple[Extent, memoryview, ChunkHead, CompressedChunk]] = []
+        buffer = ReadBuffer(self._source, ((extent.offset, extent.stop) for extent in extents))
+        for extent in extents:
             raw = memoryview(b"")
             try:
-                at = stretches.read(piece.offset, piece.stop)
-                raw = stretches.data[at].data
-                head = chunk_head(raw) if piece.is_chunk else None
-                if head is None or piece.is_cut:
-                    found.append(_whole(piece, raw if head is None else _cut(raw, head, piece, loaded)))
+                position = buffer.read(extent.offset, extent.stop)
+                raw = buffer.data[position].data
+                head = chunk_head(raw) if extent.is_chunk else None
+                if head is None:
+                    yield [_unchunked(extent, np.frombuffer(raw, np.uint8))]
+                elif extent.is_truncated:
+                    yield [self._truncated_chunk(extent, raw, head, result)]
                 else:
-                    end = at.start + min(head.end, len(raw))
-                    where = Packed(at.start + head.begin, end, head.compression, head.size)
-                    packed.append((piece, raw, head, where))
+                    start, end = position.start + head.start, position.start + min(head.end, len(raw))
+                    compressed.append(
+                        (extent, raw, head, CompressedChunk(start, end, head.compression, head.size))
+                    )
             except BagError as err:
-                loaded.unreadable.extend(_whole_chunk(piece, raw, want, err))
-        inflated = inflate_all(stretches.data, [where for *_, where in packed])
-        for place, (piece, raw, head, _) in enumerate(packed):
-            chunk = _Chunk(piece, raw, inflated.data, *inflated.places[place])
-            broken = inflated.failures.get(place) or _wrong_checksum(chunk.data, head)
-            if broken:
-                loaded.unreadable.extend(_whole_chunk(piece, raw, want, broken))
-            else:
-                found.append(chunk)
-        return found
+                result.unreadable.extend(_unreadable_chunk(extent, raw, request, err))
+        for group in decompression_groups(compressed, lambda item: item[3].size):
+            decompressed = decompress_chunks(
+                buffer.data, [chunk for *_, chunk in group], limit=self._max_chunk_bytes
+            )
+            chunks: list[_Chunk] = []
+            for number, (extent, raw, head, _) in enumerate(group):
+                chunk = _Chunk(extent, raw, decompressed.data, *decompressed.bounds[number])
+                error = decompressed.errors.get(number) or _checksum_error(chunk.records, head)
+                if error:
+                    result.unreadable.extend(_unreadable_chunk(extent, raw, request, error))
+                else:
+                    chunks.append(chunk)
+            yield chunks
 
-    def _by_index(self, chunks: Sequence[_Chunk], want: Want, loaded: Loaded) -> None:
-        """Add the wanted messages that the message indexes name; a chunk whose index is wrong is scanned."""
+    def _truncated_chunk(
+        self, extent: Extent, raw: memoryview, head: ChunkHead, result: ReadResult
+    ) -> _Chunk:
+        records = decompress_partially(
+            raw[head.start : head.end], head.compression, head.size, limit=self._max_chunk_bytes
+        )
+        reason = f"the chunk is truncated; {len(records)} of its {head.size} bytes could be read"
+        result.unreadable.append(UnreadableRange(extent.offset, reason))
+        return _unchunked(extent, records)
+
+    def _add_indexed(self, chunks: Sequence[_Chunk], request: ReadRequest, result: ReadResult) -> None:
+        """Add the requested messages through the message indexes; scan chunks whose index is wrong."""
         try:
-            keep_each(*_indexed(chunks, want.keys), want, loaded)
+            add_selected_rows(*_indexed_messages(chunks, request.connections), request, result)
         except BagError as err:
             if len(chunks) > 1:
                 for chunk in chunks:
-                    self._by_index([chunk], want, loaded)
+                    self._add_indexed([chunk], request, result)
                 return
             reason = f"{err.what}; the chunk was read record by record"
-            loaded.unreadable.append(UnreadableRange(chunks[0].piece.offset, reason, count=0))
-            self._scan(chunks[0], want, loaded)
+            result.unreadable.append(UnreadableRange(chunks[0].extent.offset, reason, count=0))
+            self._add_scanned(chunks[0], request, result)
 
-    def _scan(self, chunk: _Chunk, want: Want, loaded: Loaded) -> None:
-        """Add the wanted messages record by record, up to the first that does not fit."""
-        piece = chunk.piece
-        starts = _message_starts(chunk.data.data, piece, loaded)
-        records = chunk.data
-        heads = _heads(records, starts)
-        found = list(by_key(heads["channel"]))
-        wanted = [(key, rows) for key, rows in found if key in want.keys]
-        offsets = np.full(len(starts), piece.offset, np.int64) if piece.is_chunk else starts + piece.offset
-        keep_each(_slab(records, heads, starts, offsets), wanted, want, loaded)
+    def _add_scanned(self, chunk: _Chunk, request: ReadRequest, result: ReadResult) -> None:
+        """Add the requested messages record by record, up to the first invalid record."""
+        extent, records = chunk.extent, chunk.records
+        starts = _message_starts(records.data, extent, result)
+        heads = _message_heads(records, starts)
+        rows_of = list(rows_by_connection(heads["channel"]))
+        requested = [(key, rows) for key, rows in rows_of if key in request.connections]
+        offsets = np.full(len(starts), extent.offset, np.int64) if extent.is_chunk else starts + extent.offset
+        add_selected_rows(_block(records, heads, starts, offsets), requested, request, result)
         if self._index.counts is None:
-            unwanted = {key: len(rows) for key, rows in found if key not in want.keys}
-            loaded.unreadable.extend(orphans(unwanted, self._index.channels))
+            others = {key: len(rows) for key, rows in rows_of if key not in request.connections}
+            result.unreadable.extend(undescribed_connections(others, self._index.channels))
 
 
-def _inflated_bytes(piece: Piece) -> int:
-    return max(piece.size, piece.stop - piece.offset)
-
-
-def _stream(key: int, channel: McapChannel, index: McapIndex) -> Stream:
-    schema = index.schemas.get(channel.schema, Schema("", "", ""))
+def _connection(key: int, channel: ChannelRecord, index: McapIndex) -> SplitConnection:
+    schema = index.schemas.get(channel.schema, SchemaRecord("", "", ""))
     ros_version = 1 if channel.encoding == "ros1" or schema.encoding == "ros1msg" else 2
     counts = index.counts
-    return Stream(
+    return SplitConnection(
         key,
         channel.topic,
         schema.name,
@@ -220,135 +244,136 @@ def _stream(key: int, channel: McapChannel, index: McapIndex) -> Stream:
     )
 
 
-def _whole(piece: Piece, data: memoryview) -> _Chunk:
-    return _Chunk(piece, data, np.frombuffer(data, np.uint8), 0, len(data))
+def _decompressed_bytes(extent: Extent) -> int:
+    return max(extent.size, extent.stop - extent.offset)
 
 
-def _wrong_checksum(data: Bytes, head: ChunkHead) -> BagError | None:
-    if not head.crc or (found := zlib.crc32(data.data)) == head.crc:
+def _unchunked(extent: Extent, records: Bytes) -> _Chunk:
+    return _Chunk(extent, memoryview(b""), records, 0, len(records))
+
+
+def _checksum_error(records: Bytes, head: ChunkHead) -> BagError | None:
+    if not head.crc or (checksum := zlib.crc32(records.data)) == head.crc:
         return None
-    return BagError(f"its checksum is {found:08x}, {head.crc:08x} expected")
+    return BagError(f"its checksum is {checksum:08x}, {head.crc:08x} expected")
 
 
-def _cut(raw: memoryview, head: ChunkHead, piece: Piece, loaded: Loaded) -> memoryview:
-    data = inflate_some(raw[head.begin : head.end], head.compression, head.size)
-    reason = f"this chunk is cut off; {len(data)} of its {head.size} bytes could be read"
-    loaded.unreadable.append(UnreadableRange(piece.offset, reason))
-    return memoryview(data)
-
-
-def _whole_chunk(piece: Piece, raw: memoryview, want: Want, err: BagError) -> Iterator[UnreadableRange]:
-    """Yield the unreadable_range of a chunk, by channel where its index says how many messages each had."""
+def _unreadable_chunk(
+    extent: Extent, raw: memoryview, request: ReadRequest, err: BagError
+) -> Iterator[UnreadableRange]:
+    """Yield the unreadable range of a chunk, per channel and with counts if its indexes are readable."""
     reason = f"broken chunk: {err.what}"
-    if not piece.indexes:
-        yield UnreadableRange(piece.offset, reason)
-    for key, offset in piece.index_offsets():
-        if key in want.keys:
+    if not extent.indexes:
+        yield UnreadableRange(extent.offset, reason)
+    for key, offset in extent.index_offsets():
+        if key in request.connections:
             try:
-                count: int | None = len(_entries(raw, piece, key, offset)) // _ENTRY.itemsize
+                count: int | None = len(_index_entries(raw, extent, key, offset)) // _INDEX_ENTRY.itemsize
             except BagError:
                 count = None
-            yield UnreadableRange(piece.offset, reason, connection=key, count=count)
+            yield UnreadableRange(extent.offset, reason, connection=key, count=count)
 
 
-def _entries(raw: memoryview, piece: Piece, key: int, offset: int) -> memoryview:
-    """Return the entries of one message index record, as they stand there.
+def _index_entries(raw: memoryview, extent: Extent, key: int, offset: int) -> memoryview:
+    """Return the entries of one message index record, undecoded.
 
     Raises:
-        BagError: It is not there, or is another's.
+        BagError: There is no such record at the offset.
     """
-    at = offset - piece.offset
-    if not 0 <= at <= len(raw) - RECORD.size - 6:
-        raise BagError(f"the message index of channel {key} lies at {offset}, outside its chunk's stretch")
-    op, _, channel, size = struct.unpack_from("<BQHI", raw, at)
-    begin = at + RECORD.size + 6
-    if op != Op.MESSAGE_INDEX or channel != key or size % _ENTRY.itemsize or begin + size > len(raw):
+    start = offset - extent.offset
+    if not 0 <= start <= len(raw) - RECORD.size - 6:
+        raise BagError(f"the message index of channel {key} is at {offset}, outside its chunk's extent")
+    op, _, channel, size = struct.unpack_from("<BQHI", raw, start)
+    start += RECORD.size + 6
+    if op != Op.MESSAGE_INDEX or channel != key or size % _INDEX_ENTRY.itemsize or start + size > len(raw):
         raise BagError(f"no message index of channel {key} at {offset}")
-    return raw[begin : begin + size]
+    return raw[start : start + size]
 
 
-def _indexed(chunks: Sequence[_Chunk], keys: Collection[int]) -> tuple[Slab, list[tuple[int, slice]]]:
-    """Return the wanted messages that the indexes of all these chunks name, and which of them are of which channel.
+def _indexed_messages(
+    chunks: Sequence[_Chunk], channels: Collection[int]
+) -> tuple[MessageBlock, list[tuple[int, slice]]]:
+    """Return the messages that the chunks' indexes list for some channels, sorted by channel, and each channel's rows.
 
     Raises:
-        BagError: An index record is not there, or an entry does not agree with its record.
+        BagError: An index record is missing, or an entry does not match its message record.
     """
-    named = [
-        (key, number, _entries(chunk.raw, chunk.piece, key, offset))
+    indexes = [
+        (key, number, _index_entries(chunk.raw, chunk.extent, key, offset))
         for number, chunk in enumerate(chunks)
-        for key, offset in chunk.piece.index_offsets()
-        if key in keys
+        for key, offset in chunk.extent.index_offsets()
+        if key in channels
     ]
-    named.sort(key=itemgetter(0))
-    counts = [len(entries) // _ENTRY.itemsize for _, _, entries in named]
-    entries = np.frombuffer(b"".join(entries for _, _, entries in named), _ENTRY)
-    channels = np.repeat(np.array([key for key, _, _ in named], np.uint16), counts)
-    owners = np.repeat(np.array([number for _, number, _ in named], np.int64), counts)
-    slab = _checked(chunks, entries, channels, owners)
-    edges = np.flatnonzero(np.diff(channels.astype(np.int64), prepend=-1, append=-1)).tolist()
-    return slab, [(int(channels[begin]), slice(begin, end)) for begin, end in pairwise(edges)]
+    indexes.sort(key=itemgetter(0))
+    counts = [len(entries) // _INDEX_ENTRY.itemsize for _, _, entries in indexes]
+    entries = np.frombuffer(b"".join(entries for _, _, entries in indexes), _INDEX_ENTRY)
+    keys = np.repeat(np.array([key for key, _, _ in indexes], np.uint16), counts)
+    owners = np.repeat(np.array([number for _, number, _ in indexes], np.int64), counts)
+    block = _checked_messages(chunks, entries, keys, owners)
+    edges = np.flatnonzero(np.diff(keys.astype(np.int64), prepend=-1, append=-1)).tolist()
+    return block, [(int(keys[start]), slice(start, end)) for start, end in pairwise(edges)]
 
 
-def _checked(
-    chunks: Sequence[_Chunk],
-    entries: NDArray[np.void],
-    channels: NDArray[np.uint16],
-    owners: NDArray[np.int64],
-) -> Slab:
-    """Return the messages of all these index entries, checked at once against the records in their chunks.
+def _checked_messages(
+    chunks: Sequence[_Chunk], entries: NDArray[np.void], keys: NDArray[np.uint16], owners: Int64s
+) -> MessageBlock:
+    """Return the messages of index entries, after comparing all entries with the message records.
+
+    `keys` and `owners` are the channel and the chunk of each entry.
 
     Raises:
-        BagError: An entry does not agree with its record.
+        BagError: An entry does not match its message record.
     """
-    records = chunks[0].records
-    begins = np.array([chunk.begin for chunk in chunks], np.int64)[owners]
+    buffer = chunks[0].buffer
+    starts_of = np.array([chunk.start for chunk in chunks], np.int64)[owners]
     ends = np.array([chunk.end for chunk in chunks], np.int64)[owners]
-    room = ends - begins - _HEAD.itemsize
-    if bool((room < 0).any()) or bool((entries["offset"] > room.astype(np.uint64)).any()):
+    last = ends - starts_of - _MESSAGE_HEAD.itemsize
+    if bool((last < 0).any()) or bool((entries["offset"] > last.astype(np.uint64)).any()):
         raise BagError("a message index points outside its chunk")
-    starts = begins + entries["offset"].astype(np.int64)
-    heads = _heads(records, starts)
-    fits = (heads["op"] == Op.MESSAGE) & (heads["channel"] == channels) & (heads["time"] == entries["time"])
-    if not bool((fits & _within(heads, starts, ends)).all()):
+    starts = starts_of + entries["offset"].astype(np.int64)
+    heads = _message_heads(buffer, starts)
+    length = heads["length"]
+    is_valid = (
+        (heads["op"] == Op.MESSAGE)
+        & (heads["channel"] == keys)
+        & (heads["time"] == entries["time"])
+        & (length >= _FIXED_BYTES)
+        & (length <= (ends - RECORD.size - starts).astype(np.uint64))
+    )
+    if not bool(is_valid.all()):
         raise BagError("a message index does not point at its messages")
-    places = np.array([chunk.piece.offset for chunk in chunks], np.int64)[owners]
-    return _slab(records, heads, starts, places)
+    offsets = np.array([chunk.extent.offset for chunk in chunks], np.int64)[owners]
+    return _block(buffer, heads, starts, offsets)
 
 
-def _message_starts(data: memoryview, piece: Piece, loaded: Loaded) -> NDArray[np.int64]:
-    """Return where messages begin, up to the first record that does not fit."""
-    found: list[int] = []
-    at = 0
-    while at < len(data):
-        op, length = RECORD.unpack_from(data, at) if at + RECORD.size <= len(data) else (0, 0)
-        end = at + RECORD.size + length
+def _message_starts(data: memoryview, extent: Extent, result: ReadResult) -> Int64s:
+    """Return the positions of the message records, up to the first invalid record."""
+    starts: list[int] = []
+    position = 0
+    while position < len(data):
+        op, length = RECORD.unpack_from(data, position) if position + RECORD.size <= len(data) else (0, 0)
+        end = position + RECORD.size + length
         if op == 0 or end > len(data):
-            reason = f"no whole record at byte {at} of {len(data)}; the rest is not read"
-            loaded.unreadable.append(UnreadableRange(piece.offset, reason))
+            reason = f"no complete record at byte {position} of {len(data)}; the rest is not read"
+            result.unreadable.append(UnreadableRange(extent.offset, reason))
             break
         if op == Op.MESSAGE and length >= _FIXED_BYTES:
-            found.append(at)
+            starts.append(position)
         elif op == Op.MESSAGE:
-            reason = f"a message record of {length} bytes at byte {at}, too few for its fields"
-            loaded.unreadable.append(UnreadableRange(piece.offset, reason))
-        at = end
-    return np.array(found, np.int64)
+            reason = f"a message record of {length} bytes at byte {position}, too few for its fields"
+            result.unreadable.append(UnreadableRange(extent.offset, reason))
+        position = end
+    return np.array(starts, np.int64)
 
 
-def _heads(records: Bytes, starts: NDArray[np.int64]) -> NDArray[np.void]:
+def _message_heads(records: Bytes, starts: Int64s) -> NDArray[np.void]:
     if not len(starts):
-        return np.empty(0, _HEAD)
-    return stretches(records, starts, _HEAD.itemsize).view(_HEAD).reshape(-1)
+        return np.empty(0, _MESSAGE_HEAD)
+    return fixed_slices(records, starts, _MESSAGE_HEAD.itemsize).view(_MESSAGE_HEAD).reshape(-1)
 
 
-def _within(heads: NDArray[np.void], starts: NDArray[np.int64], ends: NDArray[np.int64]) -> NDArray[np.bool_]:
-    length = heads["length"]
-    return (length >= _FIXED_BYTES) & (length <= (ends - RECORD.size - starts).astype(np.uint64))
-
-
-def _slab(
-    records: Bytes, heads: NDArray[np.void], starts: NDArray[np.int64], offsets: NDArray[np.int64]
-) -> Slab:
-    """Return messages, of any channel, whose records have been checked."""
+def _block(records: Bytes, heads: NDArray[np.void], starts: Int64s, offsets: Int64s) -> MessageBlock:
+    """Return messages of any channels whose records have been checked."""
     lengths = heads["length"].astype(np.int64) - _FIXED_BYTES
-    return Slab(-1, np.ascontiguousarray(heads["time"]), records, starts + _HEAD.itemsize, lengths, offsets)
+    times = np.ascontiguousarray(heads["time"])
+    return MessageBlock(-1, times, records, starts + _MESSAGE_HEAD.itemsize, lengths, offsets)

@@ -1,4 +1,4 @@
-"""This file takes the records of an MCAP file apart, kinds, schemas, channels, chunk heads, and spells new ones."""
+"""The records of an MCAP file: parsing and serialization."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from mosaico_ingest.rosbag.source import Fields
 
 __all__ = [
     "RECORD",
+    "ChannelRecord",
     "ChunkHead",
-    "McapChannel",
     "Op",
-    "Schema",
+    "SchemaRecord",
     "channel_of",
     "chunk_head",
     "record_bytes",
@@ -26,11 +26,11 @@ __all__ = [
 ]
 
 RECORD = struct.Struct("<BQ")
-"""Every record begins with its kind and the number of bytes that follow."""
+"""The head of every record: its kind, and the number of bytes that follow."""
 
 
 class Op:
-    """The kinds of records that matter here, as the MCAP specification numbers them."""
+    """The kinds of records that this package uses, as numbered in the MCAP specification."""
 
     HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
     STATISTICS = 0x0B
@@ -38,16 +38,16 @@ class Op:
     DATA_END = 0x0F
 
 
-class Schema(Struct, frozen=True):
-    """A message type as the file describes it."""
+class SchemaRecord(Struct, frozen=True):
+    """A message type."""
 
     name: str
     encoding: str
     text: str
 
 
-class McapChannel(Struct, frozen=True):
-    """A channel as the file describes it."""
+class ChannelRecord(Struct, frozen=True):
+    """A channel."""
 
     schema: int
     topic: str
@@ -56,71 +56,72 @@ class McapChannel(Struct, frozen=True):
 
 
 class ChunkHead(Struct, frozen=True):
-    """A chunk's own fields; `begin` and `end` bound its data within the bytes it was read from."""
+    """The fields of a chunk record; `start` and `end` bound its data within the bytes that were read."""
 
     start_ns: int
     end_ns: int
     size: int
+    """Decompressed size in bytes."""
     crc: int
     compression: str
-    begin: int
+    start: int
     end: int
 
 
-def schema_of(fields: Fields) -> tuple[int, Schema]:
-    """Return a schema record's id and content."""
-    return fields.u16(), Schema(fields.text(), fields.text(), fields.text())
+def schema_of(fields: Fields) -> tuple[int, SchemaRecord]:
+    """Return the id and content of a schema record."""
+    return fields.u16(), SchemaRecord(fields.text(), fields.text(), fields.text())
 
 
-def channel_of(fields: Fields) -> tuple[int, McapChannel]:
-    """Return a channel record's id and content."""
-    return fields.u16(), McapChannel(fields.u16(), fields.text(), fields.text(), fields.texts())
+def channel_of(fields: Fields) -> tuple[int, ChannelRecord]:
+    """Return the id and content of a channel record."""
+    return fields.u16(), ChannelRecord(fields.u16(), fields.text(), fields.text(), fields.texts())
 
 
-def chunk_head(data: bytes | memoryview, at: int = RECORD.size) -> ChunkHead:
-    """Return a chunk's fields from the bytes of its record; its data may be cut off.
+def chunk_head(data: bytes | memoryview, start: int = RECORD.size) -> ChunkHead:
+    """Return the fields of a chunk record, whose data may be truncated.
 
     Raises:
-        BagError: The record ends within its fields.
+        BagError: The record ends before its data.
     """
-    fields = Fields(data, at)
+    fields = Fields(data, start)
     start_ns, end_ns, size, crc = fields.u64(), fields.u64(), fields.u64(), fields.u32()
     compression = fields.text()
     length = fields.u64()
-    begin = len(data) - fields.left
-    return ChunkHead(start_ns, end_ns, size, crc, compression, begin, begin + length)
+    data_start = len(data) - fields.left
+    return ChunkHead(start_ns, end_ns, size, crc, compression, data_start, data_start + length)
 
 
-def records_in(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yield kind, begin and end of every record's content.
+def records_in(data: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
+    """Yield the kind of each record, and start and end of its content.
 
     Raises:
-        BagError: One does not fit.
+        BagError: A record extends beyond the data.
     """
-    at = 0
-    while at < len(data):
-        if at + RECORD.size > len(data):
-            raise BagError(f"{len(data) - at} bytes left where a record must begin")
-        op, length = RECORD.unpack_from(data, at)
-        at += RECORD.size
-        if length > len(data) - at:
-            raise BagError(f"a record of {length} bytes with {len(data) - at} left")
-        yield op, at, at + length
-        at += length
+    position = 0
+    while position < len(data):
+        if position + RECORD.size > len(data):
+            raise BagError(f"{len(data) - position} bytes left where a record must start")
+        op, length = RECORD.unpack_from(data, position)
+        position += RECORD.size
+        if length > len(data) - position:
+            raise BagError(f"a record of {length} bytes with {len(data) - position} left")
+        yield op, position, position + length
+        position += length
 
 
 def record_bytes(op: int, content: bytes | bytearray) -> bytes:
-    """Return a record of a kind."""
+    """Return a serialized record."""
     return RECORD.pack(op, len(content)) + content
 
 
 def text_bytes(text: str) -> bytes:
-    """Return a text behind its length."""
+    """Return a serialized string: its length in bytes, then UTF-8."""
     data = text.encode()
     return struct.pack("<I", len(data)) + data
 
 
 def texts_bytes(texts: Mapping[str, str]) -> bytes:
-    """Return a map of texts behind its length in bytes."""
+    """Return a serialized map of strings: its length in bytes, then keys and values."""
     data = b"".join(text_bytes(part) for item in texts.items() for part in item)
     return struct.pack("<I", len(data)) + data

@@ -1,4 +1,8 @@
-"""This file reads ROS 1 bags: messages are found through the index records, as arrays, or record by record."""
+"""The reader of ROS 1 bags, version 2.0.
+
+Messages of a chunk are located through its index records, with array operations over all chunks that are read together.
+A chunk whose index is wrong is scanned record by record.
+"""
 
 from __future__ import annotations
 
@@ -11,24 +15,31 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.blocks import (
-    Block,
     Bytes,
     Encoding,
-    Loaded,
-    Slab,
-    Stream,
+    Int64s,
+    MessageBlock,
+    ReadRequest,
+    ReadResult,
+    ReadTask,
+    SplitConnection,
     UnreadableRange,
-    Want,
-    by_key,
-    in_groups,
-    keep,
-    keep_each,
-    orphans,
-    stretches,
+    add_selected,
+    add_selected_rows,
+    fixed_slices,
+    group_by_bytes,
+    rows_by_connection,
+    undescribed_connections,
 )
-from mosaico_ingest.rosbag.compression import Packed, inflate_all, inflate_some
+from mosaico_ingest.rosbag.compression import (
+    MAX_CHUNK_BYTES,
+    CompressedChunk,
+    decompress_chunks,
+    decompress_partially,
+    decompression_groups,
+)
 from mosaico_ingest.rosbag.definitions.model import Embedded
-from mosaico_ingest.rosbag.ros1.index import Piece, Ros1Index, read_index
+from mosaico_ingest.rosbag.ros1.index import Extent, Ros1Index, read_index
 from mosaico_ingest.rosbag.ros1.records import (
     ChunkHead,
     Op,
@@ -40,77 +51,82 @@ from mosaico_ingest.rosbag.ros1.records import (
     time_of,
     times_of,
 )
-from mosaico_ingest.rosbag.source import Source, Stretches
+from mosaico_ingest.rosbag.source import ReadBuffer, Source
 
-__all__ = ["Ros1Part"]
+__all__ = ["Ros1Reader"]
 
-_LAYOUTS = 4
-"""How many different layouts of message headers a connection may have before chunks are read record by record."""
-_CHUNKS = 16
-"""How many chunks are read at once: only they themselves know to what size they inflate."""
+_MAX_LAYOUTS = 4
+"""Maximum number of header layouts per connection; with more, chunks are scanned record by record."""
+_MAX_CHUNKS = 16
+"""Maximum number of chunks per read: their decompressed size is unknown until they are read."""
 
 
 class _Chunk(Struct, frozen=True):
-    """A piece as it was read: its data, and the index records behind it."""
+    """The records of an extent, decompressed."""
 
-    piece: Piece
-    after: memoryview
-    records: Bytes
-    """What all chunks that were read together hold."""
-    begin: int
+    extent: Extent
+    index: memoryview
+    """The index records after the chunk."""
+    buffer: Bytes
+    """The buffer that holds the records of all chunks decompressed together."""
+    start: int
     end: int
 
     @property
     def is_indexed(self) -> bool:
-        """Whether index records say where its messages are."""
-        return self.piece.is_chunk and not self.piece.is_cut
+        """Whether index records locate the messages."""
+        return self.extent.is_chunk and not self.extent.is_truncated
 
     @property
-    def data(self) -> Bytes:
-        """What this one holds."""
-        return self.records[self.begin : self.end]
+    def records(self) -> Bytes:
+        """The records of this chunk."""
+        return self.buffer[self.start : self.end]
 
 
-class Ros1Part:
-    """One `.bag` file, closed properly or not."""
+class Ros1Reader:
+    """The reader of one `.bag` file, which may lack its index or its end."""
 
     container = "ros1"
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: Source, max_chunk_bytes: int = MAX_CHUNK_BYTES) -> None:
         self.path = source.path
         self._source = source
+        self._max_chunk_bytes = max_chunk_bytes
         try:
-            self._index = read_index(self._source)
+            self._index = read_index(source, max_chunk_bytes)
         except BaseException:
             self._source.close()
             raise
-        self._pieces = sorted(self._index.pieces, key=lambda piece: piece.start_ns)
+        self._extents = sorted(self._index.extents, key=lambda extent: extent.start_ns)
         counts: dict[int, int] = {}
-        for piece in self._index.pieces:
-            for key, count in piece.counts.items():
+        for extent in self._index.extents:
+            for key, count in extent.counts.items():
                 counts[key] = counts.get(key, 0) + count
-        filled = [piece for piece in self._index.pieces if piece.counts]
-        self.streams: tuple[Stream, ...] = _streams(self._index, counts)
-        self.start_ns: int | None = min((piece.start_ns for piece in filled), default=None)
-        self.end_ns: int | None = max((piece.end_ns for piece in filled), default=None)
+        filled = [extent for extent in self._index.extents if extent.counts]
+        self.connections: tuple[SplitConnection, ...] = _connections(self._index, counts)
+        self.start_ns: int | None = min((extent.start_ns for extent in filled), default=None)
+        self.end_ns: int | None = max((extent.end_ns for extent in filled), default=None)
         self.message_count: int | None = sum(counts.values())
         self.unreadable: list[UnreadableRange] = [
             *self._index.unreadable,
-            *orphans(counts, self._index.connections),
+            *undescribed_connections(counts, self._index.connections),
         ]
         self.notes: list[str] = source.notes
 
-    def blocks(self, want: Want) -> Iterator[Block]:
-        """Yield the chunks that may hold wanted messages."""
-        keys = frozenset(want.keys)
-        wanted = [
-            piece
-            for piece in self._pieces
-            if piece.is_cut or (want.overlaps(piece.start_ns, piece.end_ns) and piece.counts.keys() & keys)
+    def read_tasks(self, request: ReadRequest) -> Iterator[ReadTask]:
+        """Yield tasks for the chunks that may contain requested messages."""
+        keys = frozenset(request.connections)
+        requested = [
+            extent
+            for extent in self._extents
+            if extent.is_truncated
+            or (request.overlaps(extent.start_ns, extent.end_ns) and extent.counts.keys() & keys)
         ]
-        self._source.prefetch((piece.offset, piece.stop) for piece in wanted)
-        for group in in_groups(wanted, _packed_bytes, want.block_bytes, most=_CHUNKS):
-            yield Block(group[0].start_ns, partial(self._load, group, want))
+        self._source.prefetch((extent.offset, extent.stop) for extent in requested)
+        for group in group_by_bytes(
+            requested, _compressed_bytes, request.block_bytes, max_length=_MAX_CHUNKS
+        ):
+            yield ReadTask(group[0].start_ns, partial(self._load, group, request))
 
     def check_unchanged(self) -> None:
         """See `Source.check_unchanged`."""
@@ -120,46 +136,66 @@ class Ros1Part:
         """Close the file."""
         self._source.close()
 
-    def _load(self, pieces: Sequence[Piece], want: Want) -> Loaded:
-        loaded = Loaded([], [])
-        chunks = self._chunks(pieces, want, loaded)
-        indexed = [chunk for chunk in chunks if chunk.is_indexed]
-        if indexed:
-            _by_index(indexed, want, loaded)
-        for chunk in chunks:
-            if not chunk.is_indexed:
-                _scan(chunk, want, loaded)
-        return loaded
+    def _load(self, extents: Sequence[Extent], request: ReadRequest) -> ReadResult:
+        result = ReadResult([], [])
+        for chunks in self._read_chunks(extents, request, result):
+            indexed = [chunk for chunk in chunks if chunk.is_indexed]
+            if indexed:
+                _add_indexed(indexed, request, result)
+            for chunk in chunks:
+                if not chunk.is_indexed:
+                    _add_scanned(chunk, request, result)
+        return result
 
-    def _chunks(self, pieces: Sequence[Piece], want: Want, loaded: Loaded) -> list[_Chunk]:
-        """Read and inflate; what is whole lies in one buffer, what is broken is among the unreadable."""
-        found: list[_Chunk] = []
-        packed: list[tuple[Piece, memoryview, Packed]] = []
-        stretches = Stretches(self._source, ((piece.offset, piece.stop) for piece in pieces))
-        for piece in pieces:
+    def _read_chunks(
+        self, extents: Sequence[Extent], request: ReadRequest, result: ReadResult
+    ) -> Iterator[list[_Chunk]]:
+        """Read and decompress extents; the indexed chunks of each list share one buffer."""
+        compressed: list[tuple[Extent, memoryview, CompressedChunk]] = []
+        buffer = ReadBuffer(self._source, ((extent.offset, extent.stop) for extent in extents))
+        for extent in extents:
             try:
-                at = stretches.read(piece.offset, piece.stop)
-                raw = stretches.data[at].data
-                head = _head(raw, piece) if piece.is_chunk else None
-                if head is None or piece.is_cut:
-                    found.append(_whole(piece, raw if head is None else _cut(raw, head, piece, loaded)))
+                position = buffer.read(extent.offset, extent.stop)
+                raw = buffer.data[position].data
+                head = _chunk_head(raw, extent) if extent.is_chunk else None
+                if head is None:
+                    yield [_unindexed(extent, np.frombuffer(raw, np.uint8))]
+                elif extent.is_truncated:
+                    yield [self._truncated_chunk(extent, raw, head, result)]
                 else:
-                    where = Packed(at.start + head.begin, at.start + head.end, head.compression, head.size)
-                    packed.append((piece, raw[head.end :], where))
-            except BagError as err:  # noqa: PERF203 - each chunk may fail for itself
-                loaded.unreadable.extend(_broken(piece, want, err))
-        inflated = inflate_all(stretches.data, [where for *_, where in packed])
-        for place, (piece, after, _) in enumerate(packed):
-            if place in inflated.failures:
-                loaded.unreadable.extend(_broken(piece, want, inflated.failures[place]))
-            else:
-                found.append(_Chunk(piece, after, inflated.data, *inflated.places[place]))
-        return found
+                    start, end = position.start + head.start, position.start + head.end
+                    chunk = CompressedChunk(start, end, head.compression, head.size)
+                    compressed.append((extent, raw[head.end :], chunk))
+            except BagError as err:  # noqa: PERF203 - each chunk may be damaged
+                result.unreadable.extend(_unreadable_chunk(extent, request, err))
+        for group in decompression_groups(compressed, lambda item: item[2].size):
+            decompressed = decompress_chunks(
+                buffer.data, [chunk for *_, chunk in group], limit=self._max_chunk_bytes
+            )
+            chunks: list[_Chunk] = []
+            for number_in_group, (extent, index, _) in enumerate(group):
+                if number_in_group in decompressed.errors:
+                    error = decompressed.errors[number_in_group]
+                    result.unreadable.extend(_unreadable_chunk(extent, request, error))
+                else:
+                    bounds = decompressed.bounds[number_in_group]
+                    chunks.append(_Chunk(extent, index, decompressed.data, *bounds))
+            yield chunks
+
+    def _truncated_chunk(
+        self, extent: Extent, raw: memoryview, head: ChunkHead, result: ReadResult
+    ) -> _Chunk:
+        records = decompress_partially(
+            raw[head.start : head.end], head.compression, head.size, limit=self._max_chunk_bytes
+        )
+        reason = f"the chunk is truncated; {len(records)} of its {head.size} bytes could be read"
+        result.unreadable.append(UnreadableRange(extent.offset, reason))
+        return _unindexed(extent, records)
 
 
-def _streams(index: Ros1Index, counts: dict[int, int]) -> tuple[Stream, ...]:
+def _connections(index: Ros1Index, counts: dict[int, int]) -> tuple[SplitConnection, ...]:
     return tuple(
-        Stream(
+        SplitConnection(
             key,
             connection.topic,
             connection.msgtype,
@@ -174,198 +210,192 @@ def _streams(index: Ros1Index, counts: dict[int, int]) -> tuple[Stream, ...]:
     )
 
 
-def _packed_bytes(piece: Piece) -> int:
-    return piece.stop - piece.offset
+def _compressed_bytes(extent: Extent) -> int:
+    return extent.stop - extent.offset
 
 
-def _whole(piece: Piece, data: memoryview) -> _Chunk:
-    return _Chunk(piece, memoryview(b""), np.frombuffer(data, np.uint8), 0, len(data))
+def _unindexed(extent: Extent, records: Bytes) -> _Chunk:
+    return _Chunk(extent, memoryview(b""), records, 0, len(records))
 
 
-def _head(raw: memoryview, piece: Piece) -> ChunkHead:
+def _chunk_head(raw: memoryview, extent: Extent) -> ChunkHead:
     head = chunk_head(raw)
-    if head.end > len(raw) and not piece.is_cut:
-        raise BagError(f"{head.end - head.begin} bytes announced, {len(raw) - head.begin} left")
+    if head.end > len(raw) and not extent.is_truncated:
+        raise BagError(f"{head.end - head.start} bytes announced, {len(raw) - head.start} left")
     return head
 
 
-def _cut(raw: memoryview, head: ChunkHead, piece: Piece, loaded: Loaded) -> memoryview:
-    data = inflate_some(raw[head.begin : head.end], head.compression, head.size)
-    reason = f"this chunk is cut off; {len(data)} of its {head.size} bytes could be read"
-    loaded.unreadable.append(UnreadableRange(piece.offset, reason))
-    return memoryview(data)
+def _unreadable_chunk(extent: Extent, request: ReadRequest, err: BagError) -> Iterator[UnreadableRange]:
+    """Yield the unreadable range of a chunk for each requested connection, with its count."""
+    reason = f"broken chunk: {err.what}"
+    for key in extent.counts.keys() & request.connections:
+        yield UnreadableRange(extent.offset, reason, connection=key, count=extent.counts[key])
 
 
-def _broken(piece: Piece, want: Want, err: BagError) -> Iterator[UnreadableRange]:
-    for key in piece.counts.keys() & want.keys:
-        yield UnreadableRange(
-            piece.offset, f"broken chunk: {err.what}", connection=key, count=piece.counts[key]
-        )
-
-
-def _by_index(chunks: Sequence[_Chunk], want: Want, loaded: Loaded) -> None:
-    """Add the wanted messages that the index records name; a chunk whose index is wrong is scanned."""
+def _add_indexed(chunks: Sequence[_Chunk], request: ReadRequest, result: ReadResult) -> None:
+    """Add the requested messages through the index records; scan chunks whose index is wrong."""
     try:
-        slabs = _indexed(chunks, want.keys)
+        blocks = _indexed_messages(chunks, request.connections)
     except BagError as err:
         if len(chunks) > 1:
             for chunk in chunks:
-                _by_index([chunk], want, loaded)
+                _add_indexed([chunk], request, result)
             return
         reason = f"{err.what}; the chunk was read record by record"
-        loaded.unreadable.append(UnreadableRange(chunks[0].piece.offset, reason, count=0))
-        _scan(chunks[0], want, loaded)
+        result.unreadable.append(UnreadableRange(chunks[0].extent.offset, reason, count=0))
+        _add_scanned(chunks[0], request, result)
         return
-    for slab in slabs:
-        keep(slab, want, loaded)
+    for block in blocks:
+        add_selected(block, request, result)
 
 
-def _indexed(chunks: Sequence[_Chunk], keys: Collection[int]) -> list[Slab]:
-    """Return the wanted messages that the index records behind all these chunks name.
+def _indexed_messages(chunks: Sequence[_Chunk], connections: Collection[int]) -> list[MessageBlock]:
+    """Return the messages that the chunks' index records list for some connections, a block for each.
 
     Raises:
-        BagError: The index does not agree with the records.
+        BagError: The index does not match the message records.
     """
-    records = chunks[0].records
-    begins = np.array([chunk.begin for chunk in chunks], np.int64)
-    ends = np.array([chunk.end for chunk in chunks], np.int64)
-    places = np.array([chunk.piece.offset for chunk in chunks], np.int64)
-    named: dict[int, list[tuple[int, NDArray[np.void]]]] = {}
+    buffer = chunks[0].buffer
+    starts_of = np.array([chunk.start for chunk in chunks], np.int64)
+    ends_of = np.array([chunk.end for chunk in chunks], np.int64)
+    offsets_of = np.array([chunk.extent.offset for chunk in chunks], np.int64)
+    indexes: dict[int, list[tuple[int, NDArray[np.void]]]] = {}
     for owner, chunk in enumerate(chunks):
-        for key, entries in _indexes(chunk, keys).items():
-            named.setdefault(key, []).append((owner, entries))
-    slabs: list[Slab] = []
-    for key, found in named.items():
-        owners = np.repeat([owner for owner, _ in found], [len(entries) for _, entries in found])
-        entries = np.concatenate([entries for _, entries in found])
-        at, times = begins[owners] + entries["offset"].astype(np.int64), times_of(entries)
-        starts, lengths = _located(records, key, at, times, ends[owners])
-        slabs.append(Slab(key, times, records, starts, lengths, places[owners]))
-    return slabs
+        for key, entries in _chunk_indexes(chunk, connections).items():
+            indexes.setdefault(key, []).append((owner, entries))
+    blocks: list[MessageBlock] = []
+    for key, of_chunks in indexes.items():
+        owners = np.repeat([owner for owner, _ in of_chunks], [len(entries) for _, entries in of_chunks])
+        entries = np.concatenate([entries for _, entries in of_chunks])
+        records = starts_of[owners] + entries["offset"].astype(np.int64)
+        times = times_of(entries)
+        starts, lengths = _locate_payloads(buffer, key, records, times, ends_of[owners])
+        blocks.append(MessageBlock(key, times, buffer, starts, lengths, offsets_of[owners]))
+    return blocks
 
 
-def _indexes(chunk: _Chunk, wanted: Collection[int]) -> dict[int, NDArray[np.void]]:
-    """Return the entries of the wanted connections.
+def _chunk_indexes(chunk: _Chunk, connections: Collection[int]) -> dict[int, NDArray[np.void]]:
+    """Return the index entries of a chunk by requested connection.
 
     Raises:
-        BagError: Some are missing, or are not as many as promised.
+        BagError: An index record is missing, or its count differs from that in the bag's index.
     """
-    counts = chunk.piece.counts
-    keys = {key for key, count in counts.items() if count and key in wanted}
-    found: dict[int, NDArray[np.void]] = {}
-    for record in records_in(chunk.after) if keys else ():
+    counts = chunk.extent.counts
+    keys = {key for key, count in counts.items() if count and key in connections}
+    indexes: dict[int, NDArray[np.void]] = {}
+    for record in records_in(chunk.index) if keys else ():
         if record.op == Op.INDEX:
-            key, entries = index_entries(record, chunk.after)
+            key, entries = index_entries(record, chunk.index)
             if key in keys and len(entries) == counts[key]:
-                found[key] = entries
-            if found.keys() == keys:
+                indexes[key] = entries
+            if indexes.keys() == keys:
                 break
-    if found.keys() != keys:
+    if indexes.keys() != keys:
         raise BagError("an index record is missing")
-    return found
+    return indexes
 
 
-def _located(
-    records: Bytes, key: int, at: NDArray[np.int64], times: NDArray[np.int64], ends: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return where the payloads of messages begin and how long they are; those with like headers go together.
+class _HeadLayout(Struct, frozen=True):
+    """The positions of the fields before the payload of a message record, which writers may order freely."""
 
-    Raises:
-        BagError: The index does not agree with the records.
-    """
-    starts, lengths = np.empty_like(at), np.empty_like(at)
-    left = np.arange(len(at))
-    for _ in range(_LAYOUTS):
-        if not len(left):
-            return starts, lengths
-        first = left[0]
-        layout = _layout(records[at[first] : ends[first]])
-        alike, starts[left], lengths[left] = _alike(
-            records, layout, key, at[left], times[left], ends=ends[left]
-        )
-        if not alike[0]:
-            break
-        left = left[~alike]
-    raise BagError("an index record does not point at its messages")
-
-
-def _alike(
-    records: Bytes,
-    layout: _Layout,
-    key: int,
-    at: NDArray[np.int64],
-    times: NDArray[np.int64],
-    *,
-    ends: NDArray[np.int64],
-) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
-    """Return which messages have this layout and are what the index says, their payloads' starts and lengths.
-
-    Raises:
-        BagError: One would lie outside its chunk.
-    """
-    begin = at + layout.skipped
-    if bool((begin > ends - layout.size).any()):
-        raise BagError("an index record points outside its chunk")
-    heads = stretches(records, begin, layout.size)
-    alike = (heads[:, layout.fixed] == heads[0, layout.fixed]).all(axis=1)
-    stamps = _words(heads, layout.time_at, 2).astype(np.int64)
-    lengths = _words(heads, layout.size - 4, 1).astype(np.int64).reshape(-1)
-    alike &= _words(heads, layout.conn_at, 1).reshape(-1) == key
-    alike &= stamps[:, 0] * 1_000_000_000 + stamps[:, 1] == times
-    alike &= begin + layout.size + lengths <= ends
-    return alike, begin + layout.size, lengths
-
-
-def _words(heads: Bytes, at: int, count: int) -> NDArray[np.uint32]:
-    return np.ascontiguousarray(heads[:, at : at + 4 * count]).view("<u4")
-
-
-class _Layout(Struct, frozen=True):
-    """How a message record begins: what lies where before its payload."""
-
-    skipped: int
-    """Bytes of connection records between where the index points and the message."""
+    skipped_bytes: int
+    """Bytes of connection records between the position in the index and the message record."""
     size: int
-    fixed: NDArray[np.bool_]
-    """Which of the bytes are the same in every message of this layout."""
-    conn_at: int
+    """Bytes of the message record before its payload."""
+    is_constant: NDArray[np.bool_]
+    """Which of these bytes are equal in all messages of this layout."""
+    connection_at: int
     time_at: int
 
 
-def _layout(data: Bytes) -> _Layout:
-    """Return the layout of the message that `data` begins with, maybe behind connection records.
+def _locate_payloads(
+    buffer: Bytes, key: int, records: Int64s, times: Int64s, ends: Int64s
+) -> tuple[Int64s, Int64s]:
+    """Return starts and lengths of the payloads of a connection's messages.
+
+    The first message determines a layout of the header; all messages with the same layout are checked together, and
+    the procedure is repeated for the others.
 
     Raises:
-        BagError: None is there.
+        BagError: The index does not match the message records.
     """
-    skipped = 0
+    starts, lengths = np.empty_like(records), np.empty_like(records)
+    remaining = np.arange(len(records))
+    for _ in range(_MAX_LAYOUTS):
+        if not len(remaining):
+            return starts, lengths
+        first = remaining[0]
+        layout = _head_layout(buffer[records[first] : ends[first]])
+        matches, starts[remaining], lengths[remaining] = _match_layout(
+            buffer, layout, key, records[remaining], times[remaining], ends=ends[remaining]
+        )
+        if not matches[0]:
+            break
+        remaining = remaining[~matches]
+    raise BagError("an index record does not point at its messages")
+
+
+def _match_layout(
+    buffer: Bytes, layout: _HeadLayout, key: int, records: Int64s, times: Int64s, *, ends: Int64s
+) -> tuple[NDArray[np.bool_], Int64s, Int64s]:
+    """Return which messages have the layout and match the index, and starts and lengths of their payloads.
+
+    Raises:
+        BagError: A message would be outside its chunk.
+    """
+    heads_at = records + layout.skipped_bytes
+    if bool((heads_at > ends - layout.size).any()):
+        raise BagError("an index record points outside its chunk")
+    heads = fixed_slices(buffer, heads_at, layout.size)
+    matches = (heads[:, layout.is_constant] == heads[0, layout.is_constant]).all(axis=1)
+    stamps = _words(heads, layout.time_at, 2).astype(np.int64)
+    lengths = _words(heads, layout.size - 4, 1).astype(np.int64).reshape(-1)
+    matches &= _words(heads, layout.connection_at, 1).reshape(-1) == key
+    matches &= stamps[:, 0] * 1_000_000_000 + stamps[:, 1] == times
+    matches &= heads_at + layout.size + lengths <= ends
+    return matches, heads_at + layout.size, lengths
+
+
+def _words(heads: Bytes, position: int, count: int) -> NDArray[np.uint32]:
+    return np.ascontiguousarray(heads[:, position : position + 4 * count]).view("<u4")
+
+
+def _head_layout(data: Bytes) -> _HeadLayout:
+    """Return the layout of the first message record in `data`, which connection records may precede.
+
+    Raises:
+        BagError: There is no message record.
+    """
+    skipped_bytes = 0
     for record in records_in(data.data):
         if record.op == Op.MESSAGE:
             break
-        skipped = record.end
+        skipped_bytes = record.end
     else:
         raise BagError("an index record points at no message")
     number(record.header, b"conn", 4)
     time_of(record.header, b"time")
-    head = data[record.at : record.begin].tobytes()
-    conn_at, time_at = head.find(b"conn=") + 5, head.find(b"time=") + 5
-    fixed = np.ones(len(head), np.bool_)
-    for begin, size in ((conn_at, 4), (time_at, 8), (len(head) - 4, 4)):
-        fixed[begin : begin + size] = False
-    return _Layout(skipped, len(head), fixed, conn_at, time_at)
+    head = data[record.offset : record.start].tobytes()
+    connection_at, time_at = head.find(b"conn=") + 5, head.find(b"time=") + 5
+    is_constant = np.ones(len(head), np.bool_)
+    for start, size in ((connection_at, 4), (time_at, 8), (len(head) - 4, 4)):
+        is_constant[start : start + size] = False
+    return _HeadLayout(skipped_bytes, len(head), is_constant, connection_at, time_at)
 
 
-def _scan(chunk: _Chunk, want: Want, loaded: Loaded) -> None:
-    """Add the wanted messages record by record, up to the first that does not fit."""
-    piece, records = chunk.piece, chunk.data
-    found: list[tuple[int, int, int, int, int]] = []
+def _add_scanned(chunk: _Chunk, request: ReadRequest, result: ReadResult) -> None:
+    """Add the requested messages record by record, up to the first invalid record."""
+    extent, data = chunk.extent, chunk.records
+    messages: list[tuple[int, int, int, int, int]] = []
     try:
-        for message in messages_in(records.data):
-            found.append((message.connection, message.time_ns, message.begin, message.end, message.at))  # noqa: PERF401 - what came before an error counts
+        for message in messages_in(data.data):
+            messages.append(  # noqa: PERF401 - messages before an error are used
+                (message.connection, message.time_ns, message.start, message.end, message.offset)
+            )
     except BagError as err:
-        loaded.unreadable.append(UnreadableRange(piece.offset, f"{err.what}; the rest is not read"))
-    columns = np.array(found, np.int64).reshape(-1, 5)
-    keys, times, begins, ends, ats = columns.T
-    offsets = np.full(len(ats), piece.offset, np.int64) if piece.is_chunk else ats + piece.offset
-    wanted = [(key, rows) for key, rows in by_key(keys) if key in want.keys]
-    keep_each(Slab(-1, times, records, begins, ends - begins, offsets), wanted, want, loaded)
+        result.unreadable.append(UnreadableRange(extent.offset, f"{err.what}; the rest is not read"))
+    keys, times, starts, ends, records = np.array(messages, np.int64).reshape(-1, 5).T
+    offsets = np.full(len(records), extent.offset, np.int64) if extent.is_chunk else records + extent.offset
+    requested = [(key, rows) for key, rows in rows_by_connection(keys) if key in request.connections]
+    block = MessageBlock(-1, times, data, starts, ends - starts, offsets)
+    add_selected_rows(block, requested, request, result)

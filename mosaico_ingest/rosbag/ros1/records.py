@@ -1,4 +1,4 @@
-"""This file takes the records of a ROS 1 bag apart, one by one: headers, connections, indexes, chunks."""
+"""The records of a ROS 1 bag: headers, connections, indexes, chunks."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from mosaico_ingest.errors import BagError
 
 __all__ = [
-    "ENTRY",
+    "INDEX_ENTRY",
     "ChunkHead",
-    "Connection",
-    "Message",
+    "ConnectionRecord",
+    "Header",
+    "MessageRecord",
     "Op",
     "Record",
     "chunk_head",
@@ -30,39 +31,41 @@ __all__ = [
     "times_of",
 ]
 
-_HEADER_LIMIT = 16 << 20
-ENTRY = np.dtype([("sec", "<u4"), ("nsec", "<u4"), ("offset", "<u4")])
-"""One entry of an index record: when, and where in the chunk's data."""
+_MAX_HEADER_BYTES = 1 << 20
+INDEX_ENTRY = np.dtype([("sec", "<u4"), ("nsec", "<u4"), ("offset", "<u4")])
+"""One entry of an index record: log time, and offset in the chunk's data."""
 Header = Mapping[bytes, bytes]
 
 
 class Op:
-    """The kinds of records, as the bag format numbers them."""
+    """The kinds of records, as numbered in the bag format."""
 
     MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 
 
 class Record(Struct, frozen=True):
-    """Where a record's data are, and what its header says."""
+    """The header of a record, and the positions of the record and of its data."""
 
     op: int
     header: Header
-    at: int
-    begin: int
+    offset: int
+    """Position of the record."""
+    start: int
     end: int
+    """Start and end of the data, which is the end of the record as well."""
 
 
-class Message(Struct, frozen=True):
-    """A message record as the slow way finds it."""
+class MessageRecord(Struct, frozen=True):
+    """A message record; the positions are those of `Record`."""
 
     connection: int
     time_ns: int
-    at: int
-    begin: int
+    offset: int
+    start: int
     end: int
 
 
-class Connection(Struct, frozen=True):
+class ConnectionRecord(Struct, frozen=True):
     """A connection as the file describes it."""
 
     topic: str
@@ -72,89 +75,90 @@ class Connection(Struct, frozen=True):
 
 
 class ChunkHead(Struct, frozen=True):
-    """A chunk's own fields; `begin` and `end` bound its data within the bytes it was read from."""
+    """The fields of a chunk record; `start` and `end` bound its data within the bytes that were read."""
 
     compression: str
     size: int
-    begin: int
+    """Decompressed size in bytes."""
+    start: int
     end: int
 
 
-class Peeking(Protocol):
-    """Anything that can be looked at by position."""
+class Peekable(Protocol):
+    """A source of bytes with random access."""
 
     def peek(self, offset: int, size: int) -> bytes:
-        """Return up to `size` bytes, fewer at the end."""
+        """Return up to `size` bytes; fewer at the end."""
         ...
 
 
 def number(header: Header, name: bytes, size: int) -> int:
-    """Return a little-endian number of a record's header.
+    """Return a little-endian number of `size` bytes from a header.
 
     Raises:
-        BagError: It is missing or of another size.
+        BagError: The field is missing or has another size.
     """
     value = header.get(name)
     if value is None or len(value) != size:
-        raise BagError(f"a record without {name.decode()}, or with one that has not {size} bytes")
+        raise BagError(f"a record without a field {name.decode()} of {size} bytes")
     return int.from_bytes(value, "little")
 
 
 def time_of(header: Header, name: bytes) -> int:
-    """Return a time of a record's header, ns since the epoch."""
+    """Return a time from a header, nanoseconds since the epoch."""
     both = number(header, name, 8)
     return (both & 0xFFFFFFFF) * 1_000_000_000 + (both >> 32)
 
 
 def times_of(entries: NDArray[np.void]) -> NDArray[np.int64]:
-    """Return the times of index entries, ns since the epoch."""
+    """Return the log times of index entries, nanoseconds since the epoch."""
     return entries["sec"].astype(np.int64) * 1_000_000_000 + entries["nsec"]
 
 
 def header_of(data: bytes) -> dict[bytes, bytes]:
-    """Return a record header's fields.
+    """Return the fields of a record header.
 
     Raises:
-        BagError: They do not fit.
+        BagError: A field extends beyond the header.
     """
-    found: dict[bytes, bytes] = {}
-    at = 0
-    while at < len(data):
-        size = int.from_bytes(data[at : at + 4], "little")
-        entry = data[at + 4 : at + 4 + size]
+    fields: dict[bytes, bytes] = {}
+    position = 0
+    while position < len(data):
+        size = int.from_bytes(data[position : position + 4], "little")
+        entry = data[position + 4 : position + 4 + size]
         name, equals, value = entry.partition(b"=")
-        if at + 4 + size > len(data) or not equals:
-            raise BagError("a record header whose fields do not fit")
-        found[name] = value
-        at += 4 + size
-    return found
+        if position + 4 + size > len(data) or not equals:
+            raise BagError("a record header with invalid fields")
+        fields[name] = value
+        position += 4 + size
+    return fields
 
 
-def record_at(window: Peeking, at: int, stop: int) -> Record:
-    """Return the record that begins at `at`.
+def record_at(window: Peekable, offset: int, stop: int) -> Record:
+    """Return the record at `offset`.
 
     Raises:
-        BagError: No whole record is there.
+        BagError: There is no complete record before `stop`.
     """
-    size = _length(window, at, stop)
-    if size > _HEADER_LIMIT:
-        raise BagError(f"a record header of {size} bytes at {at}")
-    header = header_of(window.peek(at + 4, size))
-    begin = at + 4 + size + 4
-    end = begin + _length(window, begin - 4, stop)
-    return Record(number(header, b"op", 1), header, at, begin, end)
+    size = _length(window, offset, stop)
+    if size > _MAX_HEADER_BYTES:
+        raise BagError(f"a record header of {size} bytes at {offset}")
+    header = header_of(window.peek(offset + 4, size))
+    start = offset + 4 + size + 4
+    end = start + _length(window, start - 4, stop)
+    return Record(number(header, b"op", 1), header, offset, start, end)
 
 
-def _length(window: Peeking, at: int, stop: int) -> int:
-    data = window.peek(at, 4)
+def _length(window: Peekable, offset: int, stop: int) -> int:
+    data = window.peek(offset, 4)
     size = int.from_bytes(data, "little")
-    if len(data) < 4 or at + 4 + size > stop:  # noqa: PLR2004 - a length word
-        raise BagError(f"a record of {size} bytes at {at} where {max(stop - at, 0)} are left")
+    if len(data) < 4 or offset + 4 + size > stop:  # noqa: PLR2004 - a length word
+        raise BagError(f"a record of {size} bytes at {offset} where {max(stop - offset, 0)} are left")
     return size
 
 
 class _Memory:
-    """Bytes that are looked at as a file is."""
+    """Bytes in memory as a `Peekable`."""
 
     def __init__(self, data: bytes | memoryview) -> None:
         self._data = memoryview(data)
@@ -167,76 +171,72 @@ def records_in(data: bytes | memoryview) -> Iterator[Record]:
     """Yield the records in some bytes.
 
     Raises:
-        BagError: One does not fit.
+        BagError: A record is invalid.
     """
     memory = _Memory(data)
-    at = 0
-    while at < len(data):
-        record = record_at(memory, at, len(data))
+    offset = 0
+    while offset < len(data):
+        record = record_at(memory, offset, len(data))
         yield record
-        at = record.end
+        offset = record.end
 
 
 def messages_in(
-    data: bytes | memoryview, connections: dict[int, Connection] | None = None
-) -> Iterator[Message]:
-    """Yield the messages in a chunk's data, and add the connections that are described between them.
+    data: bytes | memoryview, connections: dict[int, ConnectionRecord] | None = None
+) -> Iterator[MessageRecord]:
+    """Yield the messages in a chunk's data, and add the connection records between them to `connections`.
 
     Raises:
-        BagError: A record does not fit.
+        BagError: A record is invalid.
     """
     for record in records_in(data):
         if record.op == Op.MESSAGE:
             key, time_ns = number(record.header, b"conn", 4), time_of(record.header, b"time")
-            yield Message(key, time_ns, record.at, record.begin, record.end)
+            yield MessageRecord(key, time_ns, record.offset, record.start, record.end)
         elif record.op == Op.CONNECTION and connections is not None:
             key = number(record.header, b"conn", 4)
-            connections.setdefault(key, connection_of(record, bytes(data[record.begin : record.end])))
+            connections.setdefault(key, connection_of(record, bytes(data[record.start : record.end])))
 
 
-def connection_of(record: Record, data: bytes) -> Connection:
-    """Return what a connection record says."""
-    about = {name: value.decode("utf-8", "replace") for name, value in header_of(data).items()}
+def connection_of(record: Record, data: bytes) -> ConnectionRecord:
+    """Return the content of a connection record."""
+    fields = {name: value.decode("utf-8", "replace") for name, value in header_of(data).items()}
     topic = record.header.get(b"topic", b"").decode("utf-8", "replace")
     attributes = {
         name.decode("ascii", "replace"): value
-        for name, value in about.items()
+        for name, value in fields.items()
         if name in (b"callerid", b"md5sum", b"latching")
     }
-    return Connection(
-        re.sub("/+", "/", topic), about.get(b"type", ""), about.get(b"message_definition", ""), attributes
+    return ConnectionRecord(
+        re.sub("/+", "/", topic), fields.get(b"type", ""), fields.get(b"message_definition", ""), attributes
     )
 
 
 def index_entries(record: Record, data: bytes | memoryview) -> tuple[int, NDArray[np.void]]:
-    """Return an index record's connection and entries.
+    """Return the connection and the entries of an index record.
 
     Raises:
-        BagError: It is of another version, or its size does not fit its count.
+        BagError: The record has another version, or its size does not match its count.
     """
     if number(record.header, b"ver", 4) != 1:
         raise BagError("an index record of another version than 1")
     count = number(record.header, b"count", 4)
-    if count * ENTRY.itemsize != record.end - record.begin:
-        raise BagError(f"an index record of {record.end - record.begin} bytes for {count} messages")
-    return number(record.header, b"conn", 4), np.frombuffer(data[record.begin : record.end], ENTRY)
+    if count * INDEX_ENTRY.itemsize != record.end - record.start:
+        raise BagError(f"an index record of {record.end - record.start} bytes for {count} messages")
+    return number(record.header, b"conn", 4), np.frombuffer(data[record.start : record.end], INDEX_ENTRY)
 
 
 def chunk_head(raw: bytes | memoryview) -> ChunkHead:
-    """Return the fields of the chunk record that `raw` begins with; its data may be cut off.
+    """Return the fields of the chunk record at the start of `raw`; its data may be truncated.
 
     Raises:
-        BagError: It is no chunk record.
+        BagError: It is not a chunk record.
     """
     size = _length(_Memory(raw), 0, len(raw) - 4)
     header = header_of(bytes(raw[4 : 4 + size]))
     if number(header, b"op", 1) != Op.CHUNK:
         raise BagError("no chunk record")
-    begin = 4 + size + 4
+    start = 4 + size + 4
     compression = header.get(b"compression", b"none").decode("ascii", "replace")
-    return ChunkHead(
-        compression,
-        number(header, b"size", 4),
-        begin,
-        begin + int.from_bytes(raw[begin - 4 : begin], "little"),
-    )
+    end = start + int.from_bytes(raw[start - 4 : start], "little")
+    return ChunkHead(compression, number(header, b"size", 4), start, end)

@@ -1,6 +1,6 @@
-"""This file reads ROS bags of version 1.2, as ROS wrote them until 2010: records one after the other, without chunks.
+"""The reader of ROS 1 bags, version 1.2, which ROS wrote until 2010: a sequence of records without chunks.
 
-Their index, where there is one, is not used: it names messages only, and every record says itself what it is.
+The reader ignores the index of such bags: it lists messages only, and every record describes itself.
 """
 
 from __future__ import annotations
@@ -15,36 +15,32 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.blocks import (
-    Block,
     Encoding,
-    Loaded,
-    Slab,
-    Stream,
+    Int64s,
+    MessageBlock,
+    ReadRequest,
+    ReadResult,
+    ReadTask,
+    SplitConnection,
     UnreadableRange,
-    Want,
-    by_key,
-    keep_each,
+    add_selected_rows,
+    rows_by_connection,
 )
 from mosaico_ingest.rosbag.definitions.model import Embedded
 from mosaico_ingest.rosbag.formats import ROSRECORD
-from mosaico_ingest.rosbag.recovery import next_ros1_message
-from mosaico_ingest.rosbag.ros1.records import (
-    Header,
-    Record,
-    number,
-    record_at,
-)
+from mosaico_ingest.rosbag.recovery import find_ros1_message
+from mosaico_ingest.rosbag.ros1.records import Header, Record, number, record_at
 from mosaico_ingest.rosbag.source import Source, Window
 
-__all__ = ["RosrecordPart"]
+__all__ = ["RosrecordReader"]
 
 _DEFINITION, _MESSAGE, _FILE = 1, 2, 3
 _RUN_BYTES = 4 << 20
-"""How much of the file is read at once."""
+"""Bytes of the file per read."""
 
 
-class _Name(Struct, frozen=True):
-    """What a message says about itself; each is a stream of its own."""
+class _ConnectionKey(Struct, frozen=True):
+    """The fields of a message record that identify its connection."""
 
     topic: str
     msgtype: str
@@ -52,17 +48,19 @@ class _Name(Struct, frozen=True):
 
 
 class _Run(Struct, frozen=True):
-    """Messages that are read at once: their streams, times, and where they and their payloads lie."""
+    """Consecutive messages that are read together; shapes (n,)."""
 
-    keys: NDArray[np.int64]
-    times: NDArray[np.int64]
-    ats: NDArray[np.int64]
-    begins: NDArray[np.int64]
-    ends: NDArray[np.int64]
+    connections: Int64s
+    times: Int64s
+    offsets: Int64s
+    """File offsets of the records."""
+    starts: Int64s
+    ends: Int64s
+    """File offsets of start and end of the payloads."""
 
 
-class RosrecordPart:
-    """One `.bag` file of version 1.2, closed properly or not."""
+class RosrecordReader:
+    """The reader of one `.bag` file of version 1.2, which may lack its index or its end."""
 
     container = "ros1"
 
@@ -72,25 +70,29 @@ class RosrecordPart:
         self.notes: list[str] = source.notes
         try:
             walk = _Walk(source)
-            walk.over()
+            walk.run()
         except BaseException:
             source.close()
             raise
-        self.notes.append("a bag of version 1.2, read record by record; `rosbag fix` makes it one of 2.0")
+        self.notes.append(
+            "a bag of version 1.2, read record by record; `rosbag fix` converts it to version 2.0"
+        )
         self.unreadable: list[UnreadableRange] = walk.unreadable
-        found = np.frombuffer(walk.messages, np.int64).reshape(-1, 5)
-        self._runs = sorted(_runs(found), key=lambda run: int(run.times.min()))
-        self.streams: tuple[Stream, ...] = walk.streams(np.bincount(found[:, 0], minlength=len(walk.keys)))
-        self.message_count: int | None = len(found)
-        self.start_ns: int | None = int(found[:, 1].min()) if len(found) else None
-        self.end_ns: int | None = int(found[:, 1].max()) if len(found) else None
+        messages = np.frombuffer(walk.messages, np.int64).reshape(-1, 5)
+        self._runs = sorted(_runs(messages), key=lambda run: int(run.times.min()))
+        counts = np.bincount(messages[:, 0], minlength=len(walk.ids))
+        self.connections: tuple[SplitConnection, ...] = walk.connections(counts)
+        self.message_count: int | None = len(messages)
+        self.start_ns: int | None = int(messages[:, 1].min()) if len(messages) else None
+        self.end_ns: int | None = int(messages[:, 1].max()) if len(messages) else None
 
-    def blocks(self, want: Want) -> Iterator[Block]:
-        """Yield the stretches of the file that hold wanted messages."""
-        keys = np.array(list(want.keys), np.int64)
+    def read_tasks(self, request: ReadRequest) -> Iterator[ReadTask]:
+        """Yield tasks for the ranges of the file that contain requested messages."""
+        keys = np.array(list(request.connections), np.int64)
         for run in self._runs:
-            if want.overlaps(int(run.times.min()), int(run.times.max())) and np.isin(run.keys, keys).any():
-                yield Block(int(run.times.min()), partial(self._load, run, want))
+            first, last = int(run.times.min()), int(run.times.max())
+            if request.overlaps(first, last) and np.isin(run.connections, keys).any():
+                yield ReadTask(first, partial(self._load, run, request))
 
     def check_unchanged(self) -> None:
         """See `Source.check_unchanged`."""
@@ -100,117 +102,121 @@ class RosrecordPart:
         """Close the file."""
         self._source.close()
 
-    def _load(self, run: _Run, want: Want) -> Loaded:
-        loaded = Loaded([], [])
-        wanted = [(key, rows) for key, rows in by_key(run.keys) if key in want.keys]
-        begin = int(run.ats[0])
+    def _load(self, run: _Run, request: ReadRequest) -> ReadResult:
+        result = ReadResult([], [])
+        requested = [
+            (key, rows) for key, rows in rows_by_connection(run.connections) if key in request.connections
+        ]
+        start = int(run.offsets[0])
         try:
-            data = self._source.read(begin, int(run.ends[-1]) - begin)
+            data = self._source.read(start, int(run.ends[-1]) - start)
         except BagError as err:
-            loaded.unreadable.extend(
-                UnreadableRange(begin, err.what, connection=key, count=len(rows)) for key, rows in wanted
+            result.unreadable.extend(
+                UnreadableRange(start, err.what, connection=key, count=len(rows)) for key, rows in requested
             )
-            return loaded
-        lengths = run.ends - run.begins
-        whole = Slab(-1, run.times, np.frombuffer(data, np.uint8), run.begins - begin, lengths, run.ats)
-        keep_each(whole, wanted, want, loaded)
-        return loaded
+            return result
+        lengths = run.ends - run.starts
+        buffer = np.frombuffer(data, np.uint8)
+        block = MessageBlock(-1, run.times, buffer, run.starts - start, lengths, run.offsets)
+        add_selected_rows(block, requested, request, result)
+        return result
 
 
-def _runs(found: NDArray[np.int64]) -> Iterator[_Run]:
-    """Cut the messages, in their order in the file, into stretches of it."""
-    keys, times, ats, begins, ends = np.ascontiguousarray(found.T)
+def _runs(messages: Int64s) -> Iterator[_Run]:
+    """Split the messages, in file order, into runs of about `_RUN_BYTES`."""
+    connections, times, offsets, starts, ends = np.ascontiguousarray(messages.T)
     first = 0
-    while first < len(found):
-        last = max(int(np.searchsorted(ends, ats[first] + _RUN_BYTES, side="right")), first + 1)
-        part = slice(first, last)
-        yield _Run(keys[part], times[part], ats[part], begins[part], ends[part])
+    while first < len(messages):
+        last = max(int(np.searchsorted(ends, offsets[first] + _RUN_BYTES, side="right")), first + 1)
+        rows = slice(first, last)
+        yield _Run(connections[rows], times[rows], offsets[rows], starts[rows], ends[rows])
         first = last
 
 
 class _Walk:
-    """Goes from record to record and writes down what is there."""
+    """Visits record after record and collects messages and definitions."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
-        self.keys: dict[_Name, int] = {}
-        self._known: dict[tuple[bytes | None, ...], int] = {}
-        """The keys by what stands in the records, which need not be decoded for each."""
-        self._texts: dict[_Name, str] = {}
+        self.ids: dict[_ConnectionKey, int] = {}
+        self._ids_of_fields: dict[tuple[bytes | None, ...], int] = {}
+        """Caches ids by the undecoded fields."""
+        self._definitions: dict[_ConnectionKey, str] = {}
         self._latched = set[int]()
         self._index_at: int | None = None
         self.messages = array("q")
-        """Of each its stream, time, record, and where its payload begins and ends."""
+        """Connection, log time, offset of the record, start and end of the payload of each message."""
         self.unreadable: list[UnreadableRange] = []
 
-    def over(self) -> None:
-        """Look at every record; where one does not fit, go on at the next message."""
+    def run(self) -> None:
+        """Visit every record; after an invalid record, continue with the next message."""
         source, stop = self._source, self._source.size
         source.fetch_whole()
         window = Window(source)
         line = window.peek(0, len(ROSRECORD) + 2)
-        at = len(line) - len(line[len(ROSRECORD) :].lstrip(b"\r\n"))
-        while at < stop:
-            at = self._step(window, at, stop)
+        position = len(line) - len(line[len(ROSRECORD) :].lstrip(b"\r\n"))
+        while position < stop:
+            position = self._step(window, position, stop)
         if self._index_at == 0:
             self.unreadable.append(UnreadableRange(stop, "the bag was not closed", count=0))
         elif self._index_at and self._index_at >= stop:
-            self.unreadable.append(
-                UnreadableRange(stop, f"cut off: its index would begin at {self._index_at}")
-            )
+            reason = f"the file is truncated: its index would start at {self._index_at}"
+            self.unreadable.append(UnreadableRange(stop, reason))
 
-    def _step(self, window: Window, at: int, stop: int) -> int:
+    def _step(self, window: Window, position: int, stop: int) -> int:
         try:
-            record = record_at(window, at, stop)
-            self._record(record)
+            record = record_at(window, position, stop)
+            self._add_record(record)
         except BagError as err:
-            resumed = next_ros1_message(self._source, at + 1, stop) or stop
-            self.unreadable.append(UnreadableRange(at, f"{err.what}; {resumed - at} bytes are not read"))
-            return resumed
+            resume_at = find_ros1_message(self._source, position + 1, stop) or stop
+            reason = f"{err.what}; {resume_at - position} bytes are not read"
+            self.unreadable.append(UnreadableRange(position, reason))
+            return resume_at
         return record.end
 
-    def _record(self, record: Record) -> None:
+    def _add_record(self, record: Record) -> None:
         if record.op == _DEFINITION:
-            self._texts.setdefault(_name(record.header), _text(record.header, b"def"))
+            self._definitions.setdefault(_key(record.header), _text(record.header, b"def"))
         elif record.op == _FILE:
             self._index_at = number(record.header, b"index_pos", 8)
         elif record.op == _MESSAGE:
-            seconds, rest = number(record.header, b"sec", 4), number(record.header, b"nsec", 4)
-            key = self._key(record.header)
+            seconds, nanoseconds = number(record.header, b"sec", 4), number(record.header, b"nsec", 4)
+            connection = self._connection_id(record.header)
             if record.header.get(b"latching") in {b"1", b"\1"}:
-                self._latched.add(key)
-            time_ns = seconds * 1_000_000_000 + rest
-            self.messages.extend((key, time_ns, record.at, record.begin, record.end))
+                self._latched.add(connection)
+            time_ns = seconds * 1_000_000_000 + nanoseconds
+            self.messages.extend((connection, time_ns, record.offset, record.start, record.end))
 
-    def _key(self, header: Header) -> int:
-        raw = header.get(b"topic"), header.get(b"type"), header.get(b"md5")
-        key = self._known.get(raw)
-        if key is None:
-            key = self._known[raw] = self.keys.setdefault(_name(header), len(self.keys))
-        return key
+    def _connection_id(self, header: Header) -> int:
+        fields = header.get(b"topic"), header.get(b"type"), header.get(b"md5")
+        connection = self._ids_of_fields.get(fields)
+        if connection is None:
+            connection = self.ids.setdefault(_key(header), len(self.ids))
+            self._ids_of_fields[fields] = connection
+        return connection
 
-    def streams(self, counts: NDArray[np.intp]) -> tuple[Stream, ...]:
-        """Return the streams; a message without a definition of its topic has that of another of its type."""
-        by_type = {(name.msgtype, name.md5sum): text for name, text in self._texts.items()}
+    def connections(self, counts: NDArray[np.intp]) -> tuple[SplitConnection, ...]:
+        """Return the connections; without a definition of its own, one uses that of another topic of its type."""
+        by_type = {(key.msgtype, key.md5sum): text for key, text in self._definitions.items()}
         return tuple(
-            Stream(
-                key,
-                name.topic,
-                name.msgtype,
+            SplitConnection(
+                number,
+                key.topic,
+                key.msgtype,
                 Encoding.ROS1,
                 1,
                 None if text is None else Embedded("ros1msg", text),
-                int(counts[key]),
-                latched=key in self._latched,
-                attributes={"encoding": "ros1", "md5sum": name.md5sum},
+                int(counts[number]),
+                latched=number in self._latched,
+                attributes={"encoding": "ros1", "md5sum": key.md5sum},
             )
-            for name, key in self.keys.items()
-            for text in [self._texts.get(name, by_type.get((name.msgtype, name.md5sum)))]
+            for key, number in self.ids.items()
+            for text in [self._definitions.get(key, by_type.get((key.msgtype, key.md5sum)))]
         )
 
 
-def _name(header: Header) -> _Name:
-    return _Name(_text(header, b"topic"), _text(header, b"type"), _text(header, b"md5"))
+def _key(header: Header) -> _ConnectionKey:
+    return _ConnectionKey(_text(header, b"topic"), _text(header, b"type"), _text(header, b"md5"))
 
 
 def _text(header: Header, name: bytes) -> str:
