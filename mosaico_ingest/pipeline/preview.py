@@ -205,7 +205,7 @@ def _look(
         tuple(trials),
         start_ns=plan.read_from_ns,
         end_ns=plan.read_until_ns,
-        rows=MESSAGES,
+        max_rows=MESSAGES,
         memory_bytes=_MEMORY_BYTES,
     )
     for batch in batches:

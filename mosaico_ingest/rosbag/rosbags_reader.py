@@ -94,7 +94,7 @@ class RosbagsRecording:
                 message = self._reader.deserialize(payload, msgtype)
                 return _to_dict(message, msgtype, self._reader.typestore.fielddefs)
             except _ERRORS as error:
-                raise DecodeError(f"rosbags: {error}", rule="rosbags", where=msgtype) from error
+                raise DecodeError(f"rosbags: {error}", rule="decode", where=msgtype) from error
 
         return deserialize
 

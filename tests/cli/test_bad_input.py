@@ -208,7 +208,7 @@ def test_what_a_damaged_recording_lost_is_said_once_with_its_place(ingest: Inges
     code, out, err = ingest("bag", "cut.mcap", "--name", "cut")
     assert code == 4
     assert err.count("without a footer") == 1
-    assert "unreadable: at 43: this chunk is cut off" in err
+    assert "unreadable: at 43: the chunk is truncated" in err
     assert ", some unreadable, " in out
 
 

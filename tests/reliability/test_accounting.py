@@ -88,7 +88,7 @@ def test_the_sums_of_a_damaged_recording_hold(tmp_path: Path) -> None:
     bag.write_bytes(data)
     (report,) = api.run([ROSInjectionConfig(bag, "drive", store=tmp_path / "store")]).recordings
     assert (report.status, report.exit_code) == (RunStatus.REJECTED, 4)
-    assert report.unreadable
+    assert report.unreadable_ranges
     taken = [topic for topic in report.topics if topic.promised is not None]
     assert sum(topic.unreadable for topic in taken) > 0
     for topic in taken:
@@ -125,7 +125,7 @@ def test_messages_of_a_type_nobody_defines_are_lost_and_not_left_out_on_purpose(
     ]
     assert [
         (unreadable_range.topic, unreadable_range.count, unreadable_range.reason)
-        for unreadable_range in report.unreadable
+        for unreadable_range in report.unreadable_ranges
     ] == [("/own", 3, "no definition of own_msgs/msg/Thing can be used")]
     (chosen,) = api.run([replace(config, sequence_name="chosen", topics=("!/own",))]).recordings
     assert chosen.exit_code == 0

@@ -98,7 +98,7 @@ def test_nothing_but_bad_parts_is_one_error(
         assert code == 1, arguments
         (line,) = [line for line in err.splitlines() if line.startswith("error: ")]
         assert "part_0.db3" in line
-        assert "2 other parts" in line
+        assert "other 2 splits" in line
     assert not (tmp_path / "store").exists() or Store.open(tmp_path / "store").names() == ()
 
 

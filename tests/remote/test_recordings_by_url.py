@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 import zstandard
 from made_recordings import define, record
-from mosaico_ingest.job.model import SessionLevelErrorPolicy
 from object_store import Counts, ObjectStore, object_store
 
 from mosaico_ingest import api
@@ -19,6 +18,7 @@ from mosaico_ingest.errors import BagError, NothingMatched, Unreachable
 from mosaico_ingest.findings import Severity
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.manifest import load_manifest
+from mosaico_ingest.job.values import SessionLevelErrorPolicy
 from mosaico_ingest.pipeline.compile import compile_manifest, find_recordings
 from mosaico_ingest.remote import AnyPath, RemotePath, as_path
 from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry, TypeResolver

@@ -118,7 +118,10 @@ def test_a_definition_of_another_hash_is_not_used(tmp_path: Path) -> None:
         (channel,) = opened(path, TypeResolver(Stores.ROS2_JAZZY)).connections
         assert channel.definition is None
         assert channel.problem
-        assert f"another definition of {name} is known: the recording's is {other}" in channel.problem
+        assert (
+            f"the known definition of {name} differs from the recorded one: the recording's is {other}"
+            in channel.problem
+        )
         (channel,) = opened(path, TypeResolver(types={name: "string data"})).connections
         assert channel.definition, "what the job says about its own recording is believed"
 
