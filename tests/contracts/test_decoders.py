@@ -63,7 +63,7 @@ def payloads_of(encoding: Encoding, count: int) -> list[bytes]:
     return [serializer.from_dict(joint_state(encoding, number)) for number in range(count)]
 
 
-def test_rows_are_the_messages_in_the_ros_shape(make: MakeDecoder, encoding: Encoding) -> None:
+def test_decoder_returns_messages_in_the_ros_shape(make: MakeDecoder, encoding: Encoding) -> None:
     decoder = make(CASES[encoding], encoding)
     decoded = decoder.decode(batch_of(payloads_of(encoding, 40), encoding))
     assert decoder.shape == ros_shape(CASES[encoding]) == decoded.rows.type
@@ -71,14 +71,14 @@ def test_rows_are_the_messages_in_the_ros_shape(make: MakeDecoder, encoding: Enc
     assert decoded.rows.null_count == 0
 
 
-def test_the_index_names_the_message_of_every_row(make: MakeDecoder, encoding: Encoding) -> None:
+def test_decoder_index_gives_the_message_of_every_row(make: MakeDecoder, encoding: Encoding) -> None:
     decoded = make(CASES[encoding], encoding).decode(batch_of(payloads_of(encoding, 5), encoding))
     assert decoded.index.dtype == np.int64
     assert decoded.index.tolist() == [0, 1, 2, 3, 4]
     assert decoded.failures == ()
 
 
-def test_a_bad_message_costs_its_row_and_no_other(make: MakeDecoder, encoding: Encoding) -> None:
+def test_decoder_bad_message_rejects_only_its_row(make: MakeDecoder, encoding: Encoding) -> None:
     payloads = payloads_of(encoding, 30)
     payloads[11] = payloads[11][:-3]
     payloads[20] = b""
@@ -91,7 +91,7 @@ def test_a_bad_message_costs_its_row_and_no_other(make: MakeDecoder, encoding: E
     ] == decoded.index.tolist()
 
 
-def test_rows_and_failures_account_for_every_message_of_noise(make: MakeDecoder, encoding: Encoding) -> None:
+def test_decoder_random_bytes_give_a_row_or_a_failure_each(make: MakeDecoder, encoding: Encoding) -> None:
     random = np.random.default_rng(5)
     payloads = [random.bytes(int(random.integers(0, 80))) for _ in range(200)]
     decoded = make(CASES[encoding], encoding).decode(batch_of(payloads, encoding))
@@ -102,7 +102,7 @@ def test_rows_and_failures_account_for_every_message_of_noise(make: MakeDecoder,
     decoded.rows.validate(full=True)
 
 
-def test_no_message_gives_no_row(make: MakeDecoder, encoding: Encoding) -> None:
+def test_decoder_empty_block_gives_no_rows(make: MakeDecoder, encoding: Encoding) -> None:
     decoded = make(CASES[encoding], encoding).decode(batch_of([], encoding))
     assert len(decoded.rows) == len(decoded.index) == len(decoded.failures) == 0
     assert isinstance(decoded.rows, pa.StructArray)

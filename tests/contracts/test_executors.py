@@ -148,7 +148,7 @@ def elsewhere(request: pytest.FixtureRequest, killed_once: Path) -> Executor:
     return _executor(request)
 
 
-def test_reports_come_in_order_and_the_sequences_are_there(executor: Executor, tmp_path: Path) -> None:
+def test_executor_returns_reports_in_order_and_stores_sequences(executor: Executor, tmp_path: Path) -> None:
     reports = list(executor.map(configs(tmp_path, "abcde"), ignore_batch))
     assert [report.sequence for report in reports] == list("abcde")
     assert {report.status for report in reports} == {RunStatus.COMPLETED}
@@ -156,7 +156,7 @@ def test_reports_come_in_order_and_the_sequences_are_there(executor: Executor, t
     assert Store.open(tmp_path / "store").names() == tuple("abcde")
 
 
-def test_a_recording_that_fails_does_not_stop_the_others(executor: Executor, tmp_path: Path) -> None:
+def test_executor_failed_recording_does_not_stop_others(executor: Executor, tmp_path: Path) -> None:
     broken = tmp_path / "broken.mcap"
     broken.write_bytes(b"no recording")
     jobs = configs(tmp_path, "abc")
@@ -167,7 +167,7 @@ def test_a_recording_that_fails_does_not_stop_the_others(executor: Executor, tmp
     assert Store.open(tmp_path / "store").names() == ("a", "c")
 
 
-def test_events_tell_of_which_recording_they_are(executor: Executor, tmp_path: Path) -> None:
+def test_executor_events_state_their_recording(executor: Executor, tmp_path: Path) -> None:
     told: list[tuple[int, Event]] = []
     list(executor.map(configs(tmp_path, "abc"), lambda position, event: told.append((position, event))))
     for position, name in enumerate("abc"):
@@ -178,13 +178,13 @@ def test_events_tell_of_which_recording_they_are(executor: Executor, tmp_path: P
         assert sum(event.written for event in events if isinstance(event, TopicProgress)) == 1000
 
 
-def test_an_adapter_class_reaches_the_worker(executor: Executor, tmp_path: Path) -> None:
+def test_executor_sends_adapter_classes_to_workers(executor: Executor, tmp_path: Path) -> None:
     jobs = configs(tmp_path, "ab", adapter_override={"/imu": Refusing}, topics_on_error="raise")
     reports = list(executor.map(jobs, ignore_batch))
     assert [report.exit_code for report in reports] == [1, 1]
 
 
-def test_registered_types_reach_the_worker(executor: Executor, tmp_path: Path) -> None:
+def test_executor_sends_registered_types_to_workers(executor: Executor, tmp_path: Path) -> None:
     bare = tmp_path / "drive.mcap"
     shutil.copy(DRIVE, bare)
     before = ROSTypeRegistry.snapshot()
@@ -196,11 +196,11 @@ def test_registered_types_reach_the_worker(executor: Executor, tmp_path: Path) -
     assert [report.exit_code for report in reports] == [0, 0]
 
 
-def test_no_configuration_is_no_report(executor: Executor) -> None:
+def test_executor_without_configurations_returns_no_reports(executor: Executor) -> None:
     assert list(executor.map([], ignore_batch)) == []
 
 
-def test_a_worker_that_dies_costs_its_recording_only(elsewhere: Executor, tmp_path: Path) -> None:
+def test_executor_dead_worker_fails_only_its_recording(elsewhere: Executor, tmp_path: Path) -> None:
     jobs = configs(tmp_path, "abc")
     jobs[1] = configs(tmp_path, "b", adapter_override={"/imu": Killer})[0]
     reports = list(elsewhere.map(jobs, ignore_batch))
@@ -209,14 +209,14 @@ def test_a_worker_that_dies_costs_its_recording_only(elsewhere: Executor, tmp_pa
     assert Store.open(tmp_path / "store").names() == ("a", "c")
 
 
-def test_a_process_that_was_killed_may_have_wanted_memory(tmp_path: Path) -> None:
+def test_executor_killed_worker_hints_at_memory(tmp_path: Path) -> None:
     jobs = [*configs(tmp_path, "a", adapter_override={"/imu": Killer}), *configs(tmp_path, "b")]
     reports = list(Processes(2).map(jobs, ignore_batch))
     assert "SIGKILL" in (reports[0].error or "")
     assert "fewer jobs" in (reports[0].error or "")
 
 
-def test_a_recording_is_begun_anew_where_its_worker_died(
+def test_executor_retries_the_recording_of_a_dead_worker(
     elsewhere: Executor, killed_once: Path, tmp_path: Path
 ) -> None:
     jobs = configs(tmp_path, "ab", adapter_override={"/imu": KillerOnce})
@@ -226,7 +226,7 @@ def test_a_recording_is_begun_anew_where_its_worker_died(
 
 
 @pytest.mark.slow
-def test_what_a_worker_committed_before_it_died_is_no_obstacle_and_not_there_twice(
+def test_executor_retry_after_commit_stores_the_sequence_once(
     elsewhere: Executor, killed_once: Path, tmp_path: Path
 ) -> None:
     policies = ["append", "fail", "replace", "skip"]
@@ -242,7 +242,7 @@ def test_what_a_worker_committed_before_it_died_is_no_obstacle_and_not_there_twi
     assert [sequence.rows for sequence in sequences] == [2000, 1000, 1000, 1000]
 
 
-def test_what_cannot_be_sent_fails_with_a_remedy(tmp_path: Path) -> None:
+def test_executor_unpicklable_configuration_fails_with_a_hint(tmp_path: Path) -> None:
     class Local(Refusing):
         pass
 
@@ -252,7 +252,7 @@ def test_what_cannot_be_sent_fails_with_a_remedy(tmp_path: Path) -> None:
     assert "top level of a module" in (reports[0].error or "")
 
 
-def test_an_interrupt_ends_every_process_as_its_policy_says(tmp_path: Path) -> None:
+def test_executor_interrupt_applies_the_session_policy_in_every_process(tmp_path: Path) -> None:
     jobs = configs(tmp_path, "abcdef", adapter_override={"/imu": Slow}, topics_on_error="ignore")
     before = signal.getsignal(signal.SIGINT)
     begun: set[int] = set()
@@ -273,7 +273,7 @@ def test_an_interrupt_ends_every_process_as_its_policy_says(tmp_path: Path) -> N
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_memory_is_shared_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_executor_divides_memory_among_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[int | None] = []
     jobs = configs(tmp_path, "abcd", memory_bytes=400 << 20)
     monkeypatch.setattr(

@@ -74,7 +74,7 @@ def commit(
     return session, records.commit(claim, written(session, *topics, start_ns=start_ns))
 
 
-def test_what_is_committed_is_found_as_it_was(store: Store, records: Records) -> None:
+def test_committed_sequence_is_read_back_equal(store: Store, records: Records) -> None:
     session, replaced = commit(records, ("/a", POINT), ("/b", FLAG))
     assert replaced == []
     assert records.names() == ["s"]
@@ -95,19 +95,19 @@ def test_what_is_committed_is_found_as_it_was(store: Store, records: Records) ->
     assert records.sequence("t") is None
 
 
-def test_a_claim_is_not_seen_before_its_commit(records: Records) -> None:
+def test_claim_is_invisible_before_its_commit(records: Records) -> None:
     records.claim(new_session_id(), "s", IfExists.FAIL, is_live=alive)
     assert records.names() == []
 
 
 @pytest.mark.parametrize("policy", [IfExists.FAIL, IfExists.SKIP])
-def test_a_taken_name_is_refused(records: Records, policy: IfExists) -> None:
+def test_existing_name_is_refused(records: Records, policy: IfExists) -> None:
     commit(records, ("/a", POINT))
     with pytest.raises(SequenceExists, match="the sequence already exists"):
         records.claim(new_session_id(), "s", policy, is_live=alive)
 
 
-def test_a_second_writer_gives_way_while_the_first_lives(records: Records) -> None:
+def test_second_writer_is_refused_while_the_first_is_alive(records: Records) -> None:
     first = new_session_id()
     records.claim(first, "s", IfExists.FAIL, is_live=alive)
     with pytest.raises(SequenceExists, match="another run is writing"):
@@ -117,7 +117,7 @@ def test_a_second_writer_gives_way_while_the_first_lives(records: Records) -> No
     records.claim(new_session_id(), "s", IfExists.FAIL, is_live=alive)
 
 
-def test_the_claim_of_a_dead_writer_is_no_obstacle(records: Records) -> None:
+def test_claim_of_dead_writer_does_not_block(records: Records) -> None:
     first = new_session_id()
     claim = records.claim(first, "s", IfExists.FAIL, is_live=alive)
     second = new_session_id()
@@ -130,7 +130,7 @@ def test_the_claim_of_a_dead_writer_is_no_obstacle(records: Records) -> None:
     assert [topic.name for topic in info.topics] == ["/a"]
 
 
-def test_append_adds_to_what_is_there(records: Records) -> None:
+def test_append_adds_to_existing_sequence(records: Records) -> None:
     first, _ = commit(records, ("/a", POINT))
     second, replaced = commit(records, ("/a", POINT), ("/b", FLAG), if_exists=IfExists.APPEND, start_ns=100)
     assert replaced == []
@@ -141,7 +141,7 @@ def test_append_adds_to_what_is_there(records: Records) -> None:
     assert info.topics[1].session == second
 
 
-def test_two_may_append_at_the_same_time(records: Records) -> None:
+def test_two_writers_can_append_concurrently(records: Records) -> None:
     commit(records, ("/a", POINT))
     sessions = [new_session_id() for _ in range(2)]
     claims = [records.claim(one, "s", IfExists.APPEND, is_live=alive) for one in sessions]
@@ -152,7 +152,7 @@ def test_two_may_append_at_the_same_time(records: Records) -> None:
     assert len(info.topics[0].segments) == 3
 
 
-def test_rows_of_another_type_do_not_join_a_topic(records: Records) -> None:
+def test_append_of_another_type_to_a_topic_is_refused(records: Records) -> None:
     commit(records, ("/a", POINT))
     with pytest.raises(SinkError, match="the topic holds Point"):
         commit(records, ("/a", FLAG), if_exists=IfExists.APPEND)
@@ -161,7 +161,7 @@ def test_rows_of_another_type_do_not_join_a_topic(records: Records) -> None:
     assert len(info.sessions) == 1
 
 
-def test_replace_puts_the_new_in_place_of_the_old(records: Records) -> None:
+def test_replace_exchanges_the_sequence(records: Records) -> None:
     first, _ = commit(records, ("/a", POINT), ("/b", FLAG))
     second, replaced = commit(records, ("/c", FLAG), if_exists=IfExists.REPLACE)
     assert sorted(replaced) == [f"segments/s/{name}/{first}-0000.parquet" for name in "ab"]
@@ -171,7 +171,7 @@ def test_replace_puts_the_new_in_place_of_the_old(records: Records) -> None:
     assert [one.id for one in info.sessions] == [second]
 
 
-def test_replace_insists_on_what_it_saw(records: Records) -> None:
+def test_replace_fails_if_the_sequence_changed_meanwhile(records: Records) -> None:
     commit(records, ("/a", POINT))
     session = new_session_id()
     claim = records.claim(session, "s", IfExists.REPLACE, is_live=alive)
@@ -184,7 +184,7 @@ def test_replace_insists_on_what_it_saw(records: Records) -> None:
         records.commit(claim, written(session, ("/c", FLAG)))
 
 
-def test_notes_come_and_go(records: Records) -> None:
+def test_notes_are_added_and_deleted(records: Records) -> None:
     records.create("s", '{"a": 1}')
     records.note("s", NewNote(None, "of all", 1))
     records.note("s", NewNote("/a", "of one", 2))
@@ -200,7 +200,7 @@ def test_notes_come_and_go(records: Records) -> None:
         records.create("s", "{}")
 
 
-def test_parts_are_removed_with_what_is_theirs(records: Records) -> None:
+def test_removing_a_sequence_removes_its_records(records: Records) -> None:
     first, _ = commit(records, ("/a", POINT), ("/b", FLAG))
     second, _ = commit(records, ("/a", POINT), ("/c", FLAG), if_exists=IfExists.APPEND)
     records.note("s", NewNote("/b", "gone with it", 1))
@@ -225,13 +225,15 @@ def test_parts_are_removed_with_what_is_theirs(records: Records) -> None:
         lambda records: records.note("none", NewNote(None, "x", 1)),
     ],
 )
-def test_what_is_not_there_cannot_be_removed(records: Records, remove: Callable[[Records], object]) -> None:
+def test_removing_a_missing_sequence_is_an_error(
+    records: Records, remove: Callable[[Records], object]
+) -> None:
     commit(records, ("/a", POINT))
     with pytest.raises(NotInStore, match="there is no"):
         remove(records)
 
 
-def test_tidying_forgets_dead_claims_and_knows_every_path(records: Records) -> None:
+def test_garbage_collection_removes_dead_claims_and_lists_every_path(records: Records) -> None:
     session, _ = commit(records, ("/a", POINT))
     crashed = new_session_id()
     records.claim(crashed, "t", IfExists.FAIL, is_live=alive)
@@ -242,7 +244,7 @@ def test_tidying_forgets_dead_claims_and_knows_every_path(records: Records) -> N
     records.claim(new_session_id(), "t", IfExists.FAIL, is_live=alive)
 
 
-def test_names_of_any_length_and_spelling_are_kept(records: Records) -> None:
+def test_names_of_any_length_and_spelling_are_preserved(records: Records) -> None:
     names = sorted(["a-b_c", "with(brackets)", "per,cent~", "x" * 300, "x" * 300 + "y"])
     for name in names:
         records.create(name, "{}")

@@ -214,7 +214,7 @@ def write(
         session.topic("/gps/fix", POINT, {"mount": "roof"}).write(points(*times))
 
 
-def test_what_is_written_is_there_after_the_commit(there: Destination) -> None:
+def test_sink_written_rows_are_visible_after_the_commit(there: Destination) -> None:
     with there.sink.open("drive", {"car": {"wheels": [4, 4.5, None]}}) as session:
         writer = session.topic("/gps/fix", POINT, {"mount": "roof"})
         writer.write(points(1, 2))
@@ -226,7 +226,7 @@ def test_what_is_written_is_there_after_the_commit(there: Destination) -> None:
     assert there.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(1, 2, 3)]))
 
 
-def test_the_destination_is_asked_what_it_holds(there: Destination) -> None:
+def test_session_stored_returns_the_content_of_the_destination(there: Destination) -> None:
     with there.sink.open("drive", {}) as session:
         session.topic("/gps/fix", POINT, {}).write(points(5, 3, 4))
         session.topic("imu", FLAG, {})
@@ -236,13 +236,13 @@ def test_the_destination_is_asked_what_it_holds(there: Destination) -> None:
     assert fix.stored_bytes > 0
 
 
-def test_nothing_is_visible_before_the_commit(there: Destination) -> None:
+def test_sink_shows_nothing_before_the_commit(there: Destination) -> None:
     with there.sink.open("drive", {}) as session:
         session.topic("/gps/fix", POINT, {}).write(points(1))
         assert there.sequences() == []
 
 
-def test_an_exception_leaves_no_trace(there: Destination) -> None:
+def test_sink_exception_in_session_leaves_nothing(there: Destination) -> None:
     with pytest.raises(CrashError), there.sink.open("drive", {}) as session:
         session.topic("/gps/fix", POINT, {}).write(points(1))
         raise CrashError
@@ -250,7 +250,7 @@ def test_an_exception_leaves_no_trace(there: Destination) -> None:
     write(there, 1)
 
 
-def test_rows_come_back_in_time_order(there: Destination) -> None:
+def test_sink_rows_are_read_in_time_order(there: Destination) -> None:
     with there.sink.open("drive", {}) as session:
         writer = session.topic("/gps/fix", POINT, {})
         for times in ((7, 9, 8), (1,), (), (5, 2)):
@@ -258,7 +258,7 @@ def test_rows_come_back_in_time_order(there: Destination) -> None:
     assert there.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(1, 2, 5, 7, 8, 9)]))
 
 
-def test_an_empty_session_leaves_an_empty_sequence(there: Destination) -> None:
+def test_sink_empty_session_creates_an_empty_sequence(there: Destination) -> None:
     with there.sink.open("drive", {"car": 7}):
         pass
     assert there.sequences() == ["drive"]
@@ -266,14 +266,14 @@ def test_an_empty_session_leaves_an_empty_sequence(there: Destination) -> None:
 
 
 @pytest.mark.parametrize("if_exists", [IfExists.FAIL, IfExists.SKIP])
-def test_a_taken_name_is_refused_at_once(there: Destination, if_exists: IfExists) -> None:
+def test_sink_existing_name_is_refused_immediately(there: Destination, if_exists: IfExists) -> None:
     write(there, 1)
     with pytest.raises(SequenceExists, match="drive"), there.sink.open("drive", {}, if_exists=if_exists):
         pytest.fail("the session opened")
     assert there.rows("drive", "/gps/fix").num_rows == 1
 
 
-def test_append_adds_a_session(keeping: Destination) -> None:
+def test_sink_append_adds_a_session(keeping: Destination) -> None:
     write(keeping, 1, 4)
     with keeping.sink.open("drive", {"car": 8}, if_exists=IfExists.APPEND) as session:
         session.topic("/gps/fix", POINT, {}).write(points(2, 3))
@@ -283,7 +283,7 @@ def test_append_adds_a_session(keeping: Destination) -> None:
     assert [topic.rows for topic in session.stored()] == [2, 0]
 
 
-def test_append_adds_topics(there: Destination) -> None:
+def test_sink_append_adds_topics(there: Destination) -> None:
     write(there, 1)
     with there.sink.open("drive", {"car": 8}, if_exists=IfExists.APPEND) as session:
         session.topic("/flag", FLAG, {})
@@ -293,7 +293,7 @@ def test_append_adds_topics(there: Destination) -> None:
     assert [topic.rows for topic in session.stored()] == [0]
 
 
-def test_replace_leaves_the_new_after_the_commit(there: Destination) -> None:
+def test_sink_replace_shows_the_new_sequence_after_the_commit(there: Destination) -> None:
     write(there, 1)
     with there.sink.open("drive", {"car": 8}, if_exists=IfExists.REPLACE) as session:
         session.topic("/flag", FLAG, {})
@@ -301,12 +301,12 @@ def test_replace_leaves_the_new_after_the_commit(there: Destination) -> None:
     assert there.metadata("drive") == {"car": 8}
 
 
-def test_append_creates_what_is_not_there(there: Destination) -> None:
+def test_sink_append_creates_a_missing_sequence(there: Destination) -> None:
     write(there, 1, if_exists=IfExists.APPEND)
     assert there.sequences() == ["drive"]
 
 
-def test_append_refuses_another_type_for_the_same_topic(keeping: Destination) -> None:
+def test_sink_append_of_another_type_to_a_topic_is_refused(keeping: Destination) -> None:
     write(keeping, 1)
     with (
         pytest.raises(SinkError, match=r"/gps/fix.*Point.*Flag"),
@@ -315,7 +315,7 @@ def test_append_refuses_another_type_for_the_same_topic(keeping: Destination) ->
         session.topic("/gps/fix", FLAG, {})
 
 
-def test_replace_swaps_at_the_commit(keeping: Destination) -> None:
+def test_sink_replace_exchanges_sequences_at_the_commit(keeping: Destination) -> None:
     write(keeping, 1)
     with keeping.sink.open("drive", {"car": 8}, if_exists=IfExists.REPLACE) as session:
         session.topic("/gps/fix", POINT, {}).write(points(2, 3))
@@ -324,7 +324,7 @@ def test_replace_swaps_at_the_commit(keeping: Destination) -> None:
     assert keeping.metadata("drive") == {"car": 8}
 
 
-def test_a_failed_replace_keeps_the_old(keeping: Destination) -> None:
+def test_sink_failed_replace_keeps_the_old_sequence(keeping: Destination) -> None:
     write(keeping, 1)
     with pytest.raises(CrashError), keeping.sink.open("drive", {}, if_exists=IfExists.REPLACE) as session:
         session.topic("/gps/fix", POINT, {}).write(points(2, 3))
@@ -352,7 +352,7 @@ def test_replace_with_incomplete_session_creates_missing_sequence(there: Destina
     assert there.errors("drive") == [(None, "stopped")]
 
 
-def test_errors_are_kept_with_the_sequence(there: Destination) -> None:
+def test_sink_errors_are_stored_with_the_sequence(there: Destination) -> None:
     with there.sink.open("drive", {}) as session:
         session.topic("/gps/fix", POINT, {})
         session.note_error("the run ended early")
@@ -363,7 +363,7 @@ def test_errors_are_kept_with_the_sequence(there: Destination) -> None:
     ]
 
 
-def test_a_topic_is_opened_once(there: Destination) -> None:
+def test_sink_opening_a_topic_twice_is_refused(there: Destination) -> None:
     with there.sink.open("drive", {}) as session:
         session.topic("/imu", FLAG, {})
         with pytest.raises(SinkError, match="imu"):
@@ -381,7 +381,7 @@ def test_a_topic_is_opened_once(there: Destination) -> None:
     ],
     ids=["other name", "missing column", "no time stamp"],
 )
-def test_a_batch_that_does_not_fit_is_refused_and_the_rest_stays(
+def test_sink_batch_of_another_schema_is_refused_and_others_stay(
     there: Destination, batch: pa.RecordBatch
 ) -> None:
     with there.sink.open("drive", {}) as session:
@@ -394,13 +394,13 @@ def test_a_batch_that_does_not_fit_is_refused_and_the_rest_stays(
 
 
 @pytest.mark.parametrize("name", ["", "a b", "a/b", "a:b", "..", "ünï", "a\nb", 'a"b', "a\x00"])
-def test_a_sequence_name_the_platform_refuses_is_refused(there: Destination, name: str) -> None:
+def test_sink_invalid_sequence_name_is_refused(there: Destination, name: str) -> None:
     with pytest.raises(SinkError), there.sink.open(name, {}):
         pytest.fail("the session opened")
 
 
 @pytest.mark.parametrize("name", ["", "/", "//a", "/a//b", "/a/", "/a.b", "/../x", "/a b", "/a:b"])
-def test_a_topic_name_the_platform_refuses_is_refused(there: Destination, name: str) -> None:
+def test_sink_invalid_topic_name_is_refused(there: Destination, name: str) -> None:
     with there.sink.open("drive", {}) as session, pytest.raises(SinkError):
         session.topic(name, FLAG, {})
 
@@ -408,7 +408,7 @@ def test_a_topic_name_the_platform_refuses_is_refused(there: Destination, name: 
 @pytest.mark.parametrize(
     "name", ["/_hidden", "/~x", "/a@b/c", "/A-1_b", "/a=b", "/a\\b", "/(x)", "/" + "long" * 200]
 )
-def test_a_topic_name_the_platform_accepts_is_kept(there: Destination, name: str) -> None:
+def test_sink_valid_topic_name_is_preserved(there: Destination, name: str) -> None:
     with there.sink.open("drive", {}) as session:
         session.topic(name, POINT, {}).write(points(1))
     assert list(there.topics("drive")) == [name]
@@ -419,7 +419,7 @@ def test_a_topic_name_the_platform_accepts_is_kept(there: Destination, name: str
     "metadata",
     [{"a.b": 1}, {"a": {"b/c": 1}}, {"a": [{"--": 1}]}, {"": 1}, {"a": float("nan")}, {"a": object()}],
 )
-def test_metadata_the_platform_refuses_is_refused(there: Destination, metadata: dict[str, Any]) -> None:
+def test_sink_invalid_metadata_is_refused(there: Destination, metadata: dict[str, Any]) -> None:
     with pytest.raises(SinkError, match="drive"), there.sink.open("drive", metadata):
         pytest.fail("the session opened")
     with there.sink.open("drive", {}) as session, pytest.raises(SinkError, match="/imu"):

@@ -54,7 +54,7 @@ def tables(recording: Path, folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-def test_one_recording_compressed_three_ways_gives_identical_tables(corpus: Path, tmp_path: Path) -> None:
+def test_recording_compressed_three_ways_gives_identical_tables(corpus: Path, tmp_path: Path) -> None:
     plain, bz2, lz4 = (
         tables(corpus / "foxglove__rosbag" / f"example{kind}.bag", tmp_path / f"store{kind}")
         for kind in ("", "-bz2", "-lz4")
@@ -64,7 +64,7 @@ def test_one_recording_compressed_three_ways_gives_identical_tables(corpus: Path
 
 
 @pytest.mark.slow
-def test_no_recording_is_worse_off_than_the_table_says(corpus: Path) -> None:
+def test_corpus_recording_result_is_at_least_that_of_the_table(corpus: Path) -> None:
     with TABLE.open(encoding="utf-8", newline="") as file:
         before = {row["path"]: row for row in csv.DictReader(file, delimiter="\t")}
     worse = list[str]()
@@ -80,7 +80,7 @@ def test_no_recording_is_worse_off_than_the_table_says(corpus: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pattern", WHOLE)
-def test_recordings_of_known_types_are_ingested_whole(corpus: Path, pattern: str) -> None:
+def test_corpus_recording_of_known_types_is_ingested_completely(corpus: Path, pattern: str) -> None:
     rows = list(SURVEY.survey(corpus, [pattern]))
     assert rows
     for row in rows:

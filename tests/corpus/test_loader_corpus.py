@@ -62,7 +62,7 @@ def known_to_rosbags(path: Path) -> dict[tuple[int, str], list[Any]]:
 
 
 @pytest.mark.slow
-def test_every_message_rosbags_can_read_is_read_the_same(corpus: Path) -> None:
+def test_loader_reads_every_message_that_rosbags_reads_equally(corpus: Path) -> None:
     with (corpus / "INDEX.tsv").open(encoding="utf-8", newline="") as file:
         paths = [row["path"] for row in csv.DictReader(file, delimiter="\t")]
     compared = 0
@@ -83,7 +83,7 @@ def test_every_message_rosbags_can_read_is_read_the_same(corpus: Path) -> None:
     assert compared > 40_000
 
 
-def test_types_given_with_the_job_open_a_recording_that_has_none(corpus: Path) -> None:
+def test_custom_msgs_open_a_recording_without_definitions(corpus: Path) -> None:
     types = {
         "turtlesim/msg/Color": "uint8 r\nuint8 g\nuint8 b",
         "turtlesim/msg/Pose": "".join(

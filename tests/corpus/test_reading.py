@@ -27,7 +27,7 @@ class BlindResolver:
 
 
 @pytest.mark.slow
-def test_every_message_of_the_corpus_is_read(corpus: Path) -> None:
+def test_corpus_recording_every_message_is_read(corpus: Path) -> None:
     with (corpus / "INDEX.tsv").open(encoding="utf-8", newline="") as file:
         entries = list(csv.DictReader(file, delimiter="\t"))
     wrong: list[str] = []

@@ -84,7 +84,7 @@ def there_and_back(spec: Builtin, definition: Definition, rows: pa.StructArray) 
 
 
 @pytest.mark.parametrize("spec", BUILTIN, ids=lambda spec: spec.name)
-def test_messages_come_back_but_for_the_fields_listed(spec: Builtin) -> None:
+def test_builtin_adapter_round_trip_differs_only_in_listed_fields(spec: Builtin) -> None:
     known = definitions(spec)
     assert known
     for definition in known:
@@ -95,7 +95,7 @@ def test_messages_come_back_but_for_the_fields_listed(spec: Builtin) -> None:
 
 
 @pytest.mark.slow
-def test_every_line_of_the_list_is_a_field_that_does_differ() -> None:
+def test_every_listed_field_differs_for_some_message() -> None:
     seen: set[tuple[str, str]] = set()
     for spec in BUILTIN:
         for definition in definitions(spec):
@@ -109,7 +109,7 @@ def test_every_line_of_the_list_is_a_field_that_does_differ() -> None:
     assert needless == []
 
 
-def test_the_list_names_no_field_that_is_not_there() -> None:
+def test_every_listed_field_exists() -> None:
     by_name = {spec.name: spec for spec in BUILTIN}
     for adapter, field in listed():
         if adapter == "*":
@@ -127,7 +127,7 @@ def has_field(shape: pa.DataType, field: str) -> bool:
     return True
 
 
-def test_a_quantity_that_was_not_measured_is_told_from_one_that_is_nan() -> None:
+def test_round_trip_distinguishes_unmeasured_quantity_from_nan() -> None:
     spec = next(one for one in BUILTIN if one.name == "IMUAdapter")
     definition = DefinitionFinder().find("sensor_msgs/msg/Imu")
     nan, none = float("nan"), [-1.0] + [0.0] * 8
@@ -147,7 +147,7 @@ def cloud(points: list[tuple[float, float, float, int]]) -> bytes:
     return b"".join(struct.pack("<fffH", *point) for point in points)
 
 
-def test_a_cloud_of_stored_columns_has_the_same_points() -> None:
+def test_round_trip_of_unpacked_point_cloud_has_the_same_points() -> None:
     spec = next(one for one in BUILTIN if one.name == "LidarAdapter")
     definition = DefinitionFinder().find("sensor_msgs/msg/PointCloud2")
     fields = [

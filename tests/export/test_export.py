@@ -68,7 +68,7 @@ def ingested(tmp_path: Path) -> Ingest:
 
 
 @pytest.mark.parametrize("suffix", [".mcap", ".db3"])
-def test_messages_of_ros_2_come_back_field_by_field(ingested: Ingest, tmp_path: Path, suffix: str) -> None:
+def test_export_ros2_messages_equal_the_source(ingested: Ingest, tmp_path: Path, suffix: str) -> None:
     out = tmp_path / f"out{suffix}"
     report = export_sequence(ingested(DRIVE), "s", out)
     assert report.faithful
@@ -96,7 +96,7 @@ def ros_1_messages() -> list[tuple[str, Any, int, dict[str, Any]]]:
 
 
 @pytest.mark.parametrize("suffix", [".mcap", ".bag"])
-def test_messages_of_ros_1_come_back_field_by_field(ingested: Ingest, tmp_path: Path, suffix: str) -> None:
+def test_export_ros1_messages_equal_the_source(ingested: Ingest, tmp_path: Path, suffix: str) -> None:
     source = record(tmp_path / "in.bag", ros_1_messages())
     out = tmp_path / f"out{suffix}"
     assert export_sequence(ingested(source), "s", out).faithful
@@ -108,9 +108,7 @@ def test_messages_of_ros_1_come_back_field_by_field(ingested: Ingest, tmp_path: 
             assert {(c.topic, c.msgtype, c.digest) for c in other.connections} == digests
 
 
-def test_a_ros_1_topic_in_a_container_of_ros_2_is_left_out_and_named(
-    ingested: Ingest, tmp_path: Path
-) -> None:
+def test_export_ros1_topic_to_ros2_container_is_skipped_and_named(ingested: Ingest, tmp_path: Path) -> None:
     source = record(tmp_path / "in.bag", ros_1_messages())
     report = export_sequence(ingested(source), "s", tmp_path / "out.db3")
     left = {topic.topic: topic.excluded for topic in report.topics if topic.excluded}
@@ -120,9 +118,7 @@ def test_a_ros_1_topic_in_a_container_of_ros_2_is_left_out_and_named(
 
 
 @pytest.mark.parametrize("suffix", [".mcap", ".db3"])
-def test_types_without_an_adapter_are_exact_whatever_they_hold(
-    ingested: Ingest, tmp_path: Path, suffix: str
-) -> None:
+def test_export_unmodeled_topic_equals_the_source(ingested: Ingest, tmp_path: Path, suffix: str) -> None:
     text = ODD if suffix == ".mcap" else ODD.replace("wstring", "string")
     odd = define("acme_msgs/msg/Odd", text)
     empty = define("std_msgs/msg/Empty", "")
@@ -134,14 +130,14 @@ def test_types_without_an_adapter_are_exact_whatever_they_hold(
     assert differences(source, out) == {}
 
 
-def test_a_type_that_a_container_cannot_describe_is_left_out(ingested: Ingest, tmp_path: Path) -> None:
+def test_export_type_that_the_container_cannot_describe_is_skipped(ingested: Ingest, tmp_path: Path) -> None:
     odd, plain = define("acme_msgs/msg/Odd", ODD), define("std_msgs/msg/String", "string data\n")
     messages = [("/odd", odd, 1, ODD_VALUES), ("/s", plain, 2, {"data": "x"})]
     report = export_sequence(ingested(record(tmp_path / "in.mcap", messages)), "s", tmp_path / "out.db3")
     assert {topic.topic for topic in report.topics if "wstring" in topic.excluded} == {"/odd"}
 
 
-def test_pictures_packed_as_png_come_back_as_pixels(ingested: Ingest, tmp_path: Path) -> None:
+def test_export_images_stored_as_png_have_the_original_pixels(ingested: Ingest, tmp_path: Path) -> None:
     store = ingested(DRIVE, images={"/camera/image_raw": "png"})
     out = tmp_path / "out.mcap"
     assert export_sequence(store, "s", out, topics=["/camera/image_raw"]).faithful
@@ -149,7 +145,7 @@ def test_pictures_packed_as_png_come_back_as_pixels(ingested: Ingest, tmp_path: 
     assert "/camera/image_raw" not in differences(DRIVE, out)
 
 
-def test_a_span_of_time_is_half_open_and_topics_are_patterns(ingested: Ingest, tmp_path: Path) -> None:
+def test_export_selects_half_open_time_range_and_topic_patterns(ingested: Ingest, tmp_path: Path) -> None:
     store, out = ingested(DRIVE), tmp_path / "out.mcap"
     times = [time for time, _ in messages_of(DRIVE)["/imu"]]
     export_sequence(store, "s", out, topics=["/*", "!/c*"], start_ns=times[10], end_ns=times[20])
@@ -158,7 +154,7 @@ def test_a_span_of_time_is_half_open_and_topics_are_patterns(ingested: Ingest, t
     assert not [topic for topic in written if topic.startswith("/c")]
 
 
-def test_what_cannot_be_written_leaves_no_file(ingested: Ingest, tmp_path: Path) -> None:
+def test_export_that_fails_leaves_no_file(ingested: Ingest, tmp_path: Path) -> None:
     store = ingested(DRIVE)
     for out, error, options in (
         ("a.mcap", NothingMatched, {"topics": ["/none"]}),
@@ -172,7 +168,7 @@ def test_what_cannot_be_written_leaves_no_file(ingested: Ingest, tmp_path: Path)
     assert [path.name for path in tmp_path.iterdir()] == ["store"]
 
 
-def test_a_file_is_replaced_only_if_that_is_said(ingested: Ingest, tmp_path: Path) -> None:
+def test_export_replaces_existing_file_only_with_force(ingested: Ingest, tmp_path: Path) -> None:
     store, out = ingested(DRIVE), tmp_path / "out.mcap"
     out.write_bytes(b"mine")
     with pytest.raises(BagError, match="there already"):
@@ -182,7 +178,7 @@ def test_a_file_is_replaced_only_if_that_is_said(ingested: Ingest, tmp_path: Pat
     assert len(messages_of(out)["/imu"]) == 1000
 
 
-def test_an_adapter_of_ones_own_is_undone_where_it_is_named(ingested: Ingest, tmp_path: Path) -> None:
+def test_export_inverts_own_adapter_if_named(ingested: Ingest, tmp_path: Path) -> None:
     own = DRIVE.parent / "adapters" / "battery_pack.yaml"
     store, out = ingested(DRIVE, adapters=(str(own),)), tmp_path / "out.mcap"
     with pytest.raises(NothingMatched, match="--adapter"):
@@ -191,7 +187,7 @@ def test_an_adapter_of_ones_own_is_undone_where_it_is_named(ingested: Ingest, tm
     assert "/battery" not in differences(DRIVE, out)
 
 
-def test_columns_that_cannot_be_undone_are_named(ingested: Ingest, tmp_path: Path) -> None:
+def test_export_names_columns_that_cannot_be_inverted(ingested: Ingest, tmp_path: Path) -> None:
     adapter = tmp_path / "sum.yaml"
     adapter.write_text(
         "version: 1\nadapter: SumAdapter\nros_type: acme_msgs/msg/Two\n"
@@ -207,7 +203,7 @@ def test_columns_that_cannot_be_undone_are_named(ingested: Ingest, tmp_path: Pat
     assert not topic.faithful
 
 
-def test_a_topic_that_does_not_say_what_it_was_is_left_out(ingested: Ingest, tmp_path: Path) -> None:
+def test_export_topic_without_message_type_is_skipped(ingested: Ingest, tmp_path: Path) -> None:
     store = ingested(DRIVE)
     with store.catalog.write() as db:
         db.execute("UPDATE topics SET metadata = '{}' WHERE name = '/imu'")
@@ -227,7 +223,7 @@ LISTED = {
 
 
 @pytest.mark.slow
-def test_real_recordings_come_back_but_for_what_is_listed(corpus: Path, tmp_path: Path) -> None:
+def test_export_corpus_recordings_differ_only_in_listed_fields(corpus: Path, tmp_path: Path) -> None:
     with (corpus / "INDEX.tsv").open(encoding="utf-8", newline="") as file:
         paths = [corpus / entry["path"] for entry in csv.DictReader(file, delimiter="\t")]
     compared = 0

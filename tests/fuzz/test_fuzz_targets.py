@@ -80,7 +80,7 @@ def _mutated(seed: bytes, rng: random.Random) -> bytes:
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_mutated_seeds_are_taken_or_refused(name: str) -> None:
+def test_fuzz_target_mutated_seed_is_accepted_or_refused(name: str) -> None:
     seeds = _seeds()[name]
     assert seeds
     rng = random.Random(name)  # noqa: S311 - test data

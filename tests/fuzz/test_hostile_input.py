@@ -74,7 +74,7 @@ def job(folder: Path, text: str, name: str = "job.yaml") -> str:
 
 
 @pytest.mark.slow
-def test_names_stay_in_the_store_and_off_the_terminal(tmp_path: Path, ingest: Ingest) -> None:
+def test_hostile_topic_names_stay_in_the_store_and_off_the_terminal(tmp_path: Path, ingest: Ingest) -> None:
     record(tmp_path / "drive", TOPICS, text=ESCAPES)
     name = job(
         tmp_path, "bag: {path: drive}\nsequence: {name: s}\non_error: {session: report, topic: ignore}\n"
@@ -91,7 +91,7 @@ def test_names_stay_in_the_store_and_off_the_terminal(tmp_path: Path, ingest: In
 
 
 @pytest.mark.slow
-def test_file_names_of_any_bytes_are_read_and_reported(tmp_path: Path, ingest: Ingest) -> None:
+def test_file_name_with_any_bytes_is_read_and_reported(tmp_path: Path, ingest: Ingest) -> None:
     content = record(tmp_path / "drive").read_bytes()
     folder = os.fsencode(tmp_path / "all")
     os.mkdir(folder)  # noqa: PTH102 - pathlib takes no bytes
@@ -106,7 +106,7 @@ def test_file_names_of_any_bytes_are_read_and_reported(tmp_path: Path, ingest: I
 
 
 @pytest.mark.slow
-def test_a_folder_of_anything_is_read_or_refused(tmp_path: Path, ingest: Ingest) -> None:
+def test_folder_with_special_files_is_read_or_refused(tmp_path: Path, ingest: Ingest) -> None:
     folder = tmp_path / "all"
     record(tmp_path / "drive").rename(tmp_path / "good.mcap")
     folder.mkdir()
@@ -154,7 +154,7 @@ REFUSED = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", REFUSED)
-def test_a_hostile_job_is_refused(tmp_path: Path, ingest: Ingest, kind: str) -> None:
+def test_hostile_manifest_is_refused(tmp_path: Path, ingest: Ingest, kind: str) -> None:
     record(tmp_path / "drive")
     os.mkfifo(tmp_path / "pipe")
     os.mkfifo(tmp_path / "pipe.yaml")
@@ -174,7 +174,7 @@ def test_a_hostile_job_is_refused(tmp_path: Path, ingest: Ingest, kind: str) -> 
 
 
 @pytest.mark.slow
-def test_only_a_job_that_names_a_module_runs_it(tmp_path: Path, ingest: Ingest) -> None:
+def test_module_runs_only_if_the_job_names_it(tmp_path: Path, ingest: Ingest) -> None:
     record(tmp_path / "drive")
     sprung = tmp_path / "sprung"
     (tmp_path / "trap.py").write_text(f"open({str(sprung)!r}, 'w').close()\nclass Trap: pass\n")
@@ -189,7 +189,7 @@ def test_only_a_job_that_names_a_module_runs_it(tmp_path: Path, ingest: Ingest) 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".mcap.zstd", ".db3.zstd"])
-def test_a_compressed_file_that_grows_without_end_stays_within_memory(
+def test_compressed_file_that_expands_enormously_stays_within_memory(
     tmp_path: Path, ingest: Ingest, suffix: str
 ) -> None:
     grown = zstandard.ZstdCompressor(level=1).compress(bytes(300 << 20))

@@ -95,7 +95,7 @@ def _definitions(msgtype: str) -> Iterator[Definition]:
             yield TypeResolver(distro, types=NOT_IN_THE_DISTROS).resolve(msgtype, None, ros_version=version)
 
 
-def test_every_type_the_sdk_adapts_is_adapted_to_the_same_ontology() -> None:
+def test_type_adapted_by_the_sdk_has_the_same_ontology_type() -> None:
     theirs = {
         name: ontology_of(adapter.__mosaico_ontology_type__) for name, adapter in _default_adapters().items()
     }
@@ -105,7 +105,7 @@ def test_every_type_the_sdk_adapts_is_adapted_to_the_same_ontology() -> None:
 
 
 @pytest.mark.parametrize("msgtype", sorted({*_default_adapters()} - {IMAGE}))
-def test_the_rows_are_the_sdks(msgtype: str, fuzz: Any) -> None:
+def test_adapted_rows_equal_those_of_the_sdk(msgtype: str, fuzz: Any) -> None:
     adapter = _default_adapters()[msgtype]
     for definition in _definitions(msgtype):
         random = Random(msgtype)  # noqa: S311 - messages, not secrets
@@ -113,7 +113,7 @@ def test_the_rows_are_the_sdks(msgtype: str, fuzz: Any) -> None:
 
 
 @pytest.mark.parametrize("builtin", BUILTIN, ids=lambda builtin: builtin.name)
-def test_the_sdk_reads_every_row_as_its_own_type(builtin: Builtin, fuzz: Any) -> None:
+def test_sdk_reads_every_row_as_its_own_type(builtin: Builtin, fuzz: Any) -> None:
     model = SDK_MODELS[builtin.tag]
     for msgtype in builtin.ros_types:
         for definition in _definitions(msgtype):
@@ -123,7 +123,7 @@ def test_the_sdk_reads_every_row_as_its_own_type(builtin: Builtin, fuzz: Any) ->
                 model.model_validate(row)
 
 
-def test_stored_pictures_are_the_sdks() -> None:
+def test_stored_images_equal_those_of_the_sdk() -> None:
     (definition, *_) = _definitions(IMAGE)
     random = Random(IMAGE)  # noqa: S311 - messages, not secrets
     adapter = _default_adapters()[IMAGE]
@@ -159,7 +159,7 @@ OPT_IN = {
 
 
 @pytest.mark.parametrize("name", OPT_IN)
-def test_unpacked_clouds_are_the_sdks(name: str) -> None:
+def test_unpacked_point_clouds_equal_those_of_the_sdk(name: str) -> None:
     (definition, *_) = _definitions("sensor_msgs/msg/PointCloud2")
     random = Random(name)  # noqa: S311 - messages, not secrets
     clouds = [_cloud(random, name) for _ in range(60)]
@@ -267,6 +267,6 @@ def _is_nan(value: Any) -> bool:
     return isinstance(value, float) and math.isnan(value)
 
 
-def test_every_listed_type_is_one_of_ours() -> None:
+def test_every_listed_difference_names_an_own_type() -> None:
     known = {name for builtin in BUILTIN for name in builtin.ros_types}
     assert {m.msgtype for m in (*DIFFERENT, *ONLY_OURS)} <= known

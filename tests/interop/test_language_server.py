@@ -84,7 +84,7 @@ def server(tmp_path: Path) -> Iterator[Server]:
     server.close()
 
 
-def test_an_editor_completes_and_explains_a_manifest(server: Server, tmp_path: Path) -> None:
+def test_language_server_completes_and_explains_manifest_keys(server: Server, tmp_path: Path) -> None:
     modeline = f"# yaml-language-server: $schema={(tmp_path / 'schemas' / 'job.schema.json').as_uri()}"
     text = f"{modeline}\nbag:\n  path: x.mcap\n  ros_distro: \nsequence:\n  \n"
     uri = server.open(tmp_path / "job.yaml", text)
@@ -96,7 +96,7 @@ def test_an_editor_completes_and_explains_a_manifest(server: Server, tmp_path: P
     assert "the parts of one recording" in hover
 
 
-def test_an_editor_completes_an_adapter(server: Server, tmp_path: Path) -> None:
+def test_language_server_completes_adapter_keys(server: Server, tmp_path: Path) -> None:
     modeline = f"# yaml-language-server: $schema={(tmp_path / 'schemas' / 'adapter.schema.json').as_uri()}"
     uri = server.open(tmp_path / "pack.yaml", f"{modeline}\nversion: 1\nadapter: A\n\n")
     keys = {item["label"] for item in server.at("completion", uri, 4, 1)["items"]}

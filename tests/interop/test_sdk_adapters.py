@@ -81,7 +81,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_an_adapter_of_ours_may_fill_an_ontology_class_of_theirs(
+def test_own_adapter_can_fill_an_ontology_class_of_the_sdk(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     theirs = load_adapter_reference("theirs.py:SpeedAdapter", folder)
@@ -101,20 +101,20 @@ def _adapt(ref: str, folder: Path, *speeds: float) -> Adapted:
     return load_adapter_reference(ref, folder).bind(definition, shape).adapt(rows, envelope)
 
 
-def test_from_dict_fills_the_sdks_own_model(folder: Path) -> None:
+def test_sdk_adapter_from_dict_fills_the_sdk_model(folder: Path) -> None:
     adapted = _adapt("theirs.py:SpeedAdapter", folder, 2.0, 0.0, 4.0)
     assert adapted.rows.to_pylist() == [{"value": 0.5, "frame": "base"}, {"value": 0.25, "frame": "base"}]
     assert adapted.failures[0].reason == "SpeedAdapter: ZeroDivisionError: float division by zero"
 
 
-def test_translate_gets_the_sdks_own_message(folder: Path) -> None:
+def test_sdk_adapter_translate_receives_the_sdk_message(folder: Path) -> None:
     adapted = _adapt("theirs.py:LateAdapter", folder, 2.0)
     assert adapted.rows.field("value").to_pylist() == [0.5]
     assert adapted.log_times is not None
     assert adapted.log_times.tolist() == [5_000_000_006]
 
 
-def test_a_built_in_adapter_of_the_sdk_can_be_named(folder: Path) -> None:
+def test_override_can_name_a_builtin_adapter_of_the_sdk(folder: Path) -> None:
     bridge = ROSBridge(
         overrides={"/imu": "mosaicolabs.bridges.ros.adapters.sensor_msgs:IMUAdapter"}, base_dir=folder
     )
@@ -125,7 +125,7 @@ def test_a_built_in_adapter_of_the_sdk_can_be_named(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("msgtype", sorted(sdk.ROSBridge.get_default_adapters()))
-def test_every_adapter_of_the_sdk_runs_on_our_rows(msgtype: str, fuzz: Any) -> None:
+def test_every_sdk_adapter_converts_our_rows(msgtype: str, fuzz: Any) -> None:
     adapter = sdk.ROSBridge.get_default_adapters()[msgtype]
     types = {"nmea_msgs/msg/Sentence": "std_msgs/Header header\nstring sentence\n"}
     definition = TypeResolver(Stores.LATEST, types=types).resolve(msgtype, None, ros_version=2)
@@ -153,7 +153,7 @@ def _taken(adapter: Any, message: dict[str, Any]) -> bool:
     return True
 
 
-def test_every_setting_of_the_sdk_is_on_the_page_for_movers() -> None:
+def test_migration_page_lists_every_setting_of_the_sdk() -> None:
     page = (Path(__file__).parents[2] / "docs" / "migration.md").read_text(encoding="utf-8")
     missing = {field.name for field in fields(sdk.ROSInjectionConfig) if f"`{field.name}`" not in page}
     assert missing == set()

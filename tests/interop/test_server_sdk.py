@@ -133,7 +133,7 @@ def unexplained(found: set[tuple[str, str]]) -> set[tuple[str, str]]:
     }
 
 
-def test_the_sdk_lists_and_describes_what_we_ingested(served: Server, client: Any) -> None:
+def test_sdk_lists_and_describes_ingested_sequences(served: Server, client: Any) -> None:
     info = Store.open(served.store_path).sequence("ours")
     handler = client.sequence_handler("ours")
     assert sorted(client.list_sequences()) == ["ours", "theirs"]
@@ -146,11 +146,11 @@ def test_the_sdk_lists_and_describes_what_we_ingested(served: Server, client: An
     )
 
 
-def test_the_sdk_reads_every_row_typed_and_equal(served: Server, client: Any) -> None:
+def test_sdk_reads_every_row_typed_and_equal(served: Server, client: Any) -> None:
     check_read_back(client, Store.open(served.store_path), "ours")
 
 
-def test_the_sdk_streams_a_sequence_in_time_order(served: Server, client: Any) -> None:
+def test_sdk_streams_a_sequence_in_time_order(served: Server, client: Any) -> None:
     info = Store.open(served.store_path).sequence("ours")
     assert info.start_ns is not None
     stamps = [message.timestamp_ns for _, message in client.sequence_handler("ours").get_data_streamer()]
@@ -163,14 +163,12 @@ def test_the_sdk_streams_a_sequence_in_time_order(served: Server, client: Any) -
     ]
 
 
-def test_both_injectors_store_the_same_but_for_a_written_list(served: Server) -> None:
+def test_both_injectors_store_the_same_except_listed_differences(served: Server) -> None:
     assert unexplained(differences(Store.open(served.store_path), "ours", "theirs")) == set()
 
 
 @pytest.mark.slow
-def test_a_real_recording_of_many_types_is_read_and_stored_alike(
-    served: Server, client: Any, corpus: Path
-) -> None:
+def test_both_injectors_store_a_real_recording_equally(served: Server, client: Any, corpus: Path) -> None:
     ingest(served, corpus / CORPUS, "sensors", "sensors_theirs")
     store = Store.open(served.store_path)
     check_read_back(client, store, "sensors")
@@ -178,7 +176,7 @@ def test_a_real_recording_of_many_types_is_read_and_stored_alike(
 
 
 @pytest.mark.parametrize("low", [-1e9, -0.5, 0.0, 0.5, 9.0, 1e9])
-def test_the_query_builder_finds_what_a_scan_finds(served: Server, client: Any, low: float) -> None:
+def test_sdk_query_builder_finds_the_same_as_a_scan(served: Server, client: Any, low: float) -> None:
     store = Store.open(served.store_path)
     expected = set()
     for sequence in ("ours", "theirs"):
@@ -193,7 +191,7 @@ def test_the_query_builder_finds_what_a_scan_finds(served: Server, client: Any, 
     assert {(item.sequence.name, topic.name) for item in found for topic in item.topics} == expected
 
 
-def test_the_query_builder_selects_by_name_tag_and_metadata(client: Any) -> None:
+def test_sdk_query_builder_selects_by_name_tag_and_metadata(client: Any) -> None:
     found = client.query(
         QuerySequence().with_name_match("o*"), QueryTopic().with_ontology_tag("IMU"), QueryOntologyCatalog()
     )
@@ -208,7 +206,7 @@ def test_the_query_builder_selects_by_name_tag_and_metadata(client: Any) -> None
     assert [item.sequence.name for item in by_key] == ["theirs"]
 
 
-def test_the_sdk_writes_notes_and_deletes(client: Any) -> None:
+def test_sdk_writes_notifications_and_deletes(client: Any) -> None:
     stamp = sdk.Time(seconds=1, nanoseconds=0)
     with client.sequence_create(
         "written", {"by": "hand"}, on_error=sdk.SessionLevelErrorPolicy.Report
@@ -228,7 +226,7 @@ def test_the_sdk_writes_notes_and_deletes(client: Any) -> None:
     assert "written" not in client.list_sequences()
 
 
-def test_an_error_inside_the_sdk_leaves_its_report(client: Any) -> None:
+def test_error_inside_the_sdk_leaves_its_notification(client: Any) -> None:
     with (
         pytest.raises(ZeroDivisionError),
         client.sequence_create("failed", {}, on_error=sdk.SessionLevelErrorPolicy.Report) as sequence,
@@ -247,7 +245,7 @@ def test_an_error_inside_the_sdk_leaves_its_report(client: Any) -> None:
     assert "dropped" not in client.list_sequences()
 
 
-def test_the_sdk_comes_in_with_a_key_and_not_without(tmp_path: Path) -> None:
+def test_sdk_is_accepted_with_a_key_and_refused_without(tmp_path: Path) -> None:
     ring = Keyring(tmp_path / "keys.json")
     key = ring.add(Permission.READ)
     with serve(tmp_path / "store", port=0, keys=ring) as server:

@@ -112,7 +112,7 @@ def traffic(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Traffic,
     server.drop_uploads()
 
 
-def test_both_make_the_same_calls_with_the_same_keys(traffic: tuple[Traffic, Traffic]) -> None:
+def test_both_injectors_make_the_same_calls_with_the_same_keys(traffic: tuple[Traffic, Traffic]) -> None:
     """The handshake aside, which older SDKs make by `version`."""
     ours, theirs = ([call for call in said.actions if call[0] not in {"info", "version"}] for said in traffic)
     assert Counter(ours) == Counter(theirs)
@@ -122,7 +122,7 @@ def test_both_make_the_same_calls_with_the_same_keys(traffic: tuple[Traffic, Tra
         assert names[-1] == "session_finalize"
 
 
-def test_both_announce_the_same_topics(traffic: tuple[Traffic, Traffic]) -> None:
+def test_both_injectors_create_the_same_topics(traffic: tuple[Traffic, Traffic]) -> None:
     ours, theirs = traffic
     compressed = ours.created["camera/image_raw/compressed"]
     assert isinstance(compressed, dict)
@@ -130,7 +130,7 @@ def test_both_announce_the_same_topics(traffic: tuple[Traffic, Traffic]) -> None
     assert ours.created == theirs.created
 
 
-def test_both_upload_the_same_columns_and_rows_and_ours_in_fewer_messages(
+def test_both_injectors_upload_equal_rows_and_ours_fewer_messages(
     traffic: tuple[Traffic, Traffic],
 ) -> None:
     ours, theirs = traffic

@@ -33,34 +33,34 @@ from mosaico_ingest.protocol.names import key_problem, new_key
 
 
 @pytest.mark.parametrize("name", ["run_1", "a@b", "~x", "-"])
-def test_a_sequence_may_be_called(name: str) -> None:
+def test_sequence_name_valid_is_accepted(name: str) -> None:
     assert check_sequence_name(name) == name
 
 
 @pytest.mark.parametrize("name", ["", "a b", "a/b", "a:b", "a.b", "é", "50%", "a\n"])
-def test_a_sequence_may_not_be_called(name: str) -> None:
+def test_sequence_name_invalid_is_refused(name: str) -> None:
     with pytest.raises(SinkError):
         check_sequence_name(name)
 
 
 @pytest.mark.parametrize("name", ["/imu", "imu", "/a/b", "/_hidden"])
-def test_a_topic_may_be_called(name: str) -> None:
+def test_topic_name_valid_is_accepted(name: str) -> None:
     assert check_topic_name(name) == f"/{name.removeprefix('/')}"
 
 
 @pytest.mark.parametrize("name", ["", "/", "//a", "/a/", "/a//b", "/a:b", "/a b", "/a.b"])
-def test_a_topic_may_not_be_called(name: str) -> None:
+def test_topic_name_invalid_is_refused(name: str) -> None:
     with pytest.raises(SinkError):
         check_topic_name(name)
 
 
 @pytest.mark.parametrize("metadata", [{"a.b": 1}, {"a": {"": 1}}, {"a": [{"x--y": 1}]}, {"a": float("nan")}])
-def test_metadata_the_platform_refuses_is_refused_here(metadata: dict[str, object]) -> None:
+def test_metadata_invalid_is_refused(metadata: dict[str, object]) -> None:
     with pytest.raises(SinkError, match="seq: metadata"):
         check_metadata(metadata, where="seq")
 
 
-def test_bodies_have_exactly_the_keys_the_platform_knows() -> None:
+def test_request_bodies_have_exactly_the_documented_keys() -> None:
     put = bodies.Put(resource_locator="s/t", topic_uuid="u")
     assert json.loads(JSON.encode(put)) == {"resource_locator": "s/t", "topic_uuid": "u"}
     assert json.loads(JSON.encode(bodies.GetInfo(resource_locator="s"))) == {"resource_locator": "s"}
@@ -71,12 +71,12 @@ def test_bodies_have_exactly_the_keys_the_platform_knows() -> None:
     assert nothing == {"action": "sequence_create", "response": None}
 
 
-def test_metadata_travels_unchanged_nulls_included() -> None:
+def test_metadata_round_trip_keeps_nulls() -> None:
     body = bodies.SequenceCreate(locator="s", user_metadata={"a": None, "b": [1, {"c": "ü"}]})
     assert JSON.decode(bodies.SequenceCreate, JSON.encode(body)) == body
 
 
-def test_an_answer_comes_back_whatever_a_newer_server_adds() -> None:
+def test_response_with_unknown_keys_is_decoded() -> None:
     data = b'{"action": "topic_create", "response": {"uuid": "u", "new": 1}, "later": 2}'
     assert JSON.decode_answer(actions.TOPIC_CREATE, data).uuid == "u"
     assert JSON.decode_answer(actions.SEQUENCE_CREATE, b"") == bodies.Empty()
@@ -91,7 +91,7 @@ def test_an_answer_comes_back_whatever_a_newer_server_adds() -> None:
         (b"\xff", "Invalid JSON"),
     ],
 )
-def test_an_answer_that_is_none_says_why(data: bytes, reason: str) -> None:
+def test_response_malformed_raises_with_the_reason(data: bytes, reason: str) -> None:
     with pytest.raises(Malformed, match=reason):
         JSON.decode_answer(actions.TOPIC_CREATE, data)
 
@@ -106,24 +106,24 @@ def reason_of(decode: Callable[[], object]) -> str:
 
 
 @given(st.binary(), st.sampled_from(sorted(ACTIONS)))
-def test_any_bytes_are_a_body_or_malformed(data: bytes, name: str) -> None:
+def test_body_of_any_bytes_decodes_or_is_malformed(data: bytes, name: str) -> None:
     assert "\n" not in reason_of(lambda: JSON.decode(ACTIONS[name].question, data))
     assert "\n" not in reason_of(lambda: JSON.decode_answer(ACTIONS[name], data))
 
 
-def test_a_permission_includes_the_ones_before_it() -> None:
+def test_permission_includes_lower_ones() -> None:
     assert Permission.MANAGE.includes(Permission.READ)
     assert Permission.WRITE.includes(Permission.WRITE)
     assert not Permission.WRITE.includes(Permission.DELETE)
 
 
-def test_locators_and_names_translate() -> None:
+def test_locator_round_trip_keeps_names() -> None:
     assert bodies.topic_locator("seq", "/a/b") == "seq/a/b"
     assert bodies.topic_name("seq/a/b") == "/a/b"
     assert bodies.session_locator("seq", "01J") == "seq:01J"
 
 
-def test_a_new_key_is_a_key_and_a_mistyped_one_is_not() -> None:
+def test_api_key_new_is_valid_and_mistyped_is_not() -> None:
     key = new_key()
     assert key_problem(key) is None
     wrong = key[:5] + ("a" if key[5] != "a" else "b") + key[6:]
@@ -147,7 +147,7 @@ def refusing() -> Iterator[fl.FlightClient]:
 
 
 @pytest.mark.parametrize("condition", list(Condition))
-def test_a_condition_survives_the_wire(refusing: fl.FlightClient, condition: Condition) -> None:
+def test_condition_round_trip_keeps_its_kind(refusing: fl.FlightClient, condition: Condition) -> None:
     with pytest.raises(pa.ArrowException) as caught:
         list(refusing.do_action(fl.Action(condition.value, b"")))
     assert condition_of(caught.value) is condition

@@ -100,7 +100,7 @@ def own_objects(objects: ObjectStore) -> Iterator[ObjectStore]:
         yield running
 
 
-def test_every_container_gives_what_the_file_gives(objects: ObjectStore, small: Path) -> None:
+def test_recording_by_url_equals_the_file(objects: ObjectStore, small: Path) -> None:
     path = put(objects, small, f"every/{small.name}")
     with opened(small) as here, opened(path) as there:
         assert messages(there) == messages(here)
@@ -113,7 +113,7 @@ def test_every_container_gives_what_the_file_gives(objects: ObjectStore, small: 
         assert there.size_bytes == small.stat().st_size
 
 
-def test_what_can_only_be_read_as_a_whole_is_fetched_and_removed(
+def test_recording_without_ranges_is_downloaded_and_removed(
     objects: ObjectStore, small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     packed = tmp_path / f"{small.name}.zstd"
@@ -129,7 +129,7 @@ def test_what_can_only_be_read_as_a_whole_is_fetched_and_removed(
     assert not list(room.iterdir())
 
 
-def test_a_recording_that_does_not_fit_the_disk_is_refused(
+def test_recording_larger_than_the_temporary_folder_is_refused(
     objects: ObjectStore, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = record(folder / "no_room.db3", [("/a", FLOAT, START_NS, {"data": 1.0})])
@@ -139,7 +139,7 @@ def test_a_recording_that_does_not_fit_the_disk_is_refused(
         opened(path)
 
 
-def test_one_without_its_index_is_fetched_and_read_record_by_record(
+def test_recording_without_index_is_downloaded_and_read_record_by_record(
     objects: ObjectStore, small: Path, tmp_path: Path
 ) -> None:
     if small.suffix == ".db3":
@@ -153,7 +153,7 @@ def test_one_without_its_index_is_fetched_and_read_record_by_record(
         assert any("it has no index" in one.message for one in there.findings)
 
 
-def test_looking_into_a_recording_takes_little_of_it(objects: ObjectStore, large: Path) -> None:
+def test_inspecting_a_recording_reads_a_small_part(objects: ObjectStore, large: Path) -> None:
     path = put(objects, large, "large/large.mcap")
     with opened(path) as there:
         assert there.message_count == 510
@@ -163,7 +163,9 @@ def test_looking_into_a_recording_takes_little_of_it(objects: ObjectStore, large
 
 
 @pytest.mark.parametrize("selection", ["time", "topic"])
-def test_a_selection_takes_a_small_part(objects: ObjectStore, large: Path, selection: str) -> None:
+def test_selection_of_a_recording_reads_a_small_part(
+    objects: ObjectStore, large: Path, selection: str
+) -> None:
     path = put(objects, large, "large/large.mcap")
     window = (START_NS + 50 * SECOND_NS, START_NS + 51 * SECOND_NS)
     with opened(path) as there:
@@ -177,7 +179,7 @@ def test_a_selection_takes_a_small_part(objects: ObjectStore, large: Path, selec
     assert len(asked.requests) <= 12
 
 
-def test_reading_all_of_it_takes_few_requests(objects: ObjectStore, large: Path) -> None:
+def test_reading_a_complete_recording_needs_few_requests(objects: ObjectStore, large: Path) -> None:
     path = put(objects, large, "large/large.mcap")
     with opened(path) as there:
         assert sum(map(len, there.message_blocks())) == 510
@@ -187,7 +189,7 @@ def test_reading_all_of_it_takes_few_requests(objects: ObjectStore, large: Path)
     assert asked.sent_bytes < large.stat().st_size * 1.1
 
 
-def test_a_reader_that_stops_leaves_no_thread(objects: ObjectStore, large: Path) -> None:
+def test_reader_that_stops_early_leaves_no_thread(objects: ObjectStore, large: Path) -> None:
     path = put(objects, large, "large/large.mcap")
     with opened(path) as there:
         next(there.message_blocks())
@@ -195,7 +197,7 @@ def test_a_reader_that_stops_leaves_no_thread(objects: ObjectStore, large: Path)
     assert asked.sent_bytes < large.stat().st_size * 0.8
 
 
-def test_parts_directories_and_globs_are_found(objects: ObjectStore, tmp_path: Path) -> None:
+def test_splits_directories_and_globs_are_found(objects: ObjectStore, tmp_path: Path) -> None:
     for number in range(3):
         sent = [("/a", FLOAT, START_NS + number * SECOND_NS + step, {"data": 1.0}) for step in range(4)]
         file = record(tmp_path / f"part_{number}.mcap", sent)
@@ -225,7 +227,7 @@ def test_parts_directories_and_globs_are_found(objects: ObjectStore, tmp_path: P
         find_recordings(load_manifest(job))
 
 
-def test_a_rosbag2_directory_is_read_by_its_metadata(objects: ObjectStore, tmp_path: Path) -> None:
+def test_rosbag2_directory_is_read_through_its_metadata(objects: ObjectStore, tmp_path: Path) -> None:
     sent = [("/a", FLOAT, START_NS + step, {"data": 1.0}) for step in range(4)]
     put(objects, record(tmp_path / "x_0.mcap", sent), "rosbag2/x/x_0.mcap")
     put(objects, record(tmp_path / "stray.mcap", sent), "rosbag2/x/stray.mcap")
@@ -239,12 +241,12 @@ def test_a_rosbag2_directory_is_read_by_its_metadata(objects: ObjectStore, tmp_p
         assert any(one.rule == "missing-part" for one in there.findings)
 
 
-def test_what_is_not_there_is_said(objects: ObjectStore) -> None:
+def test_missing_recording_is_an_error_that_names_it(objects: ObjectStore) -> None:
     with pytest.raises(BagError, match=r"s3://bucket/nowhere\.mcap: does not exist"):
         opened(remote(objects, "nowhere.mcap"))
 
 
-def test_a_recording_that_changes_while_it_is_read_is_an_error(objects: ObjectStore, small: Path) -> None:
+def test_recording_that_changes_while_it_is_read_is_an_error(objects: ObjectStore, small: Path) -> None:
     if small.suffix == ".db3":
         return
     path = put(objects, small, f"changing/{small.name}")
@@ -254,7 +256,7 @@ def test_a_recording_that_changes_while_it_is_read_is_an_error(objects: ObjectSt
             list(there.message_blocks())
 
 
-def test_a_server_that_goes_away_is_an_error_and_no_loss(
+def test_unavailable_server_is_an_error_and_not_an_unreadable_range(
     own_objects: ObjectStore, large: Path, tmp_path: Path
 ) -> None:
     path = put(own_objects, large, "large.mcap")

@@ -15,7 +15,7 @@ from mosaico_ingest.pipeline.compile import compile_manifest
 from mosaico_ingest.remote import RemotePath, as_path, filesystem, is_url, reaching
 
 
-def test_a_url_has_the_parts_of_a_path() -> None:
+def test_remote_path_has_the_parts_of_a_path() -> None:
     path = as_path("s3://bucket/drives/a.mcap?region=eu-west-1")
     assert isinstance(path, RemotePath)
     assert (path.name, path.suffix, path.place) == ("a.mcap", ".mcap", "bucket/drives/a.mcap")
@@ -27,28 +27,28 @@ def test_a_url_has_the_parts_of_a_path() -> None:
 
 
 @pytest.mark.parametrize("given", ["s3://bucket", "s3://bucket/"])
-def test_a_bucket_is_a_folder(given: str) -> None:
+def test_remote_path_of_bucket_is_a_folder(given: str) -> None:
     path = as_path(given)
     assert isinstance(path, RemotePath)
     assert (path.name, str(path), str(path / "a")) == ("bucket", "s3://bucket", "s3://bucket/a")
 
 
 @pytest.mark.parametrize("scheme", ["s3", "gs"])
-def test_a_url_that_went_through_pathlib_is_still_one(scheme: str) -> None:
+def test_as_path_restores_a_url_that_pathlib_normalized(scheme: str) -> None:
     url = f"{scheme}://bucket/drives/a.mcap?anonymous=true"
     assert as_path(Path(url)) == as_path(url)
 
 
-def test_a_hash_belongs_to_an_objects_name() -> None:
+def test_remote_path_hash_is_part_of_the_name() -> None:
     assert as_path("s3://bucket/run#1.mcap?region=eu") == RemotePath("s3://bucket", "run#1.mcap", "region=eu")
 
 
-def test_a_file_url_is_a_path() -> None:
+def test_as_path_file_url_is_a_local_path() -> None:
     assert as_path("file:///data/with%20blank.mcap") == Path("/data/with blank.mcap")
 
 
 @pytest.mark.parametrize("given", ["a.mcap", "./a/b", "/a//b", "C:a", "module.name:Class", "a b:/x"])
-def test_what_is_no_url_stays_a_path(given: str) -> None:
+def test_as_path_other_text_is_a_local_path(given: str) -> None:
     assert not is_url(given)
     assert as_path(given) == Path(given)
 
@@ -63,7 +63,7 @@ def test_what_is_no_url_stays_a_path(given: str) -> None:
         ("s3://key:secret@bucket/a.mcap", "no place for a password"),
     ],
 )
-def test_a_url_that_is_not_understood_is_refused(given: str, said: str) -> None:
+def test_as_path_invalid_url_is_refused(given: str, said: str) -> None:
     with pytest.raises(IngestError, match=said) as raised:
         as_path(given)
     assert "secret" not in str(raised.value)
@@ -75,7 +75,7 @@ def test_filesystem_with_unknown_option_names_it_without_its_value() -> None:
     assert "eu-west-1" not in str(raised.value)
 
 
-def test_a_google_bucket_is_served_by_its_own_client() -> None:
+def test_filesystem_of_gs_url_is_the_google_client() -> None:
     path = as_path("gs://bucket/a.mcap?anonymous=true&endpoint_override=127.0.0.1:1&scheme=http")
     assert isinstance(path, RemotePath)
     assert path.filesystem.type_name == "gcs"
@@ -91,26 +91,26 @@ def test_a_google_bucket_is_served_by_its_own_client() -> None:
         (FileNotFoundError(2, "gone"), FileNotFoundError, "gone"),
     ],
 )  # fmt: skip
-def test_an_error_of_a_client_becomes_one_of_ours(error: OSError, kind: type[Exception], said: str) -> None:
+def test_client_error_becomes_a_typed_error(error: OSError, kind: type[Exception], said: str) -> None:
     with pytest.raises(kind, match=said) as raised, reaching("s3://bucket/a"):
         raise error
     assert type(raised.value) is kind
 
 
-def test_a_configuration_takes_urls() -> None:
+def test_config_accepts_urls() -> None:
     config = ROSInjectionConfig("s3://bucket/a.mcap", sequence_name="a", store="s3://bucket/store")
     assert config.paths == (as_path("s3://bucket/a.mcap"),)
     assert config.target == StoreTarget(as_path("s3://bucket/store"))
 
 
-def test_a_manifest_says_where_its_url_is_wrong(tmp_path: Path) -> None:
+def test_manifest_with_invalid_url_reports_its_location(tmp_path: Path) -> None:
     job = tmp_path / "job.yaml"
     job.write_text('version: 1\nbag: {path: "ftp://host/a.mcap"}\n')
     with pytest.raises(ManifestError, match=r"job.yaml:2:13: ftp://host/a.mcap: the scheme"):
         compile_manifest(load_manifest(job))
 
 
-def test_only_recordings_and_stores_may_be_urls(tmp_path: Path) -> None:
+def test_manifest_accepts_urls_only_for_recordings_and_stores(tmp_path: Path) -> None:
     job = tmp_path / "job.yaml"
     (tmp_path / "a.mcap").write_bytes(b"")
     job.write_text(

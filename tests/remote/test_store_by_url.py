@@ -88,7 +88,7 @@ def job(folder: Path, recording: str, store: str, if_exists: str = "fail") -> st
     return name
 
 
-def test_the_same_rows_are_in_both_kinds_of_store(recording: Path, url: str, tmp_path: Path) -> None:
+def test_store_by_url_has_the_same_rows_as_a_store_on_disk(recording: Path, url: str, tmp_path: Path) -> None:
     for store in ("here", url):
         done = ingest("run", job(tmp_path, str(recording), store), cwd=tmp_path)
         assert done.returncode == 0, done.stderr
@@ -108,7 +108,7 @@ def test_the_same_rows_are_in_both_kinds_of_store(recording: Path, url: str, tmp
     assert [key.partition("/")[0] for key in keys(url)] == ["catalog", "segments", "segments", "store.json"]
 
 
-def test_every_command_takes_the_url(recording: Path, url: str, tmp_path: Path) -> None:
+def test_every_store_command_accepts_a_url(recording: Path, url: str, tmp_path: Path) -> None:
     source = root_of(url) / "in/drive.mcap"
     source.write_bytes(recording.read_bytes())
     store = f"{root_of(url)}/store?{root_of(url).options}"
@@ -143,7 +143,7 @@ def test_every_command_takes_the_url(recording: Path, url: str, tmp_path: Path) 
     assert sorted(path.name for path in tmp_path.iterdir() if path.is_dir()) == []
 
 
-def test_rejected_messages_are_kept_and_come_in_later(url: str, tmp_path: Path) -> None:
+def test_quarantine_and_replay_work_with_a_store_by_url(url: str, tmp_path: Path) -> None:
     number = define("std_msgs/msg/Float64", "float64 data")
     sent = [("/x", number, START_NS + step, {"data": float(step)}) for step in range(10)]
     recording = record(tmp_path / "drive.mcap", sent)
@@ -163,7 +163,7 @@ def test_rejected_messages_are_kept_and_come_in_later(url: str, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("if_exists", ["fail", "replace"])
-def test_a_killed_writer_leaves_nothing_to_be_seen(
+def test_killed_writer_leaves_nothing_visible(
     url: str, if_exists: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = Store.open(url)
@@ -209,7 +209,7 @@ def _ended(process: subprocess.Popen[str]) -> int:
             process.kill()
 
 
-def test_a_store_that_goes_away_ends_the_run(
+def test_store_that_becomes_unavailable_ends_the_run(
     own_objects: ObjectStore, recording: Path, tmp_path: Path
 ) -> None:
     store = own_objects.url("store")
@@ -226,7 +226,7 @@ def test_a_store_that_goes_away_ends_the_run(
     [(FileNotFoundError("collected"), ["sessions"]), (Unreachable("gone"), ["segments", "sessions"])],
     ids=["its session was collected", "the store is gone"],
 )
-def test_what_an_ended_session_leaves_is_removed_by_it_or_later(
+def test_files_of_ended_session_are_removed_then_or_by_gc(
     url: str, refusal: Exception, left: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def unlink(path: RemotePath) -> None:
@@ -250,7 +250,7 @@ def test_what_an_ended_session_leaves_is_removed_by_it_or_later(
     assert sorted({key.partition("/")[0] for key in keys(url)} - {"clock"}) == ["store.json"]
 
 
-def test_a_run_whose_last_request_is_lost_has_failed(
+def test_run_whose_last_request_is_lost_fails(
     own_objects: ObjectStore, recording: Path, tmp_path: Path
 ) -> None:
     own_objects.fail_after(0, containing="PUT /bucket/store/catalog")
@@ -259,7 +259,7 @@ def test_a_run_whose_last_request_is_lost_has_failed(
     assert "does not answer" in done.stderr
 
 
-def test_of_two_writers_of_one_name_one_gives_way(url: str) -> None:
+def test_two_writers_of_one_name_exclude_each_other(url: str) -> None:
     writers = [_write(url, "fail", source) for source in (1, 2)]
     codes = sorted(map(_ended, writers))
     store = Store.open(url, create=False)
@@ -271,7 +271,7 @@ def test_of_two_writers_of_one_name_one_gives_way(url: str) -> None:
         assert store.names() == ()
 
 
-def test_a_writer_nobody_heard_of_for_long_does_not_commit(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_writer_with_expired_heartbeat_does_not_commit(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     sink = StoreSink(Store.open(url))
     with pytest.raises(SinkUnavailable, match="could not be told"), sink.open("s", {}) as session:
         session.topic("/t", POINT, {}).write(POINTS)
@@ -279,19 +279,19 @@ def test_a_writer_nobody_heard_of_for_long_does_not_commit(url: str, monkeypatch
     assert [key for key in keys(url) if key.startswith(("segments/", "catalog/"))] == []
 
 
-def test_a_store_of_a_later_format_is_not_touched(url: str) -> None:
+def test_store_of_a_later_format_is_refused_unchanged(url: str) -> None:
     (root_of(url) / "store.json").write_bytes(b'{"format": 2}')
     with pytest.raises(SinkError, match="the store has format 2, this version supports up to 1"):
         Store.open(url)
 
 
-def test_where_there_is_no_store_none_is_found(url: str) -> None:
+def test_missing_store_is_an_error(url: str) -> None:
     assert Store.find(root_of(url)) is None
     with pytest.raises(SinkError, match="there is no store here"):
         Store.open(url, create=False)
 
 
-def test_a_damaged_document_is_named(url: str) -> None:
+def test_damaged_catalog_document_is_named(url: str) -> None:
     store = Store.open(url)
     store.create_sequence("s", {})
     (root_of(url) / "catalog/s.json").write_bytes(b"{")
@@ -299,6 +299,6 @@ def test_a_damaged_document_is_named(url: str) -> None:
         store.sequence("s")
 
 
-def test_a_server_keeps_its_store_on_a_disk(url: str) -> None:
+def test_serve_refuses_a_store_by_url(url: str) -> None:
     with pytest.raises(SinkError, match="a server answers from a store on a disk"):
         serve(url)
