@@ -1,6 +1,6 @@
-"""This file is what is fuzzed: each target takes any bytes, and nothing but a refusal of ours may come out.
+"""The fuzzing targets: each accepts arbitrary bytes, and may raise only errors of this package.
 
-`python fuzz/targets.py TARGET [CORPUS] [-max_total_time=SECONDS]` fuzzes one of them with atheris, by coverage.
+`python fuzz/targets.py TARGET [CORPUS] [-max_total_time=SECONDS]` fuzzes a target with atheris, guided by coverage.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 try:
     import atheris
-except ImportError:  # only the long run needs it
+except ImportError:  # only long runs need it
     atheris = None
 
 with atheris.instrument_imports(include=["mosaico_ingest"]) if atheris else nullcontext():
@@ -38,13 +38,13 @@ with atheris.instrument_imports(include=["mosaico_ingest"]) if atheris else null
 __all__ = ["TARGETS"]
 
 READERS = (mcap, ros1, rosrecord, sqlite)
-"""Imported above to be watched: they are loaded with the first file of their kind."""
+"""Modules that are imported above so that atheris instruments them; they are otherwise loaded on demand."""
 
 _RESOLVER = TypeResolver("ros2_humble")
 
 
 def recording(data: bytes) -> None:
-    """A file of any container: what can be read is read to the end."""
+    """Read a file of any container to its end."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "recording")
         path.write_bytes(data)
@@ -57,14 +57,16 @@ def recording(data: bytes) -> None:
 
 
 def definition(data: bytes) -> None:
-    """The text of a type as a recording carries it, then messages of that type: the first byte says of which kind."""
+    """Parse a definition and decode a message of it; the first byte selects the format of the definition."""
     encoding = ("ros1msg", "ros2msg", "ros2idl")[data[0] % 3] if data else "ros2msg"
     text, _, payload = data[1:].partition(b"\0\0\0\0")
     embedded = Embedded(encoding, text.decode("utf-8", "replace"))
     ros1 = encoding == "ros1msg"
     with suppress(IngestError):
-        found = _RESOLVER.resolve("pkg/msg/Fuzzed", embedded, ros_version=1 if ros1 else 2)
-        connection = Connection(0, "/fuzzed", found.root, Encoding.ROS1 if ros1 else Encoding.CDR, 1, found)
+        resolved = _RESOLVER.resolve("pkg/msg/Fuzzed", embedded, ros_version=1 if ros1 else 2)
+        connection = Connection(
+            0, "/fuzzed", definition.root, Encoding.ROS1 if ros1 else Encoding.CDR, 1, definition
+        )
         one = np.array([0], np.int64)
         buffer = np.frombuffer(payload, np.uint8)
         decoded = decoder_for(connection).decode(MessageBlock(0, one, buffer, one, one + len(payload), one))
@@ -72,18 +74,18 @@ def definition(data: bytes) -> None:
 
 
 def manifest(data: bytes) -> None:
-    """The text of a job."""
+    """Check the text of a manifest."""
     check_manifest(load_source(data.decode("utf-8", "replace"), file="job.yaml"), env={})
 
 
 def adapter(data: bytes) -> None:
-    """The text of an adapter, its expressions among it."""
+    """Load the text of an adapter with its expressions."""
     with suppress(IngestError):
         load_adapter(data.decode("utf-8", "replace"))
 
 
 def metadata(data: bytes) -> None:
-    """The `metadata.yaml` beside a recording."""
+    """Read the `metadata.yaml` of a rosbag2 directory."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "metadata.yaml")
         path.write_bytes(data)
@@ -92,7 +94,7 @@ def metadata(data: bytes) -> None:
 
 
 def wire(data: bytes) -> None:
-    """The body of each action, its answer."""
+    """Decode a request and a response of each action."""
     for action in ACTIONS.values():
         with suppress(Malformed):
             JSON.decode(action.question, data)
@@ -106,8 +108,8 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
 
 
 def main() -> None:
-    """Fuzz the target that the command line names."""
-    if atheris is None or len(sys.argv) < 2 or sys.argv[1] not in TARGETS:  # noqa: PLR2004 - a name must be given
+    """Fuzz the target that the command line selects."""
+    if atheris is None or len(sys.argv) < 2 or sys.argv[1] not in TARGETS:  # noqa: PLR2004 - the name is required
         sys.exit(f"usage: python fuzz/targets.py {{{','.join(TARGETS)}}} [CORPUS] [-max_total_time=SECONDS]")
     atheris.Setup([sys.argv[0], *sys.argv[2:]], TARGETS[sys.argv[1]])
     atheris.Fuzz()

@@ -1,4 +1,4 @@
-"""What every decoder does, whatever its speed."""
+"""The common behavior of all decoders."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One behaviour for every executor: reports in order, a failure costs its recording, whoever registered what."""
+"""The common behavior of all executors: order of reports, failures, and registered types and adapters."""
 
 from __future__ import annotations
 

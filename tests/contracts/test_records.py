@@ -1,4 +1,4 @@
-"""One behaviour for every catalog of a store: a change happens as a whole, and two writers do not mix."""
+"""The common behavior of all catalogs of a store: atomic changes and concurrent writers."""
 
 from __future__ import annotations
 

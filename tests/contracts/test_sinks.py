@@ -1,4 +1,4 @@
-"""One behaviour for every sink: what is written is there after the commit, and nothing before or without it."""
+"""The common behavior of all sinks: rows are visible after the commit, and only then."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run every data set of the corpus through the whole tool and print what became of each.
+"""Ingest every data set of the corpus and print the result of each.
 
 python tests/corpus/survey.py [--out table.tsv] [--corpus FOLDER] [PATTERN …]
 """

@@ -1,4 +1,4 @@
-"""What becomes of real recordings, through the whole tool."""
+"""Real recordings, through the complete pipeline."""
 
 from __future__ import annotations
 

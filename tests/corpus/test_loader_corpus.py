@@ -1,4 +1,4 @@
-"""The loader gives what rosbags gives, wherever rosbags gives anything."""
+"""Comparison of the loader with rosbags on real recordings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every real recording gives all messages it is known to hold, or says why not."""
+"""Real recordings: every message is read, or the reason is reported."""
 
 from __future__ import annotations
 

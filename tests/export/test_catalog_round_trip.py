@@ -1,4 +1,4 @@
-"""Every built-in adapter there and back, over messages of every kind of value."""
+"""Round trips of random messages through every built-in adapter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings that are ingested and written back are what they were."""
+"""Export: ingested recordings are written back with equal messages."""
 
 from __future__ import annotations
 

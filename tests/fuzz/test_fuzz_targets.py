@@ -1,4 +1,4 @@
-"""A short run of every fuzzing target, on mended and mutated seeds; the long run is guided by coverage."""
+"""A short run of every fuzzing target with mutated seeds; the long run is guided by coverage."""
 
 from __future__ import annotations
 

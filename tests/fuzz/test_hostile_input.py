@@ -1,4 +1,4 @@
-"""What a hostile recording, manifest or folder can do through the real command: nothing beyond an error."""
+"""Hostile recordings, manifests and folders, through the real command: they cause errors at most."""
 
 from __future__ import annotations
 

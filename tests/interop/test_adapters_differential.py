@@ -1,4 +1,4 @@
-"""The official SDK's adapters and ours see the same messages; where the values differ, the reason is written here."""
+"""Comparison of our adapters with those of the official SDK on the same messages; each difference is listed with its reason."""
 
 from __future__ import annotations
 

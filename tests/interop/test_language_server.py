@@ -1,4 +1,4 @@
-"""The published schema works in an editor: a YAML language server completes keys and explains them."""
+"""The published schemas in an editor: a YAML language server completes and explains keys."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Adapters written for the official SDK run as they are."""
+"""Adapters written for the official SDK: they run unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The official SDK against our server: it reads what we ingested, writes what we read, and asks as a scan would."""
+"""The official SDK against `ingest serve`: reading, writing and queries."""
 
 from __future__ import annotations
 

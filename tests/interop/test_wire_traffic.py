@@ -1,4 +1,4 @@
-"""Both injectors talk to one server: what goes over the wire is compared call by call."""
+"""Comparison of the calls that both injectors send to a server."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Each folder here is a case: a job, the messages of its recording, and what must come of it; on every container.
+"""Cases of complete jobs, one per folder, each run with every container.
 
-`messages.yaml` lists `{t: seconds, topic, type, data}`; fields left out of `data` are zero. `raw: "hex"` is a payload
-as it stands. `expected.yaml` has the exit code, part of the error, and for each topic counts and rows; a row names the
-fields that matter. `containers` in `expected.yaml` narrows the list of containers.
+`job.yaml` is the manifest. `messages.yaml` lists the messages of the recording as `{t: seconds, topic, type, data}`; missing
+fields of `data` are zero, and `raw: "hex"` is a payload in bytes. `expected.yaml` contains the exit code, a part of the error,
+and counts and rows per topic; a row contains only the fields to compare. `containers` limits the containers.
 """
 
 from __future__ import annotations
@@ -32,32 +32,32 @@ CONTAINERS = {"recording.mcap": 2, "recording.db3": 2, "recording.bag": 1}
 START_S = 1_700_000_000
 
 
-def default(field: Field, definition: Definition, given: Any) -> Any:
-    """Return `given`, or zero, with every field of nested messages."""
+def default(field: Field, definition: Definition, value: Any) -> Any:
+    """Return a value with all fields of nested messages; missing values are zero."""
     if field.container is Container.SCALAR:
         if field.is_message:
-            return complete(field.type, definition, given or {})
+            return complete(field.type, definition, value or {})
         zero: Any = "" if "string" in field.type else False if field.type == "bool" else 0
-        return zero if given is None else given
+        return zero if value is None else value
     count = field.size if field.container is Container.ARRAY else 0
-    values = [None] * count if given is None else given
-    if isinstance(values, str):
-        return bytes.fromhex(values)
+    elements = [None] * count if value is None else value
+    if isinstance(elements, str):
+        return bytes.fromhex(elements)
     one = Field(field.name, field.type, field.is_message)
-    filled = [default(one, definition, value) for value in values]
+    filled = [default(one, definition, element) for element in elements]
     return bytes(filled) if field.type in {"uint8", "byte", "char"} and not count else filled
 
 
-def complete(msgtype: str, definition: Definition, given: dict[str, Any]) -> dict[str, Any]:
+def complete(msgtype: str, definition: Definition, values: dict[str, Any]) -> dict[str, Any]:
     if msgtype in {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration", "time", "duration"}:
-        return {"sec": 0, "nanosec": 0, **given}
+        return {"sec": 0, "nanosec": 0, **values}
     fields = definition.types[msgtype].fields
-    assert not given.keys() - {field.name for field in fields}, f"{msgtype} has no such field"
-    return {field.name: default(field, definition, given.get(field.name)) for field in fields}
+    assert not values.keys() - {field.name for field in fields}, f"{msgtype} has no such field"
+    return {field.name: default(field, definition, values.get(field.name)) for field in fields}
 
 
 def write_recording(path: Path, messages: list[dict[str, Any]]) -> Path:
-    """Write the messages of a case; a directory for ROS 2 is unpacked to its one file."""
+    """Write the messages of a case to one file of the given container."""
     version = CONTAINERS[path.name]
     distro = Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE
     store = get_typestore(distro)
@@ -87,17 +87,17 @@ def payload(message: dict[str, Any], resolver: TypeResolver, version: int) -> by
     return Serializer(definition, encoding).from_dict(values)
 
 
-def matches(found: Any, wanted: Any) -> bool:
-    """Whether `found` has everything `wanted` names."""
-    if isinstance(wanted, dict):
-        return isinstance(found, dict) and all(
-            matches(found.get(key), value) for key, value in wanted.items()
+def matches(actual: Any, expected: Any) -> bool:
+    """Return whether a row contains all expected fields with equal values."""
+    if isinstance(expected, dict):
+        return isinstance(actual, dict) and all(
+            matches(actual.get(key), value) for key, value in expected.items()
         )
-    if isinstance(wanted, list):
-        return len(found) == len(wanted) and all(map(matches, found, wanted))
-    if isinstance(wanted, float):
-        return isinstance(found, float) and math.isclose(found, wanted, rel_tol=1e-6)
-    return found == wanted
+    if isinstance(expected, list):
+        return len(actual) == len(expected) and all(map(matches, actual, expected))
+    if isinstance(expected, float):
+        return isinstance(actual, float) and math.isclose(actual, expected, rel_tol=1e-6)
+    return actual == expected
 
 
 def run(folder: Path) -> tuple[Report | None, int, str]:
@@ -135,7 +135,7 @@ def containers(case: Path) -> list[str]:
         for container in containers(case)
     ],
 )
-def test_case(case: Path, container: str, tmp_path: Path) -> None:
+def test_job_case_gives_the_expected_result(case: Path, container: str, tmp_path: Path) -> None:
     expected = yaml.safe_load((case / "expected.yaml").read_text())
     messages = yaml.safe_load((case / "messages.yaml").read_text())
     write_recording(tmp_path / container, messages)

@@ -1,4 +1,4 @@
-"""Rows with absent structs go through Parquet unchanged, whatever is required inside."""
+"""Rows with null structs: they pass through Parquet unchanged, also if fields inside are required."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recording behind a URL gives what the file gives, and no more of it is fetched than is needed."""
+"""Recordings behind URLs: they equal local files, and only the necessary parts are downloaded."""
 
 from __future__ import annotations
 
@@ -238,7 +238,7 @@ def test_rosbag2_directory_is_read_through_its_metadata(objects: ObjectStore, tm
     put(objects, tmp_path / "metadata.yaml", "rosbag2/x/metadata.yaml")
     with opened(remote(objects, "rosbag2/x")) as there:
         assert [file.name for file in there.files] == ["x_0.mcap"]
-        assert any(one.rule == "missing-part" for one in there.findings)
+        assert any(one.rule == "missing-split" for one in there.findings)
 
 
 def test_missing_recording_is_an_error_that_names_it(objects: ObjectStore) -> None:

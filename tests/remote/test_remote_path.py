@@ -1,4 +1,4 @@
-"""A URL becomes a path that behaves as pathlib's does; what is wrong with one is said before anybody is asked."""
+"""`RemotePath`: it behaves like a pathlib path, and invalid URLs are refused without a request."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A store behind a URL holds what a store on a disk holds, and whoever dies while writing leaves nothing to be seen."""
+"""Stores behind URLs: they equal stores on a disk, and killed writers leave nothing visible."""
 
 from __future__ import annotations
 
