@@ -65,7 +65,7 @@ def definition(data: bytes) -> None:
     with suppress(IngestError):
         resolved = _RESOLVER.resolve("pkg/msg/Fuzzed", embedded, ros_version=1 if ros1 else 2)
         connection = Connection(
-            0, "/fuzzed", definition.root, Encoding.ROS1 if ros1 else Encoding.CDR, 1, definition
+            0, "/fuzzed", resolved.root, Encoding.ROS1 if ros1 else Encoding.CDR, 1, resolved
         )
         one = np.array([0], np.int64)
         buffer = np.frombuffer(payload, np.uint8)
