@@ -1,4 +1,4 @@
-"""This file defers interrupts: an executor counts them, a worker raises them only between two messages, a commit is finished first."""
+"""Signals that ask a run to stop: counted by executors, deferred by workers and by a commit."""
 
 from __future__ import annotations
 
@@ -11,63 +11,74 @@ from typing import Any
 
 from typing_extensions import Self
 
-__all__ = ["DeferredInterrupt", "Stop", "counted_interrupts"]
+__all__ = ["Abandoned", "DeferredInterrupt", "StopHandler", "count_interrupts"]
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
+class Abandoned(BaseException):
+    """Raised by an observer in a worker whose parent process is gone: the run discards its session.
+
+    It is no `Exception`, so that neither an error policy nor a handler for unexpected errors applies to it.
+    """
+
+
 @contextmanager
-def counted_interrupts() -> Generator[list[int]]:
-    """Collect requests to stop instead of raising: an exception in the middle of a message would cost the channel."""
-    asked = list[int]()
+def count_interrupts() -> Generator[list[int]]:
+    """Yield a list that collects the numbers of SIGINT and SIGTERM instead of letting them raise.
+
+    An exception in the middle of a message from a worker would leave the rest of the message in the pipe.
+    """
+    numbers = list[int]()
     if threading.current_thread() is not threading.main_thread():
-        yield asked
+        yield numbers
         return
-    before = [signal.signal(number, lambda number, _: asked.append(number)) for number in _SIGNALS]
+    handlers = [signal.signal(number, lambda number, _: numbers.append(number)) for number in _SIGNALS]
     try:
-        yield asked
+        yield numbers
     finally:
-        for number, handler in zip(_SIGNALS, before, strict=True):
+        for number, handler in zip(_SIGNALS, handlers, strict=True):
             signal.signal(number, handler)
 
 
-class Stop:
-    """A signal handler that interrupts once, and not while it is held off."""
+class StopHandler:
+    """A signal handler that raises KeyboardInterrupt once, and only while interrupts are enabled."""
 
     def __init__(self) -> None:
-        self.asked = False
-        self._held = True
+        self.requested = False
+        """True once a signal arrived."""
+        self._enabled = False
         self._raised = False
 
     def __call__(self, _signal: int, _frame: FrameType | None) -> None:
-        """Take note, and interrupt now or when it is no longer held off."""
-        self.asked = True
-        if not self._held:
-            self.heed()
+        """Note the signal, and interrupt now or as soon as interrupts are enabled."""
+        self.requested = True
+        if self._enabled:
+            self.enable()
 
-    def hold(self) -> None:
-        """Put an interrupt off."""
-        self._held = True
+    def disable(self) -> None:
+        """Defer interrupts."""
+        self._enabled = False
 
-    def heed(self) -> None:
-        """Let interrupts through again, one that was put off at once."""
-        self._held = False
-        if self.asked and not self._raised:
+    def enable(self) -> None:
+        """Let interrupts through; raise immediately if one was deferred."""
+        self._enabled = True
+        if self.requested and not self._raised:
             self._raised = True
             raise KeyboardInterrupt
 
 
 class DeferredInterrupt:
-    """From `defer` until it is left, the first signal to stop is only noted; a second one goes through.
+    """A context in which, after `defer`, the first signal is only noted; a second one goes through.
 
-    Signals that are ignored, or end the process at once, stay as they are. Outside the main thread, where none arrives,
-    it does nothing.
+    Signals that are ignored or end the process keep their handlers. Outside the main thread, which receives every
+    signal, the context does nothing.
     """
 
     def __init__(self) -> None:
         self.asked = False
-        """Whether a signal was put off."""
-        self._before: dict[int, Any] = {}
+        """True if a signal was deferred."""
+        self._handlers: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -78,16 +89,16 @@ class DeferredInterrupt:
         self._restore()
 
     def defer(self) -> None:
-        """Begin to put signals off."""
+        """Start to defer signals."""
         if threading.current_thread() is threading.main_thread():
             for number in _SIGNALS:
                 if callable(signal.getsignal(number)):
-                    self._before[number] = signal.signal(number, self._note)
+                    self._handlers[number] = signal.signal(number, self._note)
 
     def _note(self, _signal: int, _frame: FrameType | None) -> None:
         self.asked = True
         self._restore()
 
     def _restore(self) -> None:
-        while self._before:
-            signal.signal(*self._before.popitem())
+        while self._handlers:
+            signal.signal(*self._handlers.popitem())

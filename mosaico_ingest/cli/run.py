@@ -19,7 +19,7 @@ from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.report.events import BatchObserver, Event, RunFinished, ignore_batch
 
 if TYPE_CHECKING:
-    from mosaico_ingest.executors.in_process import Executor
+    from mosaico_ingest.executors.base import Executor
     from mosaico_ingest.job.config import ROSInjectionConfig
     from mosaico_ingest.report.model import RunReport, UsedManifest
 
@@ -112,6 +112,7 @@ def run(
     """Ingest the recordings of job manifests, or exactly the decisions of a plan."""
     from mosaico_ingest import api
     from mosaico_ingest.cli.console import STANDARD_OUTPUT, print_line, write_output
+    from mosaico_ingest.executors.base import choose_executor
     from mosaico_ingest.report.metrics import prometheus_text
     from mosaico_ingest.report.units import counted
     from mosaico_ingest.textfile import check_file
@@ -137,6 +138,9 @@ def run(
         if metrics is not None:
             write_output(metrics, prometheus_text(result))
 
+    on_ray = None
+    if executor is ExecutorName.RAY:
+        on_ray = choose_executor(configs, simultaneous=jobs, ray=True, address=address)
     hide_pandas(configs)
     with send_telemetry(otel) as telemetry:
         run_configs(
@@ -145,7 +149,7 @@ def run(
             quiet=quiet,
             log=log,
             jobs=jobs,
-            executor=_ray_executor(address, jobs) if executor is ExecutorName.RAY else None,
+            executor=on_ray,
             log_format=log_format,
             manifests=used_manifests,
             observe=telemetry,
@@ -302,6 +306,7 @@ def run_configs(
     """
     from mosaico_ingest import api
     from mosaico_ingest.cli.console import STANDARD_OUTPUT, print_error
+    from mosaico_ingest.executors.base import choose_executor
     from mosaico_ingest.textfile import check_file
 
     as_json = log_format is LogFormat.JSON
@@ -322,7 +327,7 @@ def run_configs(
             observe(position, event)
             show(position, event)
 
-        chosen = executor or _local_executor(configs, jobs, prepare)
+        chosen = executor or choose_executor(configs, simultaneous=jobs, prepare=prepare)
         result = api.run(configs, executor=chosen, observe=observe_all, manifests=manifests)
     write_errors = list(_write_results(result, report_files, on_finish))
     if not quiet and not as_json:
@@ -367,25 +372,6 @@ def _write_results(
 
 def _report_path(config: ROSInjectionConfig) -> Path | None:
     return None if config.report_path is None else Path(config.report_path)
-
-
-def _local_executor(
-    configs: Sequence[ROSInjectionConfig], jobs: int | None, prepare: Callable[[], None]
-) -> Executor:
-    count = min(jobs or configs[0].jobs, len(configs)) if configs else 1
-    if count == 1:
-        from mosaico_ingest.executors.in_process import Inline
-
-        return Inline()
-    from mosaico_ingest.executors.processes import Processes
-
-    return Processes(count, prepare=prepare)
-
-
-def _ray_executor(address: str | None, jobs: int | None) -> Executor:
-    from mosaico_ingest.executors.ray import Ray
-
-    return Ray(address, jobs)
 
 
 def take_shard(items: Sequence[T], shard: str) -> list[T]:

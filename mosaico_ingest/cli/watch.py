@@ -43,7 +43,7 @@ def status(
         print_json([to_builtins(recording) for recording in recordings])
     else:
         _print_status(recordings)
-    if check and any(recording.standing.value != "done" for recording in recordings):
+    if check and any(recording.status.value != "done" for recording in recordings):
         raise typer.Exit(1)
 
 
@@ -54,17 +54,17 @@ def _print_status(recordings: list[RecordingStatus]) -> None:
 
     table = PlainTable("sequence", "status", "recording")
     for recording in recordings:
-        standing = recording.standing.value
+        status = recording.status.value
         files = ", ".join(recording.files)
-        reason = recording.why.removeprefix(f"{files}: ")  # an error already starts with its location
+        reason = recording.reason.removeprefix(f"{files}: ")  # an error already starts with its location
         table.add_row(
             recording.sequence,
-            Text(standing, style=STATUS_STYLES[standing]),
+            Text(status, style=STATUS_STYLES[status]),
             f"{files}: {reason}" if reason else files,
         )
     Terminal().print(table)
-    counts = Counter(recording.standing.value for recording in recordings)
-    print_line(", ".join(f"{count} {standing}" for standing, count in counts.items()))
+    counts = Counter(recording.status.value for recording in recordings)
+    print_line(", ".join(f"{count} {status}" for status, count in counts.items()))
 
 
 def watch(

@@ -65,6 +65,8 @@ class ExistingSequence(Struct, frozen=True):
     """By name, with the leading slash; empty if the destination does not list types."""
     has_all_sessions: bool = True
     """False if `sessions` holds only the metadata of the first session."""
+    finished: bool = True
+    """False if a session is not finished: another run may still be writing it, or was killed."""
 
 
 class DestinationStatus(Struct, frozen=True):
@@ -88,6 +90,8 @@ class Destination(ABC):
 
     kind: ClassVar[str]
     """The name of this type of destination in plans."""
+    replaces_atomically: ClassVar[bool] = True
+    """True if `replace` keeps the old sequence until the new one is committed."""
 
     @abstractmethod
     def describe(self, *, folder: Path | None = None) -> str:

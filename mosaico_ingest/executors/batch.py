@@ -1,4 +1,4 @@
-"""This file tracks a batch whose recordings run in other processes: which wait, how often each was begun, which are done."""
+"""The bookkeeping of a batch whose recordings run in other processes: waiting, attempts and finished reports."""
 
 from __future__ import annotations
 
@@ -19,49 +19,49 @@ __all__ = ["Batch"]
 
 @dataclass(slots=True)
 class Batch:
-    """Recordings by their position; every one gets exactly one report, unless it was never begun."""
+    """The recordings of a batch by position; every started recording gets exactly one report."""
 
-    configs: Sequence[ROSInjectionConfig]
+    jobs: Sequence[ROSInjectionConfig]
     observe: BatchObserver
     run: str = field(default_factory=lambda: uuid.uuid4().hex)
+    """The id of the run, by which a later attempt recognizes what an earlier one committed."""
     waiting: deque[int] = field(default_factory=deque[int])
-    begun: dict[int, int] = field(default_factory=dict[int, int])
-    """How often a recording was begun."""
-    _done: dict[int, Report] = field(default_factory=dict[int, Report])
+    attempts: dict[int, int] = field(default_factory=dict[int, int])
+    """The number of attempts per recording."""
+    _reports: dict[int, Report] = field(default_factory=dict[int, Report])
     _next: int = 0
 
     def __post_init__(self) -> None:
-        """Let every recording wait."""
-        self.waiting.extend(range(len(self.configs)))
+        self.waiting.extend(range(len(self.jobs)))
 
-    def begin(self, position: int) -> Attempt:
-        """Count an attempt."""
-        number = self.begun[position] = self.begun.get(position, 0) + 1
+    def start(self, position: int) -> Attempt:
+        """Count and return a new attempt."""
+        number = self.attempts[position] = self.attempts.get(position, 0) + 1
         return Attempt(self.run, number)
 
     def tell(self, position: int, event: Event) -> None:
-        """Pass on what happens to a recording."""
+        """Pass an event of a recording to the observer."""
         self.observe(position, event)
 
     def finish(self, position: int, report: Report) -> None:
-        """Take a recording's report."""
-        self._done[position] = report
+        """Store the report of a recording."""
+        self._reports[position] = report
 
     def fail(self, position: int, error: IngestError) -> None:
-        """Report that nothing came of a recording."""
-        self.finish(position, failed_report(self.configs[position], error, partial(self.observe, position)))
+        """Store the report of a recording that could not run."""
+        self.finish(position, failed_report(self.jobs[position], error, partial(self.observe, position)))
 
-    def again(self, position: int) -> None:
-        """Let a recording be the next to begin."""
+    def retry(self, position: int) -> None:
+        """Put a recording at the front of the queue."""
         self.waiting.appendleft(position)
 
     def reports(self) -> Iterator[Report]:
-        """Yield what is done, in order, as far as those before it are done too."""
-        while self._next in self._done:
-            yield self._done.pop(self._next)
+        """Yield the next reports in order, up to the first recording that is not finished."""
+        while self._next in self._reports:
+            yield self._reports.pop(self._next)
             self._next += 1
 
-    def rest(self) -> Iterator[Report]:
-        """Yield what is done although something before it never will be."""
-        for position in sorted(self._done):
-            yield self._done.pop(position)
+    def remaining_reports(self) -> Iterator[Report]:
+        """Yield the reports behind recordings that will never finish."""
+        for position in sorted(self._reports):
+            yield self._reports.pop(position)

@@ -6,121 +6,59 @@ import multiprocessing
 import os
 import pickle
 import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from multiprocessing.reduction import ForkingPickler
-from typing import Any
 
 import pyarrow as pa
 from msgspec import Struct
 
-from mosaico_ingest.adapters.python import register_default_adapter, registered_adapters
 from mosaico_ingest.destinations.registry import KeepOpen, keep_destinations_open
 from mosaico_ingest.errors import IngestError, Interrupted
+from mosaico_ingest.executors.base import do_nothing
 from mosaico_ingest.executors.batch import Batch
-from mosaico_ingest.interrupts import Stop, counted_interrupts
+from mosaico_ingest.executors.registrations import Registrations
+from mosaico_ingest.interrupts import Abandoned, StopHandler, count_interrupts
 from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.job.values import Stores
-from mosaico_ingest.pipeline.plan import DEFAULT_MEMORY_BYTES
-from mosaico_ingest.pipeline.run import failed_report, run_config
+from mosaico_ingest.pipeline.memory import DEFAULT_BYTES, MemoryBudget
+from mosaico_ingest.pipeline.run import failed_report, run_recording
 from mosaico_ingest.report.events import BatchObserver, Event
 from mosaico_ingest.report.model import Report
-from mosaico_ingest.rosbag.definitions.registry import Registered, ROSTypeRegistry
 
-__all__ = [
-    "Processes",
-    "Registrations",
-    "do_nothing",
-    "work",
-]
-
-
-class Registrations(Struct, frozen=True):
-    """The types and adapters a program has registered, which a new process does not know of."""
-
-    types: Mapping[Stores | None, Mapping[str, Registered]]
-    adapters: tuple[type[Any], ...]
-
-    @classmethod
-    def current(cls) -> Registrations:
-        """Return those of this process."""
-        return cls(ROSTypeRegistry.snapshot(), tuple(dict.fromkeys(registered_adapters().values())))
-
-    def register(self) -> None:
-        """Register them in this process."""
-        ROSTypeRegistry.restore(self.types)
-        for adapter in self.adapters:
-            register_default_adapter(adapter)
-
-
-def do_nothing() -> None:
-    """Prepare nothing."""
-
-
-def work(pipe: Connection, registrations: Registrations, prepare: Callable[[], None], jobs: int) -> None:
-    """Ingest what comes through the pipe until its other end is closed."""
-    os.setsid()  # Ctrl-C reaches the parent only, which passes it on once
-    stop = Stop()
-    signal.signal(signal.SIGINT, stop)
-    signal.signal(signal.SIGTERM, stop)
-    pa.set_cpu_count(max(1, (os.cpu_count() or 1) // jobs))
-    prepare()
-    registrations.register()
-    with keep_destinations_open() as keep_open, suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        while not stop.asked:
-            _ingest(pipe, pipe.recv_bytes(), stop, keep_open)
-
-
-def _ingest(pipe: Connection, pickled: bytes, stop: Stop, keep_open: KeepOpen) -> None:
-    def tell(event: Event) -> None:
-        stop.hold()  # an interrupt in the middle of a message would leave half of it in the pipe
-        pipe.send(event)
-        stop.heed()
-
-    try:
-        config: ROSInjectionConfig = pickle.loads(pickled)  # noqa: S301 - from our own parent
-    except Exception as error:  # noqa: BLE001 - the border: a class's own code runs here
-        pipe.send(IngestError(f"the job cannot be read in another process: {type(error).__name__}: {error}"))
-        return
-    try:
-        stop.heed()
-        report = run_config(config, tell)
-    except KeyboardInterrupt:
-        report = failed_report(config, Interrupted("stopped before it was begun"), tell)
-    stop.hold()
-    pipe.send(report)
-    keep_open(config.target)
-
+__all__ = ["ATTEMPTS", "Processes", "work"]
 
 ATTEMPTS = 2
-"""How often a recording is begun whose process died under it."""
+"""Number of times a recording is started if its worker process dies."""
 _SHUTDOWN_S = 10.0
+"""Seconds that a worker has to end before it is killed."""
 _POLL_S = 0.2
-"""How long a request to stop may go unnoticed."""
-_LEAST_BYTES = 32 << 20
+"""Seconds between two checks for a request to stop."""
+_STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Processes(Struct, frozen=True):
-    """The executor for one machine: at most `jobs` recordings at a time, each in a process of its own.
+    """The executor for one machine: up to `processes` recordings at a time, each in a worker process.
 
-    A process that dies takes only its recording with it, which is begun anew up to `attempts` times. The jobs' memory
-    is shared out. `prepare` is called in every process first, where logging is to be set up.
+    If a worker dies, its recording is started again, up to `attempts` times in total; other recordings are not affected.
+    The memory budget of the jobs is split among the workers. Each worker calls `prepare` first, for example to configure
+    logging.
     """
 
-    jobs: int
+    processes: int
     attempts: int = ATTEMPTS
     prepare: Callable[[], None] = do_nothing
 
-    def map(self, configs: Sequence[ROSInjectionConfig], observe: BatchObserver) -> Iterator[Report]:
-        """Yield the report of each configuration; see `Executor.map`."""
-        jobs = max(1, min(self.jobs, len(configs)))
-        shared = [replace(config, memory_bytes=_share(config.memory_bytes, jobs)) for config in configs]
-        pool = _Pool(Batch(shared, observe), jobs, self.attempts, partial(_start, self.prepare, jobs))
-        with counted_interrupts() as interrupts:
+    def map(self, jobs: Sequence[ROSInjectionConfig], observe: BatchObserver) -> Iterator[Report]:
+        """Yield the report of each job; see `Executor.map`."""
+        processes = max(1, min(self.processes, len(jobs)))
+        split = [replace(job, memory_bytes=_split_memory(job.memory_bytes, processes)) for job in jobs]
+        spawn = partial(_spawn_worker, self.prepare, processes)
+        pool = _Pool(Batch(split, observe), processes, self.attempts, spawn)
+        with count_interrupts() as interrupts:
             try:
                 yield from pool.reports(interrupts)
             finally:
@@ -129,7 +67,7 @@ class Processes(Struct, frozen=True):
 
 @dataclass(slots=True)
 class _Worker:
-    """A process, our end of the pipe to it, and the recording it has in work."""
+    """A worker process, the parent's end of its pipe, and the position of the recording it runs."""
 
     process: SpawnProcess
     pipe: Connection
@@ -139,24 +77,25 @@ class _Worker:
 @dataclass(slots=True)
 class _Pool:
     batch: Batch
-    jobs: int
+    size: int
     attempts: int
     spawn: Callable[[], _Worker]
     workers: list[_Worker] = field(default_factory=list[_Worker])
-    interrupted: int = 0
+    interrupts: int = 0
+    """Number of interrupts that were passed on to the workers."""
 
     def reports(self, interrupts: list[int]) -> Iterator[Report]:
-        """Yield reports in order, as soon as those before them are there too."""
+        """Yield reports in order, each as soon as the ones before it are finished."""
         while self.batch.waiting or any(worker.task is not None for worker in self.workers):
             self._assign()
             self._poll()
-            if len(interrupts) > self.interrupted:
+            if len(interrupts) > self.interrupts:
                 self._interrupt()
             yield from self.batch.reports()
-        yield from self.batch.rest()
+        yield from self.batch.remaining_reports()
 
     def shut_down(self) -> None:
-        """End every process: the idle by closing their pipes, one still at work by interrupting it."""
+        """End every worker: idle ones by closing their pipes, busy ones by an interrupt."""
         for worker in self.workers:
             if worker.task is not None:
                 _signal(worker, signal.SIGINT)
@@ -171,7 +110,7 @@ class _Pool:
         while self.batch.waiting:
             worker = next((worker for worker in self.workers if worker.task is None), None)
             if worker is None:
-                if len(self.workers) == self.jobs:
+                if len(self.workers) == self.size:
                     return
                 worker = self.spawn()
                 self.workers.append(worker)
@@ -179,17 +118,17 @@ class _Pool:
 
     def _send(self, worker: _Worker, task: int) -> None:
         try:
-            pickled = ForkingPickler.dumps(replace(self.batch.configs[task], attempt=self.batch.begin(task)))
-        except Exception as error:  # noqa: BLE001 - pickle raises what the object's class raises
+            pickled = ForkingPickler.dumps(replace(self.batch.jobs[task], attempt=self.batch.start(task)))
+        except Exception as error:  # noqa: BLE001 - pickling runs the code of the job's classes
             self.batch.fail(task, _unsendable(error))
             return
         worker.task = task
-        with suppress(BrokenPipeError):  # a process that is gone is noticed where we listen
+        with suppress(BrokenPipeError):  # `_receive` notices that the process is gone
             worker.pipe.send_bytes(pickled)
 
     def _poll(self) -> None:
-        at_work = [worker.pipe for worker in self.workers if worker.task is not None]
-        ready = set(wait(at_work, _POLL_S)) if at_work else set[object]()
+        busy = [worker.pipe for worker in self.workers if worker.task is not None]
+        ready = set(wait(busy, _POLL_S)) if busy else set[object]()
         for worker in self.workers[:]:
             if worker.task is not None and worker.pipe in ready:
                 self._receive(worker, worker.task)
@@ -198,7 +137,7 @@ class _Pool:
         try:
             message = worker.pipe.recv()
         except (EOFError, OSError):
-            self._worker_died(worker, task)
+            self._handle_death(worker, task)
             return
         if isinstance(message, Report):
             worker.task = None
@@ -209,38 +148,81 @@ class _Pool:
         else:
             self.batch.tell(task, message)
 
-    def _worker_died(self, worker: _Worker, task: int) -> None:
-        """Account for a process that died: its recording is begun anew, or has failed."""
+    def _handle_death(self, worker: _Worker, task: int) -> None:
+        """Remove a worker that died; start its recording again, or report it as failed."""
         worker.process.join()
         worker.pipe.close()
         self.workers.remove(worker)
-        if self.interrupted:
+        if self.interrupts:
             self.batch.fail(task, Interrupted("stopped before the end of the recording"))
-        elif self.batch.begun[task] < self.attempts:
-            self.batch.again(task)
+        elif self.batch.attempts[task] < self.attempts:
+            self.batch.retry(task)
         else:
-            self.batch.fail(task, _died(worker.process.exitcode, self.attempts))
+            self.batch.fail(task, _worker_died(worker.process.exitcode, self.attempts))
 
     def _interrupt(self) -> None:
-        """Begin nothing more and let what is in work end as its policy says; asked twice, end it at once."""
+        """Start no more recordings and interrupt the running ones; a second interrupt kills them."""
         self.batch.waiting.clear()
         for worker in self.workers:
             if worker.task is not None:
-                _signal(worker, signal.SIGKILL if self.interrupted else signal.SIGINT)
-        self.interrupted += 1
+                _signal(worker, signal.SIGKILL if self.interrupts else signal.SIGINT)
+        self.interrupts += 1
 
 
-def _start(prepare: Callable[[], None], jobs: int) -> _Worker:
-    spawning = multiprocessing.get_context("spawn")  # threads run here, so forking would be a gamble
+def work(pipe: Connection, registrations: Registrations, prepare: Callable[[], None], processes: int) -> None:
+    """Run jobs from a pipe until its other end is closed; the main function of a worker process."""
+    os.setsid()  # Ctrl-C reaches only the parent, which passes it on
+    stop = StopHandler()
+    for number in _STOP_SIGNALS:
+        signal.signal(number, stop)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOP_SIGNALS)
+    pa.set_cpu_count(max(1, (os.cpu_count() or 1) // processes))
+    prepare()
+    registrations.register()
+    with (
+        keep_destinations_open() as keep_open,
+        suppress(Abandoned, EOFError, BrokenPipeError, ConnectionResetError),
+    ):
+        while not stop.requested:
+            _run_job(pipe, pipe.recv_bytes(), stop, keep_open)
+
+
+def _run_job(pipe: Connection, pickled: bytes, stop: StopHandler, keep_open: KeepOpen) -> None:
+    def tell(event: Event) -> None:
+        stop.disable()  # an interrupt in the middle of a message would leave half of it in the pipe
+        try:
+            pipe.send(event)
+        except OSError as error:  # the parent is gone: nobody will see the result
+            raise Abandoned from error
+        stop.enable()
+
+    try:
+        job: ROSInjectionConfig = pickle.loads(pickled)  # noqa: S301 - from our own parent
+    except Exception as error:  # noqa: BLE001 - unpickling runs the code of the job's classes
+        pipe.send(IngestError(f"the job cannot be read in another process: {type(error).__name__}: {error}"))
+        return
+    try:
+        stop.enable()
+        report = run_recording(job, tell).report
+    except KeyboardInterrupt:
+        report = failed_report(job, Interrupted("stopped before the recording was opened"), tell)
+    stop.disable()
+    pipe.send(report)
+    keep_open(job.target)
+
+
+def _spawn_worker(prepare: Callable[[], None], processes: int) -> _Worker:
+    spawning = multiprocessing.get_context("spawn")  # forking is unsafe because this process has threads
     ours, theirs = spawning.Pipe()
     try:
         process = spawning.Process(
             target=work,
-            args=(theirs, Registrations.current(), prepare, jobs),
+            args=(theirs, Registrations.current(), prepare, processes),
             name="ingest-worker",
             daemon=True,
         )
-        process.start()
+        with _stop_signals_blocked():
+            process.start()
     except Exception as error:
         ours.close()
         raise _unsendable(error) from error
@@ -249,8 +231,18 @@ def _start(prepare: Callable[[], None], jobs: int) -> _Worker:
     return _Worker(process, ours)
 
 
-def _share(memory_bytes: int | None, jobs: int) -> int:
-    return max((memory_bytes or DEFAULT_MEMORY_BYTES) // jobs, _LEAST_BYTES)
+@contextmanager
+def _stop_signals_blocked() -> Generator[None]:
+    """Block signals to stop; a new process inherits the mask, so Ctrl-C cannot interrupt its imports."""
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, _STOP_SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+def _split_memory(memory_bytes: int | None, processes: int) -> int:
+    return MemoryBudget(memory_bytes or DEFAULT_BYTES).split(processes).total_bytes
 
 
 def _signal(worker: _Worker, number: signal.Signals) -> None:
@@ -265,13 +257,13 @@ def _unsendable(error: Exception) -> IngestError:
     )
 
 
-def _died(exit_code: int | None, attempts: int) -> IngestError:
+def _worker_died(exit_code: int | None, attempts: int) -> IngestError:
     if exit_code is not None and exit_code < 0:
-        how = f"was killed by {signal.Signals(-exit_code).name}"
+        cause = f"was killed by {signal.Signals(-exit_code).name}"
     else:
-        how = f"ended with exit code {exit_code}"
-    memory = exit_code == -signal.SIGKILL
+        cause = f"ended with exit code {exit_code}"
+    killed = exit_code == -signal.SIGKILL
     return IngestError(
-        f"the process that ingested it {how}, {attempts} times in all",
-        hint="memory may have run out: give fewer jobs or less run.memory" if memory else None,
+        f"the worker process {cause} in each of {attempts} attempts",
+        hint="memory may have run out: use fewer jobs or a smaller run.memory" if killed else None,
     )

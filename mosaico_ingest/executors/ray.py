@@ -1,4 +1,4 @@
-"""This file runs configurations on Ray: each recording is a task, on whichever node of a cluster has room for it."""
+"""The executor that runs recordings as tasks on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.destinations.store.errors import explained
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.batch import Batch
-from mosaico_ingest.executors.processes import ATTEMPTS, Registrations
+from mosaico_ingest.executors.processes import ATTEMPTS
+from mosaico_ingest.executors.registrations import Registrations
 from mosaico_ingest.executors.shipment import absolute, pack
-from mosaico_ingest.interrupts import counted_interrupts
+from mosaico_ingest.interrupts import count_interrupts
 from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.pipeline.plan import DEFAULT_MEMORY_BYTES
+from mosaico_ingest.pipeline.memory import DEFAULT_BYTES
 from mosaico_ingest.report.events import BatchObserver, RunStarted
 from mosaico_ingest.report.model import Report
 
@@ -46,87 +47,94 @@ __all__ = ["Ray"]
 
 _log = logging.getLogger(__name__)
 
-NODES = 3
-"""How many nodes may go under a recording before it has failed: a node that goes is not its doing, mostly."""
+NODE_LOSSES = 3
+"""Number of node losses after which a recording fails; separate from the attempts, as a lost node is rarely its fault."""
 _POLL_S = 0.1
 _SHUTDOWN_S = 10.0
 _CONNECT_S = 5.0
-_AT_ONCE = 1000
-"""How many tasks Ray is given at a time, so that it sees how many nodes there is work for."""
+_MAX_TASKS = 1000
+"""Number of tasks that Ray receives at a time; its autoscaler sizes the cluster by them."""
 _WORKER_BYTES = 256 << 20
-"""What a worker takes beside the batches."""
-_HERE: dict[str, Any] = {"include_dashboard": False, "object_store_memory": 128 << 20}
-"""How Ray is started on this machine: only configurations and reports travel."""
+"""Bytes that a worker needs in addition to the memory budget of its recording."""
+_LOCAL_OPTIONS: dict[str, Any] = {"include_dashboard": False, "object_store_memory": 128 << 20}
+"""Options for starting Ray on this machine; its object store holds only jobs and reports."""
 _PACKAGE = str(Path(__file__).parents[1])
 _NODE_ERRORS = (ray_errors.NodeDiedError, ray_errors.ObjectLostError)
 
 
 class Ray(Struct, frozen=True):
-    """The executor for a cluster: connects to the one at `address`, or starts Ray on this machine.
+    """The executor for a Ray cluster: connects to the cluster at `address`, or starts Ray on this machine.
 
-    A worker that dies takes only its recording with it, which is begun anew up to `attempts` times; one whose node went
-    is begun on another. At most `jobs` recordings are in work, without it as many as there is room for.
-    A program that is connected to Ray already keeps its connection, and its runtime environment.
+    If a worker dies, its recording is started again, up to `attempts` times in total; if a node is lost, on another node.
+    At most `simultaneous` recordings run at the same time, by default as many as the cluster has capacity for. A program
+    that is already connected to Ray keeps its connection and runtime environment.
     """
 
     address: str | None = None
-    jobs: int | None = None
+    simultaneous: int | None = None
     attempts: int = ATTEMPTS
 
-    def map(self, configs: Sequence[ROSInjectionConfig], observe: BatchObserver) -> Iterator[Report]:
-        """Yield the report of each configuration; see `Executor.map`.
+    def map(self, jobs: Sequence[ROSInjectionConfig], observe: BatchObserver) -> Iterator[Report]:
+        """Yield the report of each job; see `Executor.map`.
 
         Raises:
-            IngestError: There is no Ray at the address, or it ends under the run.
+            IngestError: There is no Ray cluster at the address, or it ends during the run.
         """
-        if not configs:
+        if not jobs:
             return
-        batch = Batch(configs, observe)
+        batch = Batch(jobs, observe)
         with ExitStack() as stack:
-            sent = [absolute(config) for config in configs]
+            sent = [absolute(job) for job in jobs]
             if not ray.is_initialized():
-                sent = stack.enter_context(_connected(self.address, self.jobs, sent))
+                sent = stack.enter_context(_connected(self.address, self.simultaneous, sent))
             beacon = stack.enter_context(_beacon(sent, batch.run))
-            run = _Run(batch, sent, self.jobs or _AT_ONCE, self.attempts, _start_mailbox(), _setting(beacon))
+            run = _Run(
+                batch,
+                sent,
+                self.simultaneous or _MAX_TASKS,
+                self.attempts,
+                _start_mailbox(),
+                _setting(beacon),
+            )
             stack.callback(run.shut_down)
-            interrupts = stack.enter_context(counted_interrupts())
+            interrupts = stack.enter_context(count_interrupts())
             try:
                 yield from run.reports(interrupts)
             except ray_errors.RayError as error:
-                raise IngestError(f"Ray ended under the run: {_said(error)}") from error
+                raise IngestError(f"Ray ended during the run: {_first_line(error)}") from error
 
 
 @dataclass(slots=True)
 class _Run:
     batch: Batch
     sent: Sequence[ROSInjectionConfig]
-    at_once: int
+    max_tasks: int
     attempts: int
     mailbox: Any
     setting: Any
     tasks: dict[Any, int] = field(default_factory=dict[Any, int])
-    """The recording each of Ray's references stands for."""
+    """The position of the recording that each of Ray's references runs."""
     started: set[int] = field(default_factory=set[int])
     nodes_lost: Counter[int] = field(default_factory=Counter[int])
     interrupted: int = 0
 
     def reports(self, interrupts: list[int]) -> Iterator[Report]:
-        """Yield reports in order, as soon as those before them are there too."""
+        """Yield reports in order, each as soon as the ones before it are finished."""
         largest_bytes = max((node["Resources"].get("memory", 0) for node in ray.nodes()), default=0)
         while self.batch.waiting or self.tasks:
-            while self.batch.waiting and len(self.tasks) < self.at_once:
-                self._begin(self.batch.waiting.popleft(), int(largest_bytes))
+            while self.batch.waiting and len(self.tasks) < self.max_tasks:
+                self._start(self.batch.waiting.popleft(), int(largest_bytes))
             done, _ = ray.wait(list(self.tasks), timeout=_POLL_S) if self.tasks else ([], [])
-            self._receive()  # whatever a task had to say came in before it was done
+            self._receive()  # a task posts its events before it ends
             for task in done:
-                self._take(task, self.tasks.pop(task))
+                self._finish(task, self.tasks.pop(task))
             if len(interrupts) > self.interrupted:
                 self._interrupt()
             yield from self.batch.reports()
-        yield from self.batch.rest()
+        yield from self.batch.remaining_reports()
 
     def shut_down(self) -> None:
-        """End what is still in work."""
+        """End the running tasks and the mailbox."""
         with suppress(ray_errors.RayError):
             for force in (False, True):
                 self._cancel(force=force)
@@ -135,63 +143,68 @@ class _Run:
                     self.tasks = {task: position for task, position in self.tasks.items() if task not in done}
             ray.kill(self.mailbox)
 
-    def _begin(self, position: int, largest_bytes: int) -> None:
-        attempt = self.batch.begin(position)
+    def _start(self, position: int, largest_bytes: int) -> None:
+        attempt = self.batch.start(position)
         config = replace(self.sent[position], attempt=attempt)
         try:
             pickled = cloudpickle.dumps(config)  # pyright: ignore[reportPrivateImportUsage] - its module re-exports it
-        except Exception as error:  # noqa: BLE001 - pickle raises what the object's class raises
+        except Exception as error:  # noqa: BLE001 - pickling runs the code of the job's classes
             self.batch.fail(position, IngestError(f"the job cannot be sent to another machine: {error}"))
             return
-        wanted_bytes = (config.memory_bytes or DEFAULT_MEMORY_BYTES) + _WORKER_BYTES
-        # Ray's own retries count no node that goes and no memory that runs out, so a recording could cost them all.
+        needed_bytes = (config.memory_bytes or DEFAULT_BYTES) + _WORKER_BYTES
+        # Ray's built-in retries do not count lost nodes or out-of-memory failures, so one recording could take down
+        # every node.
         task = ray.remote(ingest).options(
             name=f"ingest {config.sequence_name}",
             num_cpus=1,
-            memory=min(wanted_bytes, largest_bytes),
+            memory=min(needed_bytes, largest_bytes),
             max_retries=0,
             scheduling_strategy="SPREAD",
         )
         self.tasks[task.remote(pickled, position, attempt.number, self.mailbox, self.setting)] = position
 
     def _receive(self) -> None:
-        for position, attempt, said in ray.get(self.mailbox.fetch.remote()):
-            if isinstance(said, logging.LogRecord):
-                logging.getLogger(said.name).handle(said)
-            elif attempt == self.batch.begun[position]:
+        for position, attempt, message in ray.get(self.mailbox.fetch.remote()):
+            if isinstance(message, logging.LogRecord):
+                logging.getLogger(message.name).handle(message)
+            elif attempt == self.batch.attempts[position]:
                 self.started.add(position)
-                self.batch.tell(position, self._as_given(position, said))
+                self.batch.tell(position, self._with_job_paths(position, message))
 
-    def _take(self, task: Any, position: int) -> None:  # noqa: ANN401 - Ray's reference
-        said: Any
+    def _finish(self, task: Any, position: int) -> None:  # noqa: ANN401 - Ray's reference
+        message: Any
         try:
-            said = ray.get(task)
+            message = ray.get(task)
         except ray_errors.RuntimeEnvSetupError as error:
-            self.batch.fail(position, IngestError(f"Ray could not send the job's files: {_said(error)}"))
+            self.batch.fail(
+                position, IngestError(f"Ray could not send the job's files: {_first_line(error)}")
+            )
         except ray_errors.RayError as error:
             self._task_died(position, error)
         else:
-            if isinstance(said, Report):
-                self.batch.finish(position, self._as_given(position, said))
+            if isinstance(message, Report):
+                self.batch.finish(position, self._with_job_paths(position, message))
             else:
-                self.batch.fail(position, said)
+                self.batch.fail(position, message)
 
     def _task_died(self, position: int, error: ray_errors.RayError) -> None:
-        """Account for a task that came to nothing: its recording is begun anew, or has failed."""
+        """Start the recording of a task that died again, or report it as failed."""
         if self.interrupted:
             if position in self.started:
                 self.batch.fail(position, Interrupted("stopped before the end of the recording"))
             return
         self.nodes_lost[position] += isinstance(error, _NODE_ERRORS)
-        deaths = self.batch.begun[position] - self.nodes_lost[position]
-        if deaths < self.attempts and self.nodes_lost[position] < NODES:
-            _log.warning("%s is begun anew: %s", self.batch.configs[position].sequence_name, _said(error))
-            self.batch.again(position)
+        deaths = self.batch.attempts[position] - self.nodes_lost[position]
+        if deaths < self.attempts and self.nodes_lost[position] < NODE_LOSSES:
+            _log.warning(
+                "%s is started again: %s", self.batch.jobs[position].sequence_name, _first_line(error)
+            )
+            self.batch.retry(position)
         else:
-            self.batch.fail(position, _died(error, self.batch.begun[position]))
+            self.batch.fail(position, _died(error, self.batch.attempts[position]))
 
     def _interrupt(self) -> None:
-        """Begin nothing more and let what is in work end as its policy says; asked twice, end it at once."""
+        """Start no more recordings and cancel the running ones; a second interrupt kills them."""
         self.batch.waiting.clear()
         self._cancel(force=self.interrupted > 0)
         self.interrupted += 1
@@ -200,34 +213,34 @@ class _Run:
         for task in self.tasks:
             ray.cancel(task, force=force, recursive=False)
 
-    def _as_given(self, position: int, said: Any) -> Any:  # noqa: ANN401 - an event or a report, as it came
-        """Spell places as the job does: on another machine they had to be absolute."""
-        if not isinstance(said, RunStarted | Report):
-            return said
-        given = self.batch.configs[position]
-        files, destination = said.files, destination_of(given.target).describe()
-        if all(isinstance(path, Path) and not path.is_absolute() for path in given.paths):
+    def _with_job_paths(self, position: int, message: Any) -> Any:  # noqa: ANN401 - an event or a report
+        """Return an event or a report with paths as in the job; a worker uses absolute ones."""
+        if not isinstance(message, RunStarted | Report):
+            return message
+        job = self.batch.jobs[position]
+        files, destination = message.files, destination_of(job.target).describe()
+        if all(isinstance(path, Path) and not path.is_absolute() for path in job.paths):
             files = tuple(map(relpath, files))
-        if isinstance(said, Report):
-            return said.model_copy(update={"files": files, "destination": destination})
-        return replace(said, files=files, destination=destination)
+        if isinstance(message, Report):
+            return message.model_copy(update={"files": files, "destination": destination})
+        return replace(message, files=files, destination=destination)
 
 
 def _died(error: ray_errors.RayError, attempts: int) -> IngestError:
     if isinstance(error, _NODE_ERRORS):
-        return IngestError(f"the node that ingested it went away, {NODES} times in all")
+        return IngestError(f"the node of the worker was lost {NODE_LOSSES} times")
     memory = isinstance(error, ray_errors.OutOfMemoryError)
     return IngestError(
-        f"the worker that ingested it {'ran out of memory' if memory else 'died'}, {attempts} times in all",
-        hint="give less run.memory" if memory else f"Ray says: {_said(error)}",
+        f"the worker {'ran out of memory' if memory else 'died'} in each of {attempts} attempts",
+        hint="use a smaller run.memory" if memory else f"Ray reports: {_first_line(error)}",
     )
 
 
 @contextmanager
 def _connected(
-    address: str | None, jobs: int | None, configs: list[ROSInjectionConfig]
+    address: str | None, simultaneous: int | None, jobs: list[ROSInjectionConfig]
 ) -> Generator[list[ROSInjectionConfig]]:
-    """Connect to Ray; yield the configurations as its workers will understand them."""
+    """Connect to Ray; yield the configurations with paths that are valid on its workers."""
     if address is not None and address.startswith("ray://"):
         raise IngestError(
             f"{address} is the address of Ray's client server",
@@ -235,10 +248,10 @@ def _connected(
         )
     _check_reachable(address)
     with tempfile.TemporaryDirectory(prefix="mosaico-ingest-") as folder:
-        sent = configs
-        options: dict[str, Any] = {**_HERE, "num_cpus": jobs}
+        sent = jobs
+        options: dict[str, Any] = {**_LOCAL_OPTIONS, "num_cpus": simultaneous}
         if address is not None:
-            sent = pack(configs, Path(folder))
+            sent = pack(jobs, Path(folder))
             options = {"runtime_env": {"working_dir": folder, "py_modules": [_PACKAGE]}}
         try:
             ray.init(address or "local", log_to_driver=False, logging_level=logging.ERROR, **options)
@@ -251,7 +264,7 @@ def _connected(
 
 
 def _check_reachable(address: str | None) -> None:
-    """Find out whether anybody is at `host:port`: Ray would try for minutes."""
+    """Raise if nothing listens at `host:port`; Ray would retry for minutes."""
     host, _, port = (address or "").rpartition(":")
     if port.isdecimal():
         try:
@@ -262,17 +275,17 @@ def _check_reachable(address: str | None) -> None:
 
 def _unreachable(address: str | None, error: Exception) -> IngestError:
     return IngestError(
-        f"cannot connect to Ray: {_said(error)}",
+        f"cannot connect to Ray: {_first_line(error)}",
         where=address,
-        hint="`ray status --address` says more; a cluster may want a token (RAY_AUTH_MODE, RAY_AUTH_TOKEN)",
+        hint="check it with `ray status --address`; a cluster may require a token (RAY_AUTH_MODE, RAY_AUTH_TOKEN)",
     )
 
 
 @contextmanager
-def _beacon(configs: Sequence[ROSInjectionConfig], run: str) -> Generator[str]:
-    """Put a file into every store while the run goes on, so that no worker takes another folder for it."""
+def _beacon(jobs: Sequence[ROSInjectionConfig], run: str) -> Generator[str]:
+    """Keep a file in every store during the run, by which workers recognize the store."""
     name = f".run-{run}"
-    stores = {destination_of(config.target).local_folder for config in configs}
+    stores = {destination_of(job.target).local_folder for job in jobs}
     folders = [path for path in stores if path is not None]
     for folder in folders:
         with explained(folder):
@@ -284,11 +297,11 @@ def _beacon(configs: Sequence[ROSInjectionConfig], run: str) -> Generator[str]:
         for folder in folders:
             with suppress(OSError):
                 (folder / name).unlink()
-                folder.rmdir()  # where nothing came of it
+                folder.rmdir()  # if the run wrote nothing
 
 
 def _start_mailbox() -> Any:  # noqa: ANN401 - Ray's handle
-    """Start the mailbox on the driver's own node, whose end would be the run's end anyway."""
+    """Start the mailbox on the driver's node: if that node is lost, the run ends anyway."""
     here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
     return ray.remote(Mailbox).options(num_cpus=0, scheduling_strategy=here).remote()
 
@@ -298,6 +311,6 @@ def _setting(beacon: str) -> Any:  # noqa: ANN401 - Ray's reference
     return ray.put(Setting(Registrations.current(), level, beacon, machine()))
 
 
-def _said(error: Exception) -> str:
-    """Return the first line of an error of Ray's, which may have a page of advice."""
+def _first_line(error: Exception) -> str:
+    """Return the first line of a Ray error, which may be a page long."""
     return str(error).strip().partition("\n")[0] or type(error).__name__

@@ -1,4 +1,4 @@
-"""This file is the task on a node of a Ray cluster: it ingests one recording, sends events to the mailbox, returns the report."""
+"""The task of a Ray worker: ingest one recording, post its events to the mailbox, return the report."""
 
 from __future__ import annotations
 
@@ -23,44 +23,45 @@ from mosaico_ingest.errors import (
     Interrupted,
     SinkError,
 )
-from mosaico_ingest.executors.processes import Registrations
-from mosaico_ingest.interrupts import Stop
+from mosaico_ingest.executors.registrations import Registrations
+from mosaico_ingest.interrupts import StopHandler
 from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.pipeline.run import failed_report, run_config
+from mosaico_ingest.pipeline.run import failed_report, run_recording
 from mosaico_ingest.report.events import Event, RunFinished, RunStarted
 from mosaico_ingest.report.model import Report
 
 __all__ = ["Mailbox", "Notice", "Setting", "ingest", "machine", "out_of_reach"]
 
 Notice: TypeAlias = tuple[int, int, Event | logging.LogRecord]
-"""The recording's position, the number of the attempt, what there is to say."""
+"""The position of the recording, the number of the attempt, and an event or a log record."""
 
-_SEND_EVERY_S = 0.2
+_POST_INTERVAL_S = 0.2
+"""Seconds between two posts to the mailbox."""
 
 
 class Setting(Struct, frozen=True):
-    """What all tasks of a run have in common."""
+    """The settings that all tasks of a run share."""
 
     registrations: Registrations
     log_level: int
     beacon: str
-    """The name of the file by which a worker knows that it sees the same store as the driver."""
+    """The name of the file in the store by which a worker recognizes the driver's store."""
     machine: str
-    """Where the driver runs."""
+    """The id of the driver's machine; see `machine`."""
 
 
 class Mailbox:
-    """The actor beside the driver that takes in what workers say until it is fetched; the driver asks, so that it never waits."""
+    """The actor on the driver's node that collects notices of workers until the driver fetches them."""
 
     def __init__(self) -> None:
         self._notices: list[Notice] = []
 
     def post(self, notices: list[Notice]) -> None:
-        """Take in what workers have to say."""
+        """Add notices of a worker."""
         self._notices += notices
 
     def fetch(self) -> list[Notice]:
-        """Hand out what has come in."""
+        """Return the notices since the last call."""
         notices, self._notices = self._notices, []
         return notices
 
@@ -72,57 +73,57 @@ def ingest(
     mailbox: Any,  # noqa: ANN401 - Ray's handle of the actor
     setting: Setting,
 ) -> Report | IngestError:
-    """Ingest one recording; what cannot even be begun is an error."""
+    """Ingest one recording; return its report, or an error if the job cannot be read."""
     try:
-        config: ROSInjectionConfig = pickle.loads(pickled)  # noqa: S301 - from our own driver
-    except Exception as error:  # noqa: BLE001 - the border: a class's own code runs here
+        job: ROSInjectionConfig = pickle.loads(pickled)  # noqa: S301 - from our own driver
+    except Exception as error:  # noqa: BLE001 - unpickling runs the code of the job's classes
         return IngestError(f"the job cannot be read on {_node()}: {type(error).__name__}: {error}")
     pa.set_cpu_count(1)
     setting.registrations.register()
-    stop = Stop()
+    stop = StopHandler()
     outbox = _Outbox(mailbox, position, attempt, stop)
-    before = signal.signal(signal.SIGINT, stop)  # what Ray's cancellation raises
+    before = signal.signal(signal.SIGINT, stop)  # Ray cancels a task by this signal
     try:
         with _records_sent(outbox, setting.log_level):
-            report = _run(config, outbox, stop, setting)
+            report = _run(job, outbox, stop, setting)
         outbox.flush()
     finally:
         signal.signal(signal.SIGINT, before)
     return report
 
 
-def _run(config: ROSInjectionConfig, outbox: _Outbox, stop: Stop, setting: Setting) -> Report:
+def _run(job: ROSInjectionConfig, outbox: _Outbox, stop: StopHandler, setting: Setting) -> Report:
     try:
-        stop.heed()
-        blind = out_of_reach(config, setting)
-        report = failed_report(config, blind, outbox.tell) if blind else run_config(config, outbox.tell)
+        stop.enable()
+        error = out_of_reach(job, setting)
+        report = failed_report(job, error, outbox.tell) if error else run_recording(job, outbox.tell).report
     except KeyboardInterrupt:
-        report = failed_report(config, Interrupted("stopped before it was begun"), outbox.tell)
-    stop.hold()
+        report = failed_report(job, Interrupted("stopped before the recording was opened"), outbox.tell)
+    stop.disable()
     return report
 
 
-def out_of_reach(config: ROSInjectionConfig, setting: Setting) -> IngestError | None:
-    """Return what is wrong where this node cannot use the files that the driver uses."""
-    for path in config.paths:
+def out_of_reach(job: ROSInjectionConfig, setting: Setting) -> IngestError | None:
+    """Return an error if this node cannot access the recording or the store of the driver."""
+    for path in job.paths:
         if isinstance(path, Path) and not path.exists():
             return BagError(
-                f"the node {_node()} does not see the recording",
+                f"the recording does not exist on the node {_node()}",
                 where=str(path),
-                hint="put recordings on storage that every node mounts at the same place, or name them by URL",
+                hint="put recordings on storage that every node mounts at the same path, or name them by URL",
             )
-    store = destination_of(config.target).local_folder
+    store = destination_of(job.target).local_folder
     if store is None or (setting.machine == machine() and (store / setting.beacon).exists()):
         return None
     return SinkError(
-        f"the node {_node()} cannot write to this store: its catalog works on one machine only",
+        f"the node {_node()} cannot write to this store, whose catalog works on one machine only",
         where=str(store),
-        hint="use a store behind a URL, as s3://bucket/prefix, or a server",
+        hint="use a store at a URL such as s3://bucket/prefix, or a server",
     )
 
 
 def machine() -> str:
-    """Return what differs from machine to machine: processes that share it share memory, as SQLite's WAL needs."""
+    """Return an id of this machine; processes with the same id share memory, which the WAL of SQLite requires."""
     boot = Path("/proc/sys/kernel/random/boot_id")
     return boot.read_text("ascii").strip() if boot.exists() else socket.gethostname()
 
@@ -132,9 +133,9 @@ def _node() -> str:
 
 
 class _Outbox:
-    """Collects what there is to say and posts it a few times a second."""
+    """Collects notices and posts them a few times per second."""
 
-    def __init__(self, mailbox: Any, position: int, attempt: int, stop: Stop) -> None:  # noqa: ANN401 - Ray's handle
+    def __init__(self, mailbox: Any, position: int, attempt: int, stop: StopHandler) -> None:  # noqa: ANN401 - Ray's handle
         self._mailbox = mailbox
         self._address = (position, attempt)
         self._stop = stop
@@ -142,20 +143,20 @@ class _Outbox:
         self._posted_at = 0.0
 
     def tell(self, event: Event) -> None:
-        """Take an event; an interrupt is not let through while it is sent."""
-        self._stop.hold()
+        """Add an event; an interrupt waits until it is posted."""
+        self._stop.disable()
         self.put(event)
         urgent = isinstance(event, RunStarted | RunFinished)
-        if urgent or time.monotonic() - self._posted_at > _SEND_EVERY_S:
+        if urgent or time.monotonic() - self._posted_at > _POST_INTERVAL_S:
             self._post()
-        self._stop.heed()
+        self._stop.enable()
 
-    def put(self, said: Event | logging.LogRecord) -> None:
-        """Take something that goes with the next event."""
-        self._notices.append((*self._address, said))
+    def put(self, notice: Event | logging.LogRecord) -> None:
+        """Add an event or a log record to the next post."""
+        self._notices.append((*self._address, notice))
 
     def flush(self) -> None:
-        """Post everything and wait until it is there, so that no report comes before its events."""
+        """Post everything and wait for the delivery, so that no report arrives before its events."""
         ray.get(self._post())
 
     def _post(self) -> Any:  # noqa: ANN401 - Ray's reference
@@ -170,7 +171,7 @@ class _Records(logging.Handler):
         self._outbox = outbox
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Send a record as text: what it was made from may not travel."""
+        """Add a record with its message as text, because its arguments may not be picklable."""
         record.msg, record.args = record.getMessage(), None
         if record.exc_info:
             record.exc_text = logging.Formatter().formatException(record.exc_info)
@@ -180,7 +181,7 @@ class _Records(logging.Handler):
 
 @contextmanager
 def _records_sent(outbox: _Outbox, level: int) -> Generator[None]:
-    """Send what is logged to the driver, which shows it as its own."""
+    """Send log records to the driver, which logs them as its own."""
     root, handler = logging.getLogger(), _Records(outbox)
     before = root.level
     root.addHandler(handler)

@@ -1,4 +1,4 @@
-"""This file gathers the code and the definitions that jobs name by path, for machines that do not have them."""
+"""Packing of the adapters and message definitions that jobs name by path, for machines that do not have them."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ from mosaico_ingest.rosbag.definitions.registry import definition_files
 __all__ = ["absolute", "pack"]
 
 _FILES = "files"
-"""The folder of the shipment in which everything lies as it does here."""
+"""The folder of the shipment that mirrors the paths of this machine."""
 _HERE = ".here"
 _YAML = frozenset({".yaml", ".yml"})
 _CODE = _YAML | {".py"}
 
 
 def absolute(config: ROSInjectionConfig) -> ROSInjectionConfig:
-    """Return a configuration whose paths mean the same in every folder."""
+    """Return a configuration with absolute paths."""
     kept, store = config.quarantine, destination_of(config.target).local_folder
     cert = config.tls_cert_path
     return replace(
         config,
-        file_path=tuple(_anywhere(path) for path in config.paths),
+        file_path=tuple(_absolute_or_url(path) for path in config.paths),
         store=config.store if store is None or config.plugin else _absolute(store),
         plugin=config.plugin and structs.replace(config.plugin, base_dir=_absolute(config.plugin.base_dir)),
         base_dir=_absolute(config.base_dir),
-        quarantine=None if kept is None else replace(kept, path=_anywhere(kept.path)),
+        quarantine=None if kept is None else replace(kept, path=_absolute_or_url(kept.path)),
         custom_msgs=tuple((package, _absolute(path), store) for package, path, store in config.custom_msgs),
         tls_cert_path=None if cert is None else _absolute(cert),
     )
 
 
 def pack(configs: Iterable[ROSInjectionConfig], folder: Path) -> list[ROSInjectionConfig]:
-    """Copy adapters, definitions and certificates into `folder`; return configurations that are valid inside a copy of it.
+    """Copy adapters, definitions and certificates into `folder`; return configurations that are valid in a copy of it.
 
-    Adapters keep the names the manifests give them, so the plan is the same. One named by an absolute path, and
-    what is installed, must be there on every machine.
+    Adapters keep their names, so the plan stays the same. Adapters with an absolute path and installed packages are not
+    copied and must exist on every machine.
     """
     box = _Box(folder)
     return [box.add(config) for config in configs]
@@ -66,13 +66,15 @@ class _Box(Struct, frozen=True):
         self._add_all([], folder=config.base_dir)
         return replace(
             config,
-            code_dir=_place(config.base_dir),
-            custom_msgs=tuple((package, _place(path), store) for package, path, store in config.custom_msgs),
-            tls_cert_path=None if cert is None else _place(cert),
+            code_dir=_shipped(config.base_dir),
+            custom_msgs=tuple(
+                (package, _shipped(path), store) for package, path, store in config.custom_msgs
+            ),
+            tls_cert_path=None if cert is None else _shipped(cert),
         )
 
     def _add_adapter(self, reference: object, base_dir: Path) -> None:
-        """Add what a reference names, and what lies beside it: it may use that."""
+        """Copy the file or module of a reference with its neighbors, which it may import."""
         if isinstance(reference, type):
             self._add_module(reference.__module__, base_dir)
         elif isinstance(reference, (str, Path)) and str(reference) not in BY_NAME:
@@ -85,7 +87,7 @@ class _Box(Struct, frozen=True):
                 self._add_module(place, base_dir)
 
     def _add_module(self, name: str, base_dir: Path) -> None:
-        """Add a module with all of its package, unless it is installed; where Python looks, or below `base_dir`."""
+        """Copy a module with its package unless it is installed: into the import path, or below `base_dir`."""
         file = getattr(sys.modules.get(name.partition(".")[0]), "__file__", None)
         if file is None or _is_installed(Path(file)):
             return
@@ -99,15 +101,15 @@ class _Box(Struct, frozen=True):
 
     def _add_all(self, files: Iterable[Path], *, folder: Path | None = None) -> None:
         for file in files:
-            _copy(file, self.folder / _place(file))
-        if folder is not None:  # a shipment has no empty folders, and `../adapters` starts in one
-            kept = self.folder / _place(folder) / _HERE
+            _copy(file, self.folder / _shipped(file))
+        if folder is not None:  # `../adapters` needs its folder, and a shipment drops empty ones
+            kept = self.folder / _shipped(folder) / _HERE
             kept.parent.mkdir(parents=True, exist_ok=True)
             kept.touch()
 
 
 def _beside(file: Path, suffixes: frozenset[str]) -> Iterator[Path]:
-    """Yield the files of a file's folder, and those of the packages in it."""
+    """Yield the files in the folder of a file and those of its packages."""
     folder = _absolute(file).parent
     yield from _matching(folder.iterdir(), suffixes)
     for package in folder.glob("*/__init__.py"):
@@ -118,17 +120,17 @@ def _matching(paths: Iterable[Path], suffixes: frozenset[str]) -> list[Path]:
     return [path for path in paths if path.suffix in suffixes and path.is_file()]
 
 
-def _place(path: Path | str) -> Path:
-    """Return where a file lies in the shipment."""
+def _shipped(path: Path | str) -> Path:
+    """Return the path of a file in the shipment."""
     return Path(_FILES, *_absolute(path).parts[1:])
 
 
-def _anywhere(path: AnyPath) -> AnyPath:
+def _absolute_or_url(path: AnyPath) -> AnyPath:
     return _absolute(path) if isinstance(path, Path) else path
 
 
 def _absolute(path: Path | str) -> Path:
-    return Path(abspath(path))  # noqa: PTH100 - links stay: a link may be the name that is the same everywhere
+    return Path(abspath(path))  # noqa: PTH100 - keep links, which may be the path that all machines share
 
 
 def _copy(source: Path, to: Path) -> None:

@@ -29,12 +29,12 @@ from mosaico_ingest.job.values import (
     TopicLevelErrorPolicy,
 )
 from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.pipeline.memory import MemoryBudget
 from mosaico_ingest.remote import AnyPath, RemotePath
 from mosaico_ingest.rosbag.definitions.model import Resolver
 from mosaico_ingest.textfile import read_whole
 
 __all__ = [
-    "DEFAULT_MEMORY_BYTES",
     "Decisions",
     "DestinationState",
     "Difference",
@@ -57,8 +57,6 @@ __all__ = [
     "plan_schema",
     "read_plan",
 ]
-
-DEFAULT_MEMORY_BYTES = 256 * 1024 * 1024
 
 
 class TopicPlan(Struct, frozen=True):
@@ -122,14 +120,12 @@ class Plan(Struct, frozen=True):
     """Messages recorded at this instant or later are not read."""
     quarantine: QuarantineSettings | None = None
     """Where rejected messages are kept."""
-    kept_as: str | None = None
-    """The name of the file they are kept in, as the provenance of the run has it."""
     missing: tuple[AnyPath, ...] = ()
     """Parts of the recording that are not there, though its metadata list them."""
     family: str | None = None
     """What the sequences of the same job, for other recordings, have in common."""
-    memory_bytes: int = DEFAULT_MEMORY_BYTES
-    """How much memory batches may take, from reading to writing."""
+    memory: MemoryBudget = MemoryBudget()
+    """The memory for messages and rows, from reading to writing."""
     attempt: Attempt | None = None
     """Which try this is, where there may be several."""
 

@@ -32,8 +32,8 @@ from mosaico_ingest.job.values import (
     TimeBound,
     Unmodeled,
 )
+from mosaico_ingest.pipeline.memory import DEFAULT_BYTES, MemoryBudget
 from mosaico_ingest.pipeline.plan import (
-    DEFAULT_MEMORY_BYTES,
     ExcludedTopic,
     Plan,
     TopicPlan,
@@ -332,7 +332,7 @@ def resolve(
         quarantine=config.quarantine,
         missing=recording.missing_files,
         family=config.family or config.sequence_name,
-        memory_bytes=config.memory_bytes or DEFAULT_MEMORY_BYTES,
+        memory=MemoryBudget(config.memory_bytes or DEFAULT_BYTES),
         attempt=config.attempt,
     )
     if config.on_schema_change is not None:

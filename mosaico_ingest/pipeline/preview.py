@@ -33,8 +33,8 @@ from mosaico_ingest.pipeline.plan import (
     notes,
 )
 from mosaico_ingest.pipeline.planning import resolve
-from mosaico_ingest.pipeline.run import open_for, preflight
-from mosaico_ingest.pipeline.topic import Stream
+from mosaico_ingest.pipeline.run import open_job, preflight
+from mosaico_ingest.pipeline.topic import TopicPipeline
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.protocol import check_topic_name
 from mosaico_ingest.report.events import Event, Rejected
@@ -132,14 +132,12 @@ def try_messages(plan: Plan, recording: Recording) -> tuple[Sample, ...]:
     """Decode and adapt the first messages of every topic of the plan; nothing is written."""
     with MemorySink().open(plan.sequence, plan.metadata) as session:
         trials = tuple(_trial(topic, recording, session) for topic in plan.topics)
-        by_connection = {
-            connection: trial for trial in trials for connection in trial.stream.plan.connections
-        }
+        by_connection = {connection: trial for trial in trials for connection in trial.topic.plan.connections}
         with WriteBuffer(max_bytes=_MEMORY_BYTES) as buffer:
-            for batch in _first(plan, recording, by_connection):
-                by_connection[batch.connection].stream.feed(batch, buffer)
+            for block in _first(plan, recording, by_connection):
+                by_connection[block.connection].topic.process(block, buffer)
     stored = {topic.topic: topic for topic in session.stored()}
-    return tuple(trial.sample(stored.get(trial.stream.plan.target)) for trial in trials)
+    return tuple(trial.sample(stored.get(trial.topic.plan.target)) for trial in trials)
 
 
 @dataclass(slots=True)
@@ -157,7 +155,7 @@ class _Tally:
 
 
 class _Trial(Struct, frozen=True):
-    stream: Stream
+    topic: TopicPipeline
     tally: _Tally
 
     def sample(self, stored: StoredTopic | None) -> Sample:
@@ -166,8 +164,8 @@ class _Trial(Struct, frozen=True):
             for lost in self.tally.rejections.values()
         )
         return Sample(
-            target=self.stream.plan.target,
-            read=self.stream.seen,
+            target=self.topic.plan.target,
+            read=self.topic.read,
             rejected=sum(lost.count for lost in rejections),
             row_bytes=-(-stored.stored_bytes // stored.rows) if stored and stored.rows else None,
             rejections=rejections,
@@ -178,11 +176,11 @@ def _trial(topic: TopicPlan, recording: Recording, session: Session) -> _Trial:
     """Open a topic's stream so that a lost message costs nothing but itself."""
     tally = _Tally()
     patient = replace(topic, on_error=TopicLevelErrorPolicy.Ignore)
-    stream = Stream(patient, LoaderErrorPolicy.IGNORE, session, tally)
+    pipeline = TopicPipeline(patient, LoaderErrorPolicy.IGNORE, session, tally)
     connections = {connection.id: connection for connection in recording.connections}
     for connection in topic.connections:
-        stream.bind(connections[connection])
-    return _Trial(stream, tally)
+        pipeline.bind(connections[connection])
+    return _Trial(pipeline, tally)
 
 
 def _first(plan: Plan, recording: Recording, trials: dict[int, _Trial]) -> Iterator[MessageBlock]:
@@ -191,7 +189,7 @@ def _first(plan: Plan, recording: Recording, trials: dict[int, _Trial]) -> Itera
     absent = {
         connection: trial
         for connection, trial in trials.items()
-        if not trial.stream.seen and trial.stream.plan.count
+        if not trial.topic.read and trial.topic.plan.count
     }
     if absent:
         yield from _look(plan, recording, absent, enough=1)
@@ -201,18 +199,18 @@ def _look(
     plan: Plan, recording: Recording, trials: dict[int, _Trial], *, enough: int
 ) -> Iterator[MessageBlock]:
     left_bytes, until = _LOOK_BYTES, time.monotonic() + _LOOK_S
-    batches = recording.message_blocks(
+    blocks = recording.message_blocks(
         tuple(trials),
         start_ns=plan.read_from_ns,
         end_ns=plan.read_until_ns,
         max_rows=MESSAGES,
         memory_bytes=_MEMORY_BYTES,
     )
-    for batch in batches:
-        left_bytes -= int(batch.lengths.sum())
-        if trials[batch.connection].stream.seen < enough:
-            yield batch
-        if all(trial.stream.seen >= enough for trial in trials.values()):
+    for block in blocks:
+        left_bytes -= int(block.lengths.sum())
+        if trials[block.connection].topic.read < enough:
+            yield block
+        if all(trial.topic.read >= enough for trial in trials.values()):
             return
         if left_bytes < 0 or time.monotonic() > until:
             return
@@ -265,7 +263,7 @@ def preview(config: ROSInjectionConfig, *, connect: bool) -> RecordingPlan:
         IngestError: The job cannot be done; the message says why.
     """
     bridge = ROSBridge.for_config(config)
-    with open_for(config) as (recording, resolver):
+    with open_job(config) as (recording, resolver):
         plan = resolve(config, recording, bridge=bridge, resolver=resolver)
         samples = try_messages(plan, recording)
         unreadable_ranges = tuple(_unreadable(recording))
@@ -289,7 +287,7 @@ def decide(config: ROSInjectionConfig, *, folder: Path) -> Decisions:
         IngestError: The job cannot be done; the message says why.
     """
     bridge = ROSBridge.for_config(config)
-    with open_for(config) as (recording, resolver):
+    with open_job(config) as (recording, resolver):
         return decisions(resolve(config, recording, bridge=bridge, resolver=resolver), folder=folder)
 
 

@@ -11,42 +11,125 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from msgspec.structs import replace
+from msgspec import Struct
 from pydantic import BaseModel, ConfigDict, ValidationError
 from xxhash import xxh3_128
 
+from mosaico_ingest.destinations.base import ExistingSequence
 from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import BagError, SequenceExists
 from mosaico_ingest.findings import encodable
 from mosaico_ingest.job.values import PROVENANCE_KEY, IfExists, Target
 from mosaico_ingest.pipeline.plan import Plan, decisions
-from mosaico_ingest.pipeline.quarantine import kept_name
+from mosaico_ingest.pipeline.quarantine import quarantine_file_name
 from mosaico_ingest.remote import AnyPath, RemotePath
 from mosaico_ingest.version import __version__
 
 __all__ = [
-    "Held",
     "Provenance",
+    "SequenceRequest",
     "Source",
-    "certain",
+    "StoredProvenance",
+    "add_doubtful_digests",
+    "check_provenance",
     "content_digest",
-    "enter",
-    "held",
-    "provenance_of",
-    "what_to_do",
-    "whole_digest",
+    "decide_skip",
+    "full_digest",
+    "is_repeatable",
+    "read_provenance",
+    "stored_provenance",
 ]
 
 _READ_BYTES = 1 << 20
 _SAMPLES = 64
-_PIECE_BYTES = 64 << 20
+"""Number of blocks of `_READ_BYTES` that `content_digest` reads from a long file."""
+_BLOCK_BYTES = 64 << 20
+"""Bytes per block of `full_digest`; blocks are read in parallel."""
+_HINT = "set sequence.if_exists (or --if-exists of `ingest bag`) to replace or append, or choose another name"
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True, defer_build=True)
+
+
+class Source(_Part):
+    """One file of the recording: its name and its content."""
+
+    name: str
+    size_bytes: int
+    content: str
+    """The `content_digest` of a local file, the object version of a remote one."""
+    modified_ns: int | None = None
+    whole: str | None = None
+    """The `full_digest`, if `content` covers samples only and the complete file was read."""
+
+    def same_content(self, other: Source) -> bool:
+        """Return whether both describe the same bytes, as far as their digests can tell."""
+        return self.content == other.content and (
+            None in {self.whole, other.whole} or self.whole == other.whole
+        )
+
+
+class Provenance(_Part):
+    """The files and the job that a session was made from; stored in the metadata of the sequence and the session."""
+
+    tool: str
+    job: str
+    """Digest of every decision about the stored rows: topics, adapters, definitions, columns, metadata, time range."""
+    sources: tuple[Source, ...]
+    family: str | None = None
+    """The family of sequences whose message definitions are compared."""
+    run: str | None = None
+    """The id of the run, if its executor may start a recording more than once."""
+    quarantine: str | None = None
+    """The name of the quarantine file for rejected messages, if the job has a quarantine."""
+
+    def same_content(self, other: Provenance) -> bool:
+        """Return whether both were made from the same bytes, regardless of file names."""
+        pairs = zip(self.sources, other.sources, strict=False)
+        return len(self.sources) == len(other.sources) and all(one.same_content(two) for one, two in pairs)
+
+
+class StoredProvenance(_Part):
+    """The provenance of a stored sequence, one record per session."""
+
+    records: tuple[Provenance, ...]
+    complete: bool
+    """False if a run ended with an error, or if a session was never finished."""
+    finished: bool = True
+    """False if a session is not finished: another run may still be writing it, or was killed."""
+    has_all_sessions: bool = True
+    """False if `records` holds only the record of the first session."""
+
+    @classmethod
+    def of(cls, existing: ExistingSequence) -> StoredProvenance:
+        """Return the provenance of a sequence; records of other programs or newer versions are ignored."""
+        return cls(
+            records=_records(session.metadata for session in existing.sessions),
+            complete=existing.complete,
+            finished=existing.finished,
+            has_all_sessions=existing.has_all_sessions,
+        )
+
+
+class SequenceRequest(Struct, frozen=True):
+    """How to open a sequence in the sink, as `check_provenance` decided."""
+
+    name: str
+    metadata: Mapping[str, Any]
+    """The metadata of the plan, with the provenance record."""
+    if_exists: IfExists
+    quarantine_file: str | None = None
+    """The name of the quarantine file in the provenance record."""
+    replaces_stored: bool = False
+    """True if the commit swaps a stored sequence for the new one: an incomplete result must not replace it."""
 
 
 def content_digest(path: Path) -> str:
-    """Return a name for the content of a file: XXH3 (128 bits) over its length and all of it, or 64 MiB of it.
+    """Return an XXH3 digest (128 bits) of the length of a file and of its content.
 
-    Of a longer file these are pieces of a MiB, evenly from its first byte to its last, so that many long recordings are
-    looked at without reading them. A new recording differs in each of them; it is no defence against forgery.
+    Of files longer than 64 MiB, only 64 evenly spaced samples of 1 MiB are read, so that long recordings are compared
+    quickly. Different recordings differ in every sample; the digest does not protect against forgery.
 
     Raises:
         BagError: The file cannot be read.
@@ -58,8 +141,8 @@ def content_digest(path: Path) -> str:
     return _digest(path, size, [(int(number * step), _READ_BYTES) for number in range(_SAMPLES)])
 
 
-def whole_digest(path: Path) -> str | None:
-    """Return a name for every byte of a file, None where `content_digest` is one; pieces are read side by side.
+def full_digest(path: Path) -> str | None:
+    """Return a digest of every byte of a file, None if `content_digest` reads every byte already.
 
     Raises:
         BagError: The file cannot be read.
@@ -67,23 +150,188 @@ def whole_digest(path: Path) -> str | None:
     size = _size(path)
     if size <= _SAMPLES * _READ_BYTES:
         return None
-    pieces = [(start, min(_PIECE_BYTES, size - start)) for start in range(0, size, _PIECE_BYTES)]
+    blocks = [(start, min(_BLOCK_BYTES, size - start)) for start in range(0, size, _BLOCK_BYTES)]
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1), thread_name_prefix="digest") as pool:
-        digests = pool.map(partial(_digest, path, size), ([piece] for piece in pieces))
+        digests = pool.map(partial(_digest, path, size), ([block] for block in blocks))
         return xxh3_128("".join(digests).encode()).hexdigest()
 
 
-def _digest(path: Path, size: int, pieces: Iterable[tuple[int, int]]) -> str:
-    """Digest the length of a file and the stretches of it that begin and are as long as `pieces` says."""
+def check_provenance(plan: Plan) -> SequenceRequest | None:
+    """Compare the recording with the stored sequence; return how to open the sequence, None to skip it.
+
+    A sequence that an interrupted run of the same job left incomplete is replaced, so that running the same command
+    again completes it. Sessions that an earlier attempt of the same run committed before its process died are removed.
+
+    Raises:
+        SequenceExists: `if_exists` is `skip`, and the stored sequence has other content or is of another job.
+    """
+    provenance = read_provenance(plan)
+    if_exists = plan.if_exists
+    if plan.attempt is not None and plan.attempt.number > 1:
+        if_exists = _remove_earlier_attempt(plan, plan.attempt.run)
+    destination = destination_of(plan.target)
+    needed = if_exists is not IfExists.APPEND and (
+        if_exists is not IfExists.REPLACE or destination.replaces_atomically
+    )
+    stored = stored_provenance(plan.target, plan.sequence) if needed else None
+    provenance = add_doubtful_digests(provenance, plan.files, stored)
+    if if_exists is IfExists.SKIP:
+        decision = decide_skip(provenance, stored, plan.sequence)
+        if decision is None:
+            return None
+        if_exists = decision
+    elif stored is not None and if_exists is IfExists.FAIL and is_repeatable(provenance, stored):
+        if_exists = IfExists.REPLACE
+    quarantine_file = quarantine_file_name(plan.sequence) if plan.quarantine else None
+    provenance = _add_full_digests(provenance, plan.files).model_copy(update={"quarantine": quarantine_file})
+    return SequenceRequest(
+        name=plan.sequence,
+        metadata={**plan.metadata, PROVENANCE_KEY: provenance.model_dump(mode="json")},
+        if_exists=if_exists,
+        quarantine_file=quarantine_file,
+        replaces_stored=stored is not None
+        and if_exists is IfExists.REPLACE
+        and destination.replaces_atomically,
+    )
+
+
+def read_provenance(plan: Plan) -> Provenance:
+    """Read the recording's files and return the provenance record of this run, without full digests."""
+    return Provenance(
+        tool=__version__,
+        job=_job_digest(plan),
+        sources=tuple(map(_source, plan.files)),
+        family=plan.family,
+        run=plan.attempt.run if plan.attempt else None,
+    )
+
+
+def stored_provenance(target: Target, sequence: str) -> StoredProvenance | None:
+    """Return the provenance of a stored sequence, None if the destination has no sequence of this name."""
+    existing = destination_of(target).find(sequence)
+    return None if existing is None else StoredProvenance.of(existing)
+
+
+def decide_skip(provenance: Provenance, stored: StoredProvenance | None, sequence: str) -> IfExists | None:
+    """Return how to open a sequence with `if_exists: skip`, None if the same content is stored already.
+
+    Raises:
+        SequenceExists: The stored sequence was made from other content, or by another job.
+    """
+    if stored is None:
+        return IfExists.FAIL
+    same = [record for record in stored.records if record.same_content(provenance)]
+    if not same:
+        names = ", ".join(source.name for record in stored.records for source in record.sources)
+        cause = f"was made from other content ({names})" if names else "has no provenance record"
+        raise SequenceExists(f"the sequence exists and {cause}", where=sequence, hint=_HINT)
+    if not stored.complete:
+        return IfExists.REPLACE
+    if all(record.job != provenance.job for record in same):
+        raise SequenceExists(
+            "the sequence exists and was made from this recording by another job", where=sequence, hint=_HINT
+        )
+    return None
+
+
+def is_repeatable(provenance: Provenance, stored: StoredProvenance) -> bool:
+    """Return whether the stored sequence is what ended runs of the same job left incomplete of the same content."""
+    return (
+        not stored.complete
+        and stored.finished
+        and bool(stored.records)
+        and all(record.job == provenance.job and record.same_content(provenance) for record in stored.records)
+    )
+
+
+def add_doubtful_digests(
+    provenance: Provenance, files: Sequence[AnyPath], stored: StoredProvenance | None
+) -> Provenance:
+    """Add full digests of files whose samples match a stored source with another modification time.
+
+    Such a file was either copied or changed between the samples.
+    """
+    known = [source for record in (stored.records if stored else ()) for source in record.sources]
+    doubtful = {
+        source.content
+        for source in provenance.sources
+        if any(one.content == source.content and one.whole for one in known)
+        and all((one.content, one.modified_ns) != (source.content, source.modified_ns) for one in known)
+    }
+    return _add_full_digests(provenance, files, contents=doubtful) if doubtful else provenance
+
+
+def _add_full_digests(
+    provenance: Provenance, files: Sequence[AnyPath], *, contents: Container[str] | None = None
+) -> Provenance:
+    """Add full digests to the local sources with one of these `contents`, by default to all of them."""
+
+    def with_digest(source: Source, path: AnyPath) -> Source:
+        wanted = source.whole is None and (contents is None or source.content in contents)
+        if isinstance(path, RemotePath) or not wanted:
+            return source
+        return source.model_copy(update={"whole": full_digest(path)})
+
+    return provenance.model_copy(update={"sources": tuple(map(with_digest, provenance.sources, files))})
+
+
+def _remove_earlier_attempt(plan: Plan, run: str) -> IfExists:
+    """Delete what an earlier attempt of this run committed; return how to open the sequence afterwards.
+
+    A server knows only the provenance of a sequence's first session, so sessions that were appended to another run's
+    sequence are not recognized there.
+    """
+    destination = destination_of(plan.target)
+    existing = destination.find(plan.sequence)
+    if existing is None:
+        return plan.if_exists
+    own = [s.id for s in existing.sessions if any(record.run == run for record in _records([s.metadata]))]
+    if own and (len(own) == len(existing.sessions) or not destination.delete_sessions(plan.sequence, own)):
+        return IfExists.REPLACE
+    return plan.if_exists
+
+
+def _records(metadata: Iterable[Mapping[str, Any]]) -> tuple[Provenance, ...]:
+    records: list[Provenance] = []
+    for one in metadata:
+        if PROVENANCE_KEY in one:
+            try:
+                records.append(Provenance.model_validate(one[PROVENANCE_KEY]))
+            except ValidationError:
+                continue
+    return tuple(records)
+
+
+def _source(path: AnyPath) -> Source:
+    stat = path.stat()
+    name, size_bytes = encodable(path.name), stat.st_size
+    if isinstance(path, RemotePath):  # its version identifies the content without a download
+        return Source(name=name, size_bytes=size_bytes, content=path.version())
+    return Source(
+        name=name, size_bytes=size_bytes, content=content_digest(path), modified_ns=stat.st_mtime_ns
+    )
+
+
+def _job_digest(plan: Plan) -> str:
+    """Return a digest of the decisions about the stored rows: not of paths, the destination or `if_exists`."""
+    excluded: dict[str, Any] = {"files": True, "destination": True, "if_exists": True, "quarantine": {"path"}}
+    document = decisions(plan, folder=Path()).model_dump(mode="json", exclude=excluded)
+    document["metadata"] = dict(plan.metadata)
+    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def _digest(path: Path, size: int, ranges: Iterable[tuple[int, int]]) -> str:
+    """Return a digest of the length of a file and of the ranges of it given as offset and length."""
     digest = xxh3_128(size.to_bytes(8, "little"))
-    room = memoryview(bytearray(_READ_BYTES))
+    buffer = memoryview(bytearray(_READ_BYTES))
     try:
         with path.open("rb", buffering=0) as file:
-            for start, left in pieces:
-                file.seek(start)
-                while left and (got := file.readinto(room[: min(left, _READ_BYTES)])):
-                    digest.update(room[:got])
-                    left -= got  # noqa: PLW2901 - what is left of this piece
+            for offset, length in ranges:
+                file.seek(offset)
+                remaining = length
+                while remaining and (count := file.readinto(buffer[: min(remaining, _READ_BYTES)])):
+                    digest.update(buffer[:count])
+                    remaining -= count
     except OSError as error:
         raise _unreadable(path, error) from error
     return digest.hexdigest()
@@ -98,201 +346,3 @@ def _size(path: Path) -> int:
 
 def _unreadable(path: Path, error: OSError) -> BagError:
     return BagError(f"cannot be read: {error.strerror}", where=str(path))
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="ignore", frozen=True, defer_build=True)
-
-
-class Source(_Part):
-    """One file of the recording: what it is called, and what is in it."""
-
-    name: str
-    size_bytes: int
-    content: str
-    """Digest of its samples, see `content_digest`; behind a URL the version that is there."""
-    modified_ns: int | None = None
-    whole: str | None = None
-    """Digest of every byte, where `content` is not one and all of it was read."""
-
-    def same_content(self, other: Source) -> bool:
-        """Say whether both are about the same bytes, as far as is known."""
-        return self.content == other.content and (
-            None in {self.whole, other.whole} or self.whole == other.whole
-        )
-
-
-class Provenance(_Part):
-    """What a session was made from."""
-
-    tool: str
-    job: str
-    """Digest of every decision about what is stored: topics, adapters, definitions, columns, metadata, time."""
-    sources: tuple[Source, ...]
-    family: str | None = None
-    """What it shares its definitions with."""
-    run: str | None = None
-    """Which run made it, where that may begin a recording anew."""
-    quarantine: str | None = None
-    """The name of the file that has its rejected messages, if there are any."""
-
-    def same_content(self, other: Provenance) -> bool:
-        """Say whether both are about the same bytes, whatever the files are called."""
-        pairs = zip(self.sources, other.sources, strict=False)
-        return len(self.sources) == len(other.sources) and all(one.same_content(two) for one, two in pairs)
-
-
-class Held(_Part):
-    """What a destination has under a sequence's name."""
-
-    provenances: tuple[Provenance, ...]
-    complete: bool
-    """False where an error that ended a run is attached to it, or a server has no session of it that was finished."""
-    has_all_sessions: bool = True
-    """False if `provenances` holds that of the first session only."""
-
-
-def enter(plan: Plan) -> Plan | None:
-    """Return the plan with its provenance among its metadata; None where the same content is there and is to be skipped.
-
-    What an earlier attempt of the same run committed before its process died is no obstacle: it is made anew.
-
-    Raises:
-        SequenceExists: The plan skips the same content, and other content is there.
-    """
-    provenance = provenance_of(plan)
-    if_exists: IfExists | None = plan.if_exists
-    if plan.attempt is not None and plan.attempt.number > 1:
-        if_exists = _take_back(plan, plan.attempt.run)
-    if if_exists is IfExists.SKIP:
-        found = held(plan.target, plan.sequence)
-        provenance = certain(provenance, plan.files, found)
-        if_exists = what_to_do(provenance, found, plan.sequence)
-    if if_exists is None:
-        return None
-    provenance = _whole(provenance, plan.files)
-    kept_as = kept_name(plan.sequence) if plan.quarantine else None
-    noted = provenance.model_copy(update={"quarantine": kept_as}).model_dump(mode="json")
-    return replace(
-        plan, if_exists=if_exists, kept_as=kept_as, metadata={**plan.metadata, PROVENANCE_KEY: noted}
-    )
-
-
-def provenance_of(plan: Plan) -> Provenance:
-    """Read the recording's files and return what this run is going to note."""
-    sources = tuple(map(_source, plan.files))
-    run = plan.attempt.run if plan.attempt else None
-    return Provenance(tool=__version__, job=_job_digest(plan), sources=sources, family=plan.family, run=run)
-
-
-def _source(path: AnyPath) -> Source:
-    """Name the content of one file; behind a URL its version does, as reading all of it has its price."""
-    stat = path.stat()
-    name, size_bytes = encodable(path.name), stat.st_size
-    if isinstance(path, RemotePath):
-        return Source(name=name, size_bytes=size_bytes, content=path.version())
-    return Source(
-        name=name, size_bytes=size_bytes, content=content_digest(path), modified_ns=stat.st_mtime_ns
-    )
-
-
-def certain(provenance: Provenance, files: Sequence[AnyPath], found: Held | None) -> Provenance:
-    """Return the provenance with digests of whole files where samples leave a doubt.
-
-    They do where a file has the samples of one that is known, and was changed, or only copied, at another time.
-    """
-    known = [source for each in (found.provenances if found else ()) for source in each.sources]
-    doubtful = {
-        source.content
-        for source in provenance.sources
-        if any(one.content == source.content and one.whole for one in known)
-        and all((one.content, one.modified_ns) != (source.content, source.modified_ns) for one in known)
-    }
-    return _whole(provenance, files, contents=doubtful) if doubtful else provenance
-
-
-def _whole(
-    provenance: Provenance, files: Sequence[AnyPath], *, contents: Container[str] | None = None
-) -> Provenance:
-    """Return the provenance with digests of whole files, of those with these `contents` or of all."""
-
-    def whole(source: Source, path: AnyPath) -> Source:
-        wanted = source.whole is None and (contents is None or source.content in contents)
-        if isinstance(path, RemotePath):
-            return source
-        return source.model_copy(update={"whole": whole_digest(path)}) if wanted else source
-
-    return provenance.model_copy(update={"sources": tuple(map(whole, provenance.sources, files))})
-
-
-def held(target: Target, sequence: str) -> Held | None:
-    """Return the provenance of a stored sequence, or None if the destination has no sequence of this name."""
-    existing = destination_of(target).find(sequence)
-    if existing is None:
-        return None
-    return Held(
-        provenances=_provenances(session.metadata for session in existing.sessions),
-        complete=existing.complete,
-        has_all_sessions=existing.has_all_sessions,
-    )
-
-
-def what_to_do(provenance: Provenance, found: Held | None, sequence: str) -> IfExists | None:
-    """Return how to open a sequence that is to be skipped where it is the same; None: it is, so do nothing.
-
-    Raises:
-        SequenceExists: What is there was made from something else.
-    """
-    if found is None:
-        return IfExists.FAIL
-    same = [known for known in found.provenances if known.same_content(provenance)]
-    if not same:
-        names = ", ".join(source.name for known in found.provenances for source in known.sources)
-        made = f"it was made from other content ({names})" if names else "nothing says what it was made from"
-        raise SequenceExists(f"the sequence exists, and {made}", where=sequence, hint=_HINT)
-    if not found.complete:
-        return IfExists.REPLACE
-    if all(known.job != provenance.job for known in same):
-        raise SequenceExists(
-            "the sequence exists, and was made from this recording by another job", where=sequence, hint=_HINT
-        )
-    return None
-
-
-def _take_back(plan: Plan, run: str) -> IfExists:
-    """Delete what an earlier attempt of this run committed; return how to open the sequence afterwards.
-
-    A server knows only the provenance of a sequence's first session, so sessions that were appended to another run's
-    sequence are not recognised there.
-    """
-    destination = destination_of(plan.target)
-    existing = destination.find(plan.sequence)
-    if existing is None:
-        return plan.if_exists
-    own = [s.id for s in existing.sessions if any(one.run == run for one in _provenances([s.metadata]))]
-    if own and (len(own) == len(existing.sessions) or not destination.delete_sessions(plan.sequence, own)):
-        return IfExists.REPLACE
-    return plan.if_exists
-
-
-_HINT = "set sequence.if_exists (or --if-exists of `ingest bag`) to replace or append, or choose another name"
-
-
-def _provenances(metadata: Iterable[Mapping[str, Any]]) -> tuple[Provenance, ...]:
-    found: list[Provenance] = []
-    for one in metadata:
-        if PROVENANCE_KEY in one:
-            try:
-                found.append(Provenance.model_validate(one[PROVENANCE_KEY]))
-            except ValidationError:
-                continue  # written by somebody else, or by a version to come: it says nothing we know
-    return tuple(found)
-
-
-def _job_digest(plan: Plan) -> str:
-    """Digest the decisions without where things lie, where they go and what happens when the name is taken."""
-    decided = decisions(plan, folder=Path())
-    aside: dict[str, Any] = {"files": True, "destination": True, "if_exists": True, "quarantine": {"path"}}
-    noted = decided.model_dump(mode="json", exclude=aside)
-    noted["metadata"] = dict(plan.metadata)
-    return hashlib.sha256(json.dumps(noted, sort_keys=True).encode()).hexdigest()[:32]

@@ -1,4 +1,4 @@
-"""This file is one topic of a plan at work: every message that comes in is written, left out or accounted for."""
+"""One topic of a run: decode, adapt and write its messages, and account for each of them."""
 
 from __future__ import annotations
 
@@ -39,204 +39,222 @@ from mosaico_ingest.report.timing import Step, Stopwatch, Timeline
 from mosaico_ingest.rosbag.blocks import Connection, MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 
-__all__ = ["Stream"]
+__all__ = ["TopicPipeline"]
 
 
-class _Lost(Struct, frozen=True):
-    """A message that did not go through, at its position in the raw batch."""
+class _Rejection(Struct, frozen=True):
+    """A message that failed in a stage; `failure.row` is its position in the message block."""
 
     stage: Stage
     failure: RowFailure
 
 
-class _Translated(Struct, frozen=True):
-    """What became of a raw batch: rows, where they were in it, what was lost, what was sampled away."""
+class _Converted(Struct, frozen=True):
+    """The rows of one message block and the messages that did not become rows, by position in the block."""
 
     rows: pa.StructArray
     log_times: NDArray[np.int64]
     index: NDArray[np.int64]
-    lost: tuple[_Lost, ...]
-    skipped: NDArray[np.int64]
+    """The position of each row's message."""
+    rejections: tuple[_Rejection, ...]
+    """In the order of the messages."""
+    downsampled: NDArray[np.int64]
+    """Positions of the messages that `every` drops."""
 
 
 @dataclass(slots=True)
-class Stream:
-    """A topic's adapters by connection, its writer once there are rows, and its sums.
+class TopicPipeline:
+    """Decodes, adapts and writes the messages of one topic, and counts them.
 
-    A message that breaks a policy of `raise` or `finalize` ends the stream there: rows before it are
-    written, whatever the size of the batches.
+    A message that breaks a policy of `raise` or `finalize` ends the topic at this message: the rows before it are
+    written, whatever the size of the blocks.
     """
 
     plan: TopicPlan
     on_message_error: LoaderErrorPolicy
     session: Session
     observe: Observer
-    seen: int = 0
-    """Messages read so far."""
+    read: int = 0
+    """Number of messages read so far."""
     rows: int = 0
-    """Rows handed to the destination so far."""
+    """Number of rows handed to the destination so far."""
     padded: int = 0
-    """Messages that ended in zero bytes their definition does not explain."""
+    """Number of messages that end in zero bytes their definition does not explain."""
     start_ns: int | None = None
     end_ns: int | None = None
     status: TopicStatus = TopicStatus.EMPTY
     error: str | None = None
     quarantine: Quarantine | None = None
-    """Takes rejected messages; the policies come into play where it does not."""
-    _leading: int = 0
-    """How many messages failed before the first good one."""
+    """Keeps rejected messages; the error policies apply to messages beyond its limits."""
     timeline: Timeline = field(default_factory=Timeline)
-    watch: Stopwatch = field(default_factory=Stopwatch)
+    stopwatch: Stopwatch = field(default_factory=Stopwatch)
+    _leading_failures: int = 0
+    """Number of messages that failed before the first row."""
     _connections: dict[int, Connection] = field(default_factory=dict[int, Connection])
     _decoders: dict[int, Decoder] = field(default_factory=dict[int, Decoder])
     _adapters: dict[int, Adapter] = field(default_factory=dict[int, Adapter])
     _writer: TopicWriter | None = None
-    _configuration: dict[str, Any] | None = None
-    """What the adapter says of the topic, from its first message."""
+    _adapter_metadata: dict[str, Any] | None = None
+    """Topic metadata that the adapter derives from the first message."""
 
     def bind(self, connection: Connection) -> None:
-        """Make the decoder and the adapter of one connection.
+        """Create the decoder and the adapter of one connection.
 
         Raises:
             BagError: The connection has no definition.
-            AdapterError: The adapter does not fit it.
+            AdapterError: The adapter does not fit the type.
         """
         if connection.definition is None:
-            raise BagError(connection.problem or "no definition of its type is known", where=connection.topic)
+            raise BagError(connection.problem or "no definition of the type is known", where=connection.topic)
         self._connections[connection.id] = connection
         self._decoders[connection.id] = decoder_for(connection)
         self._adapters[connection.id] = self.plan.adapter.bind(
             connection.definition, ros_shape(connection.definition)
         )
 
-    def feed(self, batch: MessageBlock, buffer: WriteBuffer) -> None:
-        """Take a batch all the way; account for every message of it.
+    def process(self, block: MessageBlock, buffer: WriteBuffer) -> None:
+        """Decode, adapt and write a message block, and account for every message of it.
 
         Raises:
-            IngestError: A policy says that the run ends here.
+            IngestError: An error policy ends the run.
         """
         if self.status in {TopicStatus.FINALIZED, TopicStatus.FAILED}:
-            self.seen += len(batch)
-            self._count(batch, len(batch))
-            self._reject_rest(batch, 0)
+            self.read += len(block)
+            self._count(block, len(block))
+            self._reject_from(block, 0)
             return
-        done = self._translate(batch)
-        fatal, quarantined = self._judge(batch, done)
-        end = len(batch) if fatal is None else fatal.failure.row + 1
-        self._count(batch, end, downsampled=int((done.skipped < end).sum()))
-        self._reject(batch, (lost for lost in done.lost if lost.failure.row < end), quarantined)
-        kept = int(np.searchsorted(done.index, end))
-        if kept:
-            rows = _columns(self.plan.ontology).batch(done.log_times[:kept], done.rows[:kept])
-            self._write(rows, batch, done.index, buffer)
+        converted = self._convert(block)
+        fatal, quarantined = self._apply_policies(block, converted)
+        end = len(block) if fatal is None else fatal.failure.row + 1
+        self._count(block, end, downsampled=int((converted.downsampled < end).sum()))
+        self._report_rejections(
+            block, (one for one in converted.rejections if one.failure.row < end), quarantined
+        )
+        accepted = int(np.searchsorted(converted.index, end))
+        if accepted:
+            rows = _columns(self.plan.ontology).batch(
+                converted.log_times[:accepted], converted.rows[:accepted]
+            )
+            self._write(rows, block, converted.index, buffer)
         if fatal is not None:
-            self._end(fatal, batch, end)
+            self._stop(fatal, block, end)
 
-    def _translate(self, batch: MessageBlock) -> _Translated:
-        positions = np.arange(len(batch), dtype=np.int64)
-        taken = (positions + self.seen) % self.plan.every == 0
-        self.seen += len(batch)
-        keep = positions[taken]
-        sampled = batch if taken.all() else batch.rows(keep)
-        decoded = self._decoders[batch.connection].decode(sampled)
-        self.watch.lap(Step.DECODE)
+    def _convert(self, block: MessageBlock) -> _Converted:
+        """Downsample, decode and adapt a message block."""
+        positions = np.arange(len(block), dtype=np.int64)
+        selected = (positions + self.read) % self.plan.every == 0
+        self.read += len(block)
+        sample = positions[selected]
+        decoded = self._decoders[block.connection].decode(block if selected.all() else block.rows(sample))
+        self.stopwatch.lap(Step.DECODE)
         self.padded += decoded.padded
-        lost = [_Lost(Stage.DECODE, replace(f, row=int(keep[f.row]))) for f in decoded.failures]
-        index = keep[decoded.index]
-        envelope = Envelope(self.plan.topic, self.plan.msgtype, batch.log_times[index])
-        adapter = self._adapters[batch.connection]
+        rejections = [
+            _Rejection(Stage.DECODE, replace(failure, row=int(sample[failure.row])))
+            for failure in decoded.failures
+        ]
+        index = sample[decoded.index]
+        envelope = Envelope(self.plan.topic, self.plan.msgtype, block.log_times[index])
+        adapter = self._adapters[block.connection]
         try:
-            if self._configuration is None and len(decoded.rows):
-                self._configuration = adapter.topic_metadata(decoded.rows[0])
+            if self._adapter_metadata is None and len(decoded.rows):
+                self._adapter_metadata = adapter.topic_metadata(decoded.rows[0])
             adapted = adapter.adapt(decoded.rows, envelope)
         except AdapterError as error:
-            broken = tuple(RowFailure(row, "adapter-error", str(error)) for row in range(len(index)))
-            adapted = Adapted(decoded.rows[:0], index[:0], broken)
-        lost += [_Lost(Stage.ADAPT, replace(f, row=int(index[f.row]))) for f in adapted.failures]
+            failures = tuple(RowFailure(row, "adapter-error", str(error)) for row in range(len(index)))
+            adapted = Adapted(decoded.rows[:0], index[:0], failures)
+        rejections += [
+            _Rejection(Stage.ADAPT, replace(failure, row=int(index[failure.row])))
+            for failure in adapted.failures
+        ]
+        rejections.sort(key=lambda rejection: rejection.failure.row)
         times = envelope.log_times[adapted.index] if adapted.log_times is None else adapted.log_times
-        lost.sort(key=lambda one: one.failure.row)
-        return _Translated(adapted.rows, times, index[adapted.index], tuple(lost), positions[~taken])
+        return _Converted(adapted.rows, times, index[adapted.index], tuple(rejections), positions[~selected])
 
-    def _judge(self, batch: MessageBlock, done: _Translated) -> tuple[_Lost | None, set[int]]:
-        """Quarantine lost messages in their order; return the one that ends the topic, and the rows that were quarantined."""
+    def _apply_policies(
+        self, block: MessageBlock, converted: _Converted
+    ) -> tuple[_Rejection | None, set[int]]:
+        """Quarantine rejected messages in order; return the one that ends the topic, and the quarantined positions."""
         quarantined: set[int] = set()
-        first_good = int(done.index[0]) if len(done.index) else len(batch)
-        for lost in done.lost:
-            row = lost.failure.row
-            self._leading += self.rows == 0 and row < first_good
-            if self._try_quarantine(batch, lost):
-                quarantined.add(row)
-            elif self._ends_topic(lost):
-                return lost, quarantined
-            if self.quarantine is not None and self._leading == self.quarantine.systematic:
-                reason = f"none of the first {self._leading} messages could be used: {lost.failure.reason}"
-                return replace(lost, failure=replace(lost.failure, reason=reason)), quarantined
+        first_row = int(converted.index[0]) if len(converted.index) else len(block)
+        for rejection in converted.rejections:
+            position = rejection.failure.row
+            self._leading_failures += self.rows == 0 and position < first_row
+            if self._try_quarantine(block, rejection):
+                quarantined.add(position)
+            elif self._ends_topic(rejection):
+                return rejection, quarantined
+            if self.quarantine is not None and self._leading_failures == self.quarantine.systematic:
+                reason = (
+                    f"all of the first {self._leading_failures} messages failed: {rejection.failure.reason}"
+                )
+                return replace(rejection, failure=replace(rejection.failure, reason=reason)), quarantined
         return None, quarantined
 
-    def _try_quarantine(self, batch: MessageBlock, lost: _Lost) -> bool:
-        return self.quarantine is not None and self.quarantine.take(
-            self._connections[batch.connection],
-            batch,
-            lost.failure,
-            stage=lost.stage,
+    def _try_quarantine(self, block: MessageBlock, rejection: _Rejection) -> bool:
+        return self.quarantine is not None and self.quarantine.add(
+            self._connections[block.connection],
+            block,
+            rejection.failure,
+            stage=rejection.stage,
             target=self.plan.target,
             promised=self.plan.count,
-            read=self.seen,
+            read=self.read,
         )
 
-    def _ends_topic(self, lost: _Lost) -> bool:
+    def _ends_topic(self, rejection: _Rejection) -> bool:
         if self.quarantine is not None:
-            return self._ends_run(lost.stage) or self.plan.on_error is TopicLevelErrorPolicy.Finalize
-        if lost.stage is Stage.DECODE:
+            return self._ends_run(rejection.stage) or self.plan.on_error is TopicLevelErrorPolicy.Finalize
+        if rejection.stage is Stage.DECODE:
             return self.on_message_error is LoaderErrorPolicy.RAISE
         return self.plan.on_error is not TopicLevelErrorPolicy.Ignore
 
     def _ends_run(self, stage: Stage) -> bool:
-        """Say whether a message that ends its topic ends the run with it."""
+        """Return whether a message that ends the topic also ends the run."""
         if stage is Stage.DECODE and self.on_message_error is LoaderErrorPolicy.RAISE:
             return True
         return self.plan.on_error is TopicLevelErrorPolicy.Raise
 
-    def _end(self, fatal: _Lost, batch: MessageBlock, end: int) -> None:
-        """Apply the policy a lost message has triggered."""
+    def _stop(self, fatal: _Rejection, block: MessageBlock, end: int) -> None:
+        """End the topic at a rejected message; raise if its policy ends the run."""
         kind = DecodeError if fatal.stage is Stage.DECODE else AdapterError
-        offset = int(batch.offsets[fatal.failure.row])
+        offset = int(block.offsets[fatal.failure.row])
         error = kind(fatal.failure.reason, where=f"{self.plan.topic} at offset {offset}")
         self.error = str(error)
         self.session.note_error(self.error, topic=self.plan.target)
         if self._ends_run(fatal.stage):
             raise error
         self.status = TopicStatus.FINALIZED
-        self._count_rest(batch, end)
+        remaining = block.lengths[end:]
+        if len(remaining):
+            self.observe(
+                TopicProgress(self.plan.target, read=len(remaining), payload_bytes=int(remaining.sum()))
+            )
+            self._reject_from(block, end)
 
-    def _count_rest(self, batch: MessageBlock, end: int) -> None:
-        rest = batch.lengths[end:]
-        if len(rest):
-            self.observe(TopicProgress(self.plan.target, read=len(rest), payload_bytes=int(rest.sum())))
-            self._reject_rest(batch, end)
-
-    def _reject_rest(self, batch: MessageBlock, start: int) -> None:
+    def _reject_from(self, block: MessageBlock, start: int) -> None:
+        """Report the messages from a position on as rejected because the topic has ended."""
         self.observe(
             Rejected(
                 self.plan.target,
                 Stage.WRITE,
                 "topic-closed",
-                len(batch) - start,
+                len(block) - start,
                 f"the topic was closed: {self.error}",
-                int(batch.log_times[start]),
-                int(batch.offsets[start]),
+                int(block.log_times[start]),
+                int(block.offsets[start]),
             )
         )
 
     def _write(
-        self, rows: pa.RecordBatch, batch: MessageBlock, index: NDArray[np.int64], buffer: WriteBuffer
+        self, rows: pa.RecordBatch, block: MessageBlock, index: NDArray[np.int64], buffer: WriteBuffer
     ) -> None:
+        """Queue rows for the sink; open the topic in the sink with its first rows."""
         if self._writer is None:
             try:
-                metadata = {**(self._configuration or {}), **self.plan.metadata}
+                metadata = {**(self._adapter_metadata or {}), **self.plan.metadata}
                 self._writer = self.session.topic(self.plan.target, self.plan.ontology, metadata)
             except SinkError as error:
-                self._refused(error, rows, batch, index)
+                self._fail(error, rows, block, index)
                 return
         times = rows.column(0).to_numpy()
         first, last = int(times.min()), int(times.max())
@@ -245,16 +263,16 @@ class Stream:
         self.start_ns = first if self.start_ns is None else min(self.start_ns, first)
         self.end_ns = last if self.end_ns is None else max(self.end_ns, last)
         self.status = TopicStatus.WRITTEN
-        # Counted before they are handed over, where a run may end: what is not stored then is taken back.
+        # `put` may end the run, so rows are counted before; rows that are not stored are subtracted afterwards.
         self.observe(TopicProgress(self.plan.target, written=rows.num_rows, start_ns=first, end_ns=last))
-        self.watch.lap(Step.ADAPT)
+        self.stopwatch.lap(Step.ADAPT)
         buffer.put(self._writer, rows)
-        self.watch.lap(Step.WAIT)
+        self.stopwatch.lap(Step.WAIT)
 
-    def _refused(
-        self, error: IngestError, rows: pa.RecordBatch, batch: MessageBlock, index: NDArray[np.int64]
+    def _fail(
+        self, error: IngestError, rows: pa.RecordBatch, block: MessageBlock, index: NDArray[np.int64]
     ) -> None:
-        """Give the topic up, or the run, as its policy says."""
+        """Mark the topic as failed; raise if its error policy ends the run."""
         self.status, self.error = TopicStatus.FAILED, str(error)
         first = int(index[0])
         self.observe(
@@ -264,28 +282,30 @@ class Stream:
                 "topic-refused",
                 rows.num_rows,
                 self.error,
-                int(batch.log_times[first]),
-                int(batch.offsets[first]),
+                int(block.log_times[first]),
+                int(block.offsets[first]),
             )
         )
         if self.plan.on_error is TopicLevelErrorPolicy.Raise:
             raise error
 
-    def _count(self, batch: MessageBlock, end: int, *, downsampled: int = 0) -> None:
+    def _count(self, block: MessageBlock, end: int, *, downsampled: int = 0) -> None:
         self.observe(
             TopicProgress(
                 self.plan.target,
                 read=end,
                 downsampled=downsampled,
-                payload_bytes=int(batch.lengths[:end].sum()),
+                payload_bytes=int(block.lengths[:end].sum()),
             )
         )
 
-    def _reject(self, batch: MessageBlock, lost: Iterable[_Lost], quarantined: set[int]) -> None:
-        """Say what was lost, once for each rule, with the first message as the example."""
+    def _report_rejections(
+        self, block: MessageBlock, rejections: Iterable[_Rejection], quarantined: set[int]
+    ) -> None:
+        """Emit one event per stage and rule, with the first message as the example."""
         groups: dict[tuple[Stage, str], list[RowFailure]] = {}
-        for one in lost:
-            groups.setdefault((one.stage, one.failure.rule), []).append(one.failure)
+        for rejection in rejections:
+            groups.setdefault((rejection.stage, rejection.failure.rule), []).append(rejection.failure)
         for (stage, rule), failures in groups.items():
             first = failures[0]
             self.observe(
@@ -295,8 +315,8 @@ class Stream:
                     rule,
                     len(failures),
                     first.reason,
-                    int(batch.log_times[first.row]),
-                    int(batch.offsets[first.row]),
+                    int(block.log_times[first.row]),
+                    int(block.offsets[first.row]),
                     sum(failure.row in quarantined for failure in failures),
                 )
             )
@@ -308,7 +328,7 @@ def _columns(ontology: OntologyType) -> _Columns:
 
 
 class _Columns:
-    """The columns of a topic's batches; what their type alone decides is found once."""
+    """The schema of a topic's batches: the timestamp column, then the fields of the ontology type."""
 
     def __init__(self, kind: pa.StructType) -> None:
         self.kind = kind
@@ -316,8 +336,8 @@ class _Columns:
         self._required = RequiredFields(kind)
 
     def batch(self, log_times: NDArray[np.int64], rows: pa.StructArray) -> pa.RecordBatch:
-        """Put the time stamps before the ontology's columns."""
-        if rows.type != self.kind:  # the destination will say what is wrong with them
+        """Return a batch of the timestamps and the rows' fields."""
+        if rows.type != self.kind:  # the sink reports the difference
             return _Columns(rows.type).batch(log_times, rows)
         columns = self._required.fill(rows).flatten()
         return pa.RecordBatch.from_arrays([pa.array(log_times), *columns], schema=self._schema)

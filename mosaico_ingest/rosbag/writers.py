@@ -7,7 +7,7 @@ import sqlite3
 import struct
 import tempfile
 import zlib
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -86,7 +86,7 @@ class McapWriter:
     """Writes one MCAP file; satisfies `RecordingWriter`."""
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("wb")
+        self._file = path.open("xb")
         self._schemas: dict[tuple[str, int, str], int] = {}
         self._records: list[bytes] = []
         """Schemas and channels; they stand before the first chunk that may need them, and in the summary."""
@@ -100,15 +100,23 @@ class McapWriter:
         self._file.write(MCAP)
         self._began = False
 
-    def add_connection(self, topic: str, definition: Definition) -> int:
-        """Open a channel; two definitions of one type are two schemas."""
+    def add_connection(
+        self,
+        topic: str,
+        definition: Definition,
+        *,
+        embed: bool = True,
+        metadata: Mapping[str, str] | None = None,
+    ) -> int:
+        """Add a connection; two definitions of one type are two schemas. Without `embed` the schema has no text."""
         if len(self._versions) == _MAX_CHANNELS:
             raise BagError(f"MCAP has room for {_MAX_CHANNELS} channels", where=topic)
         number, version = len(self._versions) + 1, definition.ros_version
         self._versions.append(version)
         encoding = "ros1" if version == 1 else "cdr"
-        content = struct.pack("<HH", number, self._schema(definition))
-        self._add(Op.CHANNEL, content + text_bytes(topic) + text_bytes(encoding) + texts_bytes({}))
+        schema = self._schema(definition, definition.text if embed else "")
+        content = struct.pack("<HH", number, schema) + text_bytes(topic) + text_bytes(encoding)
+        self._add(Op.CHANNEL, content + texts_bytes(dict(metadata or {})))
         self._counts[number] = 0
         return number
 
@@ -168,13 +176,13 @@ class McapWriter:
             self._file.write(record)
         self._pending.clear()
 
-    def _schema(self, definition: Definition) -> int:
+    def _schema(self, definition: Definition, text: str) -> int:
         version = definition.ros_version
-        key = (definition.root, version, definition.text)
+        key = (definition.root, version, text)
         if key not in self._schemas:
             number = self._schemas[key] = len(self._schemas) + 1
             name = short_msgtype(definition.root) if version == 1 else definition.root
-            data = definition.text.encode()
+            data = text.encode()
             content = struct.pack("<H", number) + text_bytes(name) + text_bytes(f"ros{version}msg")
             self._add(Op.SCHEMA, content + struct.pack("<I", len(data)) + data)
         return self._schemas[key]

@@ -9,7 +9,7 @@ from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.patterns import select
 from mosaico_ingest.pipeline.plan import ExcludedTopic
 from mosaico_ingest.pipeline.planning import decide
-from mosaico_ingest.pipeline.run import open_for
+from mosaico_ingest.pipeline.run import open_job
 from mosaico_ingest.rosbag.blocks import Connection
 
 __all__ = [
@@ -66,7 +66,7 @@ def inspect(config: ROSInjectionConfig) -> Inspection:
         BagError: It cannot be opened.
     """
     bridge = ROSBridge.for_config(config)
-    with open_for(config) as (recording, _):
+    with open_job(config) as (recording, _):
         duration_ns = None
         if recording.start_ns is not None and recording.end_ns is not None:
             duration_ns = recording.end_ns - recording.start_ns

@@ -17,8 +17,8 @@ from mosaico_ingest.errors import ManifestError, NothingMatched, SinkUnavailable
 from mosaico_ingest.findings import a_few, encodable
 from mosaico_ingest.job.config import QuarantineSettings, ROSInjectionConfig, TimeRange
 from mosaico_ingest.job.values import IfExists, SessionLevelErrorPolicy, TopicLevelErrorPolicy
-from mosaico_ingest.pipeline.provenance import content_digest, held
-from mosaico_ingest.pipeline.quarantine import Kept, find_kept
+from mosaico_ingest.pipeline.provenance import content_digest, stored_provenance
+from mosaico_ingest.pipeline.quarantine import QuarantineFile, find_quarantine_files
 
 __all__ = ["Replay", "Whereabouts", "alone", "replays"]
 
@@ -37,9 +37,9 @@ class Whereabouts(Enum):
 
 
 class Replay(Struct, frozen=True):
-    """Kept messages, what the destination knows of them, and the configuration that brings them in."""
+    """QuarantineFile messages, what the destination knows of them, and the configuration that brings them in."""
 
-    kept: Kept
+    kept: QuarantineFile
     whereabouts: Whereabouts
     config: ROSInjectionConfig
 
@@ -78,10 +78,10 @@ def replays(folder: Path, configs: Sequence[ROSInjectionConfig]) -> tuple[Replay
         BagError: A file there cannot be read.
     """
     known = {config.sequence_name: config for config in configs}
-    return tuple(_replay(kept, known) for kept in find_kept(folder))
+    return tuple(_replay(kept, known) for kept in find_quarantine_files(folder))
 
 
-def _replay(kept: Kept, known: dict[str, ROSInjectionConfig]) -> Replay:
+def _replay(kept: QuarantineFile, known: dict[str, ROSInjectionConfig]) -> Replay:
     if kept.sequence not in known:
         raise ManifestError(
             f"{kept.messages.name} belongs to the sequence {kept.sequence!r}, which the manifest does not make",
@@ -92,22 +92,22 @@ def _replay(kept: Kept, known: dict[str, ROSInjectionConfig]) -> Replay:
     return Replay(kept, _whereabouts(kept, config), _configuration(kept, config))
 
 
-def _whereabouts(kept: Kept, config: ROSInjectionConfig) -> Whereabouts:
+def _whereabouts(kept: QuarantineFile, config: ROSInjectionConfig) -> Whereabouts:
     """Ask the provenances of the sequence; a server keeps that of its first session only, and adds to no topic twice."""
-    found = held(config.target, kept.sequence)
-    if found is None:
+    stored = stored_provenance(config.target, kept.sequence)
+    if stored is None:
         return Whereabouts.FORGOTTEN
     name = encodable(kept.messages.name)
-    made_from = {(source.name, source.content) for known in found.provenances for source in known.sources}
+    made_from = {(source.name, source.content) for known in stored.records for source in known.sources}
     if (name, content_digest(kept.messages)) in made_from:
         return Whereabouts.STORED
-    provenances = found.provenances if found.has_all_sessions else ()
+    provenances = stored.records if stored.has_all_sessions else ()
     if provenances and all(known.quarantine != name for known in provenances):
         return Whereabouts.FORGOTTEN
     return Whereabouts.WAITING
 
 
-def _configuration(kept: Kept, config: ROSInjectionConfig) -> ROSInjectionConfig:
+def _configuration(kept: QuarantineFile, config: ROSInjectionConfig) -> ROSInjectionConfig:
     """Return the configuration of a sequence for messages kept of it: all of them, added to what is there, or none.
 
     What fails again is kept again, however much: the copy that is there is put away.

@@ -1,4 +1,4 @@
-"""This file says where a job's recordings stand: held against what the provenances of the destination know."""
+"""The status of a job's recordings: compare each with the provenance of its sequence."""
 
 from __future__ import annotations
 
@@ -11,58 +11,60 @@ from mosaico_ingest.errors import IngestError, SequenceExists
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.pipeline.provenance import (
-    certain,
-    held,
-    provenance_of,
-    what_to_do,
+    add_doubtful_digests,
+    decide_skip,
+    read_provenance,
+    stored_provenance,
 )
 from mosaico_ingest.pipeline.run import make_plan
 
-__all__ = ["RecordingStatus", "Standing", "standings"]
+__all__ = ["RecordingStatus", "Status", "recording_statuses"]
 
 
-class Standing(str, Enum):
-    """What a run with `if_exists: skip` would find."""
+class Status(str, Enum):
+    """What a run with `if_exists: skip` would do with a recording."""
 
     DONE = "done"
-    """The same content is there, made by the same job."""
+    """Skip it: the same content is stored, ingested by the same job."""
     NEW = "new"
-    """There is no sequence of its name."""
+    """Ingest it: there is no sequence of its name."""
     CHANGED = "changed"
-    """What is there was made from other content, or by another job."""
+    """Fail: the sequence was made from other content, or by another job."""
     FAILED = "failed"
-    """The same content is there in part: an error ended its run."""
+    """Replace it: an earlier run of the same content ended with an error."""
     UNREADABLE = "unreadable"
-    """The recording cannot be opened, or the job does not fit it."""
+    """Fail: the recording cannot be opened, or the job does not fit it."""
 
 
 class RecordingStatus(Struct, frozen=True):
-    """One recording: what it becomes, how it stands, and why where that is not plain."""
+    """The status of one recording."""
 
     sequence: str
     files: tuple[str, ...]
-    standing: Standing
-    why: str = ""
+    status: Status
+    reason: str = ""
+    """The reason of a status other than `done` or `new`."""
 
 
-def standings(configs: Iterable[ROSInjectionConfig]) -> Iterator[RecordingStatus]:
-    """Look into each recording and its destination; nothing is written."""
-    for config in configs:
-        standing, why = _standing(config)
-        yield RecordingStatus(config.sequence_name, tuple(map(str, config.paths)), standing, why)
+def recording_statuses(jobs: Iterable[ROSInjectionConfig]) -> Iterator[RecordingStatus]:
+    """Yield the status of each recording; read-only."""
+    for job in jobs:
+        status, reason = _status(job)
+        yield RecordingStatus(job.sequence_name, tuple(map(str, job.paths)), status, reason)
 
 
-def _standing(config: ROSInjectionConfig) -> tuple[Standing, str]:
+def _status(job: ROSInjectionConfig) -> tuple[Status, str]:
     try:
-        plan = make_plan(config)
-        found = held(plan.target, plan.sequence)
-        if found is None:
-            return Standing.NEW, ""
-        decided = what_to_do(certain(provenance_of(plan), plan.files, found), found, plan.sequence)
+        plan = make_plan(job)
+        stored = stored_provenance(plan.target, plan.sequence)
+        if stored is None:
+            return Status.NEW, ""
+        provenance = add_doubtful_digests(read_provenance(plan), plan.files, stored)
+        decision = decide_skip(provenance, stored, plan.sequence)
     except SequenceExists as error:
-        return Standing.CHANGED, error.what
+        return Status.CHANGED, error.what
     except IngestError as error:
-        return Standing.UNREADABLE, str(error)
-    if decided is IfExists.REPLACE:
-        return Standing.FAILED, "an error ended the run that made it"
-    return Standing.DONE, ""
+        return Status.UNREADABLE, str(error)
+    if decision is IfExists.REPLACE:
+        return Status.FAILED, "the run that wrote it ended with an error"
+    return Status.DONE, ""

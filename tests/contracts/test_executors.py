@@ -16,7 +16,8 @@ import pytest
 from mosaico_ingest.adapters.python import ROSAdapterBase
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.destinations.store.session import StoreSession
-from mosaico_ingest.executors.in_process import Executor, Inline
+from mosaico_ingest.executors.base import Executor
+from mosaico_ingest.executors.in_process import InProcess
 from mosaico_ingest.executors.processes import Processes
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.ontology import IMU, Vector3d
@@ -132,10 +133,10 @@ def _executor(request: pytest.FixtureRequest) -> Executor:
     if request.param == "ray":
         pytest.importorskip("ray", reason="Ray is not installed")
         return request.getfixturevalue("on_ray")
-    return Inline() if request.param == "inline" else Processes(2)
+    return InProcess() if request.param == "in_process" else Processes(2)
 
 
-@pytest.fixture(params=["inline", "processes", RAY])
+@pytest.fixture(params=["in_process", "processes", RAY])
 def executor(request: pytest.FixtureRequest) -> Executor:
     return _executor(request)
 
@@ -205,7 +206,7 @@ def test_executor_dead_worker_fails_only_its_recording(elsewhere: Executor, tmp_
     jobs[1] = configs(tmp_path, "b", adapter_override={"/imu": Killer})[0]
     reports = list(elsewhere.map(jobs, ignore_batch))
     assert [report.exit_code for report in reports] == [0, 1, 0]
-    assert "2 times in all" in (reports[1].error or "")
+    assert "2 attempts" in (reports[1].error or "")
     assert Store.open(tmp_path / "store").names() == ("a", "c")
 
 
@@ -230,7 +231,7 @@ def test_executor_retry_after_commit_stores_the_sequence_once(
     elsewhere: Executor, killed_once: Path, tmp_path: Path
 ) -> None:
     policies = ["append", "fail", "replace", "skip"]
-    list(Inline().map(configs(tmp_path, ["append"]), ignore_batch))
+    list(InProcess().map(configs(tmp_path, ["append"]), ignore_batch))
     jobs = [
         configs(tmp_path, [policy], adapter_override={"/imu": KillerAfterCommit}, if_exists=policy)[0]
         for policy in policies
@@ -278,7 +279,7 @@ def test_executor_divides_memory_among_processes(tmp_path: Path, monkeypatch: py
     jobs = configs(tmp_path, "abcd", memory_bytes=400 << 20)
     monkeypatch.setattr(
         "mosaico_ingest.executors.processes._Pool.reports",
-        lambda self, _: iter(seen.extend(config.memory_bytes for config in self.batch.configs) or ()),
+        lambda self, _: iter(seen.extend(job.memory_bytes for job in self.batch.jobs) or ()),
     )
     assert list(Processes(4).map(jobs, ignore_batch)) == []
     assert seen == [100 << 20] * 4

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from mosaico_ingest.pipeline.provenance import content_digest, whole_digest
+from mosaico_ingest.pipeline.provenance import content_digest, full_digest
 
 MIB = 1 << 20
 
@@ -41,10 +41,10 @@ def test_the_first_and_the_last_byte_of_a_long_file_count(tmp_path: Path, mark: 
 def test_the_digest_of_a_whole_file_takes_every_byte(tmp_path: Path, mark: int) -> None:
     size = 300 * MIB
     one, other = sparse(tmp_path / "a", size), sparse(tmp_path / "b", size, mark)
-    assert whole_digest(one) != whole_digest(other)
-    assert whole_digest(one) == whole_digest(sparse(tmp_path / "c", size))
+    assert full_digest(one) != full_digest(other)
+    assert full_digest(one) == full_digest(sparse(tmp_path / "c", size))
 
 
 def test_a_short_file_needs_no_second_digest(tmp_path: Path) -> None:
-    assert whole_digest(sparse(tmp_path / "a", 64 * MIB)) is None
-    assert whole_digest(sparse(tmp_path / "b", 64 * MIB + 1)) is not None
+    assert full_digest(sparse(tmp_path / "a", 64 * MIB)) is None
+    assert full_digest(sparse(tmp_path / "b", 64 * MIB + 1)) is not None

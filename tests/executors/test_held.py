@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mosaico_ingest.destinations.registry import keep_destinations_open
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.executors.in_process import Inline
+from mosaico_ingest.executors.in_process import InProcess
 from mosaico_ingest.job.config import ROSInjectionConfig
 
 DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
@@ -19,7 +19,9 @@ def config(folder: Path, name: str) -> ROSInjectionConfig:
 
 def test_the_log_of_the_catalog_is_there_between_recordings_only(tmp_path: Path) -> None:
     log = tmp_path / "store/catalog.sqlite-wal"
-    there = [log.exists() for _ in Inline().map([config(tmp_path, name) for name in "abc"], lambda *_: None)]
+    there = [
+        log.exists() for _ in InProcess().map([config(tmp_path, name) for name in "abc"], lambda *_: None)
+    ]
     assert there == [False, True, True]
     assert not log.exists()
     assert Store.open(tmp_path / "store", create=False).names() == ("a", "b", "c")
@@ -29,7 +31,7 @@ def test_a_store_that_is_removed_meanwhile_is_made_anew(tmp_path: Path) -> None:
     """Letting go of the old catalog must not take the files of the new one."""
     with keep_destinations_open() as keep_open:
         for name in "ab":
-            list(Inline().map([config(tmp_path, name)], lambda *_: None))
+            list(InProcess().map([config(tmp_path, name)], lambda *_: None))
             keep_open(config(tmp_path, name).target)
             if name == "a":
                 shutil.rmtree(tmp_path / "store")

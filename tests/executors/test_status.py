@@ -34,21 +34,21 @@ def ingest(*arguments: str | Path) -> Result:
     return CliRunner().invoke(command_line(), [str(argument) for argument in arguments])
 
 
-def standing(job: Path) -> dict[str, str]:
-    return {one["sequence"]: one["standing"] for one in json.loads(ingest("status", job, "--json").stdout)}
+def statuses(job: Path) -> dict[str, str]:
+    return {one["sequence"]: one["status"] for one in json.loads(ingest("status", job, "--json").stdout)}
 
 
-def test_each_recording_has_its_standing(job: Path) -> None:
-    assert standing(job) == {"a": "new", "b": "new", "c": "new"}
+def test_status_reports_each_recording(job: Path) -> None:
+    assert statuses(job) == {"a": "new", "b": "new", "c": "new"}
     assert ingest("run", job, "--quiet").exit_code == 0
-    assert standing(job) == {"a": "done", "b": "done", "c": "done"}
+    assert statuses(job) == {"a": "done", "b": "done", "c": "done"}
     assert ingest("status", job, "--check").exit_code == 0
 
     (job.parent / "a.mcap").write_bytes(DRIVE.read_bytes() + b"\n")
     (job.parent / "b.mcap").write_bytes(b"torn")
     Store.open(job.parent / "store").add_note("c", "the run ended early")
     shutil.copy(DRIVE, job.parent / "d.mcap")
-    assert standing(job) == {"a": "changed", "b": "unreadable", "c": "failed", "d": "new"}
+    assert statuses(job) == {"a": "changed", "b": "unreadable", "c": "failed", "d": "new"}
     assert ingest("status", job, "--check").exit_code == 1
 
 

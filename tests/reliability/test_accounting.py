@@ -21,14 +21,14 @@ from made_recordings import define, record
 from mosaico_ingest import api
 from mosaico_ingest.cli.app import main
 from mosaico_ingest.destinations.base import StoredTopic, TopicWriter
-from mosaico_ingest.destinations.memory import MemorySink
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.destinations.store.session import StoreSession
 from mosaico_ingest.destinations.store.store import verify
 from mosaico_ingest.errors import BagError, VerificationError
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.values import LoaderErrorPolicy
-from mosaico_ingest.pipeline.run import _missing, execute, make_plan
+from mosaico_ingest.pipeline.pump import check_counts
+from mosaico_ingest.pipeline.run import run_recording
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.report.events import (
     Event,
@@ -51,20 +51,22 @@ def missing(
     topic = SimpleNamespace(target="/t", count=promised, connections=(7,))
     recording: Any = SimpleNamespace(unreadable=unreadable)
     wanted: Any = SimpleNamespace(**{"read_from_ns": None, "read_until_ns": None, **plan})
-    streams: Any = (SimpleNamespace(plan=topic, seen=seen),)
-    return _missing(wanted, recording, streams, events.append), events
+    streams: Any = (SimpleNamespace(plan=topic, read=seen),)
+    return check_counts(wanted, recording, streams, events.append), events
 
 
 def test_messages_nobody_can_account_for_are_a_difference() -> None:
     wrong, events = missing(10, 8, [UnreadableRange(0, "bad", 7, 1, "f")])
-    assert wrong == ["/t: the index promises 10 messages, 8 were read and nothing says where the others are"]
+    assert wrong == [
+        "/t: the index promises 10 messages, 8 were read and no unreadable range explains the difference"
+    ]
     assert not events
 
 
 def test_messages_in_a_stretch_nobody_can_read_are_accounted_for() -> None:
     wrong, events = missing(10, 8, [UnreadableRange(0, "bad", file="f")])
     assert not wrong
-    assert events == [Unreadable("/t", 2, None, "they lie in what could not be read")]
+    assert events == [Unreadable("/t", 2, None, "the messages are in unreadable ranges")]
     assert missing(10, 8, [UnreadableRange(0, "bad", 7, 2, "f")]) == ([], [])
 
 
@@ -146,11 +148,12 @@ def test_a_destination_that_loses_rows_fails_the_run(
     write_bag({"/speed": [number(1), number(2)]})
     (config,) = api.compile_job(write_job())
     monkeypatch.setattr(
-        "mosaico_ingest.destinations.memory._MemorySession.stored",
+        "mosaico_ingest.destinations.store.session.StoreSession.stored",
         lambda _self: (StoredTopic("/speed", 1, 0, 0, 8),),
     )
-    report, failure = execute(make_plan(config), lambda _event: None, sink=MemorySink())
-    assert isinstance(failure, VerificationError)
+    outcome = run_recording(config)
+    report = outcome.report
+    assert isinstance(outcome.error, VerificationError)
     assert report.exit_code == 5
     assert "wrote 2 rows" in str(report.error)
     assert "found 1 rows" in str(report.error)

@@ -13,7 +13,7 @@ from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.job.values import PROVENANCE_KEY
 from mosaico_ingest.pipeline.provenance import content_digest
 from mosaico_ingest.report.events import Event, RunStatus, TopicProgress
-from mosaico_ingest.services.status import Standing
+from mosaico_ingest.services.status import Status
 
 from .conftest import CUT, RunJob, WriteBag, number
 
@@ -80,7 +80,7 @@ def test_a_sequence_nobody_noted_anything_about_is_not_taken_for_the_same(
 ) -> None:
     write_bag({"/speed": [number(1)]})
     Store.open(tmp_path / "store").create_sequence("drive", {PROVENANCE_KEY: "no provenance"})
-    assert "nothing says" in str(run_job(write_job(sequence=SKIP)).error)
+    assert "no provenance record" in str(run_job(write_job(sequence=SKIP)).error)
 
 
 def test_what_an_interrupt_left_is_completed_by_the_next_run(
@@ -141,8 +141,8 @@ def test_a_long_file_that_was_changed_between_its_samples_is_noticed(
     assert run_job(job).status is RunStatus.SKIPPED, "a copy is the same, whatever its time"
     rewritten(bag, 500, 5000)
     assert "other content" in str(run_job(job).error)
-    (standing,) = api.job_status(job)
-    assert standing.standing is Standing.CHANGED
+    (recording,) = api.job_status(job)
+    assert recording.status is Status.CHANGED
     rewritten(bag, 5000, 500)
     assert run_job(job).status is RunStatus.SKIPPED
 
@@ -158,7 +158,7 @@ def test_a_long_file_with_the_time_it_had_is_not_read_again(
     write_bag({"/speed": [number(value) for value in range(1000)]})
     job = write_job(sequence=SKIP)
     assert run_job(job).status is RunStatus.COMPLETED
-    monkeypatch.delattr("mosaico_ingest.pipeline.provenance.whole_digest")
+    monkeypatch.delattr("mosaico_ingest.pipeline.provenance.full_digest")
     assert run_job(job).status is RunStatus.SKIPPED
 
 

@@ -284,7 +284,7 @@ def test_the_ledger_knows_a_recording_by_what_its_store_says(
 
     def standing() -> str:
         (status,) = api.job_status(job)
-        return status.standing.value
+        return status.status.value
 
     assert standing() == "new"
     (report,) = api.run(api.compile_job(job)).recordings

@@ -26,6 +26,7 @@ class ServerDestination(Destination):
     """A Mosaico server; every method but `describe` and `open_sink` connects to it."""
 
     kind: ClassVar[str] = "server"
+    replaces_atomically: ClassVar[bool] = False
 
     def __init__(self, target: ServerTarget) -> None:
         self.target = target
@@ -57,6 +58,7 @@ class ServerDestination(Destination):
             complete=finished and not notifications,
             sessions=(ExistingSession("", info.user_metadata),),
             has_all_sessions=False,
+            finished=finished,
         )
 
     def open_sink(self, *, buffer_bytes: int) -> Sink:

@@ -17,7 +17,7 @@ from mosaico_ingest.findings import RowFailure
 from mosaico_ingest.job.values import LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.pipeline.plan import TopicPlan
-from mosaico_ingest.pipeline.topic import Stream
+from mosaico_ingest.pipeline.topic import TopicPipeline
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.report.collect import Collector
 from mosaico_ingest.report.events import Expected, RunStarted
@@ -107,13 +107,13 @@ def run(
     plan = TopicPlan(
         "/speed", "/speed", CONNECTION.msgtype, (0,), Positive(), "", SPEED, None, {}, topic, every
     )
-    stream = Stream(plan, message, session, collector)
-    stream.bind(CONNECTION)
+    pipeline = TopicPipeline(plan, message, session, collector)
+    pipeline.bind(CONNECTION)
     error = None
     try:
         with WriteBuffer(max_bytes=1 << 20) as buffer:
             for start in range(0, len(values), size):
-                stream.feed(raw([payload(v) for v in values[start : start + size]], start), buffer)
+                pipeline.process(raw([payload(v) for v in values[start : start + size]], start), buffer)
     except (AdapterError, DecodeError, SinkError) as raised:
         error = raised
     return session, collector, error

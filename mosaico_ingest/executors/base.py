@@ -1,0 +1,60 @@
+"""The interface of an executor, and the choice of one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from mosaico_ingest.job.config import ROSInjectionConfig
+    from mosaico_ingest.report.events import BatchObserver
+    from mosaico_ingest.report.model import Report
+
+__all__ = ["Executor", "choose_executor", "do_nothing"]
+
+
+class Executor(Protocol):
+    """Runs the recordings of a batch."""
+
+    def map(self, jobs: Sequence[ROSInjectionConfig], observe: BatchObserver) -> Iterator[Report]:
+        """Yield the report of each job, in the order of the jobs; a failed recording does not stop the others.
+
+        An interrupt ends the running recordings as their session policies demand. Recordings that were not started have
+        no report.
+        """
+        ...
+
+
+def do_nothing() -> None:
+    """Do nothing: the default preparation of a worker."""
+
+
+def choose_executor(
+    jobs: Sequence[ROSInjectionConfig],
+    *,
+    simultaneous: int | None = None,
+    ray: bool = False,
+    address: str | None = None,
+    prepare: Callable[[], None] = do_nothing,
+) -> Executor:
+    """Return the executor for a batch: Ray if asked for, else worker processes, else this process.
+
+    `simultaneous` is the number of recordings to run at the same time; it defaults to the `run.jobs` of the first job.
+    `address` is that of a Ray cluster; without it, Ray starts on this machine. Each worker process calls `prepare`
+    first, for example to configure logging.
+
+    Raises:
+        IngestError: Ray is not installed.
+    """
+    if ray:
+        from mosaico_ingest.executors.ray import Ray  # noqa: PLC0415 - an optional dependency
+
+        return Ray(address, simultaneous)
+    processes = min(simultaneous or jobs[0].jobs, len(jobs)) if jobs else 1
+    if processes == 1:
+        from mosaico_ingest.executors.in_process import InProcess  # noqa: PLC0415 - it loads the pipeline
+
+        return InProcess()
+    from mosaico_ingest.executors.processes import Processes  # noqa: PLC0415 - multiprocessing is slow to import
+
+    return Processes(processes, prepare=prepare)

@@ -1,0 +1,352 @@
+"""The writing part of a run: move message blocks into a session of the sink, commit or discard it, verify the result."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+
+from msgspec import Struct
+
+from mosaico_ingest.destinations.base import Session, Sink, StoredTopic
+from mosaico_ingest.errors import IngestError, Interrupted, NothingMatched, VerificationError
+from mosaico_ingest.findings import Finding, Severity, Stage
+from mosaico_ingest.interrupts import Abandoned, DeferredInterrupt
+from mosaico_ingest.job.values import IfExists, SessionLevelErrorPolicy
+from mosaico_ingest.pipeline.plan import Plan
+from mosaico_ingest.pipeline.provenance import SequenceRequest
+from mosaico_ingest.pipeline.quarantine import Quarantine
+from mosaico_ingest.pipeline.topic import TopicPipeline
+from mosaico_ingest.pipeline.write_buffer import WriteBuffer
+from mosaico_ingest.report.events import (
+    Noted,
+    Observer,
+    Quarantined,
+    Rejected,
+    TopicClosed,
+    TopicProgress,
+    Unreadable,
+)
+from mosaico_ingest.report.timing import Step, Stopwatch
+from mosaico_ingest.rosbag.blocks import UnreadableRange
+from mosaico_ingest.rosbag.recording import Recording
+
+__all__ = ["Written", "check_counts", "verify", "write_sequence"]
+
+
+class Written(Struct, frozen=True):
+    """The result of a committed session."""
+
+    topics: tuple[TopicPipeline, ...]
+    stored: tuple[StoredTopic, ...]
+    """What the destination reports after the commit."""
+    missing: tuple[str, ...] = ()
+    """One line per topic with messages that the index promises and that were neither read nor unreadable."""
+    failure: BaseException | None = None
+    """The error after which the session policy kept the rows accepted so far."""
+    interrupted: bool = False
+    """True if a signal arrived during the commit, which was finished first."""
+
+
+def write_sequence(
+    plan: Plan,
+    request: SequenceRequest,
+    recording: Recording,
+    sink: Sink,
+    *,
+    observe: Observer,
+    stopwatch: Stopwatch,
+) -> Written:
+    """Pump every message of the plan into the sink and commit, or discard as the session policy demands.
+
+    Raises:
+        IngestError: The run ended early and its session was discarded.
+        Abandoned: The observer is gone; the session was discarded.
+    """
+    topics: tuple[TopicPipeline, ...] = ()
+    missing: list[str] = []
+    failure: BaseException | None = None
+    quarantine = _open_quarantine(plan, request)
+    try:
+        with (
+            DeferredInterrupt() as interrupt,
+            sink.open(request.name, request.metadata, if_exists=request.if_exists) as session,
+        ):
+            topics = _open_topics(
+                plan, recording, session, observe, quarantine=quarantine, stopwatch=stopwatch
+            )
+            reported = frozenset(recording.unreadable)
+            try:
+                _pump(plan, recording, topics, stopwatch)
+                _report_reading(recording, topics, observe, reported=reported)
+                missing = check_counts(plan, recording, topics, observe)
+                _check_not_empty(plan, topics)
+            except BaseException as error:
+                failure = _as_interrupt(error)
+                if not _keeps_partial(plan, request, topics, failure):
+                    raise failure from error
+                session.note_error(str(failure))
+            if quarantine is not None:
+                quarantine.close()
+            if not isinstance(failure, Interrupted):
+                interrupt.defer()  # a signal from here on waits for the commit
+    except BaseException as error:
+        # If the commit of a partial result fails too, the first error is the cause, as on a full disk.
+        cause = _as_interrupt(error) if failure is None else failure
+        _discard(topics, quarantine, cause, observe)
+        if cause is error:
+            raise
+        raise cause from error
+    if quarantine is not None:
+        _report_quarantine(quarantine, request.if_exists, observe)
+    return Written(topics, session.stored(), tuple(missing), failure, interrupt.asked)
+
+
+def verify(written: Written, observe: Observer) -> None:
+    """Close every topic in the report and compare the destination with the rows that were written.
+
+    Raises:
+        IngestError: The error after which a partial result was kept.
+        VerificationError: The destination does not have the rows that were written, or messages are missing.
+        Interrupted: A signal arrived during the commit.
+    """
+    stored = {topic.topic: topic for topic in written.stored}
+    problems = list(written.missing)
+    for topic in written.topics:
+        content = stored.get(topic.plan.target)
+        if written.failure is not None:
+            # Rows that were still in the write buffer are not stored; that is no difference to report.
+            rows = topic.rows - (content.rows if content else 0)
+            _subtract(topic, rows, f"not written before the run ended: {written.failure}", observe)
+        else:
+            problems += _difference(topic, content)
+        observe(
+            TopicClosed(
+                topic.plan.target,
+                topic.status,
+                content.stored_bytes if content else 0,
+                topic.error,
+                topic.timeline.report(),
+                content.checksum if content else None,
+            )
+        )
+    if written.failure is not None:
+        raise written.failure
+    if problems:
+        raise VerificationError(
+            "; ".join(problems),
+            hint="the stored sequence is incomplete; replace it, and report this as a bug",
+        )
+    if written.interrupted:
+        raise Interrupted("stopped after the recording was stored completely")
+
+
+def check_counts(
+    plan: Plan, recording: Recording, topics: tuple[TopicPipeline, ...], observe: Observer
+) -> list[str]:
+    """Compare the number of messages read with the index; return one line per topic with unexplained differences."""
+    if plan.read_from_ns is not None or plan.read_until_ns is not None:
+        return []
+    unreadable = Counter[int]()
+    for item in recording.unreadable:
+        if item.connection is not None:
+            unreadable[item.connection] += item.count or 0
+    any_unknown = any(item.connection is None or item.count is None for item in recording.unreadable)
+    missing: list[str] = []
+    for topic in topics:
+        target, promised = topic.plan.target, topic.plan.count
+        accounted = topic.read + sum(unreadable[connection] for connection in topic.plan.connections)
+        if promised is None or promised == accounted:
+            continue
+        text = f"{target}: the index promises {promised} messages, {topic.read} were read"
+        if promised < accounted:
+            observe(Noted(Finding("unexpected-messages", Severity.WARNING, text)))
+        elif any_unknown:
+            observe(Unreadable(target, promised - accounted, None, "the messages are in unreadable ranges"))
+        else:
+            missing.append(f"{text} and no unreadable range explains the difference")
+    return missing
+
+
+def _open_quarantine(plan: Plan, request: SequenceRequest) -> Quarantine | None:
+    if plan.quarantine is None:
+        return None
+    counts = [topic.count for topic in plan.topics]
+    promised = None if None in counts else sum(count or 0 for count in counts)
+    return Quarantine(plan.quarantine, plan.sequence, promised, name=request.quarantine_file)
+
+
+def _open_topics(
+    plan: Plan,
+    recording: Recording,
+    session: Session,
+    observe: Observer,
+    *,
+    quarantine: Quarantine | None,
+    stopwatch: Stopwatch,
+) -> tuple[TopicPipeline, ...]:
+    connections = {connection.id: connection for connection in recording.connections}
+    topics: list[TopicPipeline] = []
+    for topic_plan in plan.topics:
+        topic = TopicPipeline(
+            topic_plan, plan.on_message_error, session, observe, quarantine=quarantine, stopwatch=stopwatch
+        )
+        for connection in topic_plan.connections:
+            topic.bind(connections[connection])
+        topics.append(topic)
+    return tuple(topics)
+
+
+def _pump(plan: Plan, recording: Recording, topics: tuple[TopicPipeline, ...], stopwatch: Stopwatch) -> None:
+    """Move every message block of the recording through its topic; a thread of the buffer writes the rows."""
+    by_connection = {connection: topic for topic in topics for connection in topic.plan.connections}
+    buffer = WriteBuffer(max_bytes=plan.memory.queue_bytes)
+    try:
+        _process(plan, recording, by_connection, buffer, stopwatch)
+    finally:
+        stopwatch.lap(Step.WAIT)
+        stopwatch.add(Step.WRITE, buffer.busy_s)
+
+
+def _process(
+    plan: Plan,
+    recording: Recording,
+    topics: Mapping[int, TopicPipeline],
+    buffer: WriteBuffer,
+    stopwatch: Stopwatch,
+) -> None:
+    with buffer:
+        blocks = recording.message_blocks(
+            tuple(topics),
+            start_ns=plan.read_from_ns,
+            end_ns=plan.read_until_ns,
+            memory_bytes=plan.memory.read_bytes,
+        )
+        stopwatch.lap(Step.PREPARE)
+        for block in blocks:
+            stopwatch.lap(Step.READ)
+            topics[block.connection].process(block, buffer)
+            stopwatch.lap(Step.ADAPT)
+        stopwatch.lap(Step.READ)
+
+
+def _report_reading(
+    recording: Recording,
+    topics: tuple[TopicPipeline, ...],
+    observe: Observer,
+    *,
+    reported: frozenset[UnreadableRange],
+) -> None:
+    """Report padded messages, unreadable ranges, and ranges that were recovered in another way.
+
+    Findings of the recording describe the ranges in `reported` already, so their recovery is not reported twice.
+    """
+    for topic in topics:
+        if topic.padded:
+            observe(Noted(_padded(topic)))
+    targets = {connection: topic.plan.target for topic in topics for connection in topic.plan.connections}
+    for item in recording.unreadable:
+        if item.count != 0:
+            target = None if item.connection is None else targets.get(item.connection)
+            observe(Unreadable(target, item.count, item.offset, item.reason))
+        elif item not in reported:
+            message = f"{item.file} at {item.offset}: {item.reason}"
+            observe(Noted(Finding("recovered-range", Severity.INFO, message)))
+
+
+def _padded(topic: TopicPipeline) -> Finding:
+    return Finding(
+        "padded-messages",
+        Severity.WARNING,
+        f"{topic.plan.topic}: {topic.padded} messages end in 4 to 7 zero bytes that {topic.plan.msgtype} does not"
+        " explain",
+        help="check that the definition is the one the messages were written with",
+    )
+
+
+def _check_not_empty(plan: Plan, topics: tuple[TopicPipeline, ...]) -> None:
+    """Raise if no topic has a row: an empty sequence would look like an ingested one."""
+    if any(topic.rows for topic in topics):
+        return
+    where = str(plan.files[0])
+    read = sum(topic.read for topic in topics)
+    if read == 0:
+        in_window = plan.read_from_ns is not None or plan.read_until_ns is not None
+        scope = "in the time range" if in_window else "on the selected topics"
+        raise NothingMatched(f"there is no message {scope}", where=where, hint="nothing was written")
+    reason = next((topic.error for topic in topics if topic.error), "see the report for the reasons")
+    raise IngestError(f"all of {read} messages were rejected", where=where, hint=reason)
+
+
+def _keeps_partial(
+    plan: Plan, request: SequenceRequest, topics: tuple[TopicPipeline, ...], failure: BaseException
+) -> bool:
+    """Return whether the rows accepted before an error are committed.
+
+    A partial result never replaces a stored sequence. A stopped `append` is discarded, so that repeating the command
+    does not append the same rows twice.
+    """
+    if isinstance(failure, Abandoned) or request.replaces_stored:
+        return False
+    if isinstance(failure, Interrupted) and request.if_exists is IfExists.APPEND:
+        return False
+    return plan.on_error is SessionLevelErrorPolicy.Report and any(topic.rows for topic in topics)
+
+
+def _as_interrupt(error: BaseException) -> BaseException:
+    """Return Ctrl-C as `Interrupted` and any other error unchanged."""
+    if isinstance(error, KeyboardInterrupt):
+        return Interrupted(
+            "stopped before the end of the recording", hint="run the same command again to complete it"
+        )
+    return error
+
+
+def _discard(
+    topics: tuple[TopicPipeline, ...],
+    quarantine: Quarantine | None,
+    error: BaseException,
+    observe: Observer,
+) -> None:
+    """Discard the quarantine and account for the rows of a session that was discarded."""
+    if quarantine is not None:
+        quarantine.discard()
+    if isinstance(error, Abandoned):
+        return
+    for topic in topics:
+        _subtract(topic, topic.rows, f"the session was discarded: {error}", observe)
+        observe(TopicClosed(topic.plan.target, topic.status, 0, error=topic.error))
+
+
+def _report_quarantine(quarantine: Quarantine, if_exists: IfExists, observe: Observer) -> None:
+    """Report the quarantine file of a committed session; retire the files of a session that it replaced."""
+    if if_exists is IfExists.REPLACE:
+        quarantine.supersede()
+    if quarantine.count:
+        path = quarantine.messages_path
+        finding = Finding(
+            "quarantined",
+            Severity.WARNING,
+            f"{quarantine.count} messages are quarantined in {path}",
+            help=f"fix the manifest, then run `ingest replay {path.parent} --manifest JOB.yaml`",
+        )
+        observe(Noted(finding))
+        observe(Quarantined(str(path)))
+
+
+def _difference(topic: TopicPipeline, content: StoredTopic | None) -> Iterator[str]:
+    actual = (content.rows, content.start_ns, content.end_ns) if content else (0, None, None)
+    if (topic.rows, topic.start_ns, topic.end_ns) != actual:
+        rows, start_ns, end_ns = actual
+        yield (
+            f"{topic.plan.target}: wrote {topic.rows} rows in [{topic.start_ns}, {topic.end_ns}], "
+            f"found {rows} rows in [{start_ns}, {end_ns}]"
+        )
+
+
+def _subtract(topic: TopicPipeline, rows: int, reason: str, observe: Observer) -> None:
+    """Count rows that were handed to the sink but are not stored as rejected."""
+    if rows > 0:
+        observe(TopicProgress(topic.plan.target, written=-rows))
+        observe(
+            Rejected(topic.plan.target, Stage.WRITE, "not-written", rows, reason, topic.start_ns or 0, -1)
+        )
