@@ -47,8 +47,8 @@ __all__ = ["Ray"]
 
 _log = logging.getLogger(__name__)
 
-NODE_LOSSES = 3
-"""Number of node losses after which a recording fails; separate from the attempts, as a lost node is rarely its fault."""
+MAX_NODE_FAILURES = 3
+"""Number of failed nodes after which a recording fails; separate from the attempts, as a lost node is rarely its fault."""
 _POLL_S = 0.1
 _SHUTDOWN_S = 10.0
 _CONNECT_S = 5.0
@@ -195,7 +195,7 @@ class _Run:
             return
         self.nodes_lost[position] += isinstance(error, _NODE_ERRORS)
         deaths = self.batch.attempts[position] - self.nodes_lost[position]
-        if deaths < self.attempts and self.nodes_lost[position] < NODE_LOSSES:
+        if deaths < self.attempts and self.nodes_lost[position] < MAX_NODE_FAILURES:
             _log.warning(
                 "%s is started again: %s", self.batch.jobs[position].sequence_name, _first_line(error)
             )
@@ -228,7 +228,7 @@ class _Run:
 
 def _died(error: ray_errors.RayError, attempts: int) -> IngestError:
     if isinstance(error, _NODE_ERRORS):
-        return IngestError(f"the node of the worker was lost {NODE_LOSSES} times")
+        return IngestError(f"the node of the worker was lost {MAX_NODE_FAILURES} times")
     memory = isinstance(error, ray_errors.OutOfMemoryError)
     return IngestError(
         f"the worker {'ran out of memory' if memory else 'died'} in each of {attempts} attempts",

@@ -48,7 +48,7 @@ __all__ = [
 
 _log = logging.getLogger(__name__)
 
-EXIT_LOSSES = 4
+EXIT_WITH_ERRORS = 4
 """The exit code of a completed run with rejected rows or unreadable ranges."""
 
 
@@ -179,7 +179,7 @@ class _RunEvents:
         """End a run that was committed and verified."""
         self._report_times()
         if self._collector.rejected or self._collector.unreadable:
-            self(RunFinished(RunStatus.REJECTED, EXIT_LOSSES))
+            self(RunFinished(RunStatus.REJECTED, EXIT_WITH_ERRORS))
         else:
             self(RunFinished(RunStatus.COMPLETED, 0))
         return Outcome(self._collector.report())
