@@ -144,6 +144,7 @@ _TABLE = (
     Rule("ING410", "field-form", _ERROR, "a field with missing, conflicting or useless keys"),
     Rule("ING411", "adapter-file", _ERROR, "an adapter file that is inconsistent"),
     Rule("ING412", "adapter-cycle", _ERROR, "adapters that use each other in a cycle"),
+    Rule("ING413", "unchecked-adapter", _INFO, "an adapter for a message type whose definition is unknown"),
     Rule("ING501", "unreadable-range", _WARNING, "a part of a recording that cannot be read"),
     Rule("ING502", "recovered-range", _INFO, "damage in a recording that lost no message"),
     Rule("ING503", "missing-split", _WARNING, "a split that `metadata.yaml` lists and that does not exist"),

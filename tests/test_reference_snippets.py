@@ -56,7 +56,7 @@ MESSAGES: Mapping[str, tuple[str, dict[str, Any]]] = {
     "/lidar/rear/pointcloud": ("sensor_msgs/msg/PointCloud2", CLOUD),
 }
 MY_ONTOLOGY = """
-    from mosaico_ingest import Serializable
+    from mosaico_ingest.models import Serializable
 
 
     class MyCustomData(Serializable):
@@ -71,7 +71,8 @@ MY_ONTOLOGY = """
 MY_ADAPTER = """
     from typing import Any, Optional, Tuple, Type
 
-    from mosaico_ingest import Message, ROSAdapterBase, ROSMessage
+    from mosaico_ingest.ros_bridge import ROSAdapterBase, ROSMessage
+    from mosaico_ingest.models import Message
     from my_ontology import MyLidar
 
 
@@ -165,8 +166,8 @@ def test_injector_example_of_the_reference_stores_typed_topics(
         """
         from pathlib import Path
         from mosaico_ingest import SessionLevelErrorPolicy, TopicLevelErrorPolicy
-        from mosaico_ingest import RosbagInjector, ROSInjectionConfig, Stores
-        from mosaico_ingest.adapters import RGBDCameraAdapter
+        from mosaico_ingest.ros_bridge import RosbagInjector, ROSInjectionConfig, Stores
+        from mosaico_ingest.ros_bridge.adapters import RGBDCameraAdapter
 
 
         class MyCustomRGBDAdapter(RGBDCameraAdapter):
@@ -215,8 +216,8 @@ def test_registered_adapter_converts_its_type(project: Path) -> None:
         project,
         """
         from pathlib import Path
-        from mosaico_ingest import ROSAdapterBase, ROSInjectionConfig, ROSMessage, RosbagInjector, register_default_adapter
-        from mosaico_ingest import Message
+        from mosaico_ingest.ros_bridge import ROSAdapterBase, ROSInjectionConfig, ROSMessage, RosbagInjector, register_default_adapter
+        from mosaico_ingest.models import Message
         from my_ontology import MyCustomData
 
 
@@ -243,7 +244,7 @@ def test_adapter_override_applies_to_its_topic_only(project: Path) -> None:
         project,
         """
         from pathlib import Path
-        from mosaico_ingest import RosbagInjector, ROSInjectionConfig
+        from mosaico_ingest.ros_bridge import RosbagInjector, ROSInjectionConfig
         from my_adapter import MyCustomLidarAdapter
 
         config = ROSInjectionConfig(
@@ -269,7 +270,7 @@ def test_registered_types_are_used_by_later_runs(project: Path) -> None:
         dedent(
             """
             from pathlib import Path
-            from mosaico_ingest import ROSTypeRegistry, Stores
+            from mosaico_ingest.ros_bridge import ROSTypeRegistry, Stores
 
             def initialize_project_schemas():
                 ROSTypeRegistry.register(
@@ -289,7 +290,7 @@ def test_registered_types_are_used_by_later_runs(project: Path) -> None:
         project,
         """
         import setup_registry
-        from mosaico_ingest import RosbagInjector, ROSInjectionConfig, Stores
+        from mosaico_ingest.ros_bridge import RosbagInjector, ROSInjectionConfig, Stores
         from pathlib import Path
 
         setup_registry.initialize_project_schemas()

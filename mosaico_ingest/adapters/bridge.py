@@ -16,16 +16,21 @@ from hashlib import sha1
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from msgspec import Struct
 from msgspec.structs import replace
 
 from mosaico_ingest.adapters.adapter import AdapterSpec, UnmodeledSpec
-from mosaico_ingest.adapters.builtin import BY_NAME, BY_TYPE
+from mosaico_ingest.adapters.builtin import BY_NAME, BY_TYPE, Builtin
 from mosaico_ingest.adapters.image import PngImageSpec
 from mosaico_ingest.adapters.mapping.loader import load_adapter
-from mosaico_ingest.adapters.python import PythonAdapterSpec, is_adapter_class, registered_adapters
+from mosaico_ingest.adapters.python import (
+    PythonAdapterSpec,
+    ROSAdapterBase,
+    is_adapter_class,
+    registered_adapters,
+)
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.job.config import AdapterReference, ImageFormat, ROSInjectionConfig
 from mosaico_ingest.job.patterns import first_match
@@ -337,6 +342,24 @@ class ROSBridge:
                 hint="name an adapter that takes this type, or leave the topic out of the override",
             )
         return Resolution(spec, "override", f"override {pattern!r}")
+
+    @classmethod
+    def get_default_adapter(cls, ros_msg_type: str) -> type[ROSAdapterBase[Any]] | None:
+        """Return the class of the adapter that a message type gets without a job, None if there is none.
+
+        None is also the result for an adapter file that an installed package offers, because it is not a class.
+        """
+        from mosaico_ingest.adapters.standalone import adapter_class  # noqa: PLC0415 - imports the ontology models
+
+        spec = cls().resolve("", ros_msg_type).spec
+        if isinstance(spec, PythonAdapterSpec):
+            return spec.adapter
+        return adapter_class(spec.name) if isinstance(spec, Builtin) else None
+
+    @classmethod
+    def is_msgtype_adapted(cls, ros_msg_type: str) -> bool:
+        """Return whether a message type has an adapter without a job."""
+        return not cls().resolve("", ros_msg_type).unmodeled
 
     @classmethod
     def from_ros_message(cls, msg: ROSMessage) -> Message:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from inspect import signature
-from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast, overload
 
 import numpy as np
 import pyarrow as pa
@@ -39,48 +40,86 @@ A = TypeVar("A", bound=type[Any])
 _registered: dict[str, type[Any]] = {}
 
 
-class ROSAdapterBase(Generic[T]):
-    """Turns messages of `ros_msgtype` into objects of `__mosaico_ontology_type__`.
+class ROSAdapterBase(ABC, Generic[T]):
+    """Base class of adapters in Python: turns messages of `ros_msgtype` into objects of an ontology class.
 
-    An adapter fills in `from_dict`. One that also has a classmethod
-    `from_batch(rows: pa.StructArray) -> pa.StructArray` is given whole batches of columns instead: as many rows of
-    the ontology's columns come back, a null row is a rejected one.
+    An adapter implements `from_dict`, which receives one message. If it also has a classmethod
+    `from_batch(rows: pa.StructArray) -> pa.StructArray`, that method receives complete batches of columns instead and
+    returns one row of ontology columns per message; a null row rejects its message.
     """
 
     ros_msgtype: str | tuple[str, ...]
-    """The message types it takes, as `sensor_msgs/msg/Imu`."""
+    """The message types that the adapter takes, such as `sensor_msgs/msg/Imu`."""
     __mosaico_ontology_type__: type[Any]
-    """The class `from_dict` returns an object of."""
+    """The class of the objects that `from_dict` returns."""
 
     @classmethod
+    @abstractmethod
     def from_dict(cls, ros_data: dict[str, Any]) -> T:
-        """Return the object for one message, a dict of its fields; any exception rejects the message."""
+        """Return the object for one message, given as a dict of its fields; any exception rejects the message."""
         raise NotImplementedError(f"{cls.__name__} defines neither from_dict nor from_batch")
 
     @classmethod
     def translate(cls, ros_msg: ROSMessage, **kwargs: Any) -> Message:  # noqa: ANN401 - passed on to from_dict
-        """Return the object with its time; to be overridden where the topic or the time of a message matter."""
+        """Return the object with its time. Override it if the result depends on the topic or time of the message."""
         from mosaico_ingest.ontology.header import Message  # noqa: PLC0415 - the models are slow to import
 
-        convert: Callable[..., T] = cls.from_dict  # one that is overridden may take more
+        convert: Callable[..., T] = cls.from_dict  # An override may accept more arguments.
         return Message(timestamp_ns=ros_msg.bag_timestamp_ns, data=convert(ros_msg.data, **kwargs))
 
     @classmethod
     def schema_metadata(
         cls,
-        ros_data: dict[str, Any],  # noqa: ARG003 - for those who override it
-        **kwargs: Any,  # noqa: ANN401, ARG003 - the same
+        ros_data: dict[str, Any],  # noqa: ARG003 - for overrides
+        **kwargs: Any,  # noqa: ANN401, ARG003 - for overrides
     ) -> dict[str, Any] | None:
-        """Return topic metadata read from the topic's first message; none by default."""
+        """Return topic metadata read from the topic's first message; None by default."""
         return None
 
+    @classmethod
+    def ros_msg_type(cls) -> str | tuple[str, ...]:
+        """Return `ros_msgtype`."""
+        return cls.ros_msgtype
 
-def register_default_adapter(adapter: A) -> A:
-    """Make an adapter class the default for its types, before the built-in ones (a class decorator).
+    @classmethod
+    def get_default_ros_msg(cls) -> str:
+        """Return the first message type that the adapter takes."""
+        return cls.ros_msgtype if isinstance(cls.ros_msgtype, str) else cls.ros_msgtype[0]
+
+    @classmethod
+    def is_rosmsg_type_valid(cls, type_to_validate: str) -> bool:
+        """Return whether the adapter takes a message type."""
+        return normalize_msgtype(type_to_validate) in ros_types_of(cls)
+
+    @classmethod
+    def ontology_data_type(cls) -> type[T]:
+        """Return the class of the objects that `from_dict` returns."""
+        return cls.__mosaico_ontology_type__
+
+
+@overload
+def register_default_adapter(adapter: A) -> A: ...
+@overload
+def register_default_adapter(adapter: None = None, *, is_default: bool = False) -> Callable[[A], A]: ...
+def register_default_adapter(
+    adapter: A | None = None,
+    *,
+    is_default: bool = False,  # noqa: ARG001 - selects the adapter for export in the official SDK
+) -> A | Callable[[A], A]:
+    """Make an adapter class the default for its types, with precedence over the built-in adapters.
+
+    Use it as a class decorator, with or without parentheses. `is_default` is accepted for compatibility with the
+    official SDK; exports find the adapter of a topic in its metadata.
 
     Raises:
         AdapterError: Another class is already registered for one of the types.
     """
+    if adapter is None:
+        return _register
+    return _register(adapter)
+
+
+def _register(adapter: A) -> A:
     for msgtype in ros_types_of(adapter):
         other = _registered.get(msgtype)
         if other is not None and _path(other) != _path(adapter):

@@ -42,6 +42,7 @@ __all__ = [
 STDIN = "-"
 """The path that stands for the text of `stdin`."""
 
+_MESSAGE_FOLDER_LEVELS = 2
 _MAX_FIX_ROUNDS = 10
 _RULES_OF_COMPLETE_JOBS = frozenset({"missing-key", "unset-variable"})
 """Rules that do not apply to a file that other manifests extend, because it need not be a complete job."""
@@ -143,12 +144,21 @@ def adapter_findings(document: Document) -> Iterator[Finding]:
         yield from error.findings or [Finding("adapter-file", Severity.ERROR, error.what, start, error.hint)]
         return
     spans = set[Span | None]()
+    unknown: list[str] = []
     for msgtype in spec.ros_types:
-        definition = _definition(spec, msgtype)
-        for finding in () if definition is None else spec.check(definition, ros_shape(definition)):
+        definition = _definition(spec, msgtype, document.folder)
+        if definition is None:
+            unknown.append(msgtype)
+            continue
+        for finding in spec.check(definition, ros_shape(definition)):
             if finding.span not in spans:
                 spans.add(finding.span)
                 yield finding
+    if unknown:
+        message = f"the fields were not checked, because no definition of {', '.join(unknown)} is known"
+        hint = "put the .msg text under `definition`, or run `ingest adapters test --msg-dir DIR`"
+        location = spec.source.span(("variants",) if spec.model.variants else ("ros_type",))
+        yield Finding("unchecked-adapter", Severity.INFO, message, location, hint)
 
 
 def _is_excluded(path: Path) -> bool:
@@ -297,17 +307,25 @@ def _message_findings(message: MessageFile) -> Iterator[Finding]:
             yield from map(check.finding, check.message(message))
 
 
-def _definition(spec: MappingSpec, msgtype: str) -> Definition | None:
-    """Return the definition in the adapter file, else the definition of a distribution, else None."""
+def _definition(spec: MappingSpec, msgtype: str, folder: Path) -> Definition | None:
+    """Return the definition in the adapter file, in a folder near it, or of a distribution, else None."""
     try:
-        return _definition_finder().find(msgtype, spec)
+        return _definition_finder(_message_folders(msgtype.partition("/")[0], folder)).find(msgtype, spec)
     except BagError:
         return None
 
 
+def _message_folders(package: str, folder: Path) -> tuple[tuple[str, Path], ...]:
+    """Return the folders of a package's `.msg` files: `PACKAGE` next to an adapter or up to two levels above it."""
+    folder = folder.resolve()
+    above = [folder, *folder.parents][: _MESSAGE_FOLDER_LEVELS + 1]
+    found = (path for start in above for path in (start / package, *sorted(start.glob(f"*/{package}"))))
+    return next((((package, path),) for path in found if any(path.glob("**/*.msg"))), ())
+
+
 @cache
-def _definition_finder() -> DefinitionFinder:
-    return DefinitionFinder()
+def _definition_finder(folders: tuple[tuple[str, Path], ...]) -> DefinitionFinder:
+    return DefinitionFinder(custom=[(package, path, None) for package, path in folders])
 
 
 def _apply_fixes(text: str, findings: Iterable[Finding]) -> tuple[str, int]:

@@ -9,6 +9,7 @@ from os.path import relpath
 from pathlib import Path
 
 from mosaico_ingest.adapters.adapter import UnmodeledSpec
+from mosaico_ingest.adapters.builtin import BUILTIN
 from mosaico_ingest.job.expand import plain
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.remote import AnyPath, RemotePath
@@ -127,7 +128,12 @@ def _adapters(found: Inspection) -> Iterator[str]:
     yield "  unmodeled: keep                     # a type without an adapter: keep, skip, fail"
     yield "  # load: [adapters/mine.yaml]        # adapters of your own, for every topic of their types"
     some = kept[0].topic if kept else found.topics[0].topic if found.topics else "/topic"
-    yield f"  # override: {{{plain(some)}: MyAdapter}}"
+    offers = [(topic, known) for topic in kept for known in BUILTIN if topic.msgtype in known.ros_types]
+    for topic, adapter in offers:
+        yield f"  # {adapter.name} takes {topic.msgtype} only where an override selects it, and stores {adapter.tag}:"
+        yield f"  # override: {{{plain(topic.topic)}: {adapter.name}}}"
+    if not offers:
+        yield f"  # override: {{{plain(some)}: MyAdapter}}"
 
 
 def _merged(topics: Sequence[InspectedTopic]) -> list[InspectedTopic]:

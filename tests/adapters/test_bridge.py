@@ -268,3 +268,40 @@ def test_one_message_is_translated() -> None:
     assert ROSBridge.from_ros_message(imu).data == BridgeRow(x=4.0)
     with pytest.raises(AdapterError, match="no adapter takes visualization_msgs/msg/Marker"):
         ROSBridge.from_ros_message(ROSMessage(0, "/m", "visualization_msgs/msg/Marker", {}))
+
+
+def test_register_default_adapter_with_parentheses_registers_class() -> None:
+    adapter = base.register_default_adapter()(MyImuAdapter)
+    assert adapter is MyImuAdapter
+    assert ROSBridge.get_default_adapter(IMU) is MyImuAdapter
+
+
+def test_register_default_adapter_with_is_default_registers_class() -> None:
+    base.register_default_adapter(is_default=True)(MyImuAdapter)
+    assert ROSBridge.get_default_adapter("sensor_msgs/Imu") is MyImuAdapter
+
+
+def test_get_default_adapter_builtin_returns_its_class() -> None:
+    adapter = ROSBridge.get_default_adapter(IMU)
+    assert adapter is not None
+    assert adapter.__name__ == "IMUAdapter"
+    assert adapter.ontology_data_type().ontology_tag() == "IMU"
+
+
+def test_get_default_adapter_unknown_type_returns_none() -> None:
+    assert ROSBridge.get_default_adapter("own_msgs/msg/Unknown") is None
+    assert not ROSBridge.is_msgtype_adapted("own_msgs/msg/Unknown")
+    assert ROSBridge.is_msgtype_adapted(IMU)
+
+
+def test_adapter_base_has_members_of_the_sdk() -> None:
+    assert MyImuAdapter.ros_msg_type() == IMU
+    assert MyImuAdapter.get_default_ros_msg() == IMU
+    assert MyImuAdapter.is_rosmsg_type_valid("sensor_msgs/Imu")
+    assert not MyImuAdapter.is_rosmsg_type_valid("sensor_msgs/msg/Image")
+    assert MyImuAdapter.ontology_data_type() is BridgeRow
+
+
+def test_adapter_base_is_abstract() -> None:
+    with pytest.raises(TypeError):
+        ROSAdapterBase()  # type: ignore[abstract]

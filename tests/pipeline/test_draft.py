@@ -80,3 +80,8 @@ def test_a_recording_behind_a_url_keeps_it() -> None:
     text = draft_manifest(found, as_path("s3://fleet/a/my drive.mcap?region=eu"), folder=Path("jobs"))
     assert '  path: "s3://fleet/a/my drive.mcap?region=eu"\n' in text
     assert "  name: my_drive\n" in text
+
+
+def test_draft_manifest_offers_adapters_that_need_an_override() -> None:
+    assert "# override: {/a: GPSFixAdapter}" in draft("bag", msgtype="gps_msgs/msg/GPSFix")
+    assert "# override: {/a: MyAdapter}" in draft("bag")

@@ -1,0 +1,50 @@
+"""The public names of the official `mosaicolabs.ros_bridge`, re-exported from this package.
+
+Programs written for the official module run with `mosaicolabs` replaced by `mosaico_ingest`. The package contains no
+code of its own, and no other module of this project may depend on it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import mosaico_ingest
+from mosaico_ingest import ontology
+
+if TYPE_CHECKING:
+    from mosaico_ingest import (
+        LoaderErrorPolicy,
+        ROSAdapterBase,
+        RosbagInjector,
+        ROSBridge,
+        ROSInjectionConfig,
+        ROSLoader,
+        ROSMessage,
+        ROSTypeRegistry,
+        Stores,
+        register_default_adapter,
+    )
+    from mosaico_ingest.ontology import BatteryState, FrameTransform, PointCloud2, PointField
+
+__all__ = [
+    "BatteryState",
+    "FrameTransform",
+    "LoaderErrorPolicy",
+    "PointCloud2",
+    "PointField",
+    "ROSAdapterBase",
+    "ROSBridge",
+    "ROSInjectionConfig",
+    "ROSLoader",
+    "ROSMessage",
+    "ROSTypeRegistry",
+    "RosbagInjector",
+    "Stores",
+    "register_default_adapter",
+]
+
+
+def __getattr__(name: str) -> object:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(mosaico_ingest if name in mosaico_ingest.__all__ else ontology, name)

@@ -1,0 +1,41 @@
+"""The adapters of `sensor_msgs`, as in the official SDK."""
+
+from mosaico_ingest.adapters import (
+    BatteryStateAdapter,
+    CameraInfoAdapter,
+    CompressedImageAdapter,
+    GPSAdapter,
+    ImageAdapter,
+    IMUAdapter,
+    JoyAdapter,
+    LaserScanAdapter,
+    MagneticFieldAdapter,
+    MultiEchoLaserScanAdapter,
+    NavSatStatusAdapter,
+    NMEASentenceAdapter,
+    PointCloudAdapter,
+    PressureAdapter,
+    RobotJointAdapter,
+    ROIAdapter,
+    TemperatureAdapter,
+)
+
+__all__ = [
+    "BatteryStateAdapter",
+    "CameraInfoAdapter",
+    "CompressedImageAdapter",
+    "GPSAdapter",
+    "IMUAdapter",
+    "ImageAdapter",
+    "JoyAdapter",
+    "LaserScanAdapter",
+    "MagneticFieldAdapter",
+    "MultiEchoLaserScanAdapter",
+    "NMEASentenceAdapter",
+    "NavSatStatusAdapter",
+    "PointCloudAdapter",
+    "PressureAdapter",
+    "ROIAdapter",
+    "RobotJointAdapter",
+    "TemperatureAdapter",
+]
