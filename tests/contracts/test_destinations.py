@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
@@ -14,56 +15,9 @@ from mosaico_ingest.job.values import PluginTarget, ServerTarget, StoreTarget
 
 DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
 
-PLUGIN = '''
-"""A destination that writes one Feather file per topic: an example for authors of destinations."""
-
-from contextlib import contextmanager
-from pathlib import Path
-
-import pyarrow as pa
-import pyarrow.feather
-
-from mosaico_ingest.destinations.base import Destination, DestinationStatus
-from mosaico_ingest.destinations.memory import MemorySink
-
-
-def open_feather(options, folder):
-    return FeatherDestination(folder / options["folder"])
-
-
-class FeatherDestination(Destination):
-    kind = "feather"
-
-    def __init__(self, folder):
-        self.folder = folder
-
-    def describe(self, *, folder=None):
-        return f"feather:{self.folder.name}"
-
-    def inspect(self, sequence, *, connect):
-        return DestinationStatus(exists=self.folder.exists())
-
-    def find(self, sequence):
-        return None
-
-    def open_sink(self, *, buffer_bytes):
-        return FeatherSink(self.folder)
-
-
-class FeatherSink:
-    def __init__(self, folder):
-        self.folder = folder
-
-    @contextmanager
-    def open(self, sequence, metadata, *, if_exists=None):
-        memory = MemorySink()
-        with memory.open(sequence, metadata) as session:
-            yield session
-        for name, topic in memory.sequences[sequence].topics.items():
-            path = self.folder / sequence / f"{name.strip('/').replace('/', '.')}.feather"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            pa.feather.write_feather(topic.table(), path)
-'''
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "destinations.md"
+PLUGIN = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[0]
+"""The example of the documentation: a destination that writes one Feather file per topic."""
 
 
 @pytest.fixture
