@@ -1,9 +1,10 @@
-"""This file sums a report up in Markdown, for the page of a CI job or a pull request."""
+"""The report of a run as Markdown, for the page of a CI job or a pull request."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
+from mosaico_ingest.findings import one_line
 from mosaico_ingest.report.collect import (
     STEP_WORDS,
     longest_step,
@@ -11,77 +12,83 @@ from mosaico_ingest.report.collect import (
     total_seconds,
 )
 from mosaico_ingest.report.model import Report, RunReport, replay_command
-from mosaico_ingest.report.units import bytes_text, count_text, seconds_text
+from mosaico_ingest.report.units import bytes_text, count_text, percent_text, seconds_text
 
 __all__ = ["markdown_summary"]
 
-_SLOWEST = 3
-_MOST_ROWS = 100
-"""A job page takes a limited size; those with problems come first."""
+MAX_SLOWEST = 3
+MAX_ROWS = 100
+"""Rows of a table or list, because CI services limit the size of a job's page."""
 
 
 def markdown_summary(report: RunReport) -> str:
-    """Return headline, a row for each recording, and what was rejected or went wrong."""
-    ordered = sorted(report.recordings, key=lambda one: one.exit_code == 0)
+    """Return headline, a row for each recording, and all errors and rejections; problems come first."""
+    recordings = sorted(report.recordings, key=lambda recording: recording.exit_code == 0)
     lines = [f"## Ingestion: {report.headline}", ""]
-    if ordered:
+    if recordings:
         lines += ["| sequence | status | read | written | rejected | stored | time |"]
-        lines += ["|---|---|---:|---:|---:|---:|---:|", *map(_row, ordered[:_MOST_ROWS])]
-    if len(ordered) > _MOST_ROWS:
-        lines += ["", f"… and {len(ordered) - _MOST_ROWS} more, all of them in the report."]
-    lines += _time(report)
-    problems = list(_problems(ordered))
+        lines += ["|---|---|---:|---:|---:|---:|---:|", *map(_row, recordings[:MAX_ROWS])]
+    if len(recordings) > MAX_ROWS:
+        lines += ["", f"… and {len(recordings) - MAX_ROWS} more, see the report file."]
+    lines += _time_lines(report)
+    problems = list(_problems(recordings))
     if problems:
-        lines += ["", "### To look at", "", *problems[:_MOST_ROWS]]
-    commands = {f"    {command}" for one in ordered if (command := replay_command(report, one))}
+        lines += ["", "### Problems", "", *problems[:MAX_ROWS]]
+    commands = {f"    {command}" for one in recordings if (command := replay_command(report, one))}
     if commands:
-        lines += ["", "Rejected messages were kept; once the manifest is mended:", "", *sorted(commands)]
+        lines += ["", "Rejected messages are in the quarantine. Fix the manifest, then run:", ""]
+        lines += sorted(commands)
     return "\n".join(lines) + "\n"
 
 
-def _time(report: RunReport) -> list[str]:
-    """Return where the time went, and which recordings took longest."""
-    sums = total_seconds(report.recordings)
-    if not sums:
-        return []
-    total = sum(sums.values())
-    shares = ", ".join(f"{STEP_WORDS[name]} {spent / total:.0%}" for name, spent in sums.items())
-    lines = ["", f"Time: {shares}."]
-    if len(report.recordings) > 1:
-        longest = (
-            f"{_cell(one.sequence)} {seconds_text(one.duration_s)} ({longest_step(one.steps)})"
-            for _, one in slowest(report.recordings, _SLOWEST)
-        )
-        lines += ["", f"Longest: {'; '.join(longest)}."]
-    return lines
-
-
-def _row(one: Report) -> str:
-    totals = one.totals
+def _row(recording: Report) -> str:
+    totals = recording.totals
     cells = (
-        _cell(one.sequence),
-        one.status.value,
+        _escape(recording.sequence),
+        recording.status.value,
         count_text(totals.read),
         count_text(totals.written),
         count_text(totals.rejected),
         bytes_text(totals.stored_bytes),
-        seconds_text(one.duration_s),
+        seconds_text(recording.duration_s),
     )
     return f"| {' | '.join(cells)} |"
 
 
-def _problems(recordings: list[Report]) -> Iterator[str]:
-    for one in recordings:
-        if one.error:
-            yield f"- **{_cell(one.sequence)}**: {_cell(one.error)}"
-        for topic in one.topics:
+def _time_lines(report: RunReport) -> list[str]:
+    """Return the share of each step, and the slowest recordings if there are several."""
+    seconds = total_seconds(report.recordings)
+    if not seconds:
+        return []
+    total = sum(seconds.values())
+    shares = ", ".join(f"{STEP_WORDS[name]} {percent_text(spent / total)}" for name, spent in seconds.items())
+    lines = ["", f"Time: {shares}."]
+    if len(report.recordings) > 1:
+        recordings = (
+            f"{_escape(recording.sequence)} {seconds_text(recording.duration_s)} ({longest_step(recording.steps)})"
+            for _, recording in slowest(report.recordings, MAX_SLOWEST)
+        )
+        lines += ["", f"Slowest: {'; '.join(recordings)}."]
+    return lines
+
+
+def _problems(recordings: Sequence[Report]) -> Iterator[str]:
+    for recording in recordings:
+        name = _escape(recording.sequence)
+        if recording.error:
+            yield f"- **{name}**: {_escape(recording.error)}"
+        for topic in recording.topics:
             for rejection in topic.rejections:
-                said = f"{count_text(rejection.count)} rejected [{rejection.rule}]: {rejection.reason}"
-                yield f"- {_cell(one.sequence)} `{topic.target}`: {_cell(said)}"
+                text = f"{count_text(rejection.count)} rejected [{rejection.rule}]: {rejection.reason}"
+                yield f"- {name} {_escape(topic.target)}: {_escape(text)}"
+        for item in recording.unreadable_ranges:
+            count = "messages" if item.count is None else count_text(item.count)
+            text = f"{count} unreadable: {item.reason}"
+            yield f"- {name} {_escape(item.topic or 'recording')}: {_escape(text)}"
 
 
-def _cell(text: str) -> str:
-    """Return text that neither ends a cell nor becomes markup."""
+def _escape(text: str) -> str:
+    """Return text on one line that neither ends a table cell nor becomes markup."""
     for character in "\\|<>*`[]":
         text = text.replace(character, f"\\{character}")
-    return " ".join(text.split())
+    return one_line(" ".join(text.split()))

@@ -14,60 +14,152 @@ from numpy.typing import NDArray
 from mosaico_ingest.documents import Part
 
 __all__ = [
-    "MOST_STRETCHES",
+    "MAX_BINS",
+    "MAX_GAPS",
+    "Gap",
     "Step",
     "Stopwatch",
     "Timeline",
     "TimelineReport",
 ]
 
-MOST_STRETCHES = 120
-_FIRST_STEP_NS = 1_000_000
+MAX_BINS = 120
+"""Maximum number of bins of a timeline."""
+MAX_GAPS = 50
+"""Maximum number of gaps that a timeline lists; the longest are kept."""
+FIRST_BIN_NS = 1_000_000
+"""Initial length of a bin, in ns."""
+GAP_FACTOR = 3
+"""A gap is longer than this many median intervals."""
+IRREGULAR_FACTOR = 2
+"""With `MIN_IRREGULAR` intervals or more, a gap is also longer than this many 90th percentiles of them."""
+MIN_IRREGULAR = 20
+
+_BUCKETS_PER_OCTAVE = 8
+_MANTISSA_SHIFT = 49  # leaves the exponent and three bits of the mantissa of a float64
+_EXPONENT_BIAS = 1023 * _BUCKETS_PER_OCTAVE
+_BUCKETS = 64 * _BUCKETS_PER_OCTAVE
+
+
+class Gap(Part):
+    """An interval between two rows that is much longer than the topic's other intervals."""
+
+    start_ns: int
+    """Time of the row before the gap, in ns since the epoch."""
+    end_ns: int
+    """Time of the row after the gap, in ns since the epoch."""
 
 
 class TimelineReport(Part):
-    """How many rows there are in equal stretches of time; a stretch without any is a gap."""
+    """The rows of a topic over time, in bins of equal length, and the gaps between them."""
 
     start_ns: int
-    """Where the first stretch begins, ns since the epoch."""
+    """Start of the first bin, in ns since the epoch."""
     step_ns: int
-    """How long a stretch is."""
+    """Length of a bin, in ns."""
     counts: tuple[int, ...]
+    """Rows in each bin."""
+    interval_ns: int | None = None
+    """Median interval between two rows, in ns; null with fewer than two different times."""
+    gap_count: int = 0
+    """Number of gaps."""
+    gaps: tuple[Gap, ...] = ()
+    """The longest gaps, ordered by time."""
 
 
 @dataclass(slots=True)
 class Timeline:
-    """Counts of rows over time; times may come in any order."""
+    """Counts of rows and of the intervals between them; times may come in any order."""
 
-    step_ns: int = _FIRST_STEP_NS
+    step_ns: int = FIRST_BIN_NS
     first: int = 0
-    """The number of the first stretch, counted from the epoch."""
+    """Number of the first bin, counted from the epoch."""
     counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    _last_ns: int | None = None
+    _intervals: NDArray[np.int64] = field(default_factory=lambda: np.zeros(_BUCKETS, np.int64))
+    """A histogram of the intervals with logarithmic buckets; see `_bucket_start_ns`."""
+    _longest: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    """Start and end of the longest intervals, in any order."""
 
     def add(self, times_ns: NDArray[np.int64]) -> None:
-        """Count rows at these times."""
+        """Add rows at these times, in ns since the epoch."""
         if not len(times_ns):
             return
-        low, high = int(times_ns.min()) // self.step_ns, int(times_ns.max()) // self.step_ns
+        times_ns = np.sort(times_ns, kind="stable")  # linear in the usual case that they are sorted
+        self._add_counts(times_ns)
+        self._add_intervals(times_ns)
+
+    def _add_counts(self, times_ns: NDArray[np.int64]) -> None:
+        low, high = int(times_ns[0]) // self.step_ns, int(times_ns[-1]) // self.step_ns
         if len(self.counts):
             low, high = min(low, self.first), max(high, self.first + len(self.counts) - 1)
         factor = 1
-        while high // factor - low // factor >= MOST_STRETCHES:
+        while high // factor - low // factor >= MAX_BINS:
             factor *= 2
-        before = (np.arange(len(self.counts)) + self.first) // factor
+        bins = (np.arange(len(self.counts)) + self.first) // factor
         self.step_ns *= factor
         self.first = low // factor
-        stretches = high // factor - self.first + 1
-        counts = np.bincount(times_ns // self.step_ns - self.first, minlength=stretches)
-        np.add.at(counts, before - self.first, self.counts)
+        counts = np.bincount(times_ns // self.step_ns - self.first, minlength=high // factor - self.first + 1)
+        np.add.at(counts, bins - self.first, self.counts)
         self.counts = counts
 
+    def _add_intervals(self, times_ns: NDArray[np.int64]) -> None:
+        last_ns = self._last_ns
+        self._last_ns = int(times_ns[-1]) if last_ns is None else max(last_ns, int(times_ns[-1]))
+        if last_ns is not None and last_ns <= times_ns[0]:
+            times_ns = np.concatenate(([last_ns], times_ns))
+        intervals = np.diff(times_ns)
+        self._intervals += np.bincount(_buckets(intervals), minlength=_BUCKETS)
+        is_full = len(self._longest) == MAX_GAPS
+        minimum = int((self._longest[:, 1] - self._longest[:, 0]).min()) if is_full else 0
+        starts = np.flatnonzero(intervals > minimum)
+        if len(starts):
+            candidates = np.column_stack((times_ns[starts], times_ns[starts + 1]))
+            longest = np.concatenate((self._longest, candidates))
+            if len(longest) > MAX_GAPS:
+                lengths = longest[:, 1] - longest[:, 0]
+                longest = longest[np.argpartition(lengths, -MAX_GAPS)[-MAX_GAPS:]]
+            self._longest = longest
+
     def report(self) -> TimelineReport | None:
-        """Return the counts as a report holds them; None where there is no row."""
+        """Return the counts and the gaps; None without rows."""
         if not len(self.counts):
             return None
-        counts = tuple(int(count) for count in self.counts)
-        return TimelineReport(start_ns=self.first * self.step_ns, step_ns=self.step_ns, counts=counts)
+        interval_ns, gap_bucket = self._median_and_gap_bucket()
+        gaps = self._longest[_buckets(self._longest[:, 1] - self._longest[:, 0]) >= gap_bucket].tolist()
+        return TimelineReport(
+            start_ns=self.first * self.step_ns,
+            step_ns=self.step_ns,
+            counts=tuple(self.counts.tolist()),
+            interval_ns=interval_ns,
+            gap_count=int(self._intervals[gap_bucket:].sum()),
+            gaps=tuple(Gap(start_ns=start, end_ns=end) for start, end in sorted(gaps)),
+        )
+
+    def _median_and_gap_bucket(self) -> tuple[int | None, int]:
+        """Return the median interval in ns, within 13 %, and the first bucket of intervals that are gaps."""
+        totals = np.cumsum(self._intervals[1:])  # without rows at the same time
+        total = int(totals[-1])
+        if not total:
+            return None, _BUCKETS
+        median = int(np.searchsorted(totals, (total + 1) // 2)) + 1
+        limit_ns = GAP_FACTOR * _bucket_start_ns(median + 1)
+        if total >= MIN_IRREGULAR:
+            percentile = int(np.searchsorted(totals, np.ceil(0.9 * total))) + 1
+            limit_ns = max(limit_ns, IRREGULAR_FACTOR * _bucket_start_ns(percentile + 1))
+        return _bucket_start_ns(median), min(int(_buckets(np.array([limit_ns]))[0]) + 1, _BUCKETS)
+
+
+def _buckets(intervals_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the bucket of each interval: eight for each power of two, and bucket 0 for intervals up to 1 ns."""
+    exponents = intervals_ns.astype(np.float64).view(np.int64) >> _MANTISSA_SHIFT
+    return np.maximum(exponents - _EXPONENT_BIAS, 0)
+
+
+def _bucket_start_ns(bucket: int) -> int:
+    """Return the shortest interval of a bucket, in ns."""
+    octave, part = divmod(bucket, _BUCKETS_PER_OCTAVE)
+    return ((_BUCKETS_PER_OCTAVE + part) << octave) // _BUCKETS_PER_OCTAVE
 
 
 class Step(str, Enum):

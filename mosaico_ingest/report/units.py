@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from datetime import datetime, timezone
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ __all__ = [
     "seconds_text",
     "stored_text",
     "time_text",
+    "unreadable_text",
     "written_text",
 ]
 
@@ -85,3 +87,12 @@ def written_text(report: Report) -> str:
     if report.status.value in {"failed", "interrupted"} and promised > read:
         return f"{counted(written, 'message')} written before the run stopped, of {count_text(promised)}"
     return f"{count_text(written)} of {counted(read, 'message')} written"
+
+
+def unreadable_text(reports: Iterable[Report]) -> str:
+    """Return how many messages could not be read, such as `12`, `at least 12` or `unknown`."""
+    counts = [item.count for report in reports for item in report.unreadable_ranges]
+    total = sum(count or 0 for count in counts)
+    if None not in counts:
+        return count_text(total)
+    return f"at least {count_text(total)}" if total else "unknown"

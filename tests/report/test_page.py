@@ -1,4 +1,4 @@
-"""The page holds what the report holds, whatever texts it has; Chromium lays it out where it is present."""
+"""The report page and the Markdown summary contain the whole report, escaped; Chromium renders the page if present."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from mosaico_ingest.cli.app import command_line
 from mosaico_ingest.findings import Stage
 from mosaico_ingest.report.events import RunStatus, TopicStatus
-from mosaico_ingest.report.html import gaps, html_page
+from mosaico_ingest.report.html import draw_topic, html_page
 from mosaico_ingest.report.markdown import markdown_summary
 from mosaico_ingest.report.model import (
     Rejection,
@@ -26,7 +26,7 @@ from mosaico_ingest.report.model import (
     UnreadableRange,
     UsedManifest,
 )
-from mosaico_ingest.report.timing import TimelineReport
+from mosaico_ingest.report.timing import Gap, TimelineReport
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 VOID = {"meta", "input", "path"}
@@ -59,15 +59,17 @@ def topic(name: str, *, rejected: int = 0, counts: tuple[int, ...] = (50,) * 20)
         end_ns=T0 + len(counts) * 10**9,
         payload_bytes=10**6,
         stored_bytes=10**5,
-        timeline=TimelineReport(start_ns=T0, step_ns=10**9, counts=counts),
+        timeline=TimelineReport(start_ns=T0, step_ns=10**9, counts=counts, interval_ns=20_000_000),
     )
 
 
 def recording(number: int, status: RunStatus = RunStatus.COMPLETED, topics: int = 2) -> Report:
     failed = status is RunStatus.FAILED
     gap = (50,) * 6 + (0,) * 6 + (20,) * 8
-    made = [topic(f"/sensor_{at}", counts=gap if at == 1 else (50,) * 20) for at in range(topics - 1)]
-    made.append(topic("/imu", rejected=3 if status is RunStatus.REJECTED else 0))
+    topic_reports = [
+        topic(f"/sensor_{at}", counts=gap if at == 1 else (50,) * 20) for at in range(topics - 1)
+    ]
+    topic_reports.append(topic("/imu", rejected=3 if status is RunStatus.REJECTED else 0))
     return Report(
         sequence=f"drive_{number:03}",
         destination="mosaico",
@@ -82,7 +84,7 @@ def recording(number: int, status: RunStatus = RunStatus.COMPLETED, topics: int 
         if failed
         else Steps(prepare=0.1, read=0.6, decode=0.3, adapt=0.2, commit=0.3, write=0.4),
         quarantine="kept here/drive-1.mcap" if status is RunStatus.REJECTED else None,
-        topics=() if failed else tuple(made),
+        topics=() if failed else tuple(topic_reports),
         unreadable_ranges=(UnreadableRange(topic=None, count=4, offset=99, reason="bad checksum"),)
         if failed
         else (),
@@ -123,10 +125,10 @@ class Outline(HTMLParser):
         self.feed(page)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = dict(attrs)
+        attributes = dict(attrs)
         self.ids += [value for key, value in attrs if key == "id" and value]
         self.links += [value for key, value in attrs if key == "href" and value]
-        self.loads += [str(given[key]) for key in ("src", "srcset", "data") if key in given]
+        self.loads += [str(attributes[key]) for key in ("src", "srcset", "data") if key in attributes]
         if tag not in VOID or tag == "path":
             self.open.append(tag)
 
@@ -138,7 +140,7 @@ class Outline(HTMLParser):
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_the_page_is_well_formed_and_needs_nothing_else(name: str) -> None:
+def test_html_page_any_run_is_well_formed_and_self_contained(name: str) -> None:
     outline = Outline(html_page(RUNS[name]))
     assert outline.open == []
     assert outline.loads == []
@@ -147,24 +149,24 @@ def test_the_page_is_well_formed_and_needs_nothing_else(name: str) -> None:
     assert {link[1:] for link in outline.links if link.startswith("#")} <= set(outline.ids)
 
 
-def test_every_recording_topic_rejection_and_loss_is_on_the_page() -> None:
+def test_html_page_contains_every_recording_topic_rejection_and_unreadable_range() -> None:
     text = " ".join(Outline(html_page(RUNS["failing"])).words)
-    for wanted in ("drive_001", "drive_003", "/sensor_0", "nan", "bad checksum", "a note", NASTY):
-        assert wanted in text
+    for expected in ("drive_001", "drive_003", "/sensor_0", "nan", "bad checksum", "a note", NASTY):
+        assert expected in text
 
 
-def test_the_manifest_the_steps_and_the_way_back_from_the_quarantine_are_on_the_page(tmp_path: Path) -> None:
+def test_html_page_contains_manifest_steps_and_replay_command(tmp_path: Path) -> None:
     outline = Outline(html_page(RUNS["failing"], tmp_path))
     text = " ".join(outline.words)
     assert "api_key: " in text
-    assert "Where the time went" in text
-    assert "The recordings that took longest" in text
+    assert "Time by step" in text
+    assert "Slowest recordings" in text
     assert "ingest replay 'kept here' --manifest jobs/nightly.yaml" in text
     (link,) = {link for link in outline.links if not link.startswith("#")}
     assert (tmp_path / unquote(link)).resolve() == Path("kept here").resolve()
 
 
-def test_a_report_of_an_earlier_version_has_no_empty_parts() -> None:
+def test_html_page_without_steps_and_manifests_has_no_empty_sections() -> None:
     old = RUNS["small"].model_copy(
         update={
             "manifests": (),
@@ -174,36 +176,107 @@ def test_a_report_of_an_earlier_version_has_no_empty_parts() -> None:
         }
     )
     text = " ".join(Outline(html_page(old)).words)
-    assert "Where the time went" not in text
+    assert "Time by step" not in text
     assert "Manifest" not in text
 
 
-def test_texts_cannot_become_markup() -> None:
+def test_html_page_markup_in_texts_is_escaped() -> None:
     assert "<script>alert" not in html_page(RUNS["failing"])
 
 
-def test_500_recordings_stay_a_page_a_browser_opens_at_once() -> None:
+def test_html_page_of_500_recordings_is_below_6_mb() -> None:
     assert len(html_page(RUNS["large"])) < 6_000_000
 
 
-def test_a_drop_out_is_a_gap_and_a_slow_topic_is_not_full_of_them() -> None:
-    drop_out = TimelineReport(start_ns=0, step_ns=10**9, counts=(50,) * 6 + (0,) * 6 + (50,) * 8)
-    slow = TimelineReport(start_ns=0, step_ns=10**9, counts=((1, 0, 0) * 30 + (1,)))
-    assert [(gap.start_ns, gap.end_ns) for gap in gaps(drop_out)] == [(6 * 10**9, 12 * 10**9)]
-    assert gaps(slow) == ()
+def test_html_page_control_characters_in_texts_are_escaped() -> None:
+    report = run(
+        recording(1).model_copy(update={"sequence": "a\x1b[2Jb", "error": "x\u202ey", "findings": ("\x00",)})
+    )
+    page = html_page(report)
+    assert not set("\x1b\u202e\x00") & set(page)
+    assert "a\\x1b[2Jb" in page
+    assert "\x1b" not in markdown_summary(report)
 
 
-def test_the_summary_lists_problems_first_and_no_text_breaks_its_table() -> None:
+def test_html_page_opens_recordings_with_problems_and_collapses_healthy_ones() -> None:
+    unreadable = UnreadableRange(topic=None, count=None, offset=99, reason="bad checksum")
+    truncated = recording(4, RunStatus.REJECTED).model_copy(
+        update={"topics": (), "unreadable_ranges": (unreadable,)}
+    )
+    page = html_page(
+        run(recording(1), recording(2, RunStatus.FAILED), recording(3, RunStatus.SKIPPED), truncated)
+    )
+    opened = [
+        part.split('"')[1]
+        for part in page.split('<details class="recording" id=')[1:]
+        if " open" in part.split(">")[0]
+    ]
+    problems = [
+        part.split('"')[1]
+        for part in page.split('<details class="recording" id=')[1:]
+        if "data-problem" in part.split(">")[0]
+    ]
+    assert opened == problems == ["r1", "r3"]
+    assert "unknown unreadable" in page
+
+
+def test_html_page_single_healthy_recording_is_open() -> None:
+    assert '<details class="recording" id="r0" open' in html_page(run(recording(1)))
+
+
+def test_html_page_stored_size_states_share() -> None:
+    page = html_page(run(recording(1)))
+    assert "(5.0 MB, stored in 200.0 kB (4 %))" in page
+
+
+def test_draw_topic_one_gap_is_labelled_and_drawn() -> None:
+    timeline = TimelineReport(
+        start_ns=0,
+        step_ns=10**9,
+        counts=(10,) * 20,
+        interval_ns=10**8,
+        gap_count=1,
+        gaps=(Gap(start_ns=5 * 10**9, end_ns=7_200_000_000),),
+    )
+    drawing = draw_topic(topic("/a").model_copy(update={"timeline": timeline}), (0, 20 * 10**9))
+    assert drawing is not None
+    assert drawing["label"] == "/a: 1,000 rows, 1 gap, 2.20 s"
+    assert drawing["gaps"] == "M60.0 21H86.4V24H60.0Z"
+
+
+def test_draw_topic_single_row_is_visible() -> None:
+    timeline = TimelineReport(start_ns=10**10, step_ns=10**6, counts=(1,))
+    for span in ((0, 10**10), (10**10, 10**10)):
+        drawing = draw_topic(topic("/a").model_copy(update={"timeline": timeline, "written": 1}), span)
+        assert drawing is not None
+        assert drawing["label"] == "/a: 1 row, no gaps"
+        left, right = (
+            float(part.split("V")[0].split(" ")[0]) for part in drawing["rows"][1:].split("H")[::2]
+        )
+        assert 0 <= left < right <= 240
+        assert right - left >= 1.9
+
+
+def test_draw_topic_slow_regular_topic_has_no_empty_bars() -> None:
+    timeline = TimelineReport(
+        start_ns=0, step_ns=10**9, counts=((1, 0, 0) * 30 + (1,)), interval_ns=3 * 10**9
+    )
+    drawing = draw_topic(topic("/a").model_copy(update={"timeline": timeline}), (0, 90 * 10**9))
+    assert drawing is not None
+    assert "V24H" not in drawing["rows"]
+
+
+def test_markdown_summary_lists_problems_first_and_escapes_cells() -> None:
     lines = markdown_summary(RUNS["failing"]).splitlines()
     assert lines[0] == "## Ingestion: 3 recordings, 1 failed, 4,000 messages written"
     assert lines[4].startswith("| drive_001 | failed")
     assert any("\\<script\\>" in line for line in lines)
-    assert any(line.startswith("Longest: drive_003 4.50 s (reading, 40%); ") for line in lines)
+    assert any(line.startswith("Slowest: drive_003 4.50 s (reading, ") for line in lines)
     assert "    ingest replay 'kept here' --manifest jobs/nightly.yaml" in lines
     assert len(markdown_summary(RUNS["large"]).splitlines()) < 250
 
 
-def test_the_command_writes_the_page_and_the_summary(tmp_path: Path) -> None:
+def test_report_command_writes_page_and_summary(tmp_path: Path) -> None:
     source = tmp_path / "run.json"
     source.write_text(RUNS["small"].model_dump_json())
     page, summary = tmp_path / "out.html", tmp_path / "out.md"
@@ -219,7 +292,7 @@ def test_the_command_writes_the_page_and_the_summary(tmp_path: Path) -> None:
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("name", RUNS)
-def test_chromium_lays_the_page_out(name: str, scheme: str, tmp_path: Path) -> None:
+def test_chromium_renders_page_and_runs_filter(name: str, scheme: str, tmp_path: Path) -> None:
     page, picture = tmp_path / f"{name}.html", tmp_path / f"{name}-{scheme}.png"
     page.write_text(html_page(RUNS[name]))
     dark = ["--blink-settings=preferredColorScheme=0"] if scheme == "dark" else []
