@@ -32,7 +32,7 @@ from mosaico_ingest.report.events import (
     ignore_events,
 )
 from mosaico_ingest.report.model import Report, RunReport, UsedManifest
-from mosaico_ingest.textfile import read_whole
+from mosaico_ingest.textfile import read_limited
 from mosaico_ingest.version import __version__
 
 if TYPE_CHECKING:
@@ -284,7 +284,7 @@ def _read_metadata(argument: str | None) -> dict[str, Any]:
     if not argument.lstrip().startswith("{"):
         where = argument
         try:
-            text = read_whole(Path(argument))
+            text = read_limited(Path(argument))
         except OSError as error:
             raise ManifestError(
                 f"is neither a JSON object nor a readable file ({error.strerror})",

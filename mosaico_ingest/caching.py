@@ -1,6 +1,6 @@
-"""This file remembers what was made of an object for as long as it is used, where comparing it would cost as much as making it.
+"""Identity-keyed caching for arguments that are as expensive to hash as the result is to compute.
 
-Arrow types and schemas hash by spelling themselves out.
+Arrow types and schemas are such arguments: they are hashed by their text.
 """
 
 from __future__ import annotations
@@ -11,26 +11,26 @@ from typing import TypeVar
 
 __all__ = ["cache_by_identity"]
 
-_Given = TypeVar("_Given")
-_Made = TypeVar("_Made")
-_MOST = 256
-"""How many are remembered; the topics of one recording are those of the next."""
+_Argument = TypeVar("_Argument")
+_Result = TypeVar("_Result")
+_MAX_ENTRIES = 256
+"""Maximum number of cached results. Successive recordings have the same topics, so they share most results."""
 
 
-def cache_by_identity(make: Callable[[_Given], _Made]) -> Callable[[_Given], _Made]:
-    """Make a function remember its results by the identity of its argument (a decorator)."""
-    # What is remembered holds its argument, whose identity is not used again then.
-    known: dict[int, tuple[_Given, _Made]] = {}
+def cache_by_identity(function: Callable[[_Argument], _Result]) -> Callable[[_Argument], _Result]:
+    """Cache the results of a function by the identity of its argument, and evict the oldest; use it as a decorator."""
+    # Each entry contains its argument: while the argument is alive, no other object has its id.
+    entries: dict[int, tuple[_Argument, _Result]] = {}
     lock = Lock()
 
-    def recall(given: _Given) -> _Made:
-        found = known.get(id(given))
-        if found is None:
-            found = (given, make(given))
+    def cached(argument: _Argument) -> _Result:
+        entry = entries.get(id(argument))
+        if entry is None:
+            entry = (argument, function(argument))
             with lock:
-                while len(known) >= _MOST:
-                    del known[next(iter(known))]
-                known[id(given)] = found
-        return found[1]
+                while len(entries) >= _MAX_ENTRIES:
+                    del entries[next(iter(entries))]
+                entries[id(argument)] = entry
+        return entry[1]
 
-    return recall
+    return cached

@@ -1,4 +1,4 @@
-"""This file reads whole files, never from a pipe and never without end, and writes text files whole or not at all."""
+"""Reading of regular files up to a maximum size, and atomic writing of text files."""
 
 from __future__ import annotations
 
@@ -11,46 +11,46 @@ from stat import S_ISDIR, S_ISREG
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.remote import AnyPath
 
-__all__ = ["LONGEST", "check_file", "read_whole", "write_whole"]
+__all__ = ["MAX_FILE_BYTES", "check_output_file", "read_limited", "write_atomically"]
 
-LONGEST = 64 * 1024 * 1024
-"""Bytes of the longest text that is read."""
+MAX_FILE_BYTES = 64 * 1024 * 1024
+"""Maximum size of a manifest, definition, plan or report that is read, in bytes."""
 
 
-def read_whole(path: AnyPath) -> bytes:
-    """Return what a file holds.
+def read_limited(path: AnyPath) -> bytes:
+    """Return the content of a file.
 
     Raises:
-        OSError: It cannot be read, is no file (to open a pipe would wait for its writer), or is longer than `LONGEST`.
+        OSError: The file cannot be read, is a pipe or a device (which could block), or is larger than `MAX_FILE_BYTES`.
     """
-    about = path.stat()
-    if not S_ISREG(about.st_mode) and not S_ISDIR(about.st_mode):
+    mode = path.stat().st_mode
+    if not S_ISREG(mode) and not S_ISDIR(mode):
         raise OSError(errno.EINVAL, "a pipe, a socket or a device, not a file", str(path))
     with path.open("rb") as file:
-        content = file.read(LONGEST + 1)
-    if len(content) > LONGEST:
-        raise OSError(errno.EFBIG, f"longer than {LONGEST >> 20} MiB", str(path))
+        content = file.read(MAX_FILE_BYTES + 1)
+    if len(content) > MAX_FILE_BYTES:
+        raise OSError(errno.EFBIG, f"longer than {MAX_FILE_BYTES >> 20} MiB", str(path))
     return content
 
 
-def check_file(path: Path) -> None:
-    """Refuse what cannot be a file to write, before there is anything to write.
+def check_output_file(path: Path) -> None:
+    """Raise if a path cannot be an output file, before there is output.
 
     Raises:
-        ManifestError: It is a folder.
+        ManifestError: The path is a folder.
     """
     if path.is_dir():
         raise ManifestError("is a folder", where=str(path), hint="name a file")
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Write a text file, and its folder where there is none; what was there stays until all of it is written.
+def write_atomically(path: Path, text: str) -> None:
+    """Write a text file and create its folder; an existing file stays until the new one is complete.
 
     Raises:
-        ManifestError: It is a folder.
+        ManifestError: The path is a folder.
         SinkError: The file cannot be written.
     """
-    check_file(path)
+    check_output_file(path)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

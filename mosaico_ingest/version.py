@@ -1,3 +1,3 @@
-"""This file holds the version, alone, so that the build and `ingest --version` read it without imports."""
+"""The version, in a module without imports, so that the build and `ingest --version` read it quickly."""
 
 __version__ = "0.1.0"

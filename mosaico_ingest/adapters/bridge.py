@@ -36,7 +36,7 @@ from mosaico_ingest.job.config import AdapterReference, ImageFormat, ROSInjectio
 from mosaico_ingest.job.patterns import first_match
 from mosaico_ingest.ontology.types import SerializationFormat
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
-from mosaico_ingest.textfile import read_whole
+from mosaico_ingest.textfile import read_limited
 
 if TYPE_CHECKING:
     from mosaico_ingest.ontology.header import Message
@@ -140,7 +140,7 @@ class AdapterFinder(Struct, frozen=True):
 def _text_of(path: Path) -> str:
     """Return what a file beside a mapping says; nothing where it cannot be read."""
     try:
-        return read_whole(path).decode("utf-8", "replace")
+        return read_limited(path).decode("utf-8", "replace")
     except OSError:
         return ""
 

@@ -126,12 +126,12 @@ def write_output(path: Path, text: str, *, announce: bool = False) -> None:
     Raises:
         SinkError: The file cannot be written.
     """
-    from mosaico_ingest.textfile import write_whole
+    from mosaico_ingest.textfile import write_atomically
 
     if path == STANDARD_OUTPUT:
         sys.stdout.write(text)
         return
-    write_whole(path, text)
+    write_atomically(path, text)
     if announce:
         print_line(f"wrote {path}", stderr=True)
 

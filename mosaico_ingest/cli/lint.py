@@ -146,7 +146,7 @@ def schema(
     ] = None,
 ) -> None:
     """Print, write or check the JSON Schemas (draft 2020-12). --write and --check default to all of them."""
-    from mosaico_ingest.textfile import write_whole
+    from mosaico_ingest.textfile import write_atomically
 
     documents = [document] if document else list(Document)
     if write is None and check is None and document is None:
@@ -156,7 +156,7 @@ def schema(
     for each in documents:
         text = _schema_text(each)
         if write is not None:
-            write_whole(_schema_file(write, each), text)
+            write_atomically(_schema_file(write, each), text)
         elif check is not None:
             stale += _is_stale(_schema_file(check, each), text)
         else:

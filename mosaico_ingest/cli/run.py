@@ -115,7 +115,7 @@ def run(
     from mosaico_ingest.executors.base import choose_executor
     from mosaico_ingest.report.metrics import prometheus_text
     from mosaico_ingest.report.units import counted
-    from mosaico_ingest.textfile import check_file
+    from mosaico_ingest.textfile import check_output_file
 
     if bool(manifests) == (plan is not None):
         raise typer.BadParameter("give manifests, or a plan with --plan", param_hint="JOB.yaml")
@@ -132,7 +132,7 @@ def run(
         if not configs and not quiet and log_format is LogFormat.TEXT:
             print_line(f"shard {shard} is empty: the job has {counted(total, 'recording')}", stderr=True)
     if metrics is not None and metrics != STANDARD_OUTPUT:
-        check_file(metrics)
+        check_output_file(metrics)
 
     def write_metrics(result: RunReport) -> None:
         if metrics is not None:
@@ -307,7 +307,7 @@ def run_configs(
     from mosaico_ingest import api
     from mosaico_ingest.cli.console import STANDARD_OUTPUT, print_error
     from mosaico_ingest.executors.base import choose_executor
-    from mosaico_ingest.textfile import check_file
+    from mosaico_ingest.textfile import check_output_file
 
     as_json = log_format is LogFormat.JSON
     prepare = partial(set_up_logging, log or (configs[0].log_level if configs else "INFO"), log_format)
@@ -316,7 +316,7 @@ def run_configs(
     collect_garbage_as_usual()
     report_files = {path for path in (report, *map(_report_path, configs)) if path is not None}
     for file in report_files - {STANDARD_OUTPUT}:
-        check_file(file)
+        check_output_file(file)
     failures: list[RunFinished] = []
 
     with _display(configs, as_json=as_json, quiet=quiet) as show:

@@ -21,7 +21,7 @@ from mosaico_ingest.job.yaml_source import (
     load_source,
 )
 from mosaico_ingest.remote import is_url
-from mosaico_ingest.textfile import read_whole
+from mosaico_ingest.textfile import read_limited
 
 __all__ = [
     "EXTENDS_KEY",
@@ -264,7 +264,7 @@ def _base(path: File, span: Span, chain: tuple[File, ...], read: Iterator[int]) 
     if next(read) > MAX_FILES:
         return _finding(f"{path} is one of more than {MAX_FILES} files", span, "extend fewer files")
     try:
-        text = read_whole(path).decode()
+        text = read_limited(path).decode()
     except (OSError, UnicodeDecodeError) as error:
         why = (error.strerror or str(error)).lower() if isinstance(error, OSError) else "it is not UTF-8"
         return _finding(f"{path} cannot be extended: {why}", span, "name a manifest, or a part of one")

@@ -28,7 +28,7 @@ from mosaico_ingest.job.yaml_source import (
     resolve_plain,
 )
 from mosaico_ingest.remote import AnyPath, as_path, is_url
-from mosaico_ingest.textfile import read_whole
+from mosaico_ingest.textfile import read_limited
 
 __all__ = [
     "LoadedManifest",
@@ -174,7 +174,7 @@ def read_text(path: Path) -> str:
         )
         raise refusal((finding,), str(path))
     try:
-        return read_whole(path).decode()
+        return read_limited(path).decode()
     except UnicodeDecodeError as err:
         message = f"not UTF-8 text: byte {err.start} is 0x{err.object[err.start]:02x}"
         finding = Finding(

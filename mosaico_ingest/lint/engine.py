@@ -27,7 +27,7 @@ from mosaico_ingest.lint.settings import Settings, settings_for
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
 from mosaico_ingest.rosbag.definitions.registry import definition_files
-from mosaico_ingest.textfile import read_whole
+from mosaico_ingest.textfile import read_limited
 
 __all__ = [
     "STDIN",
@@ -186,7 +186,7 @@ def _lint_file(
 
 def _is_ours_in_another_encoding(path: Path, suffix: str) -> bool:
     try:
-        return looks_like_ours(read_whole(path), suffix)
+        return looks_like_ours(read_limited(path), suffix)
     except OSError:
         return False
 

@@ -23,7 +23,7 @@ from mosaico_ingest.job.sections import Manifest
 from mosaico_ingest.job.validation import place_of
 from mosaico_ingest.job.yaml_source import KeyPath, Source, Value, load_source, member
 from mosaico_ingest.remote import without_options
-from mosaico_ingest.textfile import read_whole
+from mosaico_ingest.textfile import read_limited
 
 __all__ = [
     "Job",
@@ -276,7 +276,7 @@ def loaded_names(job: Job) -> set[str] | None:
 def load_mapping_source(file: Path) -> Source | None:
     """Return the YAML of an adapter file, or None if the file cannot be read."""
     try:
-        return load_source(read_whole(file).decode(), file=str(file))
+        return load_source(read_limited(file).decode(), file=str(file))
     except (OSError, UnicodeDecodeError):
         return None
 
@@ -304,7 +304,7 @@ def read_classes(file: Path) -> dict[str, bool]:
         OSError: The file cannot be read.
     """
     names: dict[str, bool] = {}
-    for node in ast.parse(read_whole(file), str(file)).body:
+    for node in ast.parse(read_limited(file), str(file)).body:
         if isinstance(node, ast.ClassDef):
             methods = {item.name for item in node.body if isinstance(item, ast.FunctionDef)}
             names[node.name] = bool(node.bases) or "from_dict" in methods or "bind" in methods

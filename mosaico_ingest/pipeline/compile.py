@@ -27,7 +27,7 @@ from mosaico_ingest.job.units import (
 from mosaico_ingest.job.values import Limit, PluginTarget, TimeBound, TopicLevelErrorPolicy
 from mosaico_ingest.remote import AnyPath, RemotePath, without_options
 from mosaico_ingest.rosbag.formats import RECORDING_NAME
-from mosaico_ingest.textfile import read_whole
+from mosaico_ingest.textfile import read_limited
 
 __all__ = [
     "Recording",
@@ -339,7 +339,7 @@ def _metadata(loaded: LoadedManifest) -> dict[str, Any]:
 def _metadata_file(loaded: LoadedManifest, path: Path) -> dict[str, Any]:
     where = loaded.where("sequence", "metadata_file")
     try:
-        metadata = json.loads(read_whole(path))
+        metadata = json.loads(read_limited(path))
     except OSError as err:
         raise ManifestError(
             f"{path} cannot be read: {(err.strerror or str(err)).lower()}", where=where

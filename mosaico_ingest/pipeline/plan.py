@@ -32,7 +32,7 @@ from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.pipeline.memory import MemoryBudget
 from mosaico_ingest.remote import AnyPath, RemotePath
 from mosaico_ingest.rosbag.definitions.model import Resolver
-from mosaico_ingest.textfile import read_whole
+from mosaico_ingest.textfile import read_limited
 
 __all__ = [
     "Decisions",
@@ -315,7 +315,7 @@ def read_plan(path: Path) -> PlanDocument:
     """
     hint = "make one with `ingest plan job.yaml --out plan.json`"
     try:
-        return PlanDocument.model_validate_json(read_whole(path))
+        return PlanDocument.model_validate_json(read_limited(path))
     except OSError as error:
         raise ManifestError(f"cannot be read: {error.strerror}", where=str(path), hint=hint) from error
     except ValidationError as error:

@@ -13,7 +13,7 @@ from mosaico_ingest.errors import BagError
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.rosbag.opening import is_recording
-from mosaico_ingest.textfile import read_whole
+from mosaico_ingest.textfile import read_limited
 
 __all__ = [
     "FILE_NAME",
@@ -60,7 +60,7 @@ def read_metadata(path: AnyPath) -> Metadata:
     try:
         if path.stat().st_size > _LIMIT_BYTES:
             raise BagError(f"larger than {_LIMIT_BYTES} bytes", where=str(path))
-        content = yaml.load(read_whole(path), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))  # noqa: S506 - both are safe loaders, one is fast
+        content = yaml.load(read_limited(path), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))  # noqa: S506 - both are safe loaders, one is fast
         info = content["rosbag2_bagfile_information"]
         return Metadata(
             path,

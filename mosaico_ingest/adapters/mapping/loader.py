@@ -28,7 +28,7 @@ from mosaico_ingest.findings import Finding, RowFailure, Severity
 from mosaico_ingest.ontology.registry import UnknownTag, ontology_type
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.rosbag.definitions.model import Definition, MessageType, normalize_msgtype
-from mosaico_ingest.textfile import read_whole
+from mosaico_ingest.textfile import read_limited
 
 if TYPE_CHECKING:
     from mosaico_ingest.job.yaml_source import Source
@@ -208,7 +208,7 @@ def _source(path_or_text: Path | str, file: str | None = None) -> Source:
     if isinstance(path_or_text, Path):
         file = file or str(path_or_text)
         try:
-            path_or_text = read_whole(path_or_text).decode()
+            path_or_text = read_limited(path_or_text).decode()
         except OSError as error:
             raise AdapterError(f"the adapter file cannot be read: {error.strerror}", where=file) from error
         except UnicodeDecodeError as error:

@@ -34,7 +34,7 @@ from mosaico_ingest.rosbag.definitions.model import (
     normalize_msgtype,
 )
 from mosaico_ingest.rosbag.definitions.parser import PRIMITIVES, flatten, read_types
-from mosaico_ingest.textfile import read_whole
+from mosaico_ingest.textfile import read_limited
 
 __all__ = [
     "CustomMessages",
@@ -210,7 +210,7 @@ def _is_text(source: Path | str) -> bool:
 
 def _read(path: Path) -> tuple[str, str]:
     try:
-        return read_whole(path).decode("utf-8-sig"), str(path)
+        return read_limited(path).decode("utf-8-sig"), str(path)
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
         raise BagError(f"cannot read the definition: {reason}", where=str(path)) from error
