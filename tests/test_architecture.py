@@ -23,7 +23,7 @@ REPLACED = tuple(
     for term in re.findall(r"`(\w+)`", row)
 )
 """Terms that no name may contain, in snake case; plurals with `s` count too."""
-PENDING = frozenset({"lost", "place", "raw_batch", "room", "said", "slab", "taken", "told"})
+PENDING = frozenset({"lost", "place", "room", "said", "taken", "told"})
 """Replaced terms that some names still use."""
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
