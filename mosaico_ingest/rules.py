@@ -127,6 +127,8 @@ _TABLE = (
     Rule("ING238", "missing-adapter", _ERROR, "an adapter file or module that does not exist"),
     Rule("ING239", "missing-base", _ERROR, "an `extends` entry that cannot be used"),
     Rule("ING240", "wrong-url", _ERROR, "a URL that cannot be used"),
+    Rule("ING241", "adapter-clash", _ERROR, "two loaded adapters for the same message type"),
+    Rule("ING242", "image-setting", _WARNING, "an `image` setting for topics that are not images"),
     Rule("ING301", "msg-syntax", _ERROR, "a line of a `.msg` file that is not a declaration"),
     Rule("ING302", "msg-unknown-type", _ERROR, "a field whose type is not defined"),
     Rule("ING303", "msg-repeated-name", _ERROR, "two declarations with the same name"),

@@ -20,8 +20,10 @@ from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.rosbag.definitions.model import Definition
 
-__all__ = ["PngImageSpec", "greyscale_pixels", "greyscale_png", "without_png"]
+__all__ = ["IMAGE_TAG", "PngImageSpec", "greyscale_pixels", "greyscale_png", "without_png"]
 
+IMAGE_TAG = "Image"
+"""The tag of the ontology type whose rows can be stored as PNG."""
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _GREYSCALE_8_BIT = bytes((8, 0, 0, 0, 0))
 _FASTEST = 1
@@ -104,7 +106,7 @@ class PngImageSpec(Struct, frozen=True):
     def bind(self, definition: Definition, shape: pa.StructType) -> Adapter:
         """Bind the inner adapter."""
         adapter = self.inner.bind(definition, shape)
-        return _PngImages(adapter) if adapter.ontology.tag == "Image" else adapter
+        return _PngImages(adapter) if adapter.ontology.tag == IMAGE_TAG else adapter
 
 
 class _PngImages(Struct, frozen=True):

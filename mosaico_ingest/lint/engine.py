@@ -144,18 +144,16 @@ def adapter_findings(document: Document) -> Iterator[Finding]:
         yield from error.findings or [Finding("adapter-file", Severity.ERROR, error.what, start, error.hint)]
         return
     spans = set[Span | None]()
-    unknown: list[str] = []
-    for msgtype in spec.ros_types:
-        definition = _definition(spec, msgtype, document.folder)
-        if definition is None:
-            unknown.append(msgtype)
-            continue
+    definitions = [_definition(spec, msgtype, document.folder) for msgtype in spec.ros_types]
+    for definition in filter(None, definitions):
         for finding in spec.check(definition, ros_shape(definition)):
             if finding.span not in spans:
                 spans.add(finding.span)
                 yield finding
-    if unknown:
-        message = f"the fields were not checked, because no definition of {', '.join(unknown)} is known"
+    if not any(definitions) and not document.example:
+        message = (
+            f"the fields were not checked, because no definition of {', '.join(spec.ros_types)} is known"
+        )
         hint = "put the .msg text under `definition`, or run `ingest adapters test --msg-dir DIR`"
         location = spec.source.span(("variants",) if spec.model.variants else ("ros_type",))
         yield Finding("unchecked-adapter", Severity.INFO, message, location, hint)

@@ -76,7 +76,7 @@ def is_defined(msgtype: str, path: Path | None) -> bool:
 
 
 def _package_folders(folder: Path, package: str) -> list[Path]:
-    """Return the folders that may contain the definitions of a package, given the folder of some definition."""
+    """Return the folders that may contain the definitions of a package, given a folder that refers to it."""
     own = [folder] if package in {folder.name, folder.parent.name} else []
     parents = [folder.parent, folder.parent.parent]
     return own + [parent / package / inner for parent in parents for inner in ("", "msg")]

@@ -12,6 +12,7 @@ from msgspec.structs import replace
 
 from mosaico_ingest.adapters.adapter import ROS_METADATA_KEY, ros_metadata
 from mosaico_ingest.adapters.bridge import ROSBridge
+from mosaico_ingest.adapters.image import IMAGE_TAG
 from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import AdapterError, BagError, IngestError, NothingMatched
 from mosaico_ingest.findings import (
@@ -310,6 +311,7 @@ def resolve(
         raise _misfit(config, misfits)
     if not taken:
         raise _nothing(config, recording, left)
+    findings += _image_settings(config, taken)
     read_from_ns, read_until_ns = _window(config.time_range, recording)
     plan = Plan(
         files=recording.files,
@@ -397,6 +399,25 @@ def _findings(config: ROSInjectionConfig, selection: Selection, topics: tuple[st
         for glob in globs:
             if not any(first_match((glob,), topic) for topic in topics):
                 yield _no_match(".".join(section), glob, topics, config.places.get((*section, glob)))
+
+
+def _image_settings(config: ROSInjectionConfig, topics: Iterable[TopicPlan]) -> Iterator[Finding]:
+    """Yield a finding for each `image: png` whose pattern applies only to topics that do not become images."""
+    tags: dict[str, dict[str, str]] = {}
+    for topic in topics:
+        pattern = first_match(config.images, topic.topic)
+        if pattern is not None and config.images[pattern] == "png":
+            tags.setdefault(pattern, {})[topic.topic] = topic.ontology.tag
+    for pattern, by_topic in tags.items():
+        if IMAGE_TAG not in by_topic.values():
+            topic, tag = next(iter(by_topic.items()))
+            yield Finding(
+                "image-setting",
+                Severity.WARNING,
+                f"image: png has no effect, because {topic} becomes {tag}, not {IMAGE_TAG}",
+                config.places.get(("topic_settings", pattern, "image")),
+                "remove the setting",
+            )
 
 
 def _no_match(key: str, glob: str, topics: tuple[str, ...], place: Span | None) -> Finding:

@@ -26,5 +26,6 @@ def project(tmp_path: Path) -> Path:
     (tmp_path / "base.yaml").write_text("on_error: {topic: ignore}\n")
     (tmp_path / "metadata.json").write_text("{}")
     (tmp_path / "adapters" / "pack.yaml").write_text(ADAPTER)
+    (tmp_path / "adapters" / "pack_v2.yaml").write_text(ADAPTER.replace("PackAdapter", "PackV2Adapter"))
     (tmp_path / "adapters" / "wheel.py").write_text("class WheelAdapter(Base):\n    pass\n")
     return tmp_path

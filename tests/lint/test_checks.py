@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from made_recordings import define, record
 from typer.testing import CliRunner
 
 from mosaico_ingest.cli.app import command_line
@@ -105,3 +106,37 @@ def test_lint_url_with_credentials_from_variables_reports_no_secret(project: Pat
     file = project / "job.yaml"
     file.write_text(text)
     assert lint_paths([file], env=None).findings == ()
+
+
+@pytest.mark.parametrize(
+    ("load", "expected"),
+    [
+        ("adapters/a.py:A, adapters/b.py:B", [("adapter-clash", 2, 36)]),
+        ("adapters/a.py:A, adapters/pack.yaml", [("adapter-clash", 2, 36)]),
+        ("adapters/a.py:A, adapters/a.py:A", []),
+        ("adapters/a.py:A, adapters/a.py:Other", []),
+        ("adapters/a.py:A, adapters/optional.yaml", []),
+    ],
+)
+def test_lint_two_adapters_for_one_type_reports_the_second(
+    project: Path, load: str, expected: list[tuple[str, int, int]]
+) -> None:
+    folder = project / "adapters"
+    (folder / "a.py").write_text(
+        'class A(Base):\n    ros_msgtype = "sensor_msgs/Temperature"\n\n'
+        'class Other(Base):\n    ros_msgtype: str = "sensor_msgs/msg/Imu"\n'
+    )
+    (folder / "b.py").write_text('class B(Base):\n    ros_msgtype = ("a/B", "sensor_msgs/msg/Temperature")\n')
+    (folder / "optional.yaml").write_text((folder / "pack.yaml").read_text() + "default: false\n")
+    assert places(lint(project, f"bag: {{path: data/run.mcap}}\nadapters: {{load: [{load}]}}\n")) == expected
+
+
+def test_plan_reports_png_setting_for_topic_that_is_not_an_image(project: Path) -> None:
+    definition = define("std_msgs/msg/Bool", "bool data\n")
+    record(project / "data" / "run.mcap", [("/flag", definition, 1, {"data": True})])
+    job = project / "job.yaml"
+    job.write_text("bag: {path: data/run.mcap}\ntopic_settings:\n  /flag: {image: png}\n")
+    plan = RUN.invoke(command_line(), ["plan", str(job), "--json"])
+    (recording,) = json.loads(plan.stdout)["recordings"]
+    (note,) = [note for note in recording["notes"] if note["rule"] == "image-setting"]
+    assert (note["severity"], note["place"].rpartition("job.yaml")[2]) == ("warning", ":3:11")

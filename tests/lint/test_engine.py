@@ -63,7 +63,13 @@ def test_a_folder_is_judged_with_all_that_is_ours_below_it(project: Path) -> Non
     (project / ".git" / "job.yaml").write_text(TRAP)
     report = lint_paths([project], env={})
     names = [Path(file.file).relative_to(project).as_posix() for file in report.files]
-    assert names == ["adapters/pack.yaml", "deep/job.yml", "msgs/BatteryPack.msg", "msgs/Cell.msg"]
+    assert names == [
+        "adapters/pack.yaml",
+        "adapters/pack_v2.yaml",
+        "deep/job.yml",
+        "msgs/BatteryPack.msg",
+        "msgs/Cell.msg",
+    ]
     assert rules(report) == ["yaml-boolean"]
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from mosaico_ingest.lint.rule import Check
 from mosaico_ingest.lint.rules import (
+    adapter_clash,
     broken_adapter,
     changed_number,
     contradictory_policies,
@@ -17,6 +18,7 @@ from mosaico_ingest.lint.rules import (
     empty_time_range,
     excluded_topic,
     idle_jobs,
+    image_setting,
     machine_path,
     metadata_key,
     metadata_number,
@@ -56,6 +58,7 @@ from mosaico_ingest.lint.rules import (
 __all__ = ["CHECKS"]
 
 CHECKS: tuple[Check, ...] = (
+    adapter_clash.CHECK,
     broken_adapter.CHECK,
     changed_number.CHECK,
     contradictory_policies.CHECK,
@@ -66,6 +69,7 @@ CHECKS: tuple[Check, ...] = (
     empty_time_range.CHECK,
     excluded_topic.CHECK,
     idle_jobs.CHECK,
+    image_setting.CHECK,
     machine_path.CHECK,
     metadata_key.CHECK,
     metadata_number.CHECK,

@@ -1,0 +1,28 @@
+"""The check of `image-setting`: an `image` setting for topics that are not images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from mosaico_ingest.adapters.builtin import BY_NAME
+from mosaico_ingest.adapters.image import IMAGE_TAG
+from mosaico_ingest.job.patterns import first_match
+from mosaico_ingest.lint.job import Job, is_glob
+from mosaico_ingest.lint.rule import Check, Problem
+
+
+def check(job: Job) -> Iterator[Problem]:
+    """Report `image: png` for topics whose built-in adapter in `override` does not produce images.
+
+    The types of other topics are known only to plan and run, which report the same rule.
+    """
+    overrides = job.manifest.adapters.override
+    for topic, setting in job.manifest.topic_settings.items():
+        pattern = topic if is_glob(topic) else first_match(overrides, topic)
+        adapter = BY_NAME.get(overrides.get(pattern or "", ""))
+        if setting.image == "png" and adapter is not None and adapter.tag != IMAGE_TAG:
+            message = f"image: png has no effect, because {topic} becomes {adapter.tag}, not {IMAGE_TAG}"
+            yield Problem(message, job.key_span("topic_settings", topic, "image"), "remove the setting")
+
+
+CHECK = Check("image-setting", job=check)
