@@ -126,8 +126,12 @@ class TopicReport(_Part):
 
 
 class Totals(_Part):
-    """Sums over the topics."""
+    """Sums over the topics that were read."""
 
+    promised: int | None
+    """Number of messages in the index; None if the index does not count the messages of every topic."""
+    unreadable: int | None
+    """Number of messages in unreadable ranges; None if the number is unknown for a range."""
     read: int
     written: int
     filtered: int
@@ -182,9 +186,13 @@ class Report(_Part):
     @computed_field
     @property
     def totals(self) -> Totals:
-        """Sums over all topics that were taken."""
+        """Sums over the topics that were read."""
         taken = [topic for topic in self.topics if topic.status is not TopicStatus.EXCLUDED]
+        promised = [topic.promised for topic in taken]
+        unreadable = [item.count for item in self.unreadable_ranges]
         return Totals(
+            promised=None if None in promised else sum(count or 0 for count in promised),
+            unreadable=None if None in unreadable else sum(count or 0 for count in unreadable),
             read=sum(t.read for t in taken),
             written=sum(t.written for t in taken),
             filtered=sum(t.filtered for t in taken),

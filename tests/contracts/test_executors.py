@@ -8,6 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterable, Iterator
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,9 @@ import pytest
 from mosaico_ingest.adapters.python import ROSAdapterBase
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.destinations.store.session import StoreSession
-from mosaico_ingest.executors.base import Executor
+from mosaico_ingest.executors.base import Executor, do_nothing
 from mosaico_ingest.executors.in_process import InProcess
-from mosaico_ingest.executors.processes import Processes
+from mosaico_ingest.executors.processes import Processes, _spawn_worker
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.ontology import IMU, Vector3d
 from mosaico_ingest.report.events import (
@@ -99,6 +100,18 @@ class Slow(Refusing):
     def from_dict(cls, ros_data: dict[str, Any]) -> IMU:
         time.sleep(0.02)
         return super().from_dict(ros_data)
+
+
+class SlowJoints(ROSAdapterBase[IMU]):
+    """An adapter that rejects every message, slowly."""
+
+    ros_msgtype = "sensor_msgs/msg/JointState"
+    __mosaico_ontology_type__ = IMU
+
+    @classmethod
+    def from_dict(cls, ros_data: dict[str, Any]) -> IMU:
+        time.sleep(0.002)
+        raise ValueError(min(ros_data))
 
 
 def configs(folder: Path, names: Iterable[str], **more: Any) -> list[ROSInjectionConfig]:
@@ -283,3 +296,23 @@ def test_executor_divides_memory_among_processes(tmp_path: Path, monkeypatch: py
     )
     assert list(Processes(4).map(jobs, ignore_batch)) == []
     assert seen == [100 << 20] * 4
+
+
+def test_worker_that_loses_its_parent_discards_its_session(tmp_path: Path) -> None:
+    (job,) = configs(
+        tmp_path,
+        "a",
+        topics=["/imu", "/joint_states"],
+        adapter_override={"/joint_states": SlowJoints},
+        topics_on_error="ignore",
+    )
+    worker = _spawn_worker(do_nothing, 1)
+    worker.pipe.send_bytes(ForkingPickler.dumps(job))
+    while True:
+        event = worker.pipe.recv()
+        if isinstance(event, TopicProgress) and event.written:
+            break
+    worker.pipe.close()
+    worker.process.join(30)
+    assert worker.process.exitcode == 0
+    assert Store.open(tmp_path / "store").names() == ()

@@ -1,0 +1,115 @@
+"""Stopping a run: a stored sequence stays until the new one is complete, and the same command completes the run."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from mosaico_ingest import api
+from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.interrupts import Abandoned
+from mosaico_ingest.report.events import Event, RunStatus, TopicProgress
+from mosaico_ingest.report.model import Report
+
+from .conftest import RunJob, WriteBag, number
+
+WriteJob = Callable[..., Path]
+
+
+def stop_after_rows(job: Path, error: type[BaseException] = KeyboardInterrupt) -> Report:
+    """Run a job whose observer raises when the second batch of rows is counted."""
+    batches = 0
+
+    def stop(_position: int, event: Event) -> None:
+        nonlocal batches
+        if isinstance(event, TopicProgress) and event.written > 0:
+            batches += 1
+            if batches == 2:
+                raise error
+
+    (report,) = api.run(api.compile_job(job), observe=stop).recordings
+    assert batches >= 2
+    return report
+
+
+def rows(folder: Path) -> int:
+    info = Store.open(folder / "store").find_sequence("drive")
+    return info.rows if info else 0
+
+
+@pytest.mark.parametrize("if_exists", ["replace", "append"])
+def test_run_interrupted_with_stored_sequence_leaves_it_unchanged(
+    if_exists: str, write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [number(1)] * 70_000})
+    assert run_job(write_job()).status is RunStatus.COMPLETED
+    report = stop_after_rows(write_job(sequence={"name": "drive", "if_exists": if_exists}))
+    assert report.status is RunStatus.INTERRUPTED
+    assert report.totals.written == 0
+    assert rows(tmp_path) == 70_000
+    assert Store.open(tmp_path / "store").sequence("drive").notes == ()
+
+
+def test_run_with_error_replacing_stored_sequence_leaves_it_unchanged(
+    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [number(1)]})
+    assert run_job(write_job()).status is RunStatus.COMPLETED
+    (tmp_path / "drive.db3").unlink()
+    write_bag({"/speed": [number(1)] * 70_000 + [b"\x00\x01\x00\x00\x01"]})
+    replace = write_job(sequence={"name": "drive", "if_exists": "replace"}, on_error={"message": "raise"})
+    assert run_job(replace).status is RunStatus.FAILED
+    assert rows(tmp_path) == 1
+
+
+def test_run_repeated_after_interrupt_completes_sequence(
+    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [number(value) for value in range(70_000)]})
+    job = write_job()
+    stopped = stop_after_rows(job)
+    assert (stopped.status, stopped.totals.promised) == (RunStatus.INTERRUPTED, 70_000)
+    assert 0 < rows(tmp_path) < 70_000
+    assert run_job(job).status is RunStatus.COMPLETED
+    assert rows(tmp_path) == 70_000
+    assert run_job(job).exit_code == 1, "a complete sequence is not replaced"
+
+
+def test_run_of_other_job_after_interrupt_fails(
+    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [number(value) for value in range(70_000)]})
+    stop_after_rows(write_job())
+    before = rows(tmp_path)
+    other = write_job(file="other.yaml", topic_settings={"/speed": {"every": 2}})
+    assert run_job(other).exit_code == 1
+    assert rows(tmp_path) == before
+
+
+def test_run_abandoned_by_observer_discards_session(
+    write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
+) -> None:
+    write_bag({"/speed": [number(1)] * 70_000})
+    with pytest.raises(Abandoned):
+        stop_after_rows(write_job(), Abandoned)
+    assert rows(tmp_path) == 0
+
+
+def test_error_of_commit_after_error_of_run_reports_first_error(
+    write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_file: object, _rows: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "store"))
+
+    write_bag({"/speed": [number(1)] * 70_000})
+    monkeypatch.setattr("mosaico_ingest.destinations.store.session._FIRST_GROUP_BYTES", 1 << 10)
+    monkeypatch.setattr("mosaico_ingest.destinations.store.segment.SegmentWriter.append", full)
+    report = run_job(write_job())
+    assert (report.status, report.exit_code) == (RunStatus.FAILED, 1)
+    assert "No space left on device" in str(report.error)
+    assert "an earlier write" not in str(report.error)
+    assert rows(tmp_path) == 0
