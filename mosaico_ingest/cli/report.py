@@ -41,7 +41,7 @@ MAX_REASONS = 20
 """Reasons of rejections printed for a batch."""
 STATUS_STYLES = {
     RunStatus.COMPLETED: "green",
-    RunStatus.REJECTED: "yellow",
+    RunStatus.WITH_ERRORS: "yellow",
     RunStatus.SKIPPED: "dim",
     RunStatus.FAILED: "red",
     RunStatus.INTERRUPTED: "red",

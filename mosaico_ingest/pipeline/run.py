@@ -179,7 +179,7 @@ class _RunEvents:
         """End a run that was committed and verified."""
         self._report_times()
         if self._collector.rejected or self._collector.unreadable:
-            self(RunFinished(RunStatus.REJECTED, EXIT_WITH_ERRORS))
+            self(RunFinished(RunStatus.WITH_ERRORS, EXIT_WITH_ERRORS))
         else:
             self(RunFinished(RunStatus.COMPLETED, 0))
         return Outcome(self._collector.report())

@@ -38,7 +38,7 @@ class RunStatus(str, Enum):
     """How the ingestion of one recording ended."""
 
     COMPLETED = "completed"
-    REJECTED = "completed_with_rejected"
+    WITH_ERRORS = "completed_with_errors"
     """Everything that could be ingested was, but some messages could not."""
     SKIPPED = "skipped"
     """The same content is there already."""

@@ -44,7 +44,7 @@ __all__ = [
 
 STATUS_WORDS = {
     RunStatus.COMPLETED: "completed",
-    RunStatus.REJECTED: "completed, some messages are missing",
+    RunStatus.WITH_ERRORS: "completed, some messages are missing",
     RunStatus.SKIPPED: "skipped, already stored",
     RunStatus.FAILED: "failed",
     RunStatus.INTERRUPTED: "interrupted",

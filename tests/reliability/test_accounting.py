@@ -89,13 +89,25 @@ def test_the_sums_of_a_damaged_recording_hold(tmp_path: Path) -> None:
     bag = tmp_path / "drive.mcap"
     bag.write_bytes(data)
     (report,) = api.run([ROSInjectionConfig(bag, "drive", store=tmp_path / "store")]).recordings
-    assert (report.status, report.exit_code) == (RunStatus.REJECTED, 4)
+    assert (report.status, report.exit_code) == (RunStatus.WITH_ERRORS, 4)
     assert report.unreadable_ranges
     taken = [topic for topic in report.topics if topic.promised is not None]
     assert sum(topic.unreadable for topic in taken) > 0
     for topic in taken:
         assert topic.promised == topic.read + topic.unreadable
         assert topic.read == topic.written + topic.filtered + topic.downsampled + topic.rejected
+
+
+def test_run_of_truncated_recording_reports_unreadable_messages_in_status_counts_and_exit_code(
+    tmp_path: Path,
+) -> None:
+    bag = tmp_path / "drive.mcap"
+    bag.write_bytes(DRIVE.read_bytes()[: DRIVE.stat().st_size * 6 // 10])
+    (report,) = api.run([ROSInjectionConfig(bag, "drive", store=tmp_path / "store")]).recordings
+    assert (report.status, report.exit_code) == (RunStatus.WITH_ERRORS, 4)
+    assert report.unreadable_ranges
+    assert report.totals.unreadable is None or report.totals.unreadable > 0
+    assert report.totals.rejected == 0
 
 
 @pytest.fixture
@@ -120,7 +132,7 @@ def undefined(tmp_path: Path) -> Path:
 def test_messages_of_a_type_nobody_defines_are_lost_and_not_left_out_on_purpose(undefined: Path) -> None:
     config = ROSInjectionConfig(undefined, "old", ros_distro="ros2_humble", store=undefined.parent / "store")
     (report,) = api.run([config]).recordings
-    assert (report.status, report.exit_code) == (RunStatus.REJECTED, 4)
+    assert (report.status, report.exit_code) == (RunStatus.WITH_ERRORS, 4)
     assert [(topic.topic, topic.promised, topic.read, topic.unreadable) for topic in report.topics] == [
         ("/known", 3, 3, 0),
         ("/own", 3, 0, 3),

@@ -112,7 +112,7 @@ def test_messages_that_were_rejected_do_not_make_a_sequence_incomplete(
 ) -> None:
     write_bag({"/speed": [number(1), CUT]})
     job = write_job(sequence=SKIP)
-    assert run_job(job).status is RunStatus.REJECTED
+    assert run_job(job).status is RunStatus.WITH_ERRORS
     assert run_job(job).status is RunStatus.SKIPPED
 
 

@@ -42,7 +42,7 @@ def test_a_rejected_message_is_kept_with_its_bytes_and_its_reason(
 ) -> None:
     write_bag({"/speed": [number(1), CUT, number(3)]})
     report = run_job(write_job(quarantine={}))
-    assert report.status is RunStatus.REJECTED
+    assert report.status is RunStatus.WITH_ERRORS
     (topic,) = report.topics
     assert (topic.read, topic.written, topic.rejected, topic.quarantined) == (3, 2, 1, 1)
     (entry,) = kept(tmp_path / "quarantine")
@@ -104,7 +104,7 @@ def test_what_is_kept_comes_in_once_the_definition_is_mended(
 ) -> None:
     write_bag({"/speed": [number(value) for value in range(5)], "/std/speed": [number(1)]})
     report = run_job(write_job(definition="float64 data\nfloat64 more", quarantine={}))
-    assert (report.status, report.totals.rejected) == (RunStatus.REJECTED, 5)
+    assert (report.status, report.totals.rejected) == (RunStatus.WITH_ERRORS, 5)
     store, folder = Store.open(tmp_path / "store"), tmp_path / "quarantine"
     assert len(kept(folder)) == 5
     job = write_job(quarantine={})

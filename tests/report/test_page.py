@@ -69,13 +69,13 @@ def recording(number: int, status: RunStatus = RunStatus.COMPLETED, topics: int 
     topic_reports = [
         topic(f"/sensor_{at}", counts=gap if at == 1 else (50,) * 20) for at in range(topics - 1)
     ]
-    topic_reports.append(topic("/imu", rejected=3 if status is RunStatus.REJECTED else 0))
+    topic_reports.append(topic("/imu", rejected=3 if status is RunStatus.WITH_ERRORS else 0))
     return Report(
         sequence=f"drive_{number:03}",
         destination="mosaico",
         files=(f"drives/{NASTY if failed else number}.mcap",),
         status=status,
-        exit_code={RunStatus.FAILED: 1, RunStatus.REJECTED: 4}.get(status, 0),
+        exit_code={RunStatus.FAILED: 1, RunStatus.WITH_ERRORS: 4}.get(status, 0),
         error=f"drive.mcap: {NASTY}" if failed else None,
         started_at=datetime(2026, 3, 1, tzinfo=timezone.utc),
         duration_s=1.5 + number % 7,
@@ -83,7 +83,7 @@ def recording(number: int, status: RunStatus = RunStatus.COMPLETED, topics: int 
         steps=Steps()
         if failed
         else Steps(prepare=0.1, read=0.6, decode=0.3, adapt=0.2, commit=0.3, write=0.4),
-        quarantine="kept here/drive-1.mcap" if status is RunStatus.REJECTED else None,
+        quarantine="kept here/drive-1.mcap" if status is RunStatus.WITH_ERRORS else None,
         topics=() if failed else tuple(topic_reports),
         unreadable_ranges=(UnreadableRange(topic=None, count=4, offset=99, reason="bad checksum"),)
         if failed
@@ -98,7 +98,7 @@ def run(*recordings: Report) -> RunReport:
 
 
 def mixed(number: int) -> Report:
-    status = {7: RunStatus.FAILED, 5: RunStatus.REJECTED, 3: RunStatus.SKIPPED}.get(
+    status = {7: RunStatus.FAILED, 5: RunStatus.WITH_ERRORS, 3: RunStatus.SKIPPED}.get(
         number % 40, RunStatus.COMPLETED
     )
     return recording(number, status, topics=6)
@@ -108,7 +108,7 @@ RUNS = {
     "empty": run(),
     "small": run(recording(1), recording(2)),
     "large": run(*map(mixed, range(500))),
-    "failing": run(recording(1, RunStatus.FAILED), recording(2, RunStatus.REJECTED), recording(3)),
+    "failing": run(recording(1, RunStatus.FAILED), recording(2, RunStatus.WITH_ERRORS), recording(3)),
 }
 
 
@@ -200,7 +200,7 @@ def test_html_page_control_characters_in_texts_are_escaped() -> None:
 
 def test_html_page_opens_recordings_with_problems_and_collapses_healthy_ones() -> None:
     unreadable = UnreadableRange(topic=None, count=None, offset=99, reason="bad checksum")
-    truncated = recording(4, RunStatus.REJECTED).model_copy(
+    truncated = recording(4, RunStatus.WITH_ERRORS).model_copy(
         update={"topics": (), "unreadable_ranges": (unreadable,)}
     )
     page = html_page(
