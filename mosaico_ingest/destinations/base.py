@@ -117,9 +117,9 @@ class Destination(ABC):
             SinkError: The destination cannot be opened.
         """
 
-    def preflight(self, sequence: str, on_error: SessionLevelErrorPolicy) -> Finding | None:  # noqa: ARG002 - for subclasses
-        """Return a warning if a run could not follow its session error policy; asks the destination."""
-        return None
+    def preflight(self, sequence: str, on_error: SessionLevelErrorPolicy) -> tuple[Finding, ...]:  # noqa: ARG002 - for subclasses
+        """Return warnings about a run, for example if it could not follow its session error policy; may connect."""
+        return ()
 
     def sequences(self) -> tuple[ExistingSequence, ...] | None:
         """Return every stored sequence, or None if the destination cannot list topics with their metadata."""

@@ -23,6 +23,7 @@ from mosaico_ingest.destinations.base import (
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.protocol.batches import with_offsets
 
 __all__ = ["MemorySequence", "MemorySink", "MemoryTopic"]
 
@@ -39,7 +40,7 @@ class MemoryTopic:
     def write(self, batch: pa.RecordBatch) -> None:
         """Append the batch."""
         check_batch(batch, topic_schema(self.ontology), where=self.name)
-        self.batches.append(batch)
+        self.batches.append(with_offsets(batch))
 
     def table(self) -> pa.Table:
         """Return all rows in the order in which they were written."""

@@ -14,6 +14,7 @@ from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.findings import Span
 from mosaico_ingest.job.patterns import first_match
 from mosaico_ingest.job.values import (
+    DEFAULT_MESSAGE_BYTES,
     DEFAULT_PORT,
     DEFAULT_STORE,
     DEFAULT_TOPIC,
@@ -164,6 +165,8 @@ class ROSInjectionConfig:
     """Set by executors that may begin a recording more than once."""
     code_dir: Path | None = None
     """Where the relative paths of adapter references start instead of `base_dir`, on a machine they were sent to."""
+    message_bytes: int = DEFAULT_MESSAGE_BYTES
+    """The size up to which rows are combined into one upload message to a server."""
     plugin: PluginTarget | None = None
     """A destination that an installed package provides, instead of `store` and `host`."""
 
@@ -203,7 +206,12 @@ class ROSInjectionConfig:
             return StoreTarget(as_path(self.store) if self.store is not None else DEFAULT_STORE)
         cert = Path(self.tls_cert_path) if self.tls_cert_path is not None else None
         return ServerTarget(
-            self.host, self.port, self.mosaico_api_key, cert, self.enable_tls or cert is not None
+            self.host,
+            self.port,
+            self.mosaico_api_key,
+            cert,
+            self.enable_tls or cert is not None,
+            self.message_bytes,
         )
 
     def topic_policy(self, topic: str) -> TopicLevelErrorPolicy:

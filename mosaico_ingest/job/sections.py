@@ -279,6 +279,8 @@ class TargetSection(_Section):
     """The certificate to trust; naming one turns TLS on."""
     tls: bool = False
     """Whether the connection is encrypted; certificates are those the system trusts, unless one is named."""
+    message_size: SizeText = Field(default="10MB", examples=["4MB"])
+    """The size up to which rows are combined into one upload message; a larger row is a message of its own."""
     type: Text | None = Field(default=None, examples=["lake"])
     """The name of a destination that an installed package provides, instead of `store` and `host`."""
     options: dict[Text, JsonValue] = Field(default={}, examples=[{"bucket": "recordings"}])

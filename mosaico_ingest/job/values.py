@@ -13,6 +13,7 @@ from msgspec import Struct
 from mosaico_ingest.remote import AnyPath
 
 __all__ = [
+    "DEFAULT_MESSAGE_BYTES",
     "DEFAULT_PORT",
     "DEFAULT_STORE",
     "DEFAULT_TOPIC",
@@ -35,6 +36,8 @@ __all__ = [
 
 DEFAULT_STORE = Path("mosaico")
 DEFAULT_PORT = 6726
+DEFAULT_MESSAGE_BYTES = 10_000_000
+"""Larger upload messages gain no throughput, and may become chunks that no client can read back."""
 DEFAULT_TOPIC = "default"
 """The key of `topics_on_error` for every topic that no other key matches."""
 PROVENANCE_KEY = "mosaico_ingest"
@@ -154,6 +157,8 @@ class ServerTarget:
     api_key: str | None = field(default=None, repr=False)
     tls_cert: Path | None = None
     tls: bool = False
+    message_bytes: int = DEFAULT_MESSAGE_BYTES
+    """The size up to which rows are combined into one upload message."""
 
 
 class PluginTarget(Struct, frozen=True):

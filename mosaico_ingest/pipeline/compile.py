@@ -259,6 +259,7 @@ def _target(loaded: LoadedManifest) -> dict[str, Any]:
         "mosaico_api_key": None if target.api_key is None else target.api_key.get_secret_value(),
         "tls_cert_path": _path(loaded, target.tls_cert),
         "enable_tls": target.tls,
+        "message_bytes": parse_size(target.message_size),
     }
 
 

@@ -269,8 +269,8 @@ def preview(config: ROSInjectionConfig, *, connect: bool) -> RecordingPlan:
         unreadable_ranges = tuple(_unreadable(recording))
     decided = decisions(plan, folder=config.base_dir)
     state = ask_destination(plan, samples, connect=connect)
-    warning = preflight(plan) if connect and state.exists else None
-    found = (finding for finding in (space_finding(state), warning) if finding is not None)
+    warnings = preflight(plan) if connect and state.exists else ()
+    found = (finding for finding in (space_finding(state), *warnings) if finding is not None)
     return RecordingPlan(
         digest=decided.digest,
         decisions=decided,

@@ -111,8 +111,8 @@ def make_plan(job: ROSInjectionConfig) -> Plan:
         return _resolve(job, recording, resolver)
 
 
-def preflight(plan: Plan) -> Finding | None:
-    """Return a warning if the destination would not let the run follow its session error policy."""
+def preflight(plan: Plan) -> tuple[Finding, ...]:
+    """Return the warnings of the destination about a run."""
     return destination_of(plan.target).preflight(plan.sequence, plan.on_error)
 
 
@@ -126,9 +126,8 @@ def _resolve(job: ROSInjectionConfig, recording: Recording, resolver: TypeResolv
 
 
 def _open_sink(plan: Plan, events: _RunEvents) -> Sink:
-    """Open the destination, and report what its permissions do not allow."""
-    warning = preflight(plan)
-    if warning is not None:
+    """Open the destination, and report its warnings."""
+    for warning in preflight(plan):
         events(Noted(warning))
     return destination_of(plan.target).open_sink(buffer_bytes=plan.memory.sink_bytes)
 

@@ -1,6 +1,6 @@
-"""This file is what can go wrong on a server, and how Flight carries it across in both directions.
+"""The statuses of the protocol, and their mapping to and from exceptions of Flight.
 
-Flight for Python has no exception for two of the platform's statuses; the text then begins with their name.
+Flight for Python has no exception for some statuses; their text starts with the name of the status.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ __all__ = ["Condition", "as_flight_error", "condition_of", "text_of"]
 
 
 class Condition(str, Enum):
-    """The platform's statuses."""
+    """The statuses of the protocol."""
 
     EXISTS = "ALREADY_EXISTS"
     NOT_FOUND = "NOT_FOUND"
@@ -40,6 +40,7 @@ _BY_TYPE: tuple[tuple[type[Exception], Condition], ...] = (
     (pa.ArrowKeyError, Condition.NOT_FOUND),
     (pa.ArrowNotImplementedError, Condition.UNIMPLEMENTED),
     (pa.ArrowInvalid, Condition.INVALID),
+    (OSError, Condition.UNAVAILABLE),  # a stream that the server ended without a status
 )
 _BY_TEXT: tuple[tuple[str, Condition], ...] = (
     ("already exist", Condition.EXISTS),
@@ -63,7 +64,7 @@ _SPECIFIC = frozenset({fl.FlightUnauthenticatedError, fl.FlightUnauthorizedError
 
 
 def condition_of(error: BaseException) -> Condition:
-    """Return what went wrong; where Flight's type is too coarse, the text decides."""
+    """Return the status of an error; if Flight's type is too coarse, the text decides."""
     found = next((condition for kind, condition in _BY_TYPE if isinstance(error, kind)), Condition.INTERNAL)
     if type(error) in _SPECIFIC:
         return found
@@ -72,7 +73,7 @@ def condition_of(error: BaseException) -> Condition:
 
 
 def text_of(error: BaseException) -> str:
-    """Return what the server said, in one line and without what Flight and gRPC add."""
+    """Return the server's message in one line, without the additions of Flight and gRPC."""
     text = str(error).strip().strip("'")
     for end in (". Detail: ", ". gRPC client debug context", " Client context:", "\n"):
         text = text.partition(end)[0]
@@ -80,7 +81,7 @@ def text_of(error: BaseException) -> str:
 
 
 def as_flight_error(condition: Condition, text: str) -> Exception:
-    """Return the exception a server raises so that clients see `condition`."""
+    """Return the exception that a server raises so that clients see `condition`."""
     kind = next((kind for kind, known in _BY_TYPE if known is condition), None)
     if kind is not None:
         return kind(text)

@@ -22,7 +22,7 @@ from mosaico_ingest.ontology.types import SerializationFormat
 __all__ = [
     "ACTIONS",
     "API_KEY_HEADER",
-    "DEFAULT_DECODE_BYTES",
+    "DEFAULT_LIMIT_BYTES",
     "INFO",
     "JSON",
     "QUERY",
@@ -76,8 +76,8 @@ __all__ = [
     "topic_name",
 ]
 
-DEFAULT_DECODE_BYTES = 50 << 20
-"""What a server takes in one message where it does not say."""
+DEFAULT_LIMIT_BYTES = 50_000_000
+"""The message limit of a server that does not announce one, in bytes."""
 
 
 def topic_locator(sequence: str, topic: str) -> str:
@@ -123,9 +123,9 @@ class SemVer(Body):
 class Limits(Body):
     """What fits into one message."""
 
-    grpc_max_decode_message_size: int = DEFAULT_DECODE_BYTES
-    grpc_max_encode_message_size: int = DEFAULT_DECODE_BYTES
-    grpc_target_encode_message_size: int = DEFAULT_DECODE_BYTES // 2
+    grpc_max_decode_message_size: int = DEFAULT_LIMIT_BYTES
+    grpc_max_encode_message_size: int = DEFAULT_LIMIT_BYTES
+    grpc_target_encode_message_size: int = DEFAULT_LIMIT_BYTES // 2
 
 
 class Info(Body):

@@ -13,6 +13,7 @@ from mosaico_ingest import protocol
 from mosaico_ingest.destinations.store.model import SequenceInfo, SessionInfo, TopicInfo
 from mosaico_ingest.destinations.store.store import Store, Window, count, scan
 from mosaico_ingest.protocol import messages
+from mosaico_ingest.protocol.batches import with_offsets
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.protocol.messages import JSON, Body, Interval
 from mosaico_ingest.serve.errors import Refusal, checked
@@ -205,7 +206,7 @@ def _interval(start_ns: int | None, end_ns: int | None) -> messages.Interval | N
 
 def _messages(batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
     """Cut batches so that one message stays well below what a client takes, if rows allow."""
-    for batch in batches:
+    for batch in map(with_offsets, batches):
         rows = max(1, batch.num_rows * _MESSAGE_BYTES // max(1, batch.nbytes))
         for start in range(0, batch.num_rows, rows):
             yield batch.slice(start, rows)

@@ -16,9 +16,11 @@ from mosaico_ingest.destinations.base import ENVELOPE
 from mosaico_ingest.destinations.store.errors import NotInStore
 from mosaico_ingest.destinations.store.session import StoreSession, StoreTopic
 from mosaico_ingest.destinations.store.store import Store
+from mosaico_ingest.errors import SinkError
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.protocol import messages
+from mosaico_ingest.protocol.batches import validated
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.serve.errors import Refusal, checked
 
@@ -119,8 +121,9 @@ class Uploads:
         try:
             for batch in batches:
                 self._hear(opened)
-                columns = [batch.column(name) for name in writer.schema.names]
-                writer.write(pa.RecordBatch.from_arrays(columns, schema=writer.schema))
+                with checked():
+                    rows = _rows(batch, writer.schema)
+                writer.write(rows)
             writer.close()
         except BaseException:
             topic.state = _State.BROKEN
@@ -228,6 +231,20 @@ class Uploads:
             opened.session.discard()
             dropped = True
         return dropped
+
+
+def _rows(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:
+    """Return a client's batch in the order of a topic's columns.
+
+    Raises:
+        pa.ArrowInvalid: The batch is malformed.
+        SinkError: A row has no time stamp.
+    """
+    complete = validated(batch)
+    columns = [complete.column(name) for name in schema.names]
+    if complete.column(ENVELOPE.name).null_count:
+        raise SinkError(f"a row has no {ENVELOPE.name}")
+    return pa.RecordBatch.from_arrays(columns, schema=schema)
 
 
 def _payload(schema: pa.Schema) -> pa.StructType:

@@ -14,7 +14,7 @@ from object_store import ObjectStore
 
 from mosaico_ingest.destinations.base import Sink, topic_schema
 from mosaico_ingest.destinations.memory import MemorySink
-from mosaico_ingest.destinations.server.sink import PlatformSink
+from mosaico_ingest.destinations.server.sink import ServerSink
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.errors import SequenceExists, SinkError
 from mosaico_ingest.job.values import IfExists, ServerTarget
@@ -102,7 +102,7 @@ class OnServer:
 
     def __init__(self, server: Mosaicod) -> None:
         self.server = server
-        self.sink = PlatformSink(ServerTarget("127.0.0.1", server.port))
+        self.sink = ServerSink(ServerTarget("127.0.0.1", server.port))
 
     def sequences(self) -> Sequence[str]:
         open_ones = {session.sequence for session in self.server.sessions.values() if not session.final}
@@ -141,7 +141,7 @@ class OnServedStore(InStore):
 
     def __init__(self, folder: Path, port: int) -> None:
         super().__init__(folder)
-        self.sink = PlatformSink(ServerTarget("127.0.0.1", port))
+        self.sink = ServerSink(ServerTarget("127.0.0.1", port))
 
     def sequences(self) -> Sequence[str]:
         written_to = self.store.layout.open_sessions()

@@ -19,7 +19,7 @@ from mosaicod import Mosaicod, Proxy, exists, make_key, precondition, running
 from mosaico_ingest.destinations.base import topic_schema
 from mosaico_ingest.destinations.server.client import connect
 from mosaico_ingest.destinations.server.errors import Address
-from mosaico_ingest.destinations.server.sink import PlatformSink, delete_finding
+from mosaico_ingest.destinations.server.sink import ServerSink, delete_finding
 from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
 from mosaico_ingest.job.values import IfExists, ServerTarget
 from mosaico_ingest.ontology import Integer64
@@ -52,7 +52,7 @@ def target(server: Any, **options: Any) -> ServerTarget:
 
 
 def write(server: Mosaicod, *times: int, if_exists: IfExists = IfExists.FAIL, topic: str = "/n") -> None:
-    with PlatformSink(target(server)).open("seq", META, if_exists=if_exists) as session:
+    with ServerSink(target(server)).open("seq", META, if_exists=if_exists) as session:
         session.topic(topic, NUMBER, {"unit": "m"}).write(numbers(*times))
 
 
@@ -87,7 +87,7 @@ def test_the_calls_are_those_of_the_protocol_in_its_order(server: Mosaicod) -> N
 
 
 def test_the_server_is_asked_what_it_holds(server: Mosaicod) -> None:
-    with PlatformSink(target(server)).open("seq", {}) as session:
+    with ServerSink(target(server)).open("seq", {}) as session:
         session.topic("/n", NUMBER, {}).write(numbers(3, 1, 2))
         session.topic("/empty", NUMBER, {})
     held, empty = session.stored()
@@ -98,7 +98,7 @@ def test_the_server_is_asked_what_it_holds(server: Mosaicod) -> None:
 
 def test_small_batches_travel_together_and_large_ones_in_parts() -> None:
     with running(Mosaicod(message_bytes=100_000)) as server:
-        with PlatformSink(target(server)).open("seq", {}) as session:
+        with ServerSink(target(server)).open("seq", {}) as session:
             few = session.topic("/few", NUMBER, {})
             many = session.topic("/many", BLOB, {})
             for at in range(100):
@@ -110,7 +110,7 @@ def test_small_batches_travel_together_and_large_ones_in_parts() -> None:
 
 def test_a_row_no_message_can_hold_is_refused_and_the_topic_goes_on() -> None:
     with running(Mosaicod(message_bytes=100_000)) as server:
-        with PlatformSink(target(server)).open("seq", {}) as session:
+        with ServerSink(target(server)).open("seq", {}) as session:
             writer = session.topic("/b", BLOB, {})
             with pytest.raises(SinkError, match=r"/b: the row of 1 ns has 9.* bytes, the server takes 90000"):
                 writer.write(blobs(5, 95_000))
@@ -119,7 +119,7 @@ def test_a_row_no_message_can_hold_is_refused_and_the_topic_goes_on() -> None:
 
 
 def test_what_waits_in_memory_is_bounded_over_all_topics(server: Mosaicod) -> None:
-    with PlatformSink(target(server), buffer_bytes=10_000).open("seq", {}) as session:
+    with ServerSink(target(server), buffer_bytes=10_000).open("seq", {}) as session:
         writers = [session.topic(f"/t{n}", BLOB, {}) for n in range(4)]
         for _ in range(10):
             for writer in writers:
@@ -129,7 +129,7 @@ def test_what_waits_in_memory_is_bounded_over_all_topics(server: Mosaicod) -> No
 
 
 def test_topics_can_be_written_from_several_threads(server: Mosaicod) -> None:
-    with PlatformSink(target(server), buffer_bytes=20_000).open("seq", {}) as session:
+    with ServerSink(target(server), buffer_bytes=20_000).open("seq", {}) as session:
         writers = [session.topic(f"/t{n}", NUMBER, {}) for n in range(6)]
         threads = [
             threading.Thread(target=lambda w=w: [w.write(numbers(at)) for at in range(300)]) for w in writers
@@ -142,7 +142,7 @@ def test_topics_can_be_written_from_several_threads(server: Mosaicod) -> None:
 
 
 def test_an_exception_leaves_no_trace(server: Mosaicod) -> None:
-    with pytest.raises(ZeroDivisionError), PlatformSink(target(server)).open("seq", {}) as session:
+    with pytest.raises(ZeroDivisionError), ServerSink(target(server)).open("seq", {}) as session:
         session.topic("/n", NUMBER, {}).write(numbers(1))
         raise ZeroDivisionError
     assert (server.sequences, server.sessions, server.topics) == ({}, {}, {})
@@ -151,7 +151,7 @@ def test_an_exception_leaves_no_trace(server: Mosaicod) -> None:
 
 def test_an_exception_in_an_added_session_keeps_the_sequence(server: Mosaicod) -> None:
     write(server, 1)
-    sink = PlatformSink(target(server))
+    sink = ServerSink(target(server))
     with pytest.raises(ZeroDivisionError), sink.open("seq", {}, if_exists=IfExists.APPEND) as session:
         session.topic("/m", NUMBER, {}).write(numbers(1))
         raise ZeroDivisionError
@@ -159,7 +159,7 @@ def test_an_exception_in_an_added_session_keeps_the_sequence(server: Mosaicod) -
 
 
 def test_a_session_without_topics_is_never_begun(server: Mosaicod) -> None:
-    with PlatformSink(target(server)).open("seq", META) as session:
+    with ServerSink(target(server)).open("seq", META) as session:
         pass
     assert server.sequences == {"seq": META}
     assert "session_create" not in server.calls
@@ -179,7 +179,7 @@ def test_replace_deletes_the_old_sequence(server: Mosaicod) -> None:
     write(server, 1)
     write(server, 2, 3, if_exists=IfExists.REPLACE, topic="/m")
     assert set(server.topics) == {"seq/m"}
-    sink = PlatformSink(target(server))
+    sink = ServerSink(target(server))
     with (
         pytest.raises(SinkError, match="enough — the old sequence is deleted"),
         sink.open("seq", {}, if_exists=IfExists.REPLACE),
@@ -201,7 +201,7 @@ def test_a_name_taken_meanwhile_is_taken(server: Mosaicod) -> None:
 
 
 def test_names_and_metadata_are_checked_before_the_first_byte() -> None:
-    nowhere = PlatformSink(ServerTarget("127.0.0.1", 1))
+    nowhere = ServerSink(ServerTarget("127.0.0.1", 1))
     with pytest.raises(SinkError, match="sequence name"), nowhere.open("a b", {}):
         pytest.fail("opened")
     with pytest.raises(SinkError, match="metadata key"), nowhere.open("seq", {"a.b": 1}):
@@ -209,7 +209,7 @@ def test_names_and_metadata_are_checked_before_the_first_byte() -> None:
 
 
 def test_errors_go_to_their_topic_or_to_the_sequence(server: Mosaicod) -> None:
-    with PlatformSink(target(server)).open("seq", {}) as session:
+    with ServerSink(target(server)).open("seq", {}) as session:
         session.topic("/n", NUMBER, {})
         session.note_error("stopped")
         session.note_error("one row lost", topic="/n")
@@ -222,7 +222,7 @@ def test_an_older_server_is_spoken_to_and_counted_by_reading(server: Mosaicod) -
     with connect(target(server)) as client:
         assert client.version == "0.6.1"
         assert client.message_bytes == 50 << 20
-    with PlatformSink(target(server)).open("seq", {}) as session:
+    with ServerSink(target(server)).open("seq", {}) as session:
         session.topic("/n", NUMBER, {}).write(numbers(3, 1))
     (held,) = session.stored()
     assert (held.rows, held.start_ns, held.end_ns) == (2, 1, 3)
@@ -231,7 +231,7 @@ def test_an_older_server_is_spoken_to_and_counted_by_reading(server: Mosaicod) -
 class TestFaults:
     def test_a_refused_topic_leaves_the_others(self, server: Mosaicod) -> None:
         server.faults.refuse["topic_create"] = [pa.ArrowInvalid("bad schema")]
-        with PlatformSink(target(server)).open("seq", {}) as session:
+        with ServerSink(target(server)).open("seq", {}) as session:
             with pytest.raises(SinkError, match="topic_create is refused: bad schema"):
                 session.topic("/bad", NUMBER, {})
             session.topic("/good", NUMBER, {}).write(numbers(1))
@@ -243,7 +243,7 @@ class TestFaults:
                 raise pa.ArrowInvalid("no such column")
 
         server.faults.before_batch = refuse
-        with PlatformSink(target(server), buffer_bytes=0).open("seq", {}) as session:
+        with ServerSink(target(server), buffer_bytes=0).open("seq", {}) as session:
             good, bad = session.topic("/good", NUMBER, {}), session.topic("/bad", NUMBER, {})
             good.write(numbers(1))
             with pytest.raises(SinkError, match="the upload of /bad is refused: no such column"):
@@ -257,7 +257,7 @@ class TestFaults:
 
     def test_a_session_whose_only_topic_broke_is_taken_back(self, server: Mosaicod) -> None:
         server.faults.refuse["do_put"] = [pa.ArrowInvalid("no room")]
-        with PlatformSink(target(server), buffer_bytes=0).open("seq", META) as session:
+        with ServerSink(target(server), buffer_bytes=0).open("seq", META) as session:
             writer = session.topic("/n", NUMBER, {})
             with pytest.raises(SinkError, match="the upload of /n is refused: no room"):
                 for at in range(200):
@@ -314,7 +314,7 @@ class TestFaults:
     ) -> None:
         monkeypatch.setattr("mosaico_ingest.destinations.server.client._DELAYS_S", (0.01,))
         proxy = Proxy(server.port)
-        sink = PlatformSink(target(proxy), buffer_bytes=0)
+        sink = ServerSink(target(proxy), buffer_bytes=0)
         with (
             pytest.raises(SinkUnavailable, match="nothing listens there") as caught,
             sink.open("seq", {}) as session,
@@ -340,7 +340,7 @@ class TestFaults:
 class TestKeys:
     def test_the_key_is_sent_and_let_in(self, server: Mosaicod) -> None:
         server.keys[make_key("w")] = "write"
-        with PlatformSink(target(server, api_key=make_key("w"))).open("seq", {}) as session:
+        with ServerSink(target(server, api_key=make_key("w"))).open("seq", {}) as session:
             session.topic("/n", NUMBER, {}).write(numbers(1))
         assert session.stored()[0].rows == 1
 
@@ -362,7 +362,7 @@ class TestKeys:
         server.keys.update({make_key("w"): "write", make_key("r"): "read"})
         with (
             pytest.raises(SinkError, match=reason) as caught,
-            PlatformSink(target(server, api_key=key)).open("s", {}),
+            ServerSink(target(server, api_key=key)).open("s", {}),
         ):
             pytest.fail("opened")
         assert len(server.calls) <= 3
@@ -374,7 +374,7 @@ class TestKeys:
     def test_a_key_is_in_no_repr_and_no_pickle_of_an_error(self, server: Mosaicod) -> None:
         server.keys[make_key("w")] = "write"
         key = make_key("wrong")
-        sink = PlatformSink(target(server, api_key=key))
+        sink = ServerSink(target(server, api_key=key))
         with pytest.raises(SinkError) as caught, sink.open("s", {}):
             pytest.fail("opened")
         assert key not in repr(sink)
@@ -382,7 +382,7 @@ class TestKeys:
 
     @pytest.mark.parametrize("key", ["msco_ü", "msco_\n", "a b"])
     def test_a_key_that_cannot_be_sent_is_refused_here(self, key: str) -> None:
-        sink = PlatformSink(ServerTarget("127.0.0.1", 1, api_key=key))
+        sink = ServerSink(ServerTarget("127.0.0.1", 1, api_key=key))
         with (
             pytest.raises(SinkError, match="the API key has characters no key has") as caught,
             sink.open("s", {}),
@@ -408,7 +408,7 @@ class TestKeys:
 
     def test_a_session_that_may_not_be_deleted_is_told(self, server: Mosaicod) -> None:
         server.keys[make_key("w")] = "write"
-        sink = PlatformSink(target(server, api_key=make_key("w")))
+        sink = ServerSink(target(server, api_key=make_key("w")))
         with (
             pytest.raises(
                 SinkError, match=r"an unfinished session of seq stays on the server .*session_delete"
@@ -474,7 +474,7 @@ def test_a_server_that_never_takes_an_upload_ends_it(
     begin = time.monotonic()
     with (
         pytest.raises(SinkUnavailable, match="no answer to the upload of /n in time"),
-        PlatformSink(target(server)).open("seq", META) as session,
+        ServerSink(target(server)).open("seq", META) as session,
     ):
         for topic in ("/n", "/m"):
             session.topic(topic, NUMBER, {}).write(numbers(1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import ssl
 import threading
@@ -43,7 +44,7 @@ from mosaico_ingest.protocol.messages import (
 
 __all__ = [
     "DeadlinePassed",
-    "PlatformClient",
+    "ServerClient",
     "Uploaded",
     "connect",
     "in_thread",
@@ -53,35 +54,35 @@ __all__ = [
 _Returned = TypeVar("_Returned")
 
 DeadlinePassed = FutureTimeout
-"""The call has not ended in time; its thread goes on, since nothing can end it but the server."""
+"""A call did not end in time; its thread continues, since only the server can end it."""
 
 
 def within(seconds: float, call: Callable[[], _Returned]) -> _Returned:
-    """Return what the call returns, or raise what it raises.
+    """Return the call's result, or raise its exception.
 
     Raises:
-        DeadlinePassed: It takes longer.
+        DeadlinePassed: The call takes longer.
     """
     return in_thread(call).result(seconds)
 
 
 def in_thread(call: Callable[[], _Returned]) -> Future[_Returned]:
-    """Run the call on a thread that does not keep the process."""
+    """Run the call on a thread that does not keep the process alive."""
     outcome: Future[_Returned] = Future()
 
     def work() -> None:
         try:
             outcome.set_result(call())
-        except BaseException as error:  # noqa: BLE001 - a thread's border: raised again where the result is asked for
+        except BaseException as error:  # noqa: BLE001 - raised again by `Future.result`
             outcome.set_exception(error)
 
     threading.Thread(target=work, name="mosaico-ingest-call", daemon=True).start()
     return outcome
 
 
-_ANSWER_S = 120.0
+_RESPONSE_S = 120.0
 _MARGIN_S = 5.0
-"""By then gRPC's own limit has spoken, where a call has one."""
+"""Added to gRPC's own time limit, so that its more specific error wins."""
 _CLOSE_S = 1.0
 _DELAYS_S = (0.2, 0.6, 1.8)
 _CHANNEL: list[tuple[str, Any]] = [
@@ -89,7 +90,8 @@ _CHANNEL: list[tuple[str, Any]] = [
     ("grpc.max_reconnect_backoff_ms", 1000),
 ]
 _HOST = re.compile(r"[A-Za-z0-9._-]+|[0-9A-Fa-f:.]+%\w+")
-"""A name, or an IPv6 address with its interface."""
+"""A host name, or an IPv6 address with its interface."""
+_USER_METADATA = b"mosaico:user_metadata"
 _UNKNOWN = frozenset({Condition.UNIMPLEMENTED, Condition.INVALID, Condition.NOT_FOUND})
 
 _Question = TypeVar("_Question", bound=Body)
@@ -98,7 +100,7 @@ _Result = TypeVar("_Result")
 
 
 class Uploaded(Struct, frozen=True):
-    """What a server says it holds of a topic."""
+    """The content of a topic that a server reports."""
 
     rows: int
     start_ns: int | None
@@ -107,178 +109,185 @@ class Uploaded(Struct, frozen=True):
     stored_bytes: int
 
 
-class PlatformClient:
-    """A server that answered; made by `connect`."""
+class ServerClient:
+    """A connection to a server that responded to the handshake; created by `connect`."""
 
-    def __init__(self, flight: fl.FlightClient, address: Address, codec: Codec, answer_s: float) -> None:
+    def __init__(self, flight: fl.FlightClient, address: Address, codec: Codec, response_s: float) -> None:
         self.address = address
         self.version = "unknown"
-        self.message_bytes = messages.DEFAULT_DECODE_BYTES
-        """The most the server takes in one message."""
+        self.limit_bytes = messages.DEFAULT_LIMIT_BYTES
+        """The largest message that the server accepts and sends."""
         self._flight = flight
         self._codec = codec
-        self._answer_s = answer_s
+        self._response_s = response_s
         key = [(API_KEY_HEADER.encode(), address.key.encode())] if address.key else []
-        headers = cast("list[tuple[str, str]]", key)  # what the stubs want; Flight wants bytes
-        self._upload = fl.FlightCallOptions(headers=headers)
-        self._answer = fl.FlightCallOptions(headers=headers, timeout=answer_s)
+        headers = cast("list[tuple[str, str]]", key)  # the stubs expect text, Flight expects bytes
+        self._stream_options = fl.FlightCallOptions(headers=headers)
+        self._options = fl.FlightCallOptions(headers=headers, timeout=response_s)
 
     def handshake(self) -> None:
-        """Ask what the server is and takes; one that does not know `info` is asked for its version.
+        """Ask for the version and limits; a server that does not know `info` is asked for its version only.
 
         Raises:
-            SinkError: There is no Mosaico server that lets this key in.
+            SinkError: The address is not a Mosaico server, or the server does not accept the API key.
         """
         try:
             info = self.act(INFO, messages.Empty())
         except Refused as refusal:
             if refusal.condition not in _UNKNOWN:
                 raise
-            self.version = self._old_version()
+            self.version = self._version_before_0_7()
         else:
             self.version = info.version
-            self.message_bytes = info.config.grpc_max_decode_message_size
+            limits = info.config
+            self.limit_bytes = min(limits.grpc_max_decode_message_size, limits.grpc_max_encode_message_size)
 
     def act(self, action: Action[_Question, _Answer], question: _Question) -> _Answer:
-        """Ask the server to do something.
+        """Call an action and return its response.
 
         Raises:
-            Refused: It said no.
-            SinkUnavailable: It did not answer.
+            Refused: The server refused the action.
+            SinkUnavailable: The server did not respond.
         """
 
         def call() -> bytes:
             request = fl.Action(action.name, self._codec.encode(question))
             return b"".join(
-                result.body.to_pybytes() for result in self._flight.do_action(request, self._answer)
+                result.body.to_pybytes() for result in self._flight.do_action(request, self._options)
             )
 
         data = self._call(call, action.name, action.permission, repeatable=action.repeatable)
-        with self._understood(action.name):
+        with self._decoding(action.name):
             return self._codec.decode_answer(action, data)
 
     def find(self, sequence: str) -> messages.SequenceInfo | None:
-        """Return what the server knows of a sequence, None where there is none."""
+        """Return the sequence, or None.
+
+        Servers before 0.7 send the user metadata in the metadata of the schema only.
+        """
         try:
             info = self._info(sequence)
         except Refused as refusal:
             if refusal.condition is Condition.NOT_FOUND:
                 return None
             raise
-        with self._understood("get_flight_info"):
-            return self._codec.decode(messages.SequenceInfo, _bytes(info.app_metadata) or b"{}")
+        with self._decoding("get_flight_info"):
+            described = self._codec.decode(messages.SequenceInfo, _bytes(info.app_metadata) or b"{}")
+            if described.user_metadata:
+                return described
+            return described.model_copy(update={"user_metadata": _schema_metadata(info.schema)})
 
     def uploaded(self, sequence: str) -> dict[str, Uploaded]:
-        """Return what the server holds of each topic of a sequence, by locator, as far as it says so."""
-        found = (self._about(endpoint) for endpoint in self._info(sequence).endpoints)
-        return {about.resource_locator: _uploaded(about.data_info) for about in found if about is not None}
+        """Return the content of each topic of a sequence by locator; topics without reported counts are missing."""
+        endpoints = map(self._topic_info, self._info(sequence).endpoints)
+        return {
+            about.resource_locator: _uploaded(about.data_info) for about in endpoints if about is not None
+        }
 
-    def counted(self, locator: str) -> Uploaded:
-        """Return what the server holds of a topic by reading it, for servers that do not say."""
-        ticket = self._info(locator).endpoints[0].ticket
+    def count_rows(self, locator: str) -> Uploaded:
+        """Return the content of a topic by reading its rows, for servers that do not report counts."""
+        info = self._info(locator)
         reader = self._call(
-            lambda: self._flight.do_get(ticket, self._upload).to_reader(),
+            lambda: self._flight.do_get(info.endpoints[0].ticket, self._stream_options).to_reader(),
             "do_get",
             Permission.READ,
             repeatable=True,
         )
-        return self._counted(reader)
+        rows = 0
+        bounds: list[int] = []
+        while (batch := self._once(lambda: next(reader, None), "do_get", Permission.READ)) is not None:
+            # only the time stamps are touched: other columns may lack offsets, see `protocol.batches`
+            times = pc.min_max(batch.column("timestamp_ns"))
+            rows += batch.num_rows
+            bounds += [at for at in (times["min"].as_py(), times["max"].as_py()) if at is not None]
+        stored_bytes = max(0, info.total_bytes)
+        return Uploaded(rows, min(bounds, default=None), max(bounds, default=None), stored_bytes)
 
     def put(self, put: messages.Put, schema: pa.Schema) -> fl.FlightStreamWriter:
-        """Begin an upload."""
+        """Start an upload."""
         descriptor = fl.FlightDescriptor.for_command(self._codec.encode(put))
 
         def call() -> fl.FlightStreamWriter:
-            return self._flight.do_put(descriptor, schema, self._upload)[0]
+            return self._flight.do_put(descriptor, schema, self._stream_options)[0]
 
         return self._call(call, "do_put", Permission.WRITE, repeatable=False)
 
     @contextmanager
-    def _understood(self, doing: str) -> Generator[None, None, None]:
+    def _decoding(self, action: str) -> Generator[None, None, None]:
         try:
             yield
         except Malformed as error:
             raise SinkError(
-                f"the answer to {doing} is not understood: {error}",
+                f"the response to {action} cannot be decoded: {error}",
                 where=str(self.address),
-                hint="is it a Mosaico server of version 0.5 to 0.7?",
+                hint="check that this is a Mosaico server of version 0.5 to 0.7",
             ) from error
 
     def _info(self, locator: str) -> fl.FlightInfo:
         question = messages.GetInfo(resource_locator=locator)
         descriptor = fl.FlightDescriptor.for_command(self._codec.encode(question))
         return self._call(
-            lambda: self._flight.get_flight_info(descriptor, self._answer),
+            lambda: self._flight.get_flight_info(descriptor, self._options),
             "get_flight_info",
             Permission.READ,
             repeatable=True,
         )
 
-    def _about(self, endpoint: fl.FlightEndpoint) -> messages.TopicInfo | None:
+    def _topic_info(self, endpoint: fl.FlightEndpoint) -> messages.TopicInfo | None:
         try:
             return self._codec.decode(messages.TopicInfo, _bytes(endpoint.app_metadata))
         except Malformed:
             return None
 
-    def _counted(self, reader: pa.RecordBatchReader) -> Uploaded:
-        rows = size = 0
-        bounds: list[int] = []
-        while (batch := self._once(lambda: next(reader, None), "do_get", Permission.READ)) is not None:
-            span = pc.min_max(batch.column("timestamp_ns"))
-            rows += batch.num_rows
-            size += batch.nbytes
-            bounds += [at for at in (span["min"].as_py(), span["max"].as_py()) if at is not None]
-        return Uploaded(rows, min(bounds, default=None), max(bounds, default=None), size)
-
-    def _old_version(self) -> str:
+    def _version_before_0_7(self) -> str:
         try:
             return self.act(VERSION, messages.Empty()).version
         except Refused as refusal:
             if refusal.condition in _UNKNOWN:
                 raise SinkError(
-                    "a Flight server answers, but it is no Mosaico server",
+                    "the Flight server at this address is not a Mosaico server",
                     where=str(self.address),
                     hint="check target.host and target.port",
                 ) from refusal
             raise
 
     def _call(
-        self, call: Callable[[], _Result], doing: str, needs: Permission, *, repeatable: bool
+        self, call: Callable[[], _Result], action: str, needs: Permission, *, repeatable: bool
     ) -> _Result:
-        """Call, and again after a while where the server was away and a repetition does no harm."""
+        """Call, and retry with delays if the server was unavailable and a repetition has no side effect."""
         for delay_s in _DELAYS_S if repeatable else ():
             try:
-                return self._once(call, doing, needs)
+                return self._once(call, action, needs)
             except SinkUnavailable as error:
                 if _was_slow(error):
                     raise
             time.sleep(delay_s)
-        return self._once(call, doing, needs)
+        return self._once(call, action, needs)
 
-    def _once(self, call: Callable[[], _Result], doing: str, needs: Permission) -> _Result:
+    def _once(self, call: Callable[[], _Result], action: str, needs: Permission) -> _Result:
         try:
-            return within(self._answer_s + _MARGIN_S, call)
+            return within(self._response_s + _MARGIN_S, call)
         except DeadlinePassed as error:
-            raise late(self.address, doing) from error
-        except pa.ArrowException as error:
-            reraise(error, self.address, doing=doing, needs=needs)
+            raise late(self.address, action) from error
+        except (pa.ArrowException, OSError) as error:  # a stream that breaks is an OSError
+            reraise(error, self.address, action=action, needs=needs)
 
 
 @contextmanager
 def connect(
-    target: ServerTarget, *, codec: Codec = JSON, answer_s: float = _ANSWER_S, handshake: bool = True
-) -> Generator[PlatformClient, None, None]:
-    """Connect to a server, shake hands unless it is known already, and let go of it at the end.
+    target: ServerTarget, *, codec: Codec = JSON, response_s: float = _RESPONSE_S, handshake: bool = True
+) -> Generator[ServerClient, None, None]:
+    """Connect to a server, perform the handshake unless it is disabled, and close the connection at the end.
 
     Raises:
-        SinkError: There is no server, or it does not let us in; says which.
+        SinkError: The server cannot be reached, or does not accept the API key.
     """
     address = _address(target)
     if address.tls:
         check_tls(address)
     flight = fl.FlightClient(str(address), tls_root_certs=address.roots, generic_options=_CHANNEL)
     try:
-        client = PlatformClient(flight, address, codec, answer_s)
+        client = ServerClient(flight, address, codec, response_s)
         if handshake:
             client.handshake()
         yield client
@@ -288,7 +297,7 @@ def connect(
 
 
 def _was_slow(error: SinkUnavailable) -> bool:
-    """Say whether the server was there and did not answer in time: asking again would only load it more."""
+    """Return whether the server was reachable but too slow: a retry would only add load."""
     cause = error.__cause__
     return isinstance(cause, DeadlinePassed) or condition_of(cause or error) is Condition.TIMED_OUT
 
@@ -297,21 +306,22 @@ def _address(target: ServerTarget) -> Address:
     key = target.api_key
     if key and not (key.isascii() and key.isprintable() and " " not in key):
         raise SinkError(
-            "the API key has characters no key has", hint="check for blanks and line breaks around it"
+            "the API key contains characters that are not allowed",
+            hint="remove blanks and line breaks around the key",
         )
     _check_host(target.host)
     return Address(target.host, target.port, target.tls or target.tls_cert is not None, _roots(target), key)
 
 
 def _check_host(host: str) -> None:
-    """Raise SinkError for what cannot be a host, such as a URL or a host with its port."""
+    """Raise SinkError if the text cannot be a host, for example a URL or a host with a port."""
     with suppress(ValueError):
         ip_address(host)
         return
     if not host or not _HOST.fullmatch(host):
         raise SinkError(
-            f"host {host!r} is neither a name nor an address",
-            hint="give target.host without scheme and port, and target.port by itself",
+            f"host {host!r} is neither a host name nor an IP address",
+            hint="set target.host without scheme and port, and set target.port",
         )
 
 
@@ -322,7 +332,7 @@ def _roots(target: ServerTarget) -> str | None:
         roots = target.tls_cert.read_text("ascii", errors="ignore")  # bundles carry comments in any script
         ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_verify_locations(cadata=roots)
     except (ssl.SSLError, ValueError):
-        what, hint = "it holds no certificate", "PEM is wanted"
+        what, hint = "it contains no certificate", "use a file in PEM format"
     except OSError as error:
         what, hint = error.strerror or str(error), "check target.tls_cert"
     else:
@@ -330,9 +340,19 @@ def _roots(target: ServerTarget) -> str | None:
     raise SinkError(f"the certificate file cannot be used: {what}", where=str(target.tls_cert), hint=hint)
 
 
-def _uploaded(held: messages.DataInfo) -> Uploaded:
-    span = held.interval
-    return Uploaded(held.total_row_count, span and span.start_ns, span and span.end_ns, held.total_bytes)
+def _uploaded(info: messages.DataInfo) -> Uploaded:
+    times = info.interval
+    return Uploaded(info.total_row_count, times and times.start_ns, times and times.end_ns, info.total_bytes)
+
+
+def _schema_metadata(schema: pa.Schema) -> dict[str, Any]:
+    """Return the user metadata of a sequence as servers before 0.7 send it."""
+    text = (schema.metadata or {}).get(_USER_METADATA, b"{}")
+    try:
+        metadata = json.loads(text)
+    except ValueError as error:
+        raise Malformed(f"{_USER_METADATA.decode()}: {error}") from error
+    return metadata if isinstance(metadata, dict) else {}
 
 
 def _bytes(metadata: bytes | str) -> bytes:

@@ -13,7 +13,7 @@ from mosaico_ingest.destinations.base import (
     Sink,
 )
 from mosaico_ingest.destinations.server.client import connect as connect_to
-from mosaico_ingest.destinations.server.sink import PlatformSink, delete_finding
+from mosaico_ingest.destinations.server.sink import ServerSink, delete_finding, version_finding
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.values import ServerTarget, SessionLevelErrorPolicy
@@ -63,10 +63,12 @@ class ServerDestination(Destination):
 
     def open_sink(self, *, buffer_bytes: int) -> Sink:
         """Return a sink; its sessions connect."""
-        return PlatformSink(self.target, buffer_bytes)
+        return ServerSink(self.target, buffer_bytes)
 
-    def preflight(self, sequence: str, on_error: SessionLevelErrorPolicy) -> Finding | None:
-        """Return a warning if `on_error` is `delete` and the API key has no permission to delete."""
-        if on_error is not SessionLevelErrorPolicy.Delete:
-            return None
-        return delete_finding(self.target, sequence)
+    def preflight(self, sequence: str, on_error: SessionLevelErrorPolicy) -> tuple[Finding, ...]:
+        """Return warnings about an old server, and about a key that has no permission for `on_error: delete`."""
+        with connect_to(self.target) as client:
+            findings = [version_finding(client.version)]
+            if on_error is SessionLevelErrorPolicy.Delete:
+                findings.append(delete_finding(client, sequence))
+        return tuple(finding for finding in findings if finding is not None)

@@ -1,4 +1,4 @@
-"""This file says in one line what a server or the way to it refuses; a key is never part of what it says."""
+"""Errors of a server or of the connection to it; messages never contain an API key."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ __all__ = ["Address", "Refused", "add_hint", "check_tls", "late", "reraise"]
 
 _PATIENCE_S = 3.0
 _WRONG_NAME = frozenset({62, 64})
-"""OpenSSL's verification results for a certificate of another host name or IP address."""
+"""OpenSSL's verification codes for a certificate of another host name or IP address."""
 _NO_HTTP2 = "Failed parsing HTTP/2"
-"""What gRPC says of a server that speaks another protocol, a web server for example."""
+"""Part of gRPC's message for a server of another protocol, for example a web server."""
 _KEY_HINT = "set target.api_key or MOSAICO_API_KEY"
 
 
 class Refused(SinkError):  # noqa: N818 - the condition, as in `errors`
-    """The server said no; `condition` is the kind of no."""
+    """The server refused a call; `condition` is its status."""
 
     def __init__(
         self, what: str, *, where: str | None = None, hint: str | None = None, condition: Condition
@@ -34,13 +34,13 @@ class Refused(SinkError):  # noqa: N818 - the condition, as in `errors`
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Where a server is and how it is spoken to."""
+    """The address of a server, and the credentials for it."""
 
     host: str
     port: int
     tls: bool
     roots: str | None = field(default=None, repr=False)
-    """Certificates to trust, PEM; None: the system's."""
+    """Trusted certificates, PEM; None: those of the system."""
     key: str | None = field(default=None, repr=False)
 
     def __str__(self) -> str:
@@ -49,41 +49,41 @@ class Address:
 
 
 def add_hint(error: IngestError, hint: str) -> None:
-    """Let an error that is on its way say one thing more."""
+    """Append a hint to an error."""
     error.hint = f"{error.hint}; {hint}" if error.hint else hint
 
 
 def check_tls(address: Address) -> None:
-    """Raise SinkError where a server that answers cannot be trusted; gRPC would say so on the terminal, vaguely."""
+    """Raise SinkError if the server's certificate is not trusted; gRPC would print a vague message to the terminal."""
     try:
         connection = socket.create_connection((address.host, address.port), timeout=_PATIENCE_S)
     except OSError:
-        return  # perhaps gRPC knows a way, through a proxy; if not, `reraise` says why
+        return  # gRPC may connect through a proxy; if not, `reraise` explains the error
     with connection:
         fault = _tls_fault(connection, address)
     if fault is not None:
         raise fault
 
 
-def late(address: Address, doing: str) -> SinkUnavailable:
-    """Return the error of a call that has not ended in time."""
-    hint = "the server is slow or stuck"
-    return SinkUnavailable(f"no answer to {doing} in time", where=str(address), hint=hint)
+def late(address: Address, action: str) -> SinkUnavailable:
+    """Return the error of a call that did not end in time."""
+    hint = "check the load of the server, then try again"
+    return SinkUnavailable(f"the server did not respond to {action} in time", where=str(address), hint=hint)
 
 
-def reraise(error: Exception, address: Address, *, doing: str, needs: Permission) -> NoReturn:
-    """Raise an error of Flight as one of our own.
+def reraise(error: Exception, address: Address, *, action: str, needs: Permission) -> NoReturn:
+    """Raise the SinkError for an error of Flight.
 
     Raises:
-        Refused: The server said no.
-        SinkUnavailable: It did not answer; trying again may help.
-        SinkError: It cannot be reached this way.
+        Refused: The server refused the call.
+        SinkUnavailable: The server did not respond; a retry may succeed.
+        SinkError: The server cannot be reached with these settings.
     """
     secret = address.key is not None and address.key in str(error)
-    raise _explained(error, address, doing=doing, needs=needs) from (None if secret else error)
+    raise _explained(error, address, action=action, needs=needs) from (None if secret else error)
 
 
-def _explained(error: Exception, address: Address, *, doing: str, needs: Permission) -> SinkError:
+def _explained(error: Exception, address: Address, *, action: str, needs: Permission) -> SinkError:
     condition, text = condition_of(error), text_of(error)
     if address.key:
         text = text.replace(address.key, "<the key>")
@@ -91,45 +91,53 @@ def _explained(error: Exception, address: Address, *, doing: str, needs: Permiss
     if condition is Condition.UNAVAILABLE:
         return _diagnosed(address, text)
     if condition is Condition.TIMED_OUT:
-        return late(address, doing)
+        return late(address, action)
     if condition in {Condition.UNAUTHENTICATED, Condition.PERMISSION}:
-        what, hint = _about_key(address.key, condition, text, doing=doing, needs=needs)
+        what, hint = _about_key(address.key, condition, text, action=action, needs=needs)
         return Refused(what, where=where, hint=hint, condition=condition)
-    return Refused(f"{doing} is refused: {text}", where=where, condition=condition)
+    return Refused(f"{action} is refused: {text}", where=where, condition=condition)
 
 
 def _about_key(
-    key: str | None, condition: Condition, text: str, *, doing: str, needs: Permission
+    key: str | None, condition: Condition, text: str, *, action: str, needs: Permission
 ) -> tuple[str, str]:
     if not key:
-        return "the server wants an API key", _KEY_HINT
+        return "the server requires an API key", _KEY_HINT
     problem = key_problem(key)
     if problem:
         return f"the API key is refused: {problem}", _KEY_HINT
     if condition is Condition.PERMISSION:
-        return f"the API key may not do {doing} ({text})", f"use a key with the permission {needs.value}"
-    return f"the API key is refused ({text})", "ask for a new one"
+        return (
+            f"the API key has no permission for {action} ({text})",
+            f"use a key with the permission {needs.value}",
+        )
+    return (
+        f"the API key is refused ({text})",
+        "check that the key belongs to this server and has not expired or been revoked",
+    )
 
 
 def _diagnosed(address: Address, text: str) -> SinkError:
-    """Return why there is no connection, found out by making one step by step."""
+    """Return the reason why there is no connection, found by connecting step by step."""
     where = str(address)
     try:
         connection = socket.create_connection((address.host, address.port), timeout=_PATIENCE_S)
     except socket.gaierror:
-        return SinkError(f"no host is called {address.host!r}", where=where, hint="check target.host")
+        return SinkError(
+            f"the host {address.host!r} cannot be resolved", where=where, hint="check target.host"
+        )
     except ConnectionRefusedError:
-        hint = "check target.host and target.port, and that the server runs"
-        return SinkUnavailable("nothing listens there", where=where, hint=hint)
+        hint = "check target.host and target.port, and that the server is running"
+        return SinkUnavailable("the connection is refused", where=where, hint=hint)
     except OSError as error:
-        why = error.strerror or f"no answer within {_PATIENCE_S:g} s"
+        why = error.strerror or f"no response within {_PATIENCE_S:g} s"
         return SinkUnavailable(why, where=where, hint="check target.host and the network")
     with connection:
         found = _tls_fault(connection, address) if address.tls else _plain_fault(connection, address)
     if found is None and _NO_HTTP2 in text:
         hint = "check target.host and target.port"
-        return SinkError("what answers there is no Mosaico server", where=where, hint=hint)
-    return found or SinkUnavailable(f"the server does not answer: {text}", where=where, hint="try again")
+        return SinkError("the program at this address is not a Mosaico server", where=where, hint=hint)
+    return found or SinkUnavailable(f"the server does not respond: {text}", where=where, hint="try again")
 
 
 def _tls_fault(connection: socket.socket, address: Address) -> SinkError | None:
@@ -147,7 +155,7 @@ def _tls_fault(connection: socket.socket, address: Address) -> SinkError | None:
     except ssl.SSLError as error:
         if "ALERT" in (error.reason or ""):
             return SinkError(f"the server refuses the TLS handshake: {error.reason}", where=where)
-        return SinkError("the server does not speak TLS", where=where, hint="set target.tls: false")
+        return SinkError("the server does not use TLS", where=where, hint="set target.tls: false")
     except OSError:
         return None
     return None
@@ -156,11 +164,11 @@ def _tls_fault(connection: socket.socket, address: Address) -> SinkError | None:
 def _plain_fault(connection: socket.socket, address: Address) -> SinkError | None:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
-    context.verify_mode = ssl.CERT_NONE  # nothing is sent: the question is only whether there is TLS
+    context.verify_mode = ssl.CERT_NONE  # nothing is sent: this only tests whether the server uses TLS
     context.set_alpn_protocols(["h2"])
     try:
         context.wrap_socket(connection, server_hostname=address.host).close()
     except OSError:
         return None
     hint = "set target.tls: true, or target.tls_cert"
-    return SinkError("the server speaks TLS only", where=str(address), hint=hint)
+    return SinkError("the server accepts only TLS connections", where=str(address), hint=hint)

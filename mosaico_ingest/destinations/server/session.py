@@ -1,37 +1,57 @@
-"""This file is a writing session on a server: what it wrote becomes visible when it is finalized, or is deleted."""
+"""A writing session on a Mosaico server: its topics become visible when it is finalized, or are deleted."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Lock
 from typing import Any
 
+import pyarrow as pa
+
 from mosaico_ingest import protocol
-from mosaico_ingest.destinations.base import StoredTopic, sequence_exists
-from mosaico_ingest.destinations.server.client import PlatformClient, Uploaded, connect, in_thread
+from mosaico_ingest.destinations.base import (
+    StoredTopic,
+    TopicWriter,
+    check_batch,
+    replacement_is_incomplete,
+    sequence_exists,
+    topic_schema,
+)
+from mosaico_ingest.destinations.server.client import ServerClient, Uploaded, connect, in_thread
 from mosaico_ingest.destinations.server.errors import Refused, add_hint
-from mosaico_ingest.destinations.server.upload import Memory, Upload
+from mosaico_ingest.destinations.server.upload import MessageSizes, SharedBuffer, Upload
 from mosaico_ingest.errors import SinkError, SinkUnavailable
 from mosaico_ingest.job.values import IfExists, ServerTarget
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.protocol import messages
+from mosaico_ingest.protocol.batches import with_offsets
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.protocol.messages import Action, topic_locator
 
-__all__ = ["PlatformSession"]
+__all__ = ["ServerSession"]
 
-_OLD_IS_GONE = "the old sequence is deleted"
-_FILL = 0.9
-"""How full a message may be; the rest is left to what Flight and gRPC add."""
+_OLD_IS_DELETED = "the stored sequence is deleted"
+_UNCHECKED = (
+    "the session is finalized, so the sequence is stored, but its rows were not counted;"
+    " `ingest status` shows whether it is complete"
+)
 
 
-class PlatformSession:
-    """One writing session; `commit` or `discard` ends it."""
+class ServerSession:
+    """One writing session; `commit` or `discard` ends it.
+
+    A server cannot swap sequences. A session that replaces one therefore keeps its rows in temporary files, and deletes
+    the stored sequence only at the commit, when the new one is complete.
+    """
 
     def __init__(
         self,
         target: ServerTarget,
-        client: PlatformClient,
+        client: ServerClient,
         sequence: str,
         metadata: str,
         *,
@@ -41,68 +61,63 @@ class PlatformSession:
         self._target = target
         self._client = client
         self._sequence = sequence
-        self._memory = Memory(most_bytes=buffer_bytes)
+        self._metadata = metadata
+        self._sizes = MessageSizes(target.message_bytes, client.limit_bytes)
+        self._buffer = SharedBuffer(max_bytes=buffer_bytes)
         self._uploads: dict[str, Upload] = {}
-        self._given: dict[str, str] = {}
+        self._names: dict[str, str] = {}
+        """The path of each topic by the name that was passed to `topic`."""
         self._notes: list[tuple[str | None, str]] = []
         self._session: messages.SessionCreated | None = None
-        old = client.find(sequence)
-        self._held = _topics_of(old) if old and if_exists is IfExists.APPEND else frozenset[str]()
-        self._created = old is None or if_exists is not IfExists.APPEND
-        if old is not None and if_exists in {IfExists.FAIL, IfExists.SKIP}:
+        self._created = False
+        self._stored_is_deleted = False
+        stored = client.find(sequence)
+        if stored is not None and if_exists in {IfExists.FAIL, IfExists.SKIP}:
             raise sequence_exists(sequence)
-        self._replaced = old is not None and if_exists is IfExists.REPLACE
-        if self._replaced:
-            client.act(messages.SEQUENCE_DELETE, messages.Located(locator=sequence))
-        if self._created:
-            self._create(metadata)
+        self._replaced = stored if if_exists is IfExists.REPLACE else None
+        self._spool = _Spool(self._sizes) if self._replaced else None
+        self._existing_topics = _topics_of(stored) if stored and not self._replaced else frozenset[str]()
+        if stored is None:
+            self._create()
 
-    def topic(self, name: str, ontology: OntologyType, metadata: Mapping[str, Any]) -> Upload:
+    def topic(self, name: str, ontology: OntologyType, metadata: Mapping[str, Any]) -> TopicWriter:
         """Open a topic; see `Session.topic`."""
         path = protocol.check_topic_name(name)
         described: dict[str, Any] = json.loads(protocol.check_metadata(metadata, where=name))
-        if path in self._uploads:
-            raise SinkError("the topic is open already", where=name)
-        locator = topic_locator(self._sequence, path)
-        if locator in self._held:
-            hint = "rename it in topic_settings, or replace the sequence"
+        if path in self._names.values():
+            raise SinkError("the topic is already open", where=name)
+        if topic_locator(self._sequence, path) in self._existing_topics:
             raise SinkError(
-                "the sequence has this topic, and a server adds no rows to one", where=name, hint=hint
+                "the topic already exists in the sequence, and the server cannot append rows to an existing topic",
+                where=name,
+                hint="rename the topic in topic_settings, or replace the sequence",
             )
-        question = messages.TopicCreate(
-            session_uuid=self._open_session().uuid,
-            locator=locator,
-            serialization_format=ontology.serialization_format,
-            ontology_tag=ontology.tag,
-            user_metadata=described,
-        )
-        created = self._client.act(messages.TOPIC_CREATE, question)
-        put = messages.Put(resource_locator=locator, topic_uuid=created.uuid)
-        upload = Upload(
-            name,
-            ontology,
-            lambda schema: self._client.put(put, schema),
-            message_bytes=int(self._client.message_bytes * _FILL),
-            memory=self._memory,
-            address=self._client.address,
-        )
-        self._uploads[path] = upload
-        self._given[name] = path
-        return upload
+        if self._spool is not None:
+            writer: TopicWriter = self._spool.topic(name, path, ontology, described)
+        else:
+            writer = self._start_upload(name, path, ontology, described)
+        self._names[name] = path
+        return writer
 
     def note_error(self, message: str, *, topic: str | None = None) -> None:
         """Attach an error; see `Session.note_error`. It is sent with the commit."""
         self._notes.append((None if topic is None else protocol.check_topic_name(topic), message))
 
     def stored(self) -> tuple[StoredTopic, ...]:
-        """Return what the server says over a new connection; see `Session.stored`."""
-        with connect(self._target, handshake=False) as client:
-            held = client.uploaded(self._sequence) if self._uploads else {}
-            return tuple(self._stored(client, held, name, path) for name, path in self._given.items())
+        """Return the server's counts, read over a new connection; see `Session.stored`."""
+        try:
+            with connect(self._target, handshake=False) as client:
+                counts = client.uploaded(self._sequence) if self._uploads else {}
+                return tuple(self._stored(client, counts, name, path) for name, path in self._names.items())
+        except SinkError as error:
+            add_hint(error, _UNCHECKED)
+            raise
 
     def commit(self) -> None:
-        """Wait until the server has every topic, then make them visible at once."""
-        self._drop_broken()
+        """Upload the remaining rows, wait until the server confirms every topic, and make them visible atomically."""
+        if self._spool is not None:
+            self._send_spool(self._spool)
+        self._delete_broken_topics()
         for closing in [in_thread(upload.close) for upload in self._uploads.values()]:
             closing.result()
         for path, message in self._notes:
@@ -112,44 +127,92 @@ class PlatformSession:
             return
         if self._uploads:
             question = messages.SessionFinalize(session_uuid=session.uuid)
-            self._surely(messages.SESSION_FINALIZE, question, lambda: self._is_final(session))
+            self._act_once(messages.SESSION_FINALIZE, question, lambda: self._is_final(session))
         else:
-            self._delete_session(session)
+            self._delete_session(session.locator)
 
     def discard(self) -> str | None:
-        """Leave no trace; return what had to stay behind or is lost, None where nothing is."""
+        """Delete everything the session wrote; return a remark if something remains or was lost, else None."""
         for ending in [in_thread(upload.abandon) for upload in self._uploads.values()]:
             ending.result()
-        remarks = [self._remove()]
-        if self._replaced:
-            remarks.append(_OLD_IS_GONE)
+        if self._spool is not None:
+            self._spool.close()
+        remarks = [self._delete_remains(), _OLD_IS_DELETED if self._stored_is_deleted else None]
         return "; ".join(remark for remark in remarks if remark) or None
 
-    def _remove(self) -> str | None:
+    def _start_upload(self, name: str, path: str, ontology: OntologyType, metadata: dict[str, Any]) -> Upload:
+        locator = topic_locator(self._sequence, path)
+        question = messages.TopicCreate(
+            session_uuid=self._open_session().uuid,
+            locator=locator,
+            serialization_format=ontology.serialization_format,
+            ontology_tag=ontology.tag,
+            user_metadata=metadata,
+        )
+        created = self._client.act(messages.TOPIC_CREATE, question)
+        put = messages.Put(resource_locator=locator, topic_uuid=created.uuid)
+        upload = Upload(
+            name,
+            ontology,
+            lambda schema: self._client.put(put, schema),
+            sizes=self._sizes,
+            buffer=self._buffer,
+            address=self._client.address,
+        )
+        self._uploads[path] = upload
+        return upload
+
+    def _send_spool(self, spool: _Spool) -> None:
+        """Replace the stored sequence by the rows in the temporary files."""
+        if any(path is None for path, _ in self._notes):
+            raise replacement_is_incomplete(self._sequence)
+        spool.finish()
+        self._delete_stored()
+        self._create()
+        for topic in spool.topics:
+            upload = self._start_upload(topic.name, topic.path, topic.ontology, topic.metadata)
+            for batch in topic.batches():
+                upload.write(batch)
+        spool.close()
+
+    def _delete_stored(self) -> None:
+        question = messages.Located(locator=self._sequence)
+        try:
+            self._client.act(messages.SEQUENCE_DELETE, question)
+        except Refused as refusal:
+            if refusal.condition is not Condition.PRECONDITION or self._replaced is None:
+                raise
+            # an upload that was killed leaves a session that was never finalized
+            for session in self._replaced.sessions:
+                if not session.locked:
+                    self._delete_session(session.locator)
+            self._client.act(messages.SEQUENCE_DELETE, question)
+        self._stored_is_deleted = True
+
+    def _delete_remains(self) -> str | None:
         try:
             if self._session is not None:
-                self._delete_session(self._session)
+                self._delete_session(self._session.locator)
             if self._created:
                 self._client.act(messages.SEQUENCE_DELETE, messages.Located(locator=self._sequence))
         except Refused as refusal:
             if refusal.condition is not Condition.NOT_FOUND:
-                return f"an unfinished session of {self._sequence} stays on the server ({refusal.what})"
+                return f"an unfinished session of {self._sequence} remains on the server ({refusal.what})"
         except SinkError as error:
-            return f"an unfinished session of {self._sequence} may stay on the server ({error.what})"
+            return f"an unfinished session of {self._sequence} may remain on the server ({error.what})"
         return None
 
-    def _create(self, metadata: str) -> None:
-        question = messages.SequenceCreate(locator=self._sequence, user_metadata=json.loads(metadata))
+    def _create(self) -> None:
+        question = messages.SequenceCreate(locator=self._sequence, user_metadata=json.loads(self._metadata))
         try:
-            self._surely(
+            self._act_once(
                 messages.SEQUENCE_CREATE, question, lambda: self._client.find(self._sequence) is not None
             )
-        except SinkError as error:
-            if isinstance(error, Refused) and error.condition is Condition.EXISTS:
+        except Refused as error:
+            if error.condition is Condition.EXISTS:
                 raise sequence_exists(self._sequence) from error
-            if self._replaced:
-                add_hint(error, _OLD_IS_GONE)
             raise
+        self._created = True
 
     def _open_session(self) -> messages.SessionCreated:
         """Create the session with its first topic, since a server refuses to finalize an empty one."""
@@ -159,12 +222,12 @@ class PlatformSession:
             )
         return self._session
 
-    def _drop_broken(self) -> None:
-        """Delete the topics whose streams broke, as their errors were raised; the others stay."""
+    def _delete_broken_topics(self) -> None:
+        """Delete the topics whose streams broke, whose errors were raised already, and keep the others."""
         for path, upload in tuple(self._uploads.items()):
-            if upload.broken is not None:
+            if upload.error is not None:
                 del self._uploads[path]
-                self._memory.uploads.remove(upload)
+                self._buffer.uploads.remove(upload)
                 locator = topic_locator(self._sequence, path)
                 self._client.act(messages.TOPIC_DELETE, messages.Located(locator=locator))
 
@@ -178,8 +241,10 @@ class PlatformSession:
             note = messages.NotificationCreate(locator=self._sequence, msg=text)
             self._client.act(messages.SEQUENCE_NOTIFICATION_CREATE, note)
 
-    def _surely(self, action: Action[Any, Any], question: messages.Body, is_done: Callable[[], bool]) -> None:
-        """Act; where the answer was lost, look whether it happened before asking again."""
+    def _act_once(
+        self, action: Action[Any, Any], question: messages.Body, is_done: Callable[[], bool]
+    ) -> None:
+        """Act; if the response was lost, check whether the action took effect before repeating it."""
         try:
             self._client.act(action, question)
         except SinkUnavailable:
@@ -187,20 +252,102 @@ class PlatformSession:
                 self._client.act(action, question)
 
     def _is_final(self, session: messages.SessionCreated) -> bool:
-        found = self._client.find(self._sequence)
-        return found is not None and any(s.locked for s in found.sessions if s.locator == session.locator)
+        info = self._client.find(self._sequence)
+        return info is not None and any(s.locked for s in info.sessions if s.locator == session.locator)
 
-    def _delete_session(self, session: messages.SessionCreated) -> None:
-        self._client.act(messages.SESSION_DELETE, messages.Located(locator=session.locator))
+    def _delete_session(self, locator: str) -> None:
+        self._client.act(messages.SESSION_DELETE, messages.Located(locator=locator))
 
     def _stored(
-        self, client: PlatformClient, held: Mapping[str, Uploaded], name: str, path: str
+        self, client: ServerClient, counts: Mapping[str, Uploaded], name: str, path: str
     ) -> StoredTopic:
         if path not in self._uploads:
             return StoredTopic(name, 0, None, None, 0)
         locator = topic_locator(self._sequence, path)
-        found = held[locator] if locator in held else client.counted(locator)
-        return StoredTopic(name, found.rows, found.start_ns, found.end_ns, found.stored_bytes)
+        count = counts[locator] if locator in counts else client.count_rows(locator)
+        return StoredTopic(name, count.rows, count.start_ns, count.end_ns, count.stored_bytes)
+
+
+class _Spool:
+    """The topics of a replacement in temporary files, until the stored sequence may be deleted."""
+
+    def __init__(self, sizes: MessageSizes) -> None:
+        self.topics: list[_SpooledTopic] = []
+        self._sizes = sizes
+        self._files = ExitStack()
+        self._folder = Path(self._files.enter_context(TemporaryDirectory(prefix="mosaico-ingest-")))
+
+    def topic(self, name: str, path: str, ontology: OntologyType, metadata: dict[str, Any]) -> _SpooledTopic:
+        file = self._folder / f"{len(self.topics)}.arrow"
+        topic = _SpooledTopic(name, path, ontology, metadata, file=file, sizes=self._sizes)
+        self.topics.append(topic)
+        return topic
+
+    def finish(self) -> None:
+        for topic in self.topics:
+            topic.finish()
+
+    def close(self) -> None:
+        with suppress(SinkError):  # the files are deleted anyway
+            self.finish()
+        self._files.close()
+
+
+class _SpooledTopic:
+    """The writer of one topic in a temporary Arrow file."""
+
+    def __init__(
+        self,
+        name: str,
+        path: str,
+        ontology: OntologyType,
+        metadata: dict[str, Any],
+        *,
+        file: Path,
+        sizes: MessageSizes,
+    ) -> None:
+        self.name = name
+        self.path = path
+        self.ontology = ontology
+        self.metadata = metadata
+        self._file = file
+        self._sizes = sizes
+        self._schema = topic_schema(ontology)
+        self._lock = Lock()
+        self._finished = False
+        self._writer = pa.ipc.new_stream(
+            str(file), self._schema, options=pa.ipc.IpcWriteOptions(compression="lz4")
+        )
+
+    def write(self, batch: pa.RecordBatch) -> None:
+        """Append rows; see `TopicWriter.write`."""
+        check_batch(batch, self._schema, where=self.name)
+        complete = with_offsets(batch)
+        self._sizes.spans(complete, where=self.name)
+        with self._lock, _spool_errors(self._file.parent):
+            self._writer.write_batch(complete)
+
+    def finish(self) -> None:
+        """Complete the file; a second call has no effect."""
+        with self._lock, _spool_errors(self._file.parent):
+            if not self._finished:
+                self._finished = True
+                self._writer.close()
+
+    def batches(self) -> pa.RecordBatchReader:
+        return pa.ipc.open_stream(pa.OSFile(str(self._file)))
+
+
+@contextmanager
+def _spool_errors(folder: Path) -> Generator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise SinkError(
+            f"a temporary file cannot be written: {error}",
+            where=str(folder),
+            hint="set TMPDIR to a folder with enough free space",
+        ) from error
 
 
 def _topics_of(sequence: messages.SequenceInfo) -> frozenset[str]:

@@ -10,9 +10,9 @@ from msgspec import Struct
 
 from mosaico_ingest import protocol
 from mosaico_ingest.destinations.base import Session
-from mosaico_ingest.destinations.server.client import connect
+from mosaico_ingest.destinations.server.client import ServerClient, connect
 from mosaico_ingest.destinations.server.errors import Refused, add_hint
-from mosaico_ingest.destinations.server.session import PlatformSession
+from mosaico_ingest.destinations.server.session import ServerSession
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.values import IfExists, ServerTarget
@@ -20,31 +20,32 @@ from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.errors import Condition
 
 __all__ = [
-    "PlatformSink",
+    "ServerSink",
     "delete_finding",
+    "version_finding",
 ]
 
+_OLD_VERSIONS = ("0.1.", "0.2.", "0.3.", "0.4.", "0.5.")
 _NO_SESSION = "0" * 26
-"""As an identifier of a session is written; none has it."""
+"""The id of no session, in the format of session ids."""
 
 
-def delete_finding(target: ServerTarget, sequence: str) -> Finding | None:
-    """Return a warning where the key may not delete; found by asking to delete what is not there.
+def delete_finding(client: ServerClient, sequence: str) -> Finding | None:
+    """Return a warning if the API key has no permission to delete, found by deleting a session that does not exist.
 
     Raises:
-        SinkError: There is no server, or it does not let us in.
+        SinkError: The server cannot be reached, or does not accept the API key.
     """
     question = messages.Located(locator=messages.session_locator(sequence, _NO_SESSION))
     try:
-        with connect(target) as client:
-            client.act(messages.SESSION_DELETE, question)
+        client.act(messages.SESSION_DELETE, question)
     except Refused as refusal:
         if refusal.condition is Condition.PERMISSION:
             return Finding(
                 "delete-permission",
                 Severity.WARNING,
-                "on_error.session is delete, and the key may not delete: an early end leaves an unfinished "
-                f"session, and the name {sequence!r} taken",
+                "on_error.session is delete, but the API key has no permission to delete: an error leaves an unfinished "
+                f"session, and the name {sequence!r} stays in use",
                 help="use a key with the permission delete, or on_error.session: report",
             )
         if refusal.condition is Condition.UNAUTHENTICATED:
@@ -52,14 +53,27 @@ def delete_finding(target: ServerTarget, sequence: str) -> Finding | None:
     return None
 
 
+def version_finding(version: str) -> Finding | None:
+    """Return a warning if the server is older than the types and columns that are written."""
+    if not version.startswith(_OLD_VERSIONS):
+        return None
+    return Finding(
+        "old-server",
+        Severity.WARNING,
+        f"the server has version {version}: its own clients list the sequence with its topics, metadata and times, but"
+        " they cannot decode the rows as their types, because tags and columns changed in 0.6",
+        help="read the sequence with a client of version 0.6 or 0.7, or upgrade the server",
+    )
+
+
 _BUFFER_BYTES = 96 << 20
 
 
-class PlatformSink(Struct, frozen=True):
-    """Writes sequences to a server; one session holds at most about `buffer_bytes` in memory.
+class ServerSink(Struct, frozen=True):
+    """Writes sequences to a server; one session buffers at most about `buffer_bytes`.
 
-    A server has no way to swap sequences, so `replace` deletes the old one when the session is opened; and it
-    adds no rows to a topic that is there, so `append` takes new topics only.
+    A server cannot swap sequences: `replace` keeps the new rows in temporary files and deletes the stored sequence at the
+    commit. A server cannot append rows to an existing topic either: `append` accepts new topics only.
     """
 
     target: ServerTarget
@@ -73,7 +87,7 @@ class PlatformSink(Struct, frozen=True):
         protocol.check_sequence_name(sequence)
         described = protocol.check_metadata(metadata, where=sequence)
         with connect(self.target) as client:
-            session = PlatformSession(
+            session = ServerSession(
                 self.target, client, sequence, described, if_exists=if_exists, buffer_bytes=self.buffer_bytes
             )
             try:

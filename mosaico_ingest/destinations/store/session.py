@@ -39,6 +39,7 @@ from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import IngestError, SinkError
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.protocol.batches import has_nested_lists, with_offsets
 from mosaico_ingest.remote import AnyPath, RemotePath
 
 __all__ = [
@@ -91,6 +92,7 @@ class StoreTopic:
         self.metadata = metadata
         self._columns = columns_of(ontology)
         self.schema = self._columns.schema
+        self._has_nested_lists = has_nested_lists(self.schema)
         self.created_ns = time.time_ns()
         self.buffered_bytes = 0
         self.segments: list[Segment] = []
@@ -108,6 +110,8 @@ class StoreTopic:
         check_batch(batch, self.schema, where=self.name)
         if not batch.num_rows:
             return
+        if self._has_nested_lists:
+            batch = with_offsets(batch)
         with self._lock:
             self._refuse_if_broken()
             self._batches.append(batch)
