@@ -169,6 +169,7 @@ _TABLE = (
     Rule("ING608", "plan-drift", _ERROR, "a plan that no longer matches the recording or the job"),
     Rule("ING609", "unexpected-messages", _WARNING, "more messages than the recording's index promises"),
     Rule("ING610", "quarantined", _WARNING, "rejected messages in the quarantine"),
+    Rule("ING611", "old-server", _WARNING, "a server whose own clients cannot decode the rows"),
     Rule("ING701", "decode", _WARNING, "bytes that do not fit their message type"),
     Rule("ING702", "definition", _WARNING, "a message type without a usable definition"),
     Rule("ING703", "encoding", _WARNING, "a message that is not in a ROS encoding"),

@@ -38,27 +38,32 @@ def has_nested_lists(schema: pa.Schema) -> bool:
 
 def _with_offsets(array: Any) -> Any:  # noqa: ANN401 - any array class
     kind = array.type
-    if not kind.num_fields:
-        return array
     if len(array) == 0:
-        return pa.array([], kind)
+        return pa.array([], kind) if kind.num_fields else array
     if isinstance(kind, pa.StructType):
-        children = [array.field(i) for i in range(kind.num_fields)]
-        complete = [_with_offsets(child) for child in children]
-        if all(new is old for new, old in zip(complete, children, strict=True)):
-            return array
-        # `field` has applied the offset of the struct to its children, but not to its validity
-        return pa.StructArray.from_arrays(
-            complete, fields=list(kind), mask=array.is_null() if array.null_count else None
-        )
+        return _complete_struct(array)
     if isinstance(kind, pa.ListType | pa.LargeListType | pa.FixedSizeListType | pa.MapType):
-        values = array.values
-        complete = _with_offsets(values)
-        if complete is values:
-            return array
-        buffers = array.buffers()[: 1 if isinstance(kind, pa.FixedSizeListType) else 2]
-        return pa.Array.from_buffers(kind, len(array), buffers, array.null_count, array.offset, [complete])
+        return _complete_list(array)
     return array
+
+
+def _complete_struct(array: Any) -> Any:  # noqa: ANN401 - a struct array
+    children = [array.field(i) for i in range(array.type.num_fields)]
+    complete = [_with_offsets(child) for child in children]
+    if all(new is old for new, old in zip(complete, children, strict=True)):
+        return array
+    # `field` has applied the offset of the struct to its children
+    mask = array.is_null() if array.null_count else None
+    return pa.StructArray.from_arrays(complete, fields=list(array.type), mask=mask)
+
+
+def _complete_list(array: Any) -> Any:  # noqa: ANN401 - a list or map array
+    values = array.values
+    complete = _with_offsets(values)
+    if complete is values:
+        return array
+    buffers = array.buffers()[: 1 if isinstance(array.type, pa.FixedSizeListType) else 2]
+    return pa.Array.from_buffers(array.type, len(array), buffers, array.null_count, array.offset, [complete])
 
 
 def _lists(kind: Any) -> int:  # noqa: ANN401 - any Arrow type

@@ -118,7 +118,7 @@ def test_keys_are_listed_without_being_shown(served: tuple[Path, str, str]) -> N
             ("--host", "127.0.0.1", "--port", "{port}", "--api-key", "msco_x"),
             "the API key is refused: it is not",
         ),
-        (("--host", "127.0.0.1", "--port", "{port}"), "the server wants an API key"),
+        (("--host", "127.0.0.1", "--port", "{port}"), "the server requires an API key"),
     ],
 )
 def test_what_keeps_a_recording_from_its_server_is_one_line(

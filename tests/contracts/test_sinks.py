@@ -315,34 +315,34 @@ def test_sink_append_of_another_type_to_a_topic_is_refused(keeping: Destination)
         session.topic("/gps/fix", FLAG, {})
 
 
-def test_sink_replace_exchanges_sequences_at_the_commit(keeping: Destination) -> None:
-    write(keeping, 1)
-    with keeping.sink.open("drive", {"car": 8}, if_exists=IfExists.REPLACE) as session:
+def test_sink_replace_exchanges_sequences_at_the_commit(there: Destination) -> None:
+    write(there, 1)
+    with there.sink.open("drive", {"car": 8}, if_exists=IfExists.REPLACE) as session:
         session.topic("/gps/fix", POINT, {}).write(points(2, 3))
-        assert keeping.rows("drive", "/gps/fix").num_rows == 1
-    assert keeping.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(2, 3)]))
-    assert keeping.metadata("drive") == {"car": 8}
+        assert there.rows("drive", "/gps/fix").num_rows == 1
+    assert there.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(2, 3)]))
+    assert there.metadata("drive") == {"car": 8}
 
 
-def test_sink_failed_replace_keeps_the_old_sequence(keeping: Destination) -> None:
-    write(keeping, 1)
-    with pytest.raises(CrashError), keeping.sink.open("drive", {}, if_exists=IfExists.REPLACE) as session:
+def test_sink_failed_replace_keeps_the_old_sequence(there: Destination) -> None:
+    write(there, 1)
+    with pytest.raises(CrashError), there.sink.open("drive", {}, if_exists=IfExists.REPLACE) as session:
         session.topic("/gps/fix", POINT, {}).write(points(2, 3))
         raise CrashError
-    assert keeping.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(1)]))
+    assert there.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(1)]))
 
 
-def test_replace_with_incomplete_session_keeps_stored_sequence(keeping: Destination) -> None:
-    write(keeping, 1)
+def test_replace_with_incomplete_session_keeps_stored_sequence(there: Destination) -> None:
+    write(there, 1)
     with (
         pytest.raises(SinkError) as raised,
-        keeping.sink.open("drive", {}, if_exists=IfExists.REPLACE) as session,
+        there.sink.open("drive", {}, if_exists=IfExists.REPLACE) as session,
     ):
         session.topic("/gps/fix", POINT, {}).write(points(2, 3))
         session.note_error("stopped")
     assert raised.value.where == "drive"
-    assert keeping.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(1)]))
-    assert list(keeping.errors("drive")) == []
+    assert there.rows("drive", "/gps/fix").equals(pa.Table.from_batches([points(1)]))
+    assert list(there.errors("drive")) == []
 
 
 def test_replace_with_incomplete_session_creates_missing_sequence(there: Destination) -> None:

@@ -58,14 +58,14 @@ def test_a_trusted_server_is_let_talk(secure: Mosaicod, certificate: tuple[Path,
 def test_a_host_nobody_knows() -> None:
     found = refusal("no-such-host.invalid", 6726)
     assert str(found) == (
-        "grpc://no-such-host.invalid:6726: no host is called 'no-such-host.invalid' — check target.host"
+        "grpc://no-such-host.invalid:6726: the host 'no-such-host.invalid' cannot be resolved — check target.host"
     )
     assert not found.retryable
 
 
 @pytest.mark.parametrize("host", ["", "grpc://127.0.0.1:6726", "127.0.0.1:6726", "a b", "[::1]"])
 def test_a_host_that_cannot_be_one(host: str) -> None:
-    assert "is neither a name nor an address — give target.host without scheme and port" in str(
+    assert "is neither a host name nor an IP address — set target.host without scheme and port" in str(
         refusal(host, 6726)
     )
 
@@ -83,7 +83,9 @@ def test_a_web_server(monkeypatch: pytest.MonkeyPatch) -> None:
         found = refusal("127.0.0.1", web.server_port)
         web.shutdown()
         thread.join()
-    assert "what answers there is no Mosaico server — check target.host and target.port" in str(found)
+    assert "the program at this address is not a Mosaico server — check target.host and target.port" in str(
+        found
+    )
 
 
 def test_a_port_nobody_listens_on(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,27 +94,29 @@ def test_a_port_nobody_listens_on(monkeypatch: pytest.MonkeyPatch) -> None:
         port = free.getsockname()[1]
     found = refusal("127.0.0.1", port)
     assert isinstance(found, SinkUnavailable)
-    assert "nothing listens there — check target.host and target.port" in str(found)
+    assert "the connection is refused — check target.host and target.port" in str(found)
 
 
 def test_a_port_that_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mosaico_ingest.destinations.server.errors._PATIENCE_S", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         target = ServerTarget("127.0.0.1", silent.getsockname()[1])
-        with pytest.raises(SinkUnavailable), connect(target, answer_s=0.3):
+        with pytest.raises(SinkUnavailable), connect(target, response_s=0.3):
             pytest.fail("connected")
 
 
 def test_tls_where_the_server_has_none() -> None:
     with running(Mosaicod()) as server:
         found = refusal("127.0.0.1", server.port, tls=True)
-    assert str(found).endswith("the server does not speak TLS — set target.tls: false")
+    assert str(found).endswith("the server does not use TLS — set target.tls: false")
     assert not found.retryable
 
 
 def test_no_tls_where_the_server_wants_it(secure: Mosaicod) -> None:
     found = refusal("127.0.0.1", secure.port)
-    assert str(found).endswith("the server speaks TLS only — set target.tls: true, or target.tls_cert")
+    assert str(found).endswith(
+        "the server accepts only TLS connections — set target.tls: true, or target.tls_cert"
+    )
     assert not found.retryable
 
 
@@ -131,5 +135,5 @@ def test_a_certificate_file_that_is_none(tmp_path: Path, certificate: tuple[Path
     (tmp_path / "text").write_text("hello")
     (tmp_path / "binary").write_bytes(b"\xff\xfe")
     for path in (tmp_path / "text", tmp_path / "binary", certificate[1]):
-        assert "it holds no certificate" in str(refusal("localhost", 1, tls_cert=path))
+        assert "it contains no certificate" in str(refusal("localhost", 1, tls_cert=path))
     assert "No such file" in str(refusal("localhost", 1, tls_cert=tmp_path / "missing"))

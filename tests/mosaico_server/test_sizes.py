@@ -50,7 +50,7 @@ def test_pieces_cover_every_row_and_fit_into_a_message(
     rows: list[dict[str, Any]], most: int, cut: tuple[int, int]
 ) -> None:
     batch = pa.RecordBatch.from_pylist(rows, SCHEMA).slice(*cut)
-    spans = row_spans(batch, most_bytes=most)
+    spans = row_spans(batch, max_bytes=most)
     assert [row for first, count, _ in spans for row in range(first, first + count)] == list(
         range(batch.num_rows)
     )
@@ -65,8 +65,8 @@ def test_the_estimate_is_near_the_truth() -> None:
         {"text": "x" * 50, "list": ["ab"] * 4, "points": [{"x": 1.0, "name": "n"}], "fixed": [1, 2, 3]}
     ] * 4000
     batch = pa.RecordBatch.from_pylist(rows, SCHEMA)
-    ((_, _, whole),) = row_spans(batch, most_bytes=1 << 30)
-    parts = [size for _, _, size in row_spans(batch, most_bytes=10_000)]
+    ((_, _, whole),) = row_spans(batch, max_bytes=1 << 30)
+    parts = [size for _, _, size in row_spans(batch, max_bytes=10_000)]
     assert len(parts) > 10
     assert whole == pytest.approx(pa.ipc.get_record_batch_size(batch), rel=0.01)
     assert sum(parts) == pytest.approx(whole, rel=0.12)
@@ -75,7 +75,7 @@ def test_the_estimate_is_near_the_truth() -> None:
 def test_lists_of_millions_of_values_cost_no_memory_to_measure() -> None:
     grids = pa.array([np.zeros(4_000_000, np.int8)] * 4, pa.list_(pa.int8()))
     tracemalloc.start()
-    spans = row_spans(pa.record_batch({"grid": grids}), most_bytes=9_000_000)
+    spans = row_spans(pa.record_batch({"grid": grids}), max_bytes=9_000_000)
     peak_bytes = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert [count for _, count, _ in spans] == [2, 2]
@@ -84,13 +84,13 @@ def test_lists_of_millions_of_values_cost_no_memory_to_measure() -> None:
 
 def test_pieces_are_as_few_as_there_can_be() -> None:
     batch = pa.record_batch({"a": pa.array(range(1000), pa.int64())})
-    spans = row_spans(batch, most_bytes=8 * 99)
+    spans = row_spans(batch, max_bytes=8 * 99)
     assert [count for _, count, _ in spans] == [99] * 10 + [10]
 
 
 def test_a_row_that_is_larger_is_a_piece_of_its_own() -> None:
     batch = pa.record_batch({"a": [b"x", b"y" * 5000, b"z"]})
-    assert [(first, count) for first, count, _ in row_spans(batch, most_bytes=100)] == [
+    assert [(first, count) for first, count, _ in row_spans(batch, max_bytes=100)] == [
         (0, 1),
         (1, 1),
         (2, 1),
@@ -99,4 +99,4 @@ def test_a_row_that_is_larger_is_a_piece_of_its_own() -> None:
 
 def test_a_type_without_a_fixed_width_shares_its_bytes_out_evenly() -> None:
     batch = pa.record_batch({"a": pa.array(["x" * 100] * 10, pa.string_view())})
-    assert [count for _, count, _ in row_spans(batch, most_bytes=batch.nbytes // 2)] == [5, 5]
+    assert [count for _, count, _ in row_spans(batch, max_bytes=batch.nbytes // 2)] == [5, 5]

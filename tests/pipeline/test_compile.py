@@ -66,7 +66,7 @@ adapters:
 on_error: {session: delete, topic: {default: finalize, /gps: ignore}, message: raise}
 on_schema_change: new_topic
 quarantine: {path: q, max: 0.1%, max_run: 100, systematic: 7}
-target: {host: h, port: 1, api_key: "${KEY}", tls_cert: ca.pem, tls: true}
+target: {host: h, port: 1, api_key: "${KEY}", tls_cert: ca.pem, tls: true, message_size: 4MB}
 run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
 """,
     )
@@ -79,6 +79,7 @@ run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
         mosaico_api_key="k",
         tls_cert_path=folder / "ca.pem",
         enable_tls=True,
+        message_bytes=4_000_000,
         ros_distro=Stores.ROS2_HUMBLE,
         custom_msgs=(("p", folder / "msgs", Stores.ROS1_NOETIC),),
         time_range=TimeRange(TimeBound(10**10, relative=True), TimeBound(1772366400 * 10**9)),

@@ -29,7 +29,7 @@ Rows = Callable[..., pa.RecordBatch]
 def test_the_handshake_says_what_is_spoken_and_what_fits(client: Client) -> None:
     info = client.call("info")
     assert info["semver"] == {"major": 0, "minor": 7, "patch": 0, "pre": None}
-    assert info["config"]["grpc_max_decode_message_size"] == 50 << 20
+    assert info["config"]["grpc_max_decode_message_size"] == 50_000_000
     assert client.call("version") == {"version": "0.7.0"}
 
 
@@ -283,7 +283,7 @@ def test_columns_are_put_in_order_and_the_time_column_may_be_nullable(client: Cl
     assert client.rows("drive/imu") == [1, 2]
     session = client.call("session_create", locator="drive")["uuid"]
     uuid = client.create_topic(session, "drive/bad")
-    with refused(Condition.INTERNAL, "timestamp_ns"):
+    with refused(Condition.INVALID, "timestamp_ns"):
         client.put("drive/bad", uuid, pa.record_batch({"timestamp_ns": pa.array([None], pa.int64())}))
     with refused(Condition.PRECONDITION, "broke off"):
         client.call("session_finalize", session_uuid=session)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 
-__all__ = ["hollow_array", "hollow_batch"]
+__all__ = ["hollow_array", "hollow_batch", "malformed_batch"]
 
 EMPTY = pa.py_buffer(b"")
 
@@ -53,3 +54,13 @@ def fixed(kind: Any) -> bool:
         return bool(kind.bit_width)
     except ValueError:
         return False
+
+
+def malformed_batch() -> pa.RecordBatch:
+    """Return two rows with a text whose offset is out of range, as no writer but a hostile one sends it."""
+    offsets = np.array([0, 1, 3], np.int32)
+    text: Any = pa.Array.from_buffers(pa.string(), 2, [None, pa.py_buffer(offsets), pa.py_buffer(b"abc")])
+    schema = pa.schema([pa.field("timestamp_ns", pa.int64(), nullable=False), pa.field("a", pa.string())])
+    batch = pa.RecordBatch.from_arrays([pa.array([1, 2]), text], schema=schema)
+    offsets[1] = 1 << 28  # pyarrow checks the array when it is created only
+    return batch

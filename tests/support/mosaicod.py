@@ -89,13 +89,21 @@ class Faults:
     version: str = "0.7.0"
     """Servers before 0.7 do not support `info` and return no counts."""
     response_delay_s: float = 0.0
+    metadata_in_schema: bool = False
+    """Servers before 0.7 send user metadata in the schema only."""
+    total_bytes: int = -1
+    """The stored size of each topic."""
+    rows_sent: Callable[[Topic], fl.FlightDataStream] | None = None
+    """Replaces the rows that `do_get` sends."""
+    refuse_open_sequences: bool = False
+    """A sequence with an open session cannot be deleted."""
 
 
 class Mosaicod(fl.FlightServerBase):
     """The server. `keys` maps API keys to permissions; if empty, all calls are allowed."""
 
     def __init__(
-        self, location: str = "grpc://127.0.0.1:0", *, message_bytes: int = 52428800, **options: Any
+        self, location: str = "grpc://127.0.0.1:0", *, message_bytes: int = 50_000_000, **options: Any
     ) -> None:
         super().__init__(location, middleware={"key": _KeyFactory(self)}, **options)
         self.keys: dict[str, str] = {}
@@ -196,6 +204,10 @@ class Mosaicod(fl.FlightServerBase):
         self.topics.pop(locator)
 
     def _sequence_delete(self, locator: str) -> None:
+        if self.faults.refuse_open_sequences and any(
+            not session.final for session in self.sessions.values() if session.sequence == locator
+        ):
+            raise precondition(f"{locator} has an open session")
         if self.sequences.pop(locator, None) is None:
             raise pa.ArrowKeyError(f"sequence {locator} not found")
         self.sessions = {
@@ -207,6 +219,14 @@ class Mosaicod(fl.FlightServerBase):
     def _sequence_notification_create(self, locator: str, notification_type: str, msg: str) -> None:
         assert notification_type == "error"
         self.notes[locator].append(msg)
+
+    def _sequence_notification_list(self, locator: str) -> dict[str, Any]:
+        return {
+            "notifications": [
+                {"name": locator, "notification_type": "error", "msg": text, "created_datetime": "2026-01-01"}
+                for text in self.notes.get(locator, ())
+            ]
+        }
 
     _topic_notification_create = _sequence_notification_create
 
@@ -269,13 +289,21 @@ class Mosaicod(fl.FlightServerBase):
             "user_metadata": self.sequences[sequence],
             "sessions": sessions,
         }
+        schema = pa.schema([])
+        if self.faults.metadata_in_schema:
+            metadata = json.dumps(description.pop("user_metadata"))
+            schema = schema.with_metadata({"mosaico:user_metadata": metadata})
+        total_bytes = self.faults.total_bytes if locator in self.topics else -1
         return fl.FlightInfo(
-            pa.schema([]), descriptor, endpoints, -1, -1, app_metadata=json.dumps(description).encode()
+            schema, descriptor, endpoints, -1, total_bytes, app_metadata=json.dumps(description).encode()
         )
 
     def do_get(self, context: fl.ServerCallContext, ticket: fl.Ticket) -> fl.RecordBatchStream:
         self._check_permission(context, "do_get")
-        return fl.RecordBatchStream(self.topics[ticket.ticket.decode()].table())
+        topic = self.topics[ticket.ticket.decode()]
+        if self.faults.rows_sent is not None:
+            return self.faults.rows_sent(topic)
+        return fl.RecordBatchStream(topic.table())
 
     def _endpoint(self, topic: Topic) -> bytes:
         return b"{}" if self.faults.version < "0.7" else json.dumps(topic.info()).encode()
@@ -290,7 +318,7 @@ class Mosaicod(fl.FlightServerBase):
             raise fl.FlightUnauthenticatedError(f"unknown key {key}")
         needed = (
             "read"
-            if call in {"info", "version", "get_flight_info", "do_get"}
+            if call in {"info", "version", "get_flight_info", "do_get", "sequence_notification_list"}
             else "delete"
             if call.endswith(("_delete", "_purge"))
             else "write"

@@ -335,7 +335,7 @@ class _SpooledTopic:
                 self._writer.close()
 
     def batches(self) -> pa.RecordBatchReader:
-        return pa.ipc.open_stream(pa.OSFile(str(self._file)))
+        return pa.ipc.open_stream(pa.OSFile(str(self._file), "rb"))
 
 
 @contextmanager
