@@ -26,6 +26,41 @@ REPLACED = tuple(
 PENDING = frozenset({"lost", "place", "room", "said", "taken", "told"})
 """Replaced terms that some names still use."""
 
+OLD_DOCSTRINGS = {
+    "adapters/builtin.py",
+    "adapters/image.py",
+    "adapters/mapping/conversion.py",
+    "adapters/mapping/functions/reference.py",
+    "adapters/mapping/testing.py",
+    "decode/layout.py",
+    "destinations/server/errors.py",
+    "destinations/server/session.py",
+    "destinations/store/checksum.py",
+    "destinations/store/errors.py",
+    "destinations/store/model.py",
+    "destinations/store/protocols.py",
+    "job/config.py",
+    "job/patterns.py",
+    "job/sections.py",
+    "job/units.py",
+    "job/validation.py",
+    "ontology/columns_file.py",
+    "pipeline/write_buffer.py",
+    "protocol/errors.py",
+    "report/events.py",
+    "report/metrics.py",
+    "report/telemetry.py",
+    "rosbag/definitions/distros_file.py",
+    "rosbag/definitions/hashes.py",
+    "serve/actions.py",
+    "serve/errors.py",
+    "serve/uploads.py",
+    "services/draft.py",
+    "services/replay.py",
+    "services/watch.py",
+}
+"""Modules whose docstrings still start with "This file"."""
+
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
@@ -97,6 +132,25 @@ def test_package_docstrings_have_at_least_two_sentences() -> None:
         path for path in packages if len(re.findall(r"\.(?:\s|$)", ast.get_docstring(tree(path)) or "")) < 2
     ]
     assert not short
+
+
+def docstrings(path: Path) -> Iterator[tuple[str, int]]:
+    """Yield the docstrings of a module, its classes and its functions, with their lines."""
+    for node in ast.walk(tree(path)):
+        if isinstance(node, (ast.Module, ast.ClassDef, *Function.__args__)):
+            docstring = ast.get_docstring(node)
+            if docstring:
+                yield docstring, getattr(node, "lineno", 1)
+
+
+def test_docstrings_do_not_start_with_this_file() -> None:
+    uses = [
+        f"{path.relative_to(ROOT)}:{line}"
+        for path in FILES
+        for docstring, line in docstrings(path)
+        if docstring.startswith("This file") and path.relative_to(PACKAGE).as_posix() not in OLD_DOCSTRINGS
+    ]
+    assert not uses
 
 
 def words(name: str) -> str:
