@@ -32,11 +32,11 @@ __all__ = [
     "RemotePath",
     "RemoteStat",
     "as_path",
-    "check_options",
     "explained",
     "filesystem",
     "is_transient",
     "is_url",
+    "parse_url",
     "reaching",
     "without_options",
 ]
@@ -110,16 +110,6 @@ def _made(root: str, options: str, _process: int) -> FileSystem:
     scheme, _, bucket = root.partition("://")
     make, known = SCHEMES[scheme]
     return make(bucket, _options(root, options, known))
-
-
-def check_options(path: AnyPath) -> None:
-    """Check the options of a URL without opening a connection.
-
-    Raises:
-        IngestError: The URL has an unknown option.
-    """
-    if isinstance(path, RemotePath):
-        _options(path.root, path.options, SCHEMES[path.root.partition("://")[0]][1])
 
 
 def _options(root: str, options: str, known: tuple[str, ...]) -> dict[str, str]:
@@ -408,6 +398,25 @@ def as_path(given: str | Path | RemotePath) -> AnyPath:
             hint="credentials are taken from the environment, the client's configuration or the machine's role",
         )
     return RemotePath(f"{url.scheme}://{url.netloc}", url.path.strip("/"), url.query)
+
+
+_ONE_SLASH = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/(?!/)")
+
+
+def parse_url(text: str) -> AnyPath:
+    """Return the path that a URL in a manifest stands for. In contrast to `as_path`, check the slashes and the options.
+
+    Raises:
+        IngestError: The URL has one slash after its scheme, an unknown scheme or option, no bucket, or a password.
+    """
+    if _ONE_SLASH.match(text):
+        raise IngestError(
+            "the URL has one slash after its scheme", where=text, hint=f"write {text.replace(':/', '://', 1)}"
+        )
+    path = as_path(text)
+    if isinstance(path, RemotePath):
+        _options(path.root, path.options, SCHEMES[path.root.partition("://")[0]][1])
+    return path
 
 
 def _stat(info: FileInfo) -> RemoteStat | None:

@@ -27,7 +27,7 @@ from mosaico_ingest.job.yaml_source import (
     member,
     resolve_plain,
 )
-from mosaico_ingest.remote import AnyPath, as_path, is_url
+from mosaico_ingest.remote import AnyPath, is_url, parse_url
 from mosaico_ingest.textfile import read_limited
 
 __all__ = [
@@ -79,9 +79,13 @@ class LoadedManifest(Struct, frozen=True):
         if not is_url(path):
             return self.resolve(path)
         try:
-            return as_path(path)
+            return parse_url(path)
         except IngestError as err:
-            raise ManifestError(f"{err.where}: {err.what}", where=self.where(*place), hint=err.hint) from err
+            message = f"{err.where}: {err.what}"
+            finding = Finding("wrong-url", Severity.ERROR, message, self.source.span(place), err.hint)
+            raise ManifestError(
+                message, where=self.where(*place), hint=err.hint, findings=(finding,)
+            ) from err
 
 
 def load_manifest(path: Path | str, *, env: Mapping[str, str] | None = os.environ) -> LoadedManifest:

@@ -9,7 +9,7 @@ import pytest
 from made_recordings import define, record
 from typer.testing import CliRunner
 
-from mosaico_ingest.cli.app import command_line
+from mosaico_ingest.cli.app import command_line, main
 from mosaico_ingest.lint.engine import LintReport, lint_paths
 from mosaico_ingest.lint.formats import FORMATS
 
@@ -106,6 +106,36 @@ def test_lint_url_with_credentials_from_variables_reports_no_secret(project: Pat
     file = project / "job.yaml"
     file.write_text(text)
     assert lint_paths([file], env=None).findings == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "rule", "location"),
+    [
+        ("bag: {path: 's3:/bucket/run.mcap'}\n", "wrong-url", "1:13"),
+        ("bag: {path: ['s3://bucket/run.mcap?regoin=x']}\n", "wrong-url", "1:14"),
+        ("bag: {path: run.mcap}\ntarget: {store: 's3:/bucket/x'}\n", "wrong-url", "2:17"),
+        ("bag: {path: run.mcap}\nquarantine: {max: 200%}\n", "wrong-value", "2:19"),
+        ("bag: {path: run.mcap}\nrun: {memory: 1B}\n", "wrong-value", "2:15"),
+    ],
+)
+@pytest.mark.parametrize(("command", "exit_code"), [("lint", 12), ("plan", 2), ("run", 2)])
+def test_invalid_value_is_reported_alike_by_lint_plan_and_run(
+    project: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    text: str,
+    rule: str,
+    location: str,
+    command: str,
+    exit_code: int,
+) -> None:
+    monkeypatch.chdir(project)
+    record(project / "run.mcap", [("/flag", define("std_msgs/msg/Bool", "bool data\n"), 1, {"data": True})])
+    (project / "job.yaml").write_text(text)
+    with pytest.raises(SystemExit) as stopped:
+        main([command, "job.yaml"])
+    assert stopped.value.code == exit_code
+    assert "".join(capsys.readouterr()).startswith(f"job.yaml:{location}: error[{rule}]")
 
 
 @pytest.mark.parametrize(

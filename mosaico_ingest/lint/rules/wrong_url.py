@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.findings import has_credentials
 from mosaico_ingest.lint.job import Job, manifest_paths
 from mosaico_ingest.lint.rule import Check, Problem
-from mosaico_ingest.remote import as_path, check_options, is_url
+from mosaico_ingest.remote import is_url, parse_url
 
 _URL_KEYS = frozenset({("bag", "path"), ("target", "store")})
 """The key paths that accept URLs."""
-_ONE_SLASH = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/(?!/)")
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -25,13 +23,9 @@ def check(job: Job) -> Iterator[Problem]:
         if path[:2] not in _URL_KEYS:
             message = f"{'.'.join(map(str, path))} is a URL, but only recordings and stores can be URLs"
             yield Problem(message, span, "name a local file")
-        elif _ONE_SLASH.match(text):
-            yield Problem(
-                f"{text} has one slash after its scheme", span, f"write {text.replace(':/', '://', 1)}"
-            )
         else:
             try:
-                check_options(as_path(text))
+                parse_url(text)
             except IngestError as error:
                 yield Problem(f"{error.where}: {error.what}", span, error.hint or "")
 
