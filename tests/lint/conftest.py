@@ -1,4 +1,4 @@
-"""A project folder with every file that the examples of the rules speak of."""
+"""A project folder with the files that the examples of the rule pages name."""
 
 from __future__ import annotations
 

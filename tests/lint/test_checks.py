@@ -118,24 +118,17 @@ def test_lint_url_with_credentials_from_variables_reports_no_secret(project: Pat
         ("bag: {path: run.mcap}\nrun: {memory: 1B}\n", "wrong-value", "2:15"),
     ],
 )
-@pytest.mark.parametrize(("command", "exit_code"), [("lint", 12), ("plan", 2), ("run", 2)])
 def test_invalid_value_is_reported_alike_by_lint_plan_and_run(
-    project: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    text: str,
-    rule: str,
-    location: str,
-    command: str,
-    exit_code: int,
+    project: Path, capsys: pytest.CaptureFixture[str], text: str, rule: str, location: str
 ) -> None:
-    monkeypatch.chdir(project)
     record(project / "run.mcap", [("/flag", define("std_msgs/msg/Bool", "bool data\n"), 1, {"data": True})])
-    (project / "job.yaml").write_text(text)
-    with pytest.raises(SystemExit) as stopped:
-        main([command, "job.yaml"])
-    assert stopped.value.code == exit_code
-    assert "".join(capsys.readouterr()).startswith(f"job.yaml:{location}: error[{rule}]")
+    job = project / "job.yaml"
+    job.write_text(text)
+    for command, exit_code in (("lint", 12), ("plan", 2), ("run", 2)):
+        with pytest.raises(SystemExit) as stopped:
+            main([command, str(job)])
+        assert stopped.value.code == exit_code
+        assert "".join(capsys.readouterr()).startswith(f"{job}:{location}: error[{rule}]")
 
 
 @pytest.mark.parametrize(

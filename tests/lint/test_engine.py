@@ -1,4 +1,4 @@
-"""Files and folders are judged whole: comments, settings, Markdown, fixes, and nothing is ever a traceback."""
+"""The lint engine: files, folders, standard input, comments, settings, Markdown pages and fixes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ GOOD = "bag: {path: data/run.mcap}\n"
 TRAP = "bag: {path: data/run.mcap}\nsequence: {metadata: {a: on}}\n"
 
 
-def judged(project: Path, text: str | bytes, name: str = "job.yaml", *, fix: bool = False) -> LintReport:
+def lint(project: Path, text: str | bytes, name: str = "job.yaml", *, fix: bool = False) -> LintReport:
     file = project / name
     file.write_bytes(text if isinstance(text, bytes) else text.encode())
     report = lint_paths([file], env={}, fix=fix)
@@ -35,8 +35,8 @@ def rules(report: LintReport) -> list[str]:
     return [finding.rule for finding in report.findings]
 
 
-def test_a_clean_file_is_zero(project: Path) -> None:
-    assert judged(project, GOOD).exit_code == 0
+def test_lint_paths_without_findings_exits_with_0(project: Path) -> None:
+    assert lint(project, GOOD).exit_code == 0
 
 
 @pytest.mark.parametrize(
@@ -47,16 +47,16 @@ def test_a_clean_file_is_zero(project: Path) -> None:
         ("bag: {path: data/run.mcap}\nrun: {jobs: 2}\n", 10),
     ],
 )
-def test_the_worst_severity_is_the_exit_code(project: Path, text: str, code: int) -> None:
-    assert judged(project, text).exit_code == code
+def test_lint_paths_exit_code_follows_worst_severity(project: Path, text: str, code: int) -> None:
+    assert lint(project, text).exit_code == code
 
 
-def test_nothing_to_judge_has_its_own_code(tmp_path: Path) -> None:
+def test_lint_paths_without_documents_exits_with_3(tmp_path: Path) -> None:
     (tmp_path / "compose.yaml").write_text("services: {}\n")
     assert lint_paths([tmp_path], env={}).exit_code == 3
 
 
-def test_a_folder_is_judged_with_all_that_is_ours_below_it(project: Path) -> None:
+def test_lint_paths_folder_checks_all_documents_below_it(project: Path) -> None:
     (project / "deep").mkdir()
     (project / "deep" / "job.yml").write_text(TRAP)
     (project / "deep" / "other.yaml").write_text("services: {a: on}\n")
@@ -73,7 +73,7 @@ def test_a_folder_is_judged_with_all_that_is_ours_below_it(project: Path) -> Non
     assert rules(report) == ["yaml-boolean"]
 
 
-def test_standard_input_is_a_job() -> None:
+def test_lint_paths_dash_checks_standard_input() -> None:
     report = lint_paths(["-"], env={}, stdin=TRAP)
     assert str(report.findings[0].span) == "-:2:26"
 
@@ -87,39 +87,41 @@ def test_standard_input_is_a_job() -> None:
         (b"- a", "not-a-mapping"),
     ],
 )
-def test_a_file_that_is_no_manifest_is_a_finding(project: Path, content: bytes, rule: str) -> None:
-    assert rules(judged(project, content)) == [rule]
+def test_lint_paths_named_file_that_is_not_a_manifest_reports_it(
+    project: Path, content: bytes, rule: str
+) -> None:
+    assert rules(lint(project, content)) == [rule]
 
 
-def test_a_file_that_is_not_there_is_a_finding(tmp_path: Path) -> None:
+def test_lint_paths_missing_file_reports_unreadable_file(tmp_path: Path) -> None:
     assert rules(lint_paths([tmp_path / "job.yaml"], env={})) == ["unreadable-file"]
 
 
-def test_what_the_model_refuses_does_not_hide_what_the_rules_find(project: Path) -> None:
+def test_lint_invalid_values_do_not_hide_other_findings(project: Path) -> None:
     text = """
 bag: {path: [data/a.mcap, 5], ros_distro: humble, typo: 1}
 sequence: {name: a b}
 topics: [/a, /camera/.*]
 run: {jobs: many}
 """
-    assert rules(judged(project, text)) == [
+    assert rules(lint(project, text)) == [
         "wrong-type", "wrong-value", "unknown-key", "sequence-name", "topic-pattern", "wrong-type",
     ]  # fmt: skip
 
 
-def test_a_missing_recording_does_not_hide_the_rest(project: Path) -> None:
-    assert rules(judged(project, "sequence: {name: a b}\n")) == ["missing-key", "sequence-name"]
+def test_lint_missing_bag_does_not_hide_other_findings(project: Path) -> None:
+    assert rules(lint(project, "sequence: {name: a b}\n")) == ["missing-key", "sequence-name"]
 
 
 @pytest.mark.parametrize("word", ["yaml-boolean", "ING007"])
-def test_a_comment_silences_a_rule_on_its_line(project: Path, word: str) -> None:
+def test_ignore_comment_suppresses_rule_on_its_line(project: Path, word: str) -> None:
     text = f"bag: {{path: data/run.mcap}}\nsequence: {{metadata: {{a: on}}}}  # ingest: ignore[{word}]\n"
-    assert rules(judged(project, text)) == []
+    assert rules(lint(project, text)) == []
 
 
-def test_a_comment_alone_on_a_line_is_about_the_next(project: Path) -> None:
+def test_ignore_comment_alone_on_line_suppresses_rule_on_next_line(project: Path) -> None:
     text = "bag: {path: data/run.mcap}\n# ingest: ignore[yaml-boolean]\nsequence: {metadata: {a: on}}\n"
-    assert rules(judged(project, text)) == []
+    assert rules(lint(project, text)) == []
 
 
 @pytest.mark.parametrize(
@@ -136,21 +138,21 @@ def test_a_comment_alone_on_a_line_is_about_the_next(project: Path) -> None:
 def test_ignore_comment_without_known_lint_rule_is_reported(
     project: Path, comment: str, start: int, end: int
 ) -> None:
-    (finding,) = judged(project, f"bag: {{path: data/run.mcap}}{comment}\n").findings
+    (finding,) = lint(project, f"bag: {{path: data/run.mcap}}{comment}\n").findings
     assert finding.rule == "unknown-rule"
     assert finding.span is not None
     assert (finding.span.column, finding.span.end_column) == (start, end)
 
 
-def test_other_comments_to_the_tool_are_no_findings(project: Path) -> None:
-    assert rules(judged(project, f"# ingest: nightly run\n{GOOD}")) == []
+def test_comment_without_ignore_is_not_reported(project: Path) -> None:
+    assert rules(lint(project, f"# ingest: nightly run\n{GOOD}")) == []
 
 
-def test_a_comment_for_the_file_is_about_all_of_it(project: Path) -> None:
-    assert rules(judged(project, f"# ingest: ignore-file[yaml-boolean]\n{TRAP}")) == []
+def test_ignore_file_comment_suppresses_rule_in_entire_file(project: Path) -> None:
+    assert rules(lint(project, f"# ingest: ignore-file[yaml-boolean]\n{TRAP}")) == []
 
 
-def test_settings_change_severities_and_leave_files_out(project: Path) -> None:
+def test_settings_change_severities_and_exclude_files(project: Path) -> None:
     (project / ".ingest.yaml").write_text(
         "lint:\n  severity: {ING007: 'off', idle-jobs: error}\n  exclude: [old/*]\n"
     )
@@ -161,32 +163,32 @@ def test_settings_change_severities_and_leave_files_out(project: Path) -> None:
     assert [(finding.rule, finding.severity.value) for finding in report.findings] == [("idle-jobs", "error")]
 
 
-def test_settings_may_stand_in_pyproject(project: Path) -> None:
+def test_settings_in_pyproject_apply(project: Path) -> None:
     (project / "pyproject.toml").write_text('[tool.ingest.lint]\nseverity = {yaml-boolean = "info"}\n')
-    assert judged(project, TRAP).exit_code == 10
+    assert lint(project, TRAP).exit_code == 10
 
 
 @pytest.mark.parametrize(
     "text",
     ["lint: {severity: {yaml-bolean: info}}", "lint: {severity: {ING007: loud}}", "lnt: {}", "lint: ["],
 )
-def test_settings_that_mean_nothing_are_refused(project: Path, text: str) -> None:
+def test_invalid_settings_raise_manifest_error(project: Path, text: str) -> None:
     (project / ".ingest.yaml").write_text(text)
     with pytest.raises(ManifestError):
-        judged(project, GOOD)
+        lint(project, GOOD)
 
 
-def test_yaml_blocks_of_a_page_are_judged_at_their_place(project: Path) -> None:
+def test_lint_markdown_reports_findings_at_lines_of_page(project: Path) -> None:
     page = f"# Title\n\n```yaml\n{TRAP}```\n\n```yaml\nservices: on\n```\n\n```text\nbag: on\n```\n"
-    report = judged(project, page, "page.md")
+    report = lint(project, page, "page.md")
     assert [(finding.rule, finding.span and finding.span.line) for finding in report.findings] == [
         ("yaml-boolean", 5)
     ]
 
 
-def test_an_example_on_a_page_needs_no_files(project: Path) -> None:
+def test_lint_markdown_example_may_name_missing_files(project: Path) -> None:
     page = "```yaml\nbag: {path: data/run.mcap}\nadapters: {load: [nowhere.yaml, x.y:Z]}\n```\n"
-    assert rules(judged(project, page, "page.md")) == []
+    assert rules(lint(project, page, "page.md")) == []
 
 
 BROKEN = """\
@@ -199,7 +201,7 @@ Sequence:
 topics: [/cam/*, !/cam/debug,   */image]
 run: {jobs: "2"}
 """
-MENDED = """\
+FIXED = """\
 # A comment stays.
 bag:
     path:   data/run.mcap   # and so does this
@@ -211,25 +213,25 @@ run: {jobs: 2}
 """
 
 
-def test_a_fix_keeps_comments_and_layout_and_is_made_once(project: Path) -> None:
-    report = judged(project, BROKEN, fix=True)
-    assert (project / "job.yaml").read_text() == MENDED
-    assert report.exit_code == 10  # idle-jobs, which nobody can mend
+def test_fix_keeps_comments_and_layout_and_applies_once(project: Path) -> None:
+    report = lint(project, BROKEN, fix=True)
+    assert (project / "job.yaml").read_text() == FIXED
+    assert report.exit_code == 10  # idle-jobs has no fix
     assert report.files[0].fixed == 6
     assert lint_paths([project / "job.yaml"], env={}, fix=True).files[0].fixed == 0
 
 
-def test_a_fix_keeps_the_ends_of_lines(project: Path) -> None:
-    judged(project, BROKEN.replace("\n", "\r\n"), fix=True)
-    assert (project / "job.yaml").read_bytes() == MENDED.replace("\n", "\r\n").encode()
+def test_fix_keeps_line_ends(project: Path) -> None:
+    lint(project, BROKEN.replace("\n", "\r\n"), fix=True)
+    assert (project / "job.yaml").read_bytes() == FIXED.replace("\n", "\r\n").encode()
 
 
-def test_a_byte_order_mark_does_not_shift_a_fix(project: Path) -> None:
-    judged(project, "\ufeffbag: {path: 5}\n", fix=True)
+def test_fix_with_byte_order_mark_edits_correct_columns(project: Path) -> None:
+    lint(project, "\ufeffbag: {path: 5}\n", fix=True)
     assert (project / "job.yaml").read_text() == 'bag: {path: "5"}\n'
 
 
-def test_an_adapter_may_use_one_in_a_file_beside_it(project: Path) -> None:
+def test_lint_adapter_finds_used_adapter_in_same_folder(project: Path) -> None:
     text = """\
 version: 1
 adapter: StampedPackAdapter
@@ -239,12 +241,12 @@ fields:
   value: temperature
   header: {use: %s, of: header}
 """
-    assert rules(judged(project, text % "HeaderAdapter", "adapters/other.yaml")) == []
-    assert rules(judged(project, text % "NoAdapter", "adapters/other.yaml")) == ["unknown-adapter"]
-    assert rules(judged(project, text % "PackAdapter", "adapters/other.yaml")) == ["type-mismatch"]
+    assert rules(lint(project, text % "HeaderAdapter", "adapters/other.yaml")) == []
+    assert rules(lint(project, text % "NoAdapter", "adapters/other.yaml")) == ["unknown-adapter"]
+    assert rules(lint(project, text % "PackAdapter", "adapters/other.yaml")) == ["type-mismatch"]
 
 
-def test_the_text_of_a_definition_is_that_of_the_first_type(project: Path) -> None:
+def test_lint_adapter_definition_applies_to_first_type_only(project: Path) -> None:
     text = """\
 version: 1
 adapter: TwoTypesAdapter
@@ -253,13 +255,13 @@ ontology: Temperature
 fields: {value: degrees}
 definition: float64 degrees
 """
-    found = judged(project, text, "adapters/two.yaml")
+    report = lint(project, text, "adapters/two.yaml")
     assert rules(found) == ["unknown-field"]
     assert "sensor_msgs/msg/Temperature" in found.findings[0].message
 
 
-def test_without_fix_nothing_is_written(project: Path) -> None:
-    judged(project, BROKEN)
+def test_lint_without_fix_does_not_change_files(project: Path) -> None:
+    lint(project, BROKEN)
     assert (project / "job.yaml").read_text() == BROKEN
 
 
@@ -307,24 +309,24 @@ JOBS = st.fixed_dictionaries(
 
 @settings(max_examples=80, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(job=JOBS, style=st.sampled_from([None, True, False]))
-def test_whatever_lints_clean_compiles_and_nothing_is_a_traceback(
+def test_manifest_without_errors_compiles(
     project: Path, job: object, style: Literal[True, False] | None
 ) -> None:
     (project / "data" / "run.mcap").touch()
-    report = judged(project, yaml.safe_dump(job, default_flow_style=style))
+    report = lint(project, yaml.safe_dump(job, default_flow_style=style))
     if report.exit_code < 12:
-        with suppress(NothingMatched):  # the recording is not the linter's business
+        with suppress(NothingMatched):  # lint does not open recordings
             assert compile_manifest(load_manifest(project / "job.yaml", env={}))
 
 
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(text=st.text(alphabet="abg:-[]{}!*&#|>'\"%@`,?\t\n 01.~$_<é", max_size=80))
-def test_any_text_is_judged(project: Path, text: str) -> None:
-    judged(project, f"bag: {{path: data/run.mcap}}\n{text}")
+def test_lint_arbitrary_text_reports_registered_rules_only(project: Path, text: str) -> None:
+    lint(project, f"bag: {{path: data/run.mcap}}\n{text}")
 
 
 @pytest.mark.slow
-def test_five_hundred_manifests_are_judged_in_five_seconds(tmp_path: Path) -> None:
+def test_lint_500_manifests_takes_less_than_5_seconds(tmp_path: Path) -> None:
     example = (Path(__file__).parents[1] / "job" / "test_load.py").read_text()
     text = example.split('FULL = """\\\n')[1].split('"""')[0]
     for number in range(500):
@@ -335,7 +337,7 @@ def test_five_hundred_manifests_are_judged_in_five_seconds(tmp_path: Path) -> No
     assert time.perf_counter() - start < 5
 
 
-def test_the_environment_is_looked_at_only_if_given(project: Path) -> None:
+def test_lint_without_environment_does_not_report_unset_variables(project: Path) -> None:
     file = project / "job.yaml"
     file.write_text("bag: {path: '${NOT_SET_ANYWHERE}'}\n")
     assert rules(lint_paths([file], env=os.environ)) == ["unset-variable"]

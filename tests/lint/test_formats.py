@@ -1,4 +1,4 @@
-"""Findings are written for machines in forms those machines read."""
+"""The output formats of lint for other tools."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def report(project: Path) -> LintReport:
     return lint_paths([project / "job.yaml", project / "clean.yaml"], env={})
 
 
-def test_json_has_every_place(report: LintReport) -> None:
+def test_json_format_contains_location_and_fix_of_each_finding(report: LintReport) -> None:
     document = json.loads(FORMATS["json"](report))
     assert document["version"] == 1
     assert [Path(file["file"]).name for file in document["files"]] == ["clean.yaml", "job.yaml"]
@@ -36,7 +36,7 @@ def test_json_has_every_place(report: LintReport) -> None:
     assert document["findings"][1]["fix"] == {"text": '"!/x"'}
 
 
-def test_sarif_names_rules_places_and_fixes(report: LintReport) -> None:
+def test_sarif_format_contains_rules_locations_and_fixes(report: LintReport) -> None:
     document = json.loads(FORMATS["sarif"](report))
     assert document["version"] == "2.1.0"
     (run,) = document["runs"]
@@ -49,17 +49,17 @@ def test_sarif_names_rules_places_and_fixes(report: LintReport) -> None:
     assert change["replacements"] == [{"deletedRegion": region, "insertedContent": {"text": '"!/x"'}}]
 
 
-def test_github_annotates_lines(report: LintReport) -> None:
+def test_github_format_prints_one_command_per_finding(report: LintReport) -> None:
     first, *_ = FORMATS["github"](report).splitlines()
     assert first.startswith("::error file=")
     assert ",line=2,col=26,endLine=2,endColumn=28,title=yaml-boolean::on is a boolean" in first
 
 
-def test_junit_counts_failures(report: LintReport) -> None:
+def test_junit_format_counts_failures_per_file(report: LintReport) -> None:
     root = ET.fromstring(FORMATS["junit"](report))  # noqa: S314 - our own text
     assert [(suite.get("tests"), suite.get("failures")) for suite in root] == [("1", "0"), ("3", "3")]
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_an_empty_report_is_a_document_too(name: str) -> None:
+def test_formats_render_empty_report(name: str) -> None:
     assert isinstance(FORMATS[name](LintReport(())), str)

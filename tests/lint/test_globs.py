@@ -1,4 +1,4 @@
-"""Two globs are compared without any topic, and never wrongly."""
+"""`covers` compares two globs without topics and never claims too much."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ NAMES = st.text(alphabet="/ab", max_size=8)
         ("/a/[bc]", "/a/b", True),
     ],
 )
-def test_a_glob_that_contains_another_is_known(general: str, special: str, expected: bool) -> None:  # noqa: FBT001
+def test_covers_decides_known_pairs(general: str, special: str, expected: bool) -> None:  # noqa: FBT001
     assert covers(general, special) is expected
 
 
 @given(PATTERNS, PATTERNS, NAMES)
-def test_what_covers_matches_whatever_the_other_matches(general: str, special: str, name: str) -> None:
+def test_covering_glob_matches_every_name_of_covered_glob(general: str, special: str, name: str) -> None:
     if covers(general, special) and fnmatchcase(name, special):
         assert fnmatchcase(name, general)

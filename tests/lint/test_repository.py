@@ -1,4 +1,4 @@
-"""Everything of ours in this repository is clean, and what others use to call the linter fits it."""
+"""The documents of this repository have no findings, and the integrations of lint fit its output."""
 
 from __future__ import annotations
 
@@ -16,30 +16,31 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("path", ["configs", "docs", "README.md"])
-def test_every_configuration_and_every_yaml_block_is_clean(path: str) -> None:
+def test_files_of_repository_have_no_findings(path: str) -> None:
     assert [str(finding) for finding in lint_paths([ROOT / path], env=None).findings] == []
 
 
 @pytest.mark.slow
-def test_every_adapter_of_the_catalog_is_clean() -> None:
+def test_catalog_has_no_findings() -> None:
     catalog = ROOT / "mosaico_ingest" / "adapters" / "catalog"
     report = lint_paths([catalog], env=None)
     assert [str(finding) for finding in report.findings] == []
     assert len(report.files) == len(list(catalog.glob("*.yaml")))
 
 
-def test_the_problem_matcher_reads_what_is_printed() -> None:
+def test_problem_matcher_parses_printed_finding() -> None:
     matcher = json.loads((ROOT / ".github" / "problem-matcher.json").read_text())
     (pattern,) = matcher["problemMatcher"][0]["pattern"]
     line = str(Finding("yaml-tag", Severity.WARNING, "the message", Span("a/job.yaml", 3, 5, 3, 9)))
-    found = re.fullmatch(pattern["regexp"], line)
-    assert found is not None
-    assert [found[pattern[key]] for key in ("file", "line", "column", "severity", "code", "message")] == [
+    match = re.fullmatch(pattern["regexp"], line)
+    assert match is not None
+    assert [match[pattern[key]] for key in ("file", "line", "column", "severity", "code", "message")] == [
         "a/job.yaml", "3", "5", "warning", "yaml-tag", "the message",
     ]  # fmt: skip
 
 
-def test_the_hook_calls_the_linter() -> None:
+def test_pre_commit_hook_runs_lint_for_its_files() -> None:
     (hook,) = yaml.safe_load((ROOT / ".pre-commit-hooks.yaml").read_text())
     assert hook["entry"].split()[:2] == ["ingest", "lint"]
-    assert re.search(hook["files"], "configs/quickstart.yaml")
+    for name in ("configs/quickstart.yaml", "job.yml", "job.json", "msgs/Pack.msg", "docs/ci.md"):
+        assert re.search(hook["files"], name)
