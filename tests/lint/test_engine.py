@@ -256,8 +256,8 @@ fields: {value: degrees}
 definition: float64 degrees
 """
     report = lint(project, text, "adapters/two.yaml")
-    assert rules(found) == ["unknown-field"]
-    assert "sensor_msgs/msg/Temperature" in found.findings[0].message
+    assert rules(report) == ["unknown-field"]
+    assert "sensor_msgs/msg/Temperature" in report.findings[0].message
 
 
 def test_lint_without_fix_does_not_change_files(project: Path) -> None:
