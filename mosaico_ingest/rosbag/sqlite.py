@@ -1,4 +1,13 @@
-"""The reader of rosbag2's SQLite files (`.db3`), intact or damaged."""
+"""The reader of rosbag2's SQLite files (`.db3`), intact or damaged.
+
+SQLite has no checksums, and a damaged file often yields fewer rows without an error. Three independent numbers reveal
+most of these cases: the rows of the table, the entries of the index on the timestamp, and the range of the row ids. If
+they disagree, `PRAGMA quick_check` decides whether the file is damaged or rows were deleted.
+
+* An intact file is read by timestamp. Afterwards the rows are compared with the counts.
+* A damaged file, and the remainder of a file whose read fails or ends early, is read by row id (`RowScan`), which steps
+  over unreadable pages. Rows that are still missing become an unreadable range.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +15,9 @@ import os
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,108 +43,23 @@ from mosaico_ingest.rosbag.blocks import (
 )
 from mosaico_ingest.rosbag.definitions.model import Embedded
 
-__all__ = [
-    "BROKEN",
-    "Row",
-    "Salvage",
-    "SqliteReader",
-]
+__all__ = ["DAMAGE", "Row", "RowScan", "SqliteReader"]
 
-BROKEN = (sqlite3.Error, UnicodeDecodeError)
-"""How damage shows; the second, where SQLite's message quotes a name that is damaged."""
+DAMAGE = (sqlite3.Error, UnicodeDecodeError, MemoryError, OverflowError)
+"""Exceptions that damage causes: damaged names in SQLite's messages, and damaged sizes, have no exception of their own."""
 
-Row = tuple[int, int, int, Any]
-"""Row id, topic id, time stamp, payload; what SQLite keeps in the last column need not be bytes."""
-_LAST_ROWID = 2**63 - 1
-
-
-@dataclass(slots=True)
-class Salvage:
-    """Rows by row id instead of by time; what had to be stepped over is in `unreadable`."""
-
-    database: sqlite3.Connection
-    unreadable: list[UnreadableRange] = field(default_factory=list[UnreadableRange])
-
-    def rows(self) -> Iterator[Row]:
-        """Yield every row that can be read."""
-        at = 0
-        while True:
-            try:
-                for row in self._from(at):
-                    at = max(at, row[0] + 1)
-                    yield row
-            except BROKEN as err:  # noqa: PERF203 - each stretch may end in damage of its own
-                found = self._next_row(at)
-                upto = "the end" if found is None else f"row {found[0]}"
-                if found is None or found[0] > at:
-                    self.unreadable.append(UnreadableRange(at, f"{err}: rows are missing before {upto}"))
-                if found is None:
-                    return
-                yield found  # by itself: where the row behind it is damaged, a query for both may give neither
-                at = found[0] + 1
-            else:
-                return
-
-    def _from(self, rowid: int, limit: int = -1) -> Iterator[Row]:
-        query = (
-            "SELECT rowid, topic_id, timestamp, data FROM messages NOT INDEXED "
-            "WHERE rowid >= ? ORDER BY rowid LIMIT ?"
-        )
-        yield from self.database.execute(query, (rowid, limit))
-
-    def _next_row(self, broken: int) -> Row | None:
-        """Return the first row from `broken` on that can be read, None without any: by doubling steps, then halving."""
-        step, low, high = 1, broken - 1, broken
-        while not self._is_readable(high):
-            low, high, step = high, high + step, step * 2
-            if high > _LAST_ROWID:
-                return None
-        while high - low > 1:
-            middle = (low + high) // 2
-            low, high = (low, middle) if self._is_readable(middle) else (middle, high)
-        found = next(self._from(high, 1), None)
-        return found if found is not None and found[0] >= broken else None
-
-    def _is_readable(self, rowid: int) -> bool:
-        try:
-            list(self._from(rowid, 1))
-        except BROKEN:
-            return False
-        return True
-
-
-_PAGE_ROWS = 1 << 16
-_EVENT = "_Event"
-"""The type of a service's events; its definition is that of the service, under the service's name."""
+Row = tuple[Any, Any, Any, Any]
+"""Row id, topic id, timestamp, payload. SQLite stores values of any type in any column, so each row is checked."""
 _ROW_TYPES = [int, int, int, bytes]
-
-
-class _Done(Struct, frozen=True):
-    """How far reading by time has come: up to `time_ns`, and of that very time these rows."""
-
-    time_ns: int
-    rows: set[int]
-
-    def after(self, page: list[Row]) -> _Done:
-        """Return the state with one more page."""
-        last = int(page[-1][2])
-        rows = {row[0] for row in page if row[2] == last}
-        return _Done(last, rows | self.rows if last == self.time_ns else rows)
-
-    def leaves(self, row: Row) -> bool:
-        """Return whether the row has not been read."""
-        return row[2] > self.time_ns or (row[2] == self.time_ns and row[0] not in self.rows)
-
-
-class _Columns(Struct, frozen=True):
-    """What the tables of this file have; rosbag2 added columns and tables over the years."""
-
-    topics: frozenset[str]
-    has_definitions: bool
+_MAX_ROWID = 2**63 - 1
+_MAX_PAGE_ROWS = 1 << 16
+_MAX_BITMAP_ROWS = 1 << 28
+_EVENT = "_Event"
+"""Suffix of the type of service events; their definition is stored under the name of the service."""
 
 
 class SqliteReader:
-    """One `.db3` file."""
+    """The reader of one `.db3` file."""
 
     container = "sqlite3"
 
@@ -145,80 +69,116 @@ class SqliteReader:
         self.notes: list[str] = []
         self._stack = ExitStack()
         try:
-            self._database = _open(path, self._stack, self.notes)
-            self._columns = _columns(self._database)
-            self._counts = self._read_counts()
+            self._database = _open_database(path, self._stack, self.notes)
+            self._columns = _read_columns(self._database)
+            self._totals = _read_totals(self._database)
+            self._counts = self._totals.by_topic if self._totals.damage is None else None
             self.connections: tuple[SplitConnection, ...] = self._read_connections()
-            self.message_count: int | None = None if self._counts is None else sum(self._counts.values())
-            self.unreadable.extend(
-                undescribed_connections(self._counts, {connection.id for connection in self.connections})
-            )
-            self.start_ns, self.end_ns = self._read_bounds()
-        except (*BROKEN, OSError, TypeError, ValueError) as err:
+            self.start_ns, self.end_ns = self._read_time_bounds()
+        except (*DAMAGE, OSError, TypeError, ValueError) as err:
             self._stack.close()
             raise BagError(f"the SQLite file cannot be read: {err}", where=str(self.path)) from err
         except BaseException:
             self._stack.close()
             raise
+        self.message_count: int | None = None if self._counts is None else self._totals.table_rows
+        described = {connection.id for connection in self.connections}
+        self.unreadable += undescribed_connections(self._counts, described)
+        if self._counts is not None and self._totals.untyped_rows:
+            reason = f"{self._totals.untyped_rows} rows whose topic id is not an integer"
+            self.unreadable.append(UnreadableRange(0, reason, count=self._totals.untyped_rows))
 
     def read_tasks(self, request: ReadRequest) -> Iterator[ReadTask]:
-        """Yield pages of rows by time stamp; where a page of the file is damaged, what can still be found."""
-        keys = ",".join(str(int(key)) for key in request.connections)
-        query = (
-            "SELECT rowid, topic_id, timestamp, data FROM messages "  # noqa: S608 - the keys are numbers
-            f"WHERE topic_id IN ({keys}) AND timestamp BETWEEN ? AND ? ORDER BY timestamp"
-        )
-        bounds = (max(request.start_ns, EARLIEST_NS), min(request.end_ns - 1, LATEST_NS))
-        done = _Done(bounds[0], set())
-        try:
-            for page in _pages(self._database.execute(query, bounds), request):
-                done = done.after(page)
-                yield ReadTask(int(page[0][2]), partial(_load, page))
-        except BROKEN as err:
-            yield from self._salvaged(request, done, str(err))
-
-    def _salvaged(self, request: ReadRequest, done: _Done, reason: str) -> Iterator[ReadTask]:
-        """Yield the rows that reading by time did not reach, in whatever order they are."""
-        salvage = Salvage(self._database)
-        wanted = (
-            row
-            for row in salvage.rows()
-            if row[1] in request.connections and row[2] < request.end_ns and done.leaves(row)
-        )
-        for page in _pages(wanted, request):
-            yield ReadTask(done.time_ns, partial(_load, page))
-        unreadable = salvage.unreadable or [
-            UnreadableRange(0, f"{reason}; every row could be read in another way", count=0)
-        ]
-        yield ReadTask(done.time_ns, lambda: ReadResult([], unreadable))
+        """Yield pages of rows by timestamp; in case of damage, the remaining rows by row id."""
+        rows_read = _RowSet(self._totals.first_rowid, self._totals.last_rowid)
+        damage = self._totals.damage
+        last_ns = EARLIEST_NS
+        if damage is None:
+            bounds = (max(request.start_ns, EARLIEST_NS), min(request.end_ns - 1, LATEST_NS))
+            try:
+                for page in _pages(self._database.execute(_query(request), bounds), request):
+                    rows = rows_read.add(page)
+                    last_ns = max(last_ns, _first_time(rows, default=last_ns))
+                    yield ReadTask(_first_time(rows, default=last_ns), partial(_load, rows))
+            except DAMAGE as err:
+                damage = str(err)
+            else:
+                if not any(self._missing_rows(request, rows_read).values()):
+                    return
+                damage = "the index on the timestamp is damaged"
+        yield from self._remaining_tasks(request, rows_read, damage, last_ns)
 
     def check_unchanged(self) -> None:
         """Do nothing; see `FileSource.check_unchanged`."""
 
     def close(self) -> None:
-        """Close the file, and remove the copy, if there had to be one."""
+        """Close the file, and remove a temporary copy."""
         self._stack.close()
+
+    def _remaining_tasks(
+        self, request: ReadRequest, rows_read: _RowSet, damage: str, last_ns: int
+    ) -> Iterator[ReadTask]:
+        """Yield the rows that have not been read, by row id, and the unreadable ranges."""
+        scan = RowScan(self._database)
+        remaining = (row for row in scan.rows() if _is_requested(row, request))
+        for page in _pages(remaining, request):
+            rows = rows_read.add(page)
+            if rows:
+                yield ReadTask(last_ns, partial(_load, rows))
+        unreadable = self._unreadable_rows(request, rows_read, scan, damage)
+        yield ReadTask(last_ns, lambda: ReadResult([], unreadable))
+
+    def _unreadable_rows(
+        self, request: ReadRequest, rows_read: _RowSet, scan: RowScan, damage: str
+    ) -> list[UnreadableRange]:
+        """Return the missing rows: per connection if the counts are reliable, else in total or per gap."""
+        if self._counts is not None and _is_unlimited(request):
+            offset = scan.gaps[0].offset if scan.gaps else 0
+            missing = [
+                UnreadableRange(offset, f"{damage}: {count} rows are missing", connection=key, count=count)
+                for key, count in self._missing_rows(request, rows_read).items()
+                if count > 0
+            ]
+            return missing or [UnreadableRange(0, f"{damage}; all rows could be read by row id", count=0)]
+        if scan.gaps:
+            return scan.gaps
+        totals = self._totals
+        if totals.damage is None:
+            return [UnreadableRange(0, f"{damage}; all rows could be read by row id", count=0)]
+        if totals.index_rows is None or totals.table_rows is None:
+            return [UnreadableRange(0, f"{damage}: an unknown number of rows is missing")]
+        is_complete = len(scan.rowids) >= max(totals.index_rows, totals.table_rows, totals.rowid_range)
+        if is_complete:
+            return [UnreadableRange(0, f"{damage}; all rows could be read by row id", count=0)]
+        return [UnreadableRange(0, f"{damage}: an unknown number of rows is missing")]
+
+    def _missing_rows(self, request: ReadRequest, rows_read: _RowSet) -> dict[int, int]:
+        """Return the number of missing rows by topic; empty if the request is limited in time."""
+        if self._counts is None or not _is_unlimited(request):
+            return {}
+        return {
+            key: self._counts.get(key, 0) - rows_read.by_topic[key] for key in sorted(request.connections)
+        }
 
     def _read_connections(self) -> tuple[SplitConnection, ...]:
         definitions = self._read_definitions()
-        names = [
+        names = (
             "id",
             "name",
             "type",
             "serialization_format",
             "offered_qos_profiles",
             "type_description_hash",
-        ]
+        )
         present = [name for name in names if name in self._columns.topics]
         rows = self._database.execute(f"SELECT {','.join(present)} FROM topics ORDER BY id")  # noqa: S608 - constants
-        return tuple(_stream(dict(zip(present, row, strict=True)), self._counts, definitions) for row in rows)
-
-    def _read_counts(self) -> dict[int, int] | None:
-        try:
-            return dict(self._database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
-        except BROKEN as err:
-            self.notes.append(f"the messages cannot be counted: {err}")
-            return None
+        topics = [dict(zip(present, row, strict=True)) for row in rows]
+        invalid = [topic for topic in topics if not isinstance(topic["id"], int)]
+        if invalid:
+            reason = f"{len(invalid)} rows of the table `topics` have no integer id"
+            self.unreadable.append(UnreadableRange(0, reason))
+        by_id = {topic["id"]: topic for topic in topics if isinstance(topic["id"], int)}
+        return tuple(_connection(topic, self._counts, definitions) for topic in by_id.values())
 
     def _read_definitions(self) -> dict[str, Embedded]:
         if not self._columns.has_definitions:
@@ -229,35 +189,202 @@ class SqliteReader:
             for name, encoding, text in self._database.execute(query)
         }
 
-    def _read_bounds(self) -> tuple[int | None, int | None]:
+    def _read_time_bounds(self) -> tuple[int | None, int | None]:
         try:
-            return self._database.execute("SELECT min(timestamp), max(timestamp) FROM messages").fetchone()
-        except BROKEN as err:
-            self.notes.append(f"the first and last time stamps cannot be read: {err}")
+            first, last = self._database.execute(
+                "SELECT min(timestamp), max(timestamp) FROM messages"
+            ).fetchone()
+        except DAMAGE as err:
+            self.notes.append(f"the first and last timestamps cannot be read: {err}")
             return None, None
+        if not isinstance(first, int) or not isinstance(last, int):
+            if first is not None or last is not None:
+                self.notes.append("the first or last timestamp is not an integer")
+            return None, None
+        return first, last
 
 
-def _open(path: Path, stack: ExitStack, notes: list[str]) -> sqlite3.Connection:
-    """Open read-only; a copy, where changes must be replayed first, or where the last page is not whole."""
-    pending = [beside for suffix in ("-wal", "-journal") if _has_bytes(beside := Path(f"{path}{suffix}"))]
-    whole_bytes = _whole_pages(path)
-    if pending or whole_bytes < path.stat().st_size:
+class RowScan:
+    """Reads the table of messages by row id and steps over rows that cannot be read.
+
+    Rows of a damaged table may be out of order or repeated.
+    """
+
+    def __init__(self, database: sqlite3.Connection) -> None:
+        self._database = database
+        self.gaps: list[UnreadableRange] = []
+        """The rows that SQLite failed to read."""
+        self.rowids: set[int] = set()
+        """Row ids of the rows read so far."""
+
+    def rows(self) -> Iterator[Row]:
+        """Yield every row that can be read."""
+        position = 0
+        while True:
+            try:
+                for row in self._select(position):
+                    position = max(position, int(row[0]) + 1)
+                    self.rowids.add(row[0])
+                    yield row
+            except DAMAGE as err:  # noqa: PERF203 - every part of the table may be damaged
+                following = self._next_readable(position)
+                end = "the end" if following is None else f"row {following[0]}"
+                if following is None or following[0] > position:
+                    self.gaps.append(UnreadableRange(position, f"{err}: rows are missing before {end}"))
+                if following is None:
+                    return
+                self.rowids.add(following[0])
+                # A query for this row and its successor could fail for both, so yield the row individually.
+                yield following
+                position = int(following[0]) + 1
+            else:
+                return
+
+    def _select(self, rowid: int, limit: int = -1) -> Iterator[Row]:
+        query = (
+            "SELECT rowid, topic_id, timestamp, data FROM messages NOT INDEXED "
+            "WHERE rowid >= ? ORDER BY rowid LIMIT ?"
+        )
+        yield from self._database.execute(query, (rowid, limit))
+
+    def _next_readable(self, damaged: int) -> Row | None:
+        """Return the first readable row from `damaged` on, None if there is none: an exponential, then binary search."""
+        step, low, high = 1, damaged - 1, damaged
+        while not self._is_readable(high):
+            low, high, step = high, high + step, step * 2
+            if high > _MAX_ROWID:
+                return None
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (low, middle) if self._is_readable(middle) else (middle, high)
+        row = next(self._select(high, 1), None)
+        return row if row is not None and row[0] >= damaged else None
+
+    def _is_readable(self, rowid: int) -> bool:
+        try:
+            list(self._select(rowid, 1))
+        except DAMAGE:
+            return False
+        return True
+
+
+class _RowSet:
+    """The row ids that have been read, and the number of rows by topic."""
+
+    def __init__(self, first: int, last: int) -> None:
+        self._first = first
+        size = last - first + 1
+        self._bitmap = np.zeros(max(size, 0) if size <= _MAX_BITMAP_ROWS else 0, np.bool_)
+        self._others: set[int] = set()
+        """Row ids outside the bitmap."""
+        self.by_topic: Counter[Any] = Counter()
+
+    def add(self, page: list[Row]) -> list[Row]:
+        """Add the rows of a page; return those that were not in the set."""
+        positions = np.fromiter((row[0] for row in page), np.int64, len(page)) - self._first
+        is_inside = bool((positions >= 0).all()) and bool((positions < len(self._bitmap)).all())
+        if is_inside and not self._bitmap[positions].any() and len(np.unique(positions)) == len(page):
+            self._bitmap[positions] = True
+            rows = page
+        else:
+            rows = [row for row in page if self._add_one(int(row[0]))]
+        self.by_topic.update([row[1] for row in rows])
+        return rows
+
+    def _add_one(self, rowid: int) -> bool:
+        """Add a row id; return whether it was not in the set."""
+        position = rowid - self._first
+        if 0 <= position < len(self._bitmap):
+            is_new = not self._bitmap[position]
+            self._bitmap[position] = True
+            return is_new
+        is_new = rowid not in self._others
+        self._others.add(rowid)
+        return is_new
+
+
+class _Columns(Struct, frozen=True):
+    """The columns and tables of a file; rosbag2 has added some over the years."""
+
+    topics: frozenset[str]
+    has_definitions: bool
+
+
+class _Totals(Struct, frozen=True):
+    """The number of messages according to the table, its index and its row ids, and the damage that they reveal."""
+
+    by_topic: dict[int, int]
+    table_rows: int | None
+    untyped_rows: int
+    """Rows whose topic id is not an integer."""
+    index_rows: int | None
+    first_rowid: int
+    last_rowid: int
+    damage: str | None
+
+    @property
+    def rowid_range(self) -> int:
+        """The number of rows if no row was deleted."""
+        return self.last_rowid - self.first_rowid + 1
+
+
+def _read_totals(database: sqlite3.Connection) -> _Totals:
+    """Count the messages in three ways, and check the file if the results differ."""
+    damage: str | None = None
+    by_topic: dict[Any, int] = {}
+    table_rows = index_rows = None
+    first_rowid, last_rowid = 0, -1
+    try:
+        query = "SELECT topic_id, count(*) FROM messages NOT INDEXED GROUP BY topic_id"
+        by_topic = dict(database.execute(query))
+        table_rows = sum(by_topic.values())
+        (index_rows,) = database.execute("SELECT count(*) FROM messages").fetchone()
+        query = "SELECT (SELECT min(rowid) FROM messages), (SELECT max(rowid) FROM messages)"
+        bounds = database.execute(query).fetchone()
+        if table_rows or index_rows:
+            first_rowid, last_rowid = map(int, bounds)
+    except (*DAMAGE, TypeError, ValueError) as err:
+        damage = f"the messages cannot be counted: {err}"
+    else:
+        if not table_rows == index_rows == last_rowid - first_rowid + 1:
+            damage = _check(database)
+        if damage is None and table_rows != index_rows:
+            damage = f"the table has {table_rows} rows, its index {index_rows}"
+    typed = {key: count for key, count in by_topic.items() if isinstance(key, int)}
+    untyped_rows = sum(by_topic.values()) - sum(typed.values())
+    return _Totals(typed, table_rows, untyped_rows, index_rows, first_rowid, last_rowid, damage)
+
+
+def _check(database: sqlite3.Connection) -> str | None:
+    """Return the first problem that SQLite finds in the file, None if it finds none."""
+    try:
+        (result,) = database.execute("PRAGMA quick_check(1)").fetchone()
+    except DAMAGE as err:
+        return str(err)
+    return None if result == "ok" else " ".join(str(result).replace("*", " ").split())
+
+
+def _open_database(path: Path, stack: ExitStack, notes: list[str]) -> sqlite3.Connection:
+    """Open a file read-only; open a copy if a log must be replayed or if the last page is incomplete."""
+    logs = [log for suffix in ("-wal", "-journal") if _has_bytes(log := Path(f"{path}{suffix}"))]
+    page_bytes = _complete_pages(path)
+    if logs or page_bytes < path.stat().st_size:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mosaico-")))
-        for file in (path, *pending):
+        for file in (path, *logs):
             shutil.copyfile(file, folder / file.name)
         path = folder / path.name
-        os.truncate(path, whole_bytes)
-    if pending:
-        notes.append(f"{pending[0].name} holds changes; they were replayed on a copy")
-    uri = f"{path.absolute().as_uri()}?{'mode=rw' if pending else 'mode=ro&immutable=1'}"
+        os.truncate(path, page_bytes)
+    if logs:
+        notes.append(f"{logs[0].name} holds changes; they were replayed on a copy")
+    uri = f"{path.absolute().as_uri()}?{'mode=rw' if logs else 'mode=ro&immutable=1'}"
     database = sqlite3.connect(uri, uri=True, check_same_thread=False)
     stack.callback(database.close)
     database.text_factory = _text
     return database
 
 
-def _whole_pages(path: Path) -> int:
-    """Return the size without the page that is cut off: SQLite would take the missing bytes for zeros."""
+def _complete_pages(path: Path) -> int:
+    """Return the size of the complete pages in bytes: SQLite would read missing bytes of the last page as zeros."""
     size = path.stat().st_size
     with path.open("rb") as file:
         page_bytes = int.from_bytes(file.read(18)[16:], "big")
@@ -273,19 +400,19 @@ def _text(value: object) -> str:
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
-def _tables(database: sqlite3.Connection) -> set[str]:
-    """Return the names of the tables, also of a file that was cut off."""
+def _read_tables(database: sqlite3.Connection) -> set[str]:
+    """Return the names of the tables, also of a truncated file."""
     query = "SELECT name FROM sqlite_master WHERE type = 'table'"
     try:
         return {str(name) for (name,) in database.execute(query)}
-    except BROKEN:
-        # With this SQLite opens files shorter than their header says; nothing is ever written here.
+    except DAMAGE:
+        # With this setting, SQLite opens files that are shorter than their header states. The file is read-only.
         database.execute("PRAGMA writable_schema = ON")
         return {str(name) for (name,) in database.execute(query)}
 
 
-def _columns(database: sqlite3.Connection) -> _Columns:
-    tables = _tables(database)
+def _read_columns(database: sqlite3.Connection) -> _Columns:
+    tables = _read_tables(database)
     if not {"topics", "messages"} <= tables:
         raise BagError(
             f"a SQLite file without the tables of a recording; it has {', '.join(sorted(tables)) or 'none'}"
@@ -298,51 +425,82 @@ def _columns(database: sqlite3.Connection) -> _Columns:
     return _Columns(topics, "message_definitions" in tables)
 
 
-def _stream(
-    row: dict[str, Any], counts: dict[int, int] | None, definitions: dict[str, Embedded]
+def _connection(
+    topic: dict[str, Any], counts: dict[int, int] | None, definitions: dict[str, Embedded]
 ) -> SplitConnection:
-    encoding = str(row.get("serialization_format", "cdr"))
+    encoding, msgtype = str(topic.get("serialization_format", "cdr")), str(topic["type"])
     attributes = {"encoding": encoding}
     for name in ("offered_qos_profiles", "type_description_hash"):
-        if row.get(name):
-            attributes[name] = str(row[name])
+        if topic.get(name):
+            attributes[name] = str(topic[name])
     return SplitConnection(
-        int(row["id"]),
-        str(row["name"]),
-        str(row["type"]),
+        topic["id"],
+        str(topic["name"]),
+        msgtype,
         Encoding.CDR if encoding == "cdr" else Encoding.OTHER,
         2,
-        definitions.get(str(row["type"])) or definitions.get(str(row["type"]).removesuffix(_EVENT)),
-        None if counts is None else counts.get(int(row["id"]), 0),
+        definitions.get(msgtype) or definitions.get(msgtype.removesuffix(_EVENT)),
+        None if counts is None else counts.get(topic["id"], 0),
         attributes=attributes,
     )
 
 
+def _query(request: ReadRequest) -> str:
+    keys = ",".join(str(int(key)) for key in request.connections)
+    return (
+        "SELECT rowid, topic_id, timestamp, data FROM messages "  # noqa: S608 - the keys are numbers
+        f"WHERE topic_id IN ({keys}) AND timestamp BETWEEN ? AND ? ORDER BY timestamp"
+    )
+
+
+def _is_unlimited(request: ReadRequest) -> bool:
+    return request.start_ns <= EARLIEST_NS and request.end_ns > LATEST_NS
+
+
+def _is_requested(row: Row, request: ReadRequest) -> bool:
+    """Return whether a row belongs to the request; a row without a valid timestamp belongs to every time range."""
+    if not isinstance(row[1], int) or row[1] not in request.connections:
+        return False
+    return not isinstance(row[2], int) or request.start_ns <= row[2] < request.end_ns
+
+
 def _pages(rows: Iterator[Row], request: ReadRequest) -> Iterator[list[Row]]:
-    """Yield rows in lists of the size of a block; one is read at a time, as its size is known only then."""
-    return group_by_bytes(rows, _data_bytes, request.block_bytes, max_length=_PAGE_ROWS)
+    """Yield lists of rows of about the requested size."""
+    return group_by_bytes(rows, _payload_bytes, request.block_bytes, max_length=_MAX_PAGE_ROWS)
 
 
-def _data_bytes(row: Row) -> int:
+def _payload_bytes(row: Row) -> int:
     return len(row[3]) if isinstance(row[3], bytes) else 0
 
 
-def _load(page: list[Row]) -> ReadResult:
-    """Return a page's rows by topic; SQLite keeps any value in any column, so the types are looked at."""
-    good = [row for row in page if [type(value) for value in row] == _ROW_TYPES]
-    unreadable = [
-        UnreadableRange(row[0], "a row whose values have the wrong types", connection=row[1], count=1)
-        for row in page
-        if len(good) < len(page) and [type(value) for value in row] != _ROW_TYPES
-    ]
-    if not good:
+def _first_time(rows: Sequence[Row], *, default: int) -> int:
+    """Return the timestamp of the first row that has one."""
+    return next((row[2] for row in rows if isinstance(row[2], int)), default)
+
+
+def _load(rows: list[Row]) -> ReadResult:
+    """Return the rows of a page by topic; rows with values of the wrong types are unreadable."""
+    valid = [row for row in rows if [type(value) for value in row] == _ROW_TYPES]
+    unreadable: list[UnreadableRange] = []
+    if len(valid) < len(rows):
+        reason = "a row whose values have the wrong types"
+        unreadable = [
+            UnreadableRange(row[0], reason, connection=row[1], count=1)
+            for row in rows
+            if [type(value) for value in row] != _ROW_TYPES
+        ]
+    if not valid:
         return ReadResult([], unreadable)
-    ids, topics, times, blobs = zip(*good, strict=True)
-    data = np.frombuffer(b"".join(blobs), np.uint8)
-    lengths = np.fromiter(map(len, blobs), np.int64, len(blobs))
-    starts = np.cumsum(lengths) - lengths
-    all_times, all_ids = np.array(times, np.int64), np.array(ids, np.int64)
-    keys = np.array(topics, np.int64)
-    whole = MessageBlock(-1, all_times, data, starts, lengths, all_ids)
-    blocks = [whole.rows(rows, connection=key) for key, rows in rows_by_connection(keys)]
+    ids, topics, times, payloads = zip(*valid, strict=True)
+    lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
+    block = MessageBlock(
+        -1,
+        np.array(times, np.int64),
+        np.frombuffer(b"".join(payloads), np.uint8),
+        np.cumsum(lengths) - lengths,
+        lengths,
+        np.array(ids, np.int64),
+    )
+    topic_ids = np.array(topics, np.int64)
+    blocks = [block.rows(rows, connection=key) for key, rows in rows_by_connection(topic_ids)]
     return ReadResult(blocks, unreadable)
