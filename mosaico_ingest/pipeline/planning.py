@@ -45,7 +45,7 @@ from mosaico_ingest.rosbag.blocks import Connection, Encoding
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
-from mosaico_ingest.rosbag.recording import Recording
+from mosaico_ingest.rosbag.recording import Recording, no_topics_error
 
 __all__ = [
     "decide",
@@ -431,10 +431,12 @@ def _no_match(key: str, glob: str, topics: tuple[str, ...], place: Span | None) 
     )
 
 
-def _nothing(config: ROSInjectionConfig, recording: Recording, left: list[ExcludedTopic]) -> NothingMatched:
+def _nothing(
+    config: ROSInjectionConfig, recording: Recording, left: list[ExcludedTopic]
+) -> NothingMatched | BagError:
     where = str(recording.files[0])
     if not left:
-        return NothingMatched("the recording has no topic", where=where)
+        return no_topics_error(recording)
     if config.topics and all("`topics`" in one.why for one in left):
         what = f"no topic matches {', '.join(map(repr, config.topics))}"
         return NothingMatched(

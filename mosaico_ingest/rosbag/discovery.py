@@ -190,6 +190,8 @@ def _listed(metadata: Metadata) -> RecordingFiles:
         else:
             files.append(file)
     gone = tuple(folder / name for name in missing) if files else ()
+    unlisted = _unlisted_splits(folder, files)
+    files += unlisted
     if not files:
         files = _recordings(folder)
         if not files:
@@ -207,7 +209,29 @@ def _listed(metadata: Metadata) -> RecordingFiles:
         )
         for name in missing
     )
-    return RecordingFiles(tuple(files), metadata, findings, gone)
+    findings += tuple(
+        Finding(
+            "metadata-differs",
+            Severity.INFO,
+            f"{metadata.path}: {file.name} is not listed, and is read as a split of the recording",
+            help="the metadata may be truncated; check it",
+        )
+        for file in unlisted
+    )
+    return RecordingFiles(tuple(sorted(files, key=_natural) if unlisted else files), metadata, findings, gone)
+
+
+_SPLIT_NAME = re.compile(r"(?P<stem>.*)_\d+(?P<suffix>\.(?:db3|mcap)(?:\.zstd)?)")
+
+
+def _unlisted_splits(folder: AnyPath, files: Sequence[AnyPath]) -> list[AnyPath]:
+    """Return the recordings that are named like the listed splits: truncated metadata lists only the first ones."""
+    names = {match.groups() for file in files if (match := _SPLIT_NAME.fullmatch(file.name))}
+    return [
+        file
+        for file in (_recordings(folder) if names else ())
+        if file not in files and (match := _SPLIT_NAME.fullmatch(file.name)) and match.groups() in names
+    ]
 
 
 def _recordings(folder: AnyPath) -> list[AnyPath]:

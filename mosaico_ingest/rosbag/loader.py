@@ -20,7 +20,13 @@ from mosaico_ingest.job.values import LoaderErrorPolicy, Stores
 from mosaico_ingest.remote import RemotePath, as_path
 from mosaico_ingest.rosbag.blocks import Connection, Encoding, MessageBlock, ROSMessage, UnreadableRange
 from mosaico_ingest.rosbag.definitions.registry import CustomMessages, TypeResolver
-from mosaico_ingest.rosbag.recording import Recording, open_recording, time_bounds, time_slices
+from mosaico_ingest.rosbag.recording import (
+    Recording,
+    no_topics_error,
+    open_recording,
+    time_bounds,
+    time_slices,
+)
 from mosaico_ingest.rosbag.serialization import Deserializer
 
 __all__ = ["ROSLoader"]
@@ -64,7 +70,7 @@ class ROSLoader:
         reader, which also reads damaged and remote recordings, or that of the rosbags library.
 
         Raises:
-            BagError: The recording cannot be opened, or a definition cannot be read.
+            BagError: The recording cannot be opened, is damaged so that no topic is left, or a definition cannot be read.
             NothingMatched: The patterns select no topic.
         """
         self._policy = LoaderErrorPolicy(error_policy)
@@ -79,8 +85,10 @@ class ROSLoader:
         else:
             raise BagError(f"unknown reader {reader!r}", hint="use 'native' or 'rosbags'")
         try:
+            if self._recording and not self._recording.connections:
+                raise no_topics_error(self._recording)
             self._connections = _select_connections(self._source.connections, topics)
-        except NothingMatched:
+        except (NothingMatched, BagError):
             self.close()
             raise
         self.rejected = Counter[str]()

@@ -16,7 +16,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 from typing_extensions import Self
 
-from mosaico_ingest.errors import BagError
+from mosaico_ingest.errors import BagError, NothingMatched
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.remote import AnyPath, RemotePath
 from mosaico_ingest.rosbag.batching import (
@@ -54,6 +54,7 @@ from mosaico_ingest.rosbag.opening import open_split
 __all__ = [
     "ConnectionTable",
     "Recording",
+    "no_topics_error",
     "open_recording",
     "recording_findings",
     "time_bounds",
@@ -256,6 +257,19 @@ class Recording:
         for gap in unreadable:
             connection = None if gap.connection is None else self._table.connection_id(split, gap.connection)
             self._unreadable[replace(gap, file=file, connection=connection)] = None
+
+
+def no_topics_error(recording: Recording) -> NothingMatched | BagError:
+    """Return the error for a recording without connections: the damage that hides them, if there is any."""
+    where = str(recording.files[0])
+    if not recording.unreadable:
+        return NothingMatched("the recording has no topics", where=where)
+    damage = next((gap for gap in recording.unreadable if gap.count != 0), recording.unreadable[0])
+    return BagError(
+        f"no topic can be read: {damage.reason}",
+        where=f"{damage.file or where}: at {damage.offset}",
+        hint="copy the file again, or restore it from a backup",
+    )
 
 
 class _LoadedTask(Struct, frozen=True):

@@ -94,7 +94,9 @@ def read_index(source: Source, max_chunk_bytes: int = MAX_CHUNK_BYTES) -> McapIn
         reason = f"{problem}; the file was read record by record"
         index.unreadable.append(UnreadableRange(source.size, reason, count=0))
     source.fetch_whole()
-    _Walk(source, index, max_chunk_bytes).over(len(MCAP), source.size)
+    walk = _Walk(source, index, max_chunk_bytes)
+    walk.over(len(MCAP), source.size)
+    walk.report_undescribed_chunks()
     return index
 
 
@@ -198,6 +200,8 @@ class _Walk:
         self._run: Extent | None = None
         """The messages outside chunks that directly precede the current record."""
         self._counts: dict[int, int] | None = {}
+        self._damaged_chunks: dict[int, str] = {}
+        """Reasons by offset."""
         index.is_walked = True
 
     def over(self, start: int, stop: int) -> None:
@@ -254,7 +258,10 @@ class _Walk:
             if head is not None:
                 extent = Extent(start, stop, head.start_ns, head.end_ns, is_truncated=True)
                 self._index.extents.append(extent)
-                self._add_chunk_descriptions(extent)
+                size = self._add_chunk_descriptions(extent)
+                self._add_unreadable(
+                    start, f"the chunk is truncated; {size} of its {head.size} bytes could be read"
+                )
                 return
         record = f"a record of kind {op} with {end - start} bytes" if op else "no record"
         self._add_unreadable(start, f"{record} where {stop - start} bytes are left; they are not read")
@@ -319,8 +326,9 @@ class _Walk:
         if channel not in self._index.channels:
             self._add_chunk_descriptions(chunk)
 
-    def _add_chunk_descriptions(self, extent: Extent) -> None:
-        """Add the schemas and channels inside a chunk; reading its messages reports any damage."""
+    def _add_chunk_descriptions(self, extent: Extent) -> int:
+        """Add the schemas and channels inside a chunk; return the number of bytes that could be decompressed."""
+        size = 0
         try:
             data = self._source.read(extent.offset, extent.stop - extent.offset)
             head = chunk_head(data)
@@ -328,10 +336,18 @@ class _Walk:
             records = decompress_partially(
                 compressed, head.compression, head.size, limit=self._max_chunk_bytes
             ).data
+            size = len(records)
             for op, start, end in records_in(records):
                 _add_description(op, Fields(records, start, end), self._index)
-        except BagError:
-            return
+        except BagError as err:
+            self._damaged_chunks[extent.offset] = err.what
+        return size
+
+    def report_undescribed_chunks(self) -> None:
+        """Report damaged chunks if the file describes no channel: its chunks will not be read then."""
+        if not self._index.channels:
+            for offset, reason in self._damaged_chunks.items():
+                self._add_unreadable(offset, f"broken chunk: {reason}")
 
     def _add_totals(self) -> None:
         index = self._index

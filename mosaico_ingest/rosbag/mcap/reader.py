@@ -168,7 +168,7 @@ class McapReader:
                 if head is None:
                     yield [_unchunked(extent, np.frombuffer(raw, np.uint8))]
                 elif extent.is_truncated:
-                    yield [self._truncated_chunk(extent, raw, head, result)]
+                    yield [self._truncated_chunk(extent, raw, head)]
                 else:
                     start, end = position.start + head.start, position.start + min(head.end, len(raw))
                     compressed.append(
@@ -190,14 +190,10 @@ class McapReader:
                     chunks.append(chunk)
             yield chunks
 
-    def _truncated_chunk(
-        self, extent: Extent, raw: memoryview, head: ChunkHead, result: ReadResult
-    ) -> _Chunk:
+    def _truncated_chunk(self, extent: Extent, raw: memoryview, head: ChunkHead) -> _Chunk:
         records = decompress_partially(
             raw[head.start : head.end], head.compression, head.size, limit=self._max_chunk_bytes
         )
-        reason = f"the chunk is truncated; {len(records)} of its {head.size} bytes could be read"
-        result.unreadable.append(UnreadableRange(extent.offset, reason))
         return _unchunked(extent, records)
 
     def _add_indexed(self, chunks: Sequence[_Chunk], request: ReadRequest, result: ReadResult) -> None:

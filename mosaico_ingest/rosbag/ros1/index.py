@@ -162,8 +162,7 @@ class _Walk:
             try:
                 self._add_record(record)
             except BagError as err:
-                reason = f"a damaged record of kind {record.op}: {err.what}"
-                self._index.unreadable.append(UnreadableRange(position, reason))
+                self._add_unreadable(position, f"a damaged record of kind {record.op}: {err.what}")
             position = record.end
         self._recount_last_chunk(position)
 
@@ -219,7 +218,10 @@ class _Walk:
         return replace(extent, stop=record.end, start_ns=first, end_ns=last, counts=counts)
 
     def _counted(self, extent: Extent) -> Extent:
-        """Return the chunk's extent with times and counts from its readable messages, and add its connections."""
+        """Return the chunk's extent with times and counts from its readable messages, and add its connections.
+
+        A truncated chunk, and a chunk without readable messages, becomes an unreadable range.
+        """
         counts: dict[int, int] = {}
         first, last = 0, 0
         raw = self._source.read(extent.offset, extent.stop - extent.offset)
@@ -227,12 +229,17 @@ class _Walk:
             head = chunk_head(raw)
             compressed = memoryview(raw)[head.start : head.end]
             data = decompress_partially(compressed, head.compression, head.size, limit=self._max_chunk_bytes)
+            if extent.is_truncated:
+                size = f"{len(data)} of its {head.size} bytes"
+                self._add_unreadable(extent.offset, f"the chunk is truncated; {size} could be read")
             for message in messages_in(data.data, self._index.connections):
                 first = min(first, message.time_ns) if counts else message.time_ns
                 last = max(last, message.time_ns)
                 counts[message.connection] = counts.get(message.connection, 0) + 1
-        except BagError:
-            pass  # reading the chunk reports the damage
+        except BagError as err:
+            # The reader reports the damage of chunks with messages when it reads them.
+            if not counts and not extent.is_truncated:
+                self._add_unreadable(extent.offset, f"broken chunk: {err.what}")
         return replace(extent, start_ns=first, end_ns=last, counts=counts)
 
     def _add_invalid(self, start: int, stop: int, reason: str) -> None:
@@ -240,5 +247,9 @@ class _Walk:
         if extent.counts:
             self._index.extents.append(extent)
         else:
-            reason = f"{reason}; {stop - start} bytes are not read"
-            self._index.unreadable.append(UnreadableRange(start, reason))
+            self._add_unreadable(start, f"{reason}; {stop - start} bytes are not read")
+
+    def _add_unreadable(self, offset: int, reason: str) -> None:
+        unreadable = UnreadableRange(offset, reason)
+        if unreadable not in self._index.unreadable:
+            self._index.unreadable.append(unreadable)

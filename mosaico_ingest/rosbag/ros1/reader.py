@@ -161,7 +161,7 @@ class Ros1Reader:
                 if head is None:
                     yield [_unindexed(extent, np.frombuffer(raw, np.uint8))]
                 elif extent.is_truncated:
-                    yield [self._truncated_chunk(extent, raw, head, result)]
+                    yield [self._truncated_chunk(extent, raw, head)]
                 else:
                     start, end = position.start + head.start, position.start + head.end
                     chunk = CompressedChunk(start, end, head.compression, head.size)
@@ -182,14 +182,10 @@ class Ros1Reader:
                     chunks.append(_Chunk(extent, index, decompressed.data, *bounds))
             yield chunks
 
-    def _truncated_chunk(
-        self, extent: Extent, raw: memoryview, head: ChunkHead, result: ReadResult
-    ) -> _Chunk:
+    def _truncated_chunk(self, extent: Extent, raw: memoryview, head: ChunkHead) -> _Chunk:
         records = decompress_partially(
             raw[head.start : head.end], head.compression, head.size, limit=self._max_chunk_bytes
         )
-        reason = f"the chunk is truncated; {len(records)} of its {head.size} bytes could be read"
-        result.unreadable.append(UnreadableRange(extent.offset, reason))
         return _unindexed(extent, records)
 
 
