@@ -32,17 +32,17 @@ def _block(language: str) -> str:
     return block
 
 
-def test_the_table_is_the_catalogs() -> None:
+def test_adapters_page_table_matches_catalog() -> None:
     assert with_catalog(PAGE) == PAGE
     assert all(f"| `{name}` |" in PAGE for name in BY_NAME)
 
 
-def test_the_python_example_works(tmp_path: Path) -> None:
+def test_adapters_page_python_example_runs(tmp_path: Path) -> None:
     (tmp_path / "wheel.py").write_text(_block("python"))
     assert load_adapter_reference("wheel.py:WheelAdapter", tmp_path).ros_types == ("my_pkg/msg/WheelTicks",)
     message = ROSMessage(1, "/wheel", "my_pkg/WheelTicks", {"left": 3, "right": 4})
     assert ROSBridge.from_ros_message(message).data.model_dump() == {"left": 3, "right": 4}
 
 
-def test_the_manifest_example_has_the_manifests_keys() -> None:
+def test_adapters_page_manifest_example_is_valid() -> None:
     AdaptersSection.model_validate(yaml.safe_load(_block("yaml"))["adapters"])

@@ -78,12 +78,12 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     return offer
 
 
-def test_the_built_in_adapter_is_what_is_left(tmp_path: Path) -> None:
+def test_resolve_without_other_source_uses_builtin(tmp_path: Path) -> None:
     found = ROSBridge(base_dir=tmp_path).resolve("/imu", "sensor_msgs/Imu")
     assert (found.spec.name, found.reason, found.unmodeled) == ("IMUAdapter", "built-in", False)
 
 
-def test_a_type_without_an_adapter_keeps_its_shape() -> None:
+def test_resolve_unknown_type_is_unmodeled() -> None:
     bridge = ROSBridge(formats={"visualization_msgs/Marker": "ragged"})
     found = bridge.resolve("/m", "visualization_msgs/msg/Marker")
     assert (found.spec.name, found.reason, found.unmodeled) == ("Unmodeled", "unmodeled", True)
@@ -93,7 +93,7 @@ def test_a_type_without_an_adapter_keeps_its_shape() -> None:
     assert found.why == "no adapter takes visualization_msgs/msg/Marker; it keeps its ROS shape"
 
 
-def test_each_source_wins_over_the_ones_below(tmp_path: Path, installed: Callable[[str], None]) -> None:
+def test_resolve_sources_follow_precedence(tmp_path: Path, installed: Callable[[str], None]) -> None:
     (tmp_path / "imu.yaml").write_text(
         BY_NAME["IMUAdapter"].path.read_text().replace("IMUAdapter", "LoadedAdapter")
     )
@@ -115,7 +115,7 @@ def test_each_source_wins_over_the_ones_below(tmp_path: Path, installed: Callabl
     assert both.resolve("/other", IMU).reason == "loaded"
 
 
-def test_an_exact_override_wins_over_a_glob() -> None:
+def test_resolve_exact_override_precedes_glob() -> None:
     bridge = ROSBridge(overrides={"/lidar/*": "LidarAdapter", "/lidar/radar": "RadarAdapter"})
     assert bridge.resolve("/lidar/top", CLOUD).spec.name == "LidarAdapter"
     assert bridge.resolve("/lidar/radar", CLOUD).spec.name == "RadarAdapter"
@@ -123,7 +123,7 @@ def test_an_exact_override_wins_over_a_glob() -> None:
 
 
 @pytest.mark.parametrize("form", ["class", "spec", "name", "module", "file", "yaml", "catalog class"])
-def test_an_override_may_be_given_in_every_form(form: str, tmp_path: Path) -> None:
+def test_resolve_override_accepts_every_reference_form(form: str, tmp_path: Path) -> None:
     source = Path(__file__).read_text().replace("BridgeRow", "BridgeFileRow")
     (tmp_path / "a_file_of_adapters.py").write_text(source)
     (tmp_path / "imu.yaml").write_text(BY_NAME["IMUAdapter"].path.read_text())
@@ -141,7 +141,7 @@ def test_an_override_may_be_given_in_every_form(form: str, tmp_path: Path) -> No
     assert found.spec.name in {"MyImuAdapter", "IMUAdapter"}
 
 
-def test_an_override_for_another_type_is_an_error_that_names_both() -> None:
+def test_resolve_override_of_other_type_raises_with_both_types() -> None:
     bridge = ROSBridge(overrides={"/lidar/*": "LidarAdapter"})
     with pytest.raises(AdapterError) as caught:
         bridge.resolve("/lidar/imu", IMU)
@@ -152,19 +152,19 @@ def test_an_override_for_another_type_is_an_error_that_names_both() -> None:
     )
 
 
-def test_a_topic_can_be_kept_in_its_ros_shape() -> None:
+def test_resolve_override_unmodeled_keeps_ros_shape() -> None:
     found = ROSBridge(overrides={"/imu": "Unmodeled"}).resolve("/imu", IMU)
     assert (found.spec.name, found.reason) == ("Unmodeled", "override")
 
 
-def test_an_override_may_name_an_adapter_that_is_loaded(tmp_path: Path) -> None:
+def test_resolve_override_finds_loaded_adapter_by_name(tmp_path: Path) -> None:
     (tmp_path / "ticks.yaml").write_text(TEN_LINES.replace("ontology:", "default: false\nontology:"))
     bridge = ROSBridge(loaded=["ticks.yaml"], overrides={"/ticks": "TicksAdapter"}, base_dir=tmp_path)
     assert bridge.resolve("/ticks", "std_msgs/msg/Int32").spec.name == "TicksAdapter"
     assert bridge.resolve("/count", "std_msgs/msg/Int32").spec.name == "Integer32StdAdapter"
 
 
-def test_two_loaded_adapters_for_one_type_are_an_error(tmp_path: Path) -> None:
+def test_bridge_two_loaded_adapters_for_one_type_raise(tmp_path: Path) -> None:
     (tmp_path / "one.yaml").write_text(TEN_LINES)
     (tmp_path / "two.yaml").write_text(TEN_LINES.replace("TicksAdapter", "OtherAdapter"))
     with pytest.raises(
@@ -174,7 +174,7 @@ def test_two_loaded_adapters_for_one_type_are_an_error(tmp_path: Path) -> None:
         ROSBridge(loaded=["one.yaml", "two.yaml"], base_dir=tmp_path)
 
 
-def test_a_broken_entry_point_is_an_error_that_names_it(installed: Callable[[str], None]) -> None:
+def test_bridge_broken_entry_point_raises_with_its_name(installed: Callable[[str], None]) -> None:
     installed("no_such_module_anywhere:Adapter")
     with pytest.raises(
         AdapterError, match="entry point mine of an installed package cannot be used: ModuleNotFoundError"
@@ -182,9 +182,7 @@ def test_a_broken_entry_point_is_an_error_that_names_it(installed: Callable[[str
         ROSBridge().resolve("/imu", IMU)
 
 
-def test_ten_lines_of_yaml_adapt_a_type_to_an_ontology_of_ones_own(
-    tmp_path: Path, define: Callable[..., Definition]
-) -> None:
+def test_mapping_with_inline_ontology_adapts_rows(tmp_path: Path, define: Callable[..., Definition]) -> None:
     (tmp_path / "ticks.yaml").write_text(TEN_LINES)
     found = ROSBridge(loaded=["ticks.yaml"], base_dir=tmp_path).resolve("/ticks", "std_msgs/Int32")
     definition = define("std_msgs/msg/Int32")
@@ -194,9 +192,7 @@ def test_ten_lines_of_yaml_adapt_a_type_to_an_ontology_of_ones_own(
     assert (bound.ontology.tag, adapted.rows.to_pylist()) == ("BridgeTicks", [{"ticks": 3}])
 
 
-def test_a_mapping_uses_another_one_of_the_same_folder(
-    tmp_path: Path, define: Callable[..., Definition]
-) -> None:
+def test_mapping_uses_adapter_of_same_folder(tmp_path: Path, define: Callable[..., Definition]) -> None:
     (tmp_path / "points.yaml").write_text(
         "version: 1\nadapter: FlatPointAdapter  # without height\nros_type: geometry_msgs/msg/Point32\n"
         "ontology: Point3d\nfields: {x: x, y: y, z: 0.0}\n"
@@ -216,9 +212,7 @@ def test_a_mapping_uses_another_one_of_the_same_folder(
     assert [(p["x"], p["z"]) for p in adapted.rows[0]["points"].as_py()] == [(1.0, 0.0)]
 
 
-def test_loading_a_module_leaves_the_search_path_as_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_module_reference_restores_sys_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "ticks.py").write_text(
         "from mosaico_ingest import ROSAdapterBase\nclass Ticks(ROSAdapterBase):\n    ros_msgtype = 'a/msg/B'\n"
     )
@@ -228,7 +222,7 @@ def test_loading_a_module_leaves_the_search_path_as_it_was(
     assert sys.path == before
 
 
-def test_the_image_setting_wraps_whatever_adapter_is_chosen(define: Callable[..., Definition]) -> None:
+def test_resolve_image_setting_wraps_selected_adapter(define: Callable[..., Definition]) -> None:
     bridge = ROSBridge(images={"/cam/*": "png", "/cam/raw": "raw"})
     definition = define("sensor_msgs/msg/Image")
     message = {"height": 1, "width": 1, "step": 1, "encoding": "mono8", "data": b"x"}
@@ -245,7 +239,7 @@ def test_the_image_setting_wraps_whatever_adapter_is_chosen(define: Callable[...
     assert formats == {"/cam/left": "png", "/cam/raw": "raw", "/other": "raw"}
 
 
-def test_the_bridge_of_a_job_has_its_settings(tmp_path: Path) -> None:
+def test_bridge_for_config_applies_settings(tmp_path: Path) -> None:
     (tmp_path / "ticks.yaml").write_text(TEN_LINES)
     config = ROSInjectionConfig(
         file_path=tmp_path / "x.bag",
@@ -259,7 +253,7 @@ def test_the_bridge_of_a_job_has_its_settings(tmp_path: Path) -> None:
     assert bridge.resolve("/ticks", "std_msgs/msg/Int32").reason == "loaded"
 
 
-def test_one_message_is_translated() -> None:
+def test_from_ros_message_translates_one_message() -> None:
     message = ROSBridge.from_ros_message(ROSMessage(5, "/s", "std_msgs/String", {"data": "hello"}))
     assert (message.timestamp_ns, message.ontology_tag(), message.data.data) == (5, "String", "hello")
 

@@ -55,18 +55,18 @@ Fuzzed = Callable[[Definition, int], list[dict[str, Any]]]
 Adapt = Callable[..., Adapted]
 
 
-def test_every_file_of_the_catalog_is_listed_once() -> None:
+def test_catalog_lists_every_file_once() -> None:
     assert sorted(builtin.path for builtin in BUILTIN) == sorted(CATALOG.glob("*.yaml"))
     assert len(BY_NAME) == len(BUILTIN)
 
 
-def test_no_type_has_two_default_adapters() -> None:
+def test_catalog_types_have_one_default_adapter() -> None:
     defaults = [name for builtin in BUILTIN if builtin.default for name in builtin.ros_types]
     assert len(defaults) == len(set(defaults)) == len(BY_TYPE)
 
 
 @EVERY
-def test_the_list_says_what_the_file_says(builtin: Builtin) -> None:
+def test_catalog_entry_matches_its_file(builtin: Builtin) -> None:
     mapping = builtin.mapping
     said = (mapping.name, mapping.ontology.tag, mapping.ros_types, mapping.default)
     assert said == (builtin.name, builtin.tag, builtin.ros_types, builtin.default)
@@ -75,26 +75,26 @@ def test_the_list_says_what_the_file_says(builtin: Builtin) -> None:
 
 
 @EVERY
-def test_what_is_read_in_place_of_the_file_says_the_same(builtin: Builtin) -> None:
+def test_catalog_json_entry_matches_its_file(builtin: Builtin) -> None:
     known, read = builtin.mapping, load_adapter(builtin.path, adapters=find_builtin)
     assert repr(known.model) == repr(read.model)  # not a number is not even equal to itself
     assert known.source == read.source
     assert known.ontology == read.ontology
 
 
-def test_the_file_of_the_catalog_is_up_to_date() -> None:
+def test_catalog_json_is_up_to_date() -> None:
     assert CATALOG_FILE.read_text(encoding="utf-8") == catalog_file(), "run ./dev docs"
 
 
 @EVERY
-def test_its_own_tests_pass(builtin: Builtin) -> None:
+def test_catalog_adapter_passes_its_tests(builtin: Builtin) -> None:
     outcomes = run_tests(builtin.mapping, TypeResolver(Stores.LATEST))
     assert outcomes
     assert [f"{builtin.stem}.yaml:{o.line}: {o.name}: {o.problems}" for o in outcomes if not o.passed] == []
 
 
 @EVERY
-def test_a_spec_is_picklable(builtin: Builtin) -> None:
+def test_catalog_adapter_pickles(builtin: Builtin) -> None:
     assert pickle.loads(pickle.dumps(builtin)) == builtin  # noqa: S301 - what was just pickled
 
 
@@ -109,7 +109,7 @@ def _definitions(define: Define, msgtype: str) -> list[Definition]:
 
 
 @PAIRS
-def test_the_columns_are_the_ontologys(builtin: Builtin, msgtype: str, define: Define) -> None:
+def test_catalog_adapter_rows_have_ontology_type(builtin: Builtin, msgtype: str, define: Define) -> None:
     for definition in _definitions(define, msgtype):
         bound = builtin.bind(definition, ros_shape(definition))
         assert bound.ontology == ontology_type(builtin.tag)
@@ -117,7 +117,9 @@ def test_the_columns_are_the_ontologys(builtin: Builtin, msgtype: str, define: D
 
 
 @PAIRS
-def test_no_rows_give_no_rows(builtin: Builtin, msgtype: str, define: Define, adapt: Adapt) -> None:
+def test_catalog_adapter_empty_batch_returns_no_rows(
+    builtin: Builtin, msgtype: str, define: Define, adapt: Adapt
+) -> None:
     for definition in _definitions(define, msgtype):
         adapted = adapt(builtin, definition, [])
         assert adapted.rows.type == ontology_type(builtin.tag).struct
@@ -125,7 +127,7 @@ def test_no_rows_give_no_rows(builtin: Builtin, msgtype: str, define: Define, ad
 
 
 @PAIRS
-def test_every_row_is_kept_in_order_or_accounted_for(
+def test_catalog_adapter_random_rows_are_adapted_or_rejected(
     builtin: Builtin, msgtype: str, define: Define, adapt: Adapt, fuzzed: Fuzzed
 ) -> None:
     for definition in _definitions(define, msgtype):
@@ -141,7 +143,7 @@ def test_every_row_is_kept_in_order_or_accounted_for(
 
 
 @PAIRS
-def test_many_rows_are_what_each_is_alone(
+def test_catalog_adapter_batch_equals_single_rows(
     builtin: Builtin, msgtype: str, define: Define, adapt: Adapt, fuzzed: Fuzzed
 ) -> None:
     definition = _definitions(define, msgtype)[0]
@@ -158,7 +160,7 @@ def test_many_rows_are_what_each_is_alone(
 
 
 @PAIRS
-def test_a_slice_of_a_batch_is_adapted_like_a_batch(
+def test_catalog_adapter_slice_equals_batch(
     builtin: Builtin, msgtype: str, define: Define, fuzzed: Fuzzed
 ) -> None:
     definition = _definitions(define, msgtype)[0]
@@ -187,7 +189,7 @@ def _assert_required(rows: Any, where: str) -> None:
         _assert_required(column, f"{where}.{field.name}")
 
 
-def test_every_adapter_is_a_class_to_import() -> None:
+def test_catalog_adapter_is_importable_class() -> None:
     for builtin in BUILTIN:
         adapter = getattr(adapters, builtin.name)
         assert issubclass(adapter, ROSAdapterBase)
@@ -200,7 +202,7 @@ def test_every_adapter_is_a_class_to_import() -> None:
         _ = adapters.NoSuchAdapter
 
 
-def test_a_class_translates_single_messages() -> None:
+def test_catalog_class_translates_single_message() -> None:
     header = {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "map"}
     pose = {
         "position": {"x": 1.0, "y": 2.0, "z": 3.0},
@@ -219,7 +221,7 @@ def test_a_class_translates_single_messages() -> None:
     }
 
 
-def test_a_class_reads_ros_1_dicts_too() -> None:
+def test_catalog_class_from_dict_accepts_ros1_fields() -> None:
     header = {"seq": 9, "stamp": {"sec": 0, "nanosec": 0}, "frame_id": "imu"}
     vector = {"x": 1.0, "y": 2.0, "z": 3.0}
     translated = adapters.Vector3Adapter.from_dict({"header": header, "vector": vector})
@@ -233,14 +235,14 @@ def test_a_class_reads_ros_1_dicts_too() -> None:
     )
 
 
-def test_a_dict_that_does_not_fit_says_why() -> None:
+def test_catalog_class_from_dict_invalid_raises() -> None:
     with pytest.raises(AdapterError, match=r"Vector3Adapter: .* has no field xx"):
         adapters.Vector3Adapter.from_dict({"xx": 1.0})
     with pytest.raises(AdapterError, match="StringStdAdapter: data"):
         adapters.StringStdAdapter.from_dict({})
 
 
-def test_a_class_can_be_extended() -> None:
+def test_catalog_class_can_be_subclassed() -> None:
     class Louder(adapters.StringStdAdapter):
         @classmethod
         def from_dict(cls, ros_data: dict[str, Any]) -> Any:
@@ -249,7 +251,7 @@ def test_a_class_can_be_extended() -> None:
     assert Louder.translate(ROSMessage(1, "/s", "std_msgs/msg/String", {"data": "hi"})).data.data == "HI"
 
 
-def test_a_built_in_adapter_is_known_without_its_file() -> None:
+def test_catalog_import_reads_no_adapter_file() -> None:
     script = (
         "import sys, mosaico_ingest.adapters.builtin as b\n"
         "opened = []\n"

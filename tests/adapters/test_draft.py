@@ -59,32 +59,32 @@ def fits(text: str, definition: Definition) -> None:
         "std_msgs/msg/Float64MultiArray",
     ],
 )
-def test_a_draft_with_a_type_of_its_own_passes_its_own_test(msgtype: str) -> None:
+def test_draft_with_own_ontology_passes_its_test(msgtype: str) -> None:
     definition = TypeResolver("ros2_jazzy", types=TYPES).resolve(msgtype, None, ros_version=2)
     fits(draft(definition), definition)
 
 
 @pytest.mark.parametrize("tag", sorted(set(MODULES) - {"Unmodeled", "Floating16"}))
 @pytest.mark.parametrize("msgtype", ["sensor_msgs/msg/Imu", "sensor_msgs/msg/Image", "nav_msgs/msg/Odometry"])
-def test_a_draft_for_an_ontology_type_passes_its_own_test(msgtype: str, tag: str) -> None:
+def test_draft_for_ontology_type_passes_its_test(msgtype: str, tag: str) -> None:
     definition = DefinitionFinder().find(msgtype)
     fits(draft(definition, ontology=tag), definition)
 
 
-def test_a_draft_takes_every_field_that_has_a_column_s_name() -> None:
+def test_draft_maps_fields_by_column_name() -> None:
     text = draft(DefinitionFinder().find("sensor_msgs/msg/BatteryState"), ontology="BatteryState")
     assert "  voltage: voltage  # float32, required\n" in text
     assert "  present: present" in text
     assert "Not used" not in text
 
 
-def test_a_draft_says_what_it_leaves_out_and_takes_longer_names_for_a_column_s() -> None:
+def test_draft_lists_unused_fields_and_matches_similar_names() -> None:
     text = draft(DefinitionFinder().find("sensor_msgs/msg/Imu"), ontology="IMU")
     assert "  acceleration: linear_acceleration" in text
     assert "Not used yet, of sensor_msgs/msg/Imu: orientation_covariance, angular_velocity_covariance" in text
 
 
-def test_a_draft_with_its_definition_needs_no_distro() -> None:
+def test_draft_with_embedded_definition_needs_no_distro() -> None:
     embedded = Embedded(
         "ros2msg",
         "geometry_msgs/Point where\nint32 COUNT=3\n"
@@ -98,12 +98,12 @@ def test_a_draft_with_its_definition_needs_no_distro() -> None:
     assert "COUNT = 3" in text
 
 
-def test_a_type_without_fields_cannot_be_drafted() -> None:
+def test_draft_of_type_without_fields_raises() -> None:
     with pytest.raises(AdapterError, match="has no fields"):
         draft(DefinitionFinder().find("std_msgs/msg/Empty"))
 
 
-def test_every_message_type_of_the_catalog_can_be_drafted_towards_its_ontology() -> None:
+def test_draft_of_every_catalog_type_binds() -> None:
     for builtin in BUILTIN:
         definition = (
             DefinitionFinder().find(builtin.ros_types[0], builtin)

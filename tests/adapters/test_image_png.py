@@ -34,7 +34,7 @@ def _pixels(png: bytes) -> tuple[int, int, bytes]:
 
 
 @given(data=st.data(), width=st.integers(1, 40), height=st.integers(1, 40))
-def test_the_bytes_come_back(data: st.DataObject, width: int, height: int) -> None:
+def test_greyscale_png_round_trip_restores_bytes(data: st.DataObject, width: int, height: int) -> None:
     raw = data.draw(st.binary(min_size=width * height, max_size=width * height))
     assert _pixels(greyscale_png(raw, width=width, height=height)) == (width, height, raw)
 
@@ -51,14 +51,14 @@ def images(
     return run
 
 
-def test_the_picture_is_as_wide_as_a_row_has_bytes(images: Callable[..., list[dict[str, Any]]]) -> None:
+def test_png_images_width_is_stride(images: Callable[..., list[dict[str, Any]]]) -> None:
     (row,) = images({"height": 2, "width": 1, "step": 3, "encoding": "rgb8", "data": b"abcdef"})
     assert row["format"] == "png"
     assert _pixels(row["data"]) == (3, 2, b"abcdef")
     assert (row["width"], row["height"], row["stride"], row["encoding"]) == (1, 2, 3, "rgb8")
 
 
-def test_a_buffer_of_another_size_stays_raw(images: Callable[..., list[dict[str, Any]]]) -> None:
+def test_png_images_wrong_buffer_size_stays_raw(images: Callable[..., list[dict[str, Any]]]) -> None:
     short, empty, good = images(
         {"height": 2, "width": 1, "step": 3, "data": b"abc"},
         {"height": 0, "width": 0, "step": 0, "data": b""},
@@ -69,7 +69,7 @@ def test_a_buffer_of_another_size_stays_raw(images: Callable[..., list[dict[str,
     assert good["format"] == "png"
 
 
-def test_other_ontologies_are_left_alone(
+def test_png_images_other_ontology_is_unchanged(
     define: Callable[..., Definition], adapt: Callable[..., Adapted]
 ) -> None:
     definition = define("sensor_msgs/msg/Imu")

@@ -105,7 +105,7 @@ def restore(type_: str, value: str, message: dict[str, Any]) -> Restored:
         ("{type: list, fields: {v: float64, t: float32}}", "{of: 'cells[]', fields: {v: mv * 0.001, t: t}}", "cells"),
     ],
 )  # fmt: skip
-def test_an_expression_is_undone(type_: str, value: str, field: str) -> None:
+def test_invert_expression_restores_field(type_: str, value: str, field: str) -> None:
     restored = restore(type_, value, MESSAGE)
     assert not restored.not_invertible
     got = pa.array([MESSAGE], ros_shape(DEFINITION))
@@ -114,14 +114,14 @@ def test_an_expression_is_undone(type_: str, value: str, field: str) -> None:
 
 
 @pytest.mark.parametrize("value", ["i + u", "len(many)", "sum(many)", "i % 3", "i if flag else u", "d ** 2"])
-def test_what_has_many_sources_is_named_and_nothing_is_made_up(value: str) -> None:
+def test_invert_ambiguous_expression_reports_column(value: str) -> None:
     restored = restore("float64", value, MESSAGE)
     assert restored.not_invertible == {"x": value} or restored.changed
     assert {"text", "many", "cells"} <= set(restored.defaulted)
     assert restored.rows.field("cells").to_pylist() == [[]]
 
 
-def test_columns_of_the_elements_of_one_list_are_put_together() -> None:
+def test_invert_element_columns_rebuild_list() -> None:
     text = (
         "version: 1\nadapter: TAdapter\nros_type: acme_msgs/msg/T\n"
         "ontology: {tag: T, fields: {v: 'list[uint16]', t: 'list[float32]'}}\n"
@@ -136,7 +136,7 @@ def test_columns_of_the_elements_of_one_list_are_put_together() -> None:
     assert restored.rows.field("cells").to_pylist() == [CELLS, [], CELLS]
 
 
-def test_a_field_that_two_columns_hold_is_taken_from_the_one_that_has_it() -> None:
+def test_invert_field_of_two_columns_uses_non_null_one() -> None:
     text = (
         "version: 1\nadapter: TAdapter\nros_type: acme_msgs/msg/T\n"
         "ontology: {tag: T, fields: {large: float64, all: float64}}\n"
@@ -161,7 +161,7 @@ TYPE = pa.struct([("a", pa.float32()), ("b", pa.list_(pa.float32()))])
 
 
 @given(VALUES, VALUES)
-def test_rows_differ_where_their_text_does(left: list[Any], right: list[Any]) -> None:
+def test_differences_returns_rows_with_different_text(left: list[Any], right: list[Any]) -> None:
     size = min(len(left), len(right))
     left, right = left[:size], right[:size]
     found = differences(pa.array(left, TYPE), pa.array(right, TYPE))

@@ -113,14 +113,14 @@ def addresses(array: Any) -> set[int]:
     return {buffer.address for buffer in array.buffers() if buffer is not None and buffer.size}
 
 
-def test_a_spec_and_an_adapter_satisfy_their_seams() -> None:
+def test_mapping_spec_and_adapter_implement_protocols() -> None:
     spec = spec_of("a: float64", "a: volts")
     EXPECTED.append(bound(spec))  # pyright and a reader see the protocol satisfied
     SPECS.append(spec)
     assert (spec.name, spec.ros_types, spec.default) == ("PackAdapter", ("acme_msgs/msg/Pack",), True)
 
 
-def test_rows_keep_their_order_and_have_exactly_the_ontology_s_type() -> None:
+def test_adapt_keeps_order_and_returns_exact_type() -> None:
     spec = spec_of("a: {type: float64, nullable: false}\nb: float32", "a: volts")
     adapted = adapt(spec, rows_of({"volts": 1.0}, {"volts": 2.0}, {"volts": 3.0}))
     assert adapted.rows.type == spec.ontology.struct
@@ -128,7 +128,7 @@ def test_rows_keep_their_order_and_have_exactly_the_ontology_s_type() -> None:
     assert adapted.index.tolist() == [0, 1, 2]
 
 
-def test_an_empty_batch_gives_an_empty_batch() -> None:
+def test_adapt_empty_batch_returns_empty_batch() -> None:
     spec = spec_of(
         "a: float32\nc: list[float32]\np: Pose",
         "a: cast(volts)\nc: cells[].voltage_mv\np: {use: PoseAdapter, of: pose}",
@@ -155,7 +155,7 @@ def test_an_empty_batch_gives_an_empty_batch() -> None:
         ("a: 'list[Pose]'", "a: {use: PoseAdapter, of: 'poses[]'}", lambda rows: rows.field("poses").values.field("pose").field("position").field("x")),
     ],
 )  # fmt: skip
-def test_what_only_moves_is_not_copied(types: str, fields: str, of: Callable[[Any], Any]) -> None:
+def test_adapt_moved_fields_share_memory(types: str, fields: str, of: Callable[[Any], Any]) -> None:
     given = {
         "header": {"frame_id": "f"},
         "serial": "a",
@@ -169,7 +169,7 @@ def test_what_only_moves_is_not_copied(types: str, fields: str, of: Callable[[An
     assert addresses(of(rows)) <= addresses(adapted.rows.field("a"))
 
 
-def test_a_sliced_batch_gives_what_the_slice_holds() -> None:
+def test_adapt_sliced_batch_returns_slice() -> None:
     given = [{"volts": float(k), "cells": [{"voltage_mv": k}] * k, "nine": [float(k)] * 9} for k in range(6)]
     spec = spec_of(
         "a: float64\nc: list[float32]\nn: list[float64]\nz: 'list[float64, 9]'",
@@ -190,20 +190,20 @@ def test_a_sliced_batch_gives_what_the_slice_holds() -> None:
         ("a: int64", "a: count * count", {"count": 2**40}, "overflow", "1099511627776 * 1099511627776"),
         ("a: int64", "a: 1 // flag", {"flag": 0}, "division", "1 // 0 has no result"),
         ("a: int64", "a: status % flag", {"flag": 0}, "division", "1 % 0 has no result"),
-        ("a: float64", "a: number(serial)", {"serial": "x1"}, "number-syntax", "'x1' is no number"),
+        ("a: float64", "a: number(serial)", {"serial": "x1"}, "number-syntax", "'x1'"),
         ("a: int32", "a: {value: status, map: {1: 5, CHARGING: 5}}", {"status": 9}, "unmapped", "a: `status`: 9 is not in the map"),
         ("a: 'list[float64, 2]'", "a: any_length", {"any_length": [1.0]}, "list-length", "the list has 1 elements, not 2"),
         ("a: 'list[float64]'", "a: 'any_length[] + nine[]'", {"any_length": [1.0]}, "list-length", "lists of 9 and 1 elements"),
         ("a: 'list[uint8]'", "a: 'cast(cells[].voltage_mv)'", {"cells": [{"voltage_mv": 1}, {"voltage_mv": 300}]}, "out-of-range", "300 does not fit uint8"),
         ("a: Header", "a: header", {"header": {"stamp": {"nanosec": 2 * 10**9}}}, "nanosec", "nanosec is 2000000000"),
         ("a: 'list[Time]'", "a: 'cells[].seen'", {"cells": [{"seen": {"nanosec": 10**9}}]}, "nanosec", "nanosec is 1000000000"),
-        ("a: {type: string, nullable: false}", "a: if_else(serial == '', null, serial)", {"serial": ""}, "null", "a: null, where the ontology requires"),
-        ("a: {type: float64, nullable: false}", "a: 'any_length[0]'", {"any_length": []}, "null", "null, where"),
+        ("a: {type: string, nullable: false}", "a: if_else(serial == '', null, serial)", {"serial": ""}, "null", "a: null"),
+        ("a: {type: float64, nullable: false}", "a: 'any_length[0]'", {"any_length": []}, "null", "null"),
         ("a: 'list[Pose]'", "a: {use: PoseAdapter, of: 'poses[]'}", {"poses": [{}, {"header": {"stamp": {"nanosec": 10**9}}}]}, "nanosec", "PoseAdapter: header: nanosec is"),
         ("a: {fields: {b: int8}}", "a: {of: pose.position, fields: {b: cast(x)}}", {"pose": {"position": {"x": 0.5}}}, "out-of-range", "a.b: `cast(x)`: 0.5 does not fit"),
     ],
 )  # fmt: skip
-def test_a_row_that_does_not_fit_is_rejected_with_the_expression_and_the_value(
+def test_adapt_invalid_row_is_rejected_with_rule_and_value(
     types: str, fields: str, bad: dict[str, Any], rule: str, says: str
 ) -> None:
     good = {"flag": 1, "serial": "1", "status": 1, "any_length": [1.0] * 9} if "length[] +" in fields else {
@@ -215,7 +215,7 @@ def test_a_row_that_does_not_fit_is_rejected_with_the_expression_and_the_value(
     assert says in found[1][1]
 
 
-def test_rows_bad_in_different_ways_are_each_accounted_for() -> None:
+def test_adapt_rows_with_different_mistakes_are_all_rejected() -> None:
     given = [
         {"count": 1, "flag": 1},
         {"count": 300, "flag": 1},
@@ -230,7 +230,7 @@ def test_rows_bad_in_different_ways_are_each_accounted_for() -> None:
     assert adapted.rows.to_pylist() == [{"a": 1, "b": 8}, {"a": 2, "b": 4}]
 
 
-def test_only_the_branch_taken_can_reject_a_row() -> None:
+def test_adapt_branch_not_taken_rejects_no_row() -> None:
     assert values("a: int64", "a: 8 // flag if flag != 0 else -1", {"flag": 0}, {"flag": 4}) == [
         {"a": -1},
         {"a": 2},
@@ -245,7 +245,7 @@ def test_only_the_branch_taken_can_reject_a_row() -> None:
     assert reasons("a: Pose", fields, {**bad, "serial": "x"}).keys() == {0}
 
 
-def test_constants_fill_every_row() -> None:
+def test_adapt_constant_fills_every_row() -> None:
     types = "a: bool\nb: float32\nc: string\nd: 'list[int8, 2]'\ne: int32"
     assert (
         values(types, "a: true\nb: 0.5\nc: \"'raw'\"\nd: '[1, 2]'\ne: CHARGING", {}, {})
@@ -253,7 +253,7 @@ def test_constants_fill_every_row() -> None:
     )
 
 
-def test_a_map_knows_values_constants_and_what_to_do_with_the_rest() -> None:
+def test_adapt_map_replaces_values_and_constants() -> None:
     given = [{"status": 0}, {"status": 1}, {"status": 7}]
     assert [
         r["a"]
@@ -278,7 +278,7 @@ def test_a_map_knows_values_constants_and_what_to_do_with_the_rest() -> None:
     ) == [{"a": [2, 0]}]
 
 
-def test_with_and_when_change_the_struct_that_results() -> None:
+def test_adapt_with_and_when_change_struct() -> None:
     given = {"pose": {"position": {"x": 1.0}}, "nine": [1.0] * 9}
     fields = "p: {value: pose.position, with: {covariance: nine, covariance_type: status}, when: volts > 0}"
     first, second = values("p: Point3d", fields, {**given, "volts": 1.0, "status": 3}, given)
@@ -293,7 +293,7 @@ def test_with_and_when_change_the_struct_that_results() -> None:
     assert second["p"] is None
 
 
-def test_with_reads_outside_of_each_element() -> None:
+def test_adapt_with_reads_names_outside_of() -> None:
     fields = "p: {of: 'cells[]', fields: {x: temperature}, with: {y: volts}}"
     [row] = values(
         "p: list[Point2d]", fields, {"volts": 5.0, "cells": [{"temperature": 1.0}, {"temperature": 2.0}]}
@@ -301,7 +301,7 @@ def test_with_reads_outside_of_each_element() -> None:
     assert [(p["x"], p["y"]) for p in row["p"]] == [(1.0, 5.0), (2.0, 5.0)]
 
 
-def test_variants_say_where_the_payload_is() -> None:
+def test_adapt_variants_read_payload_from_of() -> None:
     spec = load_adapter(POSE, file="pose.yaml")
     stamped = definition("geometry_msgs/msg/PoseStamped")
     shape = ros_shape(stamped)
@@ -312,7 +312,7 @@ def test_variants_say_where_the_payload_is() -> None:
     assert adapted.rows.type == ontology_type("Pose").struct
 
 
-def test_an_adapter_that_uses_itself_is_found_and_not_followed() -> None:
+def test_bind_adapter_cycle_raises() -> None:
     text = POSE.replace(
         "{position: position, orientation: orientation}",
         "{position: position, orientation: {use: LoopAdapter, of: self}}",
@@ -331,14 +331,14 @@ def looping(name: str) -> MappingSpec:
     return load_adapter(text.replace("PoseAdapter", name), file="loop.yaml", adapters=looping)
 
 
-def test_a_spec_survives_pickling() -> None:
+def test_mapping_spec_pickles() -> None:
     spec = spec_of("a: Pose", "a: {use: PoseAdapter, of: pose}")
     again = pickle.loads(pickle.dumps(spec))  # noqa: S301 - our own bytes
     assert again.ontology == spec.ontology
     assert len(adapt(again, rows_of({})).rows) == 1
 
 
-def test_metadata_is_read_from_the_first_row() -> None:
+def test_topic_metadata_reads_first_row() -> None:
     text = (
         "version: 1\nadapter: A\nros_type: acme_msgs/msg/Pack\nontology: {tag: P, fields: {a: float64}}\n"
         "fields: {a: volts}\nschema_metadata: {rate: volts * 2, kind: \"'pack'\", channels: 3, cells: 'cells[].voltage_mv'}\n"
@@ -349,7 +349,7 @@ def test_metadata_is_read_from_the_first_row() -> None:
     assert adapter.topic_metadata(None) == {}
 
 
-def test_a_field_named_like_a_keyword_is_reached_through_self() -> None:
+def test_adapt_keyword_field_is_read_through_self() -> None:
     text = "version: 1\nadapter: A\nros_type: a/msg/B\nontology: {tag: P, fields: {a: int32}}\nfields:\n  a: self['from']\n"
     keyword = TypeResolver().resolve("a/msg/B", Embedded("ros2msg", "int32 from"), ros_version=2)
     adapter = load_adapter(text, file="a.yaml").bind(keyword, ros_shape(keyword))
@@ -379,28 +379,28 @@ tests:
         ("given: {volts: 1e300}, rejects: does not fit", None),
         ("given: {volts: 1}, expect: {a: 2}", "a: expected 2, got 1.0"),
         ("given: {volts: 1}, expect: {a: null}", "a: expected None, got 1.0"),
-        ("given: {volts: 1}, expect: {aa: 2}", "expect: there is no field aa; did you mean 'a'?"),
-        ("given: {volt: 1}, expect: {a: 2}", "given: there is no field volt; did you mean 'volts'?"),
+        ("given: {volts: 1}, expect: {aa: 2}", "field aa; did you mean 'a'?"),
+        ("given: {volt: 1}, expect: {a: 2}", "field volt; did you mean 'volts'?"),
         ("given: {any_length: [1, 2]}, expect: {b: [1]}", "b: expected 1 elements, got 2"),
         ("given: {any_length: [1, 2]}, expect: {b: [1, 3]}", "b[1]: expected 3, got 2.0"),
-        ("given: {any_length: 1}, expect: {b: [1]}", "given: any_length is a list, not 1"),
+        ("given: {any_length: 1}, expect: {b: [1]}", "any_length must be a list, not 1"),
         ("given: {volts: text}, expect: {a: 1}", "given does not fit"),
         ("given: {volts: 1}, rejects: anything", "the row is accepted"),
-        ("given: {volts: 1e300}, rejects: nanosec", "rejected, but not for 'nanosec'"),
+        ("given: {volts: 1e300}, rejects: nanosec", "does not contain 'nanosec'"),
         ("given: {volts: 1e300}, expect: {a: 1}", "the row is rejected: a: `cast(volts)`"),
-        ("given: {volts: 1}", "nothing is expected"),
+        ("given: {volts: 1}", "neither expect nor rejects"),
         ("given: {bag: x.mcap, topic: /a}, expect: {a: 1}", "recorded messages cannot be read here"),
-        ("given: {}, ros_type: acme_msgs/msg/Nope, expect: {a: 0}", "give its .msg text under `definition`"),
+        ("given: {}, ros_type: acme_msgs/msg/Nope, expect: {a: 0}", "`definition`"),
     ],
 )
-def test_the_tests_of_a_file_say_what_differs(case: str, problem: str | None) -> None:
+def test_run_tests_reports_differences(case: str, problem: str | None) -> None:
     [outcome] = run_tests(load_adapter(f"{CASES}  - {{name: it, {case}}}\n", file="a.yaml"), TypeResolver())
     assert outcome.line == 10
     assert outcome.passed == (problem is None)
     assert problem is None or problem in outcome.problems[0]
 
 
-def test_a_test_may_take_a_recorded_message() -> None:
+def test_run_tests_reads_recorded_message() -> None:
     spec = load_adapter(
         CASES + "  - {name: it, given: {bag: x.mcap, topic: /a, index: 2}, expect: {a: 5}}\n", file="a.yaml"
     )

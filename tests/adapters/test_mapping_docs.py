@@ -35,19 +35,19 @@ def block(start: str) -> str:
     return found
 
 
-def test_the_first_example_passes_its_own_tests() -> None:
+def test_mapping_page_first_example_passes_its_tests() -> None:
     outcomes = run_tests(load_adapter(block("version: 1"), file="docs"), TypeResolver(types=TYPES))
     assert [(outcome.name, outcome.problems) for outcome in outcomes] == [("nominal", ())]
 
 
-def test_the_example_of_variants_binds_to_all_of_them() -> None:
+def test_mapping_page_variants_example_binds() -> None:
     spec = load_adapter(f"version: 1\nadapter: A\nontology: Pose\n{block('variants:')}", file="docs")
     for name in spec.ros_types:
         definition = TypeResolver().resolve(name, None, ros_version=2)
         assert spec.check(definition, ros_shape(definition)) == ()
 
 
-def test_the_example_of_a_type_of_one_s_own_is_one() -> None:
+def test_mapping_page_inline_ontology_example_loads() -> None:
     text = f"version: 1\nadapter: A\nros_type: a/msg/B\nfields: {{left: 1}}\n{block('ontology:')}"
     spec = load_adapter(text, file="docs")
     assert (spec.ontology.tag, len(spec.ontology.struct)) == ("WheelTicks", 7)
@@ -56,5 +56,5 @@ def test_the_example_of_a_type_of_one_s_own_is_one() -> None:
 @pytest.mark.parametrize(
     "key", ["value", "map", "else", "use", "of", "fields", "with", "when", "variants", "definition"]
 )
-def test_every_key_is_on_the_page(key: str) -> None:
+def test_mapping_page_documents_every_key(key: str) -> None:
     assert f"`{key}`" in TEXT or f"{key}:" in TEXT

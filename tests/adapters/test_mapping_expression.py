@@ -25,27 +25,27 @@ def refused(text: str) -> tuple[str, str]:
     return text[start:end], str(caught.value)
 
 
-def test_names_attributes_and_lists_are_read() -> None:
+def test_parse_names_attributes_and_lists() -> None:
     assert parse("a.b[].c") == Attribute(EachElement(Attribute(Name("a", AT), "b", AT, AT), AT), "c", AT, AT)
     assert parse("a[-1]") == Subscript(Name("a", AT), -1, AT)
     assert parse("[]") == ListLiteral((), AT)
     assert parse("self['from']") == Attribute(Name("self", AT), "from", AT, AT)
 
 
-def test_yaml_words_are_values() -> None:
+def test_parse_yaml_words_as_literals() -> None:
     assert parse("null") == Literal(None, AT)
     assert parse("true") == Literal(value=True, span=AT)
     assert parse("-1.5") == Literal(-1.5, AT)
 
 
-def test_operators_are_calls() -> None:
+def test_parse_operators_as_calls() -> None:
     assert parse("a + 1") == Call("+", (Name("a", AT), Literal(1, AT)), AT, AT)
     assert parse("a < b < c") == parse("a < b and b < c")
     assert parse("a in [1, 2]") == parse("a == 1 or a == 2")
     assert parse("a not in [1]") == parse("not (a == 1)")
 
 
-def test_if_else_is_the_conditional() -> None:
+def test_parse_if_else_as_ternary() -> None:
     assert parse("if_else(a, b, c)") == parse("b if a else c")
     assert isinstance(parse("b if a else c"), Ternary)
 
@@ -85,11 +85,11 @@ def test_if_else_is_the_conditional() -> None:
         "\0",
     ],
 )
-def test_what_the_language_does_not_have_is_refused(text: str) -> None:
+def test_parse_unsupported_syntax_raises(text: str) -> None:
     refused(text)
 
 
-def test_the_place_is_the_offending_part() -> None:
+def test_parse_error_span_is_offending_part() -> None:
     assert refused("cells[].x + (lambda: 1)")[0] == "lambda: 1"
     assert refused("'ü€' + b'x'")[0] == "b'x'"
     assert refused("f(a[], b[c])")[0] == "c"
@@ -97,7 +97,7 @@ def test_the_place_is_the_offending_part() -> None:
     assert refused("1 +")[0] == "+"
 
 
-def test_places_count_characters_as_written() -> None:
+def test_parse_spans_count_characters_of_source() -> None:
     text = "a[].b + 'ü' + c[].d"
     node = parse(text)
     assert isinstance(node, Call)
@@ -105,10 +105,10 @@ def test_places_count_characters_as_written() -> None:
     assert text[last.span[0] : last.span[1]] == "c[].d"
 
 
-def test_brackets_in_text_are_left_alone() -> None:
+def test_parse_keeps_brackets_in_text() -> None:
     assert parse("'a[]'") == Literal("a[]", AT)
     assert parse(r"extract(s, '\d[]]')").arguments[1].value == r"\d[]]"  # type: ignore[union-attr]  # it is a call
 
 
-def test_lines_of_a_folded_text_are_one_expression() -> None:
+def test_parse_joins_lines_of_folded_text() -> None:
     assert parse("a +\n  b") == parse("a + b")

@@ -159,7 +159,7 @@ FORMATS = [
 
 
 @pytest.mark.parametrize(("text", "type_", "values", "expected"), CASES)
-def test_a_function_gives_what_its_line_says(
+def test_function_returns_expected_values(
     text: str, type_: Any, values: list[Any], expected: list[Any]
 ) -> None:
     result = column(text, values, type_)
@@ -169,11 +169,11 @@ def test_a_function_gives_what_its_line_says(
 
 
 @pytest.mark.parametrize(("said", "stored"), FORMATS)
-def test_a_compressed_image_s_format_is_the_codec_in_it(said: str, stored: str) -> None:
+def test_compressed_format_returns_codec(said: str, stored: str) -> None:
     assert column("compressed_format(x)", [said, None], TEXT) == [stored, None]
 
 
-def test_a_header_that_says_nothing_is_null() -> None:
+def test_ros_header_empty_header_is_null() -> None:
     given = [
         {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""},
         {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "map"},
@@ -187,7 +187,7 @@ def test_a_header_that_says_nothing_is_null() -> None:
     assert stamped["timestamp"] == {"seconds": 0, "nanoseconds": 1}
 
 
-def test_the_counter_of_a_ros_1_header_is_kept_and_does_not_count_as_saying_something() -> None:
+def test_ros_header_ros1_seq_becomes_sample_counter() -> None:
     given = [
         {"seq": 7, "stamp": {"sec": 0, "nanosec": 0}, "frame_id": "map"},
         {"seq": 7, "stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""},
@@ -196,23 +196,23 @@ def test_the_counter_of_a_ros_1_header_is_kept_and_does_not_count_as_saying_some
     assert (named["sample_counter"], silent) == (7, None)
 
 
-def test_header_and_time_are_those_of_the_ontology() -> None:
+def test_header_and_stamp_types_match_ontology() -> None:
     assert ontology_type("IMU").struct.field("header").type == HEADER_TYPE
     assert ontology_type("Time").struct == STAMP_TYPE
 
 
-def test_the_reference_in_the_documentation_is_current() -> None:
+def test_function_reference_page_is_up_to_date() -> None:
     path = Path(__file__).parents[2] / "docs" / "mapping.md"
     assert with_reference(path.read_text("utf-8")) == path.read_text("utf-8")
 
 
-def test_a_sum_of_more_than_64_bits_rejects_the_row() -> None:
+def test_sum_overflow_rejects_row() -> None:
     for type_ in (pa.int64(), pa.uint64()):
         with pytest.raises(RowsRejected):
             column("sum(x)", [[2**63 - 1, 1]], pa.list_(type_))
 
 
-def test_every_function_is_documented_and_has_a_case() -> None:
+def test_functions_are_documented_and_tested() -> None:
     tested = " ".join(text for text, *_ in CASES) + " ros_header( compressed_format("
     for function in functions():
         if function.apply.__module__ == operators.__name__:

@@ -146,17 +146,17 @@ def attempts(seed: int, count: int) -> int:
     return meant
 
 
-def test_random_programs_give_columns_findings_or_rejected_rows() -> None:
+def test_random_expressions_return_columns_findings_or_rejections() -> None:
     assert attempts(seed=1, count=1500) > 100
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2, 8))
-def test_many_random_programs_give_columns_findings_or_rejected_rows(seed: int) -> None:
+def test_many_random_expressions_return_columns_findings_or_rejections(seed: int) -> None:
     assert attempts(seed, count=15_000) > 1000
 
 
-def test_damaged_files_are_adapters_or_errors() -> None:
+def test_load_adapter_damaged_file_loads_or_raises_adapter_error() -> None:
     folder = Path(mosaico_ingest.__file__).parent / "adapters" / "catalog"
     texts = [path.read_text("utf-8") for path in sorted(folder.glob("*.yaml"))]
     pick = random.Random(7)  # noqa: S311 - no secret

@@ -417,7 +417,7 @@ def same(left: Any, right: Any) -> bool:
 
 @settings(max_examples=80, deadline=None)
 @given(text=SCALARS | LISTS | OTHERS, rows=ROWS)
-def test_columns_and_rows_agree(text: str, rows: list[dict[str, Any]]) -> None:
+def test_evaluation_of_columns_equals_interpreter(text: str, rows: list[dict[str, Any]]) -> None:
     typed = typed_of(text)
     assume(typed is not None)
     assert typed is not None
@@ -428,7 +428,7 @@ def test_columns_and_rows_agree(text: str, rows: list[dict[str, Any]]) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(text=SCALARS | LISTS | OTHERS, rows=ROWS)
-def test_one_row_at_a_time_gives_what_all_rows_give(text: str, rows: list[dict[str, Any]]) -> None:
+def test_evaluation_of_single_rows_equals_batch(text: str, rows: list[dict[str, Any]]) -> None:
     typed = typed_of(text)
     assume(typed is not None)
     assert typed is not None
@@ -440,7 +440,7 @@ def test_one_row_at_a_time_gives_what_all_rows_give(text: str, rows: list[dict[s
 
 @settings(max_examples=30, deadline=None)
 @given(text=SCALARS, rows=ROWS)
-def test_integers_stay_within_the_bounds_that_were_promised(text: str, rows: list[dict[str, Any]]) -> None:
+def test_evaluation_integers_stay_within_inferred_bounds(text: str, rows: list[dict[str, Any]]) -> None:
     typed = typed_of(text)
     assume(typed is not None)
     assert typed is not None

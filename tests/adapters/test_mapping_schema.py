@@ -22,17 +22,17 @@ def plain(value: Any) -> Any:
     return json.loads(json.dumps(value))
 
 
-def test_the_committed_schema_is_current() -> None:
+def test_adapter_schema_file_is_up_to_date() -> None:
     path = Path(__file__).parents[2] / "schemas" / "adapter.schema.json"
     assert json.loads(path.read_text("utf-8")) == adapter_schema()
 
 
 @pytest.mark.parametrize("path", CATALOG, ids=lambda path: path.stem)
-def test_every_built_in_adapter_satisfies_it(path: Path) -> None:
+def test_adapter_schema_accepts_every_builtin(path: Path) -> None:
     VALIDATOR.validate(plain(load_source(path.read_text("utf-8"), file=path.name).value))
 
 
-def test_every_key_is_described() -> None:
+def test_adapter_schema_describes_every_key() -> None:
     schema = adapter_schema()
     for model in [schema, *schema["$defs"].values()]:
         for key, node in model.get("properties", {}).items():
@@ -50,5 +50,5 @@ def test_every_key_is_described() -> None:
         "{version: 1, adapter: A, ros_type: a/b, ontology: T, fields: {x: {valu: 1}}}",
     ],
 )
-def test_it_refuses_what_the_model_refuses(text: str) -> None:
+def test_adapter_schema_rejects_what_the_model_rejects(text: str) -> None:
     assert not VALIDATOR.is_valid(plain(load_source(text, file="a.yaml").value))

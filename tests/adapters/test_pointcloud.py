@@ -83,13 +83,15 @@ def _assert_same(adapted: Adapted, given: list[dict[str, Any]]) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(given_clouds=st.lists(clouds(), min_size=1, max_size=4))
-def test_clouds_of_different_layouts(unpack: Unpack, given_clouds: list[dict[str, Any]]) -> None:
+def test_points_of_different_layouts_equal_reference(
+    unpack: Unpack, given_clouds: list[dict[str, Any]]
+) -> None:
     _assert_same(unpack("LidarAdapter", given_clouds), given_clouds)
 
 
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
-def test_clouds_of_one_layout_are_read_as_one_block(unpack: Unpack, data: st.DataObject) -> None:
+def test_points_of_one_layout_share_one_block(unpack: Unpack, data: st.DataObject) -> None:
     fields, step = data.draw(layouts())
     given_clouds = data.draw(st.lists(clouds(fields=fields, step=step), min_size=1, max_size=5))
     for cloud in given_clouds:
@@ -118,12 +120,12 @@ def _field(name: str, datatype: int, offset: int = 0, count: int = 1) -> dict[st
         ({"height": 2**32 - 1, "width": 2**32 - 1}, "do not fit 12 bytes of data"),
         ({"point_step": 0, "row_step": 0}, "field x ends at byte 4 of 0"),
         ({"fields": [_field("x", 9)]}, "field x has the unknown datatype 9"),
-        ({"fields": [_field("x", 7, count=3)]}, "field x has 3 values a point"),
+        ({"fields": [_field("x", 7, count=3)]}, "field x has 3 values"),
         ({"fields": [_field("x", 8, offset=8)]}, "field x ends at byte 16 of 12"),
         ({"fields": [_field("x", 7)]}, "y"),
     ],
 )
-def test_a_cloud_that_contradicts_itself_is_rejected_alone(
+def test_points_inconsistent_cloud_rejects_only_its_row(
     unpack: Unpack, changes: dict[str, Any], reason: str
 ) -> None:
     adapted = unpack("LidarAdapter", [_cloud(), _cloud(**changes), _cloud()])
@@ -134,7 +136,7 @@ def test_a_cloud_that_contradicts_itself_is_rejected_alone(
     assert adapted.rows.field("x").to_pylist() == [[1.0], [1.0]]
 
 
-def test_an_integer_column_refuses_what_it_cannot_hold(unpack: Unpack) -> None:
+def test_points_integer_out_of_range_rejects_row(unpack: Unpack) -> None:
     def with_ring(value: float) -> dict[str, Any]:
         fields = [*_cloud()["fields"], _field("ring", 7, 12)]
         data = struct.pack("<ffff", 1, 2, 3, value)
@@ -143,13 +145,13 @@ def test_an_integer_column_refuses_what_it_cannot_hold(unpack: Unpack) -> None:
     adapted = unpack("LidarAdapter", [with_ring(5), with_ring(0.5), with_ring(-1), with_ring(65535)])
     assert adapted.rows.field("beam_id").to_pylist() == [[5], [65535]]
     assert [failure.row for failure in adapted.failures] == [1, 2]
-    assert "0.5 is no uint16" in adapted.failures[0].reason
+    assert "0.5 is not a uint16" in adapted.failures[0].reason
 
 
 @pytest.mark.parametrize("datatype", [6, 7])
 @pytest.mark.parametrize("name", ["rgb", "rgba"])
 @pytest.mark.parametrize("big", [False, True])
-def test_a_packed_colour_keeps_its_bytes(unpack: Unpack, datatype: int, name: str, *, big: bool) -> None:
+def test_points_packed_keeps_bytes(unpack: Unpack, datatype: int, name: str, *, big: bool) -> None:
     order = ">" if big else "<"
     data = struct.pack(f"{order}fffI", 1, 2, 3, 0x00AABBCC)
     fields = [*_cloud()["fields"], _field(name, datatype, 12)]
@@ -159,7 +161,7 @@ def test_a_packed_colour_keeps_its_bytes(unpack: Unpack, datatype: int, name: st
     assert struct.pack("<f", colour) == struct.pack("<I", 0x00AABBCC)
 
 
-def test_no_points_are_empty_lists_and_nan_is_kept(unpack: Unpack) -> None:
+def test_points_empty_cloud_is_empty_list(unpack: Unpack) -> None:
     nothing = _cloud(width=0, row_step=0, data=b"", fields=[], point_step=0)
     nan = _cloud(data=struct.pack("<fff", float("nan"), 2, 3))
     rows = unpack("LidarAdapter", [nothing, nan]).rows.to_pylist()

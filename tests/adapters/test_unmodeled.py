@@ -20,7 +20,7 @@ def _defined(text: str, name: str = "pkg/msg/Thing") -> Definition:
     return TypeResolver().resolve(name, Embedded("ros2msg", text), ros_version=2)
 
 
-def test_the_tag_is_the_short_name_and_the_columns_are_the_message(
+def test_unmodeled_tag_is_short_name_and_columns_are_fields(
     define: Callable[..., Definition], adapt: Callable[..., Adapted]
 ) -> None:
     definition = define("visualization_msgs/msg/Marker")
@@ -32,14 +32,14 @@ def test_the_tag_is_the_short_name_and_the_columns_are_the_message(
     assert bound.topic_metadata(None) == {}
 
 
-def test_columns_are_shared_with_the_decoder_not_copied(define: Callable[..., Definition]) -> None:
+def test_unmodeled_columns_share_memory(define: Callable[..., Definition]) -> None:
     definition = define("std_msgs/msg/ColorRGBA")
     rows = pa.array([{"r": 1.0}], ros_shape(definition))
     adapted = UnmodeledSpec().bind(definition, ros_shape(definition)).adapt(rows, None)  # type: ignore[arg-type] - not looked at
     assert adapted.rows is rows
 
 
-def test_a_field_called_like_the_envelopes_column_gets_an_underscore(adapt: Callable[..., Adapted]) -> None:
+def test_unmodeled_timestamp_field_gets_underscore(adapt: Callable[..., Adapted]) -> None:
     definition = _defined("int64 timestamp_ns\nint64 timestamp_ns_\nstring name\n")
     bound = UnmodeledSpec().bind(definition, ros_shape(definition))
     assert [field.name for field in bound.ontology.struct] == ["timestamp_ns__", "timestamp_ns_", "name"]
@@ -50,12 +50,12 @@ def test_a_field_called_like_the_envelopes_column_gets_an_underscore(adapt: Call
     ]
 
 
-def test_a_message_without_fields_still_counts(adapt: Callable[..., Adapted]) -> None:
+def test_unmodeled_message_without_fields_is_one_row(adapt: Callable[..., Adapted]) -> None:
     adapted = adapt(UnmodeledSpec(), _defined(""), [{}, {}])
     assert len(adapted.rows) == len(adapted.index) == 2
 
 
-def test_a_nested_message_without_fields_gets_the_member_ros_2_gives_it(
+def test_unmodeled_empty_nested_message_gets_placeholder_member(
     adapt: Callable[..., Adapted],
 ) -> None:
     nothing = "=" * 80 + "\nMSG: pkg/Nothing\nuint8 A=1\n"
@@ -74,7 +74,7 @@ def test_a_nested_message_without_fields_gets_the_member_ros_2_gives_it(
     pq.write_table(table, pa.BufferOutputStream())
 
 
-def test_the_spec_is_picklable_and_carries_the_layout() -> None:
+def test_unmodeled_spec_pickles_with_format() -> None:
     spec = UnmodeledSpec(serialization_format=SerializationFormat.RAGGED)
     assert pickle.loads(pickle.dumps(spec)) == spec  # noqa: S301 - what was just pickled
     definition = _defined("int8 a\n")
@@ -84,7 +84,7 @@ def test_the_spec_is_picklable_and_carries_the_layout() -> None:
     )
 
 
-def test_the_origin_names_type_constants_definition_and_file() -> None:
+def test_ros_metadata_has_type_constants_definition_and_file() -> None:
     definition = _defined('uint8 A=1\nstring B="b"\nfloat64 C=nan\nfloat64 D=-inf\nstd_msgs/Header header\n')
     block = ros_metadata(definition, "run.bag")["_ros_"]
     assert block["msgtype"] == "pkg/msg/Thing"
@@ -93,7 +93,7 @@ def test_the_origin_names_type_constants_definition_and_file() -> None:
     assert "MSG: std_msgs/Header" in block["msgdef"]
 
 
-def test_constants_without_a_number_in_json_are_spelled_out() -> None:
+def test_ros_metadata_non_finite_constants_are_text() -> None:
     enums = ros_metadata(_defined("float64 A=nan\nfloat64 B=inf\nfloat64 C=-inf\nfloat64 D=0.5\n"), "f")[
         "_ros_"
     ]["enums"]

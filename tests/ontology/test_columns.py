@@ -16,28 +16,28 @@ GOLDEN: dict[str, list[str]] = json.loads(Path(__file__).with_name("fingerprints
 
 
 @pytest.mark.parametrize("tag", sorted(MODULES))
-def test_columns_and_format_are_the_ones_readers_know(tag: str) -> None:
+def test_ontology_fingerprints_and_formats_are_unchanged(tag: str) -> None:
     found = ontology_type(tag)
     assert [found.fingerprint, found.serialization_format.value] == GOLDEN[tag]
     assert found.tag == tag
 
 
-def test_every_known_fingerprint_has_a_model() -> None:
+def test_ontology_fingerprints_cover_every_model() -> None:
     assert set(GOLDEN) == set(MODULES)
 
 
 @pytest.mark.parametrize("tag", sorted(MODULES))
-def test_a_model_has_the_columns_of_the_file_that_is_read_in_its_place(tag: str) -> None:
+def test_columns_json_entry_matches_model(tag: str) -> None:
     known, made = ontology_type(tag), model(tag).ontology_type()
     assert known == made
     assert known.struct.equals(made.struct, check_metadata=True)
 
 
-def test_the_file_of_columns_is_up_to_date() -> None:
+def test_columns_json_is_up_to_date() -> None:
     assert COLUMNS_FILE.read_text(encoding="utf-8") == columns_file(), "run ./dev docs"
 
 
-def test_columns_equal_the_reference_name_by_name(shared: Path) -> None:
+def test_ontology_columns_equal_reference(shared: Path) -> None:
     reference = json.loads((shared / "spec" / "ontology.json").read_text())["classes"]
     assert {entry["ontology_tag"] for entry in reference} == set(MODULES)
     for entry in reference:
@@ -85,7 +85,7 @@ def within_a_second(value: Any) -> Any:
 @pytest.mark.parametrize("tag", sorted(set(MODULES) - SPECIAL))
 @settings(deadline=None, max_examples=5)
 @given(data=st.data())
-def test_a_row_becomes_a_model_and_the_same_row_again(tag: str, data: st.DataObject) -> None:
+def test_model_row_round_trip_restores_row(tag: str, data: st.DataObject) -> None:
     found = model(tag)
     row = within_a_second(data.draw(values(ontology_type(tag).struct)))
     batch = found.to_batch([found.from_row(row)])

@@ -43,7 +43,9 @@ rows = st.fixed_dictionaries(
 
 
 @given(st.lists(rows, max_size=8), st.integers(0, 3), st.integers(0, 3))
-def test_rows_are_the_same_and_parquet_takes_them(given_rows: list[dict], front: int, back: int) -> None:
+def test_required_fields_fill_keeps_values_and_writes_parquet(
+    given_rows: list[dict], front: int, back: int
+) -> None:
     array = pa.array(given_rows, ROW)
     array = array[front : max(front, len(array) - back)]
     filled = fill_required(array)
@@ -55,18 +57,18 @@ def test_rows_are_the_same_and_parquet_takes_them(given_rows: list[dict], front:
     assert pq.read_table(file).to_pylist() == array.to_pylist()
 
 
-def test_a_column_without_required_fields_is_not_touched() -> None:
+def test_required_fields_without_required_returns_same_array() -> None:
     array = pa.array([{"a": None}, None], pa.struct([pa.field("a", pa.int32())]))
     assert fill_required(array) is array
 
 
-def test_without_absent_structs_nothing_is_copied() -> None:
+def test_required_fields_without_null_structs_copies_nothing() -> None:
     array = pa.array([{"stamp": {"sec": 1, "frame": ""}}], pa.struct([pa.field("stamp", STAMP)]))
     assert fill_required(array) is array
 
 
 @pytest.mark.parametrize("kind", [pa.bool_(), pa.float32(), pa.binary(), pa.string(), pa.uint8()])
-def test_every_kind_of_value_has_a_zero(kind: pa.DataType) -> None:
+def test_required_fields_fill_supports_every_type(kind: pa.DataType) -> None:
     struct = pa.struct([pa.field("x", pa.struct([pa.field("y", kind, nullable=False)]))])
     filled = fill_required(pa.array([{"x": None}], struct))
     assert filled.field(0).field(0).null_count == 0

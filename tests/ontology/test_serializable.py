@@ -85,7 +85,7 @@ class Renamed(Serializable):
     data: list[UInt8]
 
 
-def test_a_users_class_gets_its_columns_from_its_annotations() -> None:
+def test_serializable_columns_follow_annotations() -> None:
     bearing = pa.struct([pa.field("angle", pa.float64(), nullable=False), pa.field("sure", pa.bool_())])
     expected = pa.struct(
         [
@@ -108,14 +108,14 @@ def test_a_users_class_gets_its_columns_from_its_annotations() -> None:
     assert Sonar.ontology_type().struct == expected
 
 
-def test_a_users_class_is_found_by_its_tag_once_defined() -> None:
+def test_serializable_subclass_is_found_by_tag() -> None:
     assert model("Sonar") is Sonar
     assert model("my_own_tag") is Renamed
     assert ontology_type("my_own_tag").serialization_format is SerializationFormat.RAGGED
     assert {"Sonar", "my_own_tag", "IMU"} <= set(tags())
 
 
-def test_a_subclass_of_a_model_has_a_tag_of_its_own() -> None:
+def test_serializable_subclass_of_model_has_own_tag() -> None:
     class Warmer(Renamed):
         heat: float
 
@@ -124,14 +124,14 @@ def test_a_subclass_of_a_model_has_a_tag_of_its_own() -> None:
     assert Warmer.ontology_type().serialization_format is SerializationFormat.RAGGED
 
 
-def test_a_built_ins_tag_cannot_be_taken() -> None:
+def test_serializable_with_builtin_tag_raises() -> None:
     with pytest.raises(
         AdapterError, match=r"'IMU' is a built-in's — rename the class or set __ontology_tag__"
     ):
         type("IMU", (Serializable,), {"__module__": __name__})
 
 
-def test_an_unknown_tag_names_the_nearest() -> None:
+def test_model_unknown_tag_suggests_nearest() -> None:
     with pytest.raises(UnknownTag, match=r"no ontology model has the tag 'Imu' — did you mean IMU") as caught:
         model("Imu")
     assert isinstance(caught.value, KeyError)
@@ -151,7 +151,7 @@ def test_an_unknown_tag_names_the_nearest() -> None:
         (list[dict[str, int]], r"Odd.field\[\]"),
     ],
 )
-def test_an_annotation_without_a_column_is_named(annotation: Any, reason: str) -> None:
+def test_struct_of_unsupported_annotation_raises_with_field(annotation: Any, reason: str) -> None:
     odd: type[Serializable] = type(
         "Odd", (Serializable,), {"__annotations__": {"field": annotation}, "__module__": __name__}
     )
@@ -163,12 +163,12 @@ class Tree(Serializable):
     children: list[Tree]
 
 
-def test_a_model_that_contains_itself_is_refused() -> None:
+def test_struct_of_recursive_model_raises() -> None:
     with pytest.raises(AdapterError, match="Tree: contains itself"):
         Tree.ontology_type()
 
 
-def test_a_list_of_the_wrong_length_is_refused() -> None:
+def test_fixed_size_wrong_length_raises() -> None:
     class Pair(Serializable):
         both: Annotated[list[int], FixedSize(2)]
 
@@ -176,7 +176,7 @@ def test_a_list_of_the_wrong_length_is_refused() -> None:
         Pair.from_row({"both": [1, 2, 3]})
 
 
-def test_a_row_that_does_not_fit_its_column_is_named() -> None:
+def test_to_batch_invalid_row_raises_with_index() -> None:
     class Counter(Serializable):
         count: int
 
@@ -184,11 +184,11 @@ def test_a_row_that_does_not_fit_its_column_is_named() -> None:
         Counter.to_batch([Counter(count=1), Counter(count=2**70)])
 
 
-def test_no_models_are_an_empty_batch_with_the_columns() -> None:
+def test_to_batch_empty_returns_typed_array() -> None:
     assert IMU.to_batch([]).type == IMU.ontology_type().struct
 
 
-def test_enums_go_in_as_values_and_come_back_as_enums() -> None:
+def test_enum_round_trip_restores_enum() -> None:
     field = PointField(name="x", offset=0, datatype=PointFieldDataType.FLOAT32, count=1)
     row = PointField.to_batch([field])[0].as_py()
     assert row == {"name": "x", "offset": 0, "datatype": 7, "count": 1}
@@ -197,35 +197,35 @@ def test_enums_go_in_as_values_and_come_back_as_enums() -> None:
     assert Image.from_row(Image.to_batch([image])[0].as_py()) == image
 
 
-def test_a_struct_without_any_value_reads_as_none() -> None:
+def test_from_row_struct_of_nulls_is_none() -> None:
     hollow = {"x": None, "y": None, "z": None}
     given_point = {"x": 1.0, "y": 2.0, "z": 3.0}
     assert GPS.from_row({"position": given_point, "velocity": hollow}).velocity is None
 
 
-def test_half_precision_survives() -> None:
+def test_float16_round_trip_restores_value() -> None:
     assert Floating16.to_batch([Floating16(data=1.5)])[0].as_py() == {"data": 1.5}
 
 
 @pytest.mark.parametrize("value", [-129, 128])
-def test_whole_numbers_stay_within_their_width(value: int) -> None:
+def test_integer_out_of_range_raises(value: int) -> None:
     with pytest.raises(ValidationError):
         Integer8(data=value)
 
 
 @pytest.mark.parametrize("nanoseconds", [-1, 10**9])
-def test_nanoseconds_stay_within_a_second(nanoseconds: int) -> None:
+def test_time_nanoseconds_out_of_range_raises(nanoseconds: int) -> None:
     with pytest.raises(ValidationError):
         Time(seconds=0, nanoseconds=nanoseconds)
 
 
 @given(st.integers(-(2**31) * 10**9, (2**31) * 10**9 - 1))
-def test_nanoseconds_survive_the_two_parts(nanoseconds: int) -> None:
+def test_time_nanoseconds_round_trip(nanoseconds: int) -> None:
     assert Time.from_nanoseconds(nanoseconds).to_nanoseconds() == nanoseconds
     assert Duration.from_nanoseconds(nanoseconds).to_milliseconds() == nanoseconds // 10**6
 
 
-def test_times_translate_to_datetimes_and_seconds() -> None:
+def test_time_converts_to_datetime_and_seconds() -> None:
     moment = datetime(2024, 5, 6, 7, 8, 9, 123456, tzinfo=timezone.utc)
     assert Time.from_datetime(moment).to_datetime() == moment
     assert Time.from_datetime(moment.replace(tzinfo=None)) == Time.from_datetime(moment)
@@ -234,19 +234,19 @@ def test_times_translate_to_datetimes_and_seconds() -> None:
     assert Time.now().seconds > moment.timestamp()
 
 
-def test_a_velocity_needs_a_part() -> None:
+def test_velocity_without_components_raises() -> None:
     assert Velocity(linear=Vector3d(x=1, y=2, z=3)).angular is None
     with pytest.raises(AdapterError, match="linear or angular must be given"):
         Velocity.from_row({})
 
 
 @pytest.mark.parametrize("value", [0.5, 5.0, math.nan, math.inf])
-def test_a_range_lies_between_its_bounds(value: float) -> None:
+def test_range_out_of_bounds_raises(value: float) -> None:
     with pytest.raises(ValidationError):
         Range(radiation_type=0, field_of_view=0.1, min_range=1, max_range=3, range=value)
 
 
-def test_an_unknown_field_is_refused_and_an_assignment_is_checked() -> None:
+def test_model_unknown_field_and_invalid_assignment_raise() -> None:
     with pytest.raises(ValidationError):
         Header(frame="map")  # type: ignore[call-arg]  # the mistake is the point
     header = Header(frame_id="map")
@@ -254,24 +254,24 @@ def test_an_unknown_field_is_refused_and_an_assignment_is_checked() -> None:
         header.sample_counter = -1
 
 
-def test_components_come_from_a_list() -> None:
+def test_from_list_sets_components() -> None:
     assert Vector3d.from_list([1, 2, 3]) == Vector3d(x=1, y=2, z=3)
     with pytest.raises(ValueError, match="shorter"):
         Vector3d.from_list([1, 2])
 
 
-def test_temperatures_translate_to_celsius() -> None:
+def test_temperature_converts_to_celsius() -> None:
     assert Temperature.from_celsius(20).value == 293.15
     assert Temperature(value=273.15).to_celsius() == 0
 
 
-def test_an_unmodeled_row_is_kept_as_it_is() -> None:
+def test_unmodeled_row_round_trip() -> None:
     row = Unmodeled.from_row({"a": {"b": 1}})
     assert row.raw_data == {"a": {"b": 1}}
     assert row.to_row() == {"a": {"b": 1}}
 
 
-def test_a_message_gives_its_row_to_who_knows_its_type() -> None:
+def test_message_get_data_returns_row_of_type() -> None:
     message = Message(timestamp_ns=5, data=Integer8(data=3))
     assert message.get_data(Integer8) == Integer8(data=3)
     assert message.get_data(IMU) is None
@@ -279,7 +279,7 @@ def test_a_message_gives_its_row_to_who_knows_its_type() -> None:
     assert message.model_dump() == {"timestamp_ns": 5, "data": {"data": 3}}
 
 
-def test_looking_up_one_tag_imports_only_what_it_needs() -> None:
+def test_model_lookup_imports_only_its_modules() -> None:
     code = (
         "import sys, mosaico_ingest.ontology as o; assert 'pydantic' not in sys.modules;"
         "o.Joy; names = {n for n in sys.modules if n.startswith('mosaico_ingest.ontology.')};"
@@ -288,12 +288,12 @@ def test_looking_up_one_tag_imports_only_what_it_needs() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)  # noqa: S603 - our own words
 
 
-def test_every_public_name_is_there() -> None:
+def test_ontology_exports_every_public_name() -> None:
     assert set(MODULES) < set(mosaico_ingest.ontology.__all__) <= set(dir(mosaico_ingest.ontology))
     for name in mosaico_ingest.ontology.__all__:
         assert getattr(mosaico_ingest.ontology, name).__name__ == name
 
 
-def test_a_name_that_is_not_there_is_an_attribute_error() -> None:
+def test_ontology_unknown_name_raises_attribute_error() -> None:
     with pytest.raises(AttributeError, match="has no attribute 'Nothing'"):
         getattr(mosaico_ingest.ontology, "Nothing")  # noqa: B009 - the type checker would see the mistake

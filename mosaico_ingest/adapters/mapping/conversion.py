@@ -1,4 +1,4 @@
-"""This file decides what fits an ontology column, before anything runs and for every value when it runs."""
+"""Conversion to the exact types of ontology columns: the static check, and the cast of the values."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ __all__ = ["check_fits", "convert", "element_type", "refuse_nulls", "to_number"]
 
 
 def element_type(target: DataType, axes: tuple[int | None, ...]) -> DataType:
-    """Return what an element must be, for a target that holds the lists around it.
+    """Return the type that the elements of open lists must have for a column.
 
     Raises:
         Unfit: The target has fewer lists, or lists of another length.
@@ -48,8 +48,8 @@ def element_type(target: DataType, axes: tuple[int | None, ...]) -> DataType:
     for size in axes:
         if not is_list(target):
             raise TypeMismatch(
-                f"a list for {format_type(target)}",
-                hint="a[0] is one element, len sum mean least greatest are one value",
+                f"a list does not fit {format_type(target)}",
+                hint="select one element with a[0], or reduce the list with len, sum, mean, least or greatest",
             )
         if size is not None and pt.is_fixed_size_list(target) and target.list_size != size:
             raise TypeMismatch(f"a list of {size} for one of {target.list_size}")
@@ -58,35 +58,35 @@ def element_type(target: DataType, axes: tuple[int | None, ...]) -> DataType:
 
 
 def check_fits(expr_type: ExprType, target: DataType) -> None:
-    """Check that every value of a expr_type fits a column.
+    """Check that every value of a type fits a column.
 
     Raises:
         Unfit: Some value may not.
     """
-    _demand(expr_type.element, element_type(target, expr_type.axes))
+    _check(expr_type.element, element_type(target, expr_type.axes))
 
 
-def _demand(expr_type: ExprType, target: DataType) -> None:
+def _check(expr_type: ExprType, target: DataType) -> None:
     source = expr_type.arrow
     if source == target or pt.is_null(source):
         return
     if is_list(source) and is_list(target):
         if pt.is_fixed_size_list(source) and pt.is_fixed_size_list(target):
             element_type(target, (source.list_size,))
-        _demand(expr_type_of(source.value_type, msgtype=expr_type.msgtype), target.value_type)
+        _check(expr_type_of(source.value_type, msgtype=expr_type.msgtype), target.value_type)
     elif pt.is_struct(source) and pt.is_struct(target):
-        _demand_fields(expr_type, target)
-    elif not (is_number(source) and is_number(target) and _surely(expr_type, target)):
-        raise TypeMismatch(_misfit(expr_type, target), hint=_remedy(source, target))
+        _check_fields(expr_type, target)
+    elif not (is_number(source) and is_number(target) and _always_fits(expr_type, target)):
+        raise TypeMismatch(_mismatch(expr_type, target), hint=_hint(source, target))
 
 
-def _surely(expr_type: ExprType, target: DataType) -> bool:
+def _always_fits(expr_type: ExprType, target: DataType) -> bool:
     if pt.is_integer(target):
         return expr_type.bounds is not None and within(expr_type.bounds, int_bounds(target))
     return exact_float(expr_type).bit_width <= target.bit_width
 
 
-def _misfit(expr_type: ExprType, target: DataType) -> str:
+def _mismatch(expr_type: ExprType, target: DataType) -> str:
     if not (is_number(expr_type.arrow) and is_number(target)):
         return f"{format_type(expr_type)} for {format_type(target)}"
     if expr_type.bounds is None or expr_type.bounds == int_bounds(expr_type.arrow):
@@ -97,45 +97,45 @@ def _misfit(expr_type: ExprType, target: DataType) -> str:
     return f"{format_type(expr_type)} from {low} to {high} may not fit {format_type(target)}"
 
 
-def _remedy(source: DataType, target: DataType) -> str | None:
-    """Return what to write instead."""
+def _hint(source: DataType, target: DataType) -> str | None:
+    """Return the hint for an incompatible pair of types."""
     computes = is_number(source) or pt.is_boolean(source)
     if computes and (is_number(target) or pt.is_boolean(target)):
-        whole = "round(x) first, then " if pt.is_floating(source) and pt.is_integer(target) else ""
-        return f"{whole}cast(…) if you know that it does; a row where it does not is then rejected"
+        first = "round(x) first, then " if pt.is_floating(source) and pt.is_integer(target) else ""
+        return f"{first}cast(…) if the values fit; rows with other values are rejected"
     if pt.is_string(target):
-        return "text(…) spells a number" if computes else None
+        return "convert it with text(…)" if computes else None
     if is_number(target) and pt.is_string(source):
-        return "cast(number(…)) reads it"
+        return "parse it with cast(number(…))"
     if pt.is_binary(target) and is_list(source):
-        return "bytes(…) if it is a list of uint8"
+        return "convert a list of uint8 with bytes(…)"
     if is_list(target) and not is_list(source):
-        return "[x] is a list of one" if computes else None
-    return "name one of its fields" if pt.is_struct(source) else None
+        return "write [x] for a list of one element" if computes else None
+    return "select one of its fields" if pt.is_struct(source) else None
 
 
-def _demand_fields(expr_type: ExprType, target: DataType) -> None:
-    if _special(expr_type.arrow, target) is not None:
+def _check_fields(expr_type: ExprType, target: DataType) -> None:
+    if _special_conversion(expr_type.arrow, target) is not None:
         return
-    there = {field.name for field in target}
-    extra = [field.name for field in expr_type.arrow if field.name not in there]
+    names = {field.name for field in target}
+    extra = [field.name for field in expr_type.arrow if field.name not in names]
     if extra:
         raise TypeMismatch(
             f"{format_type(expr_type)} has {', '.join(extra)}, which {format_type(target)} has not",
-            hint="name what goes where: {of: …, fields: {…}}, or another adapter: {use: …, of: …}",
+            hint="list the fields with {of: …, fields: {…}}, or use another adapter with {use: …, of: …}",
         )
     for field in target:
         position = expr_type.arrow.get_field_index(field.name)
         if position >= 0:
-            _demand(expr_type_of(expr_type.arrow.field(position).type), field.type)
+            _check(expr_type_of(expr_type.arrow.field(position).type), field.type)
         elif not field.nullable:
             raise TypeMismatch(
                 f"{format_type(expr_type)} has no {field.name}, which {format_type(target)} requires"
             )
 
 
-def _special(source: DataType, target: DataType) -> Callable[[RejectRows, Array], Array] | None:
-    """Return the conversion of a header or time stamp."""
+def _special_conversion(source: DataType, target: DataType) -> Callable[[RejectRows, Array], Array] | None:
+    """Return the conversion to a header or time stamp, None for any other struct."""
     if target == HEADER_TYPE and {field.name for field in source} >= {"stamp", "frame_id"}:
         return as_header
     if target == STAMP_TYPE and {field.name for field in source} == {"sec", "nanosec"}:
@@ -144,7 +144,7 @@ def _special(source: DataType, target: DataType) -> Callable[[RejectRows, Array]
 
 
 def convert(array: Array, target: DataType, refuse: RejectRows) -> Array:
-    """Return the column in exactly the target's type; what fits as it is, is not copied."""
+    """Cast a column to exactly the target type, without copying if it already has that layout."""
     if array.type == target:
         return array
     if pt.is_null(array.type):
@@ -165,29 +165,29 @@ def _convert_list(array: Array, target: DataType, refuse: RejectRows) -> Array:
             wrong &= ~axis.null
         if wrong.any():
             refuse(wrong, "list-length", lambda i: f"the list has {axis.lengths[i]} elements, not {size}")
-        elements, axis = _stretched(elements, axis, size)
-    values = convert(elements, target.value_type, _of_elements(axis, refuse))
+        elements, axis = _with_fixed_size(elements, axis, size)
+    values = convert(elements, target.value_type, _rejecting_rows_of(axis, refuse))
     if pt.is_fixed_size_list(target):
         return fixed_list(values, target.list_size, axis.null, len(array), target)
     return variable_list(values, axis.offsets, axis.null, target)
 
 
-def _stretched(elements: Array, axis: Axis, size: int) -> tuple[Array, Axis]:
-    """Return the elements with `size` of them for every row, also where the list is null."""
+def _with_fixed_size(elements: Array, axis: Axis, size: int) -> tuple[Array, Axis]:
+    """Return `size` elements for every row, with nulls as the elements of null lists."""
     fits = axis.lengths == size
     offsets = np.arange(len(fits) + 1, dtype=np.int64) * size
     if fits.all():
         return elements, Axis(offsets, axis.null, size)
     positions = (axis.offsets[:-1, None] + np.arange(size)).ravel()
     absent = np.repeat(~fits, size)
-    taken = elements.take(arrays.array(np.where(absent, 0, positions), mask=absent))
-    return taken, Axis(offsets, ~fits, size)
+    padded = elements.take(arrays.array(np.where(absent, 0, positions), mask=absent))
+    return padded, Axis(offsets, ~fits, size)
 
 
-def _of_elements(axis: Axis, refuse: RejectRows) -> RejectRows:
-    """Return a way to reject rows by the elements of their lists."""
+def _rejecting_rows_of(axis: Axis, refuse: RejectRows) -> RejectRows:
+    """Return a callback that rejects rows by the elements of their lists."""
 
-    def refuse_elements(bad: Mask, rule: str, says: Callable[[int], str]) -> None:
+    def reject_elements(bad: Mask, rule: str, says: Callable[[int], str]) -> None:
         rows, first = np.unique(axis.parents[bad], return_index=True)
         positions = dict(zip(rows.tolist(), np.flatnonzero(bad)[first].tolist(), strict=True))
         mask = np.zeros(len(axis.lengths), bool)
@@ -198,11 +198,11 @@ def _of_elements(axis: Axis, refuse: RejectRows) -> RejectRows:
             lambda row: f"element {positions[row] - int(axis.offsets[row])}: {says(positions[row])}",
         )
 
-    return refuse_elements
+    return reject_elements
 
 
 def _convert_struct(array: Array, target: DataType, refuse: RejectRows) -> Array:
-    conversion = _special(array.type, target)
+    conversion = _special_conversion(array.type, target)
     if conversion is not None:
         return conversion(refuse, array)
     absent = null_mask(array)
@@ -210,31 +210,33 @@ def _convert_struct(array: Array, target: DataType, refuse: RejectRows) -> Array
     for field in target:
         position = array.type.get_field_index(field.name)
         child = arrays.nulls(len(array), field.type) if position < 0 else array.field(position)
-        child = convert(child, field.type, _named(field.name, refuse))
-        children.append(child if field.nullable else refuse_nulls(child, absent, _named(field.name, refuse)))
+        child = convert(child, field.type, _naming_field(field.name, refuse))
+        children.append(
+            child if field.nullable else refuse_nulls(child, absent, _naming_field(field.name, refuse))
+        )
     return struct_of(children, target, absent, len(array))
 
 
-def _named(name: str, refuse: RejectRows) -> RejectRows:
-    def refuse_named(bad: Mask, rule: str, says: Callable[[int], str]) -> None:
+def _naming_field(name: str, refuse: RejectRows) -> RejectRows:
+    def reject_named(bad: Mask, rule: str, says: Callable[[int], str]) -> None:
         refuse(bad, rule, lambda i: f"{name}: {says(i)}")
 
-    return refuse_named
+    return reject_named
 
 
 def refuse_nulls(array: Array, parent_null: Mask | None, refuse: RejectRows) -> Array:
-    """Reject rows without a required value, unless what it belongs to is null as well."""
+    """Reject rows without a required value, except where the enclosing struct is null."""
     absent = null_mask(array)
     if absent is None:
         return array
     bad = absent if parent_null is None else absent & ~parent_null
     if bad.any():
-        refuse(bad, "null", lambda _: "null, where the ontology requires a value")
+        refuse(bad, "null", lambda _: "null, but the ontology requires a value")
     return _filled(array, absent)
 
 
 def _filled(array: Array, absent: Mask) -> Array:
-    """Return the array with some value where there is none; the struct around it is null there."""
+    """Replace nulls with an arbitrary value; the enclosing struct is null there, so the value is invisible."""
     present = np.flatnonzero(~absent)
     if not len(present):
         return _zeros(array.type, len(array))
@@ -243,7 +245,7 @@ def _filled(array: Array, absent: Mask) -> Array:
 
 
 def _zeros(type_: DataType, length: int) -> Array:
-    """Return an array of one value, whatever it is, that is nowhere null."""
+    """Return an array of arbitrary values without nulls."""
     if pt.is_struct(type_):
         return struct_of([_zeros(field.type, length) for field in type_], type_, None, length)
     if pt.is_fixed_size_list(type_):
@@ -259,18 +261,18 @@ def _zeros(type_: DataType, length: int) -> Array:
 
 
 def to_number(array: Array, target: DataType, refuse: RejectRows) -> Array:
-    """Return numbers in another type; a value outside it rejects its row."""
+    """Cast numbers to another type; a value out of range rejects its row."""
     if array.type == target:
         return array
-    bad = _outside(array, target)
+    bad = _out_of_range(array, target)
     if bad is not None and bad.any():
         refuse(bad, "out-of-range", lambda i: f"{array[i].as_py()} does not fit {format_type(target)}")
         array = set_null(array, bad)
     return pc.cast(array, target, safe=False)
 
 
-def _outside(array: Array, target: DataType) -> Mask | None:
-    """Return which numbers do not fit; None where none can be."""
+def _out_of_range(array: Array, target: DataType) -> Mask | None:
+    """Return which numbers are out of range, None if none can be."""
     if pt.is_boolean(array.type) or pt.is_null(array.type) or target == arrays.float64():
         return None
     values = np.asarray(pc.fill_null(array, 0))
@@ -280,7 +282,7 @@ def _outside(array: Array, target: DataType) -> Mask | None:
     if bounds is None:
         return _too_large(values, target)
     if values.dtype.kind == "f":
-        # the next float above: 2 ** 63 - 1 itself is no float64
+        # `bounds[1] + 1` is exact as a float; 2 ** 63 - 1 is not.
         return ~(
             (values >= float(bounds[0])) & (values < float(bounds[1] + 1)) & (values == np.trunc(values))
         )

@@ -1,4 +1,4 @@
-"""This file runs the tests an adapter file carries: what is given goes through the adapter, what is expected is compared."""
+"""Run the tests of an adapter file: adapt the given message and compare the record with the expected one."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, Resolv
 __all__ = ["CaseResult", "ReadRecorded", "message_row", "run_tests"]
 
 ReadRecorded: TypeAlias = Callable[[RecordedMessage], "tuple[Definition, pa.StructArray]"]
-"""Reads one recorded message: its definition, and itself as one row in the ROS shape."""
+"""Reads one recorded message and returns its definition and a batch of one row in the ROS shape."""
 
 _RELATIVE, _ABSOLUTE = 1e-6, 1e-9
-"""How far numbers may differ: float32 columns keep about seven digits."""
+"""Tolerances for numbers: float32 columns keep about seven digits."""
 
 
 class CaseResult(Struct, frozen=True):
-    """The result of one test."""
+    """The result of one test of an adapter file."""
 
     name: str
     problems: tuple[str, ...]
-    """What differs, a line each; none: it passed."""
+    """The differences, one line each; empty if the test passed."""
     line: int
-    """Where the test stands in the file."""
+    """The line of the test in the file."""
 
     @property
     def passed(self) -> bool:
-        """Whether everything expected came out."""
+        """Whether the test found no difference."""
         return not self.problems
 
 
 def run_tests(
     spec: MappingSpec, resolver: Resolver, *, recorded: ReadRecorded | None = None
 ) -> tuple[CaseResult, ...]:
-    """Run all tests of an adapter file; never raises for what is in it."""
+    """Run all tests of an adapter file; failures are part of the result."""
     outcomes: list[CaseResult] = []
     for position, case in enumerate(spec.model.tests):
         try:
@@ -59,16 +59,16 @@ def run_tests(
 
 
 def message_row(given: Mapping[str, Any], shape: DataType) -> tuple[dict[str, Any], list[str]]:
-    """Return a message with defaults for what is not given, and what is wrong with what is."""
+    """Return a message with defaults for missing fields, and the problems of the given values."""
     problems: list[str] = []
-    return _filled(given, shape, "", problems), problems
+    return _with_defaults(given, shape, "", problems), problems
 
 
 def _run(
     spec: MappingSpec, case: AdapterTest, resolver: Resolver, recorded: ReadRecorded | None
 ) -> list[str]:
     if case.expect is None and case.rejects is None:
-        return ["nothing is expected: give expect or rejects"]
+        return ["the test has neither expect nor rejects"]
     if {"bag", "topic"} <= case.given.keys():
         if recorded is None:
             return ["recorded messages cannot be read here"]
@@ -97,9 +97,9 @@ def _definition(spec: MappingSpec, case: AdapterTest, resolver: Resolver) -> Def
         return resolver.resolve(msgtype, embedded, ros_version=2)
     except BagError as unknown:
         try:
-            return resolver.resolve(msgtype, None, ros_version=1)  # a type that only ROS 1 had
+            return resolver.resolve(msgtype, None, ros_version=1)  # Some types exist only in ROS 1.
         except BagError:
-            hint = "give its .msg text under `definition`"
+            hint = "add its .msg text under `definition`"
             raise BagError(unknown.what, where=unknown.where, hint=hint) from unknown
 
 
@@ -110,20 +110,26 @@ def _compare(spec: MappingSpec, case: AdapterTest, definition: Definition, rows:
         reason = adapted.failures[0].reason
         if case.rejects is None:
             return [f"the row is rejected: {reason}"]
-        return [] if case.rejects in reason else [f"rejected, but not for {case.rejects!r}: {reason}"]
+        return (
+            []
+            if case.rejects in reason
+            else [f"rejected, but the reason does not contain {case.rejects!r}: {reason}"]
+        )
     if case.rejects is not None:
-        return [f"the row is accepted; it should be rejected for {case.rejects!r}"]
+        return [f"the row is accepted; expected a rejection with {case.rejects!r}"]
     problems: list[str] = []
     _differences(case.expect, adapted.rows[0].as_py(), adapted.rows.type, "", problems)
     return problems
 
 
-def _filled(given: Mapping[str, Any], shape: DataType, path: str, problems: list[str]) -> dict[str, Any]:
+def _with_defaults(
+    given: Mapping[str, Any], shape: DataType, path: str, problems: list[str]
+) -> dict[str, Any]:
     names = [field.name for field in shape]
     for name in given:
         if name not in names:
             near = suggest(str(name), names) or f"there are {', '.join(names)}"
-            problems.append(f"given: there is no field {path}{name}; {near}")
+            problems.append(f"given: unknown field {path}{name}; {near}")
     return {
         field.name: _value(given.get(field.name), field.type, f"{path}{field.name}", problems)
         for field in shape
@@ -133,14 +139,14 @@ def _filled(given: Mapping[str, Any], shape: DataType, path: str, problems: list
 def _value(given: Any, type_: DataType, path: str, problems: list[str]) -> Any:  # noqa: ANN401 - values of a message
     if pt.is_struct(type_):
         if given is not None and not isinstance(given, Mapping):
-            problems.append(f"given: {path} is a mapping, not {given!r}")
+            problems.append(f"given: {path} must be a mapping, not {given!r}")
             given = None
-        return _filled(given or {}, type_, f"{path}.", problems)
+        return _with_defaults(given or {}, type_, f"{path}.", problems)
     if pt.is_fixed_size_list(type_) or pt.is_list(type_):
         default = [None] * type_.list_size if pt.is_fixed_size_list(type_) else []
         items = default if given is None else given
         if not isinstance(items, list):
-            problems.append(f"given: {path} is a list, not {given!r}")
+            problems.append(f"given: {path} must be a list, not {given!r}")
             return default
         return [_value(item, type_.value_type, f"{path}[{i}]", problems) for i, item in enumerate(items)]
     if pt.is_binary(type_):
@@ -163,9 +169,7 @@ def _differences(expected: Any, got: Any, type_: DataType, path: str, problems: 
         for name, value in expected.items():
             if name not in names:
                 near = suggest(str(name), names) or f"there are {', '.join(names)}"
-                problems.append(
-                    f"expect: there is no field {path.lstrip('.')}.{name}; {near}".replace(" .", " ")
-                )
+                problems.append(f"expect: unknown field {path.lstrip('.')}.{name}; {near}".replace(" .", " "))
             elif got is None:
                 if value is not None:
                     problems.append(f"{where}.{name}: expected {value!r}, but {where} is null")

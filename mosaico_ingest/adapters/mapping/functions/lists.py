@@ -15,7 +15,7 @@ from mosaico_ingest.adapters.mapping.columns import (
     pc,
     pt,
 )
-from mosaico_ingest.adapters.mapping.functions.operators import computed, whole
+from mosaico_ingest.adapters.mapping.functions.operators import float_result, integer_result
 from mosaico_ingest.adapters.mapping.functions.registry import (
     Parameter,
     RejectRows,
@@ -36,11 +36,11 @@ NUMBERS = list_of("a list of numbers", is_number)
 BOOLEANS = list_of("a list of true and false", pt.is_boolean)
 _MOST_ELEMENTS = 2**31 - 1
 _NEAR_OVERFLOW = 2.0**62
-"""Below this a float sum of integers proves that the integer sum is exact."""
+"""If a sum in floats is below this, the sum of the integers is exact."""
 
 
 def _count(_: ExprType) -> ExprType:
-    return whole(0, _MOST_ELEMENTS)
+    return integer_result(0, _MOST_ELEMENTS)
 
 
 def _len_accepts(expr_type: ExprType) -> bool:
@@ -51,7 +51,7 @@ def _len_accepts(expr_type: ExprType) -> bool:
 
 @function(Parameter("a list, text or bytes", _len_accepts), returns=_count)
 def len_(x: Array) -> Array:
-    """Elements of a list, characters of text, bytes of binary."""
+    """Number of elements of a list, characters of a text, or bytes."""
     if pt.is_string(x.type):
         return pc.cast(pc.utf8_length(x), arrays.int64())
     return pc.cast(pc.binary_length(x) if pt.is_binary(x.type) else pc.list_value_length(x), arrays.int64())
@@ -62,16 +62,16 @@ def _element(expr_type: ExprType) -> ExprType:
 
 
 def _mean_type(expr_type: ExprType) -> ExprType:
-    return computed(_element(expr_type))
+    return float_result(_element(expr_type))
 
 
 def _total(expr_type: ExprType) -> ExprType:
     element = _element(expr_type)
-    return whole() if int_bounds(element.arrow) else computed(element)
+    return integer_result() if int_bounds(element.arrow) else float_result(element)
 
 
 def _fold(values: NDArray[Any], axis: Axis, run: np.ufunc, empty: Any) -> NDArray[Any]:  # noqa: ANN401 - a number
-    """Reduce the elements of each row; `empty` where there are none."""
+    """Reduce the elements of each row; `empty` is the result for an empty row."""
     filled = axis.lengths > 0
     result = np.full(len(filled), empty, values.dtype)
     if len(values):
@@ -81,7 +81,7 @@ def _fold(values: NDArray[Any], axis: Axis, run: np.ufunc, empty: Any) -> NDArra
 
 
 def _absent(elements: Array, axis: Axis) -> NDArray[np.bool_]:
-    """Return the rows that are null or have a null among their elements."""
+    """Return which rows are null or contain a null."""
     absent = np.zeros(len(axis.lengths), bool) if axis.null is None else axis.null.copy()
     if elements.null_count:
         absent[axis.parents[np.asarray(elements.is_null())]] = True
@@ -89,7 +89,7 @@ def _absent(elements: Array, axis: Axis) -> NDArray[np.bool_]:
 
 
 def _plain(elements: Array) -> NDArray[Any]:
-    """Return the elements in 64 bits, 0 for null."""
+    """Return the elements as 64-bit numbers, with 0 for null."""
     wide = (
         np.float64
         if not pt.is_integer(elements.type)
@@ -102,7 +102,7 @@ def _plain(elements: Array) -> NDArray[Any]:
 
 @function(NUMBERS, returns=_total, name="sum")
 def sum_(refuse: RejectRows, x: Array) -> Array:
-    """Sum of the elements; 0 where there are none."""
+    """Sum of the elements; 0 for an empty list."""
     elements, axis = open_list(x)
     values = _plain(elements)
     total = _fold(values, axis, np.add, 0)
@@ -119,7 +119,7 @@ def sum_(refuse: RejectRows, x: Array) -> Array:
 
 @function(NUMBERS, returns=_mean_type)
 def mean(x: Array) -> Array:
-    """Mean of the elements; null where there are none."""
+    """Mean of the elements; null for an empty list."""
     elements, axis = open_list(x)
     total = _fold(_plain(elements).astype(np.float64), axis, np.add, 0)
     mask = _absent(elements, axis) | (axis.lengths == 0)
@@ -135,13 +135,13 @@ def _extreme(x: Array, run: np.ufunc) -> Array:
 
 @function(NUMBERS, returns=_element)
 def least(x: Array) -> Array:
-    """Smallest element; null where there are none."""
+    """Smallest element; null for an empty list."""
     return _extreme(x, np.minimum)
 
 
 @function(NUMBERS, returns=_element)
 def greatest(x: Array) -> Array:
-    """Largest element; null where there are none."""
+    """Largest element; null for an empty list."""
     return _extreme(x, np.maximum)
 
 
@@ -153,11 +153,11 @@ def _logic(x: Array, run: np.ufunc, empty: bool) -> Array:  # noqa: FBT001 - the
 
 @function(BOOLEANS, returns=arrays.bool_(), name="any")
 def any_(x: Array) -> Array:
-    """Whether an element is true: `any(covariance[] > 0)`; null where one is null."""
+    """Whether at least one element is true, as in `any(covariance[] > 0)`; null if an element is null."""
     return _logic(x, np.logical_or, empty=False)
 
 
 @function(BOOLEANS, returns=arrays.bool_(), name="all")
 def all_(x: Array) -> Array:
-    """Whether every element is true; null where one is null."""
+    """Whether every element is true; null if an element is null."""
     return _logic(x, np.logical_and, empty=True)

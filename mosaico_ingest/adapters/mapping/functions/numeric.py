@@ -19,9 +19,9 @@ from mosaico_ingest.adapters.mapping.columns import (
 )
 from mosaico_ingest.adapters.mapping.functions.operators import (
     comparable,
-    computed,
+    float_result,
+    integer_result,
     numbers,
-    whole,
 )
 from mosaico_ingest.adapters.mapping.functions.registry import (
     ANY,
@@ -55,26 +55,26 @@ def _null_if(expr_type: ExprType, value: ExprType) -> ExprType:
 
 @function(ANY, returns=arrays.bool_(), sees_null=True)
 def is_null(x: Array) -> Array:
-    """Whether there is no value; never null itself."""
+    """Whether x is null; the result is never null."""
     return pc.is_null(x)
 
 
 @function(ANY, returns=_joined, variadic=True, sees_null=True)
 def coalesce(a: Array, *others: Array) -> Array:
-    """The first that is not null."""
+    """The first argument that is not null."""
     return pc.coalesce(*promote(a, *others))
 
 
 @function(ANY, ANY, returns=_null_if)
 def null_if(x: Array, value: Array) -> Array:
-    """Null where x equals value."""
+    """Null if x equals value, else x."""
     same = arrays.array(true_mask(pc.equal(*comparable(x, value))))
     return pc.if_else(same, arrays.scalar(None, x.type), x)
 
 
 @function(NUMBER, returns=_element_type)
 def nan_to_null(x: Array) -> Array:
-    """Null where x is NaN."""
+    """Null if x is NaN, else x."""
     return pc.if_else(pc.is_nan(x), arrays.scalar(None, x.type), x) if pt.is_floating(x.type) else x
 
 
@@ -91,7 +91,7 @@ def _empty_type(expr_type: ExprType) -> ExprType:
 
 @function(ANY, returns=_empty_type)
 def empty_to_null(x: Array) -> Array:
-    """Null where the text, bytes or list is empty."""
+    """Null if the text, bytes or list is empty, else x."""
     length = pc.list_value_length(x) if pt.is_list(x.type) else pc.binary_length(x)
     empty = true_mask(pc.equal(length, 0), null=True)
     if not empty.any():
@@ -104,7 +104,7 @@ def empty_to_null(x: Array) -> Array:
 
 @function(FLOAT, returns=arrays.bool_())
 def is_nan(x: Array) -> Array:
-    """Whether x is not a number (NaN)."""
+    """Whether x is NaN (not a number)."""
     return pc.is_nan(x)
 
 
@@ -116,14 +116,14 @@ def is_finite(x: Array) -> Array:
 
 def _magnitude(expr_type: ExprType) -> ExprType:
     if expr_type.bounds is None:
-        return computed(expr_type)
+        return float_result(expr_type)
     low, high = expr_type.bounds
-    return whole(0 if low <= 0 <= high else min(abs(low), abs(high)), max(abs(low), abs(high)))
+    return integer_result(0 if low <= 0 <= high else min(abs(low), abs(high)), max(abs(low), abs(high)))
 
 
 @function(NUMBER, returns=_magnitude, name="abs")
 def abs_(refuse: RejectRows, x: Array) -> Array:
-    """Magnitude."""
+    """Absolute value."""
     (x,) = numbers(refuse, x)
     if not pt.is_integer(x.type):
         return pc.abs(x)
@@ -134,12 +134,12 @@ def abs_(refuse: RejectRows, x: Array) -> Array:
 
 
 def _sign_type(expr_type: ExprType) -> ExprType:
-    return whole(-1, 1) if expr_type.bounds is not None else computed(expr_type)
+    return integer_result(-1, 1) if expr_type.bounds is not None else float_result(expr_type)
 
 
 @function(NUMBER, returns=_sign_type)
 def sign(x: Array) -> Array:
-    """-1, 0 or 1."""
+    """Sign: -1, 0 or 1."""
     signs = pc.sign(x)
     return pc.cast(signs, arrays.int64()) if pt.is_integer(signs.type) else signs
 
@@ -149,7 +149,7 @@ def _add_float(name: str, run: Any, summary: str) -> None:  # noqa: ANN401 - a p
         return run(x)
 
     apply.__doc__ = summary
-    function(FLOAT, returns=computed, name=name)(apply)
+    function(FLOAT, returns=float_result, name=name)(apply)
 
 
 for _name, _run, _summary in (
@@ -177,13 +177,13 @@ for _name, _run, _summary in (
     _add_float(_name, _run, _summary)
 
 
-@function(FLOAT, FLOAT, returns=computed)
+@function(FLOAT, FLOAT, returns=float_result)
 def atan2(y: Array, x: Array) -> Array:
     """Angle of the point (x, y) in rad."""
     return pc.atan2(y, x)
 
 
-@function(FLOAT, FLOAT, returns=computed)
+@function(FLOAT, FLOAT, returns=float_result)
 def hypot(x: Array, y: Array) -> Array:
     """Length of the vector (x, y)."""
     return pc.sqrt(pc.add(pc.multiply(x, x), pc.multiply(y, y)))
@@ -191,19 +191,19 @@ def hypot(x: Array, y: Array) -> Array:
 
 @function(NUMBER, NUMBER, returns=_extreme, name="min", variadic=True)
 def min_(refuse: RejectRows, a: Array, b: Array, *others: Array) -> Array:
-    """Smallest of the arguments; one that is NaN is passed over."""
+    """Smallest argument; NaN is ignored unless all arguments are NaN."""
     return pc.min_element_wise(*numbers(refuse, a, b, *others), skip_nulls=False)
 
 
 @function(NUMBER, NUMBER, returns=_extreme, name="max", variadic=True)
 def max_(refuse: RejectRows, a: Array, b: Array, *others: Array) -> Array:
-    """Largest of the arguments; one that is NaN is passed over."""
+    """Largest argument; NaN is ignored unless all arguments are NaN."""
     return pc.max_element_wise(*numbers(refuse, a, b, *others), skip_nulls=False)
 
 
 @function(NUMBER, NUMBER, NUMBER, returns=_extreme)
 def clip(refuse: RejectRows, x: Array, low: Array, high: Array) -> Array:
-    """The value, brought within the bounds; NaN stays NaN."""
+    """X limited to the range from low to high; NaN stays NaN."""
     x, low, high = numbers(refuse, x, low, high)
     clipped = pc.min_element_wise(pc.max_element_wise(x, low, skip_nulls=False), high, skip_nulls=False)
     return pc.if_else(pc.is_nan(x), x, clipped) if pt.is_floating(x.type) else clipped

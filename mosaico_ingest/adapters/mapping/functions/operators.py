@@ -33,18 +33,18 @@ from mosaico_ingest.adapters.mapping.types import (
     widest_float,
 )
 
-__all__ = ["comparable", "computed", "whole"]
+__all__ = ["comparable", "float_result", "integer_result"]
 
 _MOST_BITS = 64
 
 
-def computed(*expr_types: ExprType) -> ExprType:
-    """Return the expr_type of a float computed from numbers: as wide as the widest float field."""
+def float_result(*expr_types: ExprType) -> ExprType:
+    """Return the type of a float result: as wide as the widest float field among the operands."""
     return ExprType(widest_float(*(expr_type.arrow for expr_type in expr_types)))
 
 
-def whole(low: int = INT64[0], high: int = INT64[1]) -> ExprType:
-    """Return the expr_type of an integer computed in 64 bits."""
+def integer_result(low: int = INT64[0], high: int = INT64[1]) -> ExprType:
+    """Return the type of an integer computed in 64 bits, with its possible range."""
     return ExprType(arrays.int64(), bounds=(max(low, INT64[0]), min(high, INT64[1])))
 
 
@@ -52,14 +52,14 @@ def _integers(expr_types: tuple[ExprType, ...]) -> bool:
     return all(expr_type.bounds is not None or pt.is_null(expr_type.arrow) for expr_type in expr_types)
 
 
-def _spread(combine: Callable[[int, int], int]) -> Callable[[ExprType, ExprType], ExprType]:
-    """Return the rule for an operator whose extremes are those of its operands' extremes."""
+def _interval(combine: Callable[[int, int], int]) -> Callable[[ExprType, ExprType], ExprType]:
+    """Return the result type of an operator whose extremes result from the extremes of its operands."""
 
     def gives(left: ExprType, right: ExprType) -> ExprType:
         if not _integers((left, right)):
-            return computed(left, right)
+            return float_result(left, right)
         ends = [combine(a, b) for a in left.bounds or (0, 0) for b in right.bounds or (0, 0)]
-        return whole(min(ends), max(ends))
+        return integer_result(min(ends), max(ends))
 
     return gives
 
@@ -70,14 +70,14 @@ def _sum_type(left: ExprType, right: ExprType) -> ExprType:
         return ExprType(arrays.string())
     for position, expr_type in enumerate((left, right)):
         if not (is_number(expr_type.arrow) or pt.is_null(expr_type.arrow)):
-            hint = "text(x) makes a number text" if pt.is_string(expr_type.arrow) else None
-            what = f"+ takes two numbers or two texts, not {format_type(left)} and {format_type(right)}"
-            raise TypeMismatch(what, argument=position, hint=hint)
-    return _spread(operator.add)(left, right)
+            hint = "convert the number with text(x)" if pt.is_string(expr_type.arrow) else None
+            message = f"+ takes two numbers or two texts, not {format_type(left)} and {format_type(right)}"
+            raise TypeMismatch(message, argument=position, hint=hint)
+    return _interval(operator.add)(left, right)
 
 
 def _ordered(left: ExprType, right: ExprType) -> ExprType:
-    """Return bool, where two values can be compared."""
+    """Return the boolean type if two values can be compared."""
     for position, expr_type in enumerate((left, right)):
         if pt.is_null(expr_type.arrow):
             raise TypeMismatch(
@@ -103,14 +103,14 @@ def _to_int64(refuse: RejectRows, values: Array) -> Array:
 
 
 def numbers(refuse: RejectRows, *values: Array) -> list[Array]:
-    """Return numbers ready to compute with: all int64, or all float64."""
+    """Cast numbers to int64 if all are integers, else to float64."""
     if all(pt.is_integer(v.type) for v in values):
         return [_to_int64(refuse, v) for v in values]
     return [v if pt.is_float64(v.type) else pc.cast(v, arrays.float64(), safe=False) for v in values]
 
 
 def comparable(left: Array, right: Array) -> tuple[Array, Array]:
-    """Return two values in a type both can be compared in without loss."""
+    """Cast two values to a type in which they can be compared without loss."""
     if left.type == right.type:
         return left, right
     if pt.is_floating(left.type) or pt.is_floating(right.type):
@@ -126,18 +126,18 @@ def _length(left: Array, right: Array) -> int:
     return max(len(v) for v in (left, right) if hasattr(v, "__len__"))
 
 
-def _listed(values: Array, length: int) -> list[Any]:
+def _as_list(values: Array, length: int) -> list[Any]:
     return values.to_pylist() if hasattr(values, "to_pylist") else [values.as_py()] * length
 
 
 def _checked(
     refuse: RejectRows, sign: str, run: Callable[[Array, Array], Array], left: Array, right: Array
 ) -> Array:
-    """Run a checked integer operation; where it overflows, find the elements one by one."""
+    """Run a checked integer operation; if it overflows, find the rows one by one."""
     try:
         return run(left, right)
     except arrays.ArrowInvalid:
-        pairs = list(zip(_listed(left, n := _length(left, right)), _listed(right, n), strict=True))
+        pairs = list(zip(_as_list(left, n := _length(left, right)), _as_list(right, n), strict=True))
         bad = np.fromiter((_overflows(sign, a, b) for a, b in pairs), bool, n)
         refuse(bad, "overflow", lambda i: f"{pairs[i][0]} {sign} {pairs[i][1]} has more than 64 bits")
         return run(set_null(left, bad), set_null(right, bad))
@@ -168,28 +168,28 @@ def _arithmetic(sign: str, name: str, refuse: RejectRows, left: Array, right: Ar
 
 @function(ANY, ANY, returns=_sum_type, name="+", scalars=True)
 def add(refuse: RejectRows, left: Array, right: Array) -> Array:
-    """Sum of numbers; texts joined."""
+    """Sum of two numbers, or two texts joined."""
     if pt.is_string(left.type) or pt.is_string(right.type):
         both = (pc.cast(left, arrays.string()), pc.cast(right, arrays.string()))
         return pc.binary_join_element_wise(*both, "")
     return _arithmetic("+", "add", refuse, left, right)
 
 
-@function(NUMBER, NUMBER, returns=_spread(operator.sub), name="-", scalars=True)
+@function(NUMBER, NUMBER, returns=_interval(operator.sub), name="-", scalars=True)
 def subtract(refuse: RejectRows, left: Array, right: Array) -> Array:
     """Difference."""
     return _arithmetic("-", "subtract", refuse, left, right)
 
 
-@function(NUMBER, NUMBER, returns=_spread(operator.mul), name="*", scalars=True)
+@function(NUMBER, NUMBER, returns=_interval(operator.mul), name="*", scalars=True)
 def multiply(refuse: RejectRows, left: Array, right: Array) -> Array:
     """Product."""
     return _arithmetic("*", "multiply", refuse, left, right)
 
 
-@function(FLOAT, FLOAT, returns=computed, name="/", scalars=True)
+@function(FLOAT, FLOAT, returns=float_result, name="/", scalars=True)
 def divide(left: Array, right: Array) -> Array:
-    """Quotient, always a float; by zero: inf or nan."""
+    """Quotient, always a float; division by zero gives inf or nan."""
     return pc.divide(left, right)
 
 
@@ -201,7 +201,7 @@ def _floored(refuse: RejectRows, sign: str, run: Any, left: Array, right: Array)
         lowest = pc.and_kleene(pc.equal(left, INT64[0]), pc.equal(right, -1))
         bad = zero | (np.broadcast_to(true_mask(lowest), n) & (sign == "//"))
         if bad.any():
-            pairs = _listed(left, n), _listed(right, n)
+            pairs = _as_list(left, n), _as_list(right, n)
             refuse(bad, "division", lambda i: f"{pairs[0][i]} {sign} {pairs[1][i]} has no result")
             right = set_null(right, bad)
     absent = np.broadcast_to(np.asarray(pc.or_(pc.is_null(left), pc.is_null(right))), n)
@@ -212,17 +212,17 @@ def _floored(refuse: RejectRows, sign: str, run: Any, left: Array, right: Array)
 
 def _remainder_type(left: ExprType, right: ExprType) -> ExprType:
     if not _integers((left, right)):
-        return computed(left, right)
+        return float_result(left, right)
     low, high = right.bounds or (0, 0)
-    return whole(min(low + 1, 0), max(high - 1, 0))
+    return integer_result(min(low + 1, 0), max(high - 1, 0))
 
 
 def _floor_type(left: ExprType, right: ExprType) -> ExprType:
     if not _integers((left, right)):
-        return computed(left, right)
+        return float_result(left, right)
     reach = max(abs(end) for end in left.bounds or (0, 0))
     positive = min(*(left.bounds or (0, 0)), *(right.bounds or (0, 0))) >= 0
-    return whole(0 if positive else -reach, reach)
+    return integer_result(0 if positive else -reach, reach)
 
 
 @function(NUMBER, NUMBER, returns=_floor_type, name="//")
@@ -239,12 +239,12 @@ def remainder(refuse: RejectRows, left: Array, right: Array) -> Array:
 
 def _power_type(left: ExprType, right: ExprType) -> ExprType:
     natural = right.bounds is not None and right.bounds[0] >= 0
-    return whole() if _integers((left, right)) and natural else computed(left, right)
+    return integer_result() if _integers((left, right)) and natural else float_result(left, right)
 
 
 @function(NUMBER, NUMBER, returns=_power_type, name="**", scalars=True)
 def power(refuse: RejectRows, left: Array, right: Array) -> Array:
-    """Power; an integer where both are and the exponent cannot be negative."""
+    """Power; an integer if both operands are integers and the exponent cannot be negative."""
     natural = pt.is_unsigned_integer(right.type) or (
         isinstance(right, arrays.Int64Scalar) and right.is_valid and right.as_py() >= 0
     )
@@ -255,12 +255,12 @@ def power(refuse: RejectRows, left: Array, right: Array) -> Array:
 
 
 def _negative_type(of: ExprType) -> ExprType:
-    return whole(-of.bounds[1], -of.bounds[0]) if of.bounds is not None else computed(of)
+    return integer_result(-of.bounds[1], -of.bounds[0]) if of.bounds is not None else float_result(of)
 
 
 @function(NUMBER, returns=_negative_type)
 def negative(refuse: RejectRows, x: Array) -> Array:
-    """-x."""
+    """Negation."""
     (x,) = numbers(refuse, x)
     zero = arrays.scalar(0, x.type)
     return _checked(refuse, "-", pc.subtract_checked, zero, x) if pt.is_integer(x.type) else pc.negate(x)
@@ -272,13 +272,13 @@ def _same_type(expr_type: ExprType) -> ExprType:
 
 @function(NUMBER, returns=_same_type)
 def positive(x: Array) -> Array:
-    """+x."""
+    """The operand, unchanged."""
     return x
 
 
 def _add_comparison(sign: str, run: Callable[[Any, Any], Any]) -> None:
     def compare(left: Array, right: Array) -> Array:
-        """Compare."""
+        """Comparison."""
         return run(*comparable(left, right))
 
     function(ANY, ANY, returns=_ordered, name=sign, scalars=True, sees_null=True)(compare)
@@ -297,17 +297,17 @@ for _sign, _run in (
 
 @function(BOOLEAN, BOOLEAN, returns=arrays.bool_(), name="and", sees_null=True)
 def and_(left: Array, right: Array) -> Array:
-    """Both."""
+    """Whether both are true, with three-valued logic for null."""
     return pc.and_kleene(left, right)
 
 
 @function(BOOLEAN, BOOLEAN, returns=arrays.bool_(), name="or", sees_null=True)
 def or_(left: Array, right: Array) -> Array:
-    """One or both."""
+    """Whether at least one is true, with three-valued logic for null."""
     return pc.or_kleene(left, right)
 
 
 @function(BOOLEAN, returns=arrays.bool_(), name="not")
 def not_(x: Array) -> Array:
-    """The opposite."""
+    """Logical negation."""
     return pc.invert(x)

@@ -1,4 +1,4 @@
-"""This file makes the language's list of functions from their docstrings, for `docs/mapping.md`."""
+"""Generate the table of functions in docs/mapping.md from the docstrings of the functions."""
 
 from __future__ import annotations
 
@@ -10,28 +10,31 @@ from mosaico_ingest.adapters.mapping.functions import SUBJECTS, functions, opera
 
 __all__ = ["function_reference", "with_reference"]
 
-_BEGIN, _END = "<!-- functions: made from their docstrings -->\n", "<!-- end of functions -->\n"
+_BEGIN, _END = "<!-- functions: generated from their docstrings -->\n", "<!-- end of functions -->\n"
 _SPECIAL = (
     (
         "cast(x)",
-        "x as the type of what it fills; a value outside it, a fraction for an integer, rejects the row",
+        "x in the type of its column; a value out of range, or a fraction for an integer, rejects the row",
     ),
-    ("cast(x, 'type')", "the same as bool, int8 … int64, uint8 … uint64, float16, float32 or float64"),
+    (
+        "cast(x, 'type')",
+        "x as bool, int8 … int64, uint8 … uint64, float16, float32 or float64, with the same checks",
+    ),
     (
         "either(a, b, …)",
-        "the first that names only fields the message's type has: `either(d, D)`, `either(seq, null)`",
+        "the first argument whose fields all exist in the message type: `either(d, D)`, `either(seq, null)`",
     ),
     ("if_else(c, a, b)", "`a if c else b`"),
 )
 
 
 def function_reference() -> str:
-    """Return the tables of all functions as Markdown, by subject."""
+    """Return Markdown tables of all functions, one per subject."""
     return "\n".join(_tables())
 
 
 def with_reference(text: str) -> str:
-    """Return a document with what stands between its two marks made anew."""
+    """Return a document with the table between its two markers regenerated."""
     before, rest = text.split(_BEGIN)
     after = rest.split(_END)[1]
     return f"{before}{_BEGIN}\n{function_reference()}\n{_END}{after}"
@@ -49,7 +52,7 @@ def _tables() -> Iterator[str]:
 
 def _table(title: str, rows: list[tuple[str, str]] | tuple[tuple[str, str], ...]) -> str:
     body = "".join(f"| `{signature}` | {summary.rstrip('.')} |\n" for signature, summary in rows)
-    return f"**{title}**\n\n| function | gives |\n|---|---|\n{body}"
+    return f"**{title}**\n\n| function | result |\n|---|---|\n{body}"
 
 
 if __name__ == "__main__":

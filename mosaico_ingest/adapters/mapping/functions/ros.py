@@ -23,7 +23,7 @@ from mosaico_ingest.adapters.mapping.columns import (
     variable_list,
 )
 from mosaico_ingest.adapters.mapping.functions.lists import NUMBERS
-from mosaico_ingest.adapters.mapping.functions.operators import computed, numbers, whole
+from mosaico_ingest.adapters.mapping.functions.operators import float_result, integer_result, numbers
 from mosaico_ingest.adapters.mapping.functions.registry import (
     FLOAT,
     INTEGER,
@@ -53,7 +53,7 @@ STAMP_TYPE: DataType = arrays.struct(
         arrays.field("nanoseconds", arrays.uint32(), nullable=False),
     ]
 )
-"""The ontology's time: what `Time` and `Duration` are, and a header's `timestamp`."""
+"""The ontology's type of `Time`, `Duration` and the `timestamp` of a header."""
 STAMP = struct_with(
     "a time or duration",
     {"sec": pt.is_integer, "nanosec": pt.is_integer},
@@ -63,17 +63,17 @@ _INT32 = (-(2**31), 2**31 - 1)
 
 
 def stamp_parts(t: Array) -> tuple[Array, Array]:
-    """Return the seconds and the nanoseconds, in ROS's or the ontology's spelling."""
+    """Return the seconds and the nanoseconds of a ROS or ontology time."""
     names = ("sec", "nanosec") if t.type.get_field_index("sec") >= 0 else ("seconds", "nanoseconds")
     return field_of(t, names[0]), field_of(t, names[1])
 
 
 def as_stamp(refuse: RejectRows, t: Array) -> Array:
-    """Return `{sec, nanosec}` as the ontology's time; the fields are shared where their types agree."""
+    """Convert `{sec, nanosec}` to the ontology's time, without copying fields of matching type."""
     sec, nanosec = stamp_parts(t)
     over = true_mask(pc.greater_equal(nanosec, SECOND_NS))
     if over.any():
-        refuse(over, "nanosec", lambda i: f"nanosec is {nanosec[i]}; it must be below 1e9")
+        refuse(over, "nanosec", lambda i: f"nanosec is {nanosec[i]}, it must be below 1e9")
         nanosec = set_null(nanosec, over)
     children = [pc.cast(sec, arrays.int32()), pc.cast(nanosec, arrays.uint32())]
     absent = null_mask(t)
@@ -83,7 +83,7 @@ def as_stamp(refuse: RejectRows, t: Array) -> Array:
 
 @function(STAMP, returns=STAMP_TYPE)
 def ros_time(refuse: RejectRows, t: Array) -> Array:
-    """`{sec, nanosec}` as `{seconds, nanoseconds}`; nanosec of 1e9 or more rejects the row."""
+    """`{sec, nanosec}` as `{seconds, nanoseconds}`; rejects rows with nanosec of 1e9 or more."""
     return as_stamp(refuse, t)
 
 
@@ -95,11 +95,11 @@ def seconds(t: Array) -> Array:
     return pc.add(pc.cast(sec, arrays.float64()), fraction)
 
 
-def _whole(_: ExprType) -> ExprType:
-    return whole()
+def _integer(_: ExprType) -> ExprType:
+    return integer_result()
 
 
-@function(STAMP, returns=_whole)
+@function(STAMP, returns=_integer)
 def nanoseconds(t: Array) -> Array:
     """A time or duration in ns."""
     sec, nanosec = (pc.cast(part, arrays.int64()) for part in stamp_parts(t))
@@ -108,14 +108,14 @@ def nanoseconds(t: Array) -> Array:
 
 @function(INTEGER, returns=STAMP_TYPE)
 def time_from_ns(refuse: RejectRows, n: Array) -> Array:
-    """Nanoseconds since the epoch as `{seconds, nanoseconds}`; more seconds than 32 bits hold reject the row."""
+    """Nanoseconds since the epoch as `{seconds, nanoseconds}`; rejects rows whose seconds exceed 32 bits."""
     (n,) = numbers(refuse, n)
     absent = null_mask(n)
     total = np.asarray(pc.fill_null(n, 0))
     sec, nanosec = np.divmod(total, SECOND_NS)
     over = (sec < _INT32[0]) | (sec > _INT32[1])
     if over.any():
-        refuse(over, "overflow", lambda i: f"{total[i]} ns are more seconds than 32 bits hold")
+        refuse(over, "overflow", lambda i: f"{total[i]} ns exceed the range of 32-bit seconds")
     children = [
         arrays.array(np.where(over, 0, sec).astype(np.int32)),
         arrays.array(nanosec.astype(np.uint32)),
@@ -130,7 +130,7 @@ _QUATERNION = struct_with("a quaternion {x, y, z, w}", dict.fromkeys(_AXES, is_n
 
 
 def _halves(*angles: Array) -> tuple[NDArray[np.bool_], list[NDArray[np.float64]]]:
-    """Return half the angles, broadcast, with NaN for null; and where one of them is null."""
+    """Return where an angle is null, and half of each angle, with NaN for null."""
     plain = [np.asarray(pc.fill_null(angle, np.nan), np.float64) for angle in angles]
     absent = np.zeros(np.broadcast_shapes(*(p.shape for p in plain)), bool)
     for angle in angles:
@@ -139,7 +139,7 @@ def _halves(*angles: Array) -> tuple[NDArray[np.bool_], list[NDArray[np.float64]
 
 
 def _sin_cos(half: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    with np.errstate(invalid="ignore"):  # of an infinite angle both are NaN
+    with np.errstate(invalid="ignore"):  # Sine and cosine of an infinite angle are NaN.
         return np.sin(half), np.cos(half)
 
 
@@ -175,7 +175,7 @@ def quaternion_from_yaw(yaw: Array) -> Array:
 
 @function(_QUATERNION, returns=arrays.float64())
 def yaw(q: Array) -> Array:
-    """Heading of a quaternion: its angle about z."""
+    """Heading of a quaternion: its rotation about z in rad."""
     x, y, z, w = (pc.cast(field_of(q, axis), arrays.float64()) for axis in _AXES)
     sine = pc.multiply(pc.add(pc.multiply(w, z), pc.multiply(x, y)), 2.0)
     cosine = pc.subtract(1.0, pc.multiply(pc.add(pc.multiply(y, y), pc.multiply(z, z)), 2.0))
@@ -196,12 +196,12 @@ _CODECS = {name: name for name in ("png", "jpeg", "jpg", "tiff", "h264", "hevc",
 
 
 def as_header(refuse: RejectRows, h: Array, *, collapse: bool = True) -> Array:
-    """Return a `std_msgs/Header` as the ontology's; `collapse`: null where it says nothing."""
+    """Convert a `std_msgs/Header` to the ontology's header; `collapse` makes an empty header null."""
     stamp, frame = field_of(h, "stamp"), field_of(h, "frame_id")
     absent = null_mask(h)
     if collapse:
-        silent = _is_silent(stamp, frame)
-        absent = silent if absent is None else absent | silent
+        empty = _is_empty(stamp, frame)
+        absent = empty if absent is None else absent | empty
     counter = arrays.nulls(len(h), arrays.uint64())
     if h.type.get_field_index("seq") >= 0:
         counter = pc.cast(field_of(h, "seq"), arrays.uint64())
@@ -210,7 +210,7 @@ def as_header(refuse: RejectRows, h: Array, *, collapse: bool = True) -> Array:
     return arrays.StructArray.from_arrays(children, fields=list(HEADER_TYPE), mask=mask)
 
 
-def _is_silent(stamp: Array, frame: Array) -> Mask:
+def _is_empty(stamp: Array, frame: Array) -> Mask:
     unnamed = true_mask(pc.equal(pc.binary_length(frame), 0), null=True)
     if not unnamed.any():
         return unnamed
@@ -220,7 +220,7 @@ def _is_silent(stamp: Array, frame: Array) -> Mask:
 
 @function(HEADER, returns=HEADER_TYPE)
 def ros_header(refuse: RejectRows, h: Array) -> Array:
-    """A std_msgs/Header as the ontology's, ROS 1 `seq` as `sample_counter`; null where frame_id is empty and the stamp zero."""
+    """A std_msgs/Header as the ontology's header, with ROS 1 `seq` as `sample_counter`; null if frame_id is empty and the stamp zero."""
     return as_header(refuse, h)
 
 
@@ -230,7 +230,7 @@ def _same(expr_type: ExprType) -> ExprType:
 
 @function(NUMBERS, returns=_same)
 def covariance(c: Array) -> Array:
-    """The list, or null unless an element is > 0."""
+    """c, or null unless at least one element is > 0."""
     elements, axis = open_list(c)
     absent = ~_any_positive(elements, axis)
     if axis.null is not None:
@@ -245,18 +245,18 @@ def covariance(c: Array) -> Array:
 def _any_positive(elements: Array, axis: Axis) -> Mask:
     """Return which lists have an element > 0."""
     rows = len(axis.offsets) - 1
-    known = np.zeros(rows, bool)
+    positive = np.zeros(rows, bool)
     if axis.size is None or elements.null_count:
-        known[axis.parents[true_mask(pc.greater(elements, 0))]] = True
-        return known
+        positive[axis.parents[true_mask(pc.greater(elements, 0))]] = True
+        return positive
     for column in np.asarray(elements).reshape(rows, axis.size).T:
-        known |= column > 0
-        if known.all():
+        positive |= column > 0
+        if positive.all():
             break
-    return known
+    return positive
 
 
-@function(FLOAT, returns=computed)
+@function(FLOAT, returns=float_result)
 def variance(x: Array) -> Array:
     """x, or null unless it is > 0."""
     return pc.if_else(pc.greater(x, 0.0), x, arrays.scalar(None, arrays.float64()))
@@ -264,19 +264,19 @@ def variance(x: Array) -> Array:
 
 @function(TEXT, returns=arrays.string())
 def compressed_format(s: Array) -> Array:
-    """What a CompressedImage's `format` says is inside: png jpeg jpg tiff h264 hevc; raw where it says nothing known."""
+    """The codec that a CompressedImage's `format` names: png, jpeg, jpg, tiff, h264 or hevc; raw if it names none of these."""
     texts = s.dictionary_encode() if not pt.is_null(s.type) else s
     names = arrays.array([_codec(value) for value in texts.dictionary.to_pylist()], arrays.string())
     return names.take(texts.indices)
 
 
-def _codec(said: str) -> str:
-    """Return the codec in a format text, as in `bgr8; jpeg compressed bgr8` or `16UC1; compressedDepth png`.
+def _codec(text: str) -> str:
+    """Return the codec in a format text, such as `bgr8; jpeg compressed bgr8` or `16UC1; compressedDepth png`.
 
-    Depth without a word behind it, and no text at all, are PNG as the transports' default is.
+    An empty text, and `compressedDepth` without a codec, mean PNG, the default of the image transports.
     """
-    words = [word for word in re.split(r"[;,\s]+", said.lower()) if word]
-    known = [_CODECS[word] for word in words if word in _CODECS]
-    if known:
-        return known[0]
+    words = [word for word in re.split(r"[;,\s]+", text.lower()) if word]
+    codecs = [_CODECS[word] for word in words if word in _CODECS]
+    if codecs:
+        return codecs[0]
     return "png" if not words or words[-1] == "compresseddepth" else "raw"

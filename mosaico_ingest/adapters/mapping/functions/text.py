@@ -30,77 +30,77 @@ from mosaico_ingest.adapters.mapping.types import ExprType, is_number
 __all__: list[str] = []
 
 
-def _is_spelled(expr_type: ExprType) -> bool:
+def _is_text_or_number(expr_type: ExprType) -> bool:
     return is_number(expr_type.arrow) or pt.is_boolean(expr_type.arrow) or pt.is_string(expr_type.arrow)
 
 
-_OCTETS = list_of("bytes or a list of uint8", pt.is_uint8)
+_UINT8_LIST = list_of("bytes or a list of uint8", pt.is_uint8)
 _BYTES = Parameter(
-    _OCTETS.description, lambda expr_type: pt.is_binary(expr_type.arrow) or _OCTETS.accepts(expr_type)
+    _UINT8_LIST.description, lambda expr_type: pt.is_binary(expr_type.arrow) or _UINT8_LIST.accepts(expr_type)
 )
-_SPELLED = Parameter("a number, text, true or false", _is_spelled)
+_TEXT_OR_NUMBER = Parameter("a number, text, true or false", _is_text_or_number)
 _NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|nan)\s*")
 
 
 @function(TEXT, returns=arrays.string())
 def lower(s: Array) -> Array:
-    """Lower case."""
+    """S in lower case."""
     return pc.utf8_lower(s)
 
 
 @function(TEXT, returns=arrays.string())
 def upper(s: Array) -> Array:
-    """Upper case."""
+    """S in upper case."""
     return pc.utf8_upper(s)
 
 
 @function(TEXT, returns=arrays.string())
 def strip(s: Array) -> Array:
-    """Without white space at the ends."""
+    """S without white space at its start and end."""
     return pc.utf8_trim_whitespace(s)
 
 
 def _empty_problem(text: str) -> str | None:
-    return None if text else "the text to look for is empty"
+    return None if text else "it is empty"
 
 
-_SOUGHT = replace(TEXT_LITERAL, description="a text in quotes, not empty,", check_literal=_empty_problem)
+_NON_EMPTY = replace(TEXT_LITERAL, description="a text in quotes, not empty,", check_literal=_empty_problem)
 
 
-@function(TEXT, _SOUGHT, TEXT_LITERAL, returns=arrays.string())
+@function(TEXT, _NON_EMPTY, TEXT_LITERAL, returns=arrays.string())
 def replace_(s: Array, old: str, new: str) -> Array:
-    """Every occurrence replaced."""
+    """S with every occurrence of old replaced by new."""
     return pc.replace_substring(s, pattern=old, replacement=new)
 
 
 @function(TEXT, TEXT_LITERAL, returns=arrays.bool_())
 def starts_with(s: Array, start: str) -> Array:
-    """Whether it begins so."""
+    """Whether s starts with a text."""
     return pc.starts_with(s, pattern=start)
 
 
 @function(TEXT, TEXT_LITERAL, returns=arrays.bool_())
 def ends_with(s: Array, end: str) -> Array:
-    """Whether it ends so."""
+    """Whether s ends with a text."""
     return pc.ends_with(s, pattern=end)
 
 
 @function(TEXT, TEXT_LITERAL, returns=arrays.bool_())
 def contains(s: Array, part: str) -> Array:
-    """Whether it occurs."""
+    """Whether s contains a text."""
     return pc.match_substring(s, pattern=part)
 
 
-@function(TEXT, _SOUGHT, returns=arrays.list_(arrays.string()))
+@function(TEXT, _NON_EMPTY, returns=arrays.list_(arrays.string()))
 def split(s: Array, separator: str) -> Array:
-    """The parts between separators, a list of text."""
+    """List of the parts of s between separators."""
     return pc.split_pattern(s, pattern=separator)
 
 
 def _grouped(pattern: str) -> str:
-    """Return a pattern with its first group named, all of it where it has none: Arrow gives named groups only."""
-    named, found = re.subn(r"(?<!\\)\((?!\?)", "(?P<part>", pattern, count=1)
-    return named if found else f"(?P<part>{pattern})"
+    """Return a pattern with its first group, or else all of it, as a named group: Arrow returns named groups only."""
+    named, count = re.subn(r"(?<!\\)\((?!\?)", "(?P<part>", pattern, count=1)
+    return named if count else f"(?P<part>{pattern})"
 
 
 def _pattern_problem(pattern: str) -> str | None:
@@ -116,34 +116,34 @@ _PATTERN = replace(TEXT_LITERAL, description="a pattern in quotes", check_litera
 
 @function(TEXT, _PATTERN, returns=arrays.string())
 def extract(s: Array, pattern: str) -> Array:
-    """What the pattern's first group matches, or all of it without one; null where it does not match."""
+    """The match of the pattern's first group, or of the pattern if it has no group; null without a match."""
     return pc.struct_field(pc.extract_regex(s, pattern=_grouped(pattern)), [0])
 
 
-@function(_SPELLED, returns=arrays.string())
+@function(_TEXT_OR_NUMBER, returns=arrays.string())
 def text(x: Array) -> Array:
-    """A number, true or false as text."""
+    """A number or boolean as text."""
     return pc.cast(x, arrays.string())
 
 
 @function(TEXT, returns=arrays.float64())
 def number(refuse: RejectRows, s: Array) -> Array:
-    """Text as a number; text that is none rejects the row."""
+    """A text as a number; rejects rows with any other text."""
     try:
         return pc.cast(pc.utf8_trim_whitespace(s), arrays.float64())
     except arrays.ArrowInvalid:
         bad = bad_where(s, lambda value: _NUMBER.fullmatch(value) is not None)
-        refuse(bad, "number-syntax", lambda i: f"{s[i].as_py()!r} is no number")
+        refuse(bad, "number-syntax", lambda i: f"{s[i].as_py()!r} is not a number")
         return pc.cast(pc.utf8_trim_whitespace(set_null(s, bad)), arrays.float64())
 
 
 @function(_BYTES, returns=arrays.binary())
 def bytes_(x: Array) -> Array:
-    """A list of uint8, of fixed length or not, as bytes."""
+    """A list of uint8 as bytes."""
     if pt.is_binary(x.type) or pt.is_null(x.type):
         return pc.cast(x, arrays.binary())
-    octets, axis = open_list(x)
-    data = arrays.py_buffer(np.ascontiguousarray(np.asarray(pc.fill_null(octets, 0))))
+    elements, axis = open_list(x)
+    data = arrays.py_buffer(np.ascontiguousarray(np.asarray(pc.fill_null(elements, 0))))
     absent = null_mask(x)
     validity = None if absent is None else arrays.array(~absent).buffers()[1]
     offsets = arrays.py_buffer(axis.offsets.astype(np.int32))

@@ -16,7 +16,7 @@ IMU = TypeResolver(Stores.ROS2_HUMBLE).resolve("sensor_msgs/msg/Imu", None, ros_
 SPEC = BY_NAME["IMUAdapter"].path
 
 
-def test_the_same_definition_is_compiled_once_and_another_anew() -> None:
+def test_bind_same_definition_is_cached() -> None:
     spec, shape = load_adapter(SPEC), ros_shape(IMU)
     own = IMU.types[IMU.root]
     other = replace(IMU, types={**IMU.types, IMU.root: replace(own, fields=own.fields[:-1])})
@@ -27,7 +27,7 @@ def test_the_same_definition_is_compiled_once_and_another_anew() -> None:
     assert spec.check(other, ros_shape(other))
 
 
-def test_what_was_compiled_stays_behind_when_an_adapter_is_sent_away() -> None:
+def test_pickled_adapter_excludes_binding_cache() -> None:
     spec = load_adapter(SPEC)
     fresh = len(pickle.dumps(spec))
     spec.bind(IMU, ros_shape(IMU))

@@ -65,7 +65,7 @@ def _nothing_stays_registered() -> Iterator[None]:
     base._registered.update(before)
 
 
-def test_each_message_becomes_a_row_in_order(floats: Callable[..., Adapted]) -> None:
+def test_python_adapter_messages_become_rows_in_order(floats: Callable[..., Adapted]) -> None:
     adapted = floats(SpeedAdapter, *range(600))
     assert adapted.rows.field("value").to_pylist() == list(range(600))
     assert adapted.index.tolist() == list(range(600))
@@ -73,13 +73,13 @@ def test_each_message_becomes_a_row_in_order(floats: Callable[..., Adapted]) -> 
     assert adapted.log_times is None
 
 
-def test_no_message_is_no_row(floats: Callable[..., Adapted]) -> None:
+def test_python_adapter_empty_batch_returns_no_rows(floats: Callable[..., Adapted]) -> None:
     adapted = floats(SpeedAdapter)
     assert len(adapted.rows) == 0
     assert adapted.rows.type == Speed.ontology_type().struct
 
 
-def test_an_exception_rejects_its_row_and_no_other(floats: Callable[..., Adapted]) -> None:
+def test_python_adapter_exception_rejects_only_its_row(floats: Callable[..., Adapted]) -> None:
     adapted = floats(SpeedAdapter, 1, -2, 3)
     assert adapted.index.tolist() == [0, 2]
     (failure,) = adapted.failures
@@ -87,7 +87,7 @@ def test_an_exception_rejects_its_row_and_no_other(floats: Callable[..., Adapted
     assert failure.reason == "SpeedAdapter: ValueError: speed is -2.0"
 
 
-def test_translate_that_is_overridden_is_called_with_the_envelope(floats: Callable[..., Adapted]) -> None:
+def test_python_adapter_overridden_translate_receives_envelope(floats: Callable[..., Adapted]) -> None:
     class Shifted(SpeedAdapter):
         @classmethod
         def translate(cls, ros_msg: ROSMessage, **kwargs: Any) -> Message:
@@ -100,7 +100,7 @@ def test_translate_that_is_overridden_is_called_with_the_envelope(floats: Callab
     assert adapted.log_times.tolist() == [100, 101]
 
 
-def test_another_object_than_promised_rejects_the_row(floats: Callable[..., Adapted]) -> None:
+def test_python_adapter_wrong_class_rejects_row(floats: Callable[..., Adapted]) -> None:
     class Wrong(SpeedAdapter):
         @classmethod
         def from_dict(cls, ros_data: dict[str, Any], **_: Any) -> Any:
@@ -111,7 +111,7 @@ def test_another_object_than_promised_rejects_the_row(floats: Callable[..., Adap
     assert "returned NoneType, expected Speed" in adapted.failures[0].reason
 
 
-def test_columns_are_adapted_by_from_batch(floats: Callable[..., Adapted]) -> None:
+def test_python_adapter_with_from_batch_receives_columns(floats: Callable[..., Adapted]) -> None:
     class ByColumns(SpeedAdapter):
         calls = 0
 
@@ -132,7 +132,7 @@ def test_columns_are_adapted_by_from_batch(floats: Callable[..., Adapted]) -> No
     assert adapted.failures[0].row == 1
 
 
-def test_a_batch_that_raises_is_halved_until_the_rows_are_found(floats: Callable[..., Adapted]) -> None:
+def test_from_batch_exception_rejects_only_bad_rows(floats: Callable[..., Adapted]) -> None:
     class Picky(SpeedAdapter):
         @classmethod
         def from_batch(cls, rows: pa.StructArray) -> pa.StructArray:
@@ -148,7 +148,7 @@ def test_a_batch_that_raises_is_halved_until_the_rows_are_found(floats: Callable
     ]
 
 
-def test_columns_of_another_type_break_the_adapter(floats: Callable[..., Adapted]) -> None:
+def test_from_batch_wrong_column_type_raises(floats: Callable[..., Adapted]) -> None:
     class Broken(SpeedAdapter):
         @classmethod
         def from_batch(cls, rows: pa.StructArray) -> pa.Array:
@@ -160,7 +160,7 @@ def test_columns_of_another_type_break_the_adapter(floats: Callable[..., Adapted
         floats(Broken, 1)
 
 
-def test_metadata_is_read_from_the_first_message(define: Callable[..., Definition]) -> None:
+def test_topic_metadata_reads_first_message(define: Callable[..., Definition]) -> None:
     class Telling(SpeedAdapter):
         @classmethod
         def schema_metadata(cls, ros_data: dict[str, Any], **_: Any) -> dict[str, Any] | None:
@@ -174,7 +174,7 @@ def test_metadata_is_read_from_the_first_message(define: Callable[..., Definitio
     assert PythonAdapterSpec(SpeedAdapter).bind(definition, rows.type).topic_metadata(rows[0]) == {}
 
 
-def test_metadata_is_read_whatever_the_message_is_called() -> None:
+def test_topic_metadata_accepts_any_parameter_name() -> None:
     class Renaming(SpeedAdapter):
         @classmethod
         def schema_metadata(cls, message: dict[str, Any], **_: Any) -> dict[str, Any] | None:  # type: ignore[override] - as users write it
@@ -184,7 +184,7 @@ def test_metadata_is_read_whatever_the_message_is_called() -> None:
     assert PythonAdapter(Renaming, Speed.ontology_type()).topic_metadata(row) == {"first": 2.0}
 
 
-def test_metadata_that_cannot_be_read_breaks_the_adapter() -> None:
+def test_topic_metadata_exception_raises_adapter_error() -> None:
     class Failing(SpeedAdapter):
         @classmethod
         def schema_metadata(cls, ros_data: dict[str, Any], **_: Any) -> dict[str, Any] | None:
@@ -195,7 +195,7 @@ def test_metadata_that_cannot_be_read_breaks_the_adapter() -> None:
         PythonAdapter(Failing, Speed.ontology_type()).topic_metadata(rows[0])
 
 
-def test_registering_makes_a_class_the_default_of_its_types() -> None:
+def test_register_default_adapter_sets_default_of_its_types() -> None:
     assert register_default_adapter(SpeedAdapter) is SpeedAdapter
     assert registered_adapters()["std_msgs/msg/Float64"] is SpeedAdapter
     register_default_adapter(SpeedAdapter)
@@ -208,7 +208,7 @@ def test_registering_makes_a_class_the_default_of_its_types() -> None:
         register_default_adapter(Other)
 
 
-def test_a_class_without_its_parts_says_which_is_missing(define: Callable[..., Definition]) -> None:
+def test_adapter_class_without_member_raises_with_its_name(define: Callable[..., Definition]) -> None:
     class NoType(ROSAdapterBase[Speed]): ...
 
     class NoOntology(ROSAdapterBase[Speed]):
@@ -240,7 +240,7 @@ class {name}(ROSAdapterBase[{name}Row]):
 """
 
 
-def test_a_file_beside_the_manifest_is_loaded_and_survives_pickling(tmp_path: Path) -> None:
+def test_file_reference_loads_and_pickles(tmp_path: Path) -> None:
     (tmp_path / "beside.py").write_text("FACTOR = 2\n")
     (tmp_path / "mine.py").write_text(_FILE.format(name="Doubling"))
     spec = load_adapter_reference("mine.py:Doubling", tmp_path)
@@ -249,7 +249,7 @@ def test_a_file_beside_the_manifest_is_loaded_and_survives_pickling(tmp_path: Pa
     assert again == spec
 
 
-def test_a_module_is_found_beside_the_manifest_too(tmp_path: Path) -> None:
+def test_module_reference_finds_module_next_to_manifest(tmp_path: Path) -> None:
     (tmp_path / "beside.py").write_text("FACTOR = 2\n")
     (tmp_path / "adapters_of_mine.py").write_text(_FILE.format(name="Tripling"))
     assert load_adapter_reference("adapters_of_mine:Tripling", tmp_path).name == "Tripling"
@@ -263,7 +263,7 @@ def test_a_module_is_found_beside_the_manifest_too(tmp_path: Path) -> None:
         ("import nothing_like_it\n", "broken.py:1", "No module named 'nothing_like_it'"),
     ],
 )
-def test_a_module_that_fails_to_import_names_file_and_line(
+def test_module_reference_import_error_names_file_and_line(
     tmp_path: Path, text: str, place: str, reason: str
 ) -> None:
     (tmp_path / "broken.py").write_text(text)
@@ -283,14 +283,14 @@ def test_a_module_that_fails_to_import_names_file_and_line(
         ("mine.py:Doublin", "did you mean Doubling?"),
     ],
 )
-def test_a_reference_to_nothing_says_what_there_is(tmp_path: Path, ref: str, reason: str) -> None:
+def test_reference_to_missing_adapter_suggests_names(tmp_path: Path, ref: str, reason: str) -> None:
     (tmp_path / "beside.py").write_text("FACTOR = 2\n")
     (tmp_path / "mine.py").write_text(_FILE.format(name="Doubling"))
     with pytest.raises(AdapterError, match=reason.replace("?", r"\?")):
         load_adapter_reference(ref, tmp_path)
 
 
-def test_what_is_no_adapter_is_refused() -> None:
+def test_adapter_spec_of_other_object_raises() -> None:
     with pytest.raises(AdapterError, match="int 3 is no adapter"):
         adapter_spec(3, Path())
     with pytest.raises(AdapterError, match="Speed is no adapter"):
