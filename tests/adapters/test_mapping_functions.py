@@ -221,3 +221,7 @@ def test_functions_are_documented_and_tested() -> None:
         assert any(function.apply.__module__ == subject.__name__ for subject in SUBJECTS)
         if not function.name.startswith("points_"):
             assert f"{function.name}(" in tested, f"{function.name} has no case"
+
+
+def test_floor_division_of_null_by_zero_is_null() -> None:
+    assert column("x[0] // 0", [[]], pa.list_(pa.int64())) == [None]

@@ -263,7 +263,7 @@ PLAIN: dict[str, Callable[..., Any]] = {
     "any": folded(any, empty=False),
     "all": folded(all, empty=True),
     "lower": strict(str.lower),
-    "covariance": strict(lambda a: a if any(v > 0 for v in a) else None),
+    "covariance": strict(lambda a: a if any(v is not None and v > 0 for v in a) else None),
     "variance": strict(lambda a: a if a > 0 else None),
 }
 

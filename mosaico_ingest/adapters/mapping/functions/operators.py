@@ -197,7 +197,8 @@ def _floored(refuse: RejectRows, sign: str, run: Any, left: Array, right: Array)
     left, right = numbers(refuse, left, right)
     n = _length(left, right)
     if pt.is_integer(left.type):
-        zero = np.broadcast_to(true_mask(pc.equal(right, 0)), n)
+        # null // 0 is null: only a division that takes place can be rejected.
+        zero = np.broadcast_to(true_mask(pc.and_(pc.equal(right, 0), pc.is_valid(left))), n)
         lowest = pc.and_kleene(pc.equal(left, INT64[0]), pc.equal(right, -1))
         bad = zero | (np.broadcast_to(true_mask(lowest), n) & (sign == "//"))
         if bad.any():
