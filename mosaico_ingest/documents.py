@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, model_validator
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core.core_schema import ModelSchema
 
-from mosaico_ingest.findings import encodable
+from mosaico_ingest.findings import escape_undecodable
 
 __all__ = [
     "DIALECT",
@@ -108,7 +108,7 @@ class Part(BaseModel):
 
 def _encodable(value: Any) -> Any:  # noqa: ANN401 - every field of every part
     if type(value) is str:
-        return encodable(value)
+        return escape_undecodable(value)
     if isinstance(value, tuple):
-        return tuple(encodable(item) if type(item) is str else item for item in value)
+        return tuple(escape_undecodable(item) if type(item) is str else item for item in value)
     return value

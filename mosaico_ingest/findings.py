@@ -17,12 +17,12 @@ __all__ = [
     "Severity",
     "Span",
     "Stage",
-    "a_few",
-    "encodable",
+    "escape_undecodable",
     "has_credentials",
+    "join_names",
     "mask_credentials",
-    "offered",
     "one_line",
+    "suggest_names",
 ]
 
 
@@ -104,7 +104,7 @@ _UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u
 """Control characters, line separators and direction marks, which can disguise text in a terminal."""
 
 
-def encodable(text: str) -> str:
+def escape_undecodable(text: str) -> str:
     r"""Return the text with the undecodable bytes of file names escaped as `\xff`."""
     return _SURROGATES.sub(_escape, text)
 
@@ -144,17 +144,17 @@ def mask_credentials(text: str, *, same_length: bool = False) -> str:
     return _CREDENTIALS.sub(mask, text)
 
 
-def a_few(names: Iterable[str], *, most: int = 8) -> str:
+def join_names(names: Iterable[str], *, most: int = 8) -> str:
     """Return the first `most` names in alphabetical order, separated by commas, and the number of the others."""
     ordered = sorted(names)
     more = f" and {len(ordered) - most:,} more" if len(ordered) > most else ""
     return f"{', '.join(ordered[:most])}{more}"
 
 
-def offered(names: Iterable[str], wanted: Iterable[str] = ()) -> str:
+def suggest_names(names: Iterable[str], wanted: Iterable[str] = ()) -> str:
     """Return a hint that lists the available names, and the nearest ones to the wanted words first."""
     available = sorted(names)
     matches = (get_close_matches(word, available, n=1, cutoff=0.5) for word in wanted if word[:1] != "!")
     nearest = dict.fromkeys(name for match in matches for name in match)
-    listing = f"there are {a_few(available)}" if available else "there are none"
-    return f"the nearest is {a_few(nearest)}; {listing}" if nearest else listing
+    listing = f"there are {join_names(available)}" if available else "there are none"
+    return f"the nearest is {join_names(nearest)}; {listing}" if nearest else listing

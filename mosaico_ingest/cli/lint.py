@@ -103,7 +103,7 @@ def _print_text(report: LintReport, *, quiet: bool) -> None:
 
 def _summary(report: LintReport) -> str:
     """Return the number of files, findings and applied fixes, and a line about skipped files."""
-    from mosaico_ingest.findings import a_few
+    from mosaico_ingest.findings import join_names
     from mosaico_ingest.report.units import counted
 
     summary = "nothing to check: no manifest, adapter or .msg file"
@@ -113,7 +113,7 @@ def _summary(report: LintReport) -> str:
     if fixes:
         summary += f", {counted(fixes, 'change')} made"
     if report.skipped:
-        names = a_few(skipped.file for skipped in report.skipped)
+        names = join_names(skipped.file for skipped in report.skipped)
         skipped = counted(len(report.skipped), "file")
         summary += f"\n{skipped} skipped (not a manifest or an adapter): {names}"
     return summary

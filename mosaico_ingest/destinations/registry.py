@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 
 from mosaico_ingest.destinations.base import Destination
 from mosaico_ingest.errors import IngestError, ManifestError, SinkError
-from mosaico_ingest.findings import offered
+from mosaico_ingest.findings import suggest_names
 from mosaico_ingest.job.values import PluginTarget, ServerTarget, StoreTarget, Target
 
 __all__ = ["ENTRY_POINTS", "DestinationFactory", "KeepOpen", "destination_of", "keep_destinations_open"]
@@ -79,7 +79,7 @@ def _plugin(target: PluginTarget) -> Destination:
         raise ManifestError(
             f"no destination of type {target.kind!r} is installed",
             where="target.type",
-            hint=offered(factories, [target.kind]) or "install the package that provides it",
+            hint=suggest_names(factories, [target.kind]) or "install the package that provides it",
         )
     try:
         factory: DestinationFactory = factories[target.kind].load()

@@ -21,7 +21,7 @@ from mosaico_ingest.adapters.inverse import Inverse, Restored, invert
 from mosaico_ingest.adapters.mapping.columns import struct_of
 from mosaico_ingest.destinations.store import SequenceInfo, Store, TopicInfo
 from mosaico_ingest.errors import AdapterError, BagError, NothingMatched
-from mosaico_ingest.findings import offered
+from mosaico_ingest.findings import suggest_names
 from mosaico_ingest.job.patterns import select
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.blocks import Encoding
@@ -294,7 +294,7 @@ def _selected(found: SequenceInfo, patterns: Sequence[str]) -> tuple[TopicInfo, 
     selection = select(patterns, names)
     if not selection.selected:
         what = f"no topic matches {', '.join(map(repr, patterns))}" if names else "the sequence has no topic"
-        raise NothingMatched(what, where=found.name, hint=offered(names, patterns) if names else None)
+        raise NothingMatched(what, where=found.name, hint=suggest_names(names, patterns) if names else None)
     return tuple(topic for topic in found.topics if topic.name in selection.selected)
 
 

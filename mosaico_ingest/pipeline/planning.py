@@ -19,8 +19,8 @@ from mosaico_ingest.findings import (
     Finding,
     Severity,
     Span,
-    encodable,
-    offered,
+    escape_undecodable,
+    suggest_names,
 )
 from mosaico_ingest.job.config import ROSInjectionConfig, TimeRange
 from mosaico_ingest.job.patterns import Selection, first_match, select
@@ -299,7 +299,9 @@ def resolve(
     misfits: list[tuple[str, AdapterError]] = []
     for connection in recording.connections:
         try:
-            outcome = decide(config, connection, selection, bridge, encodable(recording.files[0].name))
+            outcome = decide(
+                config, connection, selection, bridge, escape_undecodable(recording.files[0].name)
+            )
         except AdapterError as error:
             misfits.append((connection.topic, error))
             continue
@@ -440,7 +442,7 @@ def _nothing(
     if config.topics and all("`topics`" in one.why for one in left):
         what = f"no topic matches {', '.join(map(repr, config.topics))}"
         return NothingMatched(
-            where=where, what=what, hint=offered({one.topic for one in left}, config.topics)
+            where=where, what=what, hint=suggest_names({one.topic for one in left}, config.topics)
         )
     first = left[0]
     return NothingMatched(

@@ -18,7 +18,7 @@ from xxhash import xxh3_128
 from mosaico_ingest.destinations.base import ExistingSequence
 from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import BagError, SequenceExists
-from mosaico_ingest.findings import encodable
+from mosaico_ingest.findings import escape_undecodable
 from mosaico_ingest.job.values import PROVENANCE_KEY, IfExists, Target
 from mosaico_ingest.pipeline.plan import Plan, decisions
 from mosaico_ingest.pipeline.quarantine import quarantine_file_name
@@ -304,7 +304,7 @@ def _records(metadata: Iterable[Mapping[str, Any]]) -> tuple[Provenance, ...]:
 
 def _source(path: AnyPath) -> Source:
     stat = path.stat()
-    name, size_bytes = encodable(path.name), stat.st_size
+    name, size_bytes = escape_undecodable(path.name), stat.st_size
     if isinstance(path, RemotePath):  # its version identifies the content without a download
         return Source(name=name, size_bytes=size_bytes, content=path.version())
     return Source(

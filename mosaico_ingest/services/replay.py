@@ -14,7 +14,7 @@ from msgspec import Struct
 
 from mosaico_ingest.destinations.store.files import Lease
 from mosaico_ingest.errors import ManifestError, NothingMatched, SinkUnavailable
-from mosaico_ingest.findings import a_few, encodable
+from mosaico_ingest.findings import escape_undecodable, join_names
 from mosaico_ingest.job.config import QuarantineSettings, ROSInjectionConfig, TimeRange
 from mosaico_ingest.job.values import IfExists, SessionLevelErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.pipeline.provenance import content_digest, stored_provenance
@@ -86,7 +86,7 @@ def _replay(kept: QuarantineFile, known: dict[str, ROSInjectionConfig]) -> Repla
         raise ManifestError(
             f"{kept.messages.name} belongs to the sequence {kept.sequence!r}, which the manifest does not make",
             where=next((config.where for config in known.values()), None),
-            hint=f"it makes {a_few(known)}",
+            hint=f"it makes {join_names(known)}",
         )
     config = known[kept.sequence]
     return Replay(kept, _whereabouts(kept, config), _configuration(kept, config))
@@ -97,7 +97,7 @@ def _whereabouts(kept: QuarantineFile, config: ROSInjectionConfig) -> Whereabout
     stored = stored_provenance(config.target, kept.sequence)
     if stored is None:
         return Whereabouts.FORGOTTEN
-    name = encodable(kept.messages.name)
+    name = escape_undecodable(kept.messages.name)
     made_from = {(source.name, source.content) for known in stored.records for source in known.sources}
     if (name, content_digest(kept.messages)) in made_from:
         return Whereabouts.STORED

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mosaico_ingest.findings import a_few
+from mosaico_ingest.findings import join_names
 from mosaico_ingest.report.units import counted
 
 
@@ -14,6 +14,6 @@ def test_one_is_singular(count: int, text: str) -> None:
 
 
 def test_a_list_says_how_much_of_it_is_not_shown() -> None:
-    assert a_few(["b", "a"]) == "a, b"
-    assert a_few("hgfedcba") == "a, b, c, d, e, f, g, h"
-    assert a_few([f"/t{n:04}" for n in range(1500)], most=2) == "/t0000, /t0001 and 1,498 more"
+    assert join_names(["b", "a"]) == "a, b"
+    assert join_names("hgfedcba") == "a, b, c, d, e, f, g, h"
+    assert join_names([f"/t{n:04}" for n in range(1500)], most=2) == "/t0000, /t0001 and 1,498 more"

@@ -20,7 +20,7 @@ from mosaico_ingest.destinations.store.model import Collected, SegmentInfo, Sequ
 from mosaico_ingest.destinations.store.protocols import Files, Records
 from mosaico_ingest.destinations.store.segment import sorted_rows, time_span
 from mosaico_ingest.errors import SinkError
-from mosaico_ingest.findings import offered
+from mosaico_ingest.findings import suggest_names
 from mosaico_ingest.remote import AnyPath, RemotePath, as_path
 
 __all__ = [
@@ -240,7 +240,7 @@ class Store(Struct, frozen=True):
         if info is None:
             known = self.catalog.names()
             raise NotInStore(
-                f"there is no sequence {name!r}", where=str(self.path), hint=offered(known, [name])
+                f"there is no sequence {name!r}", where=str(self.path), hint=suggest_names(known, [name])
             )
         return info
 
@@ -253,7 +253,9 @@ class Store(Struct, frozen=True):
         topics = {info.name: info for info in self.sequence(sequence).topics}
         name = f"/{topic.removeprefix('/')}"
         if name not in topics:
-            raise NotInStore(f"there is no topic {name!r}", where=sequence, hint=offered(topics, [name]))
+            raise NotInStore(
+                f"there is no topic {name!r}", where=sequence, hint=suggest_names(topics, [name])
+            )
         return topics[name]
 
     def create_sequence(self, sequence: str, metadata: Mapping[str, Any]) -> None:
@@ -341,7 +343,7 @@ def _chosen(schema: pa.Schema, columns: Sequence[str], *, where: str) -> pa.Sche
     unknown = [name for name in columns if name not in schema.names]
     if unknown:
         raise SinkError(
-            f"there is no column {unknown[0]!r}", where=where, hint=offered(schema.names, unknown[:1])
+            f"there is no column {unknown[0]!r}", where=where, hint=suggest_names(schema.names, unknown[:1])
         )
     wanted = dict.fromkeys([schema.names[0], *columns])
     return pa.schema([schema.field(name) for name in wanted])
