@@ -24,7 +24,7 @@ from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.pipeline.run import make_plan, run_recording
-from mosaico_ingest.remote import AnyPath
+from mosaico_ingest.remote import AnyPath, as_path
 from mosaico_ingest.report.events import (
     BatchObserver,
     Observer,
@@ -127,19 +127,29 @@ def compile_recording(manifest: Path, recording: Path) -> tuple[ROSInjectionConf
 def quick_config(
     path: AnyPath | str,
     *,
-    metadata: str | None,
-    api_key: str | None,
-    host: str | None,
+    sequence_name: str | None = None,
+    metadata: str | None = None,
+    topic_metadata: str | None = None,
+    api_key: str | None = None,
+    host: str | None = None,
     **options: Any,  # noqa: ANN401 - the rest of the configuration's fields
 ) -> ROSInjectionConfig:
-    """Return the configuration of `ingest bag`; `metadata` is a JSON object or the path of a JSON file.
+    """Return the configuration of `ingest bag`; `sequence_name` defaults to the name of the file without suffix.
+
+    `metadata` and `topic_metadata` are JSON objects or paths of JSON files.
 
     Raises:
         ManifestError: An option has an invalid value.
     """
+    if sequence_name is None:
+        from mosaico_ingest.services.draft import default_name
+
+        sequence_name = default_name(as_path(path) if isinstance(path, str) else path)
     return ROSInjectionConfig(
         file_path=path,
-        metadata=_read_metadata(metadata),
+        sequence_name=sequence_name,
+        metadata=_read_json_object(metadata, "--metadata"),
+        topic_metadata=_read_topic_metadata(topic_metadata),
         host=host,
         # The key may come from the environment, where it does not select a server.
         mosaico_api_key=api_key if host else None,
@@ -275,12 +285,24 @@ def job_status(manifest: Path) -> tuple[RecordingStatus, ...]:
     return tuple(recording_statuses(compile_job(manifest)))
 
 
-def _read_metadata(argument: str | None) -> dict[str, Any]:
-    """Return metadata that is given as a JSON object or as the path of a JSON file."""
+def _read_topic_metadata(argument: str | None) -> dict[str, dict[str, Any]]:
+    topics = _read_json_object(argument, "--topic-metadata")
+    for topic, metadata in topics.items():
+        if not isinstance(metadata, dict):
+            raise ManifestError(
+                f"the value of {topic!r} is not an object",
+                where="--topic-metadata",
+                hint='write {"/topic": {"key": "value"}}',
+            )
+    return topics
+
+
+def _read_json_object(argument: str | None, option: str) -> dict[str, Any]:
+    """Return the value of an option that takes a JSON object or the path of a JSON file."""
     if argument is None:
         return {}
     text: str | bytes = argument
-    where = "--metadata"
+    where = option
     if not argument.lstrip().startswith("{"):
         where = argument
         try:
@@ -288,14 +310,12 @@ def _read_metadata(argument: str | None) -> dict[str, Any]:
         except OSError as error:
             raise ManifestError(
                 f"is neither a JSON object nor a readable file ({error.strerror})",
-                where=f"--metadata {argument}",
+                where=f"{option} {argument}",
             ) from error
     try:
         value = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise ManifestError(f"is not JSON: {error}", where=where) from error
     if not isinstance(value, dict):
-        raise ManifestError(
-            f"contains {type(value).__name__}, not an object", where=where, hint='write {"key": "value"}'
-        )
+        raise ManifestError("the JSON value is not an object", where=where, hint='write {"key": "value"}')
     return value

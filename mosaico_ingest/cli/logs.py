@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import sys
 from datetime import datetime, timezone
 from enum import Enum
 from typing import Annotated, Any, TypeAlias
@@ -11,6 +12,7 @@ from typing import Annotated, Any, TypeAlias
 import typer
 
 from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.findings import one_line
 
 __all__ = [
     "LEVELS",
@@ -49,12 +51,8 @@ def set_up_logging(level: str, log_format: LogFormat = LogFormat.TEXT) -> None:
     """
     if level.upper() not in LEVELS:
         raise ManifestError(f"the log level {level!r} is unknown", hint=f"use one of {', '.join(LEVELS)}")
-    handler = logging.StreamHandler()
-    handler.setFormatter(
-        _JsonFormatter()
-        if log_format is LogFormat.JSON
-        else logging.Formatter("%(levelname)s %(name)s: %(message)s")
-    )
+    handler = _StderrHandler()
+    handler.setFormatter(_JsonFormatter() if log_format is LogFormat.JSON else _TextFormatter())
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
 
 
@@ -62,6 +60,22 @@ def json_line(event: str, **values: Any) -> str:  # noqa: ANN401 - any JSON valu
     """Return a JSON object with the current time, the name of the event and its values."""
     now = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
     return json.dumps({"time": now, "event": event, **values})
+
+
+class _StderrHandler(logging.Handler):
+    """Writes to the current `sys.stderr`, which the live display replaces while it runs."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            sys.stderr.write(self.format(record) + "\n")
+        except Exception:  # noqa: BLE001 - a record that cannot be written must not end the run
+            self.handleError(record)
+
+
+class _TextFormatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        line = one_line(f"{record.levelname} {record.name}: {record.getMessage()}")
+        return f"{line}\n{self.formatException(record.exc_info)}" if record.exc_info else line
 
 
 class _JsonFormatter(logging.Formatter):

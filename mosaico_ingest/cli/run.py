@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import replace
 from enum import Enum
 from functools import partial
 from pathlib import Path
@@ -162,7 +163,12 @@ def bag(
         str, typer.Argument(metavar="BAG", help="A .bag, .db3 or .mcap file, a rosbag2 directory, or a URL.")
     ],
     *,
-    name: Annotated[str, typer.Option("--name", "-n", help="Name of the sequence.")],
+    name: Annotated[
+        str | None,
+        typer.Option(
+            "--name", "-n", metavar="NAME", help="Name of the sequence.", show_default="the file's stem"
+        ),
+    ] = None,
     topics: Annotated[
         list[str] | None,
         typer.Option(
@@ -176,6 +182,14 @@ def bag(
         str | None,
         typer.Option(
             "--metadata", help="Metadata of the sequence: a JSON object, or a JSON file.", metavar="JSON|FILE"
+        ),
+    ] = None,
+    topic_metadata: Annotated[
+        str | None,
+        typer.Option(
+            "--topic-metadata",
+            help="Metadata by topic: a JSON object of objects, or a JSON file.",
+            metavar="JSON|FILE",
         ),
     ] = None,
     ros_distro: Annotated[
@@ -205,6 +219,15 @@ def bag(
         IfExists,
         typer.Option("--if-exists", help="Action if the sequence exists; skip needs the same content."),
     ] = IfExists.FAIL,
+    update_if_exists: Annotated[
+        bool,
+        typer.Option(
+            "--update-if-exists", help="Add topics to an existing sequence, as --if-exists append does."
+        ),
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print the plan, without writing or connecting to a server.")
+    ] = False,
     report: ReportOption = None,
     quiet: QuietOption = False,
     log: Annotated[
@@ -224,6 +247,9 @@ def bag(
     config = api.quick_config(
         path,
         sequence_name=name,
+        topic_metadata=topic_metadata,
+        update_if_exists=update_if_exists,
+        dry_run=dry_run,
         topics=[*(topics or ()), *(more_topics or ())],
         metadata=metadata,
         ros_distro=ros_distro,
@@ -235,6 +261,12 @@ def bag(
         if_exists=if_exists,
     )
     hide_pandas([config])
+    if dry_run:
+        from mosaico_ingest.cli.plan import print_plan
+
+        document = api.plan_job(Path(), configs=[config])
+        print_plan(document, folder=Path())
+        raise typer.Exit(document.exit_code)
     run_configs([config], report=report, quiet=quiet, log=log)
 
 
@@ -310,8 +342,11 @@ def run_configs(
     from mosaico_ingest.textfile import check_output_file
 
     as_json = log_format is LogFormat.JSON
-    prepare = partial(set_up_logging, log or (configs[0].log_level if configs else "INFO"), log_format)
+    level = log or ("ERROR" if quiet else configs[0].log_level if configs else "INFO")
+    prepare = partial(set_up_logging, level, log_format)
     prepare()
+    if log or quiet:
+        configs = [replace(config, log_level=level.upper()) for config in configs]
     interrupt_on_sigterm()
     collect_garbage_as_usual()
     report_files = {path for path in (report, *map(_report_path, configs)) if path is not None}

@@ -15,10 +15,12 @@ from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.values import LoaderErrorPolicy
 from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.planning import resolve
 from mosaico_ingest.pipeline.provenance import check_provenance
 from mosaico_ingest.pipeline.pump import verify, write_sequence
+from mosaico_ingest.pipeline.rejection_log import RejectionLog
 from mosaico_ingest.report.collect import Collector
 from mosaico_ingest.report.events import (
     Event,
@@ -68,7 +70,7 @@ def run_recording(job: ROSInjectionConfig, observe: Observer = ignore_events) ->
     events = _RunEvents(job, observe)
     stopwatch = events.stopwatch
     try:
-        with open_job(job) as (recording, resolver):
+        with _log_level(job.log_level), open_job(job) as (recording, resolver):
             plan = _resolve(job, recording, resolver)
             events.start(plan)
             request = None if job.dry_run else check_provenance(plan)
@@ -86,6 +88,18 @@ def run_recording(job: ROSInjectionConfig, observe: Observer = ignore_events) ->
         _log.debug("unexpected", exc_info=True)
         return events.fail(_unexpected(job, error))
     return events.complete()
+
+
+@contextmanager
+def _log_level(level: str) -> Generator[None]:
+    """Set the log level of the package during a run; handlers are those of the program."""
+    logger = logging.getLogger("mosaico_ingest")
+    previous = logger.level
+    logger.setLevel(level)
+    try:
+        yield
+    finally:
+        logger.setLevel(previous)
 
 
 @contextmanager
@@ -151,12 +165,16 @@ class _RunEvents:
         self.stopwatch = Stopwatch()
         self._job = job
         self._observe = observe
+        self._log_rejection = ignore_events
+        if job.messages_on_error is LoaderErrorPolicy.LOG_WARN:
+            self._log_rejection = RejectionLog(job.sequence_name)
         self._collector = Collector(self.stopwatch)
         self._started = False
 
     def __call__(self, event: Event) -> None:
         """Collect an event and pass it on."""
         self._collector(event)
+        self._log_rejection(event)
         self._observe(event)
 
     def start(self, plan: Plan) -> None:

@@ -19,7 +19,7 @@ from mosaico_ingest.rosbag.definitions.distros import ROS2, distro_type
 from mosaico_ingest.rosbag.definitions.model import Source
 from mosaico_ingest.services.inspection import InspectedTopic, Inspection
 
-__all__ = ["draft_manifest", "draft_name"]
+__all__ = ["default_name", "draft_manifest"]
 
 _REFUSED = re.compile(r"[^A-Za-z0-9_-]+")
 _HEAD = (
@@ -40,7 +40,7 @@ def draft_manifest(
             *_bag(found, _seen_from(folder, recording), ros_distro),
             "",
             "sequence:",
-            f"  name: {draft_name(recording)}",
+            f"  name: {plain(default_name(recording))}",
             "  # metadata: {vehicle: demo-01}",
             "  # if_exists: replace                # fail, skip, append or replace",
             "",
@@ -60,12 +60,12 @@ def draft_manifest(
     )
 
 
-def draft_name(recording: AnyPath) -> str:
-    """Return a sequence name for a recording: its file's name without what no name may have."""
+def default_name(recording: AnyPath) -> str:
+    """Return the stem of a recording's file name, with `_` for characters that sequence names cannot contain."""
     name = recording.name if isinstance(recording, RemotePath) else recording.resolve().name
     stem = re.sub(r"\.(bag|db3|mcap)(\.\w+)?$", "", name, flags=re.IGNORECASE)
     name = _REFUSED.sub("_", stem).strip("_-")
-    return plain(name if name[:1].isalnum() else f"drive_{name}".rstrip("_"))
+    return name if name[:1].isalnum() else f"drive_{name}".rstrip("_")
 
 
 def _bag(found: Inspection, path: str, ros_distro: Stores | str | None) -> Iterator[str]:

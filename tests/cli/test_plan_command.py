@@ -323,3 +323,29 @@ def test_a_plan_of_topics_without_a_message_is_no_plan(ingest: Ingest) -> None:
     assert code == 3
     assert "the selected topics have no message" in said
     assert ingest("job.yaml", "-q")[0] == 3
+
+
+def test_plan_out_dash_prints_only_the_document(ingest: Ingest) -> None:
+    code, output = ingest("plan", JOB, "--out", "-")
+    assert code == 0
+    assert PlanDocument.model_validate_json(output).recordings
+    assert not Path("-").exists()
+
+
+def test_init_out_dash_prints_the_manifest(ingest: Ingest) -> None:
+    code, output = ingest("init", "configs/quickstart/drive.mcap", "--out", "-")
+    assert code == 0
+    assert output == ingest("init", "configs/quickstart/drive.mcap")[1]
+    assert not Path("-").exists()
+
+
+def test_expand_literal_secret_is_masked(ingest: Ingest) -> None:
+    Path("secret.yaml").write_text(
+        "version: 1\nbag: {path: configs/quickstart/drive.mcap}\nsequence: {name: a}\n"
+        "target: {host: h, api_key: msco_s3cretkey}\n"
+    )
+    for options in ((), ("--json",)):
+        code, output = ingest("expand", "secret.yaml", *options)
+        assert code == 0
+        assert "s3cretkey" not in output
+        assert "***" in output

@@ -288,6 +288,19 @@ def test_report_command_writes_page_and_summary(tmp_path: Path) -> None:
     assert summary.read_text() == markdown_summary(RUNS["small"])
 
 
+@pytest.mark.parametrize("option", ["--html", "--markdown"])
+def test_report_command_dash_writes_to_stdout(
+    option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run.json").write_text(RUNS["small"].model_dump_json())
+    done = CliRunner().invoke(command_line(), ["report", "run.json", option, "-"])
+    assert done.exit_code == 0, done.output
+    expected = html_page(RUNS["small"]) if option == "--html" else markdown_summary(RUNS["small"])
+    assert done.stdout == expected
+    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 @pytest.mark.parametrize("scheme", ["light", "dark"])
