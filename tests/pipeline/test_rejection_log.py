@@ -90,8 +90,8 @@ def test_rejection_log_many_messages_logs_first_and_rest(caplog: pytest.LogCaptu
     log = RejectionLog("drive")
     for event in (rejected(1), rejected(2), rejected(3), rejected(5, Stage.ADAPT)):
         log(event)
-    log(RunFinished(RunStatus.REJECTED, 4))
-    log(RunFinished(RunStatus.REJECTED, 4))
+    log(RunFinished(RunStatus.WITH_ERRORS, 4))
+    log(RunFinished(RunStatus.WITH_ERRORS, 4))
     assert [record.getMessage().partition(" cannot")[0] for record in caplog.records] == [
         "drive: 1 message",
         "drive: 5 more messages",
