@@ -7,23 +7,33 @@ from __future__ import annotations
 
 import ast
 import inspect
+import json
+from functools import cache
 from itertools import pairwise
-from typing import Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
-from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core.core_schema import ModelSchema
 
+from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import escape_undecodable
+
+if TYPE_CHECKING:
+    from jsonschema.protocols import Validator
 
 __all__ = [
     "DIALECT",
     "Part",
+    "document_schema",
+    "read_document",
     "schema_of",
     "tidy",
 ]
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
+_MAX_MESSAGE = 200
+"""Maximum length of a schema violation in an error message, as it repeats the value."""
 
 
 def schema_of(
@@ -31,6 +41,54 @@ def schema_of(
 ) -> dict[str, Any]:
     """Return the JSON Schema of `model`; fields are named as files name them."""
     return model.model_json_schema(mode=mode, schema_generator=_WithDocstrings)
+
+
+def document_schema(model: type[BaseModel]) -> dict[str, Any]:
+    """Return the published JSON Schema of files that hold `model`; computed fields are optional."""
+    schema = schema_of(model, mode="serialization")
+    for part in (schema, *schema.get("$defs", {}).values()):
+        computed = {name for name, member in part.get("properties", {}).items() if member.get("readOnly")}
+        if computed:
+            part["required"] = [name for name in part["required"] if name not in computed]
+    return {"$schema": DIALECT, **schema}
+
+
+_Model = TypeVar("_Model", bound=BaseModel)
+
+
+def read_document(content: bytes, model: type[_Model], *, where: str, kind: str, hint: str) -> _Model:
+    """Validate a JSON file against the published schema of `model` and return the model.
+
+    Raises:
+        ManifestError: The content is not JSON, or violates the schema; the message has the JSON path and the keyword.
+    """
+    from jsonschema.exceptions import best_match  # noqa: PLC0415 - slow to import, and only needed to read plans and reports
+
+    try:
+        document = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise ManifestError(f"is not {kind}: not JSON: {error}", where=where, hint=hint) from error
+    violation = best_match(_validator(model).iter_errors(document))
+    if violation is not None:
+        message = violation.message[:_MAX_MESSAGE]
+        raise ManifestError(
+            f"is not {kind}: {violation.json_path}: {message} ({violation.validator})", where=where, hint=hint
+        )
+    try:
+        return model.model_validate_json(content)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        path = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"])
+        raise ManifestError(
+            f"is not {kind}: ${path}: {first['msg']} ({first['type']})", where=where, hint=hint
+        ) from error
+
+
+@cache
+def _validator(model: type[BaseModel]) -> Validator:
+    import jsonschema  # noqa: PLC0415 - as in `read_document`
+
+    return jsonschema.Draft202012Validator(document_schema(model))
 
 
 class _WithDocstrings(GenerateJsonSchema):

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 from msgspec import Struct
-from pydantic import Field, JsonValue, ValidationError
+from pydantic import Field, JsonValue
 
 from mosaico_ingest.adapters.adapter import ROS_METADATA_KEY, AdapterSpec
 from mosaico_ingest.adapters.image import PngImageSpec
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.destinations.registry import destination_of
-from mosaico_ingest.documents import Part, schema_of
+from mosaico_ingest.documents import Part, document_schema, read_document
 from mosaico_ingest.errors import IngestError, ManifestError
 from mosaico_ingest.findings import Finding, Severity, Span, Stage
 from mosaico_ingest.job.config import Attempt, QuarantineSettings, ROSInjectionConfig
@@ -311,18 +311,14 @@ def read_plan(path: Path) -> PlanDocument:
     """Read a plan file.
 
     Raises:
-        ManifestError: It cannot be read, or is no plan of this version.
+        ManifestError: The file cannot be read or violates the schema of plans.
     """
     hint = "make one with `ingest plan job.yaml --out plan.json`"
     try:
-        return PlanDocument.model_validate_json(read_limited(path))
+        content = read_limited(path)
     except OSError as error:
         raise ManifestError(f"cannot be read: {error.strerror}", where=str(path), hint=hint) from error
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(map(str, first["loc"]))
-        said = f"{place}: {first['msg']}" if place else first["msg"]
-        raise ManifestError(f"this is no plan: {said}", where=str(path), hint=hint) from error
+    return read_document(content, PlanDocument, where=str(path), kind="a plan", hint=hint)
 
 
 def decisions(plan: Plan, *, folder: Path) -> Decisions:
@@ -549,5 +545,4 @@ def _shown(value: Json) -> str | None:
 
 def plan_schema() -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of a plan file."""
-    schema = schema_of(PlanDocument, mode="serialization")
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+    return document_schema(PlanDocument)

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from pydantic import ConfigDict, Field, ValidationError, computed_field
+from pydantic import ConfigDict, Field, computed_field
 
-from mosaico_ingest.documents import Part, schema_of
+from mosaico_ingest.documents import Part, document_schema, read_document
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import Stage
 from mosaico_ingest.report.events import RunStatus, TopicStatus
@@ -250,8 +250,7 @@ def gravest(codes: Sequence[int]) -> int:
 
 def report_schema() -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of a report file."""
-    schema = schema_of(RunReport, mode="serialization")
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+    return document_schema(RunReport)
 
 
 def replay_command(report: RunReport, one: Report) -> str | None:
@@ -275,17 +274,12 @@ def read_report(path: Path) -> RunReport:
     """Read a report file.
 
     Raises:
-        ManifestError: It is not there, or no report.
+        ManifestError: The file does not exist or violates the schema of reports.
     """
     try:
-        return RunReport.model_validate_json(path.read_bytes())
+        content = path.read_bytes()
     except OSError as error:
         raise ManifestError(f"cannot be read: {error.strerror}", where=str(path)) from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "the file"
-        raise ManifestError(
-            f"is no report: {place}: {first['msg']}",
-            where=str(path),
-            hint="`ingest run --report FILE` writes one",
-        ) from error
+    return read_document(
+        content, RunReport, where=str(path), kind="a report", hint="write one with `ingest run --report FILE`"
+    )

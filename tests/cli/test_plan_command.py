@@ -219,9 +219,15 @@ def test_a_server_is_asked_only_when_told_to(ingest: Ingest) -> None:
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("{}", "tool: Field required"), ("no json", "this is no plan"), (None, "cannot be read")],
+    [
+        ("{}", "$: 'tool' is a required property (required)"),
+        ("no json", "not JSON"),
+        (None, "cannot be read"),
+    ],
 )
-def test_what_is_no_plan_is_said_so(ingest: Ingest, text: str | None, message: str) -> None:
+def test_run_of_file_that_is_no_plan_states_path_and_keyword(
+    ingest: Ingest, text: str | None, message: str
+) -> None:
     if text is not None:
         Path("p.json").write_text(text)
     code, said = ingest("run", "--plan", "p.json")
