@@ -1,4 +1,4 @@
-"""The quickstart, as a user runs it: every topic of the recording arrives typed and whole."""
+"""The quickstart, as a user runs it: every topic of the recording is stored with its ontology type."""
 
 from __future__ import annotations
 
@@ -42,20 +42,20 @@ def ingest(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the repository's examples in which the quickstart has been run."""
+    """A copy of the repository's examples after a run of the quickstart."""
     folder = tmp_path_factory.mktemp("project")
     shutil.copytree(ROOT / "configs", folder / "configs")
-    done = ingest("configs/quickstart.yaml", "--report", "report.json", cwd=folder)
-    assert done.returncode == 0, done.stderr
+    finished = ingest("configs/quickstart.yaml", "--report", "report.json", cwd=folder)
+    assert finished.returncode == 0, finished.stderr
     return folder
 
 
-def test_every_topic_arrives_typed_and_whole(project: Path) -> None:
+def test_quickstart_stores_every_topic_typed_and_complete(project: Path) -> None:
     topics = Store.open(project / "mosaico").sequence("quickstart_drive").topics
     assert {topic.name: (topic.ontology.tag, topic.rows) for topic in topics} == TYPED
 
 
-def test_the_report_accounts_for_every_message(project: Path) -> None:
+def test_quickstart_report_accounts_for_every_message(project: Path) -> None:
     report = RunReport.model_validate_json((project / "report.json").read_text())
     recording = report.recordings[0]
     assert recording.totals.read == recording.totals.written == sum(count for _, count in TYPED.values())
@@ -63,7 +63,7 @@ def test_the_report_accounts_for_every_message(project: Path) -> None:
     assert {topic.topic for topic in recording.topics if topic.status == "excluded"} == {"/camera/image_raw"}
 
 
-def test_the_battery_went_through_the_declared_adapter(project: Path) -> None:
+def test_quickstart_battery_is_converted_by_the_adapter_of_the_job(project: Path) -> None:
     row = Store.open(project / "mosaico").scan("quickstart_drive", "/battery").read_all().to_pylist()[0]
     assert row["voltage"] == pytest.approx(24, abs=0.2)
     assert row["current"] == pytest.approx(-2.4)
@@ -73,38 +73,38 @@ def test_the_battery_went_through_the_declared_adapter(project: Path) -> None:
     assert row["serial_number"] == "PK-0042"
 
 
-def test_a_second_run_says_that_the_name_is_taken(project: Path) -> None:
-    done = ingest("configs/quickstart.yaml", cwd=project)
-    assert done.returncode == 1
-    assert "quickstart_drive" in done.stderr
-    assert "if_exists: skip" in done.stderr
-    assert "Traceback" not in done.stderr
-    assert "/imu" not in done.stdout, "no table of a run that read nothing"
+def test_quickstart_run_twice_fails_because_the_sequence_exists(project: Path) -> None:
+    finished = ingest("configs/quickstart.yaml", cwd=project)
+    assert finished.returncode == 1
+    assert "quickstart_drive" in finished.stderr
+    assert "if_exists: skip" in finished.stderr
+    assert "Traceback" not in finished.stderr
+    assert "/imu" not in finished.stdout, "no table of a run that read nothing"
 
 
-def test_one_recording_may_be_skipped_or_replaced_without_a_manifest(project: Path) -> None:
+def test_bag_existing_sequence_is_skipped_or_replaced_with_if_exists(project: Path) -> None:
     command = ("bag", "configs/quickstart/drive.mcap", "--name", "drive", "--store", "again")
     assert ingest(*command, cwd=project).returncode == 0
     taken = ingest(*command, cwd=project)
     assert taken.returncode == 1
     assert "`ingest bag` has --if-exists" in taken.stderr.replace("\n", " ")
     for choice, says in (("skip", "skipped"), ("replace", "2,130 of 2,130 messages written")):
-        done = ingest(*command, "--if-exists", choice, cwd=project)
-        assert done.returncode == 0, done.stderr
-        assert says in done.stdout + done.stderr
+        finished = ingest(*command, "--if-exists", choice, cwd=project)
+        assert finished.returncode == 0, finished.stderr
+        assert says in finished.stdout + finished.stderr
     refused = ingest(*command, "--if-exists", "maybe", cwd=project)
     assert refused.returncode == 2
     assert "'append'" in refused.stderr
 
 
-def test_the_report_of_a_run_that_failed_says_why(project: Path) -> None:
+def test_report_of_failed_run_shows_the_error(project: Path) -> None:
     assert ingest("run", "configs/quickstart.yaml", "--report", "failed.json", cwd=project).returncode == 1
     shown = ingest("report", "failed.json", cwd=project)
     assert shown.returncode == 0
     assert "error: quickstart_drive: the sequence already exists" in shown.stdout
 
 
-def test_the_store_can_be_looked_into(project: Path) -> None:
+def test_store_commands_show_sequences_topics_and_rows(project: Path) -> None:
     listed = json.loads(ingest("store", "ls", "--json", cwd=project).stdout)
     assert [sequence["name"] for sequence in listed] == ["quickstart_drive"]
     shown = ingest("store", "show", "quickstart_drive/imu", cwd=project).stdout
@@ -117,7 +117,7 @@ def test_the_store_can_be_looked_into(project: Path) -> None:
     assert re.search(r"mosaico_ingest: \S+ from drive\.mcap\n", sequence)
 
 
-def test_the_recording_is_what_its_script_writes(tmp_path: Path) -> None:
+def test_quickstart_recording_equals_the_output_of_its_script(tmp_path: Path) -> None:
     script = ROOT / "configs" / "quickstart" / "make_recording.py"
     subprocess.run([sys.executable, str(script), str(tmp_path / "again.mcap")], check=True)  # noqa: S603 - our own script
     assert content(tmp_path / "again.mcap") == content(ROOT / "configs" / "quickstart" / "drive.mcap")
