@@ -181,3 +181,19 @@ def test_program_that_uses_the_injector_passes_a_strict_type_check(tmp_path: Pat
     settings = {"typeCheckingMode": "strict", "extraPaths": [str(ROOT)], "reportMissingTypeStubs": False}
     (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings))
     run("-m", "pyright", "--pythonpath", sys.executable, "--project", str(tmp_path), cwd=tmp_path)
+
+
+def test_paths_in_contributing_exist() -> None:
+    text = re.sub(r"```.*?```", "", TEXT[ROOT / "CONTRIBUTING.md"], flags=re.DOTALL)
+    paths = [
+        name for name in re.findall(r"`([\w./-]+)`", text) if name.endswith((".py", ".md", ".toml", "/"))
+    ]
+    assert len(paths) > 10
+    folders = (ROOT, ROOT / "mosaico_ingest")
+    assert not [path for path in paths if not any((folder / path).exists() for folder in folders)]
+
+
+def test_contributing_lists_every_package() -> None:
+    packages = {path.parent.name for path in (ROOT / "mosaico_ingest").glob("*/__init__.py")}
+    rows = re.findall(r"^\| (`\w+`(?:, `\w+`)*) \|", TEXT[ROOT / "CONTRIBUTING.md"], re.MULTILINE)
+    assert {name for row in rows for name in re.findall(r"\w+", row)} == packages
