@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,8 +21,11 @@ from mosaico_ingest.errors import IngestError, ManifestError
 from mosaico_ingest.executors.base import choose_executor
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import IfExists
+from mosaico_ingest.pipeline.plan import digest_of
 from mosaico_ingest.pipeline.run import make_plan, run_recording
+from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.remote import AnyPath, as_path
 from mosaico_ingest.report.events import (
     BatchObserver,
@@ -37,7 +39,8 @@ from mosaico_ingest.version import __version__
 
 if TYPE_CHECKING:
     from mosaico_ingest.executors.base import Executor
-    from mosaico_ingest.pipeline.plan import Difference, Plan, PlanDocument
+    from mosaico_ingest.pipeline.plan import Plan
+    from mosaico_ingest.pipeline.plan_document import Difference, PlanDocument
     from mosaico_ingest.services.inspection import Inspection
     from mosaico_ingest.services.status import RecordingStatus
 
@@ -73,7 +76,7 @@ class RosbagInjector:
         Raises:
             IngestError: The configuration does not fit the recording.
         """
-        return make_plan(self._config)
+        return make_plan(Task(self._config.job))
 
     def run(self) -> Report:
         """Read, adapt and write the recording, and return the report; a dry run writes nothing.
@@ -83,14 +86,14 @@ class RosbagInjector:
         Raises:
             IngestError: The run failed or was interrupted. The session policy decides which rows were kept.
         """
-        outcome = run_recording(self._config, self._observe)
+        outcome = run_recording(Task(self._config.job, dry_run=self._config.dry_run), self._observe)
         if outcome.error is not None:
             raise outcome.error
         return outcome.report
 
 
-def compile_job(manifest: Path) -> tuple[ROSInjectionConfig, ...]:
-    """Return the configurations of a manifest, one for each recording.
+def compile_job(manifest: Path) -> tuple[Job, ...]:
+    """Return the jobs of a manifest, one for each recording.
 
     Raises:
         ManifestError: The manifest has mistakes; `findings` has their locations.
@@ -100,14 +103,14 @@ def compile_job(manifest: Path) -> tuple[ROSInjectionConfig, ...]:
     from mosaico_ingest.job.manifest import load_manifests
     from mosaico_ingest.pipeline.compile import compile_manifests
 
-    configs = compile_manifests(load_manifests(manifest))
-    for _, group in groupby(configs, key=lambda config: (config.adapters, config.adapter_override)):
-        ROSBridge.for_config(next(group))
-    return configs
+    jobs = compile_manifests(load_manifests(manifest))
+    for _, group in groupby(jobs, key=lambda job: job.adapters):
+        ROSBridge.for_job(next(group))
+    return jobs
 
 
-def compile_recording(manifest: Path, recording: Path) -> tuple[ROSInjectionConfig, ...]:
-    """Return the configurations of a manifest for one recording instead of those of `bag.path`.
+def compile_recording(manifest: Path, recording: Path) -> tuple[Job, ...]:
+    """Return the jobs of a manifest for one recording instead of those of `bag.path`.
 
     `if_exists: fail`, the default, becomes `skip`, so that a recording may be submitted again.
 
@@ -119,8 +122,10 @@ def compile_recording(manifest: Path, recording: Path) -> tuple[ROSInjectionConf
 
     manifests = tuple(loaded.for_recording(recording.resolve()) for loaded in load_manifests(manifest))
     return tuple(
-        replace(config, if_exists=IfExists.SKIP) if config.if_exists is IfExists.FAIL else config
-        for config in compile_manifests(manifests)
+        job.replace(sequence=job.sequence.replace(if_exists=IfExists.SKIP))
+        if job.sequence.if_exists is IfExists.FAIL
+        else job
+        for job in compile_manifests(manifests)
     )
 
 
@@ -166,20 +171,20 @@ def inspect_recording(path: AnyPath | str, *, ros_distro: str | None = None) -> 
     from mosaico_ingest.services.inspection import inspect
 
     config = ROSInjectionConfig(file_path=path, sequence_name="inspected", ros_distro=ros_distro)
-    return inspect(config)
+    return inspect(config.job)
 
 
 def plan_job(
     manifest: Path,
     *,
-    configs: Sequence[ROSInjectionConfig] | None = None,
+    jobs: Sequence[Job] | None = None,
     folder: Path | None = None,
     connect: bool = False,
 ) -> PlanDocument:
     """Return the plan of a manifest with the result of a sample of each topic; write nothing.
 
     Paths in the document are relative to `folder` (default: the current directory). A server is contacted only with
-    `connect`. `configs` avoids compiling the manifest a second time.
+    `connect`. `jobs` avoids compiling the manifest a second time.
 
     Raises:
         IngestError: A recording cannot be planned.
@@ -187,7 +192,7 @@ def plan_job(
     from mosaico_ingest.pipeline.preview import plan_document
 
     return plan_document(
-        configs or compile_job(manifest), job=manifest, folder=folder or Path(), connect=connect
+        jobs or compile_job(manifest), manifest=manifest, folder=folder or Path(), connect=connect
     )
 
 
@@ -197,10 +202,10 @@ def plan_differences(path: Path, document: PlanDocument) -> tuple[Difference, ..
     Raises:
         ManifestError: The file is not a plan.
     """
-    from mosaico_ingest.pipeline.plan import differences, read_plan
+    from mosaico_ingest.pipeline.plan_document import differences, read_plan
 
-    before = [recording.decisions for recording in read_plan(path).recordings]
-    return differences(before, [recording.decisions for recording in document.recordings])
+    before = [recording.plan for recording in read_plan(path).recordings]
+    return differences(before, [recording.plan for recording in document.recordings])
 
 
 def compare_jobs(before: Path, after: Path) -> tuple[Difference, ...]:
@@ -209,27 +214,27 @@ def compare_jobs(before: Path, after: Path) -> tuple[Difference, ...]:
     Raises:
         IngestError: A recording of one of them cannot be planned.
     """
-    from mosaico_ingest.pipeline.plan import differences
+    from mosaico_ingest.pipeline.plan_document import differences
     from mosaico_ingest.pipeline.preview import decide
 
-    plans = ([decide(config, folder=Path()) for config in compile_job(job)] for job in (before, after))
+    plans = ([decide(job, folder=Path()) for job in compile_job(manifest)] for manifest in (before, after))
     return differences(*plans)
 
 
-def compile_plan(path: Path) -> tuple[ROSInjectionConfig, ...]:
-    """Return the configurations of a plan file; each runs exactly as planned or fails.
+def compile_plan(path: Path) -> tuple[Task, ...]:
+    """Return the tasks of a plan file; each runs exactly as planned or fails.
 
     Raises:
         ManifestError: The file is not a plan, or its manifest has mistakes.
         IngestError: The manifest or a recording no longer fits the plan; `findings` has the differences.
     """
-    from mosaico_ingest.pipeline.plan import differences, read_plan
+    from mosaico_ingest.pipeline.plan_document import differences, read_plan
     from mosaico_ingest.pipeline.preview import decide
 
     document = read_plan(path)
-    configs = compile_job(path.parent / document.job)
-    current = [decide(config, folder=config.base_dir) for config in configs]
-    drift = differences([recording.decisions for recording in document.recordings], current)
+    jobs = compile_job(path.parent / document.job)
+    current = [decide(job, folder=job.folder) for job in jobs]
+    drift = differences([recording.plan for recording in document.recordings], current)
     if drift:
         raise IngestError(
             f"{len(drift)} decisions differ from the plan; the first: {drift[0]}",
@@ -237,30 +242,34 @@ def compile_plan(path: Path) -> tuple[ROSInjectionConfig, ...]:
             hint="make a new plan with `ingest plan --out`",
             findings=tuple(Finding("plan-drift", Severity.ERROR, str(one)) for one in drift),
         )
-    return tuple(
-        replace(config, plan_digest=decisions.digest)
-        for config, decisions in zip(configs, current, strict=True)
-    )
+    return tuple(Task(job, plan_digest=digest_of(plan)) for job, plan in zip(jobs, current, strict=True))
 
 
 def run(
-    configs: Sequence[ROSInjectionConfig],
+    jobs: Sequence[Job | Task | ROSInjectionConfig],
     *,
     executor: Executor | None = None,
     observe: BatchObserver = ignore_batch,
     manifests: Sequence[UsedManifest] = (),
 ) -> RunReport:
-    """Run every configuration and return the report; a failed recording is part of the report.
+    """Run every job and return the report; a failed recording is part of the report.
 
-    The default executor runs as many recordings at a time as the first configuration's `jobs`. `manifests` are added to
+    The default executor runs as many recordings at a time as `run.jobs` of the first job. `manifests` are added to
     the report for its readers.
     """
-    chosen = executor or choose_executor(configs)
+    tasks = [_task(job) for job in jobs]
+    chosen = executor or choose_executor(tasks)
     return RunReport(
         tool=f"mosaico-ingest {__version__}",
         manifests=tuple(manifests),
-        recordings=tuple(chosen.map(configs, observe)),
+        recordings=tuple(chosen.map(tasks, observe)),
     )
+
+
+def _task(job: Job | Task | ROSInjectionConfig) -> Task:
+    if isinstance(job, Task):
+        return job
+    return Task(job.job, dry_run=job.dry_run) if isinstance(job, ROSInjectionConfig) else Task(job)
 
 
 def used_manifest(path: Path) -> UsedManifest:

@@ -12,9 +12,11 @@ from functools import cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError, model_validator
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic_core import CoreSchema, core_schema
 from pydantic_core.core_schema import ModelSchema
+from typing_extensions import Self
 
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import escape_undecodable
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 __all__ = [
     "DIALECT",
     "Part",
+    "Unchecked",
     "document_schema",
     "read_document",
     "schema_of",
@@ -148,10 +151,23 @@ def _tidy_member(key: str, value: object) -> object:
     return value
 
 
+class Unchecked:
+    """Marks a field whose values are not validated: objects of the program that a document describes."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401 - a type
+        """Accept every value."""
+        del source, handler
+        return core_schema.any_schema()
+
+
 class Part(BaseModel):
     """A model whose texts can be encoded, whatever the names of files hold."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+
+    def replace(self, **changes: Any) -> Self:  # noqa: ANN401 - the types of the fields
+        """Return a copy with other values, which are not validated."""
+        return self.model_copy(update=changes)
 
     @model_validator(mode="before")
     @classmethod

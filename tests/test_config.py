@@ -1,8 +1,9 @@
-"""`ROSInjectionConfig`: it validates its arguments and converts each to one form."""
+"""`ROSInjectionConfig` builds a valid job or names the argument that is wrong."""
 
 from __future__ import annotations
 
 import pickle
+from dataclasses import fields
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,15 @@ from typing import Any
 import pytest
 from rosbags.typesys import Stores as RosbagsStores
 
-from mosaico_ingest.errors import IngestError, ManifestError
+from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.model import ErrorPolicy, Job
+from mosaico_ingest.job.reference import job_schema
+from mosaico_ingest.job.validation import keys_at
 from mosaico_ingest.job.values import (
     IfExists,
     LoaderErrorPolicy,
+    PluginTarget,
     ServerTarget,
     SessionLevelErrorPolicy,
     Stores,
@@ -25,15 +30,19 @@ from mosaico_ingest.job.values import (
 
 
 class MyCustomRGBDAdapter:
-    """A placeholder for an adapter of a user."""
+    """Stands for a user's adapter."""
 
 
 def config(**fields: Any) -> ROSInjectionConfig:
     return ROSInjectionConfig(**{"file_path": "a.bag", "sequence_name": "run", **fields})
 
 
-def test_config_accepts_the_example_of_the_reference() -> None:
-    configuration = ROSInjectionConfig(
+def job(**fields: Any) -> Job:
+    return config(**fields).job
+
+
+def test_config_reference_example_builds_job() -> None:
+    made = ROSInjectionConfig(
         file_path=Path("data/session_01.db3"),
         sequence_name="test_ros_sequence",
         metadata={"driver_version": "v2.1", "weather": "sunny", "location": "test_track_A"},
@@ -45,15 +54,17 @@ def test_config_accepts_the_example_of_the_reference() -> None:
         on_error=SessionLevelErrorPolicy.Report,
         topics_on_error=TopicLevelErrorPolicy.Raise,
     )
-    assert configuration.paths == (Path("data/session_01.db3"),)
-    assert configuration.topics == ("/cam*",)
-    assert (
-        configuration.adapter_overrides
-        == configuration.adapter_override
-        == {"/camera/depth/points": MyCustomRGBDAdapter}
-    )
-    assert configuration.target == StoreTarget(Path("mosaico"))
-    assert pickle.loads(pickle.dumps(configuration)) == configuration  # noqa: S301 - our own bytes
+    assert made.job.paths == (Path("data/session_01.db3"),)
+    assert made.job.topics == ("/cam*",)
+    assert made.job.adapters.override == {"/camera/depth/points": MyCustomRGBDAdapter}
+    assert made.job.destination == StoreTarget(Path("mosaico"))
+    assert pickle.loads(pickle.dumps(made)).job == made.job  # noqa: S301 - our own bytes
+
+
+def test_config_key_of_each_argument_exists_in_manifest() -> None:
+    schema = job_schema()
+    paths = [field.metadata["key"] for field in fields(ROSInjectionConfig) if "key" in field.metadata]
+    assert [path for path in paths if path[-1] not in keys_at(schema, path[:-1])] == []
 
 
 @pytest.mark.parametrize(
@@ -68,64 +79,76 @@ def test_config_accepts_the_example_of_the_reference() -> None:
         "serialization_formats",
     ],
 )
-def test_config_none_for_a_collection_is_empty(name: str) -> None:
-    assert config(**{name: None}) == config()
+def test_config_none_stands_for_default(name: str) -> None:
+    assert job(**{name: None}) == job()
 
 
-def test_config_accepts_other_enumerations_by_value() -> None:
-    class Policy(Enum):  # as in the official SDK
+def test_config_other_enumerations_are_converted_by_value() -> None:
+    class Policy(Enum):  # as the official SDK has it
         Ignore = "ignore"
 
-    configuration = config(ros_distro=RosbagsStores.ROS2_HUMBLE, topics_on_error={"/gps": Policy.Ignore})
-    assert configuration.ros_distro is Stores.ROS2_HUMBLE
-    assert configuration.topic_policy("/gps") is TopicLevelErrorPolicy.Ignore
+    made = job(ros_distro=RosbagsStores.ROS2_HUMBLE, topics_on_error={"/gps": Policy.Ignore})
+    assert made.bag.ros_distro is Stores.ROS2_HUMBLE
+    assert made.on_error.for_topic("/gps") is TopicLevelErrorPolicy.Ignore
 
 
-def test_config_converts_strings_to_enumerations() -> None:
-    configuration = config(
+def test_config_words_are_converted_to_enumerations() -> None:
+    made = job(
         ros_distro="ros2_humble",
         on_error="delete",
         topics_on_error="ignore",
         messages_on_error="raise",
         topics="/imu",
     )
-    assert configuration.ros_distro is Stores.ROS2_HUMBLE
-    assert configuration.on_error is SessionLevelErrorPolicy.Delete
-    assert configuration.topics_on_error is TopicLevelErrorPolicy.Ignore
-    assert configuration.messages_on_error is LoaderErrorPolicy.RAISE
-    assert configuration.topics == ("/imu",)
+    assert made.bag.ros_distro is Stores.ROS2_HUMBLE
+    assert made.on_error == ErrorPolicy(
+        session=SessionLevelErrorPolicy.Delete,
+        topic=TopicLevelErrorPolicy.Ignore,
+        message=LoaderErrorPolicy.RAISE,
+    )
+    assert made.topics == ("/imu",)
 
 
-def test_config_adapter_overrides_is_an_alias_of_adapter_override() -> None:
-    configuration = config(adapter_overrides={"/a": MyCustomRGBDAdapter})
-    assert configuration.adapter_override == {"/a": MyCustomRGBDAdapter}
-    with pytest.raises(ManifestError, match="disagree on '/a'"):
+def test_config_plural_spelling_of_overrides_is_equivalent() -> None:
+    assert job(adapter_overrides={"/a": MyCustomRGBDAdapter}).adapters.override == {"/a": MyCustomRGBDAdapter}
+    with pytest.raises(ManifestError, match="differ for '/a'"):
         config(adapter_overrides={"/a": MyCustomRGBDAdapter}, adapter_override={"/a": "Other"})
 
 
-def test_config_target_is_derived_from_store_and_host() -> None:
-    assert config().target == StoreTarget(Path("mosaico"))
-    assert config(store="s").target == StoreTarget(Path("s"))
-    assert config(host="h").target == ServerTarget("h", 6726)
-    server = config(host="h", port=1, mosaico_api_key="k", tls_cert_path="c.pem").target
+def test_config_destination_is_default_store_store_or_server() -> None:
+    assert job().destination == StoreTarget(Path("mosaico"))
+    assert job(store="s").destination == StoreTarget(Path("s"))
+    assert job(host="h").destination == ServerTarget("h", 6726)
+    server = job(host="h", port=1, mosaico_api_key="k", tls_cert_path="c.pem").destination
     assert server == ServerTarget("h", 1, "k", Path("c.pem"), tls=True)
     assert "api_key" not in repr(server)
+    plugin = PluginTarget("lake", {"bucket": "b"})
+    assert job(plugin=plugin).destination == plugin
 
 
-def test_config_update_if_exists_means_append() -> None:
-    assert config(update_if_exists=True).if_exists is IfExists.APPEND
+def test_config_update_if_exists_is_append() -> None:
+    assert job(update_if_exists=True).sequence.if_exists is IfExists.APPEND
 
 
-def test_topic_policy_prefers_exact_name_then_glob_then_default() -> None:
-    configuration = config(topics_on_error={"default": "finalize", "/gps/*": "ignore", "/gps/fix": "raise"})
-    assert configuration.topic_policy("/gps/fix") is TopicLevelErrorPolicy.Raise
-    assert configuration.topic_policy("/gps/other") is TopicLevelErrorPolicy.Ignore
-    assert configuration.topic_policy("/imu") is TopicLevelErrorPolicy.Finalize
-    assert config(topics_on_error={"/a": "ignore"}).topic_policy("/b") is TopicLevelErrorPolicy.Raise
+def test_error_policy_for_topic_prefers_exact_name_then_glob_then_default() -> None:
+    policy = job(topics_on_error={"default": "finalize", "/gps/*": "ignore", "/gps/fix": "raise"}).on_error
+    assert policy.for_topic("/gps/fix") is TopicLevelErrorPolicy.Raise
+    assert policy.for_topic("/gps/other") is TopicLevelErrorPolicy.Ignore
+    assert policy.for_topic("/imu") is TopicLevelErrorPolicy.Finalize
+    assert job(topics_on_error={"/a": "ignore"}).on_error.for_topic("/b") is TopicLevelErrorPolicy.Raise
 
 
-def test_config_repr_hides_the_api_key() -> None:
-    assert "s3cret" not in repr(config(host="h", mosaico_api_key="s3cret"))
+def test_job_settings_of_topic_take_each_setting_from_first_glob_that_defines_it() -> None:
+    made = job(every={"/cam/*": 3}, images={"*": "png", "/cam/left": "raw"}, rename={"/cam/left": "/left"})
+    left, right = made.settings_of("/cam/left"), made.settings_of("/cam/right")
+    assert (left.every, left.image, left.rename) == (3, "raw", "/left")
+    assert (right.every, right.image, right.rename) == (3, "png", None)
+
+
+def test_config_repr_hides_api_key() -> None:
+    made = config(host="h", mosaico_api_key="s3cret")
+    assert "s3cret" not in repr(made)
+    assert "s3cret" not in repr(made.job)
 
 
 @pytest.mark.parametrize(
@@ -136,11 +159,13 @@ def test_config_repr_hides_the_api_key() -> None:
         ({"on_error": "explode"}, "on_error is 'explode'"),
         ({"topics_on_error": {"/a": "no"}}, "topics_on_error\\['/a'\\] is 'no'"),
         ({"log_level": "LOUD"}, "log_level is 'LOUD'"),
-        ({"store": "s", "host": "h"}, "store 's' and host 'h' are two targets"),
+        ({"store": "s", "host": "h"}, "store and host are two destinations"),
+        ({"store": "s", "plugin": PluginTarget("lake")}, "store and type are two destinations"),
         ({"port": 0}, "port is 0"),
-        ({"mosaico_api_key": "k"}, "no host is named"),
-        ({"update_if_exists": True, "if_exists": "replace"}, "append and if_exists says replace"),
+        ({"mosaico_api_key": "k"}, "host is not set"),
+        ({"update_if_exists": True, "if_exists": "replace"}, "if_exists is 'replace'"),
         ({"every": {"/a": 0}}, "every\\['/a'\\] is 0"),
+        ({"every": {"/a": 10**30}}, "every\\['/a'\\] is 1000"),
         ({"images": {"/a": "jpg"}}, "images\\['/a'\\] is 'jpg'"),
         ({"jobs": 0}, "jobs is 0"),
         ({"sequence_name": "a b"}, "sequence name 'a b'"),
@@ -150,15 +175,15 @@ def test_config_repr_hides_the_api_key() -> None:
         ({"custom_msgs": [("pkg", "dir")]}, "custom_msgs has \\('pkg', 'dir'\\)"),
         ({"topic_metadata": {"/a": {"x/y": 1}}}, "metadata key 'x/y'"),
         ({"rename": {"/a": "/b c"}}, "topic name '/b c'"),
-        ({"rename": {"/a/*": "/b"}}, "rename\\['/a/\\*'\\] is for every topic of a glob"),
+        ({"rename": {"/a/*": "/b"}}, "'/a/\\*'.*'/b'"),
     ],
 )
-def test_config_invalid_value_raises_with_the_value(fields: dict[str, Any], message: str) -> None:
-    with pytest.raises(IngestError, match=message):
+def test_config_invalid_value_is_refused_with_name_and_value(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(ManifestError, match=message):
         config(**fields)
 
 
-def test_time_bound_relative_counts_from_start_or_end() -> None:
+def test_time_bound_negative_offset_counts_from_end() -> None:
     assert TimeBound(5, relative=True).at(100, 200) == 105
     assert TimeBound(-5, relative=True).at(100, 200) == 195
     assert TimeBound(5).at(100, 200) == 5

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ValidationError
 from mosaico_ingest import api
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.pipeline.plan import PlanDocument, plan_schema, read_plan
+from mosaico_ingest.pipeline.plan_document import PlanDocument, plan_schema, read_plan
 from mosaico_ingest.report.model import RunReport, read_report, report_schema
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -124,7 +124,7 @@ def test_reader_model_and_published_schema_accept_the_same_documents(
 @pytest.mark.parametrize(
     ("kind", "path", "value", "message"),
     [
-        ("plan", ("recordings", 0, "decisions", "topics", 1, "every"), "2", "$.recordings[0].decisions.topics[1].every"),
+        ("plan", ("recordings", 0, "plan", "topics", 1, "every"), "2", "$.recordings[0].plan.topics[1].every"),
         ("report", ("recordings", 0, "status"), "fine", "$.recordings[0].status"),
         ("report", ("recordings", 0, "duration_s"), "1", "$.recordings[0].duration_s"),
     ],

@@ -32,13 +32,13 @@ from mosaico_ingest.adapters.python import (
     registered_adapters,
 )
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.job.config import AdapterReference, ImageFormat, ROSInjectionConfig
 from mosaico_ingest.job.patterns import first_match
 from mosaico_ingest.ontology.types import SerializationFormat
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
 from mosaico_ingest.textfile import read_limited
 
 if TYPE_CHECKING:
+    from mosaico_ingest.job.model import Job
     from mosaico_ingest.ontology.header import Message
     from mosaico_ingest.rosbag.blocks import ROSMessage
 
@@ -259,10 +259,10 @@ class ROSBridge:
     def __init__(
         self,
         *,
-        overrides: Mapping[str, AdapterReference] | None = None,
-        loaded: Iterable[AdapterReference] = (),
+        overrides: Mapping[str, object] | None = None,
+        loaded: Iterable[object] = (),
         base_dir: Path | None = None,
-        images: Mapping[str, ImageFormat] | None = None,
+        images: Mapping[str, str] | None = None,
         formats: Mapping[str, str] | None = None,
     ) -> None:
         """Find every adapter that is named; `base_dir` is where relative paths start.
@@ -287,18 +287,22 @@ class ROSBridge:
         self._formats = {normalize_msgtype(name): _layout(value) for name, value in (formats or {}).items()}
 
     @classmethod
-    def for_config(cls, config: ROSInjectionConfig) -> ROSBridge:
-        """Make the bridge of a job.
+    def for_job(cls, job: Job, *, folder: Path | None = None) -> ROSBridge:
+        """Return the bridge of a job; relative paths start at `folder`, by default the manifest's folder.
 
         Raises:
             AdapterError: As when it is made by hand.
         """
         return cls(
-            overrides=config.adapter_override,
-            loaded=config.adapters,
-            base_dir=config.code_dir or config.base_dir,
-            images=config.images,
-            formats=config.serialization_formats,
+            overrides=job.adapters.override,
+            loaded=job.adapters.load,
+            base_dir=job.folder if folder is None else folder,
+            images={
+                topic: settings.image
+                for topic, settings in job.topic_settings.items()
+                if "image" in settings.model_fields_set
+            },
+            formats=job.adapters.serialization_formats,
         )
 
     def resolve(self, topic: str, msgtype: str) -> Resolution:

@@ -168,7 +168,7 @@ def schema(
 def _schema_text(document: Document) -> str:
     from mosaico_ingest.adapters.mapping.model import adapter_schema
     from mosaico_ingest.job.reference import job_schema
-    from mosaico_ingest.pipeline.plan import plan_schema
+    from mosaico_ingest.pipeline.plan_document import plan_schema
     from mosaico_ingest.report.model import report_schema
 
     schemas: dict[Document, Callable[[], dict[str, Any]]] = {

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from os.path import normpath
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.text import Text
@@ -24,8 +24,7 @@ from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds
 
 if TYPE_CHECKING:
     from mosaico_ingest.job.expand import Expanded
-    from mosaico_ingest.pipeline.plan import (
-        Decisions,
+    from mosaico_ingest.pipeline.plan_document import (
         DestinationState,
         Difference,
         Note,
@@ -74,9 +73,9 @@ def plan(
     from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas
 
     collect_garbage_as_usual()
-    configs = api.compile_job(manifest)
-    hide_pandas(configs)
-    document = api.plan_job(manifest, configs=configs, folder=out.parent if out else None, connect=connect)
+    jobs = api.compile_job(manifest)
+    hide_pandas(jobs)
+    document = api.plan_job(manifest, jobs=jobs, folder=out.parent if out else None, connect=connect)
     if out is not None:
         write_output(out, document.model_dump_json(indent=2) + "\n")
     if out == STANDARD_OUTPUT:
@@ -100,32 +99,34 @@ def print_plan(document: PlanDocument, *, folder: Path) -> None:
     for recording in document.recordings:
         _print_recording(recording, folder)
     if len(document.recordings) > 1:
-        size = sum(file.size_bytes for recording in document.recordings for file in recording.decisions.files)
+        size = sum(
+            file["size_bytes"] for recording in document.recordings for file in recording.plan["files"]
+        )
         print_line(f"{counted(len(document.recordings), 'recording')}, {bytes_text(size)}", style="bold")
 
 
 def _print_recording(recording: RecordingPlan, folder: Path) -> None:
-    decisions = recording.decisions
-    destination = decisions.destination
+    plan = recording.plan
+    destination = plan["destination"]
     if recording.destination.kind == "store":
         destination = _relative(folder, destination)
-    print_line(f"{decisions.sequence} → {destination}", style="bold")
-    print_line(_source_text(decisions, folder))
+    print_line(f"{plan['sequence']['name']} → {destination}", style="bold")
+    print_line(_source_text(plan, folder))
     samples = {sample.target: sample for sample in recording.samples}
     names = ("topic", "type", "messages", "becomes", "adapter", "because", "sample")
     table = PlainTable(*names, numbers={"messages"})
-    for topic in decisions.topics:
-        renamed = "" if topic.target == topic.topic else f" → {topic.target}"
-        every = "" if topic.every == 1 else f" / {topic.every}"
-        count = "?" if topic.count is None else f"{count_text(topic.count)}{every}"
+    for topic in plan["topics"]:
+        renamed = "" if topic["target"] == topic["topic"] else f" → {topic['target']}"
+        every = "" if topic["every"] == 1 else f" / {topic['every']}"
+        count = "?" if topic["count"] is None else f"{count_text(topic['count'])}{every}"
         table.add_row(
-            f"{topic.topic}{renamed}",
-            topic.msgtype,
+            f"{topic['topic']}{renamed}",
+            topic["msgtype"],
             count,
-            topic.ontology,
-            topic.adapter,
-            topic.why,
-            _sample_text(samples[topic.target]),
+            topic["ontology"]["tag"],
+            topic["adapter"]["name"],
+            topic["why"],
+            _sample_text(samples[topic["target"]]),
         )
     Terminal().print(table)
     for sample in recording.samples:
@@ -135,18 +136,20 @@ def _print_recording(recording: RecordingPlan, folder: Path) -> None:
     _print_notes(recording.notes)
     if recording.is_empty:
         print_line("the selected topics have no message", style="red")
-    _print_destination(recording.destination, decisions, destination)
+    _print_destination(recording.destination, plan["sequence"], destination)
 
 
-def _source_text(decisions: Decisions, folder: Path) -> str:
-    size = sum(file.size_bytes for file in decisions.files)
-    names = ", ".join(_relative(folder, file.path) for file in decisions.files)
-    text = f"{names}: {decisions.container}, {bytes_text(size)}"
-    if decisions.start_ns is not None and decisions.end_ns is not None:
-        text += f", {time_text(decisions.start_ns)} .. {time_text(decisions.end_ns)} UTC"
-        text += f" ({seconds_text((decisions.end_ns - decisions.start_ns) / 1e9)})"
-    if decisions.read_from_ns is not None or decisions.read_until_ns is not None:
-        text += f", read from {time_text(decisions.read_from_ns)} until {time_text(decisions.read_until_ns)}"
+def _source_text(plan: Mapping[str, Any], folder: Path) -> str:
+    size = sum(file["size_bytes"] for file in plan["files"])
+    names = ", ".join(_relative(folder, file["path"]) for file in plan["files"])
+    text = f"{names}: {plan['container']}, {bytes_text(size)}"
+    start_ns, end_ns = plan["start_ns"], plan["end_ns"]
+    if start_ns is not None and end_ns is not None:
+        text += f", {time_text(start_ns)} .. {time_text(end_ns)} UTC"
+        text += f" ({seconds_text((end_ns - start_ns) / 1e9)})"
+    read_from_ns, read_until_ns = plan["read_from_ns"], plan["read_until_ns"]
+    if read_from_ns is not None or read_until_ns is not None:
+        text += f", read from {time_text(read_from_ns)} until {time_text(read_until_ns)}"
     return text
 
 
@@ -170,7 +173,7 @@ def _print_notes(notes: Sequence[Note]) -> None:
         print_line(line, style=NOTE_STYLES[note.severity])
 
 
-def _print_destination(state: DestinationState, decisions: Decisions, destination: str) -> None:
+def _print_destination(state: DestinationState, sequence: Mapping[str, Any], destination: str) -> None:
     name = f"{state.kind} {destination}"
     if state.problem is not None:
         print_line(f"{name} refuses: {state.problem}", style="bold red")
@@ -181,7 +184,7 @@ def _print_destination(state: DestinationState, decisions: Decisions, destinatio
     if not state.exists:
         action = "will be created"
     elif state.taken:
-        action = f"contains {decisions.sequence}; action: {decisions.if_exists.value}"
+        action = f"contains {sequence['name']}; action: {sequence['if_exists']}"
     else:
         action = "ready"
     space = ""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from mosaico_ingest.errors import AdapterError
 
 if TYPE_CHECKING:
-    from mosaico_ingest.job.config import ROSInjectionConfig
+    from mosaico_ingest.job.model import Job
 
 __all__ = [
     "collect_garbage_as_usual",
@@ -61,13 +61,13 @@ def collect_garbage_as_usual() -> None:
     gc.set_threshold(*DEFAULT_THRESHOLD)
 
 
-def hide_pandas(configs: Sequence[ROSInjectionConfig] = ()) -> None:
+def hide_pandas(jobs: Sequence[Job] = ()) -> None:
     """Make pyarrow conclude that pandas is absent, unless Python adapters run, which may return series.
 
     pyarrow imports pandas with the first array, which takes longer than a short run. Programs can still import
     pandas afterwards; only pyarrow no longer recognizes its objects inside lists.
     """
-    if "pandas" in sys.modules or any(map(_uses_python_adapters, configs)) or _has_installed_adapters():
+    if "pandas" in sys.modules or any(map(_uses_python_adapters, jobs)) or _has_installed_adapters():
         return
     import numpy as np
     import pyarrow as pa
@@ -90,8 +90,8 @@ class _NoPandas:
         return None
 
 
-def _uses_python_adapters(config: ROSInjectionConfig) -> bool:
-    references = (*config.adapters, *config.adapter_override.values())
+def _uses_python_adapters(job: Job) -> bool:
+    references = (*job.adapters.load, *job.adapters.override.values())
     return any(not str(reference).endswith((".yaml", ".yml")) for reference in references)
 
 

@@ -34,7 +34,7 @@ from mosaico_ingest.report.events import (
 from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text
 
 if TYPE_CHECKING:
-    from mosaico_ingest.job.config import ROSInjectionConfig
+    from mosaico_ingest.job.model import Job
     from mosaico_ingest.remote import AnyPath
 
 __all__ = [
@@ -193,13 +193,13 @@ class Tally:
         )
 
 
-def recording_sizes(configs: Sequence[ROSInjectionConfig]) -> list[int]:
+def recording_sizes(jobs: Sequence[Job]) -> list[int]:
     """Return the size of each recording in bytes, or 1 for each if a size is unknown."""
     sizes: list[int] = []
-    if len(configs) <= MAX_SIZED_RECORDINGS:
+    if len(jobs) <= MAX_SIZED_RECORDINGS:
         with suppress(OSError, IngestError, ValueError):
-            sizes.extend(max(1, sum(map(_size, config.paths))) for config in configs)
-    return sizes if len(sizes) == len(configs) else [1] * len(configs)
+            sizes.extend(max(1, sum(map(_size, job.paths))) for job in jobs)
+    return sizes if len(sizes) == len(jobs) else [1] * len(jobs)
 
 
 def _size(path: AnyPath) -> int:

@@ -1,11 +1,10 @@
-"""`ingest run`, `bag` and `replay`, and the function that runs configurations for all three."""
+"""`ingest run`, `bag` and `replay`, and the function that runs tasks for all three."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import replace
 from enum import Enum
 from functools import partial
 from pathlib import Path
@@ -21,14 +20,15 @@ from mosaico_ingest.report.events import BatchObserver, Event, RunFinished, igno
 
 if TYPE_CHECKING:
     from mosaico_ingest.executors.base import Executor
-    from mosaico_ingest.job.config import ROSInjectionConfig
+    from mosaico_ingest.job.model import Job
+    from mosaico_ingest.pipeline.task import Task
     from mosaico_ingest.report.model import RunReport, UsedManifest
 
 __all__ = [
     "bag",
     "replay",
     "run",
-    "run_configs",
+    "run_tasks",
     "send_telemetry",
     "take_shard",
 ]
@@ -114,6 +114,7 @@ def run(
     from mosaico_ingest import api
     from mosaico_ingest.cli.console import STANDARD_OUTPUT, print_line, write_output
     from mosaico_ingest.executors.base import choose_executor
+    from mosaico_ingest.pipeline.task import Task
     from mosaico_ingest.report.metrics import prometheus_text
     from mosaico_ingest.report.units import counted
     from mosaico_ingest.textfile import check_output_file
@@ -122,15 +123,15 @@ def run(
         raise typer.BadParameter("give manifests, or a plan with --plan", param_hint="JOB.yaml")
     if address is not None and executor is not ExecutorName.RAY:
         raise typer.BadParameter("needs --executor ray", param_hint="--address")
-    configs = [config for manifest in manifests or () for config in api.compile_job(manifest)]
+    tasks = [Task(job) for manifest in manifests or () for job in api.compile_job(manifest)]
     used_manifests = [api.used_manifest(manifest) for manifest in manifests or ()]
     if plan is not None:
-        configs += api.compile_plan(plan)
-        sources = sorted({config.where for config in configs if config.where})
+        tasks += api.compile_plan(plan)
+        sources = sorted({task.job.origin.file for task in tasks if task.job.origin.file})
         used_manifests = [api.used_manifest(Path(source)) for source in sources]
     if shard is not None:
-        total, configs = len(configs), take_shard(configs, shard)
-        if not configs and not quiet and log_format is LogFormat.TEXT:
+        total, tasks = len(tasks), take_shard(tasks, shard)
+        if not tasks and not quiet and log_format is LogFormat.TEXT:
             print_line(f"shard {shard} is empty: the job has {counted(total, 'recording')}", stderr=True)
     if metrics is not None and metrics != STANDARD_OUTPUT:
         check_output_file(metrics)
@@ -141,11 +142,11 @@ def run(
 
     on_ray = None
     if executor is ExecutorName.RAY:
-        on_ray = choose_executor(configs, simultaneous=jobs, ray=True, address=address)
-    hide_pandas(configs)
+        on_ray = choose_executor(tasks, simultaneous=jobs, ray=True, address=address)
+    hide_pandas([task.job for task in tasks])
     with send_telemetry(otel) as telemetry:
-        run_configs(
-            configs,
+        run_tasks(
+            tasks,
             report=report,
             quiet=quiet,
             log=log,
@@ -243,8 +244,9 @@ def bag(
 ) -> None:
     """Ingest one recording without a manifest."""
     from mosaico_ingest import api
+    from mosaico_ingest.pipeline.task import Task
 
-    config = api.quick_config(
+    job = api.quick_config(
         path,
         sequence_name=name,
         topic_metadata=topic_metadata,
@@ -259,15 +261,15 @@ def bag(
         tls_cert_path=tls_cert,
         store=store,
         if_exists=if_exists,
-    )
-    hide_pandas([config])
+    ).job
+    hide_pandas([job])
     if dry_run:
         from mosaico_ingest.cli.plan import print_plan
 
-        document = api.plan_job(Path(), configs=[config])
+        document = api.plan_job(Path(), jobs=[job])
         print_plan(document, folder=Path())
         raise typer.Exit(document.exit_code)
-    run_configs([config], report=report, quiet=quiet, log=log)
+    run_tasks([Task(job)], report=report, quiet=quiet, log=log)
 
 
 def replay(
@@ -285,6 +287,7 @@ def replay(
     from mosaico_ingest import api
     from mosaico_ingest.cli.console import print_line
     from mosaico_ingest.errors import NothingMatched
+    from mosaico_ingest.pipeline.task import Task
     from mosaico_ingest.services.replay import Whereabouts, alone, replays
 
     def mark_replayed(result: RunReport) -> None:
@@ -292,9 +295,9 @@ def replay(
             if recording.exit_code in SUCCESSFUL:
                 entry.kept.mark_replayed()
 
-    configs = api.compile_job(manifest)
+    jobs = api.compile_job(manifest)
     with alone(folder):
-        entries = replays(folder, configs)
+        entries = replays(folder, jobs)
         for entry in entries:
             if entry.whereabouts is Whereabouts.STORED:
                 entry.kept.mark_replayed()
@@ -306,8 +309,8 @@ def replay(
             raise NothingMatched(
                 "no message can be replayed", where=str(folder), hint=REPLAY_NOTES["FORGOTTEN"]
             )
-        run_configs(
-            [entry.config for entry in waiting],
+        run_tasks(
+            [Task(entry.job) for entry in waiting],
             report=report,
             quiet=quiet,
             log=log,
@@ -316,8 +319,8 @@ def replay(
         )
 
 
-def run_configs(
-    configs: Sequence[ROSInjectionConfig],
+def run_tasks(
+    tasks: Sequence[Task],
     *,
     report: Path | None,
     quiet: bool,
@@ -329,7 +332,7 @@ def run_configs(
     observe: BatchObserver = ignore_batch,
     on_finish: Callable[[RunReport], None] = lambda _report: None,
 ) -> None:
-    """Run the configurations with a progress display, write reports, print the result, and exit with its code.
+    """Run the tasks with a progress display, write reports, print the result, and exit with its code.
 
     `on_finish` receives the report after the run. If it or a report file cannot be written, the others still are.
 
@@ -342,19 +345,21 @@ def run_configs(
     from mosaico_ingest.textfile import check_output_file
 
     as_json = log_format is LogFormat.JSON
-    level = log or ("ERROR" if quiet else configs[0].log_level if configs else "INFO")
+    level = log or ("ERROR" if quiet else tasks[0].job.run.log_level if tasks else "INFO")
     prepare = partial(set_up_logging, level, log_format)
     prepare()
     if log or quiet:
-        configs = [replace(config, log_level=level.upper()) for config in configs]
+        tasks = [task.with_log_level(level) for task in tasks]
     interrupt_on_sigterm()
     collect_garbage_as_usual()
-    report_files = {path for path in (report, *map(_report_path, configs)) if path is not None}
+    report_files = {
+        path for path in (report, *(_report_path(task.job) for task in tasks)) if path is not None
+    }
     for file in report_files - {STANDARD_OUTPUT}:
         check_output_file(file)
     failures: list[RunFinished] = []
 
-    with _display(configs, as_json=as_json, quiet=quiet) as show:
+    with _display(tasks, as_json=as_json, quiet=quiet) as show:
 
         def observe_all(position: int, event: Event) -> None:
             if isinstance(event, RunFinished) and event.error is not None:
@@ -362,8 +367,8 @@ def run_configs(
             observe(position, event)
             show(position, event)
 
-        chosen = executor or choose_executor(configs, simultaneous=jobs, prepare=prepare)
-        result = api.run(configs, executor=chosen, observe=observe_all, manifests=manifests)
+        chosen = executor or choose_executor(tasks, simultaneous=jobs, prepare=prepare)
+        result = api.run(tasks, executor=chosen, observe=observe_all, manifests=manifests)
     write_errors = list(_write_results(result, report_files, on_finish))
     if not quiet and not as_json:
         from mosaico_ingest.cli.report import print_report
@@ -379,15 +384,13 @@ def run_configs(
         raise typer.Exit(code)
 
 
-def _display(
-    configs: Sequence[ROSInjectionConfig], *, as_json: bool, quiet: bool
-) -> AbstractContextManager[BatchObserver]:
+def _display(tasks: Sequence[Task], *, as_json: bool, quiet: bool) -> AbstractContextManager[BatchObserver]:
     """Return the progress display. It is imported only if it is used, because rich is slow to import."""
     if quiet and not as_json:
         return nullcontext(ignore_batch)
     from mosaico_ingest.cli.progress import JsonLines, Tally, live_display, recording_sizes
 
-    tally = Tally(recording_sizes(configs) if len(configs) > 1 else [1] * len(configs))
+    tally = Tally(recording_sizes([task.job for task in tasks]) if len(tasks) > 1 else [1] * len(tasks))
     return nullcontext(JsonLines(tally)) if as_json else live_display(tally)
 
 
@@ -405,8 +408,8 @@ def _write_results(
             yield error
 
 
-def _report_path(config: ROSInjectionConfig) -> Path | None:
-    return None if config.report_path is None else Path(config.report_path)
+def _report_path(job: Job) -> Path | None:
+    return None if job.run.report is None else Path(job.run.report)
 
 
 def take_shard(items: Sequence[T], shard: str) -> list[T]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from mosaico_ingest.job.config import ROSInjectionConfig
+    from mosaico_ingest.job.model import Job
     from mosaico_ingest.report.model import Report
     from mosaico_ingest.services.status import RecordingStatus
     from mosaico_ingest.services.watch import Arrivals
@@ -153,11 +153,12 @@ def _ingest(
     `arrivals` schedules another attempt of a recording that failed. Return False if the run was interrupted.
     """
     from mosaico_ingest.executors.processes import Processes
+    from mosaico_ingest.pipeline.task import Task
     from mosaico_ingest.report.events import RunStatus, ignore_batch
 
-    work = [(path, config) for path in paths for config in _configs(manifest, path, arrivals, codes)]
+    work = [(path, job) for path in paths for job in _jobs(manifest, path, arrivals, codes)]
     # Even a single recording runs in a worker process, so that a crash does not end the watch.
-    reports = Processes(jobs).map([config for _, config in work], ignore_batch)
+    reports = Processes(jobs).map([Task(job) for _, job in work], ignore_batch)
     interrupted = False
     for (path, _), report in zip(work, reports, strict=False):
         interrupted = interrupted or report.status is RunStatus.INTERRUPTED
@@ -168,9 +169,7 @@ def _ingest(
     return not interrupted
 
 
-def _configs(
-    manifest: Path, path: Path, arrivals: Arrivals | None, codes: list[int]
-) -> tuple[ROSInjectionConfig, ...]:
+def _jobs(manifest: Path, path: Path, arrivals: Arrivals | None, codes: list[int]) -> tuple[Job, ...]:
     from mosaico_ingest import api
     from mosaico_ingest.errors import IngestError
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from mosaico_ingest.job.config import ROSInjectionConfig
+    from mosaico_ingest.pipeline.task import Task
     from mosaico_ingest.report.events import BatchObserver
     from mosaico_ingest.report.model import Report
 
@@ -16,8 +16,8 @@ __all__ = ["Executor", "choose_executor", "do_nothing"]
 class Executor(Protocol):
     """Runs the recordings of a batch."""
 
-    def map(self, jobs: Sequence[ROSInjectionConfig], observe: BatchObserver) -> Iterator[Report]:
-        """Yield the report of each job, in the order of the jobs; a failed recording does not stop the others.
+    def map(self, tasks: Sequence[Task], observe: BatchObserver) -> Iterator[Report]:
+        """Yield the report of each task, in the order of the tasks; a failed recording does not stop the others.
 
         An interrupt ends the running recordings as their session policies demand. Recordings that were not started have
         no report.
@@ -30,7 +30,7 @@ def do_nothing() -> None:
 
 
 def choose_executor(
-    jobs: Sequence[ROSInjectionConfig],
+    tasks: Sequence[Task],
     *,
     simultaneous: int | None = None,
     ray: bool = False,
@@ -39,7 +39,7 @@ def choose_executor(
 ) -> Executor:
     """Return the executor for a batch: Ray if asked for, else worker processes, else this process.
 
-    `simultaneous` is the number of recordings to run at the same time; it defaults to the `run.jobs` of the first job.
+    `simultaneous` is the number of recordings to run at the same time; it defaults to `run.jobs` of the first task.
     `address` is that of a Ray cluster; without it, Ray starts on this machine. Each worker process calls `prepare`
     first, for example to configure logging.
 
@@ -50,7 +50,7 @@ def choose_executor(
         from mosaico_ingest.executors.ray import Ray  # noqa: PLC0415 - an optional dependency
 
         return Ray(address, simultaneous)
-    processes = min(simultaneous or jobs[0].jobs, len(jobs)) if jobs else 1
+    processes = min(simultaneous or tasks[0].job.run.jobs, len(tasks)) if tasks else 1
     if processes == 1:
         from mosaico_ingest.executors.in_process import InProcess  # noqa: PLC0415 - it loads the pipeline
 

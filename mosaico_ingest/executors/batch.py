@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from mosaico_ingest.errors import IngestError
-from mosaico_ingest.job.config import Attempt, ROSInjectionConfig
 from mosaico_ingest.pipeline.run import failed_report
+from mosaico_ingest.pipeline.task import Attempt, Task
 from mosaico_ingest.report.events import BatchObserver, Event
 from mosaico_ingest.report.model import Report
 
@@ -21,7 +21,7 @@ __all__ = ["Batch"]
 class Batch:
     """The recordings of a batch by position; every started recording gets exactly one report."""
 
-    jobs: Sequence[ROSInjectionConfig]
+    tasks: Sequence[Task]
     observe: BatchObserver
     run: str = field(default_factory=lambda: uuid.uuid4().hex)
     """The id of the run, by which a later attempt recognizes what an earlier one committed."""
@@ -32,7 +32,7 @@ class Batch:
     _next: int = 0
 
     def __post_init__(self) -> None:
-        self.waiting.extend(range(len(self.jobs)))
+        self.waiting.extend(range(len(self.tasks)))
 
     def start(self, position: int) -> Attempt:
         """Count and return a new attempt."""
@@ -49,7 +49,7 @@ class Batch:
 
     def fail(self, position: int, error: IngestError) -> None:
         """Store the report of a recording that could not run."""
-        self.finish(position, failed_report(self.jobs[position], error, partial(self.observe, position)))
+        self.finish(position, failed_report(self.tasks[position], error, partial(self.observe, position)))
 
     def retry(self, position: int) -> None:
         """Put a recording at the front of the queue."""

@@ -8,14 +8,14 @@ import pickle
 import signal
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from multiprocessing.reduction import ForkingPickler
 
 import pyarrow as pa
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from mosaico_ingest.destinations.registry import KeepOpen, keep_destinations_open
 from mosaico_ingest.errors import IngestError, Interrupted
@@ -23,9 +23,10 @@ from mosaico_ingest.executors.base import do_nothing
 from mosaico_ingest.executors.batch import Batch
 from mosaico_ingest.executors.registrations import Registrations
 from mosaico_ingest.interrupts import Abandoned, StopHandler, count_interrupts
-from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.pipeline.memory import DEFAULT_BYTES, MemoryBudget
+from mosaico_ingest.job.model import Job
+from mosaico_ingest.pipeline.memory import MemoryBudget
 from mosaico_ingest.pipeline.run import failed_report, run_recording
+from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.report.events import BatchObserver, Event
 from mosaico_ingest.report.model import Report
 
@@ -52,10 +53,10 @@ class Processes(Struct, frozen=True):
     attempts: int = ATTEMPTS
     prepare: Callable[[], None] = do_nothing
 
-    def map(self, jobs: Sequence[ROSInjectionConfig], observe: BatchObserver) -> Iterator[Report]:
-        """Yield the report of each job; see `Executor.map`."""
-        processes = max(1, min(self.processes, len(jobs)))
-        split = [replace(job, memory_bytes=_split_memory(job.memory_bytes, processes)) for job in jobs]
+    def map(self, tasks: Sequence[Task], observe: BatchObserver) -> Iterator[Report]:
+        """Yield the report of each task; see `Executor.map`."""
+        processes = max(1, min(self.processes, len(tasks)))
+        split = [structs.replace(task, job=_split_memory(task.job, processes)) for task in tasks]
         spawn = partial(_spawn_worker, self.prepare, processes)
         pool = _Pool(Batch(split, observe), processes, self.attempts, spawn)
         with count_interrupts() as interrupts:
@@ -118,7 +119,9 @@ class _Pool:
 
     def _send(self, worker: _Worker, task: int) -> None:
         try:
-            pickled = ForkingPickler.dumps(replace(self.batch.jobs[task], attempt=self.batch.start(task)))
+            pickled = ForkingPickler.dumps(
+                structs.replace(self.batch.tasks[task], attempt=self.batch.start(task))
+            )
         except Exception as error:  # noqa: BLE001 - pickling runs the code of the job's classes
             self.batch.fail(task, _unsendable(error))
             return
@@ -197,18 +200,18 @@ def _run_job(pipe: Connection, pickled: bytes, stop: StopHandler, keep_open: Kee
         stop.enable()
 
     try:
-        job: ROSInjectionConfig = pickle.loads(pickled)  # noqa: S301 - from our own parent
+        task: Task = pickle.loads(pickled)  # noqa: S301 - from our own parent
     except Exception as error:  # noqa: BLE001 - unpickling runs the code of the job's classes
         pipe.send(IngestError(f"the job cannot be read in another process: {type(error).__name__}: {error}"))
         return
     try:
         stop.enable()
-        report = run_recording(job, tell).report
+        report = run_recording(task, tell).report
     except KeyboardInterrupt:
-        report = failed_report(job, Interrupted("stopped before the recording was opened"), tell)
+        report = failed_report(task, Interrupted("stopped before the recording was opened"), tell)
     stop.disable()
     pipe.send(report)
-    keep_open(job.target)
+    keep_open(task.job.destination)
 
 
 def _spawn_worker(prepare: Callable[[], None], processes: int) -> _Worker:
@@ -241,8 +244,10 @@ def _stop_signals_blocked() -> Generator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
-def _split_memory(memory_bytes: int | None, processes: int) -> int:
-    return MemoryBudget(memory_bytes or DEFAULT_BYTES).split(processes).total_bytes
+def _split_memory(job: Job, processes: int) -> Job:
+    """Return a job with its share of the memory of `processes` simultaneous runs."""
+    budget = MemoryBudget() if job.run.memory is None else MemoryBudget(job.run.memory)
+    return job.replace(run=job.run.replace(memory=budget.split(processes).total_bytes))
 
 
 def _signal(worker: _Worker, number: signal.Signals) -> None:

@@ -13,7 +13,7 @@ from os.path import relpath
 from pathlib import Path
 from typing import Any
 
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.destinations.store.errors import explained
@@ -23,8 +23,8 @@ from mosaico_ingest.executors.processes import ATTEMPTS
 from mosaico_ingest.executors.registrations import Registrations
 from mosaico_ingest.executors.shipment import absolute, pack
 from mosaico_ingest.interrupts import count_interrupts
-from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.pipeline.memory import DEFAULT_BYTES
+from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.report.events import BatchObserver, RunStarted
 from mosaico_ingest.report.model import Report
 
@@ -74,17 +74,17 @@ class Ray(Struct, frozen=True):
     simultaneous: int | None = None
     attempts: int = ATTEMPTS
 
-    def map(self, jobs: Sequence[ROSInjectionConfig], observe: BatchObserver) -> Iterator[Report]:
-        """Yield the report of each job; see `Executor.map`.
+    def map(self, tasks: Sequence[Task], observe: BatchObserver) -> Iterator[Report]:
+        """Yield the report of each task; see `Executor.map`.
 
         Raises:
             IngestError: There is no Ray cluster at the address, or it ends during the run.
         """
-        if not jobs:
+        if not tasks:
             return
-        batch = Batch(jobs, observe)
+        batch = Batch(tasks, observe)
         with ExitStack() as stack:
-            sent = [absolute(job) for job in jobs]
+            sent = [absolute(task) for task in tasks]
             if not ray.is_initialized():
                 sent = stack.enter_context(_connected(self.address, self.simultaneous, sent))
             beacon = stack.enter_context(_beacon(sent, batch.run))
@@ -107,7 +107,7 @@ class Ray(Struct, frozen=True):
 @dataclass(slots=True)
 class _Run:
     batch: Batch
-    sent: Sequence[ROSInjectionConfig]
+    sent: Sequence[Task]
     max_tasks: int
     attempts: int
     mailbox: Any
@@ -145,17 +145,17 @@ class _Run:
 
     def _start(self, position: int, largest_bytes: int) -> None:
         attempt = self.batch.start(position)
-        config = replace(self.sent[position], attempt=attempt)
+        sent = structs.replace(self.sent[position], attempt=attempt)
         try:
-            pickled = cloudpickle.dumps(config)  # pyright: ignore[reportPrivateImportUsage] - its module re-exports it
+            pickled = cloudpickle.dumps(sent)  # pyright: ignore[reportPrivateImportUsage] - its module re-exports it
         except Exception as error:  # noqa: BLE001 - pickling runs the code of the job's classes
             self.batch.fail(position, IngestError(f"the job cannot be sent to another machine: {error}"))
             return
-        needed_bytes = (config.memory_bytes or DEFAULT_BYTES) + _WORKER_BYTES
+        needed_bytes = (sent.job.run.memory or DEFAULT_BYTES) + _WORKER_BYTES
         # Ray's built-in retries do not count lost nodes or out-of-memory failures, so one recording could take down
         # every node.
         task = ray.remote(ingest).options(
-            name=f"ingest {config.sequence_name}",
+            name=f"ingest {sent.job.sequence.name}",
             num_cpus=1,
             memory=min(needed_bytes, largest_bytes),
             max_retries=0,
@@ -197,7 +197,7 @@ class _Run:
         deaths = self.batch.attempts[position] - self.nodes_lost[position]
         if deaths < self.attempts and self.nodes_lost[position] < MAX_NODE_FAILURES:
             _log.warning(
-                "%s is started again: %s", self.batch.jobs[position].sequence_name, _first_line(error)
+                "%s is started again: %s", self.batch.tasks[position].job.sequence.name, _first_line(error)
             )
             self.batch.retry(position)
         else:
@@ -217,8 +217,8 @@ class _Run:
         """Return an event or a report with paths as in the job; a worker uses absolute ones."""
         if not isinstance(message, RunStarted | Report):
             return message
-        job = self.batch.jobs[position]
-        files, destination = message.files, destination_of(job.target).describe()
+        job = self.batch.tasks[position].job
+        files, destination = message.files, destination_of(job.destination).describe()
         if all(isinstance(path, Path) and not path.is_absolute() for path in job.paths):
             files = tuple(map(relpath, files))
         if isinstance(message, Report):
@@ -237,10 +237,8 @@ def _died(error: ray_errors.RayError, attempts: int) -> IngestError:
 
 
 @contextmanager
-def _connected(
-    address: str | None, simultaneous: int | None, jobs: list[ROSInjectionConfig]
-) -> Generator[list[ROSInjectionConfig]]:
-    """Connect to Ray; yield the configurations with paths that are valid on its workers."""
+def _connected(address: str | None, simultaneous: int | None, tasks: list[Task]) -> Generator[list[Task]]:
+    """Connect to Ray; yield the tasks with paths that are valid on its workers."""
     if address is not None and address.startswith("ray://"):
         raise IngestError(
             f"{address} is the address of Ray's client server",
@@ -248,10 +246,10 @@ def _connected(
         )
     _check_reachable(address)
     with tempfile.TemporaryDirectory(prefix="mosaico-ingest-") as folder:
-        sent = jobs
+        sent = tasks
         options: dict[str, Any] = {**_LOCAL_OPTIONS, "num_cpus": simultaneous}
         if address is not None:
-            sent = pack(jobs, Path(folder))
+            sent = pack(tasks, Path(folder))
             options = {"runtime_env": {"working_dir": folder, "py_modules": [_PACKAGE]}}
         try:
             ray.init(address or "local", log_to_driver=False, logging_level=logging.ERROR, **options)
@@ -282,10 +280,10 @@ def _unreachable(address: str | None, error: Exception) -> IngestError:
 
 
 @contextmanager
-def _beacon(jobs: Sequence[ROSInjectionConfig], run: str) -> Generator[str]:
+def _beacon(tasks: Sequence[Task], run: str) -> Generator[str]:
     """Keep a file in every store during the run, by which workers recognize the store."""
     name = f".run-{run}"
-    stores = {destination_of(job.target).local_folder for job in jobs}
+    stores = {destination_of(task.job.destination).local_folder for task in tasks}
     folders = [path for path in stores if path is not None]
     for folder in folders:
         with explained(folder):

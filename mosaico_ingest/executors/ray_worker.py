@@ -25,8 +25,9 @@ from mosaico_ingest.errors import (
 )
 from mosaico_ingest.executors.registrations import Registrations
 from mosaico_ingest.interrupts import StopHandler
-from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.model import Job
 from mosaico_ingest.pipeline.run import failed_report, run_recording
+from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.report.events import Event, RunFinished, RunStarted
 from mosaico_ingest.report.model import Report
 
@@ -75,7 +76,7 @@ def ingest(
 ) -> Report | IngestError:
     """Ingest one recording; return its report, or an error if the job cannot be read."""
     try:
-        job: ROSInjectionConfig = pickle.loads(pickled)  # noqa: S301 - from our own driver
+        task: Task = pickle.loads(pickled)  # noqa: S301 - from our own driver
     except Exception as error:  # noqa: BLE001 - unpickling runs the code of the job's classes
         return IngestError(f"the job cannot be read on {_node()}: {type(error).__name__}: {error}")
     pa.set_cpu_count(1)
@@ -85,25 +86,25 @@ def ingest(
     before = signal.signal(signal.SIGINT, stop)  # Ray cancels a task by this signal
     try:
         with _records_sent(outbox, setting.log_level):
-            report = _run(job, outbox, stop, setting)
+            report = _run(task, outbox, stop, setting)
         outbox.flush()
     finally:
         signal.signal(signal.SIGINT, before)
     return report
 
 
-def _run(job: ROSInjectionConfig, outbox: _Outbox, stop: StopHandler, setting: Setting) -> Report:
+def _run(task: Task, outbox: _Outbox, stop: StopHandler, setting: Setting) -> Report:
     try:
         stop.enable()
-        error = out_of_reach(job, setting)
-        report = failed_report(job, error, outbox.tell) if error else run_recording(job, outbox.tell).report
+        error = out_of_reach(task.job, setting)
+        report = failed_report(task, error, outbox.tell) if error else run_recording(task, outbox.tell).report
     except KeyboardInterrupt:
-        report = failed_report(job, Interrupted("stopped before the recording was opened"), outbox.tell)
+        report = failed_report(task, Interrupted("stopped before the recording was opened"), outbox.tell)
     stop.disable()
     return report
 
 
-def out_of_reach(job: ROSInjectionConfig, setting: Setting) -> IngestError | None:
+def out_of_reach(job: Job, setting: Setting) -> IngestError | None:
     """Return an error if this node cannot access the recording or the store of the driver."""
     for path in job.paths:
         if isinstance(path, Path) and not path.exists():
@@ -112,7 +113,7 @@ def out_of_reach(job: ROSInjectionConfig, setting: Setting) -> IngestError | Non
                 where=str(path),
                 hint="put recordings on storage that every node mounts at the same path, or name them by URL",
             )
-    store = destination_of(job.target).local_folder
+    store = destination_of(job.destination).local_folder
     if store is None or (setting.machine == machine() and (store / setting.beacon).exists()):
         return None
     return SinkError(

@@ -6,7 +6,6 @@ import shutil
 import sys
 import sysconfig
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from os.path import abspath
 from pathlib import Path
 
@@ -14,8 +13,17 @@ from msgspec import Struct, structs
 
 from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.destinations.registry import destination_of
-from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.remote import AnyPath
+from mosaico_ingest.job.fields import (
+    AdapterRef,
+    FilePath,
+    PathRole,
+    marked_fields,
+    replace_values,
+    values_at,
+)
+from mosaico_ingest.job.model import JobSettings
+from mosaico_ingest.pipeline.task import Task
+from mosaico_ingest.remote import is_url
 from mosaico_ingest.rosbag.definitions.registry import definition_files
 
 __all__ = ["absolute", "pack"]
@@ -25,53 +33,57 @@ _FILES = "files"
 _HERE = ".here"
 _YAML = frozenset({".yaml", ".yml"})
 _CODE = _YAML | {".py"}
+_SHIPPED = {PathRole.WORKER_FILE, PathRole.DEFINITIONS}
 
 
-def absolute(config: ROSInjectionConfig) -> ROSInjectionConfig:
-    """Return a configuration with absolute paths."""
-    kept, store = config.quarantine, destination_of(config.target).local_folder
-    cert = config.tls_cert_path
-    return replace(
-        config,
-        file_path=tuple(_absolute_or_url(path) for path in config.paths),
-        store=config.store if store is None or config.plugin else _absolute(store),
-        plugin=config.plugin and structs.replace(config.plugin, base_dir=_absolute(config.plugin.base_dir)),
-        base_dir=_absolute(config.base_dir),
-        quarantine=None if kept is None else replace(kept, path=_absolute_or_url(kept.path)),
-        custom_msgs=tuple((package, _absolute(path), store) for package, path, store in config.custom_msgs),
-        tls_cert_path=None if cert is None else _absolute(cert),
+def absolute(task: Task) -> Task:
+    """Return a task with absolute paths."""
+    job = task.job
+    store = destination_of(job.destination).local_folder if job.target.type is None else None
+    if store is not None:
+        job = job.replace(target=job.target.replace(store=str(store)))
+    for field in marked_fields(JobSettings, FilePath):
+        if field.marker.role is not PathRole.RECORDING:
+            job = replace_values(
+                job, field.path, lambda _, path: path if is_url(path) else str(_absolute(path))
+            )
+    return structs.replace(
+        task,
+        job=job.replace(
+            paths=tuple(_absolute(path) if isinstance(path, Path) else path for path in job.paths),
+            origin=structs.replace(job.origin, folder=_absolute(job.folder)),
+        ),
     )
 
 
-def pack(configs: Iterable[ROSInjectionConfig], folder: Path) -> list[ROSInjectionConfig]:
-    """Copy adapters, definitions and certificates into `folder`; return configurations that are valid in a copy of it.
+def pack(tasks: Iterable[Task], folder: Path) -> list[Task]:
+    """Copy adapters, definitions and certificates into `folder`; return tasks that are valid in a copy of it.
 
     Adapters keep their names, so the plan stays the same. Adapters with an absolute path and installed packages are not
     copied and must exist on every machine.
     """
     box = _Box(folder)
-    return [box.add(config) for config in configs]
+    return [box.add(task) for task in tasks]
 
 
 class _Box(Struct, frozen=True):
     folder: Path
 
-    def add(self, config: ROSInjectionConfig) -> ROSInjectionConfig:
-        for reference in (*config.adapters, *config.adapter_override.values()):
-            self._add_adapter(reference, config.base_dir)
-        for _, path, _ in config.custom_msgs:
-            self._add_all(definition_files(Path(path)))
-        cert = config.tls_cert_path
-        self._add_all([] if cert is None else [Path(cert)])
-        self._add_all([], folder=config.base_dir)
-        return replace(
-            config,
-            code_dir=_shipped(config.base_dir),
-            custom_msgs=tuple(
-                (package, _shipped(path), store) for package, path, store in config.custom_msgs
-            ),
-            tls_cert_path=None if cert is None else _shipped(cert),
-        )
+    def add(self, task: Task) -> Task:
+        job = task.job
+        for field in marked_fields(JobSettings, AdapterRef):
+            for _, reference in values_at(job, field.path):
+                self._add_adapter(reference, job.folder)
+        for field in marked_fields(JobSettings, FilePath):
+            if field.marker.role in _SHIPPED:
+                job = replace_values(job, field.path, self._add_input)
+        self._add_all([], folder=job.folder)
+        return structs.replace(task, job=job, code_dir=_shipped(job.folder))
+
+    def _add_input(self, _: object, path: str) -> str:
+        """Add a file, or the message definitions of a folder; return its path in the shipment."""
+        self._add_all(definition_files(Path(path)) if Path(path).is_dir() else [Path(path)])
+        return str(_shipped(path))
 
     def _add_adapter(self, reference: object, base_dir: Path) -> None:
         """Copy the file or module of a reference with its neighbors, which it may import."""
@@ -123,10 +135,6 @@ def _matching(paths: Iterable[Path], suffixes: frozenset[str]) -> list[Path]:
 def _shipped(path: Path | str) -> Path:
     """Return the path of a file in the shipment."""
     return Path(_FILES, *_absolute(path).parts[1:])
-
-
-def _absolute_or_url(path: AnyPath) -> AnyPath:
-    return _absolute(path) if isinstance(path, Path) else path
 
 
 def _absolute(path: Path | str) -> Path:

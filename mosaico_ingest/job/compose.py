@@ -13,6 +13,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from mosaico_ingest.findings import Finding, Severity, Span
+from mosaico_ingest.job.fields import AdapterRef, FilePath, Literally, marked_fields, replace_values
+from mosaico_ingest.job.model import MAX_JOBS, Manifest
 from mosaico_ingest.job.yaml_source import (
     KeyPath,
     Scalar,
@@ -27,7 +29,6 @@ __all__ = [
     "EXTENDS_KEY",
     "MATRIX_KEY",
     "MAX_FILES",
-    "MAX_JOBS",
     "PLACEHOLDERS",
     "Filled",
     "Placeholder",
@@ -70,8 +71,6 @@ def placeholders_in(template: str) -> Iterator[Placeholder]:
 
 
 MATRIX_KEY = "matrix"
-MAX_JOBS = 1000
-"""How many jobs one manifest may expand to."""
 
 
 def combinations(document: Value) -> list[dict[str, str]]:
@@ -103,8 +102,6 @@ def variables(mapping: Value) -> dict[str, str]:
 
 
 _REFERENCE = re.compile(r"\$(?:(\$)|\{([^{}]*)\}|(?=\{))")
-_WITHOUT = {("extends",), ("defaults",), ("matrix",)}
-"""Sections in which there are no variables."""
 _INSIDE = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)(?::([-?])(.*))?", re.DOTALL)
 
 
@@ -160,7 +157,7 @@ class _Variables(Struct, frozen=True):
 
 
 def _value(value: Value, path: KeyPath, source: Source, known: _Variables, out: Filled) -> Value:
-    if path in _WITHOUT:
+    if any(field.path == path for field in marked_fields(Manifest, Literally)):
         return value
     if isinstance(value, dict):
         return {key: _value(inner, (*path, key), source, known, out) for key, inner in value.items()}
@@ -209,19 +206,6 @@ def _text(text: str, path: KeyPath, source: Source, known: _Variables, out: Fill
 EXTENDS_KEY = "extends"
 MAX_FILES = 100
 """How many files one document may extend, each counted as often as it is named."""
-_PATHS: tuple[KeyPath, ...] = (
-    ("bag", "path"),
-    ("bag", "path", None),
-    ("bag", "custom_msgs", None, "path"),
-    ("sequence", "metadata_file"),
-    ("target", "store"),
-    ("target", "tls_cert"),
-    ("quarantine", "path"),
-    ("run", "report"),
-)
-"""Where a manifest has paths; None stands for every key and position."""
-_ADAPTERS: tuple[KeyPath, ...] = (("adapters", "load", None), ("adapters", "override", None))
-"""Where it may have them: an adapter is named by a file, or otherwise."""
 
 
 def extended(source: Source, *, folder: File) -> Source:
@@ -325,31 +309,24 @@ def _joined(own: Source, base: Source) -> Source:
 
 def _moved(source: Source, way: str) -> Source:
     """Return a document whose relative paths start elsewhere; `way` leads from there to where they started."""
-    return replace(source, value=_moved_value(source.value, (), way)) if way != "." else source
+    if way == ".":
+        return source
+    value = source.value
+    for marked in (*marked_fields(Manifest, FilePath), *marked_fields(Manifest, AdapterRef)):
+        is_path = isinstance(marked.marker, FilePath)
+
+        def rebase(_: KeyPath, text: str, *, is_path: bool = is_path) -> str:
+            if not _is_relative(text) or not (is_path or is_adapter_path(text)):
+                return text
+            return File(normpath(File(way, text))).as_posix()
+
+        value = replace_values(value, marked.path, rebase)
+    return replace(source, value=value)
 
 
-def _moved_value(value: Value, path: KeyPath, way: str) -> Value:
-    if isinstance(value, dict):
-        return {key: _moved_value(inner, (*path, key), way) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_moved_value(inner, (*path, i), way) for i, inner in enumerate(value)]
-    if isinstance(value, str) and _is_path(value, path) and _is_relative(value):
-        return File(normpath(File(way, value))).as_posix()
-    return value
-
-
-def _is_path(text: str, path: KeyPath) -> bool:
-    return _among(path, _PATHS) or (
-        _among(path, _ADAPTERS) and (text.endswith((".yaml", ".yml")) or ".py:" in text)
-    )
-
-
-def _among(path: KeyPath, patterns: tuple[KeyPath, ...]) -> bool:
-    return any(
-        len(path) == len(pattern)
-        and all(wanted in (None, part) for wanted, part in zip(pattern, path, strict=True))
-        for pattern in patterns
-    )
+def is_adapter_path(text: str) -> bool:
+    """Return whether a reference to an adapter is or begins with the path of a file."""
+    return text.endswith((".yaml", ".yml")) or ".py:" in text
 
 
 def _is_relative(text: str) -> bool:

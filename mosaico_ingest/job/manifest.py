@@ -16,8 +16,8 @@ from pydantic import ValidationError
 from mosaico_ingest.errors import IngestError, ManifestError
 from mosaico_ingest.findings import Finding, Severity, Span
 from mosaico_ingest.job.compose import Filled, combinations, extended, fill_in, fill_in_cell
+from mosaico_ingest.job.model import Manifest, Origin
 from mosaico_ingest.job.reference import job_schema
-from mosaico_ingest.job.sections import Manifest
 from mosaico_ingest.job.validation import explain
 from mosaico_ingest.job.yaml_source import (
     KeyPath,
@@ -43,49 +43,55 @@ __all__ = [
 
 
 class LoadedManifest(Struct, frozen=True):
-    """A manifest that holds together, with the place of everything in it."""
+    """A valid manifest, with the span of each of its values."""
 
     manifest: Manifest
     source: Source
     path: Path
     cell: Mapping[str, str] = field(default_factory=dict[str, str])
-    """The values of its matrix that make it this job and no other."""
+    """The values of the matrix variables for this job."""
 
-    def where(self, *place: str | int) -> str:
-        """Return `file:line:column` of the value at a path, for the errors of later stages."""
-        return str(self.source.span(place))
+    @property
+    def origin(self) -> Origin:
+        """The manifest's file and folder, and the span of each key and value."""
+        return Origin(str(self.path), self.path.parent, self.source.spans, self.source.key_spans)
 
-    def for_recording(self, path: Path) -> LoadedManifest:
-        """Return the same manifest for another recording."""
-        bag = self.manifest.bag.model_copy(update={"path": str(path)})
-        return replace(self, manifest=self.manifest.model_copy(update={"bag": bag}))
+    def where(self, *path: str | int) -> str:
+        """Return `file:line:column` of the value at a key path."""
+        return str(self.source.span(path))
 
-    def resolve(self, path: str) -> Path:
-        """Return a path of the manifest as seen from here: relative ones start in the manifest's folder.
+    def for_recording(self, recording: Path) -> LoadedManifest:
+        """Return the manifest with another recording."""
+        bag = self.manifest.bag.replace(path=str(recording))
+        return replace(self, manifest=self.manifest.replace(bag=bag))
+
+    def resolve(self, path: str, *key_path: str | int) -> Path:
+        """Return a path that starts at the current folder instead of the manifest's.
 
         Raises:
-            ManifestError: It is a URL.
+            ManifestError: The path is a URL; the error's location is that of `key_path`.
         """
         if is_url(path):
-            raise ManifestError(f"{path}: only recordings and stores may be URLs", where=str(self.path))
+            message = f"{'.'.join(map(str, key_path))} is a URL, but only recordings and stores can be URLs"
+            raise self._wrong_url(message, "name a local file", key_path)
         return self.path.parent / Path(path).expanduser()
 
-    def locate(self, path: str, *place: str | int) -> AnyPath:
-        """Return what may also lie behind a URL, as seen from here.
+    def resolve_or_url(self, path: str, *key_path: str | int) -> AnyPath:
+        """Return a path that starts at the current folder instead of the manifest's, or that of a URL.
 
         Raises:
-            ManifestError: It is a URL that is not understood; `place` is where the manifest says it.
+            ManifestError: The URL is invalid; the error's location is that of `key_path`.
         """
         if not is_url(path):
-            return self.resolve(path)
+            return self.resolve(path, *key_path)
         try:
             return parse_url(path)
-        except IngestError as err:
-            message = f"{err.where}: {err.what}"
-            finding = Finding("wrong-url", Severity.ERROR, message, self.source.span(place), err.hint)
-            raise ManifestError(
-                message, where=self.where(*place), hint=err.hint, findings=(finding,)
-            ) from err
+        except IngestError as error:
+            raise self._wrong_url(f"{error.where}: {error.what}", error.hint, key_path) from error
+
+    def _wrong_url(self, message: str, hint: str | None, key_path: KeyPath) -> ManifestError:
+        finding = Finding("wrong-url", Severity.ERROR, message, self.source.span(key_path), hint)
+        return ManifestError(message, where=str(finding.span), hint=hint, findings=(finding,))
 
 
 def load_manifest(path: Path | str, *, env: Mapping[str, str] | None = os.environ) -> LoadedManifest:

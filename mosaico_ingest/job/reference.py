@@ -10,7 +10,7 @@ from typing import Any, cast
 
 from mosaico_ingest.documents import DIALECT, schema_of, tidy
 from mosaico_ingest.job.compose import EXTENDS_KEY as EXTENDS
-from mosaico_ingest.job.sections import Manifest
+from mosaico_ingest.job.model import Manifest
 
 __all__ = [
     "job_schema",

@@ -1,4 +1,4 @@
-"""This file reads the small languages inside a manifest's texts: sizes, durations, instants."""
+"""The notations inside a manifest's texts: sizes, limits, offsets and instants."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import re
 from datetime import datetime, timezone
 from typing import Final
 
-__all__ = ["parse_instant", "parse_limit", "parse_offset", "parse_size"]
+from mosaico_ingest.job.values import Limit, TimeBound
+
+__all__ = ["format_time", "parse_instant", "parse_limit", "parse_offset", "parse_size", "parse_time"]
 
 _SIZE = re.compile(r"([0-9]{1,18}(?:\.[0-9]{1,18})?) ?([kKMGT]?i?B)")
 _BYTES: Final = {
@@ -30,59 +32,88 @@ _INSTANT = re.compile(
 )
 _LIMIT = re.compile(r"([0-9]{1,18})|([0-9]{1,18}(?:\.[0-9]{1,18})?) ?%")
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
+_INT64 = range(-(2**63), 2**63)
+"""Nanoseconds that a time in a recording can have."""
 
 
 def parse_size(text: str) -> int:
-    """Return the bytes that `512MiB`, `2 GB` or `100kB` stand for.
+    """Return the number of bytes that `512MiB`, `2 GB` or `100kB` stands for.
 
     Raises:
-        ValueError: The text is no size.
+        ValueError: The text is not a size.
     """
     match = _SIZE.fullmatch(text)
     if match is None or match[2] not in _BYTES:
-        raise ValueError(f"{text!r} is no size; write a number and a unit, as 512MiB or 2GB")
+        raise ValueError(f"{text!r} is not a size; write a number and a unit, such as 512MiB or 2GB")
     return int(float(match[1]) * _BYTES[match[2]])
 
 
-def parse_offset(text: str) -> int:
-    """Return the nanoseconds of `+10s` or `-1.5min`; units ns us ms s min h.
+def parse_limit(text: str) -> Limit:
+    """Return the limit that a number (`100`) or a share (`0.1%`) stands for.
 
     Raises:
-        ValueError: The text is no offset.
-    """
-    match = _OFFSET.fullmatch(text)
-    if match is None:
-        raise ValueError(f"{text!r} is no offset; write a sign, a number and a unit, as +10s or -1.5min")
-    whole, _, fraction = match[2].partition(".")
-    unit = _NANOSECONDS[match[3]]
-    magnitude = int(whole) * unit + (int(fraction) * unit // 10 ** len(fraction) if fraction else 0)
-    return -magnitude if match[1] == "-" else magnitude
-
-
-def parse_limit(text: str) -> tuple[int | None, float | None]:
-    """Return the number of `100`, or the share between 0 and 1 of `0.1%`; the other one is None.
-
-    Raises:
-        ValueError: The text is neither, or the share exceeds 100%.
+        ValueError: The text is neither, or the share is more than 100%.
     """
     match = _LIMIT.fullmatch(text)
     if match is None:
-        raise ValueError(f"{text!r} is no limit; write a number of messages, as 100, or a share, as 0.1%")
+        raise ValueError(
+            f"{text!r} is not a limit; write a number of messages, such as 100, or a share, such as 0.1%"
+        )
     if match[1]:
-        return int(match[1]), None
+        return Limit(count=int(match[1]))
     share = float(match[2]) / 100
     if share > 1:
+        raise ValueError(f"{text!r} is out of range; write a share from 0% to 100%")
+    return Limit(share=share)
+
+
+def parse_time(text: str) -> TimeBound:
+    """Return the instant (`2026-03-01T12:00:00Z`) or offset (`+10s`, `-5min`) that a text stands for.
+
+    Raises:
+        ValueError: The text is neither.
+    """
+    if text[:1] in {"+", "-"}:
+        return TimeBound(parse_offset(text), relative=True)
+    return TimeBound(parse_instant(text))
+
+
+def format_time(bound: TimeBound) -> str:
+    """Return a bound as a manifest writes it."""
+    if bound.relative:
+        seconds, rest = divmod(abs(bound.ns), 1_000_000_000)
+        fraction = f".{rest:09}".rstrip("0") if rest else ""
+        return f"{'-' if bound.ns < 0 else '+'}{seconds}{fraction}s"
+    seconds, rest = divmod(bound.ns, 1_000_000_000)
+    moment = datetime.fromtimestamp(seconds, tz=timezone.utc)
+    fraction = f".{rest:09}".rstrip("0") if rest else ""
+    return f"{moment:%Y-%m-%dT%H:%M:%S}{fraction}Z"
+
+
+def parse_offset(text: str) -> int:
+    """Return the nanoseconds of `+10s` or `-1.5min`; units are ns, us, ms, s, min and h.
+
+    Raises:
+        ValueError: The text is not an offset, or more than 292 years.
+    """
+    match = _OFFSET.fullmatch(text)
+    if match is None:
         raise ValueError(
-            f"{text!r} is more than 100%; write a share of at most 100%, or a number of messages"
+            f"{text!r} is not an offset; write a sign, a number and a unit, such as +10s or -1.5min"
         )
-    return None, share
+    whole, _, fraction = match[2].partition(".")
+    unit = _NANOSECONDS[match[3]]
+    magnitude = int(whole) * unit + (int(fraction) * unit // 10 ** len(fraction) if fraction else 0)
+    if magnitude not in _INT64:
+        raise ValueError(f"{text!r} is out of range; write an offset of at most 292 years (2562047h)")
+    return -magnitude if match[1] == "-" else magnitude
 
 
 def parse_instant(text: str) -> int:
-    """Return the nanoseconds since the epoch of an ISO 8601 date or date and time; UTC where no zone is given.
+    """Return the nanoseconds since the epoch of an ISO 8601 date, or date and time; the time zone defaults to UTC.
 
     Raises:
-        ValueError: The text is no instant.
+        ValueError: The text is not an instant, or is not between 1678 and 2262.
     """
     match = _INSTANT.fullmatch(text)
     if match is None:
@@ -91,4 +122,7 @@ def parse_instant(text: str) -> int:
     moment = datetime.fromisoformat(f"{match[1]}T{match[2] or '00:00'}{zone}")
     since = moment - _EPOCH
     seconds = since.days * 86_400 + since.seconds
-    return seconds * 1_000_000_000 + int((match[3] or "0").ljust(9, "0"))
+    instant = seconds * 1_000_000_000 + int((match[3] or "0").ljust(9, "0"))
+    if instant not in _INT64:
+        raise ValueError(f"{text!r} is out of range; write an instant between the years 1678 and 2262")
+    return instant

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from mosaico_ingest.job.sections import Manifest
+from mosaico_ingest.job.model import Manifest
 
 __all__ = ["Document", "Kind", "documents_in", "files_below", "kind_of", "looks_like_ours"]
 

@@ -18,8 +18,9 @@ from pydantic_core import ErrorDetails
 
 from mosaico_ingest.findings import Finding, Span
 from mosaico_ingest.job.compose import fill_in
+from mosaico_ingest.job.fields import AdapterRef, FilePath, PathRole, TopicGlob, marked_fields, values_at
 from mosaico_ingest.job.manifest import check_manifest
-from mosaico_ingest.job.sections import Manifest
+from mosaico_ingest.job.model import JobSettings, Manifest
 from mosaico_ingest.job.validation import place_of
 from mosaico_ingest.job.yaml_source import KeyPath, Source, Value, load_source, member
 from mosaico_ingest.remote import without_options
@@ -124,11 +125,6 @@ def _repair(value: Value, location: KeyPath, *, missing: bool) -> None:
         parent.clear()
 
 
-_PATTERN_SECTIONS = (("topic_settings",), ("adapters", "override"), ("on_error", "topic"))
-"""The mappings whose keys are topic names and globs."""
-_DEFAULT_POLICY = ("on_error", "topic", "default")
-
-
 def topic_patterns(job: Job) -> Iterator[tuple[str, str, Span]]:
     """Yield the section, the text and the span of every topic name and glob."""
     for i, pattern in enumerate(job.manifest.topics):
@@ -138,11 +134,11 @@ def topic_patterns(job: Job) -> Iterator[tuple[str, str, Span]]:
 
 def keyed_patterns(job: Job) -> Iterator[tuple[str, str, Span]]:
     """Yield the section, the text and the span of every key that is a topic name or glob, in order of precedence."""
-    for section in _PATTERN_SECTIONS:
-        mapping = job.source.at(section)
-        for key in mapping if isinstance(mapping, dict) else ():
-            if isinstance(key, str) and (*section, key) != _DEFAULT_POLICY:
-                yield ".".join(section), key, job.key_span(*section, key)
+    for field in marked_fields(JobSettings, TopicGlob):
+        for path, mapping in values_at(job.source.value, field.path) if field.is_key else ():
+            for key in mapping if isinstance(mapping, dict) else ():
+                if isinstance(key, str) and key != field.marker.default:
+                    yield ".".join(path), key, job.key_span(*path, key)
 
 
 def is_glob(pattern: str) -> bool:
@@ -193,36 +189,17 @@ def key_paths_below(value: Value, path: KeyPath) -> Iterator[KeyPath]:
 
 def recording_paths(job: Job) -> Iterator[tuple[KeyPath, str]]:
     """Yield the key path and the text of each expanded path in `bag.path`, without the options of URLs."""
-    for path, text in _recording_texts(job):
+    for path, text in manifest_paths(job, PathRole.RECORDING):
         yield path, without_options(text)
 
 
-def manifest_paths(job: Job) -> Iterator[tuple[KeyPath, str]]:
-    """Yield the key path and the text of every expanded path in a manifest."""
-    manifest = job.manifest
-    yield from _recording_texts(job)
-    for i, custom in enumerate(manifest.bag.custom_msgs):
-        yield ("bag", "custom_msgs", i, "path"), custom.path
-    single: dict[KeyPath, str | None] = {
-        ("sequence", "metadata_file"): manifest.sequence.metadata_file,
-        ("target", "store"): manifest.target.store,
-        ("target", "tls_cert"): manifest.target.tls_cert,
-        ("run", "report"): manifest.run.report,
-    }
-    if manifest.quarantine is not None and job.has("quarantine", "path"):
-        single["quarantine", "path"] = manifest.quarantine.path
-    for path, text in single.items():
-        if text is not None and job.is_expanded(text):
-            yield path, text
-
-
-def _recording_texts(job: Job) -> Iterator[tuple[KeyPath, str]]:
-    text = job.manifest.bag.path
-    if isinstance(text, str):
-        splits: list[tuple[KeyPath, str]] = [(("bag", "path"), text)]
-    else:
-        splits = [(("bag", "path", i), split) for i, split in enumerate(text)]
-    yield from ((path, split) for path, split in splits if job.is_expanded(split))
+def manifest_paths(job: Job, *roles: PathRole) -> Iterator[tuple[KeyPath, str]]:
+    """Yield the key path and the text of every expanded path in a manifest, or of the paths with these roles."""
+    for field in marked_fields(JobSettings, FilePath):
+        if not roles or field.marker.role in roles:
+            for path, text in values_at(job.manifest, field.path):
+                if isinstance(text, str) and path in job.source.spans and job.is_expanded(text):
+                    yield path, text
 
 
 class PythonReference(Struct, frozen=True):
@@ -239,11 +216,8 @@ class PythonReference(Struct, frozen=True):
 
 def adapter_references(job: Job) -> Iterator[tuple[KeyPath, str]]:
     """Yield the key path and the text of every adapter reference."""
-    adapters = job.manifest.adapters
-    for i, reference in enumerate(adapters.load):
-        yield ("adapters", "load", i), reference
-    for topic, reference in adapters.override.items():
-        yield ("adapters", "override", topic), reference
+    for field in marked_fields(JobSettings, AdapterRef):
+        yield from values_at(job.manifest, field.path)
 
 
 def is_mapping_file(reference: str) -> bool:

@@ -1,4 +1,4 @@
-"""Compile a manifest to configurations, one per recording."""
+"""Compile a manifest to jobs, one per recording."""
 
 from __future__ import annotations
 
@@ -10,21 +10,15 @@ from datetime import datetime, timezone
 from difflib import get_close_matches
 from glob import has_magic
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from msgspec import Struct
 
 from mosaico_ingest.errors import ManifestError, NothingMatched
 from mosaico_ingest.job.compose import PLACEHOLDERS, Placeholder, placeholders_in
-from mosaico_ingest.job.config import QuarantineSettings, ROSInjectionConfig, TimeRange
+from mosaico_ingest.job.fields import FilePath, PathRole, marked_fields, replace_values
 from mosaico_ingest.job.manifest import LoadedManifest
-from mosaico_ingest.job.units import (
-    parse_instant,
-    parse_limit,
-    parse_offset,
-    parse_size,
-)
-from mosaico_ingest.job.values import Limit, PluginTarget, TimeBound, TopicLevelErrorPolicy
+from mosaico_ingest.job.model import Job, JobSettings, Manifest, Origin, SequenceSettings
 from mosaico_ingest.remote import AnyPath, RemotePath, without_options
 from mosaico_ingest.rosbag.formats import RECORDING_NAME
 from mosaico_ingest.textfile import read_limited
@@ -37,6 +31,7 @@ __all__ = [
     "sequence_name",
 ]
 
+_READ_LATER = {PathRole.WORKER_FILE, PathRole.DEFINITIONS}
 _REFUSED = re.compile(r"[^A-Za-z0-9_-]+")
 
 
@@ -103,7 +98,7 @@ def _fill(placeholder: Placeholder, recording: Recording) -> str:
 
 def _matches(loaded: LoadedManifest, pattern: str, place: tuple[str | int, ...]) -> list[AnyPath]:
     """Return the file or directory `pattern` names, or the recordings it matches, sorted."""
-    path = loaded.locate(pattern, *place)
+    path = loaded.resolve_or_url(pattern, *place)
     if path.exists():
         return [path]
     where = loaded.where(*place)
@@ -169,39 +164,40 @@ def _nearby(path: AnyPath) -> str:
     return f"{folder} has {', '.join(recordings[:5]) or 'no recording'}"
 
 
-def compile_manifests(jobs: Sequence[LoadedManifest]) -> tuple[ROSInjectionConfig, ...]:
-    """Return the configurations of every job of a manifest; see `compile_manifest`."""
-    configs = tuple(config for job in jobs for config in compile_manifest(job))
-    _refuse_duplicates(jobs[0], [config.sequence_name for config in configs])
-    return configs
+def compile_manifests(jobs: Sequence[LoadedManifest]) -> tuple[Job, ...]:
+    """Return the jobs of the recordings of every combination of a manifest's matrix; see `compile_manifest`."""
+    compiled = tuple(job for loaded in jobs for job in compile_manifest(loaded))
+    _refuse_duplicates(jobs[0], [job.sequence.name for job in compiled])
+    return compiled
 
 
-def compile_manifest(loaded: LoadedManifest) -> tuple[ROSInjectionConfig, ...]:
-    """Return a configuration for each recording that `bag.path` names, in the order of their paths.
+def compile_manifest(loaded: LoadedManifest) -> tuple[Job, ...]:
+    """Return a job for each recording that `bag.path` names, in the order of their paths.
 
     Raises:
-        NothingMatched: A file is not there, or a glob matches no recording.
-        ManifestError: Two recordings would get the same name, the platform refuses one, or a file the manifest names
-            cannot be used.
+        NothingMatched: A file does not exist, or a glob matches no recording.
+        ManifestError: Two recordings would have the same name, the platform refuses a name or metadata, or a file that
+            the manifest names cannot be used.
     """
     recordings = find_recordings(loaded)
     names = [sequence_name(loaded, recording) for recording in recordings]
     _refuse_duplicates(loaded, names)
-    fields = _fields(loaded)
+    shared = _resolve_paths(loaded)
+    sequence = shared.sequence.replace(
+        family=shared.sequence.family or shared.sequence.name,
+        metadata=_metadata(loaded, shared.sequence),
+        metadata_file=None,
+    )
+    sections: dict[str, Any] = {key: getattr(shared, key) for key in JobSettings.model_fields}
+    origin = loaded.origin
     return tuple(
-        _config(loaded, recording, name, fields) for recording, name in zip(recordings, names, strict=True)
+        _job({**sections, "sequence": sequence.replace(name=name)}, recording.paths, origin)
+        for recording, name in zip(recordings, names, strict=True)
     )
 
 
-def _config(
-    loaded: LoadedManifest, recording: Recording, name: str, fields: dict[str, Any]
-) -> ROSInjectionConfig:
-    try:
-        return ROSInjectionConfig(file_path=recording.paths, sequence_name=name, **fields)
-    except ManifestError as err:
-        if err.where is None:
-            err.where = loaded.where("sequence", "name")
-        raise
+def _job(sections: dict[str, Any], paths: tuple[AnyPath, ...], origin: Origin) -> Job:
+    return Job.model_construct(None, **sections, paths=paths, origin=origin).check()
 
 
 def _refuse_duplicates(loaded: LoadedManifest, names: list[str]) -> None:
@@ -210,143 +206,47 @@ def _refuse_duplicates(loaded: LoadedManifest, names: list[str]) -> None:
         raise ManifestError(
             f"{count} recordings would be named {name!r}",
             where=loaded.where("sequence", "name"),
-            hint="put {stem}, {parent} or {index}, or a variable of the matrix, into sequence.name",
+            hint="add {stem}, {parent}, {index} or a variable of the matrix to sequence.name",
         )
 
 
-def _fields(loaded: LoadedManifest) -> dict[str, Any]:
-    """Return what all the recordings of the job have in common."""
+def _resolve_paths(loaded: LoadedManifest) -> Manifest:
+    """Return the manifest with every path but those of recordings starting at the current folder."""
     manifest = loaded.manifest
-    return {
-        "metadata": _metadata(loaded),
-        "ros_distro": manifest.bag.ros_distro,
-        "custom_msgs": _custom_msgs(loaded),
-        "time_range": _time_range(loaded),
-        "if_exists": manifest.sequence.if_exists,
-        "topics": manifest.topics,
-        "unmodeled": manifest.adapters.unmodeled,
-        "adapters": manifest.adapters.load,
-        "adapter_override": dict(manifest.adapters.override),
-        "serialization_formats": dict(manifest.adapters.serialization_formats),
-        "base_dir": loaded.path.parent,
-        "on_error": manifest.on_error.session,
-        "topics_on_error": _topic_policies(loaded),
-        "messages_on_error": manifest.on_error.message,
-        "family": manifest.sequence.family or manifest.sequence.name,
-        "on_schema_change": manifest.on_schema_change,
-        "quarantine": _quarantine(loaded),
-        "log_level": manifest.run.log_level,
-        "report_path": _path(loaded, manifest.run.report),
-        "memory_bytes": None if manifest.run.memory is None else parse_size(manifest.run.memory),
-        "jobs": manifest.run.jobs,
-        "where": str(loaded.path),
-        "places": {**loaded.source.spans, **loaded.source.key_spans},
-        **_topic_settings(loaded),
-        **_target(loaded),
-    }
+    for field in marked_fields(JobSettings, FilePath):
+        role = field.marker.role
+
+        def resolve(path: tuple[str | int, ...], text: str, role: PathRole = role) -> str:
+            if role is PathRole.STORE:
+                found = loaded.resolve_or_url(text, *path)
+                return text if isinstance(found, RemotePath) else str(found)
+            found = loaded.resolve(text, *path)
+            if role in _READ_LATER and not found.exists():
+                raise ManifestError(
+                    f"no such file or directory: {found}",
+                    where=loaded.where(*path),
+                    hint="correct the path; relative paths start at the manifest's folder",
+                )
+            return str(found)
+
+        if role is not PathRole.RECORDING:
+            manifest = replace_values(manifest, field.path, resolve)
+    return manifest
 
 
-def _target(loaded: LoadedManifest) -> dict[str, Any]:
-    target = loaded.manifest.target
-    if target.type is not None:
-        return {"plugin": PluginTarget(target.type, dict(target.options), loaded.path.parent)}
-    if target.host is None:
-        store = target.store
-        return {"store": None if store is None else loaded.locate(store, "target", "store")}
-    return {
-        "host": target.host,
-        "port": target.port,
-        "mosaico_api_key": None if target.api_key is None else target.api_key.get_secret_value(),
-        "tls_cert_path": _path(loaded, target.tls_cert),
-        "enable_tls": target.tls,
-        "message_bytes": parse_size(target.message_size),
-    }
-
-
-def _topic_settings(loaded: LoadedManifest) -> dict[str, Any]:
-    settings = loaded.manifest.topic_settings
-    return {
-        "topic_metadata": {
-            topic: setting.metadata for topic, setting in settings.items() if setting.metadata
-        },
-        "rename": {
-            topic: setting.rename for topic, setting in settings.items() if setting.rename is not None
-        },
-        "every": {
-            topic: setting.every for topic, setting in settings.items() if "every" in setting.model_fields_set
-        },
-        "images": {
-            topic: setting.image for topic, setting in settings.items() if "image" in setting.model_fields_set
-        },
-    }
-
-
-def _topic_policies(loaded: LoadedManifest) -> TopicLevelErrorPolicy | dict[str, TopicLevelErrorPolicy]:
-    policies = loaded.manifest.on_error.topic
-    return policies if isinstance(policies, TopicLevelErrorPolicy) else dict(policies)
-
-
-def _quarantine(loaded: LoadedManifest) -> QuarantineSettings | None:
-    section = loaded.manifest.quarantine
-    if section is None:
-        return None
-    return QuarantineSettings(
-        loaded.resolve(section.path), _limit(section.max), _limit(section.max_run), section.systematic
-    )
-
-
-def _limit(text: str | None) -> Limit | None:
-    return None if text is None else Limit(*parse_limit(text))
-
-
-def _time_range(loaded: LoadedManifest) -> TimeRange:
-    time = loaded.manifest.bag.time
-    return TimeRange() if time is None else TimeRange(_bound(time.start), _bound(time.end))
-
-
-def _bound(text: str | None) -> TimeBound | None:
-    if text is None:
-        return None
-    if text[:1] in {"+", "-"}:
-        return TimeBound(parse_offset(text), relative=True)
-    return TimeBound(parse_instant(text))
-
-
-def _path(loaded: LoadedManifest, path: str | None) -> Path | None:
-    return None if path is None else loaded.resolve(path)
-
-
-def _custom_msgs(loaded: LoadedManifest) -> tuple[tuple[str, Path, object], ...]:
-    found: list[tuple[str, Path, object]] = []
-    for index, custom in enumerate(loaded.manifest.bag.custom_msgs):
-        path = loaded.resolve(custom.path)
-        if not path.exists():
-            raise ManifestError(
-                f"no such file or directory: {path}",
-                where=loaded.where("bag", "custom_msgs", index, "path"),
-                hint="name a directory of .msg files, or one .msg file",
-            )
-        found.append((custom.package, path, custom.store))
-    return tuple(found)
-
-
-def _metadata(loaded: LoadedManifest) -> dict[str, Any]:
-    sequence = loaded.manifest.sequence
+def _metadata(loaded: LoadedManifest, sequence: SequenceSettings) -> dict[str, Any]:
+    """Return the metadata of the manifest and of its metadata file."""
     if sequence.metadata_file is None:
-        return dict(sequence.metadata)
-    return {**_metadata_file(loaded, loaded.resolve(sequence.metadata_file)), **sequence.metadata}
-
-
-def _metadata_file(loaded: LoadedManifest, path: Path) -> dict[str, Any]:
+        return sequence.metadata
     where = loaded.where("sequence", "metadata_file")
+    path = sequence.metadata_file
     try:
-        metadata = json.loads(read_limited(path))
-    except OSError as err:
-        raise ManifestError(
-            f"{path} cannot be read: {(err.strerror or str(err)).lower()}", where=where
-        ) from err
-    except (ValueError, RecursionError) as err:
-        raise ManifestError(f"{path} is not JSON: {err}", where=where) from err
+        metadata = json.loads(read_limited(Path(path)))
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise ManifestError(f"{path} cannot be read: {reason}", where=where) from error
+    except (ValueError, RecursionError) as error:
+        raise ManifestError(f"{path} is not JSON: {error}", where=where) from error
     if not isinstance(metadata, dict):
-        raise ManifestError(f"{path} holds no JSON object", where=where, hint='write {"key": "value"}')
-    return cast("dict[str, Any]", metadata)
+        raise ManifestError(f"{path} has no JSON object", where=where, hint='write {"key": "value"}')
+    return {**metadata, **sequence.metadata}

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from os.path import relpath
 from pathlib import Path
+from typing import Any
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -17,23 +18,21 @@ from mosaico_ingest.destinations.memory import MemorySink
 from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import IngestError, SinkError
 from mosaico_ingest.findings import Finding, Severity
-from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.patterns import first_match
 from mosaico_ingest.job.values import IfExists, LoaderErrorPolicy, TopicLevelErrorPolicy
-from mosaico_ingest.pipeline.plan import (
-    Decisions,
+from mosaico_ingest.pipeline.plan import Plan, TopicPlan, digest_of
+from mosaico_ingest.pipeline.plan_document import (
     DestinationState,
-    Plan,
     PlanDocument,
     RecordingPlan,
     Sample,
     SampleRejection,
-    TopicPlan,
-    decisions,
     notes,
 )
-from mosaico_ingest.pipeline.planning import resolve
+from mosaico_ingest.pipeline.planning import plan_recording
 from mosaico_ingest.pipeline.run import open_job, preflight
+from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.pipeline.topic import TopicPipeline
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.protocol import check_topic_name
@@ -54,8 +53,8 @@ __all__ = [
 
 def ask_destination(plan: Plan, samples: Iterable[Sample], *, connect: bool) -> DestinationState:
     """Return the state of the destination; a server is asked only with `connect`."""
-    destination = destination_of(plan.target)
-    status = destination.inspect(plan.sequence, connect=connect)
+    destination = destination_of(plan.destination)
+    status = destination.inspect(plan.sequence.name, connect=connect)
     taken: bool | None = None if status.exists is None else status.sequence is not None
     problem = status.problem
     if problem is None and status.sequence is not None:
@@ -84,9 +83,9 @@ def space_finding(state: DestinationState) -> Finding | None:
 
 def _sequence_problem(plan: Plan, existing: ExistingSequence) -> str | None:
     """Return why a plan cannot write a sequence that exists, None if it can."""
-    if plan.if_exists is IfExists.FAIL:
-        return f"there is a sequence {plan.sequence!r}, and sequence.if_exists is fail"
-    if plan.if_exists is IfExists.APPEND:
+    if plan.sequence.if_exists is IfExists.FAIL:
+        return f"there is a sequence {plan.sequence.name!r}, and sequence.if_exists is fail"
+    if plan.sequence.if_exists is IfExists.APPEND:
         try:
             for topic in plan.topics:
                 stored = existing.topics.get(check_topic_name(topic.target))
@@ -130,7 +129,7 @@ _LOOK_S = 5.0
 
 def try_messages(plan: Plan, recording: Recording) -> tuple[Sample, ...]:
     """Decode and adapt the first messages of every topic of the plan; nothing is written."""
-    with MemorySink().open(plan.sequence, plan.metadata) as session:
+    with MemorySink().open(plan.sequence.name, plan.sequence.metadata) as session:
         trials = tuple(_trial(topic, recording, session) for topic in plan.topics)
         by_connection = {connection: trial for trial in trials for connection in trial.topic.plan.connections}
         with WriteBuffer(max_bytes=_MEMORY_BYTES) as buffer:
@@ -175,7 +174,7 @@ class _Trial(Struct, frozen=True):
 def _trial(topic: TopicPlan, recording: Recording, session: Session) -> _Trial:
     """Open a topic's stream so that a lost message costs nothing but itself."""
     tally = _Tally()
-    patient = replace(topic, on_error=TopicLevelErrorPolicy.Ignore)
+    patient = topic.replace(on_error=TopicLevelErrorPolicy.Ignore)
     pipeline = TopicPipeline(patient, LoaderErrorPolicy.IGNORE, session, tally)
     connections = {connection.id: connection for connection in recording.connections}
     for connection in topic.connections:
@@ -216,29 +215,27 @@ def _look(
             return
 
 
-def plan_document(
-    configs: Sequence[ROSInjectionConfig], *, job: Path, folder: Path, connect: bool
-) -> PlanDocument:
-    """Return what a manifest's configurations would do, as a document for `folder`.
+def plan_document(jobs: Sequence[Job], *, manifest: Path, folder: Path, connect: bool) -> PlanDocument:
+    """Return the plan document of a manifest's jobs, with paths relative to `folder`.
 
     Raises:
         IngestError: One of them cannot be done; of several that cannot, `findings` says why of each.
     """
-    tried = [_tried(config, connect=connect) for config in configs]
+    tried = [_tried(job, connect=connect) for job in jobs]
     planned = tuple(one for one in tried if isinstance(one, RecordingPlan))
     refused = [one for one in tried if isinstance(one, IngestError)]
     if refused:
         raise refused[0] if len(tried) == 1 else _all_of(refused, len(tried))
     return PlanDocument(
         tool=f"mosaico-ingest {__version__}",
-        job=Path(relpath(job, folder)).as_posix(),
+        job=Path(relpath(manifest, folder)).as_posix(),
         recordings=planned,
     )
 
 
-def _tried(config: ROSInjectionConfig, *, connect: bool) -> RecordingPlan | IngestError:
+def _tried(job: Job, *, connect: bool) -> RecordingPlan | IngestError:
     try:
-        return preview(config, connect=connect)
+        return preview(job, connect=connect)
     except IngestError as error:
         return error
 
@@ -256,39 +253,39 @@ def _all_of(refused: Sequence[IngestError], count: int) -> IngestError:
     return one
 
 
-def preview(config: ROSInjectionConfig, *, connect: bool) -> RecordingPlan:
+def preview(job: Job, *, connect: bool) -> RecordingPlan:
     """Open the recording, decide everything, try a few messages, ask the destination (a server only with `connect`).
 
     Raises:
         IngestError: The job cannot be done; the message says why.
     """
-    bridge = ROSBridge.for_config(config)
-    with open_job(config) as (recording, resolver):
-        plan = resolve(config, recording, bridge=bridge, resolver=resolver)
+    bridge = ROSBridge.for_job(job)
+    with open_job(job) as (recording, resolver):
+        plan = plan_recording(Task(job), recording, bridge=bridge, resolver=resolver)
         samples = try_messages(plan, recording)
         unreadable_ranges = tuple(_unreadable(recording))
-    decided = decisions(plan, folder=config.base_dir)
+    document = plan.document(folder=job.folder)
     state = ask_destination(plan, samples, connect=connect)
     warnings = preflight(plan) if connect and state.exists else ()
     found = (finding for finding in (space_finding(state), *warnings) if finding is not None)
     return RecordingPlan(
-        digest=decided.digest,
-        decisions=decided,
+        digest=digest_of(document),
+        plan=document,
         destination=state,
         samples=samples,
-        notes=notes((*plan.findings, *unreadable_ranges, *_chosen(config, plan), *_excluded(plan), *found)),
+        notes=notes((*plan.findings, *unreadable_ranges, *_chosen(job, plan), *_excluded(plan), *found)),
     )
 
 
-def decide(config: ROSInjectionConfig, *, folder: Path) -> Decisions:
-    """Open the recording and decide everything; paths are seen from `folder`.
+def decide(job: Job, *, folder: Path) -> dict[str, Any]:
+    """Open the recording and return its plan as a document; paths are relative to `folder`.
 
     Raises:
         IngestError: The job cannot be done; the message says why.
     """
-    bridge = ROSBridge.for_config(config)
-    with open_job(config) as (recording, resolver):
-        return decisions(resolve(config, recording, bridge=bridge, resolver=resolver), folder=folder)
+    bridge = ROSBridge.for_job(job)
+    with open_job(job) as (recording, resolver):
+        return plan_recording(Task(job), recording, bridge=bridge, resolver=resolver).document(folder=folder)
 
 
 def _unreadable(recording: Recording) -> Iterator[Finding]:
@@ -297,12 +294,12 @@ def _unreadable(recording: Recording) -> Iterator[Finding]:
         yield Finding("unreadable-range", Severity.WARNING, f"{where}: {item.reason}")
 
 
-def _chosen(config: ROSInjectionConfig, plan: Plan) -> Iterator[Finding]:
+def _chosen(job: Job, plan: Plan) -> Iterator[Finding]:
     """Yield a note for each topic whose adapter the manifest names, with the line that does."""
     for topic in plan.topics:
-        glob = first_match(config.adapter_override, topic.topic)
+        glob = first_match(job.adapters.override, topic.topic)
         if glob is not None:
-            place = config.places.get(("adapters", "override", glob))
+            place = job.span("adapters", "override", glob)
             yield Finding(
                 "adapter-override", Severity.INFO, f"{topic.topic}: {topic.adapter.name} by {glob!r}", place
             )

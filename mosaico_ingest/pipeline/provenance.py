@@ -20,7 +20,7 @@ from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import BagError, SequenceExists
 from mosaico_ingest.findings import escape_undecodable
 from mosaico_ingest.job.values import PROVENANCE_KEY, IfExists, Target
-from mosaico_ingest.pipeline.plan import Plan, decisions
+from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.quarantine import quarantine_file_name
 from mosaico_ingest.remote import AnyPath, RemotePath
 from mosaico_ingest.version import __version__
@@ -166,27 +166,27 @@ def check_provenance(plan: Plan) -> SequenceRequest | None:
         SequenceExists: `if_exists` is `skip`, and the stored sequence has other content or is of another job.
     """
     provenance = read_provenance(plan)
-    if_exists = plan.if_exists
+    if_exists = plan.sequence.if_exists
     if plan.attempt is not None and plan.attempt.number > 1:
         if_exists = _remove_earlier_attempt(plan, plan.attempt.run)
-    destination = destination_of(plan.target)
+    destination = destination_of(plan.destination)
     needed = if_exists is not IfExists.APPEND and (
         if_exists is not IfExists.REPLACE or destination.replaces_atomically
     )
-    stored = stored_provenance(plan.target, plan.sequence) if needed else None
+    stored = stored_provenance(plan.destination, plan.sequence.name) if needed else None
     provenance = add_doubtful_digests(provenance, plan.files, stored)
     if if_exists is IfExists.SKIP:
-        decision = decide_skip(provenance, stored, plan.sequence)
+        decision = decide_skip(provenance, stored, plan.sequence.name)
         if decision is None:
             return None
         if_exists = decision
     elif stored is not None and if_exists is IfExists.FAIL and is_repeatable(provenance, stored):
         if_exists = IfExists.REPLACE
-    quarantine_file = quarantine_file_name(plan.sequence) if plan.quarantine else None
+    quarantine_file = quarantine_file_name(plan.sequence.name) if plan.quarantine else None
     provenance = _add_full_digests(provenance, plan.files).model_copy(update={"quarantine": quarantine_file})
     return SequenceRequest(
-        name=plan.sequence,
-        metadata={**plan.metadata, PROVENANCE_KEY: provenance.model_dump(mode="json")},
+        name=plan.sequence.name,
+        metadata={**plan.sequence.metadata, PROVENANCE_KEY: provenance.model_dump(mode="json")},
         if_exists=if_exists,
         quarantine_file=quarantine_file,
         replaces_stored=stored is not None
@@ -201,7 +201,7 @@ def read_provenance(plan: Plan) -> Provenance:
         tool=__version__,
         job=_job_digest(plan),
         sources=tuple(map(_source, plan.files)),
-        family=plan.family,
+        family=plan.sequence.family,
         run=plan.attempt.run if plan.attempt else None,
     )
 
@@ -281,14 +281,16 @@ def _remove_earlier_attempt(plan: Plan, run: str) -> IfExists:
     A server knows only the provenance of a sequence's first session, so sessions that were appended to another run's
     sequence are not recognized there.
     """
-    destination = destination_of(plan.target)
-    existing = destination.find(plan.sequence)
+    destination = destination_of(plan.destination)
+    existing = destination.find(plan.sequence.name)
     if existing is None:
-        return plan.if_exists
+        return plan.sequence.if_exists
     own = [s.id for s in existing.sessions if any(record.run == run for record in _records([s.metadata]))]
-    if own and (len(own) == len(existing.sessions) or not destination.delete_sessions(plan.sequence, own)):
+    if own and (
+        len(own) == len(existing.sessions) or not destination.delete_sessions(plan.sequence.name, own)
+    ):
         return IfExists.REPLACE
-    return plan.if_exists
+    return plan.sequence.if_exists
 
 
 def _records(metadata: Iterable[Mapping[str, Any]]) -> tuple[Provenance, ...]:
@@ -314,9 +316,13 @@ def _source(path: AnyPath) -> Source:
 
 def _job_digest(plan: Plan) -> str:
     """Return a digest of the decisions about the stored rows: not of paths, the destination or `if_exists`."""
-    excluded: dict[str, Any] = {"files": True, "destination": True, "if_exists": True, "quarantine": {"path"}}
-    document = decisions(plan, folder=Path()).model_dump(mode="json", exclude=excluded)
-    document["metadata"] = dict(plan.metadata)
+    document = plan.document(folder=Path())
+    for key in ("files", "destination"):
+        del document[key]
+    for key in ("if_exists", "family"):
+        del document["sequence"][key]
+    if document["quarantine"] is not None:
+        del document["quarantine"]["path"]
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:32]
 
 

@@ -172,7 +172,7 @@ def _open_quarantine(plan: Plan, request: SequenceRequest) -> Quarantine | None:
         return None
     counts = [topic.count for topic in plan.topics]
     promised = None if None in counts else sum(count or 0 for count in counts)
-    return Quarantine(plan.quarantine, plan.sequence, promised, name=request.quarantine_file)
+    return Quarantine(plan.quarantine, plan.sequence.name, promised, name=request.quarantine_file)
 
 
 def _open_topics(
@@ -188,7 +188,7 @@ def _open_topics(
     topics: list[TopicPipeline] = []
     for topic_plan in plan.topics:
         topic = TopicPipeline(
-            topic_plan, plan.on_message_error, session, observe, quarantine=quarantine, stopwatch=stopwatch
+            topic_plan, plan.on_error.message, session, observe, quarantine=quarantine, stopwatch=stopwatch
         )
         for connection in topic_plan.connections:
             topic.bind(connections[connection])
@@ -289,7 +289,7 @@ def _keeps_partial(
         return False
     if isinstance(failure, Interrupted) and request.if_exists is IfExists.APPEND:
         return False
-    return plan.on_error is SessionLevelErrorPolicy.Report and any(topic.rows for topic in topics)
+    return plan.on_error.session is SessionLevelErrorPolicy.Report and any(topic.rows for topic in topics)
 
 
 def _as_interrupt(error: BaseException) -> BaseException:

@@ -17,7 +17,8 @@ from msgspec import Struct
 
 from mosaico_ingest.errors import BagError, NothingMatched, SinkError
 from mosaico_ingest.findings import RowFailure, Stage
-from mosaico_ingest.job.config import Limit, QuarantineSettings
+from mosaico_ingest.job.model import QuarantineSettings
+from mosaico_ingest.job.values import Limit
 from mosaico_ingest.rosbag.blocks import Connection, MessageBlock
 from mosaico_ingest.rosbag.definitions.model import Source
 from mosaico_ingest.rosbag.writers import McapWriter
@@ -104,7 +105,7 @@ class Quarantine:
     ) -> None:
         """Prepare a quarantine; `promised` is the number of messages in the index, None if it is unknown."""
         self.systematic = settings.systematic
-        self.messages_path = settings.path / (name or quarantine_file_name(sequence))
+        self.messages_path = Path(settings.path) / (name or quarantine_file_name(sequence))
         self.count = 0
         """Number of quarantined messages."""
         self._settings = settings

@@ -14,13 +14,14 @@ from mosaico_ingest.destinations.base import Sink
 from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.findings import Finding
-from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import LoaderErrorPolicy
 from mosaico_ingest.pipeline.plan import Plan
-from mosaico_ingest.pipeline.planning import resolve
+from mosaico_ingest.pipeline.planning import plan_recording
 from mosaico_ingest.pipeline.provenance import check_provenance
 from mosaico_ingest.pipeline.pump import verify, write_sequence
 from mosaico_ingest.pipeline.rejection_log import RejectionLog
+from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.report.collect import Collector
 from mosaico_ingest.report.events import (
     Event,
@@ -61,19 +62,20 @@ class Outcome(Struct, frozen=True):
     error: IngestError | None = None
 
 
-def run_recording(job: ROSInjectionConfig, observe: Observer = ignore_events) -> Outcome:
-    """Ingest one recording, or plan it if the job is a dry run; every error, expected or not, is part of the outcome.
+def run_recording(task: Task, observe: Observer = ignore_events) -> Outcome:
+    """Ingest one recording, or plan it if the task is a dry run; every error, expected or not, is part of the outcome.
 
     Raises:
         Abandoned: The observer is gone; the session was discarded.
     """
-    events = _RunEvents(job, observe)
+    job = task.job
+    events = _RunEvents(task, observe)
     stopwatch = events.stopwatch
     try:
-        with _log_level(job.log_level), open_job(job) as (recording, resolver):
-            plan = _resolve(job, recording, resolver)
+        with _log_level(job.run.log_level), open_job(job) as (recording, resolver):
+            plan = _plan(task, recording, resolver)
             events.start(plan)
-            request = None if job.dry_run else check_provenance(plan)
+            request = None if task.dry_run else check_provenance(plan)
             if request is None:
                 return events.skip()
             sink = _open_sink(plan, events)
@@ -103,50 +105,51 @@ def _log_level(level: str) -> Generator[None]:
 
 
 @contextmanager
-def open_job(job: ROSInjectionConfig) -> Generator[tuple[Recording, TypeResolver]]:
+def open_job(job: Job) -> Generator[tuple[Recording, TypeResolver]]:
     """Open the recording of a job with the resolver for its message definitions.
 
     Raises:
         BagError: The recording cannot be opened.
     """
-    custom = [(package, Path(path), store) for package, path, store in job.custom_msgs]
-    resolver = TypeResolver(job.ros_distro, custom, registry=job.registry or ROSTypeRegistry)
+    custom = [(messages.package, Path(messages.path), messages.store) for messages in job.bag.custom_msgs]
+    resolver = TypeResolver(job.bag.ros_distro, custom, registry=job.registry or ROSTypeRegistry)
     with open_recording(job.paths, resolve=resolver) as recording:
         yield recording, resolver
 
 
-def make_plan(job: ROSInjectionConfig) -> Plan:
-    """Open the recording of a job and decide everything, without writing.
+def make_plan(task: Task) -> Plan:
+    """Open the recording of a task and decide everything, without writing.
 
     Raises:
         IngestError: The job does not fit the recording.
     """
-    with open_job(job) as (recording, resolver):
-        return _resolve(job, recording, resolver)
+    with open_job(task.job) as (recording, resolver):
+        return _plan(task, recording, resolver)
 
 
 def preflight(plan: Plan) -> tuple[Finding, ...]:
     """Return the warnings of the destination about a run."""
-    return destination_of(plan.target).preflight(plan.sequence, plan.on_error)
+    return destination_of(plan.destination).preflight(plan.sequence.name, plan.on_error.session)
 
 
-def failed_report(job: ROSInjectionConfig, error: IngestError, observe: Observer) -> Report:
+def failed_report(task: Task, error: IngestError, observe: Observer) -> Report:
     """Return the report of a recording that was not started."""
-    return _RunEvents(job, observe).fail(error).report
+    return _RunEvents(task, observe).fail(error).report
 
 
-def _resolve(job: ROSInjectionConfig, recording: Recording, resolver: TypeResolver) -> Plan:
-    return resolve(job, recording, bridge=ROSBridge.for_config(job), resolver=resolver)
+def _plan(task: Task, recording: Recording, resolver: TypeResolver) -> Plan:
+    bridge = ROSBridge.for_job(task.job, folder=task.adapter_folder)
+    return plan_recording(task, recording, bridge=bridge, resolver=resolver)
 
 
 def _open_sink(plan: Plan, events: _RunEvents) -> Sink:
     """Open the destination, and report its warnings."""
     for warning in preflight(plan):
         events(Noted(warning))
-    return destination_of(plan.target).open_sink(buffer_bytes=plan.memory.sink_bytes)
+    return destination_of(plan.destination).open_sink(buffer_bytes=plan.memory.sink_bytes)
 
 
-def _unexpected(job: ROSInjectionConfig, cause: Exception) -> IngestError:
+def _unexpected(job: Job, cause: Exception) -> IngestError:
     first_line = str(cause).strip().partition("\n")[0]
     name = type(cause).__name__
     error = IngestError(
@@ -161,13 +164,13 @@ def _unexpected(job: ROSInjectionConfig, cause: Exception) -> IngestError:
 class _RunEvents:
     """Passes the events of one run to its observer and collects them into the report."""
 
-    def __init__(self, job: ROSInjectionConfig, observe: Observer) -> None:
+    def __init__(self, task: Task, observe: Observer) -> None:
         self.stopwatch = Stopwatch()
-        self._job = job
+        self._task = task
         self._observe = observe
         self._log_rejection = ignore_events
-        if job.messages_on_error is LoaderErrorPolicy.LOG_WARN:
-            self._log_rejection = RejectionLog(job.sequence_name)
+        if task.job.on_error.message is LoaderErrorPolicy.LOG_WARN:
+            self._log_rejection = RejectionLog(task.job.sequence.name)
         self._collector = Collector(self.stopwatch)
         self._started = False
 
@@ -183,7 +186,7 @@ class _RunEvents:
         self(_run_started(plan))
         for finding in plan.findings:
             self(Noted(finding))
-        if not self._job.dry_run:
+        if not self._task.dry_run:
             for event in _unreadable_by_plan(plan):
                 self(event)
 
@@ -206,7 +209,7 @@ class _RunEvents:
         if self._started:
             self._report_times()
         else:
-            self(_not_planned(self._job))
+            self(_not_planned(self._task.job))
         status = RunStatus.INTERRUPTED if isinstance(error, Interrupted) else RunStatus.FAILED
         self(RunFinished(status, error.exit_code, str(error), error.findings))
         return Outcome(self._collector.report(), error)
@@ -225,18 +228,18 @@ def _run_started(plan: Plan) -> RunStarted:
         Expected(t.topic, t.topic, t.msgtype, "", "", t.why, t.count, excluded=True) for t in plan.excluded
     )
     return RunStarted(
-        sequence=plan.sequence,
-        destination=destination_of(plan.target).describe(),
+        sequence=plan.sequence.name,
+        destination=destination_of(plan.destination).describe(),
         files=tuple(str(path) for path in plan.files),
         source_bytes=plan.source_bytes,
         topics=(*selected, *excluded),
     )
 
 
-def _not_planned(job: ROSInjectionConfig) -> RunStarted:
+def _not_planned(job: Job) -> RunStarted:
     return RunStarted(
-        sequence=job.sequence_name,
-        destination=destination_of(job.target).describe(),
+        sequence=job.sequence.name,
+        destination=destination_of(job.destination).describe(),
         files=tuple(str(path) for path in job.paths),
         source_bytes=0,
         topics=(),

@@ -26,8 +26,10 @@ from mosaico_ingest.errors import AdapterError, BagError, DecodeError, NothingMa
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.manifest import load_manifest
+from mosaico_ingest.job.model import Job
 from mosaico_ingest.pipeline.compile import compile_manifest
 from mosaico_ingest.pipeline.run import make_plan
+from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.rosbag.blocks import Connection, MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import (
@@ -275,18 +277,17 @@ def explain_topics(
         IngestError: The job cannot be done; the message says why.
     """
     if job is not None:
-        configs = compile_manifest(load_manifest(job))
+        jobs = compile_manifest(load_manifest(job))
     else:
-        configs = (
-            ROSInjectionConfig(
-                file_path=bag or Path(), sequence_name="explained", ros_distro=distro, custom_msgs=custom
-            ),
+        config = ROSInjectionConfig(
+            file_path=bag or Path(), sequence_name="explained", ros_distro=distro, custom_msgs=custom
         )
-    return tuple(choice for config in configs for choice in _choices(config))
+        jobs = (config.job,)
+    return tuple(choice for each in jobs for choice in _choices(each))
 
 
-def _choices(config: ROSInjectionConfig) -> Iterator[TopicChoice]:
-    plan = make_plan(config)
+def _choices(job: Job) -> Iterator[TopicChoice]:
+    plan = make_plan(Task(job))
     name = ", ".join(path.name for path in plan.files)
     chosen = [
         TopicChoice(name, one.topic, one.msgtype, one.adapter.name, one.ontology.tag, one.why)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from mosaico_ingest.adapters.bridge import ROSBridge
 from mosaico_ingest.documents import Part
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.patterns import select
 from mosaico_ingest.pipeline.plan import ExcludedTopic
-from mosaico_ingest.pipeline.planning import decide
+from mosaico_ingest.pipeline.planning import plan_connection
 from mosaico_ingest.pipeline.run import open_job
 from mosaico_ingest.rosbag.blocks import Connection
 
@@ -59,18 +59,18 @@ class Inspection(Part):
         return (self.end_ns - self.start_ns) / 1e9
 
 
-def inspect(config: ROSInjectionConfig) -> Inspection:
+def inspect(job: Job) -> Inspection:
     """Open the recording and describe it.
 
     Raises:
         BagError: It cannot be opened.
     """
-    bridge = ROSBridge.for_config(config)
-    with open_job(config) as (recording, _):
+    bridge = ROSBridge.for_job(job)
+    with open_job(job) as (recording, _):
         duration_ns = None
         if recording.start_ns is not None and recording.end_ns is not None:
             duration_ns = recording.end_ns - recording.start_ns
-        topics = [_topic(config, connection, bridge, duration_ns) for connection in recording.connections]
+        topics = [_topic(job, connection, bridge, duration_ns) for connection in recording.connections]
         return Inspection(
             files=tuple(str(path) for path in recording.files),
             container=recording.container,
@@ -83,13 +83,13 @@ def inspect(config: ROSInjectionConfig) -> Inspection:
         )
 
 
-def _topic(
-    config: ROSInjectionConfig, connection: Connection, bridge: ROSBridge, duration_ns: int | None
-) -> InspectedTopic:
+def _topic(job: Job, connection: Connection, bridge: ROSBridge, duration_ns: int | None) -> InspectedTopic:
     try:
-        outcome = decide(config, connection, select((), [connection.topic]), bridge, "")
+        outcome = plan_connection(job, connection, select((), [connection.topic]), bridge, "")
     except AdapterError as error:
-        outcome = ExcludedTopic(connection.topic, connection.msgtype, connection.count, str(error))
+        outcome = ExcludedTopic(
+            topic=connection.topic, msgtype=connection.msgtype, count=connection.count, why=str(error)
+        )
     rate = None
     if connection.count and connection.count > 1 and duration_ns:
         rate = (connection.count - 1) / (duration_ns / 1e9)

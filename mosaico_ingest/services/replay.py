@@ -6,7 +6,6 @@ import sqlite3
 import sys
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from enum import Enum
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from msgspec import Struct
 from mosaico_ingest.destinations.store.files import Lease
 from mosaico_ingest.errors import ManifestError, NothingMatched, SinkUnavailable
 from mosaico_ingest.findings import escape_undecodable, join_names
-from mosaico_ingest.job.config import QuarantineSettings, ROSInjectionConfig, TimeRange
+from mosaico_ingest.job.model import ErrorPolicy, Job, QuarantineSettings, TimeRange, TopicSettings
 from mosaico_ingest.job.values import IfExists, SessionLevelErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.pipeline.provenance import content_digest, stored_provenance
 from mosaico_ingest.pipeline.quarantine import QuarantineFile, find_quarantine_files
@@ -41,7 +40,7 @@ class Replay(Struct, frozen=True):
 
     kept: QuarantineFile
     whereabouts: Whereabouts
-    config: ROSInjectionConfig
+    job: Job
 
 
 @contextmanager
@@ -69,7 +68,7 @@ def alone(folder: Path) -> Generator[None, None, None]:
         lease.release()
 
 
-def replays(folder: Path, configs: Sequence[ROSInjectionConfig]) -> tuple[Replay, ...]:
+def replays(folder: Path, jobs: Sequence[Job]) -> tuple[Replay, ...]:
     """Return what lies in a quarantine, each with the configuration of its sequence.
 
     Raises:
@@ -77,24 +76,24 @@ def replays(folder: Path, configs: Sequence[ROSInjectionConfig]) -> tuple[Replay
         ManifestError: None of the configurations is for a sequence that has messages there.
         BagError: A file there cannot be read.
     """
-    known = {config.sequence_name: config for config in configs}
+    known = {job.sequence.name: job for job in jobs}
     return tuple(_replay(kept, known) for kept in find_quarantine_files(folder))
 
 
-def _replay(kept: QuarantineFile, known: dict[str, ROSInjectionConfig]) -> Replay:
+def _replay(kept: QuarantineFile, known: dict[str, Job]) -> Replay:
     if kept.sequence not in known:
         raise ManifestError(
             f"{kept.messages.name} belongs to the sequence {kept.sequence!r}, which the manifest does not make",
-            where=next((config.where for config in known.values()), None),
+            where=next((job.origin.file for job in known.values()), None),
             hint=f"it makes {join_names(known)}",
         )
-    config = known[kept.sequence]
-    return Replay(kept, _whereabouts(kept, config), _configuration(kept, config))
+    job = known[kept.sequence]
+    return Replay(kept, _whereabouts(kept, job), _replay_job(kept, job))
 
 
-def _whereabouts(kept: QuarantineFile, config: ROSInjectionConfig) -> Whereabouts:
+def _whereabouts(kept: QuarantineFile, job: Job) -> Whereabouts:
     """Ask the provenances of the sequence; a server keeps that of its first session only, and adds to no topic twice."""
-    stored = stored_provenance(config.target, kept.sequence)
+    stored = stored_provenance(job.destination, kept.sequence)
     if stored is None:
         return Whereabouts.FORGOTTEN
     name = escape_undecodable(kept.messages.name)
@@ -107,21 +106,27 @@ def _whereabouts(kept: QuarantineFile, config: ROSInjectionConfig) -> Whereabout
     return Whereabouts.WAITING
 
 
-def _configuration(kept: QuarantineFile, config: ROSInjectionConfig) -> ROSInjectionConfig:
-    """Return the configuration of a sequence for messages kept of it: all of them, added to what is there, or none.
+def _replay_job(kept: QuarantineFile, job: Job) -> Job:
+    """Return the job that appends quarantined messages to their sequence: all of them, or none.
 
-    What fails again is kept again, however much: the copy that is there is put away.
+    Messages that fail again are quarantined again without a limit, because the current copy is set aside.
     """
-    folder = config.quarantine.path if config.quarantine else kept.messages.parent
-    return replace(
-        config,
-        file_path=kept.messages,
-        if_exists=IfExists.APPEND,
-        on_error=SessionLevelErrorPolicy.Delete,
-        topics_on_error=TopicLevelErrorPolicy.Raise,
+    folder = job.quarantine.path if job.quarantine else str(kept.messages.parent)
+    return job.replace(
+        bag=job.bag.replace(path=str(kept.messages), time=TimeRange()),
+        paths=(kept.messages,),
+        sequence=job.sequence.replace(if_exists=IfExists.APPEND),
+        on_error=ErrorPolicy(
+            session=SessionLevelErrorPolicy.Delete,
+            topic=TopicLevelErrorPolicy.Raise,
+            message=job.on_error.message,
+        ),
         topics=(),
-        every={},
-        time_range=TimeRange(),
-        quarantine=QuarantineSettings(folder, systematic=sys.maxsize),
-        plan_digest=None,
+        topic_settings={
+            topic: TopicSettings.model_construct(
+                **{key: getattr(settings, key) for key in settings.model_fields_set - {"every"}}
+            )
+            for topic, settings in job.topic_settings.items()
+        },
+        quarantine=QuarantineSettings(path=folder).replace(systematic=sys.maxsize),
     )

@@ -8,7 +8,7 @@ from enum import Enum
 from msgspec import Struct
 
 from mosaico_ingest.errors import IngestError, SequenceExists
-from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.pipeline.provenance import (
     add_doubtful_digests,
@@ -17,6 +17,7 @@ from mosaico_ingest.pipeline.provenance import (
     stored_provenance,
 )
 from mosaico_ingest.pipeline.run import make_plan
+from mosaico_ingest.pipeline.task import Task
 
 __all__ = ["RecordingStatus", "Status", "recording_statuses"]
 
@@ -46,21 +47,21 @@ class RecordingStatus(Struct, frozen=True):
     """The reason of a status other than `done` or `new`."""
 
 
-def recording_statuses(jobs: Iterable[ROSInjectionConfig]) -> Iterator[RecordingStatus]:
+def recording_statuses(jobs: Iterable[Job]) -> Iterator[RecordingStatus]:
     """Yield the status of each recording; read-only."""
     for job in jobs:
         status, reason = _status(job)
-        yield RecordingStatus(job.sequence_name, tuple(map(str, job.paths)), status, reason)
+        yield RecordingStatus(job.sequence.name, tuple(map(str, job.paths)), status, reason)
 
 
-def _status(job: ROSInjectionConfig) -> tuple[Status, str]:
+def _status(job: Job) -> tuple[Status, str]:
     try:
-        plan = make_plan(job)
-        stored = stored_provenance(plan.target, plan.sequence)
+        plan = make_plan(Task(job))
+        stored = stored_provenance(plan.destination, plan.sequence.name)
         if stored is None:
             return Status.NEW, ""
         provenance = add_doubtful_digests(read_provenance(plan), plan.files, stored)
-        decision = decide_skip(provenance, stored, plan.sequence)
+        decision = decide_skip(provenance, stored, plan.sequence.name)
     except SequenceExists as error:
         return Status.CHANGED, error.what
     except IngestError as error:

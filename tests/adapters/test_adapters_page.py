@@ -13,7 +13,7 @@ from mosaico_ingest.adapters import python as base
 from mosaico_ingest.adapters.bridge import ROSBridge, load_adapter_reference
 from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.adapters.builtin_files import with_catalog
-from mosaico_ingest.job.sections import AdaptersSection
+from mosaico_ingest.job.model import AdapterSettings
 from mosaico_ingest.rosbag.blocks import ROSMessage
 
 PAGE = (Path(__file__).parents[2] / "docs" / "adapters.md").read_text("utf-8")
@@ -45,4 +45,4 @@ def test_adapters_page_python_example_runs(tmp_path: Path) -> None:
 
 
 def test_adapters_page_manifest_example_is_valid() -> None:
-    AdaptersSection.model_validate(yaml.safe_load(_block("yaml"))["adapters"])
+    AdapterSettings.model_validate(yaml.safe_load(_block("yaml"))["adapters"])

@@ -248,7 +248,7 @@ def test_bridge_for_config_applies_settings(tmp_path: Path) -> None:
         adapters=["ticks.yaml"],
         base_dir=tmp_path,
     )
-    bridge = ROSBridge.for_config(config)
+    bridge = ROSBridge.for_job(config.job)
     assert bridge.resolve("/imu", IMU).reason == "override"
     assert bridge.resolve("/ticks", "std_msgs/msg/Int32").reason == "loaded"
 

@@ -235,9 +235,9 @@ def test_an_inspection_of_nothing_says_so(ingest: Ingest, tmp_path: Path) -> Non
     ("settings", "place"),
     [
         ("sequence: {name: a/b}", "job.yaml:2:18: sequence name 'a/b' has '/'"),
-        ("sequence: {metadata: {a.b: 1}}", "job.yaml: metadata key 'a.b'"),
-        ('topic_settings: {/imu: {rename: "/a b"}}', "job.yaml: topic /imu: topic name '/a b' has ' '"),
-        ("topic_settings: {/imu: {metadata: {a.b: 1}}}", "job.yaml: topic /imu: metadata key 'a.b'"),
+        ("sequence: {metadata: {a.b: 1}}", "job.yaml:2:22: metadata key 'a.b'"),
+        ('topic_settings: {/imu: {rename: "/a b"}}', "job.yaml:2:33: topic name '/a b' has ' '"),
+        ("topic_settings: {/imu: {metadata: {a.b: 1}}}", "job.yaml:2:35: metadata key 'a.b'"),
     ],
 )
 def test_a_name_that_the_platform_refuses_is_a_mistake_of_the_manifest(

@@ -14,7 +14,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from mosaico_ingest.cli.app import main
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.pipeline.plan import PlanDocument
+from mosaico_ingest.pipeline.plan import digest_of
+from mosaico_ingest.pipeline.plan_document import PlanDocument
 
 ROOT = Path(__file__).resolve().parents[2]
 JOB = "configs/quickstart.yaml"
@@ -93,9 +94,8 @@ def test_an_adapter_that_is_named_is_told_with_the_line_that_does(ingest: Ingest
     (note,) = (note for note in recording.notes if note.rule == "adapter-override")
     assert note.message == "/odom: OdometryAdapter by '/od*'"
     assert note.place == location('"/od*"')
-    kept = recording.decisions.quarantine
-    assert kept is not None
-    assert (kept.path, kept.max) == ("quarantine", 0.01)
+    quarantine = recording.plan["quarantine"]
+    assert (quarantine["path"], quarantine["max"]) == ("quarantine", 0.01)
 
 
 def test_every_adapter_that_does_not_fit_is_told_at_once(ingest: Ingest) -> None:
@@ -125,9 +125,9 @@ def test_the_document_fits_its_schema_and_reads_back(ingest: Ingest) -> None:
     document = PlanDocument.model_validate_json(said)
     assert document.job == JOB
     (recording,) = document.recordings
-    assert recording.digest == recording.decisions.digest
-    assert [topic.topic for topic in recording.decisions.excluded] == ["/camera/image_raw"]
-    assert sum(topic.count or 0 for topic in recording.decisions.topics) == 2110
+    assert recording.digest == digest_of(recording.plan)
+    assert [topic["topic"] for topic in recording.plan["excluded"]] == ["/camera/image_raw"]
+    assert sum(topic["count"] or 0 for topic in recording.plan["topics"]) == 2110
     assert {sample.target: sample.rejected for sample in recording.samples if sample.rejected} == {}
     assert all(sample.row_bytes for sample in recording.samples)
     assert "_ros_" not in said
@@ -153,9 +153,9 @@ def test_check_tells_what_has_changed(ingest: Ingest) -> None:
     code, said = ingest("plan", JOB, "--check", "plan.json")
     assert code == 1
     lines = said.splitlines()
-    assert "quickstart_drive: metadata vehicle: demo-01 → demo-02" in lines
+    assert "quickstart_drive: sequence metadata vehicle: demo-01 → demo-02" in lines
     assert "quickstart_drive: - topic /odom: nav_msgs/msg/Odometry by OdometryAdapter to MotionState" in lines
-    assert "quickstart_drive: + excluded topic /odom: left out by '!/odom' in `topics`" in lines
+    assert "quickstart_drive: + excluded topic /odom: excluded by '!/odom' in `topics`" in lines
     assert "quickstart_drive: topic /camera/camera_info on_error: ignore → finalize" in lines
     assert len(lines) == 5
 
@@ -168,7 +168,7 @@ def test_a_changed_adapter_is_a_drift_and_a_comment_in_it_is_none(ingest: Ingest
     edit(adapter, "location: header.frame_id", "location: '\"roof\"'")
     code, said = ingest("plan", JOB, "--check", "plan.json")
     assert code == 1
-    assert "topic /battery adapter_digest" in said
+    assert "topic /battery adapter digest" in said
 
 
 def test_a_plan_that_fits_is_run_and_one_that_does_not_is_not(ingest: Ingest) -> None:
@@ -250,13 +250,13 @@ def test_diff_tells_what_another_manifest_would_do(ingest: Ingest) -> None:
     code, said = ingest("diff", JOB, "configs/other.yaml")
     assert code == 1
     lines = said.splitlines()
-    assert "quickstart_drive: sequence: quickstart_drive → other_drive" in lines
+    assert "quickstart_drive: sequence name: quickstart_drive → other_drive" in lines
     assert "quickstart_drive: destination: mosaico → h:6726" in lines
     assert any(line.startswith("quickstart_drive: - topic /battery: ") for line in lines)
     assert any(line.startswith("quickstart_drive: + excluded topic /battery: ") for line in lines)
     code, said = ingest("diff", JOB, "configs/other.yaml", "--json")
     assert code == 1
-    assert {"sequence", "what", "before", "after"} == set(json.loads(said)[0])
+    assert {"sequence", "name", "before", "after"} == set(json.loads(said)[0])
 
 
 def test_a_job_of_a_matrix_is_planned_for_each_combination(ingest: Ingest) -> None:
@@ -266,7 +266,7 @@ def test_a_job_of_a_matrix_is_planned_for_each_combination(ingest: Ingest) -> No
     code, said = ingest("plan", "night.yaml", "--json")
     assert code == 0
     plans = PlanDocument.model_validate_json(said).recordings
-    assert [plan.decisions.sequence for plan in plans] == ["run_1", "run_2"]
+    assert [recording.plan["sequence"]["name"] for recording in plans] == ["run_1", "run_2"]
     code, said = ingest("expand", "night.yaml")
     assert code == 0
     assert "name: run_2\n" in said
@@ -317,7 +317,7 @@ def test_a_plan_of_many_recordings_says_of_each_why_it_cannot_be_ingested(ingest
     Path("a.mcap").unlink()
     assert ingest("plan", "job.yaml", "--json") == (
         3,
-        "error[plan-failed] c.bag: the recording has no topic\n",
+        "error[plan-failed] c.bag: the recording has no topics\n",
     )
 
 

@@ -121,13 +121,13 @@ def test_recording_sizes_one_unknown_returns_equal_sizes(tmp_path: Path) -> None
     (tmp_path / "b").mkdir()
     (tmp_path / "b/0.db3").write_bytes(b"x" * 20)
     (tmp_path / "b/metadata.yaml").write_bytes(b"x" * 5)
-    configs = [
-        ROSInjectionConfig(file_path=tmp_path / name, sequence_name=name.partition(".")[0])
+    jobs = [
+        ROSInjectionConfig(file_path=tmp_path / name, sequence_name=name.partition(".")[0]).job
         for name in ("a.mcap", "b", "gone.mcap")
     ]
-    assert recording_sizes(configs[:2]) == [10, 25]
-    assert recording_sizes(configs) == [1, 1, 1]
-    assert recording_sizes([ROSInjectionConfig(file_path="s3://bucket/a.mcap", sequence_name="a")]) == [1]
+    assert recording_sizes(jobs[:2]) == [10, 25]
+    assert recording_sizes(jobs) == [1, 1, 1]
+    assert recording_sizes([ROSInjectionConfig(file_path="s3://bucket/a.mcap", sequence_name="a").job]) == [1]
 
 
 def test_text_lines_name_with_line_break_prints_one_line() -> None:

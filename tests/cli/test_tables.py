@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -36,8 +35,8 @@ def words(capsys: pytest.CaptureFixture[str]) -> set[str]:
 
 
 def run_quickstart(folder: Path) -> RunReport:
-    (config,) = api.compile_job(JOB)  # whose store is in the checkout
-    return api.run([replace(config, store=folder / "store")])
+    (job,) = api.compile_job(JOB)  # whose store is in the checkout
+    return api.run([job.replace(target=job.target.replace(store=str(folder / "store")))])
 
 
 @pytest.mark.usefixtures("narrow")

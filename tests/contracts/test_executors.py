@@ -22,6 +22,7 @@ from mosaico_ingest.executors.in_process import InProcess
 from mosaico_ingest.executors.processes import Processes, _spawn_worker
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.ontology import IMU, Vector3d
+from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.report.events import (
     Event,
     RunFinished,
@@ -114,9 +115,9 @@ class SlowJoints(ROSAdapterBase[IMU]):
         raise ValueError(min(ros_data))
 
 
-def configs(folder: Path, names: Iterable[str], **more: Any) -> list[ROSInjectionConfig]:
+def tasks(folder: Path, names: Iterable[str], **more: Any) -> list[Task]:
     options: dict[str, Any] = {"store": folder / "store", "topics": ["/imu"], **more}
-    return [ROSInjectionConfig(DRIVE, name, **options) for name in names]
+    return [Task(ROSInjectionConfig(DRIVE, name, **options).job) for name in names]
 
 
 @pytest.fixture(scope="module")
@@ -163,7 +164,7 @@ def elsewhere(request: pytest.FixtureRequest, killed_once: Path) -> Executor:
 
 
 def test_executor_returns_reports_in_order_and_stores_sequences(executor: Executor, tmp_path: Path) -> None:
-    reports = list(executor.map(configs(tmp_path, "abcde"), ignore_batch))
+    reports = list(executor.map(tasks(tmp_path, "abcde"), ignore_batch))
     assert [report.sequence for report in reports] == list("abcde")
     assert {report.status for report in reports} == {RunStatus.COMPLETED}
     assert {report.totals.written for report in reports} == {1000}
@@ -173,8 +174,8 @@ def test_executor_returns_reports_in_order_and_stores_sequences(executor: Execut
 def test_executor_failed_recording_does_not_stop_others(executor: Executor, tmp_path: Path) -> None:
     broken = tmp_path / "broken.mcap"
     broken.write_bytes(b"no recording")
-    jobs = configs(tmp_path, "abc")
-    jobs[1] = ROSInjectionConfig(broken, "b", store=tmp_path / "store")
+    jobs = tasks(tmp_path, "abc")
+    jobs[1] = Task(ROSInjectionConfig(broken, "b", store=tmp_path / "store").job)
     reports = list(executor.map(jobs, ignore_batch))
     assert [report.exit_code for report in reports] == [0, 1, 0]
     assert "broken.mcap" in (reports[1].error or "")
@@ -183,7 +184,7 @@ def test_executor_failed_recording_does_not_stop_others(executor: Executor, tmp_
 
 def test_executor_events_state_their_recording(executor: Executor, tmp_path: Path) -> None:
     told: list[tuple[int, Event]] = []
-    list(executor.map(configs(tmp_path, "abc"), lambda position, event: told.append((position, event))))
+    list(executor.map(tasks(tmp_path, "abc"), lambda position, event: told.append((position, event))))
     for position, name in enumerate("abc"):
         events = [event for at, event in told if at == position]
         assert isinstance(events[0], RunStarted)
@@ -193,7 +194,7 @@ def test_executor_events_state_their_recording(executor: Executor, tmp_path: Pat
 
 
 def test_executor_sends_adapter_classes_to_workers(executor: Executor, tmp_path: Path) -> None:
-    jobs = configs(tmp_path, "ab", adapter_override={"/imu": Refusing}, topics_on_error="raise")
+    jobs = tasks(tmp_path, "ab", adapter_override={"/imu": Refusing}, topics_on_error="raise")
     reports = list(executor.map(jobs, ignore_batch))
     assert [report.exit_code for report in reports] == [1, 1]
 
@@ -204,7 +205,7 @@ def test_executor_sends_registered_types_to_workers(executor: Executor, tmp_path
     before = ROSTypeRegistry.snapshot()
     ROSTypeRegistry.register("acme_msgs/msg/OnlyHere", "uint8 x")
     try:
-        reports = list(executor.map(configs(tmp_path, "ab"), ignore_batch))
+        reports = list(executor.map(tasks(tmp_path, "ab"), ignore_batch))
     finally:
         ROSTypeRegistry.restore(before)
     assert [report.exit_code for report in reports] == [0, 0]
@@ -215,8 +216,8 @@ def test_executor_without_configurations_returns_no_reports(executor: Executor) 
 
 
 def test_executor_dead_worker_fails_only_its_recording(elsewhere: Executor, tmp_path: Path) -> None:
-    jobs = configs(tmp_path, "abc")
-    jobs[1] = configs(tmp_path, "b", adapter_override={"/imu": Killer})[0]
+    jobs = tasks(tmp_path, "abc")
+    jobs[1] = tasks(tmp_path, "b", adapter_override={"/imu": Killer})[0]
     reports = list(elsewhere.map(jobs, ignore_batch))
     assert [report.exit_code for report in reports] == [0, 1, 0]
     assert "2 attempts" in (reports[1].error or "")
@@ -224,7 +225,7 @@ def test_executor_dead_worker_fails_only_its_recording(elsewhere: Executor, tmp_
 
 
 def test_executor_killed_worker_hints_at_memory(tmp_path: Path) -> None:
-    jobs = [*configs(tmp_path, "a", adapter_override={"/imu": Killer}), *configs(tmp_path, "b")]
+    jobs = [*tasks(tmp_path, "a", adapter_override={"/imu": Killer}), *tasks(tmp_path, "b")]
     reports = list(Processes(2).map(jobs, ignore_batch))
     assert "SIGKILL" in (reports[0].error or "")
     assert "fewer jobs" in (reports[0].error or "")
@@ -233,7 +234,7 @@ def test_executor_killed_worker_hints_at_memory(tmp_path: Path) -> None:
 def test_executor_retries_the_recording_of_a_dead_worker(
     elsewhere: Executor, killed_once: Path, tmp_path: Path
 ) -> None:
-    jobs = configs(tmp_path, "ab", adapter_override={"/imu": KillerOnce})
+    jobs = tasks(tmp_path, "ab", adapter_override={"/imu": KillerOnce})
     reports = list(elsewhere.map(jobs, ignore_batch))
     assert [path.name for path in killed_once.iterdir()] == ["once"]
     assert [(report.status, report.totals.written) for report in reports] == [(RunStatus.COMPLETED, 1000)] * 2
@@ -244,9 +245,9 @@ def test_executor_retry_after_commit_stores_the_sequence_once(
     elsewhere: Executor, killed_once: Path, tmp_path: Path
 ) -> None:
     policies = ["append", "fail", "replace", "skip"]
-    list(InProcess().map(configs(tmp_path, ["append"]), ignore_batch))
+    list(InProcess().map(tasks(tmp_path, ["append"]), ignore_batch))
     jobs = [
-        configs(tmp_path, [policy], adapter_override={"/imu": KillerAfterCommit}, if_exists=policy)[0]
+        tasks(tmp_path, [policy], adapter_override={"/imu": KillerAfterCommit}, if_exists=policy)[0]
         for policy in policies
     ]
     reports = list(elsewhere.map(jobs, ignore_batch))
@@ -260,14 +261,14 @@ def test_executor_unpicklable_configuration_fails_with_a_hint(tmp_path: Path) ->
     class Local(Refusing):
         pass
 
-    jobs = [*configs(tmp_path, "a", adapter_override={"/imu": Local}), *configs(tmp_path, "b")]
+    jobs = [*tasks(tmp_path, "a", adapter_override={"/imu": Local}), *tasks(tmp_path, "b")]
     reports = list(Processes(2).map(jobs, ignore_batch))
     assert [report.exit_code for report in reports] == [1, 0]
     assert "top level of a module" in (reports[0].error or "")
 
 
 def test_executor_interrupt_applies_the_session_policy_in_every_process(tmp_path: Path) -> None:
-    jobs = configs(tmp_path, "abcdef", adapter_override={"/imu": Slow}, topics_on_error="ignore")
+    jobs = tasks(tmp_path, "abcdef", adapter_override={"/imu": Slow}, topics_on_error="ignore")
     before = signal.getsignal(signal.SIGINT)
     begun: set[int] = set()
 
@@ -289,17 +290,17 @@ def test_executor_interrupt_applies_the_session_policy_in_every_process(tmp_path
 
 def test_executor_divides_memory_among_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[int | None] = []
-    jobs = configs(tmp_path, "abcd", memory_bytes=400 << 20)
+    jobs = tasks(tmp_path, "abcd", memory_bytes=400 << 20)
     monkeypatch.setattr(
         "mosaico_ingest.executors.processes._Pool.reports",
-        lambda self, _: iter(seen.extend(job.memory_bytes for job in self.batch.jobs) or ()),
+        lambda self, _: iter(seen.extend(job.job.run.memory for job in self.batch.tasks) or ()),
     )
     assert list(Processes(4).map(jobs, ignore_batch)) == []
     assert seen == [100 << 20] * 4
 
 
 def test_worker_that_loses_its_parent_discards_its_session(tmp_path: Path) -> None:
-    (job,) = configs(
+    (job,) = tasks(
         tmp_path,
         "a",
         topics=["/imu", "/joint_states"],

@@ -9,19 +9,19 @@ from mosaico_ingest.destinations.registry import keep_destinations_open
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.executors.in_process import InProcess
 from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.pipeline.task import Task
 
 DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
 
 
-def config(folder: Path, name: str) -> ROSInjectionConfig:
-    return ROSInjectionConfig(file_path=DRIVE, sequence_name=name, topics=["/imu"], store=folder / "store")
+def task(folder: Path, name: str) -> Task:
+    config = ROSInjectionConfig(file_path=DRIVE, sequence_name=name, topics=["/imu"], store=folder / "store")
+    return Task(config.job)
 
 
 def test_the_log_of_the_catalog_is_there_between_recordings_only(tmp_path: Path) -> None:
     log = tmp_path / "store/catalog.sqlite-wal"
-    there = [
-        log.exists() for _ in InProcess().map([config(tmp_path, name) for name in "abc"], lambda *_: None)
-    ]
+    there = [log.exists() for _ in InProcess().map([task(tmp_path, name) for name in "abc"], lambda *_: None)]
     assert there == [False, True, True]
     assert not log.exists()
     assert Store.open(tmp_path / "store", create=False).names() == ("a", "b", "c")
@@ -31,8 +31,8 @@ def test_a_store_that_is_removed_meanwhile_is_made_anew(tmp_path: Path) -> None:
     """Letting go of the old catalog must not take the files of the new one."""
     with keep_destinations_open() as keep_open:
         for name in "ab":
-            list(InProcess().map([config(tmp_path, name)], lambda *_: None))
-            keep_open(config(tmp_path, name).target)
+            list(InProcess().map([task(tmp_path, name)], lambda *_: None))
+            keep_open(task(tmp_path, name).job.destination)
             if name == "a":
                 shutil.rmtree(tmp_path / "store")
         kept = Store.open(tmp_path / "store", create=False).catalog.keep_open()
@@ -43,5 +43,5 @@ def test_a_store_that_is_removed_meanwhile_is_made_anew(tmp_path: Path) -> None:
 
 def test_where_there_is_no_store_nothing_is_held_or_made(tmp_path: Path) -> None:
     with keep_destinations_open() as keep_open:
-        keep_open(config(tmp_path, "a").target)
+        keep_open(task(tmp_path, "a").job.destination)
     assert list(tmp_path.iterdir()) == []

@@ -18,6 +18,7 @@ import pytest
 
 from mosaico_ingest.api import compile_job
 from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.job.model import DestinationSettings
 from mosaico_ingest.report.events import Event, RunStarted
 from mosaico_ingest.report.model import RunReport
 
@@ -174,15 +175,14 @@ def test_no_cluster_at_an_address_is_said(tmp_path: Path) -> None:
 
 
 def test_what_a_node_cannot_reach_is_said_and_never_made_anew_there(tmp_path: Path) -> None:
-    config = compile_job(make_job(tmp_path, "a"))[0]
+    job = compile_job(make_job(tmp_path, "a"))[0]
     here = Setting(Registrations.current(), 0, ".run-1", machine())
     (tmp_path / "store").mkdir()
-    assert "one machine only" in str(out_of_reach(config, here))
+    assert "one machine only" in str(out_of_reach(job, here))
     (tmp_path / "store" / here.beacon).touch()
-    assert out_of_reach(config, here) is None
-    assert "one machine only" in str(out_of_reach(config, replace(here, machine="another")))
-    assert (
-        out_of_reach(replace(config, store=None, host="localhost"), replace(here, machine="another")) is None
-    )
+    assert out_of_reach(job, here) is None
+    assert "one machine only" in str(out_of_reach(job, replace(here, machine="another")))
+    on_server = job.replace(target=DestinationSettings(host="localhost"))
+    assert out_of_reach(on_server, replace(here, machine="another")) is None
     (tmp_path / "a.mcap").unlink()
-    assert "does not see the recording" in str(out_of_reach(config, here))
+    assert "does not see the recording" in str(out_of_reach(job, here))

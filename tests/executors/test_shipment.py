@@ -11,8 +11,8 @@ import pytest
 from mosaico_ingest.api import compile_job
 from mosaico_ingest.cli.app import main
 from mosaico_ingest.executors.shipment import absolute, pack
-from mosaico_ingest.pipeline.plan import decisions
 from mosaico_ingest.pipeline.run import make_plan
+from mosaico_ingest.pipeline.task import Task
 
 QUICKSTART = Path(__file__).resolve().parents[2] / "configs" / "quickstart"
 PYTHON = """
@@ -63,21 +63,21 @@ def test_the_plan_is_the_same_where_only_the_shipment_and_the_recording_are(
     job: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(job.parent.parent)
-    given = compile_job(Path("jobs/job.yaml"))
-    planned = decisions(make_plan(given[0]), folder=given[0].base_dir)
+    tasks = [Task(one) for one in compile_job(Path("jobs/job.yaml"))]
+    planned = make_plan(tasks[0]).document(folder=tasks[0].job.folder)
     (tmp_path / "box").mkdir()
-    sent = pack([absolute(config) for config in given], tmp_path / "box")
+    sent = pack([absolute(task) for task in tasks], tmp_path / "box")
     for name in ("jobs", "adapters", "acme_msgs"):
         shutil.rmtree(tmp_path / "here" / name)
     for name in [name for name in sys.modules if name.startswith(("mosaico_ingest_adapters_", "factor"))]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.chdir(tmp_path / "box")
-    assert decisions(make_plan(sent[0]), folder=sent[0].base_dir) == planned
+    assert make_plan(sent[0]).document(folder=sent[0].job.folder) == planned
 
 
 def test_nothing_but_code_and_definitions_is_sent(job: Path, tmp_path: Path) -> None:
     (tmp_path / "box").mkdir()
-    pack([absolute(config) for config in compile_job(job)], tmp_path / "box")
+    pack([absolute(Task(one)) for one in compile_job(job)], tmp_path / "box")
     sent = {path.name for path in (tmp_path / "box").rglob("*") if path.is_file()}
     assert sent == {
         ".here",

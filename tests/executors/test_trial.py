@@ -9,10 +9,11 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from mosaico_ingest.job.config import ROSInjectionConfig, TimeRange
+from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.model import TimeRange
 from mosaico_ingest.job.values import TimeBound
 from mosaico_ingest.pipeline import preview as trial
-from mosaico_ingest.pipeline.plan import RecordingPlan, Sample
+from mosaico_ingest.pipeline.plan_document import RecordingPlan, Sample
 from mosaico_ingest.pipeline.preview import preview
 
 FLOAT = b"\0\1\0\0" + bytes(8)
@@ -32,7 +33,7 @@ def recording(folder: Path, payloads: dict[str, list[bytes]]) -> Path:
 
 def planned(path: Path, **options: object) -> RecordingPlan:
     config = ROSInjectionConfig(path, "s", store=path.parent / "store", **options)  # type: ignore[arg-type] # a test's own
-    return preview(config, connect=False)
+    return preview(config.job, connect=False)
 
 
 def sample(plan: RecordingPlan, topic: str) -> Sample:
@@ -72,7 +73,7 @@ def test_a_topic_that_comes_late_is_tried_too(tmp_path: Path) -> None:
 
 def test_only_the_part_of_the_recording_that_is_read_is_tried(tmp_path: Path) -> None:
     path = recording(tmp_path, {"/a": [FLOAT[:-1]] * 5 + [FLOAT] * 5})
-    window = TimeRange(TimeBound(5 * 10**9, relative=True))
+    window = TimeRange(start=TimeBound(5 * 10**9, relative=True))
     assert sample(planned(path, time_range=window), "/a").rejected == 0
 
 
@@ -80,7 +81,7 @@ def test_an_error_policy_is_for_the_run_not_for_the_trial(tmp_path: Path) -> Non
     path = recording(tmp_path, {"/a": [FLOAT[:-1]] * 3})
     plan = planned(path, messages_on_error="raise", on_error="delete")
     assert sample(plan, "/a").rejected == 3
-    assert plan.decisions.on_message_error == "raise"
+    assert plan.plan["on_error"]["message"] == "raise"
 
 
 def test_room_is_judged_by_the_rows_that_will_be_read(tmp_path: Path) -> None:
@@ -89,7 +90,7 @@ def test_room_is_judged_by_the_rows_that_will_be_read(tmp_path: Path) -> None:
     assert whole is not None
     assert whole >= 100 * 16
     assert planned(path, every={"/a": 10}).destination.estimated_bytes == whole // 10
-    half = TimeRange(TimeBound(int(49.5e9), relative=True))
+    half = TimeRange(start=TimeBound(int(49.5e9), relative=True))
     assert planned(path, time_range=half).destination.estimated_bytes == whole // 2
 
 

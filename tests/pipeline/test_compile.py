@@ -1,16 +1,16 @@
-"""A manifest compiles to a configuration for each recording, field by field."""
+"""A manifest compiles to a job for each recording."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 from mosaico_ingest.errors import IngestError, ManifestError, NothingMatched
-from mosaico_ingest.job.config import QuarantineSettings, ROSInjectionConfig, TimeRange
+from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.manifest import load_manifest
+from mosaico_ingest.job.model import Job, JobSettings, QuarantineSettings, TimeRange
 from mosaico_ingest.job.values import (
     IfExists,
     Limit,
@@ -26,8 +26,10 @@ from mosaico_ingest.job.values import (
 )
 from mosaico_ingest.pipeline.compile import compile_manifest
 
+DEFAULT = ROSInjectionConfig("a", "b").job
 
-def compiled(folder: Path, text: str) -> tuple[ROSInjectionConfig, ...]:
+
+def compiled(folder: Path, text: str) -> tuple[Job, ...]:
     file = folder / "job.yaml"
     file.write_text(text)
     return compile_manifest(load_manifest(file, env={"KEY": "k"}))
@@ -42,12 +44,13 @@ def folder(tmp_path: Path) -> Path:
         (data / name).touch()
         os.utime(data / name, (86_400, 86_400))
     (tmp_path / "msgs").mkdir()
+    (tmp_path / "ca.pem").touch()
     (tmp_path / "metadata.json").write_text('{"weather": "rain", "driver": "Ada"}')
     return tmp_path
 
 
-def test_every_key_arrives(folder: Path) -> None:
-    (config,) = compiled(
+def test_compile_manifest_with_every_key_sets_every_field(folder: Path) -> None:
+    (job,) = compiled(
         folder,
         """
 bag:
@@ -70,7 +73,7 @@ target: {host: h, port: 1, api_key: "${KEY}", tls_cert: ca.pem, tls: true, messa
 run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
 """,
     )
-    assert config == ROSInjectionConfig(
+    expected = ROSInjectionConfig(
         file_path=(folder / "data/run_a.bag", folder / "data/run 1.2.mcap"),
         sequence_name="x_run_a",
         metadata={"weather": "sunny", "driver": "Ada"},
@@ -82,7 +85,7 @@ run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
         message_bytes=4_000_000,
         ros_distro=Stores.ROS2_HUMBLE,
         custom_msgs=(("p", folder / "msgs", Stores.ROS1_NOETIC),),
-        time_range=TimeRange(TimeBound(10**10, relative=True), TimeBound(1772366400 * 10**9)),
+        time_range=TimeRange(start=TimeBound(10**10, relative=True), end=TimeBound(1772366400 * 10**9)),
         if_exists=IfExists.APPEND,
         topics=("/cam*",),
         topic_metadata={"/imu": {"mount": "roof"}},
@@ -99,56 +102,51 @@ run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
         messages_on_error=LoaderErrorPolicy.RAISE,
         family="f",
         on_schema_change=OnSchemaChange.NEW_TOPIC,
-        quarantine=QuarantineSettings(folder / "q", Limit(share=0.001), Limit(100), 7),
+        quarantine=QuarantineSettings(
+            path=str(folder / "q"), max=Limit(share=0.001), max_run=Limit(100), systematic=7
+        ),
         log_level="DEBUG",
         report_path=folder / "r.json",
         memory_bytes=2**20,
         jobs=2,
-    )
-    assert config.where == str(folder / "job.yaml")
-    default = ROSInjectionConfig("a", "b")
-    unsaid = {f.name for f in fields(config) if getattr(config, f.name) == getattr(default, f.name)}
-    assert unsaid == {
-        "update_if_exists",
-        "dry_run",
-        "registry",
-        "store",
-        "plan_digest",
-        "attempt",
-        "code_dir",
-        "plugin",
-    }  # if_exists, a command, Python's, the host, a plan, an executor's two, another destination
+    ).job
+    bag = expected.bag.replace(path=("data/run_a.bag", "data/run 1.2.mcap"))
+    assert job == expected.replace(bag=bag, origin=job.origin)
+    assert job.bag.custom_msgs[0].path == str(folder / "msgs")
+    assert job.origin.file == str(folder / "job.yaml")
+    assert job.where("run", "jobs") == f"{folder / 'job.yaml'}:19:61"
+    assert [key for key in JobSettings.model_fields if getattr(job, key) == getattr(DEFAULT, key)] == []
 
 
-def test_the_smallest_manifest_is_a_job(folder: Path) -> None:
-    (config,) = compiled(folder, "bag: {path: data/run_a.bag}")
-    assert config == ROSInjectionConfig(
-        file_path=folder / "data/run_a.bag", sequence_name="run_a", base_dir=folder, family="{stem}"
-    )
-    assert config.target == StoreTarget(Path("mosaico"))
+def test_compile_smallest_manifest_has_defaults(folder: Path) -> None:
+    (job,) = compiled(folder, "bag: {path: data/run_a.bag}")
+    assert (job.sequence.name, job.family) == ("run_a", "{stem}")
+    assert job.destination == StoreTarget(Path("mosaico"))
+    changed = [key for key in JobSettings.model_fields if getattr(job, key) != getattr(DEFAULT, key)]
+    assert changed == ["bag", "sequence"]
 
 
-def test_a_store_lies_where_the_manifest_says_seen_from_the_manifest(folder: Path) -> None:
-    (config,) = compiled(folder, "bag: {path: data/run_a.bag}\ntarget: {store: ./s}")
-    assert config.target == StoreTarget(folder / "s")
-    (config,) = compiled(folder, "bag: {path: data/run_a.bag}\ntarget: {host: h}")
-    assert config.target == ServerTarget("h", 6726)
+def test_compile_store_path_starts_at_manifest_folder(folder: Path) -> None:
+    (job,) = compiled(folder, "bag: {path: data/run_a.bag}\ntarget: {store: ./s}")
+    assert job.destination == StoreTarget(folder / "s")
+    (job,) = compiled(folder, "bag: {path: data/run_a.bag}\ntarget: {host: h}")
+    assert job.destination == ServerTarget("h", 6726)
 
 
-def test_a_glob_is_one_sequence_for_each_recording(folder: Path) -> None:
-    configs = compiled(folder, 'bag: {path: "data/*"}\nsequence: {name: "{parent}_{stem}_{index:02}"}')
-    assert [(config.paths[0].name, config.sequence_name) for config in configs] == [
+def test_compile_glob_makes_one_job_per_recording(folder: Path) -> None:
+    jobs = compiled(folder, 'bag: {path: "data/*"}\nsequence: {name: "{parent}_{stem}_{index:02}"}')
+    assert [(job.paths[0].name, job.sequence.name) for job in jobs] == [
         ("run 1.2.mcap", "data_run_1_2_01"),
         ("run_a.bag", "data_run_a_02"),
         ("run_c", "data_run_c_03"),
     ]
 
 
-def test_a_recursive_glob_works(folder: Path) -> None:
-    assert [config.sequence_name for config in compiled(folder, 'bag: {path: "**/*.bag"}')] == ["run_a"]
+def test_compile_recursive_glob_finds_recordings(folder: Path) -> None:
+    assert [job.sequence.name for job in compiled(folder, 'bag: {path: "**/*.bag"}')] == ["run_a"]
 
 
-def test_a_pattern_passes_over_what_is_hidden_unless_it_names_it(
+def test_compile_glob_skips_hidden_files_unless_it_names_them(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (folder / "data" / "._run_a.bag").write_bytes(b"a copy's attributes")
@@ -160,22 +158,22 @@ def test_a_pattern_passes_over_what_is_hidden_unless_it_names_it(
         ("data/.*.bag", ["run_a"]),
         (".trash/*.bag", ["run_d"]),
     ):
-        configs = compiled(folder, f'bag: {{path: "{pattern}"}}')
-        assert [config.sequence_name for config in configs] == names, pattern
+        jobs = compiled(folder, f'bag: {{path: "{pattern}"}}')
+        assert [job.sequence.name for job in jobs] == names, pattern
     monkeypatch.chdir(folder / "data")
-    (config,) = compiled(Path(), 'bag: {path: "*.bag"}')
-    assert config.sequence_name == "run_a"
+    (job,) = compiled(Path(), 'bag: {path: "*.bag"}')
+    assert job.sequence.name == "run_a"
 
 
-def test_two_stars_beside_other_characters_are_one(folder: Path) -> None:
-    assert [config.sequence_name for config in compiled(folder, 'bag: {path: "data/**.bag"}')] == ["run_a"]
+def test_compile_two_stars_beside_other_characters_match_like_one(folder: Path) -> None:
+    assert [job.sequence.name for job in compiled(folder, 'bag: {path: "data/**.bag"}')] == ["run_a"]
 
 
-def test_placeholders_stand_for_parts_of_the_path(folder: Path) -> None:
-    (config,) = compiled(folder, 'bag: {path: data/run_a.bag}\nsequence: {name: "{name}_{date}_{index}"}')
-    assert config.sequence_name == "run_a_bag_1970-01-02_1"
-    (config,) = compiled(folder, "bag: {path: data/run_c/metadata.yaml}")
-    assert config.sequence_name == "run_c"
+def test_sequence_name_placeholders_are_parts_of_the_path(folder: Path) -> None:
+    (job,) = compiled(folder, 'bag: {path: data/run_a.bag}\nsequence: {name: "{name}_{date}_{index}"}')
+    assert job.sequence.name == "run_a_bag_1970-01-02_1"
+    (job,) = compiled(folder, "bag: {path: data/run_c/metadata.yaml}")
+    assert job.sequence.name == "run_c"
 
 
 @pytest.mark.parametrize(
@@ -210,7 +208,7 @@ def test_placeholders_stand_for_parts_of_the_path(folder: Path) -> None:
         ),
     ],
 )
-def test_what_is_not_there_is_said_with_its_place(
+def test_compile_missing_file_or_invalid_name_is_refused_with_location(
     folder: Path, text: str, kind: type[IngestError], message: str
 ) -> None:
     with pytest.raises(kind, match=message) as caught:
@@ -218,7 +216,7 @@ def test_what_is_not_there_is_said_with_its_place(
     assert "\n" not in str(caught.value)
 
 
-def test_metadata_that_is_no_object_is_refused(folder: Path) -> None:
+def test_compile_metadata_file_without_object_is_refused(folder: Path) -> None:
     (folder / "metadata.json").write_text("[1]")
     with pytest.raises(ManifestError, match="no JSON object"):
         compiled(folder, "bag: {path: data/run_a.bag}\nsequence: {metadata_file: metadata.json}")

@@ -105,7 +105,17 @@ def run(
     expected = Expected("/speed", "/speed", CONNECTION.msgtype, "Positive", "Speed", "", None)
     collector(RunStarted("s", "d", (), 0, (expected,)))
     plan = TopicPlan(
-        "/speed", "/speed", CONNECTION.msgtype, (0,), Positive(), "", SPEED, None, {}, topic, every
+        topic="/speed",
+        target="/speed",
+        msgtype=CONNECTION.msgtype,
+        connections=(0,),
+        adapter=Positive(),
+        why="",
+        ontology=SPEED,
+        count=None,
+        metadata={},
+        on_error=topic,
+        every=every,
     )
     pipeline = TopicPipeline(plan, message, session, collector)
     pipeline.bind(CONNECTION)

@@ -29,6 +29,7 @@ from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.values import LoaderErrorPolicy
 from mosaico_ingest.pipeline.pump import check_counts
 from mosaico_ingest.pipeline.run import run_recording
+from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.report.events import (
     Event,
@@ -158,12 +159,12 @@ def test_a_destination_that_loses_rows_fails_the_run(
     write_bag: WriteBag, write_job: WriteJob, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_bag({"/speed": [number(1), number(2)]})
-    (config,) = api.compile_job(write_job())
+    (job,) = api.compile_job(write_job())
     monkeypatch.setattr(
         "mosaico_ingest.destinations.store.session.StoreSession.stored",
         lambda _self: (StoredTopic("/speed", 1, 0, 0, 8),),
     )
-    outcome = run_recording(config)
+    outcome = run_recording(Task(job))
     report = outcome.report
     assert isinstance(outcome.error, VerificationError)
     assert report.exit_code == 5

@@ -43,7 +43,7 @@ def test_fail_refuses_with_the_lines_that_differ(session: Session, tmp_path: Pat
     assert session("two", "float32", "fail").status is RunStatus.COMPLETED
     report = session("three", "float64", "fail")
     assert (report.status, report.exit_code) == (RunStatus.FAILED, 1)
-    said = "/speed: own_msgs/msg/Number is not what it was in two: -float32 data, +float64 data"
+    said = "/speed: own_msgs/msg/Number differs from its definition in two: -float32 data, +float64 data"
     assert said in str(report.error)
     assert Store.open(tmp_path / "store").names() == ("one", "two")
 

@@ -99,8 +99,8 @@ def test_client_error_becomes_a_typed_error(error: OSError, kind: type[Exception
 
 def test_config_accepts_urls() -> None:
     config = ROSInjectionConfig("s3://bucket/a.mcap", sequence_name="a", store="s3://bucket/store")
-    assert config.paths == (as_path("s3://bucket/a.mcap"),)
-    assert config.target == StoreTarget(as_path("s3://bucket/store"))
+    assert config.job.paths == (as_path("s3://bucket/a.mcap"),)
+    assert config.job.destination == StoreTarget(as_path("s3://bucket/store"))
 
 
 def test_manifest_with_invalid_url_reports_its_location(tmp_path: Path) -> None:
@@ -116,5 +116,5 @@ def test_manifest_accepts_urls_only_for_recordings_and_stores(tmp_path: Path) ->
     job.write_text(
         "version: 1\nbag: {path: a.mcap}\nsequence: {name: a}\nquarantine: {path: 's3://bucket/rejected'}\n"
     )
-    with pytest.raises(ManifestError, match="only recordings and stores may be URLs"):
+    with pytest.raises(ManifestError, match=r"job.yaml:4:20: .*is a URL"):
         compile_manifest(load_manifest(job))

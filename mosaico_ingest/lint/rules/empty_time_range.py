@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.job.units import parse_instant, parse_offset
+from mosaico_ingest.job.units import format_time
+from mosaico_ingest.job.values import TimeBound
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.rule import Check, Problem
 
@@ -12,19 +13,18 @@ from mosaico_ingest.lint.rule import Check, Problem
 def check(job: Job) -> Iterator[Problem]:
     """Report a range whose end is not later than its start, if both are relative to the same moment."""
     time = job.manifest.bag.time
-    if time is None or time.start is None or time.end is None:
+    if time.start is None or time.end is None:
         return
-    start, end = _moment(time.start), _moment(time.end)
-    if start[0] == end[0] and start[1] >= end[1]:
-        message = f"the end {time.end} is not later than the start {time.start}"
+    if _reference(time.start) == _reference(time.end) and time.start.ns >= time.end.ns:
+        message = f"the end {format_time(time.end)} is not later than the start {format_time(time.start)}"
         yield Problem(message, job.span("bag", "time", "end"), "swap the two values")
 
 
-def _moment(text: str) -> tuple[str, int]:
-    """Return the reference point (`+` start, `-` end, epoch) and the distance from it in nanoseconds."""
-    if text[0] in "+-":
-        return text[0], parse_offset(text)
-    return "epoch", parse_instant(text)
+def _reference(bound: TimeBound) -> str:
+    """Return the moment that a bound is relative to."""
+    if not bound.relative:
+        return "epoch"
+    return "last message" if bound.ns < 0 else "first message"
 
 
 CHECK = Check("empty-time-range", job=check)

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.lint.job import Job
+from mosaico_ingest.job.fields import PathRole
+from mosaico_ingest.lint.job import Job, manifest_paths
 from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
     """Report a metadata file or TLS certificate that does not exist."""
-    files = {
-        ("sequence", "metadata_file"): job.manifest.sequence.metadata_file,
-        ("target", "tls_cert"): job.manifest.target.tls_cert,
-    }
-    for path, text in files.items():
-        if text is not None and job.is_expanded(text) and not job.resolve(text).is_file():
+    for path, text in manifest_paths(job, PathRole.INPUT, PathRole.WORKER_FILE):
+        if not job.resolve(text).is_file():
             message = f"the file {job.resolve(text)} does not exist"
             hint = "correct the path; it starts at the manifest's folder"
             yield Problem(message, job.source.span(path), hint)

@@ -1,0 +1,229 @@
+"""Annotations that state what a field of a job is, and the functions that find and change the fields that have one.
+
+`extends`, lint, the removal of secrets, shipping to a cluster, JSON Schema and docs/manifest.md are derived from these
+annotations, so a new key needs no entry in a list.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from enum import Enum
+from functools import cache
+from typing import Annotated, Any, TypeAlias, get_args, get_origin
+
+from msgspec import Struct
+from pydantic import BaseModel, GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, core_schema
+
+__all__ = [
+    "ANY",
+    "AdapterRef",
+    "FilePath",
+    "Literally",
+    "MarkedField",
+    "Parsed",
+    "PathPattern",
+    "PathRole",
+    "Secret",
+    "TopicGlob",
+    "marked_fields",
+    "matches",
+    "replace_values",
+    "values_at",
+]
+
+PathPattern: TypeAlias = tuple["str | None", ...]
+"""A key path in which `ANY` stands for every key of a mapping or position in a list."""
+ANY = None
+
+
+class PathRole(Enum):
+    """What a job does with a file or folder."""
+
+    RECORDING = "recording"
+    BASE = "base"
+    """Another manifest."""
+    INPUT = "input"
+    """A file that the manifest's machine reads when it loads the job."""
+    WORKER_FILE = "worker file"
+    """A file that the machine reads that ingests the recording."""
+    DEFINITIONS = "definitions"
+    """A `.msg` file or a folder of them, read by the machine that ingests the recording."""
+    STORE = "store"
+    OUTPUT_FILE = "output file"
+    OUTPUT_FOLDER = "output folder"
+
+
+class FilePath(Struct, frozen=True):
+    """The text is a path; a relative one starts at the manifest's folder."""
+
+    role: PathRole
+
+
+class AdapterRef(Struct, frozen=True):
+    """The text is the name of an adapter, `module:Class`, `file.py:Class` or the path of a YAML file."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401 - a type
+        """Accept text in manifests; accept classes and specs too in Python."""
+        del source, handler
+        return core_schema.json_or_python_schema(
+            json_schema=core_schema.str_schema(min_length=1, strict=True),
+            python_schema=core_schema.any_schema(),
+        )
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        """Describe the text."""
+        del schema, handler
+        return {"type": "string", "minLength": 1}
+
+
+class TopicGlob(Struct, frozen=True):
+    """The text is a topic name or glob."""
+
+    excludes: bool = False
+    """Whether a leading `!` excludes topics."""
+    default: str | None = None
+    """The key that is no topic and applies to topics that no other key matches."""
+
+
+class Secret(Struct, frozen=True):
+    """The text must not be shown."""
+
+
+class Literally(Struct, frozen=True):
+    """The value is used as written: `${NAME}` in it is not a variable."""
+
+
+class Parsed(Struct, frozen=True):
+    """A value that manifests write as text in a notation of its own, such as `512MiB`."""
+
+    parse: Callable[[str], Any]
+    """Returns the value; raises ValueError."""
+    pattern: str
+    """What JSON Schema can express of the notation."""
+    whole_numbers: bool = False
+    """Whether a manifest may write a whole number without quotes."""
+    to_json: Callable[[Any], Any] = str
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401 - a type
+        """Accept the notation in manifests; accept the value too in Python."""
+        del handler
+        text: CoreSchema = core_schema.str_schema(min_length=1, strict=True)
+        if self.whole_numbers:
+            text = core_schema.no_info_before_validator_function(_number_as_text, text)
+        text = core_schema.no_info_after_validator_function(self.parse, text)
+        value = core_schema.is_instance_schema(source)
+        return core_schema.json_or_python_schema(
+            json_schema=text,
+            python_schema=core_schema.union_schema([value, text]),
+            serialization=core_schema.plain_serializer_function_ser_schema(self.to_json),
+        )
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        """Describe the notation."""
+        del schema, handler
+        if self.whole_numbers:
+            return {"type": ["string", "integer"], "minLength": 1, "minimum": 0, "pattern": self.pattern}
+        return {"type": "string", "minLength": 1, "pattern": self.pattern}
+
+
+def _number_as_text(value: object) -> object:
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+class MarkedField(Struct, frozen=True):
+    """A place in a model whose annotation has a marker."""
+
+    path: PathPattern
+    marker: Any
+    is_key: bool = False
+    """Whether the marker is on the keys of the mapping at `path` and not on the value."""
+
+
+@cache
+def marked_fields(model: type[BaseModel], kind: type[Any]) -> tuple[MarkedField, ...]:
+    """Return the fields of a model and of the models inside it whose annotations have a marker of this kind."""
+    fields: dict[MarkedField, None] = {}
+    for name, field in model.model_fields.items():
+        fields.update(dict.fromkeys(_marked(field.annotation, tuple(field.metadata), (name,), kind)))
+    return tuple(fields)
+
+
+def _marked(
+    annotation: Any,  # noqa: ANN401 - a type
+    metadata: tuple[Any, ...],
+    path: PathPattern,
+    kind: type[Any],
+) -> Iterator[MarkedField]:
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        yield from _marked(arguments[0], (*metadata, *arguments[1:]), path, kind)
+        return
+    yield from (MarkedField(path, marker) for marker in metadata if isinstance(marker, kind))
+    if origin is tuple:
+        yield from _marked(arguments[0], (), (*path, ANY), kind)
+    elif origin is dict:
+        key, value = arguments
+        for field in _marked(key, (), path, kind):
+            yield MarkedField(path, field.marker, is_key=True)
+        yield from _marked(value, (), (*path, ANY), kind)
+    elif isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        for field in marked_fields(annotation, kind):
+            yield MarkedField((*path, *field.path), field.marker, field.is_key)
+    else:
+        for argument in arguments:
+            yield from _marked(argument, (), path, kind)
+
+
+def matches(path: tuple[object, ...], pattern: PathPattern) -> bool:
+    """Return whether a key path has the form of a pattern."""
+    return len(path) == len(pattern) and all(
+        part in (ANY, key) for part, key in zip(pattern, path, strict=True)
+    )
+
+
+def values_at(value: object, pattern: PathPattern) -> Iterator[tuple[tuple[Any, ...], Any]]:
+    """Yield the values of a model or document whose key path has the form of a pattern, each with its key path."""
+    if not pattern:
+        yield (), value
+        return
+    for key, child in _children(value, pattern[0]):
+        for path, inner in values_at(child, pattern[1:]):
+            yield (key, *path), inner
+
+
+def _children(value: object, part: str | None) -> Iterator[tuple[Any, Any]]:
+    if isinstance(value, BaseModel):
+        if part is not None and part in type(value).model_fields:
+            yield part, getattr(value, part)
+    elif isinstance(value, Mapping):
+        yield from ((key, child) for key, child in value.items() if part in (ANY, key))
+    elif isinstance(value, list | tuple) and part is ANY:
+        yield from enumerate(value)
+
+
+def replace_values(
+    value: Any,  # noqa: ANN401 - any model or document
+    pattern: PathPattern,
+    change: Callable[[tuple[Any, ...], str], Any],
+    path: tuple[Any, ...] = (),
+) -> Any:  # noqa: ANN401 - as `value`
+    """Return a model or document with `change(key path, text)` for each text at a pattern; `value` stays as it is."""
+    if not pattern:
+        return change(path, value) if isinstance(value, str) else value
+    children = dict(_children(value, pattern[0]))
+    changed = {
+        key: replace_values(child, pattern[1:], change, (*path, key)) for key, child in children.items()
+    }
+    if all(changed[key] is child for key, child in children.items()):
+        return value
+    if isinstance(value, BaseModel):
+        return value.model_copy(update=changed)
+    if isinstance(value, Mapping):
+        return {**value, **changed}
+    return type(value)(changed.values())

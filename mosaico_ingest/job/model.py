@@ -1,0 +1,537 @@
+"""The sections of a job, each defined once: manifests are parsed to them, pipelines and plans use them."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
+from math import prod
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+from msgspec import Struct
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    JsonValue,
+    SecretStr,
+    SkipValidation,
+    StringConstraints,
+    Tag,
+    WithJsonSchema,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
+from typing_extensions import Self
+
+from mosaico_ingest.errors import ManifestError, SinkError
+from mosaico_ingest.findings import Span
+from mosaico_ingest.job.fields import (
+    AdapterRef,
+    FilePath,
+    Literally,
+    Parsed,
+    PathRole,
+    Secret,
+    TopicGlob,
+)
+from mosaico_ingest.job.patterns import first_match
+from mosaico_ingest.job.units import format_time, parse_limit, parse_size, parse_time
+from mosaico_ingest.job.values import (
+    DEFAULT_MESSAGE_BYTES,
+    DEFAULT_PORT,
+    DEFAULT_STORE,
+    DEFAULT_TOPIC,
+    PROVENANCE_KEY,
+    IfExists,
+    Limit,
+    LoaderErrorPolicy,
+    OnSchemaChange,
+    PluginTarget,
+    ServerTarget,
+    SessionLevelErrorPolicy,
+    Stores,
+    StoreTarget,
+    Target,
+    TimeBound,
+    TopicLevelErrorPolicy,
+    Unmodeled,
+)
+from mosaico_ingest.protocol import check_metadata, check_sequence_name, check_topic_name
+from mosaico_ingest.remote import RemotePath, as_path
+
+__all__ = [
+    "MAX_JOBS",
+    "VERSION",
+    "AdapterReference",
+    "AdapterSettings",
+    "BagSource",
+    "CustomMessages",
+    "DestinationSettings",
+    "ErrorPolicy",
+    "Job",
+    "JobSettings",
+    "Manifest",
+    "Origin",
+    "QuarantineSettings",
+    "RunOptions",
+    "SequenceSettings",
+    "TimeRange",
+    "TopicSettings",
+]
+
+VERSION = 1
+"""The newest manifest version that this tool reads."""
+MAX_JOBS = 1000
+"""Maximum number of jobs that a matrix may expand to."""
+KeyPath: TypeAlias = "tuple[str | int | float | bool | None, ...]"
+_SIZES = range(1 << 20, (1 << 50) + 1)
+_MAX_COUNT = 1_000_000_000
+
+
+def _bytes(text: str) -> int:
+    size = parse_size(text)
+    if size not in _SIZES:
+        raise ValueError(f"{text!r} is out of range; write a size from 1MiB to 1024TiB")
+    return size
+
+
+def _shape(value: Any) -> str:  # noqa: ANN401 - any YAML value
+    return "several" if isinstance(value, list | tuple | dict) else "one"
+
+
+def _check_variable(value: Any) -> str | int:  # noqa: ANN401 - any YAML value
+    if isinstance(value, bool) or not isinstance(value, str | int):
+        raise ValueError("a variable's value is a text or a whole number")  # noqa: TRY004 - validators raise ValueError
+    return value
+
+
+def _check_matrix(value: Any) -> Any:  # noqa: ANN401 - one of two shapes
+    if isinstance(value, dict) and prod(map(len, value.values())) > MAX_JOBS:
+        raise ValueError(f"more than {MAX_JOBS} combinations")
+    return value
+
+
+def _matrix_form(value: Any) -> str:  # noqa: ANN401 - any YAML value
+    return "combinations" if isinstance(value, list | tuple) else "axes"
+
+
+def _limit_to_json(limit: Limit) -> int | float | None:
+    return limit.count if limit.share is None else limit.share
+
+
+Text = Annotated[str, StringConstraints(min_length=1)]
+Count = Annotated[int, Field(ge=1, le=_MAX_COUNT)]
+VariableName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
+VariableValue = Annotated[
+    Any,
+    AfterValidator(_check_variable),
+    WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "integer"}]}),
+]
+Matrix = Annotated[
+    Annotated[dict[VariableName, Annotated[tuple[VariableValue, ...], Field(min_length=1)]], Tag("axes")]
+    | Annotated[
+        tuple[dict[VariableName, VariableValue], ...],
+        Field(min_length=1, max_length=MAX_JOBS),
+        Tag("combinations"),
+    ],
+    Discriminator(_matrix_form),
+    AfterValidator(_check_matrix),
+]
+Time = Annotated[
+    TimeBound,
+    Parsed(
+        parse_time, r"^([+-][0-9.]+ ?(ns|us|ms|s|min|h)|[0-9]{4}-[0-9]{2}-[0-9]{2}.*)$", to_json=format_time
+    ),
+]
+Bytes = Annotated[int, Parsed(_bytes, r"^[0-9.]+ ?[kKMGT]?i?B$", to_json=int)]
+MessageLimit = Annotated[
+    Limit,
+    Parsed(
+        parse_limit,
+        r"^[0-9]+$|^0*(100(\.0*)?|[0-9]{1,2}(\.[0-9]+)?) ?%$",
+        whole_numbers=True,
+        to_json=_limit_to_json,
+    ),
+]
+Topic = Annotated[Text, TopicGlob()]
+AdapterReference = Annotated[Any, AdapterRef()]
+"""An adapter: in manifests a text, in Python also a class or an `AdapterSpec`."""
+RecordingPath = Annotated[Text, FilePath(PathRole.RECORDING)]
+BasePath = Annotated[Text, FilePath(PathRole.BASE)]
+InputPath = Annotated[Text, FilePath(PathRole.INPUT)]
+DefinitionsPath = Annotated[Text, FilePath(PathRole.DEFINITIONS)]
+WorkerPath = Annotated[Text, FilePath(PathRole.WORKER_FILE)]
+OutputPath = Annotated[Text, FilePath(PathRole.OUTPUT_FILE)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+
+    def replace(self, **changes: Any) -> Self:  # noqa: ANN401 - the types of the fields
+        """Return a copy with other values, which are not validated."""
+        return self.model_copy(update=changes)
+
+
+class CustomMessages(_Section):
+    """Message definitions of one package, for recordings that do not contain them."""
+
+    package: Text = Field(examples=["my_custom_pkg"])
+    """The ROS package; the types are `<package>/msg/<file name>`."""
+    path: DefinitionsPath = Field(examples=["definitions/my_pkg"])
+    """A directory of `.msg` files, or one `.msg` file."""
+    store: Stores | None = None
+    """The distro that the definitions belong to; defaults to every distro."""
+
+
+class TimeRange(_Section):
+    """Part of a recording, as offsets (`+10s` from the first message, `-5s` from the last) or instants."""
+
+    start: Time | None = Field(default=None, examples=["+10s", "2026-03-01T12:00:00Z"])
+    """The start, inclusive."""
+    end: Time | None = Field(default=None, examples=["-5s", "2026-03-01T12:30:00Z"])
+    """The end, exclusive."""
+
+
+class BagSource(_Section):
+    """The recording, and the options for reading it."""
+
+    path: Annotated[
+        Annotated[RecordingPath, Tag("one")]
+        | Annotated[tuple[RecordingPath, ...], Field(min_length=1), Tag("several")],
+        Discriminator(_shape),
+    ] = Field(examples=["data/session_01.db3", ["part_0.mcap", "part_1.mcap"], "data/*.mcap"])
+    """A file, a rosbag2 directory or a URL. A list names the splits of one recording. A glob makes one sequence for each
+    match that is not hidden."""
+    ros_distro: Stores | None = Field(default=None, examples=["ros2_humble"])
+    """The distro whose definitions are used if the recording does not contain its own."""
+    custom_msgs: tuple[CustomMessages, ...] = ()
+    """Definitions of messages that are in no distro."""
+    time: TimeRange = TimeRange()
+    """The part of the recording to ingest; defaults to all of it."""
+
+
+class SequenceSettings(_Section):
+    """The sequence that a recording becomes."""
+
+    name: Text = Field(default="{stem}", examples=["Test_Run_01", "{parent}_{stem}"])
+    """The sequence's name. Each recording fills in {stem} and {name} (its file name without and with the suffix), {parent}
+    (its folder's name), {date} (the day of its last change), {index} (its position, from 1) and {index:03} (padded)."""
+    family: Text | None = Field(default=None, examples=["delivery robots"])
+    """Sequences of one family have the same message definitions, see `on_schema_change`; defaults to `name` as written."""
+    metadata: dict[Text, JsonValue] = Field(
+        default={}, examples=[{"driver_version": "v2.1", "weather": "sunny"}]
+    )
+    """Metadata of the sequence; any JSON."""
+    metadata_file: InputPath | None = Field(default=None, examples=["metadata.json"])
+    """A JSON file with more metadata; `metadata` takes precedence."""
+    if_exists: IfExists = IfExists.FAIL
+    """Action if the sequence exists: fail, skip (if its content is the same), append, replace."""
+
+
+class TopicSettings(_Section):
+    """Settings of the topics that a name or glob matches."""
+
+    rename: Text | None = Field(default=None, examples=["/sensors/imu"])
+    """The topic's name in the sequence; only for a topic name, not for a glob."""
+    metadata: dict[Text, JsonValue] = Field(default={}, examples=[{"mount": "roof"}])
+    """Metadata of the topic."""
+    every: Count = Field(default=1, examples=[3])
+    """Keep the first of each `every` messages."""
+    image: Literal["raw", "png"] = "raw"
+    """The encoding of raw images: as recorded, or PNG."""
+
+
+class AdapterSettings(_Section):
+    """The adapters that turn messages into ontology records in place of the built-in ones."""
+
+    load: tuple[AdapterReference, ...] = Field(
+        default=(), examples=[["adapters/battery_pack.yaml", "my_pkg.adapters:WheelAdapter"]]
+    )
+    """Adapters for every topic of their types: YAML files, `module:Class` or `file.py:Class`."""
+    override: dict[Topic, AdapterReference] = Field(default={}, examples=[{"/lidar/*": "LidarAdapter"}])
+    """The adapter for a topic name or glob, written as in `load` or as the name of a built-in adapter. The exact topic name
+    takes precedence, followed by the first matching glob."""
+    unmodeled: Unmodeled = Unmodeled.KEEP
+    """Action for a type without an adapter: keep its ROS shape, skip its topics, fail."""
+    serialization_formats: dict[Text, Literal["default", "ragged", "image"]] = Field(
+        default={}, examples=[{"acme_msgs/msg/Scan": "ragged"}]
+    )
+    """The platform's serialization format for types without an adapter, by message type."""
+
+
+class ErrorPolicy(_Section):
+    """Whether an error affects one message, one topic, or the entire run."""
+
+    session: SessionLevelErrorPolicy = SessionLevelErrorPolicy.Report
+    """Action after an error that ends the run: report (keep the accepted rows and attach the error) or delete the session."""
+    topic: Annotated[
+        Annotated[TopicLevelErrorPolicy, Tag("one")]
+        | Annotated[
+            dict[Annotated[Text, TopicGlob(default=DEFAULT_TOPIC)], TopicLevelErrorPolicy], Tag("several")
+        ],
+        Discriminator(_shape),
+    ] = Field(
+        default=TopicLevelErrorPolicy.Raise, examples=["raise", {"default": "raise", "/gps/*": "ignore"}]
+    )
+    """Action after an error in a topic: raise (end the run), ignore (reject the message), finalize (close the topic). One
+    action, or one for each topic name or glob, with `default` for the other topics. The exact topic name takes precedence,
+    followed by the first matching glob."""
+    message: LoaderErrorPolicy = LoaderErrorPolicy.LOG_WARN
+    """Action for messages that cannot be decoded: `ignore` counts them, `log_warn` also logs a warning, `raise` ends the
+    run."""
+
+    def for_topic(self, topic: str) -> TopicLevelErrorPolicy:
+        """Return the action after an error in a topic."""
+        if isinstance(self.topic, TopicLevelErrorPolicy):
+            return self.topic
+        match = first_match((glob for glob in self.topic if glob != DEFAULT_TOPIC), topic)
+        return self.topic.get(match or DEFAULT_TOPIC, TopicLevelErrorPolicy.Raise)
+
+
+class QuarantineSettings(_Section):
+    """The quarantine, which keeps rejected messages for `ingest replay`; `on_error` applies only beyond its limits."""
+
+    path: Annotated[Text, FilePath(PathRole.OUTPUT_FOLDER)] = Field(
+        default="quarantine", examples=["quarantine"]
+    )
+    """The folder for the messages' bytes (MCAP) and the reasons of their rejection (JSONL)."""
+    max: MessageLimit | None = Field(default=None, examples=[100, "0.1%"])
+    """Maximum number of rejected messages kept per topic, or their share of the topic's messages. Beyond this limit,
+    `on_error.topic` applies. Defaults to no limit."""
+    max_run: MessageLimit | None = Field(default=None, examples=[1000, "0.01%"])
+    """Maximum number or share of rejected messages kept of all topics together."""
+    systematic: Count = 100
+    """Number of consecutive rejections from a topic's first message after which the topic ends: its definition or mapping is
+    wrong."""
+
+
+class DestinationSettings(_Section):
+    """Where sequences are written: a store of files or a Mosaico server; defaults to the store `./mosaico`."""
+
+    store: Annotated[Text, FilePath(PathRole.STORE)] | None = Field(default=None, examples=["./mosaico"])
+    """The directory of the embedded store, or a URL (`s3://bucket/prefix`, `gs://bucket/prefix`)."""
+    host: Text | None = Field(default=None, examples=["mosaico.example.org"])
+    """The server's name or address."""
+    port: Annotated[int, Field(ge=1, le=65535)] = DEFAULT_PORT
+    """The server's port."""
+    api_key: Annotated[SecretStr, Secret()] | None = Field(
+        default=None, examples=["${MOSAICO_API_KEY:?a key with write permission}"]
+    )
+    """A key with write permission; take it from the environment."""
+    tls_cert: WorkerPath | None = Field(default=None, examples=["certs/ca.pem"])
+    """The CA certificate to trust; implies `tls`."""
+    tls: bool = False
+    """Whether the connection is encrypted; without `tls_cert` the system's certificates are trusted."""
+    message_size: Bytes = Field(default=DEFAULT_MESSAGE_BYTES, examples=["4MB"])
+    """The size up to which rows are combined into one upload message; a larger row is a message of its own."""
+    type: Text | None = Field(default=None, examples=["lake"])
+    """The name of a destination that an installed package provides, in place of `store` and `host`."""
+    options: dict[Text, JsonValue] = Field(default={}, examples=[{"bucket": "recordings"}])
+    """The options of this destination; the package that provides it defines them."""
+
+    @model_validator(mode="after")
+    def _check_one_destination(self) -> DestinationSettings:
+        kinds = [key for key in ("store", "host", "type") if getattr(self, key) is not None]
+        if len(kinds) > 1:
+            raise _conflict(f"{kinds[0]} and {kinds[1]} are two destinations", kinds[1])
+        if self.options and self.type is None:
+            raise _conflict("options are set, and type is not", "options")
+        server_only = sorted(self.model_fields_set - {"store", "host", "type", "options"})
+        if self.host is None and server_only:
+            raise _conflict(f"{server_only[0]} is for a server, and host is not set", server_only[0])
+        return self
+
+    def target(self, folder: Path) -> Target:
+        """Return the store, server or installed destination; `folder` is where relative paths of `options` start."""
+        if self.type is not None:
+            return PluginTarget(self.type, self.options, folder)
+        if self.host is None:
+            return StoreTarget(DEFAULT_STORE if self.store is None else as_path(self.store))
+        key = None if self.api_key is None else self.api_key.get_secret_value()
+        certificate = None if self.tls_cert is None else Path(self.tls_cert)
+        return ServerTarget(
+            self.host, self.port, key, certificate, self.tls or certificate is not None, self.message_size
+        )
+
+
+def _conflict(message: str, key: str) -> PydanticCustomError:
+    return PydanticCustomError("conflicting-keys", "{message}", {"key": key, "message": message})
+
+
+class RunOptions(_Section):
+    """Options of a run; none of them changes the stored content."""
+
+    log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"] = "INFO"
+    """The least severe log messages to show on the terminal."""
+    report: OutputPath | None = Field(default=None, examples=["report.json"])
+    """The file to write the run's report to."""
+    memory: Bytes | None = Field(default=None, examples=["512MiB"])
+    """Maximum memory of batches, for all `jobs` together; from 1MiB to 1024TiB, defaults to 256MiB."""
+    jobs: Annotated[int, Field(ge=1, le=1024)] = 1
+    """Maximum number of recordings to ingest at the same time."""
+
+
+class _Composition(_Section):
+    """The keys that are resolved before there is a job."""
+
+    version: Annotated[int, Field(ge=1, le=VERSION)] = VERSION
+    """The version of the manifest language."""
+    extends: (
+        Annotated[
+            Annotated[BasePath, Tag("one")]
+            | Annotated[tuple[BasePath, ...], Field(min_length=1), Tag("several")],
+            Discriminator(_shape),
+        ]
+        | None
+    ) = Field(default=None, examples=["base.yaml", ["fleet.yaml", "night.yaml"]])
+    """Manifests, or parts of them, that provide the keys that this one does not set. Mappings are merged key by key; later
+    files take precedence."""
+    defaults: Annotated[dict[VariableName, VariableValue], Literally()] = Field(
+        default={}, examples=[{"VEHICLE": "demo-01"}]
+    )
+    """Values of `${NAME}` that neither the matrix nor the environment sets."""
+    matrix: Annotated[Matrix, Literally()] | None = Field(
+        default=None,
+        examples=[{"vehicle": ["a", "b"], "day": ["monday", "tuesday"]}, [{"vehicle": "a", "day": "monday"}]],
+    )
+    """Values of `${NAME}`, with one job for each combination; or a list of the combinations."""
+
+
+class JobSettings(_Section):
+    """The sections of a job."""
+
+    bag: BagSource
+    """The recording, and the options for reading it."""
+    sequence: SequenceSettings = SequenceSettings()
+    """The sequence that a recording becomes."""
+    topics: tuple[Annotated[Text, TopicGlob(excludes=True)], ...] = Field(
+        default=(), examples=[["/cam*", "!/cam/debug*"]]
+    )
+    """Topic names and globs; the last match decides, a leading `!` excludes, `*` also matches `/`. Defaults to every topic."""
+    topic_settings: dict[Topic, TopicSettings] = Field(default={}, examples=[{"/camera/*": {"every": 3}}])
+    """Settings per topic name or glob. For each setting, the exact topic name takes precedence, followed by the first matching
+    glob that defines the setting."""
+    adapters: AdapterSettings = AdapterSettings()
+    """The adapters that turn messages into ontology records in place of the built-in ones."""
+    on_error: ErrorPolicy = ErrorPolicy()
+    """Whether an error affects one message, one topic, or the entire run."""
+    on_schema_change: OnSchemaChange | None = None
+    """Action if a topic's message definition differs from that of earlier sequences of the family: fail, evolve (warn and
+    store the new columns), new_topic (store it under another name). If omitted, definitions are not compared."""
+    quarantine: QuarantineSettings | None = None
+    """Where rejected messages are kept; without this section they are only counted."""
+    target: DestinationSettings = DestinationSettings()
+    """Where sequences are written."""
+    run: RunOptions = RunOptions()
+    """Options of a run."""
+
+
+class Manifest(JobSettings, _Composition):
+    """A job: which recordings to ingest, how to convert them, and where to store the results."""
+
+
+class Origin(Struct, frozen=True):
+    """The manifest that a job comes from."""
+
+    file: str | None = None
+    """Its path; None for a job that a program has built."""
+    folder: Path = Path()
+    """The folder where the relative paths of adapters start."""
+    spans: Mapping[KeyPath, Span] = {}
+    """The span of each value, by key path."""
+    key_spans: Mapping[KeyPath, Span] = {}
+    """The span of each key, by key path."""
+
+
+class Job(JobSettings):
+    """The job of one recording: its variables and name are filled in, and its paths start at the current folder."""
+
+    model_config = ConfigDict(arbitrary_types_allowed=True)
+
+    paths: SkipValidation[tuple[Path | RemotePath, ...]]
+    """The recording's splits."""
+    origin: SkipValidation[Origin] = Field(default=Origin(), repr=False)
+    registry: SkipValidation[Any] = Field(default=None, repr=False)
+    """The `ROSTypeRegistry` for definitions; None stands for the process-wide one."""
+
+    @property
+    def folder(self) -> Path:
+        """The folder where the relative paths of adapters start."""
+        return self.origin.folder
+
+    @property
+    def family(self) -> str:
+        """The name that sequences with the same message definitions share."""
+        return self.sequence.family or self.sequence.name
+
+    @property
+    def destination(self) -> Target:
+        """The store, server or installed destination that the sequence is written to."""
+        return self.target.target(self.folder)
+
+    def span(self, *path: str | int) -> Span | None:
+        """Return the span of a key or list item in the manifest, None if the manifest does not have it."""
+        return self.origin.key_spans.get(path) or self.origin.spans.get(path)
+
+    def where(self, *path: str | int) -> str | None:
+        """Return `file:line:column` of a value or of what contains it, or the file; None without a manifest."""
+        for length in range(len(path), 0, -1):
+            span = self.origin.spans.get(path[:length])
+            if span is not None:
+                return str(span)
+        return self.origin.file
+
+    def settings_of(self, topic: str) -> TopicSettings:
+        """Return the settings of a topic: for each, that of its name, else of the first glob that defines it."""
+        values: dict[str, Any] = {}
+        for name in TopicSettings.model_fields:
+            globs = (glob for glob, entry in self.topic_settings.items() if name in entry.model_fields_set)
+            match = first_match(globs, topic)
+            if match is not None:
+                values[name] = getattr(self.topic_settings[match], name)
+        return TopicSettings.model_construct(**values)
+
+    def check(self) -> Self:
+        """Return the job if the platform accepts its names and metadata.
+
+        Raises:
+            ManifestError: The platform refuses a name or metadata, or a run uses the metadata key itself.
+        """
+        with _located(self, "sequence", "name"):
+            check_sequence_name(self.sequence.name)
+        with _located(self, "sequence", "metadata"):
+            check_metadata(self.sequence.metadata, where="")
+        if PROVENANCE_KEY in self.sequence.metadata:
+            raise ManifestError(
+                f"the metadata key {PROVENANCE_KEY!r} is reserved for the sequence's provenance",
+                where=self.where("sequence", "metadata", PROVENANCE_KEY) or "metadata",
+                hint="use another key",
+            )
+        for topic, settings in self.topic_settings.items():
+            with _located(self, "topic_settings", topic, "metadata"):
+                check_metadata(settings.metadata, where="")
+            with _located(self, "topic_settings", topic, "rename"):
+                if settings.rename is not None:
+                    check_topic_name(settings.rename)
+                    _check_one_topic(topic, settings.rename)
+        return self
+
+
+def _check_one_topic(topic: str, name: str) -> None:
+    if any(character in topic for character in "*?["):
+        raise SinkError(
+            f"every topic that {topic!r} matches would be renamed to {name!r}", hint="name one topic"
+        )
+
+
+@contextmanager
+def _located(job: Job, *path: str) -> Generator[None]:
+    """Raise what the platform refuses as a mistake at a key path of the job."""
+    try:
+        yield
+    except SinkError as error:
+        where = job.where(*path) or ".".join(path)
+        raise ManifestError(error.what, where=where, hint=error.hint) from error

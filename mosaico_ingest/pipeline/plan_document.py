@@ -1,0 +1,298 @@
+"""The plan document: plans of all recordings of a manifest with samples, its file format, and its comparison."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+from msgspec import Struct
+from pydantic import Field, GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
+
+from mosaico_ingest.documents import Part, document_schema, read_document
+from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.findings import Finding, Severity, Stage
+from mosaico_ingest.pipeline.plan import Plan
+from mosaico_ingest.textfile import read_limited
+
+__all__ = [
+    "DestinationState",
+    "Difference",
+    "Note",
+    "PlanDocument",
+    "RecordingPlan",
+    "Sample",
+    "SampleRejection",
+    "differences",
+    "notes",
+    "plan_schema",
+    "read_plan",
+]
+
+Json: TypeAlias = Any
+
+
+class Note(Part):
+    """A finding, with its location as text."""
+
+    severity: Severity
+    rule: str
+    message: str
+    place: str | None
+    """The location, such as `job.yaml:3:5`."""
+    help: str | None
+
+
+class SampleRejection(Part):
+    """Sampled messages that would be rejected for the same reason."""
+
+    stage: Stage
+    rule: str
+    count: int
+    reason: str
+
+
+class Sample(Part):
+    """The first messages of a topic, decoded and adapted without being written."""
+
+    target: str
+    """The topic's name in the sequence."""
+    read: int
+    rejected: int
+    row_bytes: int | None
+    """Uncompressed bytes per row; None if no message was adapted."""
+    rejections: tuple[SampleRejection, ...]
+
+
+class DestinationState(Part):
+    """The state of the destination; null for a value that is unknown."""
+
+    kind: str
+    """`store`, `server`, or the type of an installed destination."""
+    exists: bool | None
+    """Whether the store exists or the server responds."""
+    taken: bool | None
+    """Whether the destination has a sequence of this name."""
+    problem: str | None
+    """The reason why the sequence cannot be written."""
+    free_bytes: int | None
+    estimated_bytes: int | None
+    """Uncompressed bytes of all rows, estimated from the samples; compression usually reduces them."""
+
+
+class _SerializedPlan:
+    """Marks a field that holds `Plan.document`."""
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        """Describe the serialized plan."""
+        del schema
+        Plan.model_rebuild()
+        return handler(Plan.__pydantic_core_schema__)
+
+
+class RecordingPlan(Part):
+    """The plan of one recording, with the state of its destination and the result of its samples."""
+
+    digest: str
+    """Identifies the plan; `ingest run --plan` runs no other one."""
+    plan: Annotated[dict[str, Any], _SerializedPlan()]
+    """The serialized plan, see `Plan.document`."""
+    destination: DestinationState
+    samples: tuple[Sample, ...]
+    notes: tuple[Note, ...]
+
+    @property
+    def rejected(self) -> int:
+        """The number of sampled messages that would be rejected."""
+        return sum(sample.rejected for sample in self.samples)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether the index has no message of any selected topic."""
+        return all(topic["count"] == 0 for topic in self.plan["topics"])
+
+
+class PlanDocument(Part):
+    """The plans of all recordings of a manifest; `version` changes with the format."""
+
+    version: Literal[1] = 1
+    tool: str
+    """Name and version of the program that wrote the document."""
+    job: str = Field(examples=["job.yaml"])
+    """The manifest, relative to this file's folder."""
+    recordings: tuple[RecordingPlan, ...]
+
+    @property
+    def exit_code(self) -> int:
+        """1 if a destination refuses, 3 if a recording has no message, 4 if sampled messages would be rejected, else 0."""
+        if any(recording.destination.problem for recording in self.recordings):
+            return 1
+        if any(recording.is_empty for recording in self.recordings):
+            return 3
+        return 4 if any(recording.rejected for recording in self.recordings) else 0
+
+
+def read_plan(path: Path) -> PlanDocument:
+    """Read a plan file.
+
+    Raises:
+        ManifestError: The file cannot be read or violates the schema of plans.
+    """
+    hint = "create a plan with `ingest plan job.yaml --out plan.json`"
+    try:
+        content = read_limited(path)
+    except OSError as error:
+        raise ManifestError(f"cannot be read: {error.strerror}", where=str(path), hint=hint) from error
+    return read_document(content, PlanDocument, where=str(path), kind="a plan", hint=hint)
+
+
+def plan_schema() -> dict[str, Any]:
+    """Return the JSON Schema (draft 2020-12) of a plan file."""
+    return document_schema(PlanDocument)
+
+
+def notes(findings: Iterable[Finding]) -> tuple[Note, ...]:
+    """Return findings in the form of a document."""
+    return tuple(
+        Note(
+            severity=finding.severity,
+            rule=finding.rule,
+            message=finding.message,
+            place=str(finding.span) if finding.span else None,
+            help=finding.help,
+        )
+        for finding in findings
+    )
+
+
+_NAMES = {"topics": ("topic", "target"), "excluded": ("excluded topic", "topic"), "files": ("file", "path")}
+"""For each list of a plan, the name of its items and the key that identifies an item."""
+
+
+class Difference(Struct, frozen=True):
+    """One difference between two plans; None for a value that one of them does not have."""
+
+    sequence: str
+    name: str
+    """The key path of the value, such as `topic /imu every`."""
+    before: str | None
+    after: str | None
+
+    def __str__(self) -> str:
+        """Return the difference in one line."""
+        if self.before is None:
+            return f"{self.sequence}: + {self.name}: {self.after}"
+        if self.after is None:
+            return f"{self.sequence}: - {self.name}: {self.before}"
+        return f"{self.sequence}: {self.name}: {self.before} → {self.after}"
+
+
+PlanJson: TypeAlias = Mapping[str, Any]
+"""A serialized plan, see `Plan.document`."""
+
+
+def differences(before: Sequence[PlanJson], after: Sequence[PlanJson]) -> tuple[Difference, ...]:
+    """Return the differences between the plans of two documents.
+
+    Plans are compared with each other if they have the same sequence name, or else the same files.
+    """
+    return tuple(
+        difference
+        for old, new in _pairs(before, after)
+        for difference in (_compare(old, new) if old and new else [_one_side(old, new)])
+    )
+
+
+def _pairs(
+    before: Sequence[PlanJson], after: Sequence[PlanJson]
+) -> Iterator[tuple[PlanJson | None, PlanJson | None]]:
+    rest = list(after)
+    unpaired: list[PlanJson] = []
+    for old in before:
+        new = next((plan for plan in rest if _sequence(plan) == _sequence(old)), None)
+        if new is None:
+            unpaired.append(old)
+            continue
+        rest.remove(new)
+        yield old, new
+    for old in unpaired:
+        same = [plan for plan in rest if plan["files"] == old["files"]]
+        new = same[0] if same else rest[0] if len(rest) == len(unpaired) == 1 else None
+        if new is not None:
+            rest.remove(new)
+        yield old, new
+    yield from ((None, new) for new in rest)
+
+
+def _sequence(plan: PlanJson) -> str:
+    return plan["sequence"]["name"]
+
+
+def _one_side(old: PlanJson | None, new: PlanJson | None) -> Difference:
+    def summary(plan: PlanJson | None) -> str | None:
+        if plan is None:
+            return None
+        return f"{', '.join(file['path'] for file in plan['files'])}, {len(plan['topics'])} topics"
+
+    plan = old or new
+    return Difference(_sequence(plan) if plan else "", "recording", summary(old), summary(new))
+
+
+def _compare(old: PlanJson, new: PlanJson) -> Iterator[Difference]:
+    for name, before, after in _compare_mappings("", old, new):
+        yield Difference(_sequence(old), name, before, after)
+
+
+_Change: TypeAlias = "tuple[str, str | None, str | None]"
+"""Key path, text before, text after."""
+
+
+def _compare_mappings(name: str, old: Mapping[str, Json], new: Mapping[str, Json]) -> Iterator[_Change]:
+    for key in dict.fromkeys((*old, *new)):
+        inner = f"{name} {key}".strip()
+        if key not in old or key not in new:
+            yield inner, _text(old.get(key)), _text(new.get(key))
+        else:
+            yield from _compare_values(inner, key, old[key], new[key])
+
+
+def _compare_values(name: str, key: str, old: Json, new: Json) -> Iterator[_Change]:
+    if old == new:
+        return
+    if isinstance(old, dict) and isinstance(new, dict):
+        yield from _compare_mappings(name, old, new)
+    elif key in _NAMES:
+        kind, identity = _NAMES[key]
+        yield from _compare_items(
+            kind, {item[identity]: item for item in old}, {item[identity]: item for item in new}
+        )
+    else:
+        yield name, _text(old) or "none", _text(new) or "none"
+
+
+def _compare_items(kind: str, old: Mapping[str, Json], new: Mapping[str, Json]) -> Iterator[_Change]:
+    for identity in dict.fromkeys((*old, *new)):
+        name = f"{kind} {identity}"
+        if identity in old and identity in new:
+            yield from _compare_mappings(name, old[identity], new[identity])
+        else:
+            yield name, _item_text(old.get(identity)), _item_text(new.get(identity))
+
+
+def _item_text(item: Mapping[str, Json] | None) -> str | None:
+    if item is None:
+        return None
+    if "adapter" in item:
+        return f"{item['msgtype']} by {item['adapter']['name']} to {item['ontology']['tag']}"
+    return item["why"] if "why" in item else f"{item['size_bytes']} bytes"
+
+
+def _text(value: Json) -> str | None:
+    if value is None or isinstance(value, str):
+        return value
+    return json.dumps(value, ensure_ascii=False)

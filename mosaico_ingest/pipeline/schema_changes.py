@@ -1,0 +1,120 @@
+"""Comparison of a plan's message definitions with those of earlier sequences of the same family."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from difflib import unified_diff
+from typing import Any, cast
+
+from msgspec import Struct
+
+from mosaico_ingest.adapters.adapter import ROS_METADATA_KEY
+from mosaico_ingest.destinations.registry import destination_of
+from mosaico_ingest.errors import IngestError
+from mosaico_ingest.findings import Finding, Severity
+from mosaico_ingest.job.values import PROVENANCE_KEY, OnSchemaChange, Target
+from mosaico_ingest.pipeline.plan import Plan, TopicPlan
+from mosaico_ingest.protocol import check_topic_name
+
+__all__ = ["follow_schema_changes"]
+
+
+class _StoredDefinition(Struct, frozen=True):
+    """A definition that a sequence of the family has for a topic."""
+
+    sequence: str
+    text: str
+
+
+def follow_schema_changes(plan: Plan, action: OnSchemaChange) -> Plan:
+    """Return the plan with a finding for each changed definition, and with changed topics renamed for `new_topic`.
+
+    Raises:
+        IngestError: A definition has changed and the action is `fail`; `findings` has every change.
+    """
+    stored = _stored_definitions(plan.destination, plan.sequence.family)
+    if stored is None:
+        unchecked = Finding(
+            "schema-change-unchecked",
+            Severity.WARNING,
+            "on_schema_change needs a store; a server does not list its definitions",
+        )
+        return plan.replace(findings=(*plan.findings, unchecked))
+    findings: list[Finding] = []
+    topics: list[TopicPlan] = []
+    for topic in plan.topics:
+        history = stored.get(check_topic_name(topic.target), [])
+        reference = history[:1] if action is OnSchemaChange.NEW_TOPIC else history[-1:]
+        text = _definition(topic.metadata)
+        changed = next((one for one in reference if text is not None and one.text != text), None)
+        if changed is None or text is None:
+            topics.append(topic)
+            continue
+        target = _versioned_name(topic.target, text) if action is OnSchemaChange.NEW_TOPIC else topic.target
+        topics.append(topic.replace(target=target))
+        findings.append(_finding(topic, changed, text, action, target))
+    if findings and action is OnSchemaChange.FAIL:
+        raise IngestError(
+            f"{len(findings)} message definitions have changed; the first: {findings[0].message}",
+            where=str(plan.files[0]),
+            hint="set on_schema_change to evolve or new_topic, or use another sequence.family",
+            findings=tuple(findings),
+        )
+    return plan.replace(topics=tuple(topics), findings=(*plan.findings, *findings))
+
+
+def _stored_definitions(target: Target, family: str | None) -> dict[str, list[_StoredDefinition]] | None:
+    """Return the stored definitions by topic in the order of the family's sessions, or None if they cannot be listed."""
+    sequences = destination_of(target).sequences()
+    if sequences is None:
+        return None
+    by_topic: dict[str, list[tuple[str, _StoredDefinition]]] = {}
+    for sequence in sequences:
+        sessions = {one.id for one in sequence.sessions if _family(one.metadata) == family}
+        for name, topic in sequence.topics.items():
+            text = _definition(topic.metadata)
+            if topic.session in sessions and text is not None:
+                entry = (topic.session, _StoredDefinition(sequence.name, text))
+                by_topic.setdefault(name, []).append(entry)
+    return {
+        name: [definition for _, definition in sorted(history, key=lambda entry: entry[0])]
+        for name, history in by_topic.items()
+    }
+
+
+def _family(metadata: Mapping[str, Any]) -> object:
+    return _member(metadata.get(PROVENANCE_KEY), "family")
+
+
+def _definition(metadata: Mapping[str, Any]) -> str | None:
+    text = _member(metadata.get(ROS_METADATA_KEY), "msgdef")
+    return text if isinstance(text, str) else None
+
+
+def _member(value: object, key: str) -> object:
+    return cast("Mapping[str, object]", value).get(key) if isinstance(value, Mapping) else None
+
+
+def _versioned_name(target: str, text: str) -> str:
+    return f"{target}/v_{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
+def _finding(
+    topic: TopicPlan, old: _StoredDefinition, text: str, action: OnSchemaChange, target: str
+) -> Finding:
+    lines = ", ".join(_changed_lines(old.text, text))
+    stored = f"; it is stored as {target}" if action is OnSchemaChange.NEW_TOPIC else ""
+    severity = Severity.ERROR if action is OnSchemaChange.FAIL else Severity.WARNING
+    return Finding(
+        "schema-change",
+        severity,
+        f"{topic.topic}: {topic.msgtype} differs from its definition in {old.sequence}: {lines}{stored}",
+    )
+
+
+def _changed_lines(old: str, new: str) -> Iterator[str]:
+    """Yield the lines that differ, such as `-float64 x` and `+float32 x`."""
+    for line in unified_diff(old.splitlines(), new.splitlines(), lineterm="", n=0):
+        if line[:1] in "+-" and line[:3] not in {"+++", "---"}:
+            yield line
