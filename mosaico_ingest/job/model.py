@@ -211,6 +211,8 @@ class BagSource(_Section):
     """Definitions of messages that are in no distro."""
     time: TimeRange = TimeRange()
     """The part of the recording to ingest; defaults to all of it."""
+    max_chunk_size: Bytes | None = Field(default=None, examples=["1GiB"])
+    """Maximum decompressed size of a chunk; larger chunks are unreadable. Defaults to 256MiB."""
 
 
 class SequenceSettings(_Section):

@@ -37,6 +37,7 @@ from mosaico_ingest.report.events import (
 )
 from mosaico_ingest.report.model import Report
 from mosaico_ingest.report.timing import Step, Stopwatch
+from mosaico_ingest.rosbag.compression import MAX_CHUNK_BYTES
 from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry, TypeResolver
 from mosaico_ingest.rosbag.recording import Recording, open_recording
 
@@ -113,7 +114,8 @@ def open_job(job: Job) -> Generator[tuple[Recording, TypeResolver]]:
     """
     custom = [(messages.package, Path(messages.path), messages.store) for messages in job.bag.custom_msgs]
     resolver = TypeResolver(job.bag.ros_distro, custom, registry=job.registry or ROSTypeRegistry)
-    with open_recording(job.paths, resolve=resolver) as recording:
+    max_chunk_bytes = job.bag.max_chunk_size or MAX_CHUNK_BYTES
+    with open_recording(job.paths, resolve=resolver, max_chunk_bytes=max_chunk_bytes) as recording:
         yield recording, resolver
 
 

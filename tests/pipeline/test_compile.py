@@ -25,6 +25,8 @@ from mosaico_ingest.job.values import (
     Unmodeled,
 )
 from mosaico_ingest.pipeline.compile import compile_manifest
+from mosaico_ingest.pipeline.run import run_recording
+from mosaico_ingest.pipeline.task import Task
 
 DEFAULT = ROSInjectionConfig("a", "b").job
 
@@ -220,3 +222,16 @@ def test_compile_metadata_file_without_object_is_refused(folder: Path) -> None:
     (folder / "metadata.json").write_text("[1]")
     with pytest.raises(ManifestError, match="no JSON object"):
         compiled(folder, "bag: {path: data/run_a.bag}\nsequence: {metadata_file: metadata.json}")
+
+
+def test_make_plan_chunk_larger_than_max_chunk_size_is_unreadable(tmp_path: Path) -> None:
+    drive = Path(__file__).parents[2] / "configs" / "quickstart" / "drive.mcap"
+    text = f"bag: {{path: {drive}, max_chunk_size: 1MiB}}\ntarget: {{store: {tmp_path}/store}}\n"
+    (job,) = compiled(tmp_path, text)
+    report = run_recording(Task(job)).report
+    assert report.exit_code == 4
+    assert any("1048576 bytes" in loss.reason for loss in report.unreadable_ranges)
+    unlimited = job.replace(
+        bag=job.bag.replace(max_chunk_size=None), sequence=job.sequence.replace(name="unlimited")
+    )
+    assert run_recording(Task(unlimited)).report.exit_code == 0
