@@ -25,7 +25,7 @@ __all__ = [
 ]
 
 ROS_METADATA_KEY = "_ros_"
-"""Reserved: it wins over a key of the same name in the user's own topic metadata."""
+"""Reserved key: it takes precedence over the same key in the user's topic metadata."""
 
 
 def ros_metadata(definition: Definition, source_file: str) -> dict[str, Any]:
@@ -52,24 +52,24 @@ def _json_value(value: object) -> object:
 
 
 class Envelope(Struct, frozen=True):
-    """What is known of the rows beside their content."""
+    """Properties of a batch of rows besides their content."""
 
     topic: str
     msgtype: str
     log_times: NDArray[np.int64]
-    """ns since the epoch, shape (n,)."""
+    """Log times in ns since the epoch, shape (n,)."""
 
 
 class Adapted(Struct, frozen=True):
-    """The rows that fit, which of the given rows they were, and the ones that did not."""
+    """The result of adapting a batch: the rows that fit, and the failures."""
 
     rows: pa.StructArray
-    """Type = the ontology's struct."""
+    """The adapted rows; their type is the ontology's struct."""
     index: NDArray[np.int64]
-    """Position among the given rows, ascending, shape (len(rows),)."""
+    """Positions of the adapted rows in the batch, ascending, shape (len(rows),)."""
     failures: tuple[RowFailure, ...]
     log_times: NDArray[np.int64] | None = None
-    """Times to store instead of the recorded ones, shape (len(rows),); only a Python `translate` changes them."""
+    """Times to store instead of the log times, shape (len(rows),); only a `translate` in Python changes them."""
 
 
 class Adapter(Protocol):
@@ -77,56 +77,56 @@ class Adapter(Protocol):
 
     @property
     def ontology(self) -> OntologyType:
-        """What the rows become."""
+        """The ontology type of the adapted rows."""
         ...
 
     def adapt(self, rows: pa.StructArray, envelope: Envelope) -> Adapted:
-        """Adapt a whole batch; a row that does not fit is a failure, the others go on.
+        """Adapt a batch; rows that do not fit become failures.
 
         Raises:
-            AdapterError: The adapter itself is broken; no row can be adapted.
+            AdapterError: The adapter itself fails, so no row can be adapted.
         """
         ...
 
     def topic_metadata(self, first_row: pa.StructScalar | None) -> dict[str, Any]:
-        """Return what the platform should know of the topic's configuration; {} by default."""
+        """Return topic metadata read from the first row; {} without any."""
         ...
 
 
 class AdapterSpec(Protocol):
-    """An adapter before it meets a definition: cheap, picklable, what registries and plans hold."""
+    """An adapter that is not yet bound to a definition: cheap, picklable, and held by registries and plans."""
 
     @property
     def name(self) -> str:
-        """As `IMUAdapter`."""
+        """The adapter's name, such as `IMUAdapter`."""
         ...
 
     @property
     def ros_types(self) -> tuple[str, ...]:
-        """The message types it takes, as `sensor_msgs/msg/Imu`."""
+        """The message types that the adapter takes, such as `sensor_msgs/msg/Imu`."""
         ...
 
     @property
     def default(self) -> bool:
-        """Whether it is used for its types without being asked for."""
+        """Whether the adapter applies to its types without an override."""
         ...
 
     def bind(self, definition: Definition, shape: pa.StructType) -> Adapter:
-        """Check the adapter against the real definition and make it ready.
+        """Check the adapter against a message definition, and prepare it.
 
         Raises:
-            AdapterError: A field it needs is not there or has another type; names the fields that are.
+            AdapterError: A required field is missing or has another type.
         """
         ...
 
 
 _ENVELOPE_COLUMN = "timestamp_ns"
 _ONE_MEMBER = pa.struct([("structure_needs_at_least_one_member", pa.uint8())])
-"""What a nested message without fields becomes, as ROS 2 itself spells it: Parquet has no struct without fields."""
+"""Type of a nested message without fields, named as in ROS 2: Parquet has no structs without fields."""
 
 
 class UnmodeledSpec(Struct, frozen=True):
-    """Keeps a message as it is; fits every type, and is nobody's default."""
+    """Keeps messages in their ROS shape; takes every type, and is not the default of any."""
 
     name: str = "Unmodeled"
     ros_types: tuple[str, ...] = ()
@@ -134,7 +134,7 @@ class UnmodeledSpec(Struct, frozen=True):
     serialization_format: SerializationFormat = SerializationFormat.DEFAULT
 
     def bind(self, definition: Definition, shape: pa.StructType) -> UnmodeledAdapter:
-        """Take the ROS shape for the ontology's columns; two types of one short name differ by fingerprint."""
+        """Use the ROS shape as ontology columns; types with the same short name differ by fingerprint."""
         tag = definition.root.rsplit("/", 1)[-1]
         names = _free_of_the_envelope(shape)
         struct = pa.struct([pa.field(names[field.name], _storable(field.type)) for field in shape])
@@ -143,13 +143,13 @@ class UnmodeledSpec(Struct, frozen=True):
 
 
 class UnmodeledAdapter(Struct, frozen=True):
-    """Hands the rows on without copying; at most fields get another name, or a member where they have none."""
+    """Returns rows without copying, except that it renames fields and completes structs without fields."""
 
     ontology: OntologyType
     renamed: dict[str, str]
-    """New name -> name in the message; only a field called like the envelope's column is in it."""
+    """Column name → field name, for a field that has the name of the envelope's column."""
 
-    def adapt(self, rows: pa.StructArray, envelope: Envelope) -> Adapted:  # noqa: ARG002 - the seam's signature
+    def adapt(self, rows: pa.StructArray, envelope: Envelope) -> Adapted:  # noqa: ARG002 - the protocol's signature
         """Return the same columns."""
         columns = list(self.ontology.struct)
         if any(field.type != column.type for field, column in zip(rows.type, columns, strict=True)):
@@ -159,12 +159,12 @@ class UnmodeledAdapter(Struct, frozen=True):
         return Adapted(rows, np.arange(len(rows), dtype=np.int64), ())
 
     def topic_metadata(self, first_row: pa.StructScalar | None) -> dict[str, Any]:  # noqa: ARG002 - as above
-        """Say which fields have another name than in the message, if any."""
+        """Return the renamed fields, if any."""
         return {"renamed_fields": dict(self.renamed)} if self.renamed else {}
 
 
 def _free_of_the_envelope(shape: pa.StructType) -> dict[str, str]:
-    """Name each column after its field; one called `timestamp_ns` gets underscores until its name is free."""
+    """Return the column name of each field: `timestamp_ns` gets underscores until its name is unique."""
     names = {field.name: field.name for field in shape}
     if _ENVELOPE_COLUMN in names:
         free = f"{_ENVELOPE_COLUMN}_"
@@ -175,7 +175,7 @@ def _free_of_the_envelope(shape: pa.StructType) -> dict[str, str]:
 
 
 def _storable(kind: Any) -> pa.DataType:  # noqa: ANN401 - the stubs hide what a nested type is made of
-    """Return the type with a member in every struct that has none."""
+    """Return the type with a placeholder field in every struct without fields."""
     if pa.types.is_struct(kind):
         members = [field.with_type(_storable(field.type)) for field in kind]
         return pa.struct(members) if members else _ONE_MEMBER
@@ -187,7 +187,7 @@ def _storable(kind: Any) -> pa.DataType:  # noqa: ANN401 - the stubs hide what a
 
 
 def _with_members(rows: Any, struct: pa.StructType) -> pa.StructArray:  # noqa: ANN401 - as above
-    """Rebuild rows with the members they lack, null; through Python, since hardly a type has such fields."""
+    """Rebuild rows with null placeholder fields. It runs in Python, because such types are rare."""
     names = [field.name for field in struct]
     renamed = [dict(zip(names, row.values(), strict=True)) for row in rows.to_pylist()]
     return cast("pa.StructArray", pa.array(renamed, type=struct))

@@ -60,32 +60,33 @@ _ADAPTER_KEY = re.compile(r"^adapter:\s*['\"]?(?P<name>\w+)['\"]?\s*(#|$)", re.M
 
 
 def adapter_spec(adapter: object, base_dir: Path) -> AdapterSpec:
-    """Return the spec an adapter is given by: a spec itself, a class, or a reference as text or path.
+    """Return the spec for a spec, an adapter class, or a reference as text or path.
 
     Raises:
-        AdapterError: It stands for none.
+        AdapterError: The object is not an adapter.
     """
     if isinstance(adapter, (str, Path)):
         return load_adapter_reference(str(adapter), base_dir)
     if isinstance(adapter, type):
-        if "__adapter_spec__" in vars(adapter):  # a built-in's own class, not one that extends it
+        if "__adapter_spec__" in vars(adapter):  # the class of a built-in adapter, but not a subclass
             return vars(adapter)["__adapter_spec__"]
         if is_adapter_class(adapter):
             return PythonAdapterSpec(adapter)
     elif hasattr(adapter, "bind") and hasattr(adapter, "ros_types"):
-        return cast("AdapterSpec", adapter)  # it has what the protocol asks for
+        return cast("AdapterSpec", adapter)  # it implements the protocol
     raise AdapterError(
-        f"{_spell(adapter)} is no adapter", hint="give a subclass of ROSAdapterBase, or a reference to one"
+        f"{_spell(adapter)} is not an adapter",
+        hint="give a subclass of ROSAdapterBase, or a reference to one",
     )
 
 
 def load_adapter_reference(ref: str, base_dir: Path) -> AdapterSpec:
-    """Find `LidarAdapter`, `adapters/pack.yaml`, `pkg.module:Class` or `path/to/file.py:Class`.
+    """Load the adapter that a reference names: `LidarAdapter`, `adapters/pack.yaml`, `pkg.module:Class` or `file.py:Class`.
 
-    Paths start at `base_dir`; a module is looked for where Python looks, then there.
+    Paths are relative to `base_dir`. Modules are imported from Python's search path, then from `base_dir`.
 
     Raises:
-        AdapterError: There is none, or its file has a mistake: names the file and the line.
+        AdapterError: There is no such adapter, or its file has a mistake; the error has file and line.
     """
     if ref in BY_NAME:
         return BY_NAME[ref]
@@ -93,33 +94,37 @@ def load_adapter_reference(ref: str, base_dir: Path) -> AdapterSpec:
         return UnmodeledSpec()
     if Path(ref).suffix in _MAPPING_SUFFIXES:
         return _load_mapping(base_dir / ref)
-    place, colon, qualname = ref.rpartition(":")
-    if not colon or not place or not qualname:
-        raise AdapterError(f"no adapter is called {ref!r}", hint=suggest_reference(ref, BY_NAME))
-    module = _load_file(base_dir / place) if place.endswith(".py") else _load_module(place, base_dir)
-    found = _attribute(module, qualname, ref)
-    spec = adapter_spec(found, base_dir)
+    module_path, colon, qualname = ref.rpartition(":")
+    if not colon or not module_path or not qualname:
+        raise AdapterError(f"there is no adapter {ref!r}", hint=suggest_reference(ref, BY_NAME))
+    module = (
+        _load_file(base_dir / module_path)
+        if module_path.endswith(".py")
+        else _load_module(module_path, base_dir)
+    )
+    value = _attribute(module, qualname, ref)
+    spec = adapter_spec(value, base_dir)
     if isinstance(spec, PythonAdapterSpec):
         return PythonAdapterSpec(spec.adapter, origin=(load_adapter_reference, (ref, base_dir)))
     return spec
 
 
-def suggest_reference(ref: str, known: Iterable[str] = ()) -> str:
-    """Return what to write instead of a name that no adapter has."""
+def suggest_reference(ref: str, names: Iterable[str] = ()) -> str:
+    """Return the hint for a reference that names no adapter."""
     if ref.endswith(".py"):
         return f"name the class in it: {ref}:Class"
-    if near := get_close_matches(ref, list(known), n=1, cutoff=0.6):
-        return f"did you mean {near[0]}?"
+    if nearest := get_close_matches(ref, list(names), n=1, cutoff=0.6):
+        return f"did you mean {nearest[0]}?"
     return "see `ingest adapters list`, or write a YAML path, module:Class or file.py:Class"
 
 
 class AdapterFinder(Struct, frozen=True):
-    """Finds the adapters a mapping may use: the built-in ones, and those of the files beside it."""
+    """Finds the adapters that a mapping may use: the built-in ones, and those in the files of its folder."""
 
     folder: Path
 
     def __call__(self, name: str) -> AdapterSpec | None:
-        """Return the adapter of that name, None where there is none."""
+        """Return the adapter of a name, None if there is none."""
         if name in BY_NAME:
             return BY_NAME[name]
         for path in self._files():
@@ -130,15 +135,15 @@ class AdapterFinder(Struct, frozen=True):
 
     def names(self) -> Iterable[str]:
         """Return the names of the built-in adapters and of those in the folder."""
-        found = (_ADAPTER_KEY.search(_text_of(path)) for path in self._files())
-        return [*BY_NAME, *(match["name"] for match in found if match)]
+        matches = (_ADAPTER_KEY.search(_text_of(path)) for path in self._files())
+        return [*BY_NAME, *(match["name"] for match in matches if match)]
 
     def _files(self) -> list[Path]:
         return sorted(path for path in self.folder.iterdir() if path.suffix in _MAPPING_SUFFIXES)
 
 
 def _text_of(path: Path) -> str:
-    """Return what a file beside a mapping says; nothing where it cannot be read."""
+    """Return the text of a file next to a mapping, or an empty text if it cannot be read."""
     try:
         return read_limited(path).decode("utf-8", "replace")
     except OSError:
@@ -150,18 +155,20 @@ def _load_mapping(path: Path) -> AdapterSpec:
 
 
 def _attribute(module: ModuleType, qualname: str, ref: str) -> object:
-    found: object = module
+    value: object = module
     for name in qualname.split("."):
-        if not hasattr(found, name):
+        if not hasattr(value, name):
             classes = [name for name, value in vars(module).items() if is_adapter_class(value)]
-            near = get_close_matches(qualname, classes, n=1)
-            known = near or [name for name in classes if name != "ROSAdapterBase"]
+            nearest = get_close_matches(qualname, classes, n=1)
+            names = nearest or [name for name in classes if name != "ROSAdapterBase"]
             raise AdapterError(
                 f"{ref.rpartition(':')[0]} has no {qualname}",
-                hint=f"did you mean {near[0]}?" if near else f"its adapters are {', '.join(known) or 'none'}",
+                hint=f"did you mean {nearest[0]}?"
+                if nearest
+                else f"its adapters are {', '.join(names) or 'none'}",
             )
-        found = getattr(found, name)
-    return found
+        value = getattr(value, name)
+    return value
 
 
 def _load_module(name: str, base_dir: Path) -> ModuleType:
@@ -184,7 +191,7 @@ def _load_file(path: Path) -> ModuleType:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, path)
     if not path.is_file() or spec is None or spec.loader is None:
-        raise AdapterError(f"there is no file {path}", hint="the path starts at the folder of the manifest")
+        raise AdapterError(f"there is no file {path}", hint="write a path relative to the manifest")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:
@@ -198,9 +205,9 @@ def _load_file(path: Path) -> ModuleType:
 
 @contextmanager
 def _also_searched(folder: Path) -> Generator[None]:
-    """Let imports find modules in `folder`, after everything that is installed."""
+    """Let imports also find modules in `folder`, after the installed packages."""
     entry = str(folder.resolve())
-    if entry in sys.path:  # and there it stays
+    if entry in sys.path:
         yield
         return
     sys.path.append(entry)
@@ -211,19 +218,19 @@ def _also_searched(folder: Path) -> Generator[None]:
 
 
 def _broken(name: str, error: Exception) -> AdapterError:
-    """Say where an import failed: in the deepest line that is the user's own, if one is."""
+    """Return the error for a failed import, located at the deepest line of the user's own code."""
     if isinstance(error, SyntaxError) and error.filename:
-        place = f"{error.filename}:{error.lineno}"
+        location = f"{error.filename}:{error.lineno}"
     else:
         frames = [
             frame
             for frame in traceback.extract_tb(error.__traceback__)
             if "importlib" not in frame.filename and frame.filename != __file__
         ]
-        own = [frame for frame in frames if "site-packages" not in frame.filename] or frames
-        place = f"{own[-1].filename}:{own[-1].lineno}" if own else name
+        own_frames = [frame for frame in frames if "site-packages" not in frame.filename] or frames
+        location = f"{own_frames[-1].filename}:{own_frames[-1].lineno}" if own_frames else name
     text = " ".join(str(error).split())
-    return AdapterError(f"importing {name} failed: {type(error).__name__}: {text}", where=place)
+    return AdapterError(f"importing {name} failed: {type(error).__name__}: {text}", where=location)
 
 
 def _spell(candidate: object) -> str:
@@ -235,13 +242,13 @@ def _spell(candidate: object) -> str:
 
 
 ENTRY_POINTS = "mosaico_ingest.adapters"
-"""The group under which an installed package names its adapters: a class, a spec, or a list of them."""
+"""The entry point group in which installed packages offer adapters: a class, a spec, or a list of them."""
 
 Reason = Literal["override", "loaded", "registered", "entry point", "built-in", "unmodeled"]
 
 
 class Resolution(Struct, frozen=True):
-    """The adapter of a topic and which rule chose it; the first of the reasons that applies does."""
+    """The adapter of a topic, and the reason for the choice."""
 
     spec: AdapterSpec
     reason: Reason
@@ -254,7 +261,7 @@ class Resolution(Struct, frozen=True):
 
 
 class ROSBridge:
-    """Every adapter a run knows: its overrides by topic, its own by type, those installed, the built-in ones."""
+    """The adapters of a run: overrides by topic; then loaded, registered, installed and built-in ones by type."""
 
     def __init__(
         self,
@@ -265,18 +272,18 @@ class ROSBridge:
         images: Mapping[str, str] | None = None,
         formats: Mapping[str, str] | None = None,
     ) -> None:
-        """Find every adapter that is named; `base_dir` is where relative paths start.
+        """Load all adapters; `base_dir` is the folder for relative paths.
 
         `overrides` and `images` are by topic name or glob, `formats` (of types without an adapter) by type.
 
         Raises:
-            AdapterError: One is not there, has a mistake, or two are loaded for one type.
+            AdapterError: An adapter is missing or has a mistake, or two are loaded for one type.
         """
         folder = base_dir or Path()
-        own = [(str(reference), adapter_spec(reference, folder)) for reference in loaded]
-        self._loaded = _by_type((f"loaded from {origin}", spec) for origin, spec in own)
+        specs = [(str(reference), adapter_spec(reference, folder)) for reference in loaded]
+        self._loaded = _by_type((f"loaded from {origin}", spec) for origin, spec in specs)
         self._installed = _by_type(installed_adapters())
-        names = {spec.name: spec for _, spec in (*installed_adapters(), *own)}
+        names = {spec.name: spec for _, spec in (*installed_adapters(), *specs)}
         self._overrides = {
             pattern: names.get(reference) or adapter_spec(reference, folder)
             if isinstance(reference, str)
@@ -291,7 +298,7 @@ class ROSBridge:
         """Return the bridge of a job; relative paths start at `folder`, by default the manifest's folder.
 
         Raises:
-            AdapterError: As when it is made by hand.
+            AdapterError: As in the constructor.
         """
         return cls(
             overrides=job.adapters.override,
@@ -306,16 +313,16 @@ class ROSBridge:
         )
 
     def resolve(self, topic: str, msgtype: str) -> Resolution:
-        """Choose the adapter of a topic.
+        """Return the adapter of a topic.
 
         Raises:
             AdapterError: The topic's override does not take the type.
         """
-        found = self._resolve(topic, normalize_msgtype(msgtype))
+        resolution = self._resolve(topic, normalize_msgtype(msgtype))
         pattern = first_match(self._images, topic)
         if pattern is None or self._images[pattern] == "raw":
-            return found
-        return replace(found, spec=PngImageSpec(found.spec))
+            return resolution
+        return replace(resolution, spec=PngImageSpec(resolution.spec))
 
     def _resolve(self, topic: str, msgtype: str) -> Resolution:
         pattern = first_match(self._overrides, topic)
@@ -343,7 +350,7 @@ class ROSBridge:
                 f"the override {pattern!r} names {spec.name}, which takes {', '.join(spec.ros_types)}; "
                 f"the topic carries {msgtype}",
                 where=topic,
-                hint="name an adapter that takes this type, or leave the topic out of the override",
+                hint="name an adapter that takes this type, or exclude the topic from the override",
             )
         return Resolution(spec, "override", f"override {pattern!r}")
 
@@ -367,33 +374,37 @@ class ROSBridge:
 
     @classmethod
     def from_ros_message(cls, msg: ROSMessage) -> Message:
-        """Translate one message with the adapter its type gets without a job.
+        """Translate one message with the adapter that its type gets without a job.
 
         Raises:
             AdapterError: No adapter takes the type, or the message does not fit.
         """
         from mosaico_ingest.adapters.standalone import translate  # noqa: PLC0415 - a run has no single messages
 
-        found = cls().resolve(msg.topic, msg.msg_type)
-        if found.unmodeled:
+        resolution = cls().resolve(msg.topic, msg.msg_type)
+        if resolution.unmodeled:
             raise AdapterError(
                 f"no adapter takes {msg.msg_type}",
                 where=msg.topic,
                 hint="register one with @register_default_adapter",
             )
-        return translate(found.spec, msg)
+        return translate(resolution.spec, msg)
 
 
-def _layout(said: object) -> SerializationFormat:
+def _layout(value: object) -> SerializationFormat:
     try:
-        return SerializationFormat(said.value if isinstance(said, Enum) else said)  # the SDK has its own
+        return SerializationFormat(
+            value.value if isinstance(value, Enum) else value
+        )  # the SDK has its own enum
     except ValueError:
         allowed = ", ".join(layout.value for layout in SerializationFormat)
-        raise AdapterError(f"there is no serialization format {said!r}", hint=f"allowed: {allowed}") from None
+        raise AdapterError(
+            f"there is no serialization format {value!r}", hint=f"allowed: {allowed}"
+        ) from None
 
 
 def _by_type(specs: Iterable[tuple[str, AdapterSpec]]) -> dict[str, tuple[str, AdapterSpec]]:
-    """Arrange default adapters by message type; two for one type are a mistake."""
+    """Return default adapters by message type; two adapters for one type raise an error."""
     by_type: dict[str, tuple[str, AdapterSpec]] = {}
     for origin, spec in specs:
         for msgtype in spec.ros_types if spec.default else ():
@@ -401,7 +412,7 @@ def _by_type(specs: Iterable[tuple[str, AdapterSpec]]) -> dict[str, tuple[str, A
                 other_origin, other = by_type[msgtype]
                 raise AdapterError(
                     f"{other.name} ({other_origin}) and {spec.name} ({origin}) both take {msgtype}",
-                    hint="drop one, or give it `default: false` and name it in an override",
+                    hint="remove one, or set `default: false` in it and select it with an override",
                 )
             by_type[msgtype] = (origin, spec)
     return by_type
@@ -416,22 +427,22 @@ def _registered() -> dict[str, tuple[str, AdapterSpec]]:
 
 @cache
 def installed_adapters() -> tuple[tuple[str, AdapterSpec], ...]:
-    """Return what installed packages offer, with where it comes from.
+    """Return the adapters of installed packages, each with the name of its entry point.
 
     Raises:
-        AdapterError: One of them cannot be imported or is no adapter; names the package.
+        AdapterError: An entry point cannot be imported or is not an adapter; the error names the package.
     """
-    found: list[tuple[str, AdapterSpec]] = []
+    adapters: list[tuple[str, AdapterSpec]] = []
     for entry in entry_points(group=ENTRY_POINTS):
         package = entry.dist.name if entry.dist else "an installed package"
         try:
             offered = entry.load()
             offers = offered if isinstance(offered, (list, tuple)) else (offered,)
-            specs = [adapter_spec(one, Path()) for one in offers]
+            specs = [adapter_spec(offer, Path()) for offer in offers]
         except Exception as error:
             raise AdapterError(
                 f"entry point {entry.name} of {package} cannot be used: {type(error).__name__}: {error}",
                 hint=f"repair or remove {package}",
             ) from error
-        found += [(f"entry point {entry.name} of {package}", spec) for spec in specs]
-    return tuple(found)
+        adapters += [(f"entry point {entry.name} of {package}", spec) for spec in specs]
+    return tuple(adapters)

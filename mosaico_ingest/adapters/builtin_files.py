@@ -18,10 +18,10 @@ __all__ = [
 
 
 def catalog_file() -> str:
-    """Return the file: a line for each adapter.
+    """Return the content of `catalog.json`: one line per adapter.
 
     Raises:
-        AdapterError: One of them has a mistake.
+        AdapterError: An adapter file has a mistake.
     """
     sources = {builtin.stem: load_adapter(builtin.path, adapters=find_builtin).source for builtin in BUILTIN}
     lines = (f'"{stem}": {json.dumps(_plain(source.value))}' for stem, source in sources.items())
@@ -41,14 +41,14 @@ _BEGIN, _END = "<!-- catalog: made from its files -->\n", "<!-- end of catalog -
 
 
 def catalog_table() -> str:
-    """Return the built-in adapters as Markdown tables: those used without being asked for, and the others."""
+    """Return Markdown tables of the built-in adapters: first the defaults, then those that need an override."""
     used = _table([builtin for builtin in BUILTIN if builtin.default])
     named = _table([builtin for builtin in BUILTIN if not builtin.default])
     return f"{used}\nOnly where an override names them:\n\n{named}"
 
 
 def with_catalog(text: str) -> str:
-    """Return a document with what stands between its two marks made anew."""
+    """Return a document with the table between its two markers regenerated."""
     before, rest = text.split(_BEGIN)
     return f"{before}{_BEGIN}\n{catalog_table()}\n{_END}{rest.split(_END)[1]}"
 
@@ -62,7 +62,7 @@ def _table(builtins: list[Builtin]) -> str:
 
 
 def _types(names: tuple[str, ...]) -> str:
-    """Return `pkg: A, B` for each package, as `sensor_msgs: Imu`."""
+    """Return type names grouped by package, such as `sensor_msgs: Imu`."""
     packages: dict[str, list[str]] = {}
     for name in names:
         package, _, short = name.partition("/msg/")

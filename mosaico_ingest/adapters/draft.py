@@ -45,17 +45,17 @@ __all__ = [
 
 
 def quote_key(name: str) -> str:
-    """Return a mapping's key, quoted where it would not be read as text."""
+    """Return a key of a YAML mapping, quoted if it would not be read as text."""
     return name if name.isidentifier() and resolve_plain(name) == (name, None) else json.dumps(name)
 
 
 def quote_expression(text: str) -> str:
-    """Return an expression, quoted where it would not be read as text."""
+    """Return an expression, quoted if YAML would not read it as text."""
     return text if resolve_plain(text) == (text, None) else json.dumps(text)
 
 
 def flow_style(value: Any) -> str:  # noqa: ANN401 - whatever a message holds
-    """Return a value in flow style; bytes become a list of numbers."""
+    """Return a value in YAML's flow style; bytes become a list of numbers."""
     if isinstance(value, Mapping):
         return (
             "{"
@@ -80,29 +80,29 @@ def _number(value: float) -> str:
 
 
 _RESERVED = frozenset({"self", "nan", "inf", "pi", "true", "false", "null"})
-"""What means something else in an expression."""
+"""Names with another meaning in expressions."""
 _TELLING = 4
-"""From how many letters on a column's name is looked for inside longer ones."""
+"""Minimum length of a column name that is searched for within field names."""
 
 
 class ColumnDraft(Struct, frozen=True):
-    """What may fill a column."""
+    """The proposed value of a column."""
 
     name: str
     value: str | None
-    """As the file spells it, the `of` of one with fields; None: nothing is known, the column stays null."""
+    """The value as text of the file; for a struct with `fields`, its `of`. None leaves the column null."""
     note: str = ""
-    """What a reader should know: the column's type, and what was taken for it."""
+    """A comment: the column's type, and why the value was chosen."""
     fields: tuple[ColumnDraft, ...] = ()
 
 
 class _Candidate(Struct, frozen=True):
-    """A field of the message, however deep, but not inside a list."""
+    """A field of the message, also a nested one, but not inside a list."""
 
     path: tuple[str, ...]
     type: DataType
     msgtype: str | None
-    """Where it is a message, or a list of them: which."""
+    """The message type of a message, or of a list of messages."""
     listed: bool
 
     @property
@@ -111,44 +111,58 @@ class _Candidate(Struct, frozen=True):
 
 
 def draft_columns(struct: DataType, definition: Definition, shape: pa.StructType) -> tuple[ColumnDraft, ...]:
-    """Return a guess for every column of an ontology type; one that is required gets some value."""
-    known = sorted(_candidates(definition, definition.root, shape, ()), key=lambda one: len(one.path))
-    return tuple(_column(field, known) for field in struct)
+    """Return a proposal for every column of an ontology type; required columns always get a value."""
+    candidates = sorted(
+        _candidates(definition, definition.root, shape, ()), key=lambda candidate: len(candidate.path)
+    )
+    return tuple(_column(field, candidates) for field in struct)
 
 
-def _column(field: DataType, known: Sequence[_Candidate]) -> ColumnDraft:
+def _column(field: DataType, candidates: Sequence[_Candidate]) -> ColumnDraft:
     type_ = format_type(field.type)
-    for some in _by_likeness(field, known):
-        values = [value for one in some if (value := _fitting(one, field.type)) is not None]
+    for group in _by_likeness(field, candidates):
+        values = [value for candidate in group if (value := _fitting(candidate, field.type)) is not None]
         if len(values) == 1:
             return ColumnDraft(
                 field.name, values[0], f"{type_}, {'may be null' if field.nullable else 'required'}"
             )
-    perhaps = ", ".join(
-        one.text for one in known if len(one.path) == 1 and _resembles(field.name, one.path[0])
+    similar = ", ".join(
+        candidate.text
+        for candidate in candidates
+        if len(candidate.path) == 1 and _resembles(field.name, candidate.path[0])
     )
-    note = f"{type_}, perhaps {perhaps}" if perhaps else type_
+    note = f"{type_}, perhaps {similar}" if similar else type_
     if field.nullable:
         return ColumnDraft(field.name, None, note)
     if pt.is_struct(field.type):
         inner = tuple(_column(child, ()) for child in field.type)
-        return ColumnDraft(field.name, None, "required: no field is called so", inner)
-    return ColumnDraft(field.name, _nothing(field.type), f"{note}, required: no field is called so")
+        return ColumnDraft(field.name, None, "required: no field has this name", inner)
+    return ColumnDraft(field.name, _placeholder(field.type), f"{note}, required: no field has this name")
 
 
-def _by_likeness(field: DataType, known: Sequence[_Candidate]) -> Iterator[list[_Candidate]]:
-    """Yield fields that may be meant, the likeliest first; of several at once none is taken."""
-    named = [one for one in known if _plain(one.path[-1]) == _plain(field.name)]
-    yield [one for one in named if len(one.path) == 1]
+def _by_likeness(field: DataType, candidates: Sequence[_Candidate]) -> Iterator[list[_Candidate]]:
+    """Yield groups of candidate fields, best match first. A group with several fitting fields is ambiguous."""
+    named = [
+        candidate for candidate in candidates if _normalized(candidate.path[-1]) == _normalized(field.name)
+    ]
+    yield [candidate for candidate in named if len(candidate.path) == 1]
     yield named
     if pt.is_struct(field.type):
-        yield [one for one in known if one.msgtype is not None and _resembles(field.name, one.path[-1])]
+        yield [
+            candidate
+            for candidate in candidates
+            if candidate.msgtype is not None and _resembles(field.name, candidate.path[-1])
+        ]
         if not field.nullable:
-            yield [one for one in known if one.msgtype is not None and len(one.path) == 1]
+            yield [
+                candidate
+                for candidate in candidates
+                if candidate.msgtype is not None and len(candidate.path) == 1
+            ]
 
 
 def _resembles(column: str, name: str) -> bool:
-    return len(column) >= _TELLING and _plain(column) in _plain(name)
+    return len(column) >= _TELLING and _normalized(column) in _normalized(name)
 
 
 def _candidates(
@@ -163,16 +177,16 @@ def _candidates(
 
 
 def _fitting(candidate: _Candidate, target: DataType) -> str | None:
-    """Return an expression of a candidate that fits a column, the plainest first."""
+    """Return the simplest expression of a candidate that fits a column, None if there is none."""
     if _fits(candidate.type, target, candidate.msgtype):
         return candidate.text
     if is_number(candidate.type) and is_number(target):
         return f"cast({candidate.text})"
-    used = _adapted(candidate.msgtype, listed=candidate.listed)
-    if used is None:
+    nested = _adapted(candidate.msgtype, listed=candidate.listed)
+    if nested is None:
         return None
-    adapter, made = used
-    return _by_adapter(adapter, candidate.text, listed=candidate.listed) if _fits(made, target) else None
+    adapter, columns = nested
+    return _by_adapter(adapter, candidate.text, listed=candidate.listed) if _fits(columns, target) else None
 
 
 def _by_adapter(adapter: str, text: str, *, listed: bool) -> str:
@@ -180,7 +194,7 @@ def _by_adapter(adapter: str, text: str, *, listed: bool) -> str:
 
 
 def _expression(first: str, *rest: str) -> str:
-    """Return the way to a field, as expressions spell it."""
+    """Return the expression that reads a field."""
     odd = keyword.iskeyword(first) or first in _RESERVED
     names = "".join(f"['{name}']" if keyword.iskeyword(name) else f".{name}" for name in rest)
     return (f"self['{first}']" if odd else first) + names
@@ -195,7 +209,7 @@ def _fits(source: DataType, target: DataType, msgtype: str | None = None) -> boo
 
 
 def _adapted(msgtype: str | None, *, listed: bool) -> tuple[str, DataType] | None:
-    """Return the built-in adapter of a nested message and what it makes of it."""
+    """Return the built-in adapter of a nested message and the type of its records."""
     builtin = BY_TYPE.get(msgtype or "")
     if builtin is None:
         return None
@@ -203,8 +217,8 @@ def _adapted(msgtype: str | None, *, listed: bool) -> tuple[str, DataType] | Non
     return builtin.name, pa.list_(struct) if listed else struct
 
 
-def _nothing(type_: DataType) -> str:
-    """Return a value that fits a required column and means nothing."""
+def _placeholder(type_: DataType) -> str:
+    """Return a placeholder that fits a required column."""
     return f'"{text}"' if (text := _zero(type_))[:1] in {"[", "'", "b"} else text
 
 
@@ -220,83 +234,87 @@ def _zero(type_: DataType) -> str:
     return "[]" if pt.is_list(type_) else "0"
 
 
-def _plain(name: str) -> str:
+def _normalized(name: str) -> str:
     return name.replace("_", "").lower()
 
 
 def draft_ontology_type(definition: Definition) -> tuple[list[str], tuple[ColumnDraft, ...]]:
-    """Return the fields of an ontology type of one's own as lines of YAML, and what fills each."""
-    made = _own_fields(definition, definition.root, ros_shape(definition), "    ", top=True)
-    return [line for lines, _ in made for line in lines], tuple(guess for _, some in made for guess in some)
+    """Return the YAML lines of an ontology type that mirrors a message, and the value of each of its fields."""
+    columns = _mirrored_fields(definition, definition.root, ros_shape(definition), "    ", top=True)
+    return [line for lines, _ in columns for line in lines], tuple(
+        column_draft for _, group in columns for column_draft in group
+    )
 
 
-_Made = tuple[list[str], list[ColumnDraft]]
+_Columns = tuple[list[str], list[ColumnDraft]]
 
 
-def _own_fields(
+def _mirrored_fields(
     definition: Definition, msgtype: str, shape: DataType, margin: str, *, top: bool = False
-) -> list[_Made]:
-    made: list[_Made] = []
+) -> list[_Columns]:
+    columns: list[_Columns] = []
     for field in definition.types[msgtype].fields:
         name = (
             f"{field.name}_" if top and field.name == "timestamp_ns" else field.name
         )  # the envelope's column
         type_ = shape.field(shape.get_field_index(field.name)).type
-        made.append(_own(definition, field, name, type_, margin))
-    return made
+        columns.append(_mirrored_field(definition, field, name, type_, margin))
+    return columns
 
 
-def _own(definition: Definition, field: Field, name: str, type_: DataType, margin: str) -> _Made:
-    """Return what a field of the message becomes: a column like it, or some for a list of messages."""
+def _mirrored_field(
+    definition: Definition, field: Field, name: str, type_: DataType, margin: str
+) -> _Columns:
+    """Return the columns for one field of the message."""
     listed, text = field.container is not Container.SCALAR, _expression(field.name)
     if not field.is_message:
         return [f"{margin}{quote_key(name)}: {format_type(type_)}"], [
             ColumnDraft(name, quote_expression(text))
         ]
-    used = _adapted(field.type, listed=listed)
-    if used is not None:
+    nested = _adapted(field.type, listed=listed)
+    if nested is not None:
         tag = BY_TYPE[field.type].tag
         own = (
             quote_expression(text)
             if tag == "Header" and not listed
-            else _by_adapter(used[0], text, listed=listed)
+            else _by_adapter(nested[0], text, listed=listed)
         )
         return [f"{margin}{quote_key(name)}: {f'list[{tag}]' if listed else tag}"], [ColumnDraft(name, own)]
     if listed:
-        return _spread(definition, field, margin)
-    inner = _own_fields(definition, field.type, type_, margin + "    ")
+        return _list_columns(definition, field, margin)
+    inner = _mirrored_fields(definition, field.type, type_, margin + "    ")
     lines = [line for part, _ in inner for line in part]
-    guesses = tuple(guess for _, part in inner for guess in part)
+    drafts = tuple(column_draft for _, part in inner for column_draft in part)
     if not lines:
         return [], []
     return [f"{margin}{quote_key(name)}:", f"{margin}  fields:", *lines], [
-        ColumnDraft(name, quote_expression(text), fields=guesses)
+        ColumnDraft(name, quote_expression(text), fields=drafts)
     ]
 
 
-def _spread(definition: Definition, field: Field, margin: str) -> _Made:
-    """Return a list for each plain field of a list's messages; what nests deeper is left to the author."""
-    made: _Made = ([], [])
+def _list_columns(definition: Definition, field: Field, margin: str) -> _Columns:
+    """Return one list per plain field of a list of messages; deeper nesting is left to the author."""
+    columns: _Columns = ([], [])
     for child in definition.types[field.type].fields:
         if not child.is_message and child.container is Container.SCALAR:
             name = f"{field.name}_{child.name}"
             kind = "uint8" if child.type in BYTES else "string" if child.type in TEXTS else child.type
-            made[0].append(f"{margin}{quote_key(name)}: list[{kind}]")
-            made[1].append(ColumnDraft(name, f"{_expression(field.name)}[]{_expression('', child.name)}"))
-    return made
+            columns[0].append(f"{margin}{quote_key(name)}: list[{kind}]")
+            columns[1].append(ColumnDraft(name, f"{_expression(field.name)}[]{_expression('', child.name)}"))
+    return columns
 
 
 _LONG = 1500
-"""How many characters of a message a test spells out; a longer one is named by its place in the recording."""
+"""Maximum number of characters of a message in a test; longer messages are referenced in their recording."""
 
 
 class RecordedExample(Struct, frozen=True):
-    """A recorded message for the draft's test."""
+    """A recorded message for the test of a draft."""
 
     row: pa.StructArray
-    """The message as the only row, in the ROS shape."""
-    place: Mapping[str, Any]
-    """Where it is: bag, topic, index."""
+    """The message in the ROS shape, as the only row."""
+    location: Mapping[str, Any]
+    """Its location: bag, topic, index."""
 
 
 def draft(
@@ -306,23 +324,23 @@ def draft(
     embed: bool = False,
     example: RecordedExample | None = None,
 ) -> str:
-    """Return an adapter file for a message type that binds to it as it is.
+    """Return an adapter file that binds to a message type without changes.
 
-    Without `ontology` it defines a type of its own. `embed` puts the definition in, for a type no distro knows.
+    Without `ontology`, the file declares a type of its own. `embed` adds the definition, for a type that no distro has.
 
     Raises:
-        AdapterError: The message type has no fields, or there is no such ontology.
+        AdapterError: The message type has no fields, or the ontology does not exist.
     """
     shape = ros_shape(definition)
     if not definition.message.fields:
-        raise AdapterError(f"{definition.root} has no fields", hint="there is nothing to adapt")
+        raise AdapterError(f"{definition.root} has no fields", hint="choose a type with fields")
     if ontology is None:
-        own, guesses = draft_ontology_type(definition)
+        own, drafts = draft_ontology_type(definition)
         target = "\n".join(["ontology:", f"  tag: {_tag(definition)}", "  fields:", *own])
     else:
-        guesses = draft_columns(ontology_type(ontology).struct, definition, shape)
+        drafts = draft_columns(ontology_type(ontology).struct, definition, shape)
         target = f"ontology: {ontology}"
-    lines = list(_lines(guesses, "  "))
+    lines = list(_lines(drafts, "  "))
     head = [*_head(definition), target, "", _opening(lines), *lines]
     spec = load_adapter("\n".join(head) + "\n", file="<draft>", adapters=find_builtin)
     adapter = spec.bind(definition, shape)
@@ -334,13 +352,13 @@ def draft(
 
 
 def _tag(definition: Definition) -> str:
-    """Return a tag for a type of one's own; those of the ontology are taken."""
+    """Return a tag that no built-in ontology type has."""
     short = definition.root.rpartition("/")[2]
     return f"{short}Message" if short in tags() else short
 
 
 def _head(definition: Definition) -> Iterator[str]:
-    yield f"# A first draft for {definition.root}: what has an equal name is filled in, the rest is for you."
+    yield f"# A draft for {definition.root}: fields with matching names are mapped; complete the rest."
     constants = ", ".join(f"{one.name} = {one.value}" for one in definition.message.constants)
     if constants:
         yield f"# Constants of the message, usable by name: {constants}"
@@ -349,25 +367,25 @@ def _head(definition: Definition) -> Iterator[str]:
     yield f"ros_type: {definition.root}"
 
 
-def _lines(guesses: tuple[ColumnDraft, ...], margin: str) -> Iterator[str]:
-    for guess in guesses:
-        note = f"  # {guess.note}" if guess.note else ""
-        if guess.fields:
-            of = f"of: {guess.value}" if guess.value else None
-            yield f"{margin}{quote_key(guess.name)}:{note}"
+def _lines(drafts: tuple[ColumnDraft, ...], margin: str) -> Iterator[str]:
+    for column_draft in drafts:
+        note = f"  # {column_draft.note}" if column_draft.note else ""
+        if column_draft.fields:
+            of = f"of: {column_draft.value}" if column_draft.value else None
+            yield f"{margin}{quote_key(column_draft.name)}:{note}"
             if of:
                 yield f"{margin}  {of}"
-            inner = list(_lines(guess.fields, margin + "    "))
+            inner = list(_lines(column_draft.fields, margin + "    "))
             yield f"{margin}  {_opening(inner)}"
             yield from inner
-        elif guess.value is None:
-            yield f"{margin}# {quote_key(guess.name)}:{note}"
+        elif column_draft.value is None:
+            yield f"{margin}# {quote_key(column_draft.name)}:{note}"
         else:
-            yield f"{margin}{quote_key(guess.name)}: {guess.value}{note}"
+            yield f"{margin}{quote_key(column_draft.name)}: {column_draft.value}{note}"
 
 
 def _opening(lines: list[str]) -> str:
-    """Return what stands before fields: YAML needs an empty mapping where all of them are comments."""
+    """Return the line above the fields; YAML needs an explicit empty mapping if all fields are comments."""
     return "fields: {}" if all(line.lstrip().startswith("#") for line in lines) else "fields:"
 
 
@@ -381,20 +399,21 @@ def _test(
     spec: MappingSpec, adapter: MappingAdapter, definition: Definition, example: RecordedExample | None
 ) -> Iterator[str]:
     if example is None:
-        yield "  - name: nothing but zeros"
+        yield "  - name: all fields zero"
         yield "    given: {}"
         yield "    expect: {}"
         return
     adapted = adapter.adapt(example.row, Envelope("", definition.root, np.zeros(1, np.int64)))
-    given = flow_style(_said(cast("Any", example.row)[0].as_py()))
-    yield f"  - name: a message of {example.place['topic']}"
-    yield f"    given: {given if len(given) <= _LONG else flow_style(example.place)}"
+    given = flow_style(_without_defaults(cast("Any", example.row)[0].as_py()))
+    yield f"  - name: a message of {example.location['topic']}"
+    yield f"    given: {given if len(given) <= _LONG else flow_style(example.location)}"
     if adapted.failures:
         yield f"    # {spec.name} rejects it: {adapted.failures[0].reason}"
         yield f"    rejects: {flow_style(adapted.failures[0].reason)}"
         return
     expected = {
-        name: flow_style(value) for name, value in _known(cast("Any", adapted.rows)[0].as_py()).items()
+        name: flow_style(value)
+        for name, value in _without_nulls(cast("Any", adapted.rows)[0].as_py()).items()
     }
     short = {name: text for name, text in expected.items() if len(text) <= _LONG}
     yield "    expect:" if short else "    expect: {}"
@@ -402,21 +421,23 @@ def _test(
         yield f"      {quote_key(name)}: {text}"
 
 
-def _said(message: dict[str, Any]) -> dict[str, Any]:
-    """Return a message without what a test need not give: zeros, empty texts and lists."""
-    kept = {
-        name: _said(cast("Any", value)) if isinstance(value, dict) else value
+def _without_defaults(message: dict[str, Any]) -> dict[str, Any]:
+    """Return a message without zeros, empty texts and empty lists, which are the defaults of a test."""
+    values = {
+        name: _without_defaults(cast("Any", value)) if isinstance(value, dict) else value
         for name, value in message.items()
     }
     return {
-        name: value for name, value in kept.items() if value is not None and value not in (0, "", b"", [], {})
+        name: value
+        for name, value in values.items()
+        if value is not None and value not in (0, "", b"", [], {})
     }
 
 
-def _known(record: dict[str, Any]) -> dict[str, Any]:
-    """Return a record without its nulls."""
-    kept = {
-        name: _known(cast("Any", value)) if isinstance(value, dict) else value
+def _without_nulls(record: dict[str, Any]) -> dict[str, Any]:
+    """Return a record without nulls."""
+    values = {
+        name: _without_nulls(cast("Any", value)) if isinstance(value, dict) else value
         for name, value in record.items()
     }
-    return {name: value for name, value in kept.items() if value is not None and value != {}}
+    return {name: value for name, value in values.items() if value is not None and value != {}}

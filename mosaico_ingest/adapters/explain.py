@@ -45,42 +45,42 @@ __all__ = [
     "unread_fields",
 ]
 
-_Place: TypeAlias = "tuple[str, ...]"
+_FieldPath: TypeAlias = "tuple[str, ...]"
 
 
 def unread_fields(adapter: Adapter, shape: pa.StructType) -> tuple[str, ...]:
-    """Return the fields no expression names, as `header.seq`; none of an adapter that is no mapping.
+    """Return the fields that no expression reads, such as `header.seq`; () for an adapter in Python.
 
     A struct that is handed on whole counts as read.
     """
     if not isinstance(adapter, MappingAdapter):
         return ()
     read = set(_of_adapter(adapter, ()))
-    return tuple(".".join(place) for place in _outside(shape, (), read))
+    return tuple(".".join(path) for path in _outside(shape, (), read))
 
 
-def _outside(shape: DataType, at: _Place, read: set[_Place]) -> Iterator[_Place]:
+def _outside(shape: DataType, at: _FieldPath, read: set[_FieldPath]) -> Iterator[_FieldPath]:
     for field in shape:
-        place = (*at, field.name)
-        if any(place[:length] in read for length in range(len(place) + 1)):
+        path = (*at, field.name)
+        if any(path[:length] in read for length in range(len(path) + 1)):
             continue
         element = field.type
         while is_list(element):
             element = element.value_type
-        if pt.is_struct(element) and any(known[: len(place)] == place for known in read):
-            yield from _outside(element, place, read)
+        if pt.is_struct(element) and any(path_read[: len(path)] == path for path_read in read):
+            yield from _outside(element, path, read)
         else:
-            yield place
+            yield path
 
 
-def _of_adapter(adapter: MappingAdapter, at: _Place) -> Iterator[_Place]:
+def _of_adapter(adapter: MappingAdapter, at: _FieldPath) -> Iterator[_FieldPath]:
     yield from _of_field(adapter.record, at)
     for typed in adapter.metadata.values():
         yield from _of_value(typed, at)
 
 
-def _of_field(field: ColumnPlan, at: _Place) -> Iterator[_Place]:
-    """Yield what a column reads, as seen from the message; `at` is where its names are looked up."""
+def _of_field(field: ColumnPlan, at: _FieldPath) -> Iterator[_FieldPath]:
+    """Yield the fields that a column reads, as paths from the message; `at` is the scope of its names."""
     source = field.source
     match source:
         case ExpressionSource():
@@ -91,21 +91,21 @@ def _of_field(field: ColumnPlan, at: _Place) -> Iterator[_Place]:
                 yield from _of_value(source.otherwise, at)
         case NestedAdapter():
             inner = source.adapter
-            place = _place(source.operand, at)
-            yield from _of_adapter(inner, place) if isinstance(inner, MappingAdapter) else (place,)
+            path = _path_of(source.operand, at)
+            yield from _of_adapter(inner, path) if isinstance(inner, MappingAdapter) else (path,)
         case StructSource():
-            inside = at if source.operand is None else _place(source.operand, at)
-            for one in source.fields:
-                yield from _of_field(one, inside)
+            inside = at if source.operand is None else _path_of(source.operand, at)
+            for column in source.fields:
+                yield from _of_field(column, inside)
         case _:
             pass
-    for one in field.overrides:
-        yield from _of_field(one, at)
+    for column in field.overrides:
+        yield from _of_field(column, at)
     if field.when is not None:
         yield from _of_value(field.when, at)
 
 
-def _of_value(typed: TypedExpression, at: _Place) -> Iterator[_Place]:
+def _of_value(typed: TypedExpression, at: _FieldPath) -> Iterator[_FieldPath]:
     match typed:
         case Constant():
             return
@@ -116,7 +116,7 @@ def _of_value(typed: TypedExpression, at: _Place) -> Iterator[_Place]:
         case Cast():
             parts = (typed.operand,)
         case _:
-            yield _place(typed, at)
+            yield _path_of(typed, at)
             if not isinstance(typed, MessageRef):
                 yield from _computed_inside(typed, at)
             return
@@ -124,8 +124,10 @@ def _of_value(typed: TypedExpression, at: _Place) -> Iterator[_Place]:
         yield from _of_value(part, at)
 
 
-def _computed_inside(typed: FieldAccess | OpenList | CloseList | ElementAt, at: _Place) -> Iterator[_Place]:
-    """Yield what is read under a list that is computed before it is opened, as `sorted(a)[0]`."""
+def _computed_inside(
+    typed: FieldAccess | OpenList | CloseList | ElementAt, at: _FieldPath
+) -> Iterator[_FieldPath]:
+    """Yield the fields below a computed list, as in `sorted(a)[0]`."""
     inner: Any = typed
     while isinstance(inner, (FieldAccess, OpenList, CloseList, ElementAt)):
         inner = inner.operand
@@ -133,49 +135,49 @@ def _computed_inside(typed: FieldAccess | OpenList | CloseList | ElementAt, at: 
         yield from _of_value(inner, at)
 
 
-def _place(typed: TypedExpression, at: _Place) -> _Place:
-    """Return the field an expression walks to; where it starts from something computed, that adds nothing."""
+def _path_of(typed: TypedExpression, at: _FieldPath) -> _FieldPath:
+    """Return the path of the field that an expression reads; computed values have the path of no field."""
     match typed:
         case FieldAccess():
-            return (*_place(typed.operand, at), typed.name)
+            return (*_path_of(typed.operand, at), typed.name)
         case OpenList() | CloseList() | ElementAt():
-            return _place(typed.operand, at)
+            return _path_of(typed.operand, at)
         case MessageRef():
             return at
         case _:
-            return ("",)  # no field is called so
+            return ("",)  # no field has an empty name
 
 
 class ColumnOrigin(Struct, frozen=True):
-    """One column of the records, or a field of one, and where its values come from."""
+    """One column of the records, or a nested field, and the source of its values."""
 
     name: str
-    """As `orientation.covariance`; `poses[].header` is a field of a list's elements."""
+    """The path, such as `orientation.covariance`; `poses[].header` is a field of the elements of a list."""
     type: str
     required: bool
     origin: str | None
-    """An expression, or a form in one line; None: it is null."""
+    """An expression or a form in one line; None if the column is null."""
 
 
 class Description(Struct, frozen=True):
-    """An adapter in words."""
+    """The description of an adapter."""
 
     name: str
     summary: str
     default: bool
-    """Whether it is used for its types without being asked for."""
+    """Whether the adapter applies to its types without an override."""
     ontology: str
     serialization_format: str
     takes: Mapping[str, str]
-    """Message type → where the payload sits in it; empty where it is the message itself."""
+    """Message type → path of the payload in it; empty if the payload is the message."""
     columns: tuple[ColumnOrigin, ...]
 
 
 def describe(spec: AdapterSpec, msgtype: str | None = None) -> Description:
-    """Describe an adapter as it treats one of its types, or the first.
+    """Describe an adapter for one of its types, by default the first.
 
     Raises:
-        AdapterError: Its ontology class is no such class.
+        AdapterError: The adapter's ontology class is invalid.
     """
     mapping = mapping_of(spec)
     if mapping is not None:
@@ -217,7 +219,7 @@ def _of_class(spec: PythonAdapterSpec) -> Description:
 
 
 def _columns(struct: DataType, values: Mapping[str, Value], prefix: str) -> Iterator[ColumnOrigin]:
-    """Yield the fields of a struct in its order, those that are mappings of their own with their fields."""
+    """Yield the fields of a struct in order, followed by their nested fields."""
     for field in struct:
         name = f"{prefix}{field.name}"
         value = values.get(field.name)
@@ -252,7 +254,7 @@ def _origin(form: ValueForm) -> str:
 
 
 def _text(value: Value) -> str:
-    """Return a plain value as the file spells it."""
+    """Return a plain value as text of the file."""
     if isinstance(value, ValueForm):
         return _origin(value)
     words: dict[Scalar, str] = {None: "null", True: "true", False: "false"}

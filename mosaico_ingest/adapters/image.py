@@ -1,4 +1,4 @@
-"""This file is the PNG form of stored images: the raw buffer's bytes as an 8-bit greyscale picture, lossless."""
+"""Lossless PNG storage of raw images: the buffer's bytes as an 8-bit greyscale picture."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ _FASTEST = 1
 
 
 def greyscale_png(data: bytes | memoryview, *, width: int, height: int) -> bytes:
-    """Encode `height` rows of `width` bytes; `data` must hold exactly that many, and both be positive."""
+    """Encode `height` rows of `width` bytes; `data` contains exactly these bytes, and both are positive."""
     scanlines = np.empty((height, width + 1), np.uint8)
-    scanlines[:, 0] = 0  # filter type "none"
+    scanlines[:, 0] = 0  # the filter type "none"
     scanlines[:, 1:] = np.frombuffer(data, np.uint8).reshape(height, width)
     header = struct.pack(">II", width, height) + _GREYSCALE_8_BIT
     chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(scanlines.data, _FASTEST)), (b"IEND", b""))
@@ -43,7 +43,7 @@ def greyscale_pixels(png: bytes) -> bytes:
     """Return the bytes that `greyscale_png` encoded.
 
     Raises:
-        AdapterError: It is another kind of PNG.
+        AdapterError: The picture is not such a PNG.
     """
     at, packed = len(_SIGNATURE), b""
     width = height = 0
@@ -64,7 +64,7 @@ def greyscale_pixels(png: bytes) -> bytes:
 
 
 def without_png(rows: pa.StructArray) -> pa.StructArray:
-    """Return images with their raw buffers, where they were packed."""
+    """Return images with the raw buffers of those stored as PNG."""
     columns = {field.name: rows.field(field.name) for field in rows.type}
     formats = columns["format"].to_pylist()
     if "png" not in formats:
@@ -84,7 +84,7 @@ def _chunk(kind: bytes, body: bytes) -> bytes:
 
 
 class PngImageSpec(Struct, frozen=True):
-    """An image adapter whose raw rows are stored as PNG; of other ontologies it changes nothing."""
+    """Stores the raw images of an adapter as PNG; adapters of other ontology types are unchanged."""
 
     inner: AdapterSpec
 
@@ -100,7 +100,7 @@ class PngImageSpec(Struct, frozen=True):
 
     @property
     def default(self) -> bool:
-        """Whether the inner adapter is its types' default."""
+        """Whether the inner adapter is the default of its types."""
         return self.inner.default
 
     def bind(self, definition: Definition, shape: pa.StructType) -> Adapter:
@@ -125,7 +125,7 @@ class _PngImages(Struct, frozen=True):
 
 
 def _as_png(rows: pa.StructArray) -> pa.StructArray:
-    """Encode every row whose buffer is height x stride bytes; the others stay raw."""
+    """Encode the images whose buffer has height x stride bytes; the others stay raw."""
     columns = {field.name: rows.field(field.name) for field in rows.type}
     heights, strides = columns["height"].to_numpy(), columns["stride"].to_numpy()
     formats = columns["format"].to_pylist()

@@ -137,10 +137,10 @@ def registered_adapters() -> dict[str, type[Any]]:
 
 
 def ros_types_of(adapter: type[Any]) -> tuple[str, ...]:
-    """Return the message types an adapter class names.
+    """Return the message types of an adapter class.
 
     Raises:
-        AdapterError: It names none.
+        AdapterError: The class has none.
     """
     declared: object = getattr(adapter, "ros_msgtype", None)
     names = (declared,) if isinstance(declared, str) else declared
@@ -157,34 +157,34 @@ def _path(adapter: type[Any]) -> str:
 
 
 _BASE = "ROSAdapterBase"
-"""What the base class of adapters is called, here and in the official SDK."""
+"""Name of the base class of adapters, here and in the official SDK."""
 _SDK_FIRST = "typestore"
-"""The first parameter of `schema_metadata` in newer SDKs: what it returns is known here already."""
+"""First parameter of `schema_metadata` in newer SDKs, whose result this package derives itself."""
 _ROWS_AS_DICTS = 256
-"""How many messages are Python objects at a time; an image topic must not be in memory twice as a whole."""
+"""Messages per batch of Python objects; limits the memory for large messages."""
 
 
 @dataclass(frozen=True, slots=True)
 class PythonAdapterSpec:
-    """An adapter class: a subclass of `ROSAdapterBase`, ours or the official SDK's."""
+    """An adapter class: a subclass of `ROSAdapterBase` of this package or of the official SDK."""
 
     adapter: type[Any]
     default: bool = True
     origin: tuple[Callable[..., Any], tuple[Any, ...]] | None = field(default=None, compare=False)
-    """How another process gets the same spec, where importing the class by its name does not do."""
+    """How another process obtains the spec if the class cannot be imported by its name."""
 
     @property
     def name(self) -> str:
-        """The class's name."""
+        """The name of the class."""
         return self.adapter.__name__
 
     @property
     def ros_types(self) -> tuple[str, ...]:
-        """What `ros_msgtype` says."""
+        """The types in `ros_msgtype`."""
         return ros_types_of(self.adapter)
 
     def bind(self, definition: Definition, shape: pa.StructType) -> PythonAdapter:  # noqa: ARG002 - a dict has no shape
-        """Find the columns of the adapter's ontology class."""
+        """Return the adapter with the columns of its ontology class."""
         model = getattr(self.adapter, "__mosaico_ontology_type__", None)
         if not isinstance(model, type):
             raise AdapterError(
@@ -198,22 +198,22 @@ class PythonAdapterSpec:
 
 
 class PythonAdapter(Struct, frozen=True):
-    """Calls an adapter class for rows; whatever it raises rejects the row it was raised for."""
+    """Calls an adapter class; an exception rejects the row that raised it."""
 
     adapter: type[Any]
     ontology: OntologyType
 
     def adapt(self, rows: pa.StructArray, envelope: Envelope) -> Adapted:
-        """Adapt by columns where the class can, else message by message."""
+        """Adapt a batch with `from_batch` if the class has it, else message by message."""
         if hasattr(self.adapter, "from_batch"):
             return self._by_columns(rows)
         return self._by_messages(rows, envelope)
 
     def topic_metadata(self, first_row: pa.StructScalar | None) -> dict[str, Any]:
-        """Return what `schema_metadata` reads from the first message; the newer SDK's is given no message.
+        """Return the result of `schema_metadata` for the first message; {} for adapters of the newer SDK.
 
         Raises:
-            AdapterError: It raised something.
+            AdapterError: `schema_metadata` raised an exception.
         """
         method = getattr(self.adapter, "schema_metadata", None)
         if first_row is None or method is None or _SDK_FIRST in signature(method).parameters:
@@ -245,10 +245,10 @@ class PythonAdapter(Struct, frozen=True):
     def _columns(
         self, rows: pa.StructArray, *, first: int
     ) -> Iterator[RowFailure | tuple[int, pa.StructArray]]:
-        """Yield adapted stretches and failed rows in order; a stretch that raises is halved until a row is found."""
+        """Yield adapted ranges and failed rows in order; a range that raises is halved until the row is found."""
         try:
             result = self.adapter.from_batch(rows)
-        except Exception as error:  # noqa: BLE001 - the border to a user's code
+        except Exception as error:  # noqa: BLE001 - user code may raise anything
             if len(rows) > 1:
                 half = len(rows) // 2
                 yield from self._columns(rows.slice(0, half), first=first)
@@ -263,13 +263,13 @@ class PythonAdapter(Struct, frozen=True):
         if isinstance(result, pa.RecordBatch):
             result = result.to_struct_array()
         if not isinstance(result, pa.StructArray) or result.type != wanted or len(result) != count:
-            found = (
+            description = (
                 f"{len(result)} rows of {result.type}"
                 if isinstance(result, pa.Array)
                 else type(result).__name__
             )
             raise AdapterError(
-                f"{self.adapter.__name__}.from_batch returned {found}, expected {count} rows of {self.ontology.tag}",
+                f"{self.adapter.__name__}.from_batch returned {description}, expected {count} rows of {self.ontology.tag}",
                 hint=f"return a StructArray of type {wanted}",
             )
         return result
@@ -282,7 +282,7 @@ class PythonAdapter(Struct, frozen=True):
             for row, ros_data in enumerate(_as_dicts(rows.slice(start, _ROWS_AS_DICTS)), start):
                 try:
                     part.add(row, *convert(ros_data, envelope, row))
-                except Exception as error:  # noqa: BLE001, PERF203 - the border to a user's code, a row at a time
+                except Exception as error:  # noqa: BLE001, PERF203 - user code may raise anything, for every row
                     part.failures.append(self._failure(row, error))
             parts.append(part)
         arrays = [self._columns_of(part) for part in parts]
@@ -318,10 +318,10 @@ class PythonAdapter(Struct, frozen=True):
         if not isinstance(value, wanted):
             raise TypeError(f"returned {type(value).__name__}, expected {wanted.__name__}")
         own: Any = value
-        return own.to_row() if hasattr(own, "to_row") else own.model_dump()  # the SDK's are plain pydantic
+        return own.to_row() if hasattr(own, "to_row") else own.model_dump()  # the SDK's models have no to_row
 
     def _columns_of(self, part: _Rows) -> pa.StructArray:
-        """Make columns of the rows; where one does not fit them, move it to the failures."""
+        """Convert rows to columns, and move rows that do not fit to the failures."""
         struct = self.ontology.struct
         try:
             return _struct_array(part.rows, struct)
@@ -329,7 +329,7 @@ class PythonAdapter(Struct, frozen=True):
             for at in reversed(range(len(part.rows))):
                 try:
                     _struct_array(part.rows[at : at + 1], struct)
-                except _MISFITS as error:  # noqa: PERF203 - finds the rows once something is known to be wrong
+                except _MISFITS as error:  # noqa: PERF203 - runs only for batches that failed
                     part.failures.append(self._failure(part.index[at], error))
                     part.drop(at)
             part.failures.sort(key=lambda failure: failure.row)
@@ -344,7 +344,7 @@ _MISFITS = (pa.ArrowException, OverflowError, TypeError, ValueError)
 
 @dataclass(slots=True)
 class _Rows:
-    """The rows of one stretch while they are Python objects."""
+    """A range of rows as Python objects."""
 
     index: list[int] = field(default_factory=list[int])
     times: list[int] = field(default_factory=list[int])
@@ -361,15 +361,15 @@ class _Rows:
 
 
 def is_adapter_class(candidate: object) -> bool:
-    """Whether `candidate` has what an adapter class needs, whichever base it comes from."""
+    """Return whether an object is a subclass of `ROSAdapterBase`, of this package or of the SDK."""
     return isinstance(candidate, type) and any(base.__name__ == _BASE for base in candidate.__mro__[1:])
 
 
 def ontology_of(model: type[Any]) -> OntologyType:
-    """Return tag, format and columns of an ontology class, ours or the SDK's.
+    """Return the ontology type of a model class of this package or of the SDK.
 
     Raises:
-        AdapterError: It is neither.
+        AdapterError: The class is neither.
     """
     if hasattr(model, "ontology_type"):
         return model.ontology_type()
@@ -381,7 +381,7 @@ def ontology_of(model: type[Any]) -> OntologyType:
 
 
 def _message_class(adapter: type[Any]) -> Callable[..., Any]:
-    """Return the message class of the base the adapter was written for: ours, or the SDK's beside its base."""
+    """Return the message class that belongs to the adapter's base class."""
     base = next(base for base in adapter.__mro__ if base.__name__ == _BASE)
     return getattr(sys.modules[base.__module__], "ROSMessage", ROSMessage)
 
@@ -393,7 +393,7 @@ def _one_line(error: Exception) -> str:
 
 
 def _overrides(adapter: type[Any], method: str) -> bool:
-    """Whether the class, and not only the base of all adapters, defines `method`."""
+    """Return whether the adapter class overrides a method of `ROSAdapterBase`."""
     owner = next((base for base in adapter.__mro__ if method in vars(base)), None)
     return owner is not None and owner.__name__ != _BASE
 

@@ -36,35 +36,35 @@ __all__ = [
 
 
 class DefinitionFinder:
-    """Finds definitions by type alone; satisfies `Resolver`."""
+    """Finds definitions by type name; implements `Resolver`."""
 
     def __init__(self, distro: Stores | str | None = None, custom: Iterable[CustomMessages] = ()) -> None:
-        """Look in `custom` first, then in `distro`; None: the newest of ROS 2, and Noetic.
+        """Look up types in `custom`, then in `distro`, by default in the newest ROS 2 and in ROS 1 Noetic.
 
         Raises:
-            BagError: A definition of `custom` cannot be read, or there is no such distro.
+            BagError: A definition of `custom` cannot be read, or the distro does not exist.
         """
-        named, own = store_of(distro), tuple(custom)
-        one = named is not None and named.value.startswith("ros1")
+        store, definitions = store_of(distro), tuple(custom)
+        is_ros1 = store is not None and store.value.startswith("ros1")
         self._resolvers = {
-            1: TypeResolver(named if named and one else Stores.ROS1_NOETIC, own),
-            2: TypeResolver(named if named and not one else Stores.LATEST, own),
+            1: TypeResolver(store if store and is_ros1 else Stores.ROS1_NOETIC, definitions),
+            2: TypeResolver(store if store and not is_ros1 else Stores.LATEST, definitions),
         }
-        self._first, self._second = (1, 2) if one else (2, 1)
+        self._first, self._second = (1, 2) if is_ros1 else (2, 1)
 
     def resolve(self, msgtype: str, embedded: Embedded | None, *, ros_version: int) -> Definition:
         """Return the definition of a type in a version of ROS.
 
         Raises:
-            BagError: It is not known there.
+            BagError: The type is unknown in that version.
         """
         return self._resolvers[ros_version].resolve(msgtype, embedded, ros_version=ros_version)
 
     def find(self, msgtype: str, spec: AdapterSpec | None = None) -> Definition:
-        """Return the definition of a type in either version, an adapter's own text before any other.
+        """Return the definition of a type in either version of ROS; the text in an adapter file takes precedence.
 
         Raises:
-            BagError: It is not known.
+            BagError: The type is unknown.
         """
         mapping = mapping_of(spec) if spec else None
         text = mapping.own_text(msgtype) if mapping else None
@@ -79,18 +79,18 @@ class DefinitionFinder:
 
 
 def mapping_of(spec: AdapterSpec) -> MappingSpec | None:
-    """Return what an adapter's file says; None of one written in Python."""
+    """Return the mapping of an adapter, None for an adapter in Python."""
     if isinstance(spec, Builtin):
         return spec.mapping
     return spec if isinstance(spec, MappingSpec) else None
 
 
 _DISTROS = (Stores.LATEST, Stores.ROS2_HUMBLE, Stores.ROS2_FOXY, Stores.ROS1_NOETIC)
-"""Where the definition of a dict is looked for: the first whose fields include the dict's is taken."""
+"""The distros to look up the type of a dict in; the first definition that has all keys of the dict is used."""
 
 
 def translate(spec: AdapterSpec, msg: ROSMessage) -> Message:
-    """Return the ontology's object for one message, with its time.
+    """Return the ontology object and the time of one message.
 
     Raises:
         AdapterError: The message does not fit.
@@ -102,7 +102,7 @@ def translate(spec: AdapterSpec, msg: ROSMessage) -> Message:
 
 
 def adapt_dict(spec: AdapterSpec, ros_data: Mapping[str, Any], msgtype: str | None = None) -> Serializable:
-    """Return the ontology's object for the fields of one message; of several types the first the dict fits.
+    """Return the ontology object for a dict of fields; among several types, the first that has all keys is used.
 
     Raises:
         AdapterError: A field is unknown or missing, or a value does not fit.
@@ -115,7 +115,7 @@ def adapt_dict(spec: AdapterSpec, ros_data: Mapping[str, Any], msgtype: str | No
 
 
 def metadata_of(spec: AdapterSpec, ros_data: Mapping[str, Any], msgtype: str | None = None) -> dict[str, Any]:
-    """Return the topic metadata the adapter reads from a first message."""
+    """Return the topic metadata of a first message."""
     adapter, rows, _ = _bind(spec, ros_data, msgtype)
     return adapter.topic_metadata(rows[0])
 
@@ -123,39 +123,39 @@ def metadata_of(spec: AdapterSpec, ros_data: Mapping[str, Any], msgtype: str | N
 def _bind(
     spec: AdapterSpec, ros_data: Mapping[str, Any], msgtype: str | None
 ) -> tuple[Adapter, pa.StructArray, str]:
-    own = () if msgtype is None else (normalize_msgtype(msgtype),)
-    misfits: list[str] = []
-    for definition in _candidates(spec, own):
+    names = () if msgtype is None else (normalize_msgtype(msgtype),)
+    problems: list[str] = []
+    for definition in _candidates(spec, names):
         shape = ros_shape(definition)
         unknown = next(_unknown(ros_data, shape, ""), None)
         if unknown is None:
             return spec.bind(definition, shape), _row(ros_data, shape, spec.name), definition.root
-        misfits.append(f"{definition.root} has no field {unknown}")
-    known = f"no distro knows {', '.join(own or spec.ros_types)}"
-    raise AdapterError(f"{spec.name}: {misfits[0] if misfits else known}")
+        problems.append(f"{definition.root} has no field {unknown}")
+    unknown_types = f"no distro defines {', '.join(names or spec.ros_types)}"
+    raise AdapterError(f"{spec.name}: {problems[0] if problems else unknown_types}")
 
 
-def _candidates(spec: AdapterSpec, own: tuple[str, ...]) -> Iterator[Definition]:
-    """Yield what the message may look like: its own type in any distro, then the other types the adapter takes."""
+def _candidates(spec: AdapterSpec, names: tuple[str, ...]) -> Iterator[Definition]:
+    """Yield the definitions that a dict may have: its own type in all distros, then the adapter's other types."""
     mapping = mapping_of(spec)
-    for name in dict.fromkeys((*own, *spec.ros_types)):
+    for name in dict.fromkeys((*names, *spec.ros_types)):
         yield from _versions(name, mapping.own_text(name) if mapping else None)
 
 
 @cache
 def _versions(msgtype: str, text: str | None) -> tuple[Definition, ...]:
-    """Return a type as the distros have it, or as an adapter's own text says."""
-    found: list[Definition] = []
+    """Return the definitions of a type in all distros, or in an adapter's own text."""
+    definitions: list[Definition] = []
     for distro in _DISTROS:
         version = 1 if distro is Stores.ROS1_NOETIC else 2
-        own = {msgtype: text} if text else None
+        types = {msgtype: text} if text else None
         with suppress(BagError):
-            found.append(TypeResolver(distro, types=own).resolve(msgtype, None, ros_version=version))
-    return tuple(found)
+            definitions.append(TypeResolver(distro, types=types).resolve(msgtype, None, ros_version=version))
+    return tuple(definitions)
 
 
 def _unknown(ros_data: Mapping[str, Any], shape: pa.StructType, where: str) -> Iterator[str]:
-    """Yield the keys that are no fields, nested ones too."""
+    """Yield the keys that are not fields, including nested keys."""
     fields = {field.name: field.type for field in shape}
     for name, value in ros_data.items():
         if name not in fields:
@@ -178,13 +178,13 @@ def _row(ros_data: Mapping[str, Any], shape: pa.StructType, name: str) -> pa.Str
 
 
 class CatalogAdapter(ROSAdapterBase[Serializable]):
-    """A built-in adapter as a class: for an override, for single messages, as the base of one's own."""
+    """A built-in adapter as a class, for overrides, single messages and subclasses."""
 
     __adapter_spec__: ClassVar[Builtin]
 
     @classmethod
     def from_dict(cls, ros_data: dict[str, Any]) -> Serializable:
-        """Return the ontology's object for the fields of one message.
+        """Return the ontology object for the fields of one message.
 
         Raises:
             AdapterError: A field is unknown or missing, or a value does not fit.
@@ -204,13 +204,13 @@ class CatalogAdapter(ROSAdapterBase[Serializable]):
         ros_data: dict[str, Any],
         **kwargs: Any,  # noqa: ANN401, ARG003 - the base's
     ) -> dict[str, Any] | None:
-        """Return the topic metadata the adapter reads from a first message."""
+        """Return the topic metadata of a first message."""
         return metadata_of(cls.__adapter_spec__, ros_data) or None
 
 
 @cache
 def adapter_class(name: str) -> type[CatalogAdapter]:
-    """Return the class of a built-in adapter, as `IMUAdapter`; KeyError where there is none."""
+    """Return the class of a built-in adapter by name; raises KeyError if there is none."""
     builtin = BY_NAME[name]
     members = {
         "__doc__": builtin.mapping.model.description,

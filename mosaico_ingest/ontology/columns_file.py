@@ -1,4 +1,4 @@
-"""This file writes `columns.json` from the models of the built-in tags."""
+"""Generate `columns.json` from the built-in ontology models."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["columns_file"]
 
 
 def columns_file() -> str:
-    """Return the file: an entry for each tag, a line for each column."""
+    """Return the content of the file: one entry per tag, one line per column."""
     entries = (_entry(tag, model(tag).ontology_type()) for tag in sorted(MODULES))
     return "{\n" + ",\n".join(entries) + "\n}\n"
 

@@ -34,35 +34,35 @@ __all__ = [
 
 
 class Uncertain(Stamped):
-    """A stamped value of several components."""
+    """A value of several components, with a header and a covariance."""
 
     covariance: list[Float64] | None = None
-    """The covariance matrix row by row, in the square of the components' units; null where it is not known."""
+    """The covariance matrix in row-major order, in the square of the components' units; null if unknown."""
     covariance_type: Int16 | None = None
-    """How the covariance came about, in the sender's code."""
+    """The kind of covariance, as a code of the sender."""
 
 
 class Varying(BaseModel):
-    """A value of one component; these columns come before its header."""
+    """A value of one component; its columns precede the header."""
 
     variance: Float64 | None = None
-    """In the square of the value's unit; null where it is not known."""
+    """The variance in the square of the value's unit; null if unknown."""
     variance_type: Int16 | None = None
-    """How the variance came about, in the sender's code."""
+    """The kind of variance, as a code of the sender."""
 
 
 _Component = Annotated[Float64, Nullable]
 
 
 class _Components(BaseModel):
-    """Values along axes, in an order."""
+    """Named components in a fixed order."""
 
     @classmethod
     def from_list(cls, values: Sequence[float]) -> Self:
-        """Return the components given one after the other.
+        """Return the components from a list.
 
         Raises:
-            ValueError: There are too few or too many.
+            ValueError: The number of values is wrong.
         """
         axes = [name for name in cls.model_fields if name in "xyzw"]
         return cls(**dict(zip(axes, values, strict=True)))
@@ -82,7 +82,7 @@ class _Spatial(_Planar):
 
 class _Quadruple(_Spatial):
     w: _Component
-    """The fourth component; of a rotation the scalar part."""
+    """The fourth component; the scalar part of a rotation."""
 
 
 class Vector2d(_Planar, Uncertain, Serializable):
@@ -90,64 +90,64 @@ class Vector2d(_Planar, Uncertain, Serializable):
 
 
 class Vector3d(_Spatial, Uncertain, Serializable):
-    """A direction and length in space; the unit is that of the field it stands in."""
+    """A direction and length in space, in the unit of the field that contains it."""
 
 
 class Vector4d(_Quadruple, Uncertain, Serializable):
-    """Four components that belong together."""
+    """Four components."""
 
 
 class Point2d(_Planar, Uncertain, Serializable):
-    """A position in a plane, m unless the field says otherwise."""
+    """A position in a plane, in m unless the field states another unit."""
 
 
 class Point3d(_Spatial, Uncertain, Serializable):
-    """A position in space, m unless the field says otherwise."""
+    """A position in space, in m unless the field states another unit."""
 
 
 class Quaternion(_Quadruple, Uncertain, Serializable):
-    """A rotation: `x`, `y`, `z` the vector part, `w` the scalar part; length 1."""
+    """A rotation as a unit quaternion: `x`, `y`, `z` are the vector part, `w` is the scalar part."""
 
 
 class Pose(Uncertain, Serializable):
-    """Where a body is and how it is turned, in the header's frame; the covariance is 6 by 6, position first."""
+    """The position and orientation of a body in the header's frame; the covariance is 6 x 6, position first."""
 
     position: Point3d
     """m."""
     orientation: Quaternion
-    """From the body's frame into the header's."""
+    """Rotation from the body's frame to the header's."""
 
 
 class Transform(Uncertain, Serializable):
-    """The way from one frame to another: the header's frame is the parent."""
+    """The transformation between two frames; the header's frame is the parent."""
 
     translation: Vector3d
-    """Origin of the target frame in the parent's, m."""
+    """Origin of the target frame in the parent frame, m."""
     rotation: Quaternion
-    """From the target frame into the parent's."""
+    """Rotation from the target frame to the parent frame."""
     target_frame_id: str | None = None
-    """The frame that is placed."""
+    """The target frame."""
 
 
 class Polygon(Stamped, Serializable):
-    """A closed line; the last point joins the first."""
+    """A closed polygon; the last point connects to the first."""
 
     points: list[Point3d]
     """Corners in order, m."""
 
 
 class RobotPath(Stamped, Serializable):
-    """Poses to go through, in order."""
+    """A path as a sequence of poses."""
 
     poses: list[Pose]
-    """Each with its own header."""
+    """The poses, each with its own header."""
 
 
 class _LinearOrAngular(BaseModel):
     linear: Vector3d | None = None
-    """Of the origin: m/s for a velocity, m/s² for an acceleration."""
+    """Linear part: m/s of a velocity, m/s² of an acceleration."""
     angular: Vector3d | None = None
-    """About the axes: rad/s for a velocity, rad/s² for an acceleration."""
+    """Angular part: rad/s of a velocity, rad/s² of an acceleration."""
 
     @model_validator(mode="after")
     def _has_one(self) -> Self:
@@ -157,28 +157,28 @@ class _LinearOrAngular(BaseModel):
 
 
 class Velocity(_LinearOrAngular, Uncertain, Serializable):
-    """How fast a body moves and turns; the covariance is 6 by 6, linear first."""
+    """Linear and angular velocity of a body; the covariance is 6 x 6, linear first."""
 
 
 class Acceleration(_LinearOrAngular, Uncertain, Serializable):
-    """How fast a velocity changes; the covariance is 6 by 6, linear first."""
+    """Linear and angular acceleration of a body; the covariance is 6 x 6, linear first."""
 
 
 class MotionState(Uncertain, Serializable):
-    """Where a body is and how it moves."""
+    """The pose and the motion of a body."""
 
     pose: Pose
     """In the header's frame."""
     velocity: Velocity
     """In the target frame."""
     target_frame_id: str
-    """The body's own frame."""
+    """The body's frame."""
     acceleration: Acceleration | None = None
     """In the target frame."""
 
 
 class ForceTorque(Uncertain, Serializable):
-    """What acts on a body at the header's frame."""
+    """Force and torque on a body in the header's frame."""
 
     force: Vector3d
     """N."""
@@ -187,18 +187,18 @@ class ForceTorque(Uncertain, Serializable):
 
 
 class Inertia(Stamped, Serializable):
-    """How a body resists being moved and turned."""
+    """The mass distribution of a body."""
 
     mass: Float64
     """kg."""
     center_of_mass: Vector3d
     """m."""
     inertia: Annotated[list[Float64], FixedSize(6)]
-    """The symmetric tensor as xx, xy, xz, yy, yz, zz; kg·m²."""
+    """The symmetric inertia tensor as xx, xy, xz, yy, yz, zz, in kg·m²."""
 
 
 class FrameTransform(Serializable):
-    """Edges of the tree of frames."""
+    """Edges of the transform tree."""
 
     transforms: list[Transform]
-    """Each with its own header."""
+    """The transforms, each with its own header."""

@@ -23,16 +23,16 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 
 
 class _SecondsAndNanoseconds(BaseModel):
-    """A signed number of nanoseconds in two parts, the second of which always counts upwards."""
+    """A signed time span in two parts; `nanoseconds` is never negative."""
 
     seconds: Int32
-    """Whole seconds, rounded down."""
+    """Seconds, rounded down."""
     nanoseconds: Annotated[UInt32, Field(lt=_SECOND)]
-    """What remains, ns in [0, 1e9)."""
+    """Remaining nanoseconds, in [0, 1e9)."""
 
     @classmethod
     def from_nanoseconds(cls, nanoseconds: int) -> Self:
-        """Return the same span, given in ns."""
+        """Return the span for a number of ns."""
         seconds, rest = divmod(nanoseconds, _SECOND)
         return cls(seconds=seconds, nanoseconds=rest)
 
@@ -42,7 +42,7 @@ class _SecondsAndNanoseconds(BaseModel):
 
     @classmethod
     def from_milliseconds(cls, milliseconds: int) -> Self:
-        """Return the same span, given in ms."""
+        """Return the span for a number of ms."""
         return cls.from_nanoseconds(milliseconds * 1_000_000)
 
     def to_milliseconds(self) -> int:
@@ -51,30 +51,30 @@ class _SecondsAndNanoseconds(BaseModel):
 
     @classmethod
     def from_float(cls, seconds: float) -> Self:
-        """Return the span nearest to `seconds`."""
+        """Return the span nearest to a number of seconds."""
         return cls.from_nanoseconds(round(seconds * _SECOND))
 
     def to_float(self) -> float:
-        """Return the span in s; a double keeps about 0.2 µs of a present-day time."""
+        """Return the span in s; a double resolves about 0.2 µs of a present-day time."""
         return self.to_nanoseconds() / _SECOND
 
 
 class Time(_SecondsAndNanoseconds, Serializable):
-    """A moment, counted from the epoch (or from the start of a simulation)."""
+    """A point in time, since the epoch or since the start of a simulation."""
 
     @classmethod
     def from_datetime(cls, moment: datetime) -> Self:
-        """Return the moment of an aware `datetime`; one without a zone counts as UTC."""
+        """Return the time of a `datetime`; one without a time zone counts as UTC."""
         aware = moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)
         return cls.from_nanoseconds((aware - _EPOCH) // timedelta(microseconds=1) * 1000)
 
     def to_datetime(self) -> datetime:
-        """Return the moment in UTC, rounded down to the microsecond."""
+        """Return the time in UTC, rounded down to microseconds."""
         return _EPOCH + timedelta(microseconds=self.to_nanoseconds() // 1000)
 
     @classmethod
     def now(cls) -> Self:
-        """Return the present moment."""
+        """Return the current time."""
         return cls.from_datetime(datetime.now(timezone.utc))
 
 
@@ -83,45 +83,45 @@ class Duration(_SecondsAndNanoseconds, Serializable):
 
 
 class Header(Serializable):
-    """When a message was stamped by its sender, and the frame its values are in."""
+    """The sender's time stamp and the coordinate frame of the values."""
 
     timestamp: Time | None = None
-    """The sender's clock."""
+    """The time stamp on the sender's clock."""
     frame_id: str | None = None
     """The coordinate frame."""
     sample_counter: UInt64 | None = None
-    """A number the sender counts up; ROS 1's `seq`."""
+    """A counter of the sender, such as `seq` in ROS 1."""
 
 
 class Stamped(BaseModel):
-    """The first column of everything that has a header."""
+    """The base of all models with a header, which is their first column."""
 
     header: Header | None = None
-    """Time and frame of the values; null where the sender gave none."""
+    """Time stamp and frame of the values; null if the sender set neither."""
 
 
 _Model = TypeVar("_Model", bound=Serializable)
 
 
 def _ontology_object(value: object) -> object:
-    """Return the value as it is; the official SDK's own objects are as good as ours."""
+    """Return an ontology object of this package or of the official SDK."""
     if not isinstance(value, BaseModel) or not hasattr(value, "ontology_tag"):
         raise ValueError(f"{type(value).__name__} is no ontology object")
     return value
 
 
 class Message(BaseModel):
-    """The envelope around a row."""
+    """A row with its log time."""
 
     model_config = ConfigDict(extra="forbid", defer_build=True)
 
     timestamp_ns: int
-    """When it was recorded, ns since the epoch."""
+    """Log time, ns since the epoch."""
     data: Annotated[SerializeAsAny[Serializable], PlainValidator(_ontology_object)]
-    """The row itself."""
+    """The row."""
 
     def get_data(self, model: type[_Model]) -> _Model | None:
-        """Return the row where it is a `model`, None otherwise."""
+        """Return the row if it is an instance of `model`, else None."""
         return self.data if isinstance(self.data, model) else None
 
     def ontology_tag(self) -> str:

@@ -20,7 +20,7 @@ __all__ = [
 
 
 class ImageFormat(str, Enum):
-    """How the bytes of a picture are packed."""
+    """The encoding of an image's bytes."""
 
     RAW = "raw"
     PNG = "png"
@@ -32,68 +32,68 @@ class ImageFormat(str, Enum):
 
 
 class Image(Stamped, Serializable):
-    """A picture whose pixels are known."""
+    """An image with a known pixel format."""
 
     __serialization_format__ = SerializationFormat.IMAGE
 
     data: bytes
-    """The rows of pixels, `stride` bytes each, packed as `format` says."""
+    """The image rows of `stride` bytes each, encoded as `format`."""
     format: ImageFormat
-    """`png` is lossless: a grey picture `stride` bytes wide, whatever the encoding."""
+    """The encoding of `data`; `png` is a lossless greyscale picture `stride` bytes wide, whatever the pixel encoding."""
     width: Int32
     """pixels."""
     height: Int32
     """pixels."""
     stride: Int32
-    """bytes from one row to the next."""
+    """Bytes per image row."""
     encoding: str
-    """What a pixel is, as `rgb8`."""
+    """The pixel encoding, such as `rgb8`."""
     is_bigendian: bool | None = None
-    """Byte order of pixels wider than a byte."""
+    """Byte order of multi-byte pixels."""
 
 
 class CompressedImage(Stamped, Serializable):
-    """A picture, or a piece of a video stream, as the camera compressed it."""
+    """A compressed image, or a part of a video stream, as the camera sent it."""
 
     __serialization_format__ = SerializationFormat.IMAGE
 
     data: bytes
     """The compressed bytes, unchanged."""
     format: ImageFormat
-    """What they are."""
+    """The encoding of `data`."""
 
 
 class ROI(Serializable):
-    """A rectangle of pixels."""
+    """A rectangle within an image."""
 
     offset: Vector2d
-    """Its left upper corner, pixels."""
+    """Upper left corner, pixels."""
     height: UInt32
     """pixels."""
     width: UInt32
     """pixels."""
     do_rectify: bool | None = None
-    """Whether a rectified picture should be cut there too."""
+    """Whether the rectangle also applies to the rectified image."""
 
 
 class CameraInfo(Stamped, Serializable):
-    """How a camera maps space to pixels; matrices are row by row."""
+    """The calibration of a camera; matrices are in row-major order."""
 
     height: UInt32
     """pixels, at calibration."""
     width: UInt32
     """pixels, at calibration."""
     distortion_model: str
-    """As `plumb_bob`."""
+    """The distortion model, such as `plumb_bob`."""
     distortion_parameters: list[Float64]
-    """As many as the model has."""
+    """The parameters of the distortion model."""
     intrinsic_parameters: Annotated[list[Float64], FixedSize(9)]
-    """3 by 3, pixels: focal lengths and principal point of the raw picture."""
+    """3 x 3, pixels: focal lengths and principal point of the raw image."""
     rectification_parameters: Annotated[list[Float64], FixedSize(9)]
-    """3 by 3: the rotation that makes a stereo pair's rows parallel."""
+    """3 x 3: the rotation that aligns the rows of a stereo pair."""
     projection_parameters: Annotated[list[Float64], FixedSize(12)]
-    """3 by 4, pixels: of the rectified picture."""
+    """3 x 4, pixels: projection of the rectified image."""
     binning: Vector2d | None = None
-    """Sensor pixels joined to one, across and down; null: none."""
+    """Number of sensor pixels combined into one, horizontally and vertically; null without binning."""
     roi: ROI | None = None
-    """The part of the sensor in use; null: all."""
+    """The part of the sensor in use; null for all of it."""

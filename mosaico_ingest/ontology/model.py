@@ -59,7 +59,7 @@ Float64 = Annotated[float, pa.float64()]
 
 
 class Nullable(Struct, frozen=True):
-    """Marks a column that may hold nulls although the model wants a value."""
+    """Marks a column that may contain nulls, although the model requires a value."""
 
 
 class FixedSize(Struct, frozen=True):
@@ -68,18 +68,18 @@ class FixedSize(Struct, frozen=True):
     length: int
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401 - pydantic's signature
-        """Check the length after the items."""
+        """Validate the items, then their number."""
         return core_schema.no_info_after_validator_function(self.check, handler(source))
 
     def check(self, values: list[Any]) -> list[Any]:
-        """Return `values`, or raise ValueError where they are not `length`."""
+        """Return the list if it has the right length; raises ValueError otherwise."""
         if len(values) != self.length:
             raise ValueError(f"expected {self.length} values, found {len(values)}")
         return values
 
 
 _PLAIN: dict[type, pa.DataType] = {
-    bool: pa.bool_(),  # before int, which it is a subclass of
+    bool: pa.bool_(),  # precedes int, because bool is a subclass of int
     int: pa.int64(),
     float: pa.float64(),
     str: pa.string(),
@@ -98,7 +98,7 @@ def struct_of(model: type[BaseModel]) -> pa.StructType:
 
 
 class _Column(Struct, frozen=True):
-    """An annotation taken apart: the bare type and what was said about it."""
+    """An analyzed annotation: the bare type and its marks."""
 
     bare: Any
     nullable: bool
@@ -130,7 +130,7 @@ def _take_apart(annotation: Any, metadata: Iterable[object] = ()) -> _Column:  #
             marks += more
         elif origin in (Union, types.UnionType) and type(None) in get_args(annotation):
             rest = tuple(arg for arg in get_args(annotation) if arg is not type(None))
-            annotation, nullable = Union[rest], True  # noqa: UP007 - a tuple cannot be spelled with |
+            annotation, nullable = Union[rest], True  # noqa: UP007 - a tuple has no spelling with |
         else:
             break
     exact = next((mark for mark in marks if isinstance(mark, pa.DataType)), None)
@@ -188,15 +188,15 @@ class Serializable(BaseModel):
     model_config = ConfigDict(extra="forbid", validate_assignment=True, defer_build=True)
 
     __ontology_tag__: ClassVar[str]
-    """The name the platform stores; the class's own name where nothing is said."""
+    """The tag that the platform stores; by default the name of the class."""
     __serialization_format__: ClassVar[SerializationFormat] = SerializationFormat.DEFAULT
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:  # noqa: ANN401 - pydantic's signature
-        """Make the class known by its tag.
+        """Register the class by its tag.
 
         Raises:
-            AdapterError: The tag is a built-in's, whose readers expect the built-in's columns.
+            AdapterError: The tag belongs to a built-in model with other columns.
         """
         super().__pydantic_init_subclass__(**kwargs)
         tag = cls.__dict__.get("__ontology_tag__", cls.__name__)
@@ -211,7 +211,7 @@ class Serializable(BaseModel):
 
     @classmethod
     def ontology_tag(cls) -> str:
-        """Return the tag, as `IMU`."""
+        """Return the tag, such as `IMU`."""
         return cls.__ontology_tag__
 
     @classmethod
@@ -225,10 +225,10 @@ class Serializable(BaseModel):
 
     @classmethod
     def to_batch(cls, models: Iterable[Self]) -> pa.StructArray:
-        """Return one row a model.
+        """Return a struct array with one row per model.
 
         Raises:
-            AdapterError: A value does not fit its column; names the row.
+            AdapterError: A value does not fit its column; the error names the row.
         """
         rows, columns = [model.to_row() for model in models], cls._columns()
         try:
@@ -240,10 +240,10 @@ class Serializable(BaseModel):
 
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> Self:
-        """Return the model of one row as Arrow gives it; a struct of nulls alone counts as null.
+        """Return the model of a row of Arrow values; a struct that contains only nulls counts as null.
 
         Raises:
-            AdapterError: The values break the model's rules; names the field and the value.
+            AdapterError: A value violates the model; the error names the field and the value.
         """
         try:
             return cls.model_validate({name: _without_empty(value) for name, value in row.items()})
@@ -266,7 +266,7 @@ def _array(rows: list[dict[str, Any]], columns: pa.StructType) -> pa.StructArray
 
 
 def _misfit(row: dict[str, Any], columns: pa.StructType) -> str | None:
-    """Return why `row` does not fit, None where it does."""
+    """Return why `row` does not fit, None if it fits."""
     try:
         _array([row], columns)
     except _MISFITS as reason:
@@ -275,7 +275,7 @@ def _misfit(row: dict[str, Any], columns: pa.StructType) -> str | None:
 
 
 def _without_empty(value: Any) -> Any:  # noqa: ANN401 - any cell
-    """Return `value` with every struct of nothing but nulls replaced by None."""
+    """Replace every struct that contains only nulls with None."""
     if not isinstance(value, dict):
         return value
     cells = {name: _without_empty(cell) for name, cell in value.items()}

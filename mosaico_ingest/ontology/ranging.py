@@ -39,7 +39,7 @@ __all__ = [
 
 
 class Cloud(Stamped):
-    """Points as lists of the same length, one for each coordinate."""
+    """Points as lists of coordinates; all lists have the same length."""
 
     x: list[Float32]
     """m."""
@@ -50,7 +50,7 @@ class Cloud(Stamped):
 
 
 class PointFieldDataType(IntEnum):
-    """The type of one value of a record."""
+    """The type of one value of a point."""
 
     INT8 = 1
     UINT8 = 2
@@ -63,132 +63,132 @@ class PointFieldDataType(IntEnum):
 
 
 class PointField(Serializable):
-    """One field of a record."""
+    """One field of the points of a `PointCloud2`."""
 
     name: str
-    """As `x`."""
+    """The name of the field, such as `x`."""
     offset: UInt32
-    """bytes from the start of the record."""
+    """Byte offset from the start of a point."""
     datatype: PointFieldDataType
-    """What a value is."""
+    """The type of the values."""
     count: UInt32
-    """How many values."""
+    """The number of values."""
 
 
 class PointCloud2(Stamped, Serializable):
-    """Points row by row, each a record of `point_step` bytes."""
+    """A point cloud with its binary layout: rows of points of `point_step` bytes."""
 
     height: UInt32
-    """rows; 1 of a cloud without order."""
+    """Number of rows; 1 for an unordered cloud."""
     width: UInt32
-    """points a row."""
+    """Number of points per row."""
     fields: list[PointField]
-    """What a record holds."""
+    """The fields of a point."""
     is_bigendian: bool
-    """Byte order of the records."""
+    """Byte order of the values."""
     point_step: UInt32
-    """bytes a point."""
+    """Bytes per point."""
     row_step: UInt32
-    """bytes a row."""
+    """Bytes per row."""
     data: bytes
     """`row_step` times `height` bytes."""
     is_dense: bool
-    """Whether every point is valid."""
+    """Whether all points are valid."""
 
 
 class _Coloured(Cloud):
     rgb: list[Float32] | None = None
-    """The colour, packed into the bits of a float as 0x00rrggbb."""
+    """The colour, packed as 0x00rrggbb into the bits of a float."""
     intensity: list[Float32] | None = None
-    """Brightness, in the sensor's unit."""
+    """Brightness in the sensor's unit."""
 
 
 class RGBDCamera(_Coloured, Serializable):
-    """A cloud from structured light."""
+    """A point cloud of a structured-light camera."""
 
 
 class ToFCamera(_Coloured, Serializable):
-    """A cloud from the time light takes."""
+    """A point cloud of a time-of-flight camera."""
 
     noise: list[Float32] | None = None
-    """Of the distance, in the sensor's unit."""
+    """Noise of the distance in the sensor's unit."""
     grayscale: list[Float32] | None = None
-    """Brightness under the camera's own light."""
+    """Brightness under the camera's own illumination."""
 
 
 class StereoCamera(_Coloured, Serializable):
-    """A cloud from two pictures."""
+    """A point cloud of a stereo camera."""
 
     luma: list[UInt8] | None = None
     """Brightness of the pixel."""
     cost: list[UInt8] | None = None
-    """Of the match: 0 is certain."""
+    """Matching cost; 0 is certain."""
 
 
 class _Sweep(Stamped):
-    """One turn of the beam."""
+    """One sweep of a scanning beam."""
 
     angle_min: Float32
-    """Of the first beam, rad."""
+    """Angle of the first beam, rad."""
     angle_max: Float32
-    """Of the last beam, rad."""
+    """Angle of the last beam, rad."""
     angle_increment: Float32
-    """From one beam to the next, rad."""
+    """Angle between beams, rad."""
     time_increment: Float32
-    """From one beam to the next, s."""
+    """Time between beams, s."""
     scan_time: Float32
-    """From one scan to the next, s."""
+    """Time between scans, s."""
     range_min: Float32
-    """Anything nearer is no measurement, m."""
+    """Minimum valid range, m."""
     range_max: Float32
-    """Anything farther is no measurement, m."""
+    """Maximum valid range, m."""
 
 
 class LaserScan(_Sweep, Serializable):
-    """One distance a beam."""
+    """A laser scan with one range per beam."""
 
     ranges: list[Float32]
     """m."""
     intensities: list[Float32] | None = None
-    """In the sensor's unit; null where it gives none."""
+    """Intensities in the sensor's unit; null if the sensor has none."""
 
 
 class MultiEchoLaserScan(_Sweep, Serializable):
-    """Several distances a beam."""
+    """A laser scan with several echoes per beam."""
 
     ranges: list[list[Float32]]
     """The echoes of each beam, m."""
     intensities: list[list[Float32]] | None = None
-    """The echoes of each beam, in the sensor's unit; null where it gives none."""
+    """The intensities of each beam's echoes, in the sensor's unit; null if the sensor has none."""
 
 
 class Lidar(Cloud, Serializable):
-    """A cloud and what the sensor says of each point; null where it says nothing."""
+    """A lidar point cloud with properties per point; null if the sensor does not report them."""
 
     intensity: list[Float32] | None = None
     """Strength of the return, in the sensor's unit."""
     reflectivity: list[UInt16] | None = None
-    """Of the surface, in the sensor's unit."""
+    """Reflectivity of the surface in the sensor's unit."""
     beam_id: list[UInt16] | None = None
-    """Which laser; also called ring or channel."""
+    """The laser that measured the point; also called ring or channel."""
     range: list[Float32] | None = None
     """Distance, m."""
     near_ir: list[Float32] | None = None
-    """Ambient near-infrared light, in the sensor's unit."""
+    """Ambient near-infrared light in the sensor's unit."""
     azimuth: list[Float32] | None = None
     """rad."""
     elevation: list[Float32] | None = None
     """rad."""
     confidence: list[UInt8] | None = None
-    """In the sensor's unit."""
+    """Confidence in the sensor's unit."""
     return_type: list[UInt8] | None = None
-    """Which return of the pulse: first, strongest, last, in the sensor's code."""
+    """The kind of return (first, strongest, last), as a code of the sensor."""
     point_timestamp: list[Float64] | None = None
-    """When the point was measured, in the sensor's unit and from its start."""
+    """Time of each point, in the sensor's unit and relative to its start."""
 
 
 class Radar(Cloud, Serializable):
-    """Detections and what the sensor says of each; null where it says nothing."""
+    """Radar detections with properties per detection; null if the sensor does not report them."""
 
     range: list[Float32] | None = None
     """Distance, m."""
@@ -199,32 +199,32 @@ class Radar(Cloud, Serializable):
     rcs: list[Float32] | None = None
     """Radar cross-section, dBm²."""
     snr: list[Float32] | None = None
-    """Signal to noise, dB."""
+    """Signal-to-noise ratio, dB."""
     doppler_velocity: list[Float32] | None = None
-    """Along the beam, m/s."""
+    """Velocity along the beam, m/s."""
     vx: list[Float32] | None = None
     """m/s."""
     vy: list[Float32] | None = None
     """m/s."""
     vx_comp: list[Float32] | None = None
-    """`vx` without the sensor's own motion, m/s."""
+    """`vx` compensated for the sensor's own motion, m/s."""
     vy_comp: list[Float32] | None = None
-    """`vy` without the sensor's own motion, m/s."""
+    """`vy` compensated for the sensor's own motion, m/s."""
     ax: list[Float32] | None = None
     """m/s²."""
     ay: list[Float32] | None = None
     """m/s²."""
     radial_speed: list[Float32] | None = None
-    """Away from the sensor, m/s."""
+    """Speed away from the sensor, m/s."""
 
 
 class Range(Stamped, Varying, Serializable):
-    """One distance, which lies between the sensor's bounds."""
+    """One distance measurement within the sensor's bounds."""
 
     radiation_type: UInt8
-    """0 ultrasound, 1 infrared."""
+    """0 for ultrasound, 1 for infrared."""
     field_of_view: Float32
-    """The cone's full angle, rad."""
+    """Full opening angle of the cone, rad."""
     min_range: Float32
     """m."""
     max_range: Float32
@@ -242,35 +242,35 @@ class Range(Stamped, Varying, Serializable):
 
 
 class MapMetadata(Serializable):
-    """Where a map lies and how fine it is."""
+    """The position and resolution of a map."""
 
     map_load_time: Time
-    """When it was loaded."""
+    """The time at which the map was loaded."""
     resolution: Float32
-    """Side of a cell, m."""
+    """Side length of a cell, m."""
     width: UInt32
     """cells."""
     height: UInt32
     """cells."""
     origin: Pose
-    """Of the corner of cell (0, 0), in the header's frame."""
+    """Pose of the corner of cell (0, 0) in the header's frame."""
 
 
 class OccupancyGrid(Stamped, Serializable):
-    """How likely each cell is taken."""
+    """The occupancy probability of each cell of a map."""
 
     info: MapMetadata
-    """Where it lies."""
+    """Position and resolution of the map."""
     data: list[Int8]
-    """Row by row from (0, 0): 0 to 100 percent, -1 not known."""
+    """Occupancy in row-major order from (0, 0): 0 to 100 percent, -1 if unknown."""
 
 
 class GridCells(Stamped, Serializable):
-    """Some cells of a grid."""
+    """A set of grid cells."""
 
     cell_width: Float32
     """m."""
     cell_height: Float32
     """m."""
     cells: list[Point3d]
-    """Their centres, m."""
+    """Centres of the cells, m."""

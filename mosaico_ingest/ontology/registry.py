@@ -1,7 +1,8 @@
 """Find ontology models and their Arrow columns by tag.
 
-The file says of each tag how it is laid out and what its columns are: the name of an Arrow type, a mapping for a
-struct, a list for a list (of so many items); a name that ends in ? may be null.
+`columns.json` contains the columns of the built-in models, so that a run does not import them. A type is the name of
+an Arrow type, a mapping for a struct, or a list with the element type and an optional length; a column whose name ends
+in `?` is nullable.
 """
 
 from __future__ import annotations
@@ -22,10 +23,6 @@ from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 
 if TYPE_CHECKING:
     from mosaico_ingest.ontology.model import Serializable
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-if TYPE_CHECKING:
-    from mosaico_ingest.ontology.model import Serializable
 
 __all__ = [
     "COLUMNS_FILE",
@@ -41,7 +38,7 @@ __all__ = [
 ]
 
 DEFINED: dict[str, type[Serializable]] = {}
-"""Every model class by tag, from the moment it is defined; a later one of the same tag replaces it."""
+"""Model classes by tag; a later class with the same tag replaces an earlier one."""
 
 MODULES: Mapping[str, str] = MappingProxyType(
     {
@@ -66,19 +63,19 @@ MODULES: Mapping[str, str] = MappingProxyType(
         for tag in names.split()
     }
 )
-"""The built-in tags, which are class names, and the module each is defined in."""
+"""The module of each built-in tag; tags are class names."""
 
 COLUMNS_FILE = Path(__file__).with_name("columns.json")
 
 EncodedType: TypeAlias = "str | list[Any] | dict[str, Any]"
-"""An Arrow type as the file has it."""
+"""An Arrow type in `columns.json`."""
 _arrow: Any = pa
-"""The stubs know each name of a type for itself, but not `str`."""
+"""pyarrow, whose stubs do not accept a `str` as the name of a type."""
 
 
 @cache
 def builtin_type(tag: str) -> OntologyType:
-    """Return tag, columns and serialization format of a built-in tag; KeyError for any other."""
+    """Return the ontology type of a built-in tag; raises KeyError for any other tag."""
     known = _known()[tag]
     return OntologyType(tag, pa.struct(_fields(known["columns"])), SerializationFormat(known["format"]))
 
@@ -104,7 +101,7 @@ def _type(kind: EncodedType) -> pa.DataType:
 
 
 def encode_fields(struct: pa.StructType) -> dict[str, EncodedType]:
-    """Return the fields of a struct as the file has them."""
+    """Return the fields of a struct as in `columns.json`."""
     return {field.name + "?" * field.nullable: _written(field.type) for field in struct}
 
 
@@ -117,11 +114,11 @@ def _written(kind: Any) -> EncodedType:  # noqa: ANN401 - the stubs hide what a 
 
 
 class UnknownTag(AdapterError, KeyError):  # noqa: N818 - the condition, as `NothingMatched`
-    """No model has this tag."""
+    """No model has the tag."""
 
 
 def model(tag: str) -> type[Serializable]:
-    """Return the class of a tag: the last one defined with it, otherwise the built-in.
+    """Return the class of a tag: the last one defined, otherwise the built-in.
 
     Raises:
         UnknownTag: There is none; names the nearest.
@@ -137,7 +134,7 @@ def model(tag: str) -> type[Serializable]:
 
 
 def ontology_type(tag: str) -> OntologyType:
-    """Return tag, columns and serialization format of a tag.
+    """Return the ontology type of a tag.
 
     Raises:
         UnknownTag: There is none; names the nearest.
@@ -146,10 +143,10 @@ def ontology_type(tag: str) -> OntologyType:
 
 
 def tags() -> tuple[str, ...]:
-    """Return every known tag in alphabetical order."""
+    """Return all tags in alphabetical order."""
     return tuple(sorted({*MODULES, *DEFINED}))
 
 
 def _letters(tag: str) -> str:
-    """Return the tag without what older tags, as `vector_3_d`, spell differently."""
+    """Return a tag without underscores and upper case, so that older spellings such as `vector_3_d` match."""
     return tag.replace("_", "").lower()

@@ -42,7 +42,7 @@ __all__ = [
 
 
 class Boolean(Serializable):
-    """Yes or no."""
+    """A boolean."""
 
     data: bool
     """The value."""
@@ -70,73 +70,73 @@ class Floating64(Serializable):
 
 
 class Integer8(Serializable):
-    """A whole number of 8 bits with a sign."""
+    """A signed 8-bit integer."""
 
     data: Int8
     """The value."""
 
 
 class Integer16(Serializable):
-    """A whole number of 16 bits with a sign."""
+    """A signed 16-bit integer."""
 
     data: Int16
     """The value."""
 
 
 class Integer32(Serializable):
-    """A whole number of 32 bits with a sign."""
+    """A signed 32-bit integer."""
 
     data: Int32
     """The value."""
 
 
 class Integer64(Serializable):
-    """A whole number of 64 bits with a sign."""
+    """A signed 64-bit integer."""
 
     data: Int64
     """The value."""
 
 
 class Unsigned8(Serializable):
-    """A whole number of 8 bits, never negative."""
+    """An unsigned 8-bit integer."""
 
     data: UInt8
     """The value."""
 
 
 class Unsigned16(Serializable):
-    """A whole number of 16 bits, never negative."""
+    """An unsigned 16-bit integer."""
 
     data: UInt16
     """The value."""
 
 
 class Unsigned32(Serializable):
-    """A whole number of 32 bits, never negative."""
+    """An unsigned 32-bit integer."""
 
     data: UInt32
     """The value."""
 
 
 class Unsigned64(Serializable):
-    """A whole number of 64 bits, never negative."""
+    """An unsigned 64-bit integer."""
 
     data: UInt64
     """The value."""
 
 
 class String(Serializable):
-    """A text, UTF-8."""
+    """A UTF-8 text."""
 
     data: str
     """The value."""
 
 
 class Unmodeled(Serializable):
-    """A row kept in the shape of its message; its topic's columns are those of the message type."""
+    """A row in the shape of its ROS message; the columns depend on the message type."""
 
     raw_data: dict[str, Any]
-    """The columns' values."""
+    """The values of the columns."""
 
     def to_row(self) -> dict[str, Any]:
         """Return the values of the columns."""
@@ -144,7 +144,7 @@ class Unmodeled(Serializable):
 
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> Self:
-        """Return the row as it is."""
+        """Return the model of a row."""
         return cls(raw_data=dict(row))
 
     @classmethod

@@ -23,32 +23,32 @@ __all__ = [
 
 
 class IMU(Stamped, Serializable):
-    """Acceleration and rate of turn of a body, each with its own covariance, 3 by 3."""
+    """Acceleration and angular velocity of a body, each with a 3 x 3 covariance."""
 
     acceleration: Vector3d
-    """m/s², gravity included."""
+    """Acceleration including gravity, m/s²."""
     angular_velocity: Vector3d
     """rad/s."""
     orientation: Quaternion | None = None
-    """null where the sensor does not estimate it."""
+    """Orientation; null if the sensor does not estimate it."""
 
 
 class Magnetometer(Stamped, Serializable):
-    """The field at the sensor."""
+    """The magnetic field at the sensor."""
 
     magnetic_field: Vector3d
-    """T; its covariance is 3 by 3, T²."""
+    """T; the covariance is 3 x 3, in T²."""
 
 
 class GPSStatus(Serializable):
-    """How good a fix is."""
+    """The quality of a position fix."""
 
     status: Int8
-    """-1 no fix, 0 fix, 1 satellite-based, 2 ground-based augmentation."""
+    """-1 no fix, 0 fix, 1 satellite-based augmentation, 2 ground-based augmentation."""
     service: UInt16
-    """The systems used, one bit each: 1 GPS, 2 GLONASS, 4 COMPASS, 8 Galileo."""
+    """The satellite systems in use, one bit each: 1 GPS, 2 GLONASS, 4 COMPASS, 8 Galileo."""
     satellites: Int8 | None = None
-    """Satellites in use."""
+    """Number of satellites in use."""
     hdop: Float64 | None = None
     """Horizontal dilution of precision."""
     vdop: Float64 | None = None
@@ -56,21 +56,21 @@ class GPSStatus(Serializable):
 
 
 class GPS(Stamped, Serializable):
-    """A fix on the WGS 84 ellipsoid."""
+    """A position on the WGS 84 ellipsoid."""
 
     position: Point3d
-    """x latitude and y longitude in degrees, z altitude in m; its covariance is 3 by 3, east north up, m²."""
+    """x is latitude and y longitude in degrees, z is altitude in m; the covariance is 3 x 3, east-north-up, in m²."""
     velocity: Vector3d | None = None
     """m/s."""
     status: GPSStatus | None = None
-    """null where the receiver does not say."""
+    """Quality of the fix; null if the receiver does not report it."""
 
 
 class NMEASentence(Stamped, Serializable):
-    """A line of a receiver."""
+    """An NMEA sentence of a receiver."""
 
     sentence: str
-    """From `$` on, without the line's end."""
+    """The text from `$`, without the line end."""
 
 
 class Pressure(Stamped, Varying, Serializable):
@@ -91,7 +91,7 @@ class Temperature(Stamped, Varying, Serializable):
 
     @classmethod
     def from_celsius(cls, celsius: float) -> Self:
-        """Return the temperature of so many °C."""
+        """Return the temperature for a value in °C."""
         return cls(value=celsius + _ICE_K)
 
     def to_celsius(self) -> float:
@@ -100,7 +100,7 @@ class Temperature(Stamped, Varying, Serializable):
 
 
 class BatteryState(Stamped, Serializable):
-    """The state of a battery; null is a value the sender does not measure."""
+    """The state of a battery; null for values that the sender does not measure."""
 
     voltage: Float32
     """V."""
@@ -109,13 +109,13 @@ class BatteryState(Stamped, Serializable):
     current: Float32 | None = None
     """A, negative while discharging."""
     charge: Float32 | None = None
-    """Ah left."""
+    """Remaining charge, Ah."""
     capacity: Float32 | None = None
-    """Ah when last full."""
+    """Last full capacity, Ah."""
     design_capacity: Float32 | None = None
-    """Ah when new."""
+    """Design capacity, Ah."""
     percentage: Float32
-    """0 to 1."""
+    """Charge as a fraction, 0 to 1."""
     power_supply_status: UInt8
     """0 unknown, 1 charging, 2 discharging, 3 not charging, 4 full."""
     power_supply_health: UInt8
@@ -123,24 +123,24 @@ class BatteryState(Stamped, Serializable):
     power_supply_technology: UInt8
     """0 unknown, 1 NiMH, 2 Li-ion, 3 Li-polymer, 4 LiFe, 5 NiCd, 6 LiMn."""
     present: bool
-    """Whether there is a battery."""
+    """Whether a battery is present."""
     location: str
-    """The slot it is in."""
+    """The slot or position of the battery."""
     serial_number: str
-    """Of the battery."""
+    """The battery's serial number."""
     cell_voltage: list[Float32] | None = None
-    """V each."""
+    """Voltage of each cell, V."""
     cell_temperature: list[Float32] | None = None
-    """°C each."""
+    """Temperature of each cell, °C."""
 
 
 class RobotJoint(Stamped, Serializable):
-    """The state of joints: one entry a joint in every list, or an empty list where it is not known."""
+    """The state of joints: one entry per joint in every list; a list is empty if its values are unknown."""
 
     names: list[str]
-    """The joints' names."""
+    """Names of the joints."""
     positions: list[Float64]
-    """rad of a revolute joint, m of a prismatic one."""
+    """rad for a revolute joint, m for a prismatic joint."""
     velocities: list[Float64]
     """rad/s or m/s."""
     efforts: list[Float64]
@@ -148,9 +148,9 @@ class RobotJoint(Stamped, Serializable):
 
 
 class Joy(Stamped, Serializable):
-    """The state of every axis and button."""
+    """The state of a controller's axes and buttons."""
 
     axes: list[Float32]
     """-1 to 1 each."""
     buttons: list[Int32]
-    """0 released, 1 pressed."""
+    """0 for released, 1 for pressed."""

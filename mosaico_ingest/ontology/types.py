@@ -32,7 +32,7 @@ _PLAIN: dict[pa.DataType, pa.DataType] = {
 
 
 class SerializationFormat(str, Enum):
-    """How the platform lays a topic out."""
+    """The layout of a topic on the platform."""
 
     DEFAULT = "default"
     RAGGED = "ragged"
@@ -40,7 +40,7 @@ class SerializationFormat(str, Enum):
 
 
 class OntologyType(Struct, frozen=True):
-    """What a topic's rows are; `struct` has every column but `timestamp_ns`."""
+    """The type of a topic's rows; `struct` has every column except `timestamp_ns`."""
 
     tag: str
     struct: pa.StructType
@@ -48,32 +48,32 @@ class OntologyType(Struct, frozen=True):
 
     @property
     def fingerprint(self) -> str:
-        """The name readers know these columns by."""
+        """Identifier of the columns, which readers compare."""
         return fingerprint(self.struct)
 
 
 @cache_by_identity
 def fingerprint(struct: pa.StructType) -> str:
-    """Return the first ten hex digits of the SHA-1 of the struct's spelling; top-level large and view types count as plain."""
+    """Return the first ten hex digits of the SHA-1 of the struct's text; top-level large and view types count as plain."""
     fields = [pa.field(field.name, _PLAIN.get(field.type) or field.type, field.nullable) for field in struct]
     return hashlib.sha1(str(pa.struct(fields)).encode(), usedforsecurity=False).hexdigest()[:10]
 
 
 _arrays: Any = pa
-"""The stubs do not know `type` beside `mask`."""
+"""pyarrow, whose stubs do not accept `type` together with `mask`."""
 _KEPT_BYTES = 1 << 20
 _Fill: TypeAlias = Callable[[Any], Any]
-"""Fills an array, or returns the array itself where there is nothing to fill."""
+"""Fills an array, or returns it unchanged if there is nothing to fill."""
 
 
 class RequiredFields:
-    """Where the required fields of a struct are, found once for all batches of a topic."""
+    """Fills the required fields of a struct type; the constructor finds them once for all batches of a topic."""
 
     def __init__(self, kind: pa.StructType) -> None:
         self._fill = _filling(kind)
 
     def fill(self, rows: pa.StructArray) -> pa.StructArray:
-        """Return the same rows, where a required field that is null because its struct is null holds zero instead.
+        """Return the rows with zeros in required fields that are null because their struct is null.
 
         No value that can be seen changes. Parquet's writer refuses `struct<a: int32 not null>` with a null in `a`
         although the struct itself is null there.
@@ -82,7 +82,7 @@ class RequiredFields:
 
 
 class NullRows:
-    """Rows of one type that are all null, with zeros where fields are required; few of them are made only once."""
+    """Null rows of one type, with zeros in required fields; small arrays are built once."""
 
     def __init__(self, kind: Any) -> None:  # noqa: ANN401 - any Arrow type; the stubs have no common base with children
         self._kind = kind
@@ -90,11 +90,11 @@ class NullRows:
         self._kept: Any = None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Travel without what was made."""
+        """Pickle without the cached rows."""
         return NullRows, (self._kind,)
 
     def of(self, count: int) -> Any:  # noqa: ANN401 - an array of whatever type it is
-        """Return `count` nulls."""
+        """Return `count` null rows."""
         if self._kept is not None and count <= len(self._kept):
             return self._kept.slice(0, count)
         rows: Any = pa.nulls(count, self._kind)
@@ -105,7 +105,7 @@ class NullRows:
 
 
 def _filling(kind: Any) -> _Fill | None:  # noqa: ANN401 - as above
-    """Return how to fill arrays of a type, None where nothing inside is required."""
+    """Return a function that fills arrays of a type, None if nothing inside is required."""
     if pt.is_struct(kind):
         return _filling_struct(list(kind))
     if pt.is_fixed_size_list(kind):
@@ -165,7 +165,7 @@ def _filled_list(array: Any, fill: _Fill) -> Any:  # noqa: ANN401 - as above
 
 
 def _without_nulls(array: Any) -> Any:  # noqa: ANN401 - as above
-    """Return the values with whatever lies under a null."""
+    """Return the values without their null mask."""
     if pt.is_struct(array.type):
         children = [array.field(position) for position in range(array.type.num_fields)]
         return pa.StructArray.from_arrays(children, fields=list(array.type))

@@ -145,11 +145,9 @@ def test_resolve_override_of_other_type_raises_with_both_types() -> None:
     bridge = ROSBridge(overrides={"/lidar/*": "LidarAdapter"})
     with pytest.raises(AdapterError) as caught:
         bridge.resolve("/lidar/imu", IMU)
-    assert str(caught.value) == (
-        "/lidar/imu: the override '/lidar/*' names LidarAdapter, which takes sensor_msgs/msg/PointCloud2; "
-        "the topic carries sensor_msgs/msg/Imu — name an adapter that takes this type, or leave the topic out "
-        "of the override"
-    )
+    assert caught.value.where == "/lidar/imu"
+    for value in ("/lidar/*", "LidarAdapter", "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Imu"):
+        assert value in caught.value.what
 
 
 def test_resolve_override_unmodeled_keeps_ros_shape() -> None:

@@ -291,7 +291,7 @@ def test_reference_to_missing_adapter_suggests_names(tmp_path: Path, ref: str, r
 
 
 def test_adapter_spec_of_other_object_raises() -> None:
-    with pytest.raises(AdapterError, match="int 3 is no adapter"):
+    with pytest.raises(AdapterError, match="int 3 "):
         adapter_spec(3, Path())
-    with pytest.raises(AdapterError, match="Speed is no adapter"):
+    with pytest.raises(AdapterError, match="Speed "):
         adapter_spec(Speed, Path())

@@ -92,7 +92,7 @@ def _to_ns(values: Array) -> Array:
 
 
 def filled_int(values: Array) -> Array:
-    """Return numbers as int64, 0 where there is none."""
+    """Return numbers as int64, with 0 for null."""
     return pc.fill_null(pc.cast(values, arrays.int64(), safe=False), 0)
 
 
@@ -115,18 +115,18 @@ ONE_ARGUMENT: Mapping[str, Callable[[Array], Array]] = {
     "nanoseconds": _from_ns,
     "time_from_ns": _to_ns,
 }
-"""By the function's name: what its (first) argument was. A null stands for the field's own zero."""
+"""Inverses of functions in their first argument, by name. Null stands for the field's own zero."""
 
 
 def with_constant(name: str, values: Array, number: Any, *, first: bool) -> Array | None:  # noqa: ANN401 - a literal
-    """Return x of `x name number` (`first`: of `number name x`) where that gave `values`; None where it cannot be."""
+    """Solve `x name number` (or `number name x` if `first`) for x; None if there is no unique solution."""
     if isinstance(number, bool) or not isinstance(number, (int, float)):
         return None
     if name == "!=" and number == 0:
         return values
     if pt.is_boolean(values.type):
         return None
-    solved: dict[tuple[str, bool], Callable[[], Array]] = {
+    solution: dict[tuple[str, bool], Callable[[], Array]] = {
         ("+", False): lambda: pc.subtract(values, number),
         ("+", True): lambda: pc.subtract(values, number),
         ("-", False): lambda: pc.add(values, number),
@@ -136,7 +136,7 @@ def with_constant(name: str, values: Array, number: Any, *, first: bool) -> Arra
         ("/", False): lambda: pc.multiply(values, number),
         ("/", True): lambda: pc.divide(float(number), pc.cast(values, arrays.float64())),
     }
-    solve = solved.get((name, first))
+    solve = solution.get((name, first))
     return None if solve is None or (name == "*" and number == 0) else solve()
 
 
@@ -146,38 +146,38 @@ _OPERANDS = 2
 
 
 class _Scope(Struct, frozen=True):
-    """Where names are looked up, and the lists that were opened on the way there."""
+    """The message in which names are looked up, and the lists that were opened to reach it."""
 
-    place: FieldPath = ()
+    path: FieldPath = ()
     axes: tuple[Axis, ...] = ()
 
 
 class ColumnInverter:
-    """Puts the columns of a batch back into the fields of its messages."""
+    """Assigns the columns of a batch to the fields of its messages."""
 
-    def __init__(self, parts: MessageBuilder, said: Mapping[FieldPath, str]) -> None:
-        """`said` is what the topic's metadata keeps of the first message."""
-        self._parts = parts
-        self._said = said
+    def __init__(self, builder: MessageBuilder, metadata_texts: Mapping[FieldPath, str]) -> None:
+        """`metadata_texts` are the fields of the first message that the topic metadata contains."""
+        self._builder = builder
+        self._metadata_texts = metadata_texts
         self._clouds: list[CloudField] = []
-        self._held: dict[tuple[FieldPath, int | None, Any], Mask] = {}
+        self._equalities: dict[tuple[FieldPath, int | None, Any], Mask] = {}
         self._target = ""
         self.not_invertible: dict[str, str] = {}
-        """Columns that could not be undone, and what they are computed as."""
+        """Columns that cannot be inverted, with their expressions."""
 
     def record(self, record: ColumnPlan, rows: Array) -> None:
-        """Invert a whole record."""
+        """Invert a complete record."""
         self._column(record, rows, _Scope())
-        for (place, index, value), where in self._held.items():
-            self._parts.constrain(place, index, where, value)
+        for (path, index, value), where in self._equalities.items():
+            self._builder.constrain(path, index, where, value)
         if self._clouds:
-            self._parts.assign((), pack_clouds(self._clouds, len(rows)))
+            self._builder.assign((), pack_clouds(self._clouds, len(rows)))
 
     def _column(self, field: ColumnPlan, values: Array, scope: _Scope) -> None:
         self._target = field.path
         absent = null_mask(values)
         if field.when is not None and absent is not None:
-            self._fails(field.when, absent, scope)
+            self._make_false(field.when, absent, scope)
         for replaced in field.overrides:
             self._column(replaced, field_of(values, replaced.name), scope)
         self._target = field.path
@@ -187,7 +187,7 @@ class ColumnInverter:
             case ExpressionSource(expression=typed):
                 self._expression(typed, values, scope)
             case MapLookup():
-                self._looked(field.source, values, scope)
+                self._map_lookup(field.source, values, scope)
             case NestedAdapter():
                 self._adapter(field.source, values, scope)
             case StructSource(operand=of, fields=fields):
@@ -198,8 +198,8 @@ class ColumnInverter:
     ) -> None:
         inside = (values, scope) if of is None else self._inside(of, values, scope)
         if inside is not None:
-            for one in fields:
-                self._column(one, field_of(inside[0], one.name), inside[1])
+            for argument in fields:
+                self._column(argument, field_of(inside[0], argument.name), inside[1])
 
     def _adapter(self, source: NestedAdapter, values: Array, scope: _Scope) -> None:
         inside = self._inside(source.operand, values, scope)
@@ -208,38 +208,38 @@ class ColumnInverter:
         if isinstance(source.adapter, MappingAdapter):
             self._column(source.adapter.record, *inside)
         else:
-            self._give_up(f"{source.name} of {source.operand.text}")
+            self._report_not_invertible(f"{source.name} of {source.operand.text}")
 
     def _inside(self, of: TypedExpression, values: Array, scope: _Scope) -> tuple[Array, _Scope] | None:
-        place = _place(of, scope)
-        if place is None:
-            self._give_up(of.text)
+        path = _field_path(of, scope)
+        if path is None:
+            self._report_not_invertible(of.text)
             return None
         values, axes = _opened(of, values)
-        return values, _Scope(place, (*scope.axes, *axes))
+        return values, _Scope(path, (*scope.axes, *axes))
 
-    def _looked(self, source: MapLookup, values: Array, scope: _Scope) -> None:
+    def _map_lookup(self, source: MapLookup, values: Array, scope: _Scope) -> None:
         values, axes = _opened(source.operand, values)
         index = pc.index_in(values, value_set=pc.cast(source.values, values.type))
-        found = source.keys.take(index)
-        if source.otherwise == source.operand and found.type != values.type:
-            found = pc.cast(found, values.type)
+        originals = source.keys.take(index)
+        if source.otherwise == source.operand and originals.type != values.type:
+            originals = pc.cast(originals, values.type)
         if source.otherwise == source.operand:
-            found = pc.coalesce(found, values)
-        self._assign(source.operand, found, _Scope(scope.place, (*scope.axes, *axes)))
+            originals = pc.coalesce(originals, values)
+        self._assign(source.operand, originals, _Scope(scope.path, (*scope.axes, *axes)))
 
     def _expression(self, typed: TypedExpression, values: Array, scope: _Scope) -> None:
         values, axes = _opened(typed, values)
-        self._assign(typed, values, _Scope(scope.place, (*scope.axes, *axes)))
+        self._assign(typed, values, _Scope(scope.path, (*scope.axes, *axes)))
 
     def _assign(self, typed: TypedExpression, values: Array, scope: _Scope) -> None:
-        """Say what an expression's fields were, given what it came to, one value an element of all open lists."""
-        place = _place(typed, scope)
-        if place is not None:
-            if place.count(EACH_ELEMENT) != len(scope.axes):
-                self._give_up(typed.text)
+        """Assign the values of an expression to the fields it reads; one value per element of all open lists."""
+        path = _field_path(typed, scope)
+        if path is not None:
+            if path.count(EACH_ELEMENT) != len(scope.axes):
+                self._report_not_invertible(typed.text)
             else:
-                self._parts.assign(place, values, scope.axes)
+                self._builder.assign(path, values, scope.axes)
             return
         match typed:
             case Constant():
@@ -256,16 +256,16 @@ class ColumnInverter:
             case FunctionCall():
                 self._apply(typed, values, scope)
             case _:
-                self._give_up(typed.text)
+                self._report_not_invertible(typed.text)
 
     def _item(self, typed: ElementAt, values: Array, scope: _Scope) -> None:
-        """Put one number into its list, which is as long as its type says."""
-        named = _marked_place(typed, scope)
-        if named is None or not is_number(values.type):
-            self._give_up(typed.text)
+        """Assign one number to its element of a fixed-size list."""
+        location = _element_path(typed, scope)
+        if location is None or not is_number(values.type):
+            self._report_not_invertible(typed.text)
         else:
             present = np.asarray(values.is_valid())
-            self._parts.constrain(*named, present, np.asarray(pc.fill_null(values, 0)))
+            self._builder.constrain(*location, present, np.asarray(pc.fill_null(values, 0)))
 
     def _apply(self, typed: FunctionCall, values: Array, scope: _Scope) -> None:
         first = typed.arguments[0]
@@ -274,126 +274,132 @@ class ColumnInverter:
         elif typed.name in ONE_ARGUMENT:
             self._assign(first, ONE_ARGUMENT[typed.name](values), scope)
         elif typed.name == "compressed_format":
-            self._assign(first, self._as_said(first, values, scope, typed.function.apply), scope)
+            self._assign(
+                first, self._explained_by_metadata(first, values, scope, typed.function.apply), scope
+            )
         elif typed.name == "null_if" and isinstance(typed.arguments[1], Constant):
             value = arrays.scalar(typed.arguments[1].value).cast(values.type)
             self._assign(first, pc.fill_null(values, value), scope)
         elif typed.name in {"min", "max", "clip"}:
-            self._assign(self._namesake(typed), values, scope)
+            self._assign(self._argument_named_like_column(typed), values, scope)
         else:
             self._operator(typed, values, scope)
 
     def _operator(self, typed: FunctionCall, values: Array, scope: _Scope) -> None:
-        """Undo `x + 1` and `1 + x`; one side is a literal."""
+        """Invert an operator with one literal operand, such as `x + 1` or `1 + x`."""
         if len(typed.arguments) != _OPERANDS:
-            self._give_up(typed.text)
+            self._report_not_invertible(typed.text)
             return
         left, right = typed.arguments
         if isinstance(right, Constant):
-            solved, unknown = with_constant(typed.name, values, right.value, first=False), left
+            solution, unknown = with_constant(typed.name, values, right.value, first=False), left
         elif isinstance(left, Constant):
-            solved, unknown = with_constant(typed.name, values, left.value, first=True), right
+            solution, unknown = with_constant(typed.name, values, left.value, first=True), right
         else:
-            solved, unknown = None, left
-        if solved is None:
-            self._give_up(typed.text)
+            solution, unknown = None, left
+        if solution is None:
+            self._report_not_invertible(typed.text)
         else:
-            self._assign(unknown, solved, scope)
+            self._assign(unknown, solution, scope)
 
-    def _namesake(self, typed: FunctionCall) -> TypedExpression:
-        """Return the argument that is called like the column; the first where none is."""
+    def _argument_named_like_column(self, typed: FunctionCall) -> TypedExpression:
+        """Return the argument with the name of the column, else the first."""
         name = self._target.rpartition(".")[2]
-        named = (one for one in typed.arguments if isinstance(one, FieldAccess) and one.name == name)
-        return next(named, typed.arguments[0])
+        location = (
+            argument
+            for argument in typed.arguments
+            if isinstance(argument, FieldAccess) and argument.name == name
+        )
+        return next(location, typed.arguments[0])
 
-    def _as_said(
+    def _explained_by_metadata(
         self, typed: TypedExpression, values: Array, scope: _Scope, function: Callable[[Array], Array]
     ) -> Array:
-        """Take the text of the topic's metadata in the rows it explains."""
-        said = self._said.get(_place(typed, scope) or ())
-        if said is None:
+        """Use the text of the topic metadata in the rows that it explains."""
+        metadata_text = self._metadata_texts.get(_field_path(typed, scope) or ())
+        if metadata_text is None:
             return values
-        gives = function(arrays.array([said]))[0]
-        return pc.if_else(pc.equal(values, gives), arrays.scalar(said), values)
+        stored = function(arrays.array([metadata_text]))[0]
+        return pc.if_else(pc.equal(values, stored), arrays.scalar(metadata_text), values)
 
     def _choice(self, typed: Conditional, values: Array, scope: _Scope) -> None:
         if isinstance(typed.then, Constant):
             missing = typed.then.value
             nan = isinstance(missing, float) and math.isnan(missing)
             if nan:
-                self._holds(typed.condition, true_mask(pc.is_nan(values)), scope)
+                self._make_true(typed.condition, true_mask(pc.is_nan(values)), scope)
             elif missing is not None:
-                self._give_up(typed.text)
+                self._report_not_invertible(typed.text)
             self._assign(typed.otherwise, values, scope)
         elif isinstance(typed.otherwise, Constant):
             self._assign(typed.then, values, scope)
         else:
-            self._give_up(typed.text)
+            self._report_not_invertible(typed.text)
 
-    def _holds(self, condition: TypedExpression, where: Mask, scope: _Scope) -> None:
-        """Make `a == 1` true in some rows, unless other columns that depend on it show that it was not."""
+    def _make_true(self, condition: TypedExpression, where: Mask, scope: _Scope) -> None:
+        """Make `a == 1` true in some rows, unless other columns of the same field contradict it."""
         match condition:
             case FunctionCall(name="==", arguments=(value, Constant(value=constant))):
-                named = _marked_place(value, scope)
-                if named is not None:
-                    key = (*named, constant)
-                    self._held[key] = where & self._held.get(key, where)
+                location = _element_path(value, scope)
+                if location is not None:
+                    key = (*location, constant)
+                    self._equalities[key] = where & self._equalities.get(key, where)
             case _:
                 pass
 
-    def _fails(self, condition: TypedExpression, where: Mask, scope: _Scope) -> None:
-        """Make a condition false in some rows, where one can see how; zero does it for many."""
+    def _make_false(self, condition: TypedExpression, where: Mask, scope: _Scope) -> None:
+        """Make a condition false in some rows if possible; for many conditions, the default zero does."""
         match condition:
             case FunctionCall(name="!=", arguments=(value, Constant(value=constant))):
                 self._mark(value, where, constant, scope)
             case FunctionCall(name=">=", arguments=(value, Constant(value=int(constant)))) if constant <= 0:
                 self._mark(value, where, constant - 1, scope)
-            case FunctionCall(name="or", arguments=both):
-                for one in both:
-                    self._fails(one, where, scope)
+            case FunctionCall(name="or", arguments=conditions):
+                for argument in conditions:
+                    self._make_false(argument, where, scope)
             case _:
                 pass
 
     def _mark(self, typed: TypedExpression, where: Mask, value: Any, scope: _Scope) -> None:  # noqa: ANN401 - a literal
-        named = _marked_place(typed, scope)
-        if named is not None:
-            self._parts.constrain(*named, where, value)
+        location = _element_path(typed, scope)
+        if location is not None:
+            self._builder.constrain(*location, where, value)
 
-    def _give_up(self, text: str) -> None:
+    def _report_not_invertible(self, text: str) -> None:
         self.not_invertible.setdefault(self._target, text)
 
 
-def _place(typed: TypedExpression, scope: _Scope) -> FieldPath | None:
-    """Return the field an expression names; None where it computes something."""
+def _field_path(typed: TypedExpression, scope: _Scope) -> FieldPath | None:
+    """Return the field that an expression reads, None if it computes a value."""
     match typed:
         case MessageRef():
-            return scope.place
+            return scope.path
         case FieldAccess(operand=FunctionCall(name="ros_time", arguments=(of,)), name=name):
-            inner = _place(of, scope)
+            inner = _field_path(of, scope)
             return None if inner is None else (*inner, _STAMP_PARTS[name])
         case FieldAccess(operand=of, name=name):
-            inner = _place(of, scope)
+            inner = _field_path(of, scope)
             return None if inner is None else (*inner, name)
         case OpenList(operand=of):
-            inner = _place(of, scope)
+            inner = _field_path(of, scope)
             return None if inner is None else (*inner, EACH_ELEMENT)
         case FunctionCall(name=name, arguments=(of,)) if name in _MOVES:
-            return _place(of, scope)
+            return _field_path(of, scope)
         case _:
             return None
 
 
-def _marked_place(typed: TypedExpression, scope: _Scope) -> tuple[FieldPath, int | None] | None:
-    """Return the field an expression names, and which element of it; None where it computes something."""
+def _element_path(typed: TypedExpression, scope: _Scope) -> tuple[FieldPath, int | None] | None:
+    """Return the field that an expression reads and the index of its element, None if it computes a value."""
     index = typed.index if isinstance(typed, ElementAt) else None
-    place = _place(typed.operand if isinstance(typed, ElementAt) else typed, scope)
-    if place is None or place.count(EACH_ELEMENT) != len(scope.axes) or (index is not None and index < 0):
+    path = _field_path(typed.operand if isinstance(typed, ElementAt) else typed, scope)
+    if path is None or path.count(EACH_ELEMENT) != len(scope.axes) or (index is not None and index < 0):
         return None
-    return place, index
+    return path, index
 
 
 def _opened(typed: TypedExpression, values: Array) -> tuple[Array, tuple[Axis, ...]]:
-    """Open the lists of a column that the expression made."""
+    """Open the lists of a column that its expression opened."""
     axes: list[Axis] = []
     for _ in typed.type.axes:
         values, axis = open_list(values)
@@ -402,10 +408,10 @@ def _opened(typed: TypedExpression, values: Array) -> tuple[Array, tuple[Axis, .
 
 
 def _element(lists: Array, position: int) -> Array:
-    """Return one element of every list, null where there is none."""
+    """Return one element of every list, null if the list is too short."""
     elements, axis = open_list(lists)
-    there = axis.lengths > position
-    at = np.where(there, axis.offsets[:-1] + position, 0)
+    is_present = axis.lengths > position
+    at = np.where(is_present, axis.offsets[:-1] + position, 0)
     if pt.is_null(elements.type) or not len(elements):
         return arrays.nulls(len(lists), elements.type)
-    return elements.take(arrays.array(at, mask=~there))
+    return elements.take(arrays.array(at, mask=~is_present))

@@ -42,31 +42,31 @@ CLOUD_FUNCTIONS: Mapping[str, tuple[str, int]] = {
     "points_uint16": ("<u2", 4),
     "points_packed": ("<f4", 7),
 }
-"""What a function reads from a cloud: numpy's name of it, and the number PointField has for it."""
+"""For each function, the numpy type of the points and the `datatype` of PointField."""
 
 
 class CloudField(Struct, frozen=True):
-    """A field of the points of every row."""
+    """One field of the points of every row."""
 
     name: str
     function: str
     values: Array
-    """Lists, one element a point; null where the cloud has no such field."""
+    """Lists with one element per point; null if the cloud has no such field."""
 
 
 def pack_clouds(fields: Sequence[CloudField], rows: int) -> Array:
-    """Return what a cloud is made of, without its header, one a row."""
+    """Return clouds without their headers, one per row."""
     opened = [(field, *open_list(field.values)) for field in fields]
     flat = [np.asarray(elements).astype(CLOUD_FUNCTIONS[field.function][0]) for field, elements, _ in opened]
-    made: list[dict[str, Any]] = []
+    clouds: list[dict[str, Any]] = []
     for row in range(rows):
-        there = [
+        present = [
             (field, values[axis.offsets[row] : axis.offsets[row + 1]])
             for (field, _, axis), values in zip(opened, flat, strict=True)
             if axis.null is None or not axis.null[row]
         ]
-        made.append(_cloud(there))
-    return arrays.array(made, _CLOUD)
+        clouds.append(_cloud(present))
+    return arrays.array(clouds, _CLOUD)
 
 
 def _cloud(fields: Sequence[tuple[CloudField, Any]]) -> dict[str, Any]:
@@ -127,17 +127,17 @@ _ONTOLOGY_NAMES = {
     "sec": "seconds",
     "nanosec": "nanoseconds",
 }
-"""What the ontology calls the fields of a header and of a time."""
+"""The names in the ontology of the fields of headers and times."""
 
 
 class _Constraint(Struct, frozen=True):
-    """A value that a field, or one element of its list, must have had in some rows; used where the field itself is not known."""
+    """A value that a field, or one element of its list, must have in some rows; applies where the field is unknown."""
 
     index: int | None
-    """Which element of the list; None: the value itself."""
+    """The index of the list element; None for the value itself."""
     where: Mask
     value: Any
-    """One for all rows, or an array of one a row."""
+    """One value for all rows, or an array with one value per row."""
 
     def of(self, rows: Any) -> Any:  # noqa: ANN401 - numpy's positions, a field's values
         """Return the values of some rows."""
@@ -145,142 +145,144 @@ class _Constraint(Struct, frozen=True):
 
 
 class MessageBuilder:
-    """The fields of a batch of messages, as they become known; what was put first stays, where it is not null."""
+    """Builds a batch of messages from field values; the first non-null value of a field is kept."""
 
     def __init__(self, shape: DataType, rows: int) -> None:
         self._shape = shape
         self._rows = rows
         self._values: dict[FieldPath, Array] = {}
         self._axes: dict[FieldPath, Axis] = {}
-        self._marks: dict[FieldPath, list[_Constraint]] = defaultdict(list)
+        self._constraints: dict[FieldPath, list[_Constraint]] = defaultdict(list)
         self.defaulted: list[str] = []
-        """The fields that `build` had to make up, as `header.seq`."""
+        """The fields that `build` filled with defaults, such as `header.seq`."""
 
-    def assign(self, place: FieldPath, values: Array, axes: tuple[Axis, ...] = ()) -> None:
-        """Say what a field is: one value a row, or one an element of the lists around it."""
-        kind = self.type_at(place)
-        if pt.is_struct(kind):
-            self._put_fields(place, kind, values, axes)
-        elif is_list(kind) and pt.is_struct(kind.value_type):
+    def assign(self, path: FieldPath, values: Array, axes: tuple[Axis, ...] = ()) -> None:
+        """Set a field: one value per row, or one per element of the lists around it."""
+        type_ = self.type_at(path)
+        if pt.is_struct(type_):
+            self._put_fields(path, type_, values, axes)
+        elif is_list(type_) and pt.is_struct(type_.value_type):
             elements, axis = open_list(values)
-            self.assign((*place, EACH_ELEMENT), elements, (*axes, axis))
+            self.assign((*path, EACH_ELEMENT), elements, (*axes, axis))
         else:
-            lists = [at for at, name in enumerate(place) if name == EACH_ELEMENT]
+            lists = [at for at, name in enumerate(path) if name == EACH_ELEMENT]
             for at, axis in zip(lists, axes, strict=True):
-                self._axes.setdefault(place[:at], axis)
-            known = self._values.get(place)
-            self._values[place] = values if known is None else _either(known, values)
+                self._axes.setdefault(path[:at], axis)
+            current = self._values.get(path)
+            self._values[path] = values if current is None else _coalesce(current, values)
 
-    def constrain(self, place: FieldPath, index: int | None, where: Mask, value: Any) -> None:  # noqa: ANN401 - a field's value
-        """Say what a field, or an element of it, must have been in some rows, unless more is known of it."""
-        self._marks[place].append(_Constraint(index, where, value))
+    def constrain(self, path: FieldPath, index: int | None, where: Mask, value: Any) -> None:  # noqa: ANN401 - a field's value
+        """Record the value that a field, or one of its elements, must have in some rows if nothing else is known."""
+        self._constraints[path].append(_Constraint(index, where, value))
 
-    def type_at(self, place: FieldPath) -> DataType:
+    def type_at(self, path: FieldPath) -> DataType:
         """Return the type of a field of the message."""
-        kind = self._shape
-        for name in place:
-            kind = kind.value_type if name == EACH_ELEMENT else kind.field(name).type
-        return kind
+        type_ = self._shape
+        for name in path:
+            type_ = type_.value_type if name == EACH_ELEMENT else type_.field(name).type
+        return type_
 
     def build(self) -> Array:
         """Return the messages."""
         self.defaulted.clear()
         return self._struct(self._shape, (), self._rows)
 
-    def _put_fields(self, place: FieldPath, kind: DataType, values: Array, axes: tuple[Axis, ...]) -> None:
-        there = {field.name for field in values.type}
-        for field in kind:
-            own = field.name if field.name in there else _ONTOLOGY_NAMES.get(field.name)
-            if own in there:
-                self.assign((*place, field.name), field_of(values, str(own)), axes)
+    def _put_fields(self, path: FieldPath, type_: DataType, values: Array, axes: tuple[Axis, ...]) -> None:
+        present = {field.name for field in values.type}
+        for field in type_:
+            source_name = field.name if field.name in present else _ONTOLOGY_NAMES.get(field.name)
+            if source_name in present:
+                self.assign((*path, field.name), field_of(values, str(source_name)), axes)
 
-    def _struct(self, kind: DataType, place: FieldPath, rows: int) -> Array:
-        children = [self._field(field.type, (*place, field.name), rows) for field in kind]
-        return struct_of(children, kind, None, rows)
+    def _struct(self, type_: DataType, path: FieldPath, rows: int) -> Array:
+        children = [self._field(field.type, (*path, field.name), rows) for field in type_]
+        return struct_of(children, type_, None, rows)
 
-    def _field(self, kind: DataType, place: FieldPath, rows: int) -> Array:
-        if pt.is_struct(kind):
-            return self._struct(kind, place, rows)
-        if place in self._axes:
-            axis = self._axes[place]
-            elements = self._field(kind.value_type, (*place, EACH_ELEMENT), int(axis.offsets[-1]))
-            plain = variable_list(elements, axis.offsets, None, arrays.list_(kind.value_field))
-            return _of_size(plain, kind) if pt.is_fixed_size_list(kind) else plain
-        values = self._values.get(place)
-        if values is None and place not in self._marks:
-            self.defaulted.append(".".join(place).replace(f".{EACH_ELEMENT}", EACH_ELEMENT))
-        array = zeros(kind, rows) if values is None else fill_nulls(values, kind)
+    def _field(self, type_: DataType, path: FieldPath, rows: int) -> Array:
+        if pt.is_struct(type_):
+            return self._struct(type_, path, rows)
+        if path in self._axes:
+            axis = self._axes[path]
+            elements = self._field(type_.value_type, (*path, EACH_ELEMENT), int(axis.offsets[-1]))
+            variable = variable_list(elements, axis.offsets, None, arrays.list_(type_.value_field))
+            return _of_size(variable, type_) if pt.is_fixed_size_list(type_) else variable
+        values = self._values.get(path)
+        if values is None and path not in self._constraints:
+            self.defaulted.append(".".join(path).replace(f".{EACH_ELEMENT}", EACH_ELEMENT))
+        array = zeros(type_, rows) if values is None else fill_nulls(values, type_)
         absent = np.ones(rows, bool) if values is None else null_mask(values)
-        return array if absent is None else self._marked(array, place, absent)
+        return array if absent is None else self._apply_constraints(array, path, absent)
 
-    def _marked(self, array: Array, place: FieldPath, absent: Mask) -> Array:
-        for mark in self._marks.get(place, ()):
-            rows = np.flatnonzero(mark.where & absent)
+    def _apply_constraints(self, array: Array, path: FieldPath, absent: Mask) -> Array:
+        for constraint in self._constraints.get(path, ()):
+            rows = np.flatnonzero(constraint.where & absent)
             if not len(rows):
                 continue
-            if mark.index is None:
-                array = _with(array, rows, mark.of(rows))
+            if constraint.index is None:
+                array = _with_values(array, rows, constraint.of(rows))
                 continue
             elements, axis = open_list(array)
-            rows = rows[axis.lengths[rows] > mark.index]
-            changed = _with(elements, axis.offsets[:-1][rows] + mark.index, mark.of(rows))
+            rows = rows[axis.lengths[rows] > constraint.index]
+            changed = _with_values(elements, axis.offsets[:-1][rows] + constraint.index, constraint.of(rows))
             array = axis.close(changed, array.type)
         return array
 
 
-def zeros(kind: DataType, rows: int) -> Array:
-    """Return an array of zeros, empty texts and lists."""
-    if pt.is_struct(kind):
-        return struct_of([zeros(field.type, rows) for field in kind], kind, None, rows)
-    if pt.is_fixed_size_list(kind):
-        return fixed_list(zeros(kind.value_type, rows * kind.list_size), kind.list_size, None, rows, kind)
-    if pt.is_list(kind):
-        return variable_list(zeros(kind.value_type, 0), np.zeros(rows + 1, np.int64), None, kind)
-    return arrays.repeat(_zero(kind), rows)
+def zeros(type_: DataType, rows: int) -> Array:
+    """Return an array of zeros, empty texts and empty lists."""
+    if pt.is_struct(type_):
+        return struct_of([zeros(field.type, rows) for field in type_], type_, None, rows)
+    if pt.is_fixed_size_list(type_):
+        return fixed_list(zeros(type_.value_type, rows * type_.list_size), type_.list_size, None, rows, type_)
+    if pt.is_list(type_):
+        return variable_list(zeros(type_.value_type, 0), np.zeros(rows + 1, np.int64), None, type_)
+    return arrays.repeat(_zero(type_), rows)
 
 
-def fill_nulls(values: Array, kind: DataType) -> Array:
-    """Return values in a field's type, the field's zero where there is none."""
+def fill_nulls(values: Array, type_: DataType) -> Array:
+    """Cast values to the type of a field, with zero for null."""
     if pt.is_null(values.type):
-        return zeros(kind, len(values))
-    if is_list(kind):
+        return zeros(type_, len(values))
+    if is_list(type_):
         elements, axis = open_list(values)
-        plain = variable_list(
-            fill_nulls(elements, kind.value_type), axis.offsets, None, arrays.list_(kind.value_field)
+        variable = variable_list(
+            fill_nulls(elements, type_.value_type), axis.offsets, None, arrays.list_(type_.value_field)
         )
-        return _of_size(plain, kind) if pt.is_fixed_size_list(kind) else plain
-    if values.type != kind:
-        if pt.is_integer(kind) and pt.is_floating(values.type):
+        return _of_size(variable, type_) if pt.is_fixed_size_list(type_) else variable
+    if values.type != type_:
+        if pt.is_integer(type_) and pt.is_floating(values.type):
             values = pc.round(values)
-        values = pc.cast(values, kind, safe=False)
-    return pc.fill_null(values, _zero(kind)) if values.null_count else values
+        values = pc.cast(values, type_, safe=False)
+    return pc.fill_null(values, _zero(type_)) if values.null_count else values
 
 
-def _either(known: Array, more: Array) -> Array:
-    """Return what is known, and more where it is null."""
-    if not known.null_count or pt.is_nested(known.type) or len(known) != len(more):
-        return known
-    return pc.coalesce(known, pc.cast(more, known.type, safe=False))
+def _coalesce(current: Array, more: Array) -> Array:
+    """Return the first array, with nulls replaced from the second."""
+    if not current.null_count or pt.is_nested(current.type) or len(current) != len(more):
+        return current
+    return pc.coalesce(current, pc.cast(more, current.type, safe=False))
 
 
-def _zero(kind: DataType) -> Any:  # noqa: ANN401 - an Arrow scalar
-    plain = "" if pt.is_string(kind) else b"" if pt.is_binary(kind) else False if pt.is_boolean(kind) else 0
-    return arrays.scalar(plain, kind)
+def _zero(type_: DataType) -> Any:  # noqa: ANN401 - an Arrow scalar
+    variable = (
+        "" if pt.is_string(type_) else b"" if pt.is_binary(type_) else False if pt.is_boolean(type_) else 0
+    )
+    return arrays.scalar(variable, type_)
 
 
-def _of_size(array: Array, kind: DataType) -> Array:
-    """Return lists as lists of a fixed length: those of another length become zeros."""
+def _of_size(array: Array, type_: DataType) -> Array:
+    """Convert lists to a fixed length; lists of another length become zeros."""
     elements, axis = open_list(array)
-    size, good = kind.list_size, axis.lengths == kind.list_size
-    if not good.all():
+    size, fits = type_.list_size, axis.lengths == type_.list_size
+    if not fits.all():
         positions = (axis.offsets[:-1, None] + np.arange(size)).ravel()
-        absent = np.repeat(~good, size)
-        taken = elements.take(arrays.array(np.where(absent, 0, positions), mask=absent))
-        elements = fill_nulls(taken, kind.value_type) if not pt.is_struct(kind.value_type) else taken
-    return fixed_list(elements, size, None, len(array), kind)
+        absent = np.repeat(~fits, size)
+        padded = elements.take(arrays.array(np.where(absent, 0, positions), mask=absent))
+        elements = fill_nulls(padded, type_.value_type) if not pt.is_struct(type_.value_type) else padded
+    return fixed_list(elements, size, None, len(array), type_)
 
 
-def _with(array: Array, positions: Any, value: Any) -> Array:  # noqa: ANN401 - numpy's, and a field's value
+def _with_values(array: Array, positions: Any, value: Any) -> Array:  # noqa: ANN401 - numpy's, and a field's value
     values = np.array(array)
     values[positions] = value
     return arrays.array(values, array.type)

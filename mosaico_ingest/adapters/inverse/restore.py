@@ -42,9 +42,9 @@ __all__ = [
 
 
 def differences(left: Array, right: Array) -> Mapping[str, Mask]:
-    """Return where the fields of two columns of one struct differ, without those that never do."""
-    both = ((f.name, ~_same(field_of(left, f.name), field_of(right, f.name))) for f in left.type)
-    return {name: wrong for name, wrong in both if wrong.any()}
+    """Return where the fields of two columns of one struct differ, for the fields that differ at all."""
+    pairs = ((f.name, ~_same(field_of(left, f.name), field_of(right, f.name))) for f in left.type)
+    return {name: wrong for name, wrong in pairs if wrong.any()}
 
 
 def _same(left: Array, right: Array) -> Mask:
@@ -59,7 +59,7 @@ def _same(left: Array, right: Array) -> Mask:
 
 
 def _same_values(left: Array, right: Array) -> Mask:
-    """Compare where neither is null."""
+    """Compare values without nulls."""
     if pt.is_struct(left.type):
         equal = np.ones(len(left), bool)
         for field in left.type:
@@ -91,31 +91,31 @@ _IMAGE = "Image"
 
 
 class Restored(Struct, frozen=True):
-    """A batch of messages, and how far they are what was stored."""
+    """A batch of restored messages, and how they differ from the original ones."""
 
     rows: pa.StructArray
-    """In the ROS shape, without nulls."""
+    """The messages in the ROS shape, without nulls."""
     defaulted: tuple[str, ...] = ()
-    """Fields of the message that are not in the rows; they are zero, empty or false."""
+    """Fields that are not stored; they are zero, empty or false."""
     not_invertible: Mapping[str, str] | None = None
-    """Columns that no field could be computed from, and what they were computed as."""
+    """Columns that cannot be inverted, with their expressions."""
     changed: Mapping[str, int] | None = None
-    """Columns that would come out otherwise if the messages were ingested again, and in how many rows."""
+    """Columns that differ if the messages are ingested again, with the number of rows."""
 
 
 class Inverse(Protocol):
-    """Takes rows of one topic back."""
+    """Restores the messages of one topic."""
 
     def restore(self, rows: pa.StructArray, envelope: Envelope) -> Restored:
-        """Return one message a row."""
+        """Return one message per row."""
         ...
 
 
 def invert(adapter: Adapter, shape: pa.StructType, metadata: Mapping[str, Any]) -> Inverse:
-    """Return the way back through a bound adapter; `metadata` is the topic's.
+    """Return the inverse of a bound adapter; `metadata` is the topic's.
 
     Raises:
-        AdapterError: The adapter is a class, of which nobody knows what it does.
+        AdapterError: The adapter is written in Python and has no inverse.
     """
     if isinstance(adapter, UnmodeledAdapter):
         return _UnmodeledInverse(shape)
@@ -125,11 +125,11 @@ def invert(adapter: Adapter, shape: pa.StructType, metadata: Mapping[str, Any]) 
 
 
 class _UnmodeledInverse(Struct, frozen=True):
-    """Of messages that kept their shape: exact."""
+    """The exact inverse for messages stored in their ROS shape."""
 
     shape: pa.StructType
 
-    def restore(self, rows: pa.StructArray, envelope: Envelope) -> Restored:  # noqa: ARG002 - the seam's signature
+    def restore(self, rows: pa.StructArray, envelope: Envelope) -> Restored:  # noqa: ARG002 - the protocol's signature
         columns = [
             _in_shape(values, field.type) for values, field in zip(rows.flatten(), self.shape, strict=True)
         ]
@@ -137,7 +137,7 @@ class _UnmodeledInverse(Struct, frozen=True):
 
 
 class _MappingInverse(Struct, frozen=True):
-    """Of messages that went through a mapping."""
+    """The inverse for messages that a mapping adapted."""
 
     adapter: MappingAdapter
     shape: pa.StructType
@@ -146,42 +146,42 @@ class _MappingInverse(Struct, frozen=True):
     def restore(self, rows: pa.StructArray, envelope: Envelope) -> Restored:
         if self.adapter.ontology.tag == _IMAGE:
             rows = without_png(rows)
-        parts = MessageBuilder(self.shape, len(rows))
-        undo = ColumnInverter(parts, self.metadata_texts)
+        builder = MessageBuilder(self.shape, len(rows))
+        undo = ColumnInverter(builder, self.metadata_texts)
         undo.record(self.adapter.record, rows)
-        messages = parts.build()
+        messages = builder.build()
         changed = self._changed(rows, messages, replace(envelope, msgtype=self.adapter.msgtype))
-        return Restored(messages, tuple(parts.defaulted), undo.not_invertible, changed)
+        return Restored(messages, tuple(builder.defaulted), undo.not_invertible, changed)
 
     def _changed(self, rows: Array, messages: Array, envelope: Envelope) -> Mapping[str, int]:
-        again = self.adapter.adapt(messages, envelope)
-        given = rows if len(again.index) == len(rows) else rows.take(arrays.array(again.index))
-        changed = {name: int(wrong.sum()) for name, wrong in differences(given, again.rows).items()}
-        return changed | ({"(refused)": len(again.failures)} if again.failures else {})
+        adapted = self.adapter.adapt(messages, envelope)
+        stored = rows if len(adapted.index) == len(rows) else rows.take(arrays.array(adapted.index))
+        changed = {name: int(wrong.sum()) for name, wrong in differences(stored, adapted.rows).items()}
+        return changed | ({"(refused)": len(adapted.failures)} if adapted.failures else {})
 
 
 def _metadata_texts(
     values: Mapping[str, TypedExpression], metadata: Mapping[str, Any]
 ) -> Mapping[FieldPath, str]:
-    """Return what the metadata keeps of fields of the first message."""
-    found: dict[FieldPath, str] = {}
+    """Return the fields of the first message that the topic metadata contains."""
+    texts: dict[FieldPath, str] = {}
     for key, typed in values.items():
         if (
             isinstance(typed, FieldAccess)
             and isinstance(typed.operand, MessageRef)
             and isinstance(metadata.get(key), str)
         ):
-            found[(typed.name,)] = metadata[key]
-    return found
+            texts[(typed.name,)] = metadata[key]
+    return texts
 
 
 def _in_shape(values: Array, kind: DataType) -> Array:
-    """Return values in the message's own type: empty messages lose the member that storage gave them."""
+    """Cast values to the message's own type, and drop the placeholder fields of empty messages."""
     if values.type == kind and not values.null_count:
         return values
     if pt.is_struct(kind):
-        there = [field.name for field in values.type]
-        children = [_in_shape(field_of(values, f.name), f.type) for f in kind if f.name in there]
+        names = [field.name for field in values.type]
+        children = [_in_shape(field_of(values, f.name), f.type) for f in kind if f.name in names]
         return struct_of(children, kind, None, len(values))
     if is_list(kind):
         elements, axis = open_list(values)

@@ -1,4 +1,4 @@
-"""The model of an adapter file, its JSON Schema, and ontology types defined inline."""
+"""The model of an adapter file, and its JSON Schema."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ __all__ = [
 
 
 def _plain(value: object) -> object:
-    """Refuse what is no plain value, once and not once for each type it is not."""
+    """Reject values that are not plain, with one error instead of one per type of the union."""
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
-    raise PydanticCustomError("plain_value", "it is an expression, a number, true, false or null")
+    raise PydanticCustomError("plain_value", "it must be an expression, a number, true, false or null")
 
 
 Scalar: TypeAlias = Annotated[bool | int | float | str | None, BeforeValidator(_plain)]
@@ -59,47 +59,47 @@ def _type_or_text(value: object) -> str:
 
 
 class ValueForm(_Strict):
-    """A value that needs more than an expression; one of `value`, `use` and `fields` says where it comes from."""
+    """A value that needs more than an expression; exactly one of `value`, `use` and `fields` is its source."""
 
     value: Scalar = None
     """An expression."""
     map: Annotated[Mapping[Scalar, Scalar], Field(min_length=1)] | None = None
-    """What `value` becomes, by value or by the name of a constant of the message."""
+    """Replacements for `value`: keys are values, or names of constants of the message."""
     otherwise: Annotated[
         Scalar, Field(alias="else", default="error", examples=["error", "keep", "'unknown'"])
     ]
-    """What a value that is not in `map` becomes: `error` rejects the row, `keep` keeps it, or an expression."""
+    """The result for a value that is not in `map`: `error` rejects the row, `keep` keeps the value, text is an expression."""
     use: str | None = None
-    """The adapter that makes the record of the nested message `of`."""
+    """The adapter that converts the nested message `of`."""
     of: str | None = None
-    """An expression: the nested message (`a.b`), or the messages of a list (`a[]`)."""
+    """An expression for the nested message (`a.b`), or for the messages of a list (`a[]`)."""
     fields: Mapping[str, Value] | None = None
-    """Field of the struct → value; names are read inside `of` where that is given."""
+    """Field of the struct → value; names are looked up in `of` if it is given."""
     replaced: Annotated[Mapping[str, Value] | None, Field(alias="with")] = None
-    """Fields of the resulting struct that come from elsewhere; names are read outside `of`."""
+    """Fields of the resulting struct with another source; names are looked up outside `of`."""
     when: str | None = None
-    """A condition; where it does not hold, the whole value is null."""
+    """A condition; the value is null in rows where it is not true."""
 
 
 Value: TypeAlias = Annotated[
     Annotated[Scalar, Tag("scalar")] | Annotated[ValueForm, Tag("form")], Discriminator(_form_or_scalar)
 ]
-"""Text is an expression; numbers, `true`, `false` and `null` are themselves; a mapping is a `Form`."""
+"""Text is an expression; numbers, `true`, `false` and `null` are literals; a mapping is a `ValueForm`."""
 
 
 class FieldDeclaration(_Strict):
-    """A field of an ontology type of one's own."""
+    """A field of a declared ontology type."""
 
     type: str | None = None
-    """As `float32`, `list[float64]`, `list[float64, 9]`, or an ontology tag."""
+    """`float32`, `list[float64]`, `list[float64, 9]`, or an ontology tag."""
     fields: Mapping[str, FieldType] | None = None
-    """The fields of a nested struct; with `type: list`, of each struct in a list."""
+    """The fields of a nested struct; with `type: list`, the fields of each struct in a list."""
     nullable: bool = True
-    """Whether a row may have no value."""
+    """Whether rows may lack a value."""
     unit: str | None = None
-    """As `m/s`; for the reader."""
+    """The unit, such as `m/s`; documentation only."""
     description: str | None = None
-    """For the reader."""
+    """Documentation only."""
 
 
 FieldType: TypeAlias = Annotated[
@@ -108,40 +108,40 @@ FieldType: TypeAlias = Annotated[
 
 
 class InlineType(_Strict):
-    """An ontology type of one's own."""
+    """An ontology type that the file declares."""
 
     tag: Annotated[str, Field(pattern=_NAME, examples=["WheelTicks"])]
-    """The name that readers find it by."""
+    """The name of the type, by which readers find it."""
     format: Annotated[SerializationFormat, Field(strict=False)] = SerializationFormat.DEFAULT
-    """How the platform lays it out."""
+    """The serialization format on the platform."""
     fields: Annotated[Mapping[str, FieldType], Field(min_length=1)]
     """Column → type."""
 
 
 class RecordedMessage(_Strict):
-    """A recorded message."""
+    """A reference to a recorded message."""
 
     bag: str
-    """A recording; relative to the adapter file."""
+    """The path of a recording, relative to the adapter file."""
     topic: str
-    """The topic in it."""
+    """The topic."""
     index: Annotated[int, Field(ge=0)] = 0
-    """Which of the topic's messages."""
+    """The position of the message within its topic, from 0."""
 
 
 class AdapterTest(_Strict):
-    """What must come out of what."""
+    """A test: a message, and the record or rejection to expect."""
 
     name: str
-    """What the test shows."""
+    """A short description of the test."""
     ros_type: TypeName | None = None
-    """Which of the adapter's types; the first if not said."""
+    """The message type; by default the adapter's first."""
     given: Mapping[str, Any]
-    """Fields of the message (those not named are zero, empty, false), or `{bag, topic, index}`."""
+    """Fields of the message (all others are zero, empty or false), or `{bag, topic, index}`."""
     expect: Mapping[str, Any] | None = None
-    """What is compared; fields not named may be anything."""
+    """The expected record; fields that are not listed are not compared."""
     rejects: str | None = None
-    """The row must be rejected, for a reason that contains this."""
+    """The row must be rejected with a reason that contains this text."""
 
 
 TypeNames: TypeAlias = Annotated[
@@ -151,36 +151,36 @@ TypeNames: TypeAlias = Annotated[
 
 
 class MappingFile(_Strict):
-    """How messages of one or more ROS types become records of one ontology type."""
+    """A mapping from messages of one or more ROS types to records of one ontology type."""
 
     version: Literal[1]
-    """The version of this language."""
+    """The version of the language."""
     adapter: Annotated[str, Field(pattern=_NAME, examples=["BatteryPackAdapter"])]
     """The adapter's name, for `adapters.override` and `use`."""
     description: str | None = None
     """One line for lists of adapters."""
     ros_type: TypeNames | None = None
-    """The message type, or types that all have the fields that are named."""
+    """The message type, or a list of types that all have the fields used."""
     variants: Annotated[Mapping[TypeName, Mapping[str, Value]], Field(min_length=1)] | None = None
-    """Instead of `ros_type`: types that wrap the same payload. `of` says where it is; other keys are fields."""
+    """Instead of `ros_type`: types that wrap the same payload. `of` selects the payload; other keys are columns."""
     ontology: Annotated[
         Annotated[str, Tag("text")] | Annotated[InlineType, Tag("inline")], Discriminator(_type_or_text)
     ]
-    """The ontology type: a known tag, or one of one's own."""
+    """The ontology type: a known tag, or a declaration."""
     default: bool = True
-    """Whether it is used for its types without being asked for."""
+    """Whether the adapter applies to its types without an override."""
     fields: Mapping[str, Value]
     """Column → value."""
     schema_metadata: Mapping[str, Value] = Field(default_factory=dict)
-    """What the topic's metadata says, read from the first row."""
+    """Topic metadata, computed from the topic's first row."""
     definition: str | None = None
-    """The `.msg` text of a type that no distro knows, so that the tests run without a recording."""
+    """The `.msg` text of a type that no distro has, so that the file can be checked and tested without a recording."""
     tests: Sequence[AdapterTest] = ()
-    """Messages and what must come out of them."""
+    """Tests: messages, and the records or rejections to expect."""
 
     @property
     def ros_types(self) -> tuple[str, ...]:
-        """The types it takes, in the order written."""
+        """The message types that the adapter takes, in the order of the file."""
         if self.variants is not None:
             return tuple(self.variants)
         if self.ros_type is None:
@@ -190,7 +190,7 @@ class MappingFile(_Strict):
 
 @cache
 def adapter_schema() -> dict[str, Any]:
-    """Return the schema (draft 2020-12) that editors complete and check adapter files with."""
+    """Return the JSON Schema (draft 2020-12) of adapter files, for validation and for completion in editors."""
     schema = tidy(schema_of(MappingFile))
     takes = [{"required": ["ros_type"]}, {"required": ["variants"]}]
     return {"$schema": DIALECT, "title": "mosaico-ingest adapter", **schema, "oneOf": takes}
