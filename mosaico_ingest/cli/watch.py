@@ -21,6 +21,8 @@ __all__ = [
     "watch",
 ]
 
+EXIT_UNFINISHED = 4
+"""Exit code of `watch --once` if a recording was not ingested because its end is missing."""
 STATUS_STYLES = {"done": "green", "new": "cyan", "changed": "yellow", "failed": "red", "unreadable": "red"}
 
 
@@ -85,7 +87,7 @@ def watch(
             "--rest",
             min=0.0,
             metavar="SECONDS",
-            help="Time without a change after which a recording is complete.",
+            help="Time without a change after which a recording is complete; 600 s if its end is missing.",
         ),
     ] = 10.0,
     every: Annotated[
@@ -139,6 +141,9 @@ def watch(
             time.sleep(every)
     except KeyboardInterrupt:
         pass
+    for path in arrivals.unfinished() if once else ():
+        _print(f"{path}: not ingested: the end of the recording is missing, it may still be written")
+        codes.append(EXIT_UNFINISHED)
     _print("stopped watching")
     code = gravest(codes) if once else 0
     if code:

@@ -125,8 +125,8 @@ class SequenceRequest(Struct, frozen=True):
     """True if the commit swaps a stored sequence for the new one: an incomplete result must not replace it."""
 
 
-def content_digest(path: Path) -> str:
-    """Return an XXH3 digest (128 bits) of the length of a file and of its content.
+def content_digest(path: Path, size_bytes: int | None = None) -> str:
+    """Return an XXH3 digest (128 bits) of the length of a file and of its content, or of its first `size_bytes`.
 
     Of files longer than 64 MiB, only 64 evenly spaced samples of 1 MiB are read, so that long recordings are compared
     quickly. Different recordings differ in every sample; the digest does not protect against forgery.
@@ -134,7 +134,7 @@ def content_digest(path: Path) -> str:
     Raises:
         BagError: The file cannot be read.
     """
-    size = _size(path)
+    size = _size(path) if size_bytes is None else size_bytes
     if size <= _SAMPLES * _READ_BYTES:
         return _digest(path, size, [(0, size)])
     step = (size - _READ_BYTES) / (_SAMPLES - 1)
@@ -176,7 +176,7 @@ def check_provenance(plan: Plan) -> SequenceRequest | None:
     stored = stored_provenance(plan.destination, plan.sequence.name) if needed else None
     provenance = add_doubtful_digests(provenance, plan.files, stored)
     if if_exists is IfExists.SKIP:
-        decision = decide_skip(provenance, stored, plan.sequence.name)
+        decision = decide_skip(provenance, stored, files=plan.files, sequence=plan.sequence.name)
         if decision is None:
             return None
         if_exists = decision
@@ -212,8 +212,13 @@ def stored_provenance(target: Target, sequence: str) -> StoredProvenance | None:
     return None if existing is None else StoredProvenance.of(existing)
 
 
-def decide_skip(provenance: Provenance, stored: StoredProvenance | None, sequence: str) -> IfExists | None:
+def decide_skip(
+    provenance: Provenance, stored: StoredProvenance | None, *, files: Sequence[AnyPath], sequence: str
+) -> IfExists | None:
     """Return how to open a sequence with `if_exists: skip`, None if the same content is stored already.
+
+    A sequence is replaced if its run ended early, or if its source files have grown since and still begin with the content
+    that was ingested, for example because an upload stalled.
 
     Raises:
         SequenceExists: The stored sequence was made from other content, or by another job.
@@ -221,6 +226,8 @@ def decide_skip(provenance: Provenance, stored: StoredProvenance | None, sequenc
     if stored is None:
         return IfExists.FAIL
     same = [record for record in stored.records if record.same_content(provenance)]
+    if not same and any(_has_grown(record, files) for record in stored.records):
+        return IfExists.REPLACE
     if not same:
         names = ", ".join(source.name for record in stored.records for source in record.sources)
         cause = f"was made from other content ({names})" if names else "has no provenance record"
@@ -241,6 +248,19 @@ def is_repeatable(provenance: Provenance, stored: StoredProvenance) -> bool:
         and stored.finished
         and bool(stored.records)
         and all(record.job == provenance.job and record.same_content(provenance) for record in stored.records)
+    )
+
+
+def _has_grown(record: Provenance, files: Sequence[AnyPath]) -> bool:
+    """Return whether every file begins with the content of the record's source, and at least one is longer."""
+    if len(files) != len(record.sources):
+        return False
+    sizes = [path.stat().st_size for path in files]
+    return any(size > source.size_bytes for size, source in zip(sizes, record.sources, strict=True)) and all(
+        isinstance(path, Path)
+        and size >= source.size_bytes
+        and content_digest(path, source.size_bytes) == source.content
+        for path, size, source in zip(files, sizes, record.sources, strict=True)
     )
 
 

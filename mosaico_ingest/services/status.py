@@ -30,7 +30,7 @@ class Status(str, Enum):
     NEW = "new"
     """Ingest it: there is no sequence of its name."""
     CHANGED = "changed"
-    """Fail: the sequence was made from other content, or by another job."""
+    """Fail: the sequence was made from other content, or by another job. If the recording has grown: replace it."""
     FAILED = "failed"
     """Replace it: an earlier run of the same content ended with an error."""
     UNREADABLE = "unreadable"
@@ -61,11 +61,13 @@ def _status(job: Job) -> tuple[Status, str]:
         if stored is None:
             return Status.NEW, ""
         provenance = add_doubtful_digests(read_provenance(plan), plan.files, stored)
-        decision = decide_skip(provenance, stored, plan.sequence.name)
+        decision = decide_skip(provenance, stored, files=plan.files, sequence=plan.sequence.name)
     except SequenceExists as error:
         return Status.CHANGED, error.what
     except IngestError as error:
         return Status.UNREADABLE, str(error)
+    if decision is IfExists.REPLACE and stored.complete:
+        return Status.CHANGED, "the recording has grown since it was ingested"
     if decision is IfExists.REPLACE:
         return Status.FAILED, "the run that wrote it ended with an error"
     return Status.DONE, ""

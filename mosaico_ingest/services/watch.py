@@ -1,107 +1,187 @@
-"""This file finds recordings that arrive in a folder and have come to rest: whole, closed, no longer changing."""
+"""Recordings that arrive in a folder, and whether they are complete."""
 
 from __future__ import annotations
 
 import fcntl
 import re
+import struct
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO, TypeAlias
 
-from mosaico_ingest.rosbag.formats import RECORDING_NAME
+from mosaico_ingest.rosbag.formats import MCAP, RECORDING_NAME
 
-__all__ = ["Arrivals"]
+__all__ = ["UNFINISHED_REST_S", "Arrivals", "is_unfinished"]
 
+UNFINISHED_REST_S = 600.0
+"""Seconds without a change after which a recording is ingested although its end is missing."""
 _METADATA = "metadata.yaml"
 _FIRST_RETRY_S, _LAST_RETRY_S = 60.0, 3600.0
-_Look = tuple[tuple[str, int, int], ...]
-"""Name, size and time of change of each of a recording's files."""
+_ROS1 = b"#ROSBAG V2.0\n"
+_INDEX_OFFSET = b"index_pos="
+_SQLITE = b"SQLite format 3\x00"
+_HEAD_BYTES = 4096
+_FileStates: TypeAlias = tuple[tuple[str, int, int], ...]
+"""Name, size and modification time of each file of a recording."""
 
 
 @dataclass(slots=True)
-class _Seen:
-    look: _Look
+class _Arrival:
+    files: _FileStates
     since: float
-    taken: bool = False
+    """When these files were first seen."""
+    settled: bool = False
     retry_at: float | None = None
     delay_s: float = _FIRST_RETRY_S
 
 
 @dataclass(slots=True)
 class Arrivals:
-    """The recordings of a folder and of those in it; hidden files, as copying programs write them, are passed over."""
+    """The recordings in a folder and its subfolders; hidden files, which copying programs use, are ignored."""
 
     folder: Path
     rest_s: float
-    """How long a recording must not have changed."""
-    _seen: dict[Path, _Seen] = field(default_factory=dict[Path, _Seen])
+    """Seconds without a change after which a recording is complete."""
+    unfinished_rest_s: float = UNFINISHED_REST_S
+    """The same for a recording whose end is missing: its upload may have stalled, or its recorder crashed."""
+    _arrivals: dict[Path, _Arrival] = field(default_factory=dict[Path, _Arrival])
 
     def settled(self, now: float) -> tuple[Path, ...]:
-        """Look once; return what has come to rest since the last look, each recording once until it changes."""
-        found = {path: look for path in _recordings(self.folder) if (look := _look(path))}
-        self._seen = {path: seen for path, seen in self._seen.items() if path in found}
-        return tuple(path for path, look in sorted(found.items()) if self._has_settled(path, look, now))
+        """Return the recordings that became complete since the last call; each once until it changes.
+
+        `now` is a monotonic time in seconds.
+        """
+        states = {path: files for path in _recordings(self.folder) if (files := _file_states(path))}
+        self._arrivals = {path: arrival for path, arrival in self._arrivals.items() if path in states}
+        return tuple(path for path, files in sorted(states.items()) if self._has_settled(path, files, now))
+
+    def unfinished(self) -> tuple[Path, ...]:
+        """Return the recordings that are not settled because their end is missing."""
+        return tuple(
+            path
+            for path, arrival in sorted(self._arrivals.items())
+            if not arrival.settled and _is_growing(path)
+        )
 
     def again(self, path: Path, now: float) -> float:
-        """Return the seconds until a recording that failed is given out once more; doubled every time."""
-        seen = self._seen[path]
-        wait_s, seen.delay_s = seen.delay_s, min(2 * seen.delay_s, _LAST_RETRY_S)
-        seen.retry_at = now + wait_s
-        return wait_s
+        """Schedule a recording that failed to settle again, and return the delay in seconds; it doubles every time."""
+        arrival = self._arrivals[path]
+        delay_s, arrival.delay_s = arrival.delay_s, min(2 * arrival.delay_s, _LAST_RETRY_S)
+        arrival.retry_at = now + delay_s
+        return delay_s
 
-    def _has_settled(self, path: Path, look: _Look, now: float) -> bool:
-        seen = self._seen.get(path)
-        if seen is None or seen.look != look:
-            seen = self._seen[path] = _Seen(look, now)
-        if seen.retry_at is not None and now >= seen.retry_at:
-            seen.taken, seen.retry_at = False, None
-        if seen.taken or now - seen.since < self.rest_s or any(map(_is_written, _files(path))):
+    def _has_settled(self, path: Path, files: _FileStates, now: float) -> bool:
+        arrival = self._arrivals.get(path)
+        if arrival is None or arrival.files != files:
+            arrival = self._arrivals[path] = _Arrival(files, now)
+        if arrival.retry_at is not None and now >= arrival.retry_at:
+            arrival.settled, arrival.retry_at = False, None
+        if arrival.settled or now - arrival.since < self.rest_s or any(map(_is_open, _files(path))):
             return False
-        seen.taken = True
+        age_s = time.time() - max(modified_ns for _, _, modified_ns in files) / 1e9
+        if age_s < self.unfinished_rest_s and _is_growing(path):
+            return False
+        arrival.settled = True
         return True
 
 
-def _recordings(folder: Path, above: frozenset[Path] = frozenset()) -> Iterator[Path]:
-    """Yield files, and rosbag2 directories as one; one that is not finished has no metadata.yaml yet.
+def is_unfinished(path: Path) -> bool:
+    """Return whether the end of a recording's file is missing: still being written, stalled, or truncated.
 
-    A link that leads back to a folder `above` is not followed.
+    MCAP files end with their magic bytes, ROS 1 bags have the offset of their index in their header, and SQLite databases
+    have their number of pages. Other files, compressed ones too, do not tell.
     """
-    here = folder.resolve()
-    if here in above:
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+            size = file.seek(0, 2)
+            if head.startswith(MCAP):
+                return not _ends_with_magic(file, size)
+            if head.startswith(_ROS1):
+                return not _ends_with_index(file, head, size)
+            if head.startswith(_SQLITE) and len(head) >= 32:  # noqa: PLR2004 - the end of the page count
+                page_bytes = int.from_bytes(head[16:18], "big")
+                page_count = int.from_bytes(head[28:32], "big")
+                return size < page_count * (1 << 16 if page_bytes == 1 else page_bytes)
+    except OSError:
+        pass  # opening the recording reports the error
+    return False
+
+
+def _ends_with_magic(file: BinaryIO, size: int) -> bool:
+    file.seek(max(0, size - len(MCAP)))
+    return size >= 2 * len(MCAP) and file.read() == MCAP
+
+
+def _ends_with_index(file: BinaryIO, head: bytes, size: int) -> bool:
+    """Return whether the index records of a ROS 1 bag end exactly at the end of the file."""
+    position = head.find(_INDEX_OFFSET)
+    if position < 0:
+        return True  # not a bag header; opening the recording reports the error
+    (offset,) = struct.unpack_from("<Q", head, position + len(_INDEX_OFFSET))
+    if not 0 < offset < size:
+        return False
+    file.seek(offset)
+    index = file.read()
+    end = 0
+    while end < len(index):  # a record is a header and data, each after its length
+        for _ in range(2):
+            if end + 4 > len(index):
+                return False
+            end += 4 + int.from_bytes(index[end : end + 4], "little")
+    return end == len(index)
+
+
+def _is_growing(path: Path) -> bool:
+    return any(is_unfinished(file) for file in _files(path))
+
+
+def _recordings(folder: Path, parents: frozenset[Path] = frozenset()) -> Iterator[Path]:
+    """Yield recordings: files, and rosbag2 directories that have their metadata.yaml, which is written last.
+
+    Links that lead back to one of the parents are ignored.
+    """
+    resolved = folder.resolve()
+    if resolved in parents:
         return
     try:
         entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
-    except OSError:  # it has gone, or may not be listed
+    except OSError:  # the folder was removed, or may not be listed
         return
     if any(entry.name == _METADATA for entry in entries):
         yield folder
         return
     for entry in entries:
         if entry.is_dir():
-            yield from _recordings(entry, above | {here})
+            yield from _recordings(entry, parents | {resolved})
         elif RECORDING_NAME.search(entry.name) and not _is_split(entry):
             yield entry
 
 
 def _is_split(file: Path) -> bool:
-    """Say whether a file is named as rosbag2 names those of a directory: it is ingested with the others."""
+    """Return whether a file is named like a split of a rosbag2 directory, with which it is ingested."""
     return re.match(rf"{re.escape(file.parent.name)}_\d+\.(db3|mcap)", file.name) is not None
 
 
 def _files(path: Path) -> list[Path]:
-    return [path] if path.is_file() else [file for file in path.iterdir() if file.is_file()]
+    with suppress(OSError):
+        return [path] if path.is_file() else [file for file in path.iterdir() if file.is_file()]
+    return []
 
 
-def _look(path: Path) -> _Look:
+def _file_states(path: Path) -> _FileStates:
     try:
-        stats = [(file.name, file.stat()) for file in sorted(_files(path))]
+        states = [(file.name, file.stat()) for file in sorted(_files(path))]
     except OSError:
         return ()
-    return tuple((name, stat.st_size, stat.st_mtime_ns) for name, stat in stats if stat.st_size)
+    return tuple((name, state.st_size, state.st_mtime_ns) for name, state in states if state.st_size)
 
 
-def _is_written(file: Path) -> bool:
-    """Say whether somebody has the file open for writing, where the system tells: Linux grants no read lease then."""
+def _is_open(file: Path) -> bool:
+    """Return whether a process has the file open for writing; Linux grants no read lease in this case."""
     if not hasattr(fcntl, "F_SETLEASE"):
         return False
     try:
@@ -110,6 +190,6 @@ def _is_written(file: Path) -> bool:
             fcntl.fcntl(opened, fcntl.F_SETLEASE, fcntl.F_UNLCK)
     except BlockingIOError:
         return True
-    except OSError:  # not our file, or a file system without leases: the time at rest must do
+    except OSError:  # a file of another user, or a file system without leases: only the time of rest decides
         return False
     return False

@@ -7,12 +7,20 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
+from made_recordings import define, record
 
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.services.watch import Arrivals
+from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.values import IfExists
+from mosaico_ingest.pipeline.run import run_recording
+from mosaico_ingest.pipeline.task import Task
+from mosaico_ingest.report.events import RunStatus
+from mosaico_ingest.services.status import recording_statuses
+from mosaico_ingest.services.watch import Arrivals, is_unfinished
 
 DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
 JOB = 'bag: {path: "nothing/*.mcap"}\ntopics: [/imu]\ntarget: {store: store}\n'
@@ -83,6 +91,61 @@ def test_what_failed_is_given_out_again_later_and_later(tmp_path: Path) -> None:
     assert arrivals.settled(60) == (file,)
     assert arrivals.again(file, 60) == 120
     assert arrivals.settled(179) == ()
+
+
+def unfinished_mcap(folder: Path) -> tuple[Path, bytes]:
+    """Write the first half of a recording, and return its path and the rest."""
+    content = DRIVE.read_bytes()
+    file = folder / "a.mcap"
+    file.write_bytes(content[: len(content) // 2])
+    return file, content[len(content) // 2 :]
+
+
+def test_arrivals_unfinished_recording_settles_after_longer_rest(tmp_path: Path) -> None:
+    file, rest = unfinished_mcap(tmp_path)
+    arrivals = Arrivals(tmp_path, rest_s=5)
+    assert [arrivals.settled(now) for now in (0, 10, 100)] == [(), (), ()]
+    assert arrivals.unfinished() == (file,)
+    an_hour_ago = time.time() - 3600
+    os.utime(file, (an_hour_ago, an_hour_ago))
+    assert arrivals.settled(110) == ()
+    assert arrivals.settled(120) == (file,)
+    with file.open("ab") as appended:
+        appended.write(rest)
+    assert arrivals.settled(130) == ()
+    assert arrivals.settled(140) == (file,)
+    assert arrivals.unfinished() == ()
+
+
+@pytest.mark.parametrize("name", ["drive.bag", "drive.mcap", "drive.db3"])
+def test_is_unfinished_is_true_until_the_last_byte(name: str, tmp_path: Path) -> None:
+    number = define("std_msgs/msg/Int32", "int32 data\n", version=1 if name == "drive.bag" else 2)
+    messages = [("/number", number, at, {"data": at}) for at in range(1000)]
+    content = record(tmp_path / name, messages).read_bytes()
+    file = tmp_path / f"part_{name}"
+    for size in (len(content), len(content) - 1, len(content) // 2):
+        file.write_bytes(content[:size])
+        assert is_unfinished(file) == (size < len(content)), size
+
+
+def test_run_of_recording_that_has_grown_replaces_sequence(tmp_path: Path) -> None:
+    file, rest = unfinished_mcap(tmp_path)
+    job = ROSInjectionConfig(
+        file, "a", store=tmp_path / "store", if_exists=IfExists.SKIP, topics=("/imu",)
+    ).job
+    assert run_recording(Task(job)).report.status is RunStatus.WITH_ERRORS
+    assert run_recording(Task(job)).report.status is RunStatus.SKIPPED
+    with file.open("ab") as appended:
+        appended.write(rest)
+    assert [(one.status.value, one.reason) for one in recording_statuses([job])] == [
+        ("changed", "the recording has grown since it was ingested")
+    ]
+    assert run_recording(Task(job)).report.status is RunStatus.COMPLETED
+    assert Store.open(tmp_path / "store").sequence("a").rows == 1000
+    content = bytearray(file.read_bytes())
+    content[1000] ^= 1
+    file.write_bytes(content + b"more")
+    assert run_recording(Task(job)).report.exit_code == 1, "other content does not replace the sequence"
 
 
 STRICT = os.environ | {"PYTHONIOENCODING": "utf-8:strict"}
