@@ -28,7 +28,7 @@ from mosaico_ingest.report.events import (
 )
 from mosaico_ingest.report.timing import Step, Stopwatch
 from mosaico_ingest.rosbag.blocks import UnreadableRange
-from mosaico_ingest.rosbag.recording import Recording
+from mosaico_ingest.rosbag.recording import Recording, damage_error
 
 __all__ = ["Written", "check_counts", "verify", "write_sequence"]
 
@@ -79,7 +79,7 @@ def write_sequence(
                 _pump(plan, recording, topics, stopwatch)
                 _report_reading(recording, topics, observe, reported=reported)
                 missing = check_counts(plan, recording, topics, observe)
-                _check_not_empty(plan, topics)
+                _check_not_empty(plan, recording, topics)
             except BaseException as error:
                 failure = _as_interrupt(error)
                 if not _keeps_partial(plan, request, topics, failure):
@@ -263,13 +263,16 @@ def _padded(topic: TopicPipeline) -> Finding:
     )
 
 
-def _check_not_empty(plan: Plan, topics: tuple[TopicPipeline, ...]) -> None:
+def _check_not_empty(plan: Plan, recording: Recording, topics: tuple[TopicPipeline, ...]) -> None:
     """Raise if no topic has a row: an empty sequence would look like an ingested one."""
     if any(topic.rows for topic in topics):
         return
     where = str(plan.files[0])
     read = sum(topic.read for topic in topics)
     if read == 0:
+        damage = damage_error(recording, "message")
+        if damage is not None and any(gap.count != 0 for gap in recording.unreadable):
+            raise damage
         in_window = plan.read_from_ns is not None or plan.read_until_ns is not None
         scope = "in the time range" if in_window else "on the selected topics"
         raise NothingMatched(f"there is no message {scope}", where=where, hint="nothing was written")

@@ -54,6 +54,7 @@ from mosaico_ingest.rosbag.opening import open_split
 __all__ = [
     "ConnectionTable",
     "Recording",
+    "damage_error",
     "no_topics_error",
     "open_recording",
     "recording_findings",
@@ -262,12 +263,17 @@ class Recording:
 def no_topics_error(recording: Recording) -> NothingMatched | BagError:
     """Return the error for a recording without connections: the damage that hides them, if there is any."""
     where = str(recording.files[0])
+    return damage_error(recording, "topic") or NothingMatched("the recording has no topics", where=where)
+
+
+def damage_error(recording: Recording, what: str) -> BagError | None:
+    """Return the error for a recording whose damage hides all topics or messages; None if it is intact."""
     if not recording.unreadable:
-        return NothingMatched("the recording has no topics", where=where)
+        return None
     damage = next((gap for gap in recording.unreadable if gap.count != 0), recording.unreadable[0])
     return BagError(
-        f"no topic can be read: {damage.reason}",
-        where=f"{damage.file or where}: at {damage.offset}",
+        f"no {what} can be read: {damage.reason}",
+        where=f"{damage.file or recording.files[0]}: at {damage.offset}",
         hint="copy the file again, or restore it from a backup",
     )
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import zstandard
 
+from mosaico_ingest.cli.app import main
 from mosaico_ingest.errors import BagError, NothingMatched
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.loader import ROSLoader
@@ -106,3 +107,17 @@ def test_mcap_many_chunks_beyond_buffer_limit_are_read_individually(
     monkeypatch.setattr("mosaico_ingest.rosbag.compression._MAX_BUFFER_BYTES", 1)
     with open_recording(path, resolve=recordings.blind) as recording:
         assert recordings.received(recording) == sorted(messages)
+
+
+def test_run_all_messages_unreadable_names_the_damage(
+    tmp_path: Path, recordings: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = recordings.mcap(tmp_path / "a.mcap", recordings.sent(40), chunk_messages=40)
+    content = bytearray(path.read_bytes())
+    content[len(content) // 3] ^= 1
+    path.write_bytes(content)
+    arguments = ["bag", str(path), "--name", "drive", "--store", str(tmp_path / "store")]
+    with pytest.raises(SystemExit) as ended:
+        main([*arguments, "--ros-distro", "ros2_humble"])
+    assert ended.value.code == 1
+    assert "no message can be read: broken chunk" in capsys.readouterr().err
