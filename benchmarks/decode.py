@@ -28,10 +28,10 @@ Values = dict[str, Any]
 Make = Callable[[int], Values]
 
 
-def header(number: int, frame: str = "base_link") -> Values:
+def header(number: int, payloads: str = "base_link") -> Values:
     return {
         "stamp": {"sec": 1_700_000_000 + number // 100, "nanosec": number % 100 * 10_000_000},
-        "frame_id": frame,
+        "frame_id": payloads,
     }
 
 
@@ -85,21 +85,21 @@ def joint_state(number: int) -> Values:
     return {"header": header(number), "name": JOINTS, **arrays}
 
 
-def transform(number: int, frame: str) -> Values:
+def transform(number: int, payloads: str) -> Values:
     return {
         "header": header(number),
-        "child_frame_id": frame,
+        "child_frame_id": payloads,
         "transform": {"translation": vector(), "rotation": quaternion()},
     }
 
 
 def transforms(number: int) -> Values:
-    return {"transforms": [transform(number, frame) for frame in JOINTS[: 2 + number % 5]]}
+    return {"transforms": [transform(number, payloads) for payloads in JOINTS[: 2 + number % 5]]}
 
 
 def any_transforms(number: int) -> Values:
     frames = [text(4, 20) for _ in range(int(RNG.integers(1, 30)))]
-    return {"transforms": [transform(number, frame) for frame in frames]}
+    return {"transforms": [transform(number, payloads) for payloads in frames]}
 
 
 def fix(number: int) -> Values:

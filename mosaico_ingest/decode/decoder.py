@@ -1,4 +1,4 @@
-"""Decoders of one connection: columnar, and row-wise as its fallback and oracle."""
+"""Decoders of one connection: columnar, with row-wise decoding as fallback and reference."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mosaico_ingest.decode.columns import build_columns
 from mosaico_ingest.decode.layout import PADDING, compile_layout
 from mosaico_ingest.decode.lockstep import locate
-from mosaico_ingest.decode.spans import Frame, Int64s, array_of, bytes_at
+from mosaico_ingest.decode.spans import Int64s, Payloads, array_of, bytes_at
 from mosaico_ingest.errors import DecodeError
 from mosaico_ingest.findings import RowFailure
 from mosaico_ingest.rosbag.blocks import Connection, Encoding, MessageBlock
@@ -33,33 +33,33 @@ __all__ = [
 
 
 class Decoded(Struct, frozen=True):
-    """The rows that could be decoded, which messages they were, and the ones that could not."""
+    """The result of decoding a message block: rows, their positions in the block, and failures."""
 
     rows: pa.StructArray
-    """One row a good message, in the ROS shape, no null rows."""
+    """One row per decoded message, in the ROS shape, without nulls."""
     index: NDArray[np.int64]
-    """Position in the batch of each row, ascending, shape (len(rows),)."""
+    """Position of each row in the block, ascending, shape (len(rows),)."""
     failures: tuple[RowFailure, ...]
-    """`row` is the position in the batch; len(index) + len(failures) = len(batch)."""
+    """`row` is the position in the block; len(index) + len(failures) = len(block)."""
     padded: int = 0
-    """How many rows end in 4 to 7 zero bytes which the definition does not account for."""
+    """Number of rows that end in 4 to 7 zero bytes that the definition does not explain."""
 
 
 class Decoder(Protocol):
-    """Decodes batches of one connection; any bytes give rows or failures, never an exception."""
+    """Decodes message blocks of one connection. Invalid bytes become failures, never exceptions."""
 
     @property
     def shape(self) -> pa.StructType:
         """The ROS shape: the type of `Decoded.rows`."""
         ...
 
-    def decode(self, batch: MessageBlock) -> Decoded:
-        """Decode all messages of the batch."""
+    def decode(self, block: MessageBlock) -> Decoded:
+        """Decode all messages of the block."""
         ...
 
 
 class RowwiseDecoder:
-    """Decodes each message into plain values, and those into Arrow.
+    """Decodes each message to a dictionary, and the dictionaries to Arrow.
 
     Raises:
         DecodeError: The definition has no Arrow shape.
@@ -74,19 +74,19 @@ class RowwiseDecoder:
         """The ROS shape."""
         return self._shape
 
-    def decode(self, batch: MessageBlock) -> Decoded:
-        """Decode all messages of the batch."""
+    def decode(self, block: MessageBlock) -> Decoded:
+        """Decode all messages of the block."""
         values: list[dict[str, Any]] = []
         index: list[int] = []
         failures: list[RowFailure] = []
         padded = self._deserializer.padded
-        for row in range(len(batch)):
+        for row in range(len(block)):
             try:
-                values.append(self._deserializer.to_dict(batch.payload(row)))
+                values.append(self._deserializer.to_dict(block.payload(row)))
                 index.append(row)
-            except DecodeError as error:  # noqa: PERF203 - a bad row costs a row
+            except DecodeError as error:  # noqa: PERF203 - each message may fail
                 failures.append(RowFailure(row, error.rule, str(error)))
-        # An array of a struct type is one of structs, which the stubs cannot know.
+        # The stubs cannot express that an array of a struct type is a StructArray.
         rows = cast("pa.StructArray", pa.array(values, type=self._shape))
         padded = self._deserializer.padded - padded
         return Decoded(rows, np.array(index, np.int64), tuple(failures), padded)
@@ -95,13 +95,13 @@ class RowwiseDecoder:
 _HEADER = 4
 _LARGEST = 2**31 - 1
 _FEW, _SMALL = 8, 4096
-"""Messages, and bytes in all, up to which building columns costs more than it saves."""
+"""Up to this many messages and bytes in total, row-wise decoding is faster."""
 _ORDERS = {">": 0, "<": 1}
 """The second byte of the encapsulation header of plain CDR."""
 
 
 class ColumnarDecoder:
-    """Decodes by columns; what `RowwiseDecoder` says about a message is what counts.
+    """Decodes by columns. Messages that it cannot decode are decoded by `RowwiseDecoder`, which is authoritative.
 
     Raises:
         DecodeError: The definition has no Arrow shape.
@@ -117,77 +117,77 @@ class ColumnarDecoder:
         """The ROS shape."""
         return self._rowwise.shape
 
-    def decode(self, batch: MessageBlock) -> Decoded:
-        """Decode all messages of the batch.
+    def decode(self, block: MessageBlock) -> Decoded:
+        """Decode all messages of the block.
 
         Raises:
-            DecodeError: A column of the batch would be larger than the 2 GiB it can hold.
+            DecodeError: A column of the block would exceed 2 GiB.
         """
-        total = int(batch.lengths.sum())
+        total = int(block.lengths.sum())
         if total > _LARGEST:
-            return self._in_two(batch, total)
-        if len(batch) <= _FEW and total <= _SMALL:
-            return self._rowwise.decode(batch)
-        parts = [self._by_columns(batch, order, rows) for order, rows in self._by_order(batch)]
-        left = np.ones(len(batch), bool)
+            return self._in_two(block, total)
+        if len(block) <= _FEW and total <= _SMALL:
+            return self._rowwise.decode(block)
+        parts = [self._by_columns(block, order, rows) for order, rows in self._by_order(block)]
+        is_remaining = np.ones(len(block), bool)
         for part in parts:
-            left[part.index] = False
-        if left.any() or not parts:
-            parts.append(self._by_rows(batch, np.flatnonzero(left)))
+            is_remaining[part.index] = False
+        if is_remaining.any() or not parts:
+            parts.append(self._by_rows(block, np.flatnonzero(is_remaining)))
         return _merge(parts)
 
-    def _in_two(self, batch: MessageBlock, total: int) -> Decoded:
-        """Decode a batch too large for the offsets of a column, half of its bytes after the other."""
-        if len(batch) == 1:
-            reason = f"{total} bytes, a message can have {_LARGEST}"
-            none = self._rowwise.decode(batch.rows(slice(0)))
+    def _in_two(self, block: MessageBlock, total: int) -> Decoded:
+        """Decode a block too large for the 32-bit offsets of a column in two halves."""
+        if len(block) == 1:
+            reason = f"a message of {total} bytes; the limit is {_LARGEST} bytes"
+            none = self._rowwise.decode(block.rows(slice(0)))
             return replace(none, failures=(RowFailure(0, "too-large", reason),))
-        middle = int(np.searchsorted(np.cumsum(batch.lengths), total // 2)) + 1
-        edges = (0, min(middle, len(batch) - 1), len(batch))
-        first, second = (self.decode(batch.rows(slice(begin, end))) for begin, end in pairwise(edges))
+        middle = int(np.searchsorted(np.cumsum(block.lengths), total // 2)) + 1
+        edges = (0, min(middle, len(block) - 1), len(block))
+        first, second = (self.decode(block.rows(slice(begin, end))) for begin, end in pairwise(edges))
         try:
             rows = pa.concat_arrays([first.rows, second.rows])
         except pa.ArrowInvalid as error:
             raise DecodeError(
-                f"a batch of {total} bytes, a column holds {_LARGEST}",
+                f"a column of a block of {total} bytes exceeds {_LARGEST} bytes",
                 rule="batch-size",
                 where=self._definition.root,
-                hint="read smaller batches",
+                hint="lower the memory limit, so that smaller blocks are read",
             ) from error
         index = np.concatenate([first.index, second.index + edges[1]])
         later = (replace(failure, row=failure.row + edges[1]) for failure in second.failures)
         return Decoded(rows, index, (*first.failures, *later), first.padded + second.padded)
 
-    def _by_order(self, batch: MessageBlock) -> list[tuple[str, Int64s]]:
-        """Return the positions of the messages of each byte order, without those of none."""
+    def _by_order(self, block: MessageBlock) -> list[tuple[str, Int64s]]:
+        """Return the positions of the messages of each byte order; omit messages without a valid header."""
         if self._layout.encoding is Encoding.ROS1:
-            return [("<", np.arange(len(batch)))] if len(batch) else []
-        rows = np.flatnonzero(batch.lengths >= _HEADER)
-        first, second = (bytes_at(batch.data, batch.starts[rows] + place) for place in range(2))
+            return [("<", np.arange(len(block)))] if len(block) else []
+        rows = np.flatnonzero(block.lengths >= _HEADER)
+        first, second = (bytes_at(block.data, block.starts[rows] + place) for place in range(2))
         groups = [(order, rows[(first == 0) & (second == kind)]) for order, kind in _ORDERS.items()]
         return [(order, members) for order, members in groups if len(members)]
 
-    def _by_columns(self, batch: MessageBlock, order: str, rows: Int64s) -> Decoded:
-        """Decode those of some messages, all of one byte order, that can be vouched for."""
+    def _by_columns(self, block: MessageBlock, order: str, rows: Int64s) -> Decoded:
+        """Decode the valid ones of some messages of one byte order."""
         skip = _HEADER if self._layout.encoding is Encoding.CDR else 0
-        starts, lengths = batch.starts[rows], batch.lengths[rows]
-        frame = Frame(np.ascontiguousarray(batch.data), order, starts + skip, starts + lengths)
-        located = locate(self._layout, frame)
-        values, unread = build_columns(self._layout, self.shape, frame, located)
-        if len(unread):
-            located = located.take(np.delete(np.arange(len(located.rows)), unread))
-            values, _ = build_columns(self._layout, self.shape, frame, located)
+        starts, lengths = block.starts[rows], block.lengths[rows]
+        payloads = Payloads(np.ascontiguousarray(block.data), order, starts + skip, starts + lengths)
+        located = locate(self._layout, payloads)
+        values, invalid = build_columns(self._layout, self.shape, payloads, located)
+        if len(invalid):
+            located = located.take(np.delete(np.arange(len(located.rows)), invalid))
+            values, _ = build_columns(self._layout, self.shape, payloads, located)
         return Decoded(values, rows[located.rows], (), int((located.tails > PADDING).sum()))
 
-    def _by_rows(self, batch: MessageBlock, rows: Int64s) -> Decoded:
+    def _by_rows(self, block: MessageBlock, rows: Int64s) -> Decoded:
         """Decode some messages one by one."""
-        decoded = self._rowwise.decode(batch.rows(rows))
+        decoded = self._rowwise.decode(block.rows(rows))
         failures = tuple(replace(failure, row=int(rows[failure.row])) for failure in decoded.failures)
         return replace(decoded, index=rows[decoded.index], failures=failures)
 
 
 def _merge(parts: list[Decoded]) -> Decoded:
-    """Put parts of one batch together in its order; only the last can have failures."""
+    """Merge the parts of one block in order; only the last part may have failures."""
     failures, padded = parts[-1].failures, sum(part.padded for part in parts)
     filled = [part for part in parts if len(part.index)] or parts[:1]
     if len(filled) == 1:
@@ -199,10 +199,10 @@ def _merge(parts: list[Decoded]) -> Decoded:
 
 
 def decoder_for(connection: Connection) -> Decoder:
-    """Return the decoder of a connection's messages.
+    """Return the decoder of a connection.
 
     Raises:
-        DecodeError: The connection is not in a ROS encoding, has no definition, or one without an Arrow shape.
+        DecodeError: The encoding is not a ROS encoding, or the connection has no definition with an Arrow shape.
     """
     if connection.encoding is Encoding.OTHER:
         raise DecodeError(
@@ -216,11 +216,11 @@ def decoder_for(connection: Connection) -> Decoder:
             rule="definition",
             where=connection.topic,
         )
-    return _decoder(_Known(connection.definition), connection.encoding)
+    return _decoder(_DefinitionKey(connection.definition), connection.encoding)
 
 
-class _Known(Struct, frozen=True):
-    """A definition, told from others by what a decoder needs to know of it."""
+class _DefinitionKey(Struct, frozen=True):
+    """A definition as a cache key: equal if the root, ROS version and fields are equal."""
 
     definition: Definition
 
@@ -228,13 +228,13 @@ class _Known(Struct, frozen=True):
         return hash((self.definition.root, self.definition.text))
 
     def __eq__(self, other: object) -> bool:
-        if not isinstance(other, _Known):
+        if not isinstance(other, _DefinitionKey):
             return NotImplemented
         own, others = self.definition, other.definition
         return (own.root, own.ros_version, own.types) == (others.root, others.ros_version, others.types)
 
 
 @lru_cache(maxsize=128)
-def _decoder(known: _Known, encoding: Encoding) -> Decoder:
-    """Return a decoder, the same one for each recording of a batch: it remembers nothing of what it decodes."""
-    return ColumnarDecoder(known.definition, encoding)
+def _decoder(key: _DefinitionKey, encoding: Encoding) -> Decoder:
+    """Return a cached decoder; decoders have no state, so that several recordings can share one."""
+    return ColumnarDecoder(key.definition, encoding)

@@ -1,8 +1,12 @@
-"""This file resolves a definition once: the steps that walk a message, and where each column lies among them.
+"""Layouts: a definition compiled to the steps that walk its messages, and to the columns that the values become.
 
-A message is walked in *steps*. Values of fixed size that follow each other are one `Block`, whatever the
-structs they belong to, because their distances do not depend on the message; only texts and sequences are
-steps of their own. The *columns* are the tree of the Arrow type, its leaves pointing into the steps.
+The *steps* follow the bytes of a message. Consecutive values of fixed size form one `FixedBlock`, even across nested
+structs, because their distances are constant. Only texts and sequences, whose sizes vary, are steps of their own.
+
+The *columns* follow the Arrow type. Each leaf refers to a step, and for numbers to an offset in the step's block.
+
+For example, `std_msgs/Header header; float64 x; float64[] ranges` in CDR has the steps `FixedBlock` (stamp), `Text`
+(frame_id), `FixedBlock` (x), `Run` (ranges).
 """
 
 from __future__ import annotations
@@ -27,19 +31,19 @@ __all__ = [
     "PADDING",
     "WORD",
     "ZEROS",
-    "Block",
     "Body",
     "Column",
-    "Grid",
-    "Items",
+    "FixedArrayColumn",
+    "FixedBlock",
     "Layout",
-    "Leaf",
+    "ListColumn",
     "Loop",
-    "Record",
+    "NumberColumn",
     "Run",
     "Step",
+    "StructColumn",
     "Text",
-    "Words",
+    "TextColumn",
     "compile_layout",
     "least_bytes",
 ]
@@ -47,58 +51,58 @@ __all__ = [
 WORD = 4
 """Bytes of a length word."""
 PADDING, ZEROS = 3, 7
-"""Bytes that CDR may leave behind a message, and that it may if they are zero."""
+"""Maximum number of arbitrary bytes, and of zero bytes, after the last value of a CDR message."""
 _MAX_ALIGN = 8
 _UNITS = {"string": 1, "wstring": 4}
 
 
-class Block(Struct, frozen=True):
-    """`size` bytes that start at a multiple of `align`."""
+class FixedBlock(Struct, frozen=True):
+    """Values of fixed size: `size` bytes that start at a multiple of `align`."""
 
     align: int
     size: int
 
 
 class Text(Struct, frozen=True):
-    """A length word and that many units of text."""
+    """A string: a length word and that many units."""
 
     unit: int
-    """Bytes of a unit: 1 for `string`, 4 for `wstring`."""
-    closed: bool = False
-    """Whether a NUL ends the text and is counted, as in a CDR `string`."""
+    """Bytes per unit: 1 for `string`, 4 for `wstring`."""
+    has_nul: bool = False
+    """Whether the count includes a terminating NUL, as in a CDR `string`."""
 
 
 class Run(Struct, frozen=True):
-    """A length word and that many cells, one every `stride` bytes."""
+    """A sequence of elements of fixed size: a length word and that many cells, `stride` bytes apart."""
 
-    cell: Block
+    cell: FixedBlock
     stride: int
     bound: int = 0
-    """The most elements there may be; 0: any number."""
+    """Maximum number of elements; 0 means unbounded."""
 
 
 class Loop(Struct, frozen=True):
-    """Elements that have to be walked one after the other."""
+    """A sequence or array of elements of variable size, which must be walked one after the other."""
 
     body: Body
     count: int | None
-    """None: a length word says, and `bound` limits it as in a run."""
+    """Number of elements of an array; None for a sequence, which has a length word and may have a `bound`."""
     bound: int = 0
 
 
-Step: TypeAlias = Block | Text | Run | Loop
+Step: TypeAlias = FixedBlock | Text | Run | Loop
 
 
 class Body(Struct, frozen=True):
-    """The steps of one message or element."""
+    """The steps of a message or of an element."""
 
     steps: tuple[Step, ...]
     least: int
-    """Bytes an instance has at least, alignment apart."""
+    """Minimum size of an instance in bytes, without alignment."""
 
 
-class Leaf(Struct, frozen=True):
-    """A number in a block; `dims` are (count, stride) of the fixed arrays around it within the block."""
+class NumberColumn(Struct, frozen=True):
+    """A number at an offset in a block; `dims` are (count, stride) of the fixed arrays around it."""
 
     step: int
     offset: int
@@ -106,67 +110,67 @@ class Leaf(Struct, frozen=True):
     dims: tuple[tuple[int, int], ...] = ()
 
 
-class Words(Struct, frozen=True):
-    """A text."""
+class TextColumn(Struct, frozen=True):
+    """A string."""
 
     step: int
     text: Text
 
 
-class Grid(Struct, frozen=True):
+class FixedArrayColumn(Struct, frozen=True):
     """A fixed array within a block."""
 
     count: int
     item: Column
 
 
-class Items(Struct, frozen=True):
-    """The elements of a run or a loop; the leaves of `item` point into the cell or the body."""
+class ListColumn(Struct, frozen=True):
+    """A list of the elements of a run or loop; the leaves of `item` refer to its cell or body."""
 
     step: int
     of: Run | Loop
     item: Column
 
 
-class Record(Struct, frozen=True):
+class StructColumn(Struct, frozen=True):
     """A struct."""
 
     children: tuple[Column, ...]
 
 
-Column: TypeAlias = Leaf | Words | Grid | Items | Record
+Column: TypeAlias = NumberColumn | TextColumn | FixedArrayColumn | ListColumn | StructColumn
 
 
 class Layout(Struct, frozen=True):
-    """How the messages of one definition are walked, and the columns they become."""
+    """The steps and columns of one definition in one encoding."""
 
     encoding: Encoding
     body: Body
-    record: Record
+    record: StructColumn
 
 
 def compile_layout(definition: Definition, encoding: Encoding) -> Layout:
-    """Resolve a definition whose `ros_shape` exists."""
+    """Compile a definition whose `ros_shape` exists."""
     compiler = _Compiler(definition, aligned=encoding is Encoding.CDR)
-    # A message starts at a multiple of the largest alignment: nothing in front can move its first block.
-    draft = _Draft(open_block=Block(_MAX_ALIGN, 0))
+    # The start of a message is aligned to the maximum, so no padding precedes its first block.
+    draft = _Draft(open_block=FixedBlock(_MAX_ALIGN, 0))
     record = compiler.struct(definition.message, draft)
     return Layout(encoding, draft.body(), record)
 
 
 @dataclass(slots=True)
 class _Draft:
-    """The steps found so far; the last may be a block that still grows."""
+    """The steps compiled so far; `open_block` is a block that may still grow."""
 
     steps: list[Step] = field(default_factory=list[Step])
-    open_block: Block | None = None
+    open_block: FixedBlock | None = None
 
     def place(self, align: int, size: int) -> tuple[int, int]:
-        """Add `size` bytes and return their step and the offset in its block."""
+        """Add a value of `size` bytes; return the number of its step and its offset in the block."""
         block = self.open_block
         if block is None or align > block.align:
             self.close()
-            block = Block(align, 0)
+            block = FixedBlock(align, 0)
         offset = -(-block.size // align) * align
         self.open_block = replace(block, size=offset + size)
         return len(self.steps), offset
@@ -190,10 +194,10 @@ class _Compiler(Struct, frozen=True):
     definition: Definition
     aligned: bool
 
-    def struct(self, message: MessageType, draft: _Draft) -> Record:
+    def struct(self, message: MessageType, draft: _Draft) -> StructColumn:
         if self.aligned and not message.fields:
-            draft.place(1, 1)  # CDR has no empty struct: a byte without meaning stands for it
-        return Record(tuple(self._field(field, draft) for field in message.fields))
+            draft.place(1, 1)  # CDR represents an empty struct by one unused byte
+        return StructColumn(tuple(self._field(field, draft) for field in message.fields))
 
     def _field(self, field: Field, draft: _Draft) -> Column:
         if field.container is Container.SCALAR:
@@ -204,29 +208,29 @@ class _Compiler(Struct, frozen=True):
         cell = _single_block(body)
         if field.container is Container.SEQUENCE:
             many = Loop(body, None, field.size) if cell is None else Run(cell, _stride(cell), field.size)
-            return Items(draft.add(many), many, item)
+            return ListColumn(draft.add(many), many, item)
         if cell is None:
             loop = Loop(body, field.size)
-            return Items(draft.add(loop), loop, item)
+            return ListColumn(draft.add(loop), loop, item)
         if not field.size:
-            return Grid(0, item)
+            return FixedArrayColumn(0, item)
         stride = _stride(cell)
         step, offset = draft.place(cell.align, stride * (field.size - 1) + cell.size)
-        return Grid(field.size, _moved(item, step, offset, (field.size, stride)))
+        return FixedArrayColumn(field.size, _moved(item, step, offset, (field.size, stride)))
 
     def _item(self, field: Field, draft: _Draft) -> Column:
         if field.is_message:
             return self.struct(self.definition.types[field.type], draft)
         if field.type in TEXTS:
-            text = Text(_UNITS[field.type], closed=self.aligned and field.type == "string")
-            return Words(draft.add(text), text)
+            text = Text(_UNITS[field.type], has_nul=self.aligned and field.type == "string")
+            return TextColumn(draft.add(text), text)
         size = np.dtype(NUMBERS[field.type]).itemsize
         step, offset = draft.place(size if self.aligned else 1, size)
-        return Leaf(step, offset, field.type)
+        return NumberColumn(step, offset, field.type)
 
 
 def least_bytes(step: Step) -> int:
-    """Return how many bytes each thing that a step counts takes at least; 1 where it could be none."""
+    """Return the minimum size of a unit or element that a step counts, at least 1."""
     match step:
         case Text(unit=unit):
             return unit
@@ -234,25 +238,25 @@ def least_bytes(step: Step) -> int:
             return max(cell.size, 1)
         case Loop(body=body):
             return max(body.least, 1)
-        case Block():
+        case FixedBlock():
             return 1
 
 
-def _single_block(body: Body) -> Block | None:
-    """Return the only block of a body whose instances are all of one size."""
+def _single_block(body: Body) -> FixedBlock | None:
+    """Return the block of a body that consists of one block, which means that its instances have a fixed size."""
     if not body.steps:
-        return Block(1, 0)
+        return FixedBlock(1, 0)
     first = body.steps[0]
-    return first if len(body.steps) == 1 and isinstance(first, Block) else None
+    return first if len(body.steps) == 1 and isinstance(first, FixedBlock) else None
 
 
-def _stride(cell: Block) -> int:
+def _stride(cell: FixedBlock) -> int:
     return -(-cell.size // cell.align) * cell.align
 
 
 def _least(step: Step) -> int:
     match step:
-        case Block(size=size):
+        case FixedBlock(size=size):
             return size
         case Loop(body=body, count=int(count)):
             return count * body.least
@@ -261,13 +265,13 @@ def _least(step: Step) -> int:
 
 
 def _moved(column: Column, step: int, offset: int, dim: tuple[int, int]) -> Column:
-    """Return a column of a cell as a column of the block the cell's array lies in."""
+    """Return a column of an array's cell as a column of the block that contains the array."""
     match column:
-        case Leaf():
-            return Leaf(step, column.offset + offset, column.type, (dim, *column.dims))
-        case Grid():
-            return Grid(column.count, _moved(column.item, step, offset, dim))
-        case Record():
-            return Record(tuple(_moved(child, step, offset, dim) for child in column.children))
+        case NumberColumn():
+            return NumberColumn(step, column.offset + offset, column.type, (dim, *column.dims))
+        case FixedArrayColumn():
+            return FixedArrayColumn(column.count, _moved(column.item, step, offset, dim))
+        case StructColumn():
+            return StructColumn(tuple(_moved(child, step, offset, dim) for child in column.children))
         case _:
             return column

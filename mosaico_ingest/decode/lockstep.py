@@ -1,9 +1,36 @@
-"""Locate the values of all messages in lockstep, and choose between this and the other walks.
+"""Locate the values of many messages together, one array operation per layout step.
 
-Elements of a sequence are taken by index: the first of every message, then the second of those that have one.
-Where one is as long as that before it, more of that length are guessed, and taken as far as they turn out to be so.
-A message whose bytes do not fit is marked and parked at its origin, where reading on is safe; what is noted
-about it is dropped at the end.
+A layout (`layout.py`) describes a message as a list of steps. For example, a message with an `int32`, a `string` and a
+`float64[]` in CDR has the steps
+
+    FixedBlock(4 bytes) → Text → Run(8-byte cells)
+
+*Lockstep* means that all messages take each step together. A cursor holds the position of every message as an array;
+each step aligns the positions, reads the length words of all messages with one gather, and advances all positions:
+
+    message   position → after FixedBlock → length word → after Text → length word → after Run
+    A         0          4                  3             11           2             32
+    B         0          4                  5             13           0             20
+
+The result of each step is a `StepOffsets`: the offset (and count) of its value in every message. `columns.py` copies
+all values of a column with one more gather. No step executes Python code per message.
+
+**Loops.** Elements that contain texts or sequences have different sizes, so that the offset of element k is known only
+after element k - 1. A loop therefore walks the first element of all messages in lockstep, then the second element of
+the messages that have one, and so on. Two strategies handle long loops of few messages:
+
+* *Speculation*: If two consecutive elements of a message have the same size, assume that the following ones do too,
+  and walk `ahead` elements at equidistant offsets in one lockstep pass. Keep the longest prefix whose elements really
+  have that size. `ahead` grows eightfold with each correct guess.
+* *Fallback*: If at most `FEW` messages are active and speculation does not succeed, `MessageWalker` walks the
+  remaining elements in plain Python, which is faster for few messages.
+
+**Invalid messages.** A length word that exceeds the remaining bytes marks its message as invalid. The cursor of an
+invalid message stays at its origin with no bytes left, where the following steps can read safely; its offsets are
+removed at the end. The row-wise decoder reports the error of such a message.
+
+`locate` chooses the method: templates (`walk.py`) for messages with equal length words, lockstep for many other
+messages, and `MessageWalker` for few.
 """
 
 from __future__ import annotations
@@ -18,8 +45,8 @@ from mosaico_ingest.decode.layout import (
     PADDING,
     WORD,
     ZEROS,
-    Block,
     Body,
+    FixedBlock,
     Layout,
     Loop,
     Run,
@@ -28,55 +55,87 @@ from mosaico_ingest.decode.layout import (
     least_bytes,
 )
 from mosaico_ingest.decode.spans import (
-    Frame,
+    BodyOffsets,
     Int64s,
-    Located,
-    Place,
-    Places,
-    expand,
-    join,
+    LocatedMessages,
+    Payloads,
+    StepOffsets,
+    expand_ranges,
+    interleave,
 )
-from mosaico_ingest.decode.walk import Notes, Stepper, locate_clustered, locate_stepwise
+from mosaico_ingest.decode.walk import (
+    MessageWalker,
+    OffsetRecorder,
+    locate_by_template,
+    locate_one_by_one,
+)
 from mosaico_ingest.rosbag.blocks import Encoding
 
-__all__ = [
-    "FEW",
-    "locate",
-    "locate_lockstep",
-]
+__all__ = ["FEW", "locate", "locate_lockstep"]
 
 FEW = 16
-"""So many messages are walked faster one at a time."""
-_MANY = 64
-"""So many elements of so few messages are worth a look whether they are alike."""
-_LOOKS = 3
-"""After so many elements a sequence of equal ones shows: the first may be padded otherwise."""
-_RARE = 4
-"""Messages are guessed at where at least one of so many seems to have equal elements."""
+"""Maximum number of messages for which walking one at a time is faster than lockstep."""
+_MANY_ELEMENTS = 64
+"""With at most `FEW` active messages, stay in lockstep only if more than this many elements remain in total."""
+_FIRST_ELEMENTS = 3
+"""Number of elements after which equal sizes must show; alignment may change the size of the first element."""
+_SPECULATION_SHARE = 4
+"""Speculate if at least one in this many active messages has two consecutive elements of equal size."""
 _AHEAD = 8
-"""How many elements are guessed at first, and how many times as many after each guess that was right."""
+"""Number of elements of the first speculation, and growth factor after a correct one."""
+_LARGE_BYTES = 64 << 10
+"""Minimum total size for lockstep with few messages, because they may contain long loops."""
 
 
-def locate_lockstep(layout: Layout, frame: Frame) -> Located:
-    """Walk all messages of the frame together."""
-    whole = np.flatnonzero(frame.ends - frame.origins >= layout.body.least)
-    walk = _Walk(layout, frame)
-    cursor = _Cursor(frame.origins[whole], frame.ends[whole], frame.origins[whole], whole)
-    places = walk.body(layout.body, cursor)
-    located = Located(whole, walk.tails(cursor), places)
-    broken = walk.broken[whole]
-    return located.take(np.flatnonzero(~broken)) if broken.any() else located
+def locate(layout: Layout, payloads: Payloads) -> LocatedMessages:
+    """Return the offsets of all values of the messages that match the layout."""
+    if all(isinstance(step, FixedBlock) for step in layout.body.steps):
+        return locate_lockstep(layout, payloads)  # all offsets are constant
+    parts = locate_by_template(layout, payloads)
+    is_remaining = np.ones(len(payloads), bool)
+    for part in parts:
+        is_remaining[part.rows] = False
+    rows = np.flatnonzero(is_remaining)
+    if len(rows) or not parts:
+        remaining = payloads.take(rows)
+        is_small = len(rows) <= FEW and int((remaining.ends - remaining.origins).sum()) < _LARGE_BYTES
+        located = (locate_one_by_one if is_small else locate_lockstep)(layout, remaining)
+        parts.append(replace(located, rows=rows[located.rows]))
+    return _merge(parts)
+
+
+def _merge(parts: list[LocatedMessages]) -> LocatedMessages:
+    if len(parts) == 1:
+        return parts[0]
+    rows = np.concatenate([part.rows for part in parts])
+    order = np.argsort(rows)
+    slots = np.empty(len(rows), np.int64)
+    slots[order] = np.arange(len(rows))
+    tails = np.concatenate([part.tails for part in parts])
+    offsets = interleave([part.offsets for part in parts], slots)
+    return LocatedMessages(rows[order], tails[order], offsets)
+
+
+def locate_lockstep(layout: Layout, payloads: Payloads) -> LocatedMessages:
+    """Walk all messages together."""
+    rows = np.flatnonzero(payloads.ends - payloads.origins >= layout.body.least)
+    walk = _LockstepWalk(layout, payloads)
+    cursor = _Cursor(payloads.origins[rows], payloads.ends[rows], payloads.origins[rows], rows)
+    offsets = walk.body(layout.body, cursor)
+    located = LocatedMessages(rows, walk.tails(cursor), offsets)
+    is_invalid = walk.is_invalid[rows]
+    return located.take(np.flatnonzero(~is_invalid)) if is_invalid.any() else located
 
 
 @dataclass(slots=True)
 class _Cursor:
-    """Where each of m messages is; shapes (m,)."""
+    """The current position in each of m messages; shapes (m,)."""
 
     pos: Int64s
     end: Int64s
     origin: Int64s
     row: Int64s
-    """Its position in the frame."""
+    """Index of the message in its `Payloads`."""
 
     def take(self, index: Int64s) -> _Cursor:
         return _Cursor(self.pos[index], self.end[index], self.origin[index], self.row[index])
@@ -88,256 +147,229 @@ class _Cursor:
 
 @dataclass(slots=True)
 class _Elements:
-    """The elements of a loop that have been walked, part by part."""
+    """The elements of a loop that have been walked, in the order in which they were walked."""
 
     count: Int64s
-    """How many each message has, shape (m,)."""
-    parts: list[Places] = field(default_factory=list[Places])
-    taken: list[tuple[Int64s, Int64s]] = field(default_factory=list[tuple[Int64s, Int64s]])
-    """Of each part, whose elements they are, and which."""
+    """Number of elements per message, shape (m,)."""
+    parts: list[BodyOffsets] = field(default_factory=list[BodyOffsets])
+    indices: list[tuple[Int64s, Int64s]] = field(default_factory=list[tuple[Int64s, Int64s]])
+    """Message and element number of each instance of each part."""
     done: Int64s = field(init=False)
-    """How many of each message have been walked, shape (m,)."""
+    """Number of walked elements per message, shape (m,)."""
 
     def __post_init__(self) -> None:
         self.done = np.zeros_like(self.count)
 
-    def left(self, rows: Int64s) -> Int64s:
+    def remaining(self, rows: Int64s) -> Int64s:
         return self.count[rows] - self.done[rows]
 
-    def take(self, places: Places, rows: Int64s) -> None:
+    def add_next(self, offsets: BodyOffsets, rows: Int64s) -> None:
         """Add the next element of each of some messages."""
-        self.note(places, rows, self.done[rows])
+        self.add(offsets, rows, self.done[rows])
         self.done[rows] += 1
 
-    def note(self, places: Places, rows: Int64s, numbers: Int64s) -> None:
-        self.parts.append(places)
-        self.taken.append((rows, numbers))
+    def add(self, offsets: BodyOffsets, rows: Int64s, numbers: Int64s) -> None:
+        self.parts.append(offsets)
+        self.indices.append((rows, numbers))
 
-    def join(self) -> Places:
-        """Return all of them, message by message."""
+    def by_message(self) -> BodyOffsets:
+        """Return the offsets of all elements, ordered by message."""
         firsts = np.cumsum(self.done) - self.done
-        return join(self.parts, np.concatenate([firsts[rows] + numbers for rows, numbers in self.taken]))
+        slots = np.concatenate([firsts[rows] + numbers for rows, numbers in self.indices])
+        return interleave(self.parts, slots)
 
 
-class _Guesses:
-    """What the elements so far say of those to come; shapes (m,)."""
+class _Speculation:
+    """The sizes of previous elements, from which the offsets of the following ones are guessed; shapes (m,)."""
 
-    __slots__ = ("_looks", "_right", "ahead", "alike", "size")
+    __slots__ = ("_last_succeeded", "_walked", "ahead", "is_repeated", "size")
 
     def __init__(self, messages: int) -> None:
         self.size = np.zeros(messages, np.int64)
-        """The bytes of the last element."""
-        self.alike = np.zeros(messages, bool)
-        """Whether it had as many as that before it."""
+        """Bytes of the last element."""
+        self.is_repeated = np.zeros(messages, bool)
+        """Whether the last two elements have the same size."""
         self.ahead = np.full(messages, _AHEAD)
-        self._looks = 0
-        self._right = False
+        """Number of elements to guess."""
+        self._walked = 0
+        self._last_succeeded = False
 
-    def are_worth(self, active: Int64s, walked: _Elements) -> bool:
-        """Say whether the next elements are walked together; few messages only where their elements are alike."""
+    def is_lockstep_faster(self, active: Int64s, elements: _Elements) -> bool:
+        """Return whether to continue in lockstep: with many messages, or while speculation succeeds."""
         if len(active) > FEW:
             return True
-        promising = self._looks < _LOOKS or self._right
-        return promising and int(walked.left(active).sum()) > _MANY
+        is_promising = self._walked < _FIRST_ELEMENTS or self._last_succeeded
+        return is_promising and int(elements.remaining(active).sum()) > _MANY_ELEMENTS
 
-    def note(self, active: Int64s, size: Int64s) -> None:
-        self.alike[active] = (size == self.size[active]) & (size > 0)
+    def record_sizes(self, active: Int64s, size: Int64s) -> None:
+        self.is_repeated[active] = (size == self.size[active]) & (size > 0)
         self.size[active] = size
-        self._looks += 1
-        self._right = False
+        self._walked += 1
+        self._last_succeeded = False
 
-    def judge(self, rows: Int64s, right: NDArray[np.bool_]) -> None:
-        self.ahead[rows] = np.where(right, self.ahead[rows] * _AHEAD, _AHEAD)
-        self._right = bool(right.any())
+    def record_result(self, rows: Int64s, is_correct: NDArray[np.bool_]) -> None:
+        self.ahead[rows] = np.where(is_correct, self.ahead[rows] * _AHEAD, _AHEAD)
+        self._last_succeeded = bool(is_correct.any())
 
 
-class _Walk:
-    """One pass over the messages of a frame."""
+class _LockstepWalk:
+    """One pass over all messages."""
 
-    __slots__ = ("_aligned", "_frame", "_last", "_layout", "_words", "broken")
+    __slots__ = ("_aligned", "_last_word", "_layout", "_payloads", "_words", "is_invalid")
 
-    def __init__(self, layout: Layout, frame: Frame) -> None:
+    def __init__(self, layout: Layout, payloads: Payloads) -> None:
         self._layout = layout
-        self._frame = frame
-        self._words = frame.words()
-        self._last = len(self._words) - 1
+        self._payloads = payloads
+        self._words = payloads.words()
+        self._last_word = len(self._words) - 1
         self._aligned = layout.encoding is Encoding.CDR
-        self.broken = np.zeros(len(frame), bool)
+        self.is_invalid = np.zeros(len(payloads), bool)
 
-    def body(self, body: Body, cursor: _Cursor) -> Places:
+    def body(self, body: Body, cursor: _Cursor) -> BodyOffsets:
+        """Walk one instance of a body in each message of the cursor."""
         return tuple(self._step(step, cursor) for step in body.steps)
 
     def tails(self, cursor: _Cursor) -> Int64s:
-        """Return how many bytes are left of each message, which have to be few or none."""
-        left = cursor.end - cursor.pos
+        """Return the number of bytes after each message; mark messages with an invalid tail."""
+        sizes = cursor.end - cursor.pos
         if not self._aligned:
-            self._drop(cursor, left != 0)
-            return left
-        self._drop(cursor, (left < 0) | (left > ZEROS))
-        more = np.flatnonzero((left > PADDING) & (left <= ZEROS))
-        if len(more):
-            first, last = self._words[cursor.pos[more]], self._words[cursor.end[more] - WORD]
-            wrong = np.zeros(len(left), bool)
-            wrong[more] = (first != 0) | (last != 0)
-            self._drop(cursor, wrong)
-        return left
+            self._invalidate(cursor, sizes != 0)
+            return sizes
+        self._invalidate(cursor, (sizes < 0) | (sizes > ZEROS))
+        long_tails = np.flatnonzero((sizes > PADDING) & (sizes <= ZEROS))
+        if len(long_tails):
+            first = self._words[cursor.pos[long_tails]]
+            last = self._words[cursor.end[long_tails] - WORD]
+            is_wrong = np.zeros(len(sizes), bool)
+            is_wrong[long_tails] = (first != 0) | (last != 0)
+            self._invalidate(cursor, is_wrong)
+        return sizes
 
-    def _step(self, step: Step, cursor: _Cursor) -> Place:
+    def _step(self, step: Step, cursor: _Cursor) -> StepOffsets:
         match step:
-            case Block(align=align, size=size):
+            case FixedBlock(align=align, size=size):
                 cursor.align(align)
                 at = cursor.pos
                 cursor.pos = at + size
-                return Place(at)
+                return StepOffsets(at)
             case Text(unit=unit):
-                count = self._count(cursor, step)
+                count = self._read_counts(cursor, step)
                 at = cursor.pos
                 cursor.pos = at + count * unit
-                return Place(at, count)
+                return StepOffsets(at, count)
             case Run():
                 return self._run(step, cursor)
             case Loop():
                 return self._loop(step, cursor)
 
-    def _run(self, step: Run, cursor: _Cursor) -> Place:
-        count = self._count(cursor, step, step.bound)
-        if step.cell.align > WORD:  # an empty run is not aligned
-            behind = cursor.pos
+    def _run(self, step: Run, cursor: _Cursor) -> StepOffsets:
+        count = self._read_counts(cursor, step, step.bound)
+        if step.cell.align > WORD:  # CDR does not align an empty sequence
+            unaligned = cursor.pos
             cursor.align(step.cell.align)
-            cursor.pos = np.where(count > 0, cursor.pos, behind)
+            cursor.pos = np.where(count > 0, cursor.pos, unaligned)
         at = cursor.pos
         padding = step.stride - step.cell.size
         cursor.pos = at + (np.maximum(count * step.stride - padding, 0) if padding else count * step.stride)
-        return Place(at, count)
+        return StepOffsets(at, count)
 
-    def _loop(self, step: Loop, cursor: _Cursor) -> Place:
+    def _loop(self, step: Loop, cursor: _Cursor) -> StepOffsets:
         if step.count is None:
-            count = self._count(cursor, step, step.bound)
+            count = self._read_counts(cursor, step, step.bound)
         else:
             count = np.full(len(cursor.pos), step.count, np.int64)
         at = cursor.pos
         cursor.pos = at.copy()
-        walked = _Elements(count)
+        elements = _Elements(count)
+        speculation = _Speculation(len(count))
         active = np.flatnonzero(count > 0)
-        guesses = _Guesses(len(count))
-        while guesses.are_worth(active, walked):
-            begins = cursor.pos[active]
-            walked.take(self._element(step.body, cursor, active), active)
-            guesses.note(active, cursor.pos[active] - begins)
-            active = active[(walked.left(active) > 0) & ~self.broken[cursor.row[active]]]
-            alike = active[guesses.alike[active]]
-            if len(alike) * _RARE >= len(active):
-                self._guess(step.body, cursor, alike, walked, guesses)
-                active = active[walked.left(active) > 0]
-        active = active[~self.broken[cursor.row[active]]]
-        if len(active) or not walked.parts:
-            self._rest(step.body, cursor, active, walked)
-        return Place(at, walked.done, walked.join())
+        while speculation.is_lockstep_faster(active, elements):
+            starts = cursor.pos[active]
+            elements.add_next(self._next_element(step.body, cursor, active), active)
+            speculation.record_sizes(active, cursor.pos[active] - starts)
+            active = active[(elements.remaining(active) > 0) & ~self.is_invalid[cursor.row[active]]]
+            repeated = active[speculation.is_repeated[active]]
+            if len(repeated) * _SPECULATION_SHARE >= len(active):
+                self._speculate(step.body, cursor, repeated, elements, speculation)
+                active = active[elements.remaining(active) > 0]
+        active = active[~self.is_invalid[cursor.row[active]]]
+        if len(active) or not elements.parts:
+            self._walk_remaining(step.body, cursor, active, elements)
+        return StepOffsets(at, elements.done, elements.by_message())
 
-    def _guess(self, body: Body, cursor: _Cursor, rows: Int64s, walked: _Elements, guesses: _Guesses) -> None:
-        """Walk elements of some messages where they begin if each is as long as the last; take those that are."""
-        size = guesses.size[rows]
-        room = (cursor.end[rows] - cursor.pos[rows]) // size
-        width = np.minimum(np.minimum(guesses.ahead[rows], walked.left(rows)), room)
+    def _next_element(self, body: Body, cursor: _Cursor, active: Int64s) -> BodyOffsets:
+        """Walk the next element of the active messages."""
+        inner = cursor.take(active)
+        offsets = self.body(body, inner)
+        cursor.pos[active] = inner.pos
+        cursor.end[active] = inner.end
+        return offsets
+
+    def _speculate(
+        self, body: Body, cursor: _Cursor, rows: Int64s, elements: _Elements, speculation: _Speculation
+    ) -> None:
+        """Walk elements at equidistant offsets, and keep the prefix of each message whose sizes are correct."""
+        size = speculation.size[rows]
+        available = (cursor.end[rows] - cursor.pos[rows]) // size
+        width = np.minimum(np.minimum(speculation.ahead[rows], elements.remaining(rows)), available)
         rows, size, width = (each[width > 0] for each in (rows, size, width))
         if not len(rows):
             return
-        number = expand(np.zeros_like(width), width)
+        number = expand_ranges(np.zeros_like(width), width)
         owner, sizes = np.repeat(rows, width), np.repeat(size, width)
-        begins = cursor.pos[owner] + number * sizes
-        # None may reach into the next: what is walked by mistake is then no more than there are bytes.
-        ends = begins + sizes
-        frame = self._frame
+        starts = cursor.pos[owner] + number * sizes
+        # Each guessed element ends where the next one starts, so that wrong guesses cannot walk more bytes than exist.
+        ends = starts + sizes
         origins = cursor.origin[owner]
-        trial = _Walk(self._layout, Frame(frame.data, frame.order, origins, ends))
-        inner = _Cursor(begins, ends.copy(), origins, np.arange(len(owner)))
-        places = trial.body(body, inner)
-        fits = (inner.pos == ends) & ~trial.broken
+        payloads = Payloads(self._payloads.data, self._payloads.order, origins, ends)
+        trial = _LockstepWalk(self._layout, payloads)
+        inner = _Cursor(starts, ends.copy(), origins, np.arange(len(owner)))
+        offsets = trial.body(body, inner)
+        is_correct = (inner.pos == ends) & ~trial.is_invalid
         firsts = np.cumsum(width) - width
-        taken = np.minimum.reduceat(np.where(fits, np.repeat(width, width), number), firsts)
-        kept = np.flatnonzero(number < np.repeat(taken, width))
+        accepted = np.minimum.reduceat(np.where(is_correct, np.repeat(width, width), number), firsts)
+        kept = np.flatnonzero(number < np.repeat(accepted, width))
         if len(kept) < len(owner):
-            places = tuple(place.take(kept) for place in places)
-        walked.note(places, owner[kept], walked.done[owner[kept]] + number[kept])
-        walked.done[rows] += taken
-        cursor.pos[rows] += taken * size
-        guesses.judge(rows, taken == width)
+            offsets = tuple(step.take(kept) for step in offsets)
+        elements.add(offsets, owner[kept], elements.done[owner[kept]] + number[kept])
+        elements.done[rows] += accepted
+        cursor.pos[rows] += accepted * size
+        speculation.record_result(rows, accepted == width)
 
-    def _element(self, body: Body, cursor: _Cursor, active: Int64s) -> Places:
-        """Walk the next element of the active messages."""
-        inner = cursor.take(active)
-        places = self.body(body, inner)
-        cursor.pos[active] = inner.pos
-        cursor.end[active] = inner.end
-        return places
-
-    def _rest(self, body: Body, cursor: _Cursor, active: Int64s, walked: _Elements) -> None:
-        """Walk all elements that are left of the active messages, which are few; take those that fit."""
-        stepper, notes = Stepper(self._layout, self._frame), Notes(body)
-        before = walked.done[active]
+    def _walk_remaining(self, body: Body, cursor: _Cursor, active: Int64s, elements: _Elements) -> None:
+        """Walk all remaining elements of the active messages, which are few, in plain Python."""
+        walker, recorder = MessageWalker(self._layout, self._payloads), OffsetRecorder(body)
+        before = elements.done[active]
         for index in active.tolist():
-            left = int(walked.count[index] - walked.done[index])
+            remaining = int(elements.count[index] - elements.done[index])
             row, pos = int(cursor.row[index]), int(cursor.pos[index])
-            fit, end = stepper.elements(row, notes, pos=pos, count=left)
-            walked.done[index] += fit
+            valid, end = walker.walk_elements(row, recorder, pos=pos, count=remaining)
+            elements.done[index] += valid
             cursor.pos[index] = end
-            if fit < left:
-                self._drop(cursor, np.arange(len(walked.count)) == index)
-        more = walked.done[active] - before
-        walked.note(notes.places(), np.repeat(active, more), expand(before, more))
+            if valid < remaining:
+                self._invalidate(cursor, np.arange(len(elements.count)) == index)
+        added = elements.done[active] - before
+        elements.add(recorder.offsets(), np.repeat(active, added), expand_ranges(before, added))
 
-    def _count(self, cursor: _Cursor, step: Step, bound: int = 0) -> Int64s:
-        """Read a length word each, and check it against the bytes left."""
+    def _read_counts(self, cursor: _Cursor, step: Step, bound: int = 0) -> Int64s:
+        """Read the length word of each message, and check it against the remaining bytes."""
         if self._aligned:
             cursor.align(WORD)
-        # A word beyond the message's end is out of bounds below, as less than nothing is left behind it.
-        count = self._words[np.minimum(cursor.pos, self._last)].astype(np.int64)
+        # A word beyond the end of its message fails the check below, because fewer than zero bytes remain.
+        count = self._words[np.minimum(cursor.pos, self._last_word)].astype(np.int64)
         cursor.pos = cursor.pos + WORD
-        over = count * least_bytes(step) > cursor.end - cursor.pos
+        is_invalid = count * least_bytes(step) > cursor.end - cursor.pos
         if bound:
-            over |= count > bound
-        if over.any():
-            count[over] = 0
-            self._drop(cursor, over)
+            is_invalid |= count > bound
+        if is_invalid.any():
+            count[is_invalid] = 0
+            self._invalidate(cursor, is_invalid)
         return count
 
-    def _drop(self, cursor: _Cursor, wrong: NDArray[np.bool_]) -> None:
-        """Mark messages as broken and park them at their origin, with no bytes left."""
-        if not wrong.any():
+    def _invalidate(self, cursor: _Cursor, is_invalid: NDArray[np.bool_]) -> None:
+        """Mark messages as invalid and move their cursors to the origin, with no bytes left."""
+        if not is_invalid.any():
             return
-        self.broken[cursor.row[wrong]] = True
-        cursor.pos = np.where(wrong, cursor.origin, cursor.pos)
-        cursor.end = np.where(wrong, cursor.origin, cursor.end)
-
-
-_LARGE_BYTES = 64 << 10
-"""So many bytes of few messages may be long sequences, whose elements can be walked together."""
-
-
-def locate(layout: Layout, frame: Frame) -> Located:
-    """Find where everything lies in the messages that fit the layout."""
-    if all(isinstance(step, Block) for step in layout.body.steps):
-        return locate_lockstep(layout, frame)  # nothing in a message depends on its bytes
-    parts = locate_clustered(layout, frame)
-    left = np.ones(len(frame), bool)
-    for part in parts:
-        left[part.rows] = False
-    rest = np.flatnonzero(left)
-    if len(rest) or not parts:
-        others = frame.take(rest)
-        is_small = len(rest) <= FEW and int((others.ends - others.origins).sum()) < _LARGE_BYTES
-        walk = locate_stepwise if is_small else locate_lockstep
-        found = walk(layout, others)
-        parts.append(replace(found, rows=rest[found.rows]))
-    return _merge(parts)
-
-
-def _merge(parts: list[Located]) -> Located:
-    if len(parts) == 1:
-        return parts[0]
-    rows = np.concatenate([part.rows for part in parts])
-    order = np.argsort(rows)
-    slots = np.empty(len(rows), np.int64)
-    slots[order] = np.arange(len(rows))
-    tails = np.concatenate([part.tails for part in parts])
-    return Located(rows[order], tails[order], join([part.places for part in parts], slots))
+        self.is_invalid[cursor.row[is_invalid]] = True
+        cursor.pos = np.where(is_invalid, cursor.origin, cursor.pos)
+        cursor.end = np.where(is_invalid, cursor.origin, cursor.end)

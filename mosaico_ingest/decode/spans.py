@@ -1,4 +1,4 @@
-"""Spans of bytes in a buffer, and copies of them into Arrow arrays."""
+"""Offsets of values in a buffer, and copies of the values into Arrow arrays."""
 
 from __future__ import annotations
 
@@ -10,147 +10,146 @@ import pyarrow as pa
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from mosaico_ingest.rosbag.blocks import Bytes, Int64s
 from mosaico_ingest.rosbag.compression import allocate
 
 __all__ = [
     "Array",
+    "BodyOffsets",
     "Cells",
-    "Frame",
     "Int64s",
-    "Located",
-    "Place",
-    "Places",
+    "LocatedMessages",
+    "Payloads",
+    "StepOffsets",
     "array_of",
     "bytes_at",
-    "cells",
-    "expand",
-    "join",
-    "offsets_of",
-    "spans",
+    "copy_slices",
+    "expand_ranges",
+    "fixed_cells",
+    "interleave",
+    "list_offsets",
 ]
 
-Int64s: TypeAlias = NDArray[np.int64]
+_LARGE_BYTES = 4096
+"""Average slice size above which individual copies are faster than `take`."""
+_FAR_BYTES = 1 << 28
+"""Maximum distance of the first and last slice for `take`, which reserves half as many bytes."""
+
+Array: TypeAlias = "pa.Array[Any]"
 
 
-class Frame(Struct, frozen=True):
-    """n messages of one byte order in a buffer; alignment counts from `origins`, shapes (n,)."""
+class Payloads(Struct, frozen=True):
+    """n payloads of one byte order in a buffer, without their encapsulation headers; shapes (n,)."""
 
-    data: NDArray[np.uint8]
+    data: Bytes
     order: str
-    """`<` or `>`, as numpy and struct spell it."""
+    """`<` or `>`, as in numpy and struct."""
     origins: Int64s
+    """Start of each payload, from which CDR counts alignment."""
     ends: Int64s
 
     def __len__(self) -> int:
-        """Return the number of messages."""
+        """Return the number of payloads."""
         return len(self.origins)
 
-    def take(self, rows: Int64s) -> Frame:
-        """Return some of the messages."""
-        return Frame(self.data, self.order, self.origins[rows], self.ends[rows])
+    def take(self, rows: Int64s) -> Payloads:
+        """Return the selected payloads."""
+        return Payloads(self.data, self.order, self.origins[rows], self.ends[rows])
 
     def words(self) -> NDArray[np.uint32]:
-        """Return the length word that begins at each byte of the buffer, without copying it."""
+        """Return a view with the 32-bit word at each byte of the buffer; it reads length words at any offset."""
         count = max(len(self.data) - 3, 0)
         return np.ndarray((count,), f"{self.order}u4", self.data.data, 0, (1,))
 
 
-class Place(Struct, frozen=True):
-    """Where one step lies in each of m instances of its body, in the order of the messages."""
+class StepOffsets(Struct, frozen=True):
+    """The offsets of one layout step in m instances of its body, ordered by message."""
 
     at: Int64s
-    """The first byte, shape (m,)."""
+    """Offset of the first byte after any length word, shape (m,)."""
     count: Int64s | None = None
-    """Bytes of a text, elements of a run or loop, shape (m,); None for a block."""
-    body: Places = ()
-    """The steps of a loop's elements, one instance each, sum(count) in all."""
+    """Units of a text, or elements of a run or loop, shape (m,); None for a block."""
+    body: BodyOffsets = ()
+    """Offsets of the steps of a loop's elements: sum(count) instances."""
 
     @property
     def counts(self) -> Int64s:
-        """The counts of a text, run or loop."""
+        """`count`, or zeros for a block."""
         return np.zeros_like(self.at) if self.count is None else self.count
 
-    def take(self, index: Int64s) -> Place:
-        """Return the place in the instances of `index`, in that order."""
+    def take(self, index: Int64s) -> StepOffsets:
+        """Return the offsets in the selected instances."""
         count = None if self.count is None else self.count[index]
         if self.count is None or count is None or not self.body:
-            return Place(self.at[index], count)
+            return StepOffsets(self.at[index], count)
         firsts = np.cumsum(self.count) - self.count
-        inner = expand(firsts[index], count)
-        return Place(self.at[index], count, tuple(place.take(inner) for place in self.body))
+        elements = expand_ranges(firsts[index], count)
+        return StepOffsets(self.at[index], count, tuple(step.take(elements) for step in self.body))
 
-    def spread(self, origins: Int64s) -> Place:
-        """Return the place of a message whose origin is 0 in messages that are laid out like it."""
+    def repeat_at(self, origins: Int64s) -> StepOffsets:
+        """Return the offsets of a message at offset 0 for messages with the same layout at `origins`."""
         at = (origins[:, None] + self.at).ravel()
         count = None if self.count is None else np.tile(self.count, len(origins))
-        return Place(at, count, tuple(place.spread(origins) for place in self.body))
+        return StepOffsets(at, count, tuple(step.repeat_at(origins) for step in self.body))
 
 
-Places: TypeAlias = tuple[Place, ...]
-"""One for each step of a body."""
+BodyOffsets: TypeAlias = tuple[StepOffsets, ...]
+"""The offsets of each step of a body."""
 
 
-class Located(Struct, frozen=True):
-    """The n messages that fit the layout, and where their steps lie."""
+class LocatedMessages(Struct, frozen=True):
+    """The n payloads whose bytes match the layout, and the offsets of their values."""
 
     rows: Int64s
-    """Their positions in the frame, ascending, shape (n,)."""
+    """Index of each in its `Payloads`, ascending, shape (n,)."""
     tails: Int64s
-    """How many bytes follow what the layout describes, shape (n,)."""
-    places: Places
+    """Bytes after the last value, shape (n,)."""
+    offsets: BodyOffsets
 
-    def take(self, index: Int64s) -> Located:
-        """Return some of the messages; `index` ascends."""
-        return Located(self.rows[index], self.tails[index], tuple(place.take(index) for place in self.places))
+    def take(self, index: Int64s) -> LocatedMessages:
+        """Return the selected messages; `index` ascends."""
+        offsets = tuple(step.take(index) for step in self.offsets)
+        return LocatedMessages(self.rows[index], self.tails[index], offsets)
 
 
-def expand(firsts: Int64s, counts: Int64s, stride: int = 1) -> Int64s:
-    """Return `firsts[i] + j * stride` for each i and each j below `counts[i]`."""
+def expand_ranges(firsts: Int64s, counts: Int64s, stride: int = 1) -> Int64s:
+    """Return `firsts[i] + j * stride` for each i and each j in range(counts[i])."""
     ends = np.cumsum(counts)
     total = int(ends[-1]) if len(ends) else 0
     return np.repeat(firsts - (ends - counts) * stride, counts) + np.arange(total) * stride
 
 
-def join(parts: Sequence[Places], slots: Int64s) -> Places:
-    """Put the instances of all parts, one part behind the other, into the order of their `slots`, which are 0 to m-1."""
+def interleave(parts: Sequence[BodyOffsets], slots: Int64s) -> BodyOffsets:
+    """Concatenate the instances of all parts and move instance i to position `slots[i]`, a permutation."""
     order = np.empty(len(slots), np.int64)
     order[slots] = np.arange(len(slots))
-    return tuple(_concatenate(pieces).take(order) for pieces in zip(*parts, strict=True))
+    return tuple(_concatenate(steps).take(order) for steps in zip(*parts, strict=True))
 
 
-def _concatenate(pieces: tuple[Place, ...]) -> Place:
-    at = np.concatenate([piece.at for piece in pieces])
-    counts = [piece.count for piece in pieces if piece.count is not None]
-    bodies = zip(*(piece.body for piece in pieces), strict=True)
-    return Place(at, np.concatenate(counts) if counts else None, tuple(map(_concatenate, bodies)))
-
-
-Array: TypeAlias = "pa.Array[Any]"
-Bytes: TypeAlias = NDArray[np.uint8]
-
-_LARGE = 4096
-"""Bytes from which on a copy of its own is faster than taking the value among others."""
-_FAR = 1 << 28
-"""Bytes from the first to the last value from which on taking, which reserves half as many, could be refused."""
+def _concatenate(parts: tuple[StepOffsets, ...]) -> StepOffsets:
+    at = np.concatenate([part.at for part in parts])
+    counts = [part.count for part in parts if part.count is not None]
+    bodies = zip(*(part.body for part in parts), strict=True)
+    return StepOffsets(at, np.concatenate(counts) if counts else None, tuple(map(_concatenate, bodies)))
 
 
 class Cells(Struct, frozen=True):
-    """`count` pieces of one size: the first begins at `begin` in `data`, each other `stride` bytes further."""
+    """`count` fixed-size structs in `data`: the first at `start`, the others `stride` bytes apart."""
 
     data: Bytes
     count: int
     stride: int
-    begin: int = 0
+    start: int = 0
 
     def numbers(self, kind: np.dtype[Any], offset: int, dims: Sequence[tuple[int, int]] = ()) -> NDArray[Any]:
-        """Return what lies at `offset` in each piece; `dims` are (count, stride) of what is there more than once."""
+        """Return a view of the number at `offset` in each struct; `dims` are (count, stride) of surrounding arrays."""
         counts, strides = zip(*dims, strict=True) if dims else ((), ())
-        at = self.begin + offset if self.count else 0
+        at = self.start + offset if self.count else 0
         return np.ndarray((self.count, *counts), kind, self.data.data, at, (self.stride, *strides))
 
 
-def cells(data: Bytes, at: Int64s, size: int) -> Cells:
-    """Return the `size` bytes at each position: where they are equally far from each other, they are not copied."""
+def fixed_cells(data: Bytes, at: Int64s, size: int) -> Cells:
+    """Return the structs of `size` bytes at some offsets: a view if they are equidistant, else a copy."""
     if not len(at) or not size:
         return Cells(np.zeros(0, np.uint8), len(at), 0)
     stride = _stride(at)
@@ -161,20 +160,20 @@ def cells(data: Bytes, at: Int64s, size: int) -> Cells:
 
 
 def bytes_at(data: Bytes, at: Int64s) -> Bytes:
-    """Return the byte at each position."""
-    return cells(data, at, 1).numbers(np.dtype(np.uint8), 0)
+    """Return the byte at each offset."""
+    return fixed_cells(data, at, 1).numbers(np.dtype(np.uint8), 0)
 
 
 def _stride(at: Int64s) -> int | None:
-    """Return how far positions are from each other, where all are equally far and ascend."""
+    """Return the distance of ascending, equidistant offsets; None for others."""
     stride = int(at[-1] - at[0]) // max(len(at) - 1, 1)
     if stride <= 0 or int(at[0]) + stride * (len(at) - 1) != at[-1]:
         return stride if len(at) == 1 else None
     return stride if (at[1:] - at[:-1] == stride).all() else None
 
 
-def spans(data: Bytes, at: Int64s, sizes: Int64s) -> Bytes:
-    """Return `sizes[i]` bytes from each `at[i]`, one behind the other; a view where they lie so already."""
+def copy_slices(data: Bytes, at: Int64s, sizes: Int64s) -> Bytes:
+    """Return the slices `data[at[i] : at[i] + sizes[i]]` one after the other; a view if they are adjacent in `data`."""
     if not len(at):
         return np.zeros(0, np.uint8)
     ends = at + sizes
@@ -182,40 +181,41 @@ def spans(data: Bytes, at: Int64s, sizes: Int64s) -> Bytes:
         return data[at[0] : ends[-1]]
     if sizes[0] == sizes.max() == sizes.min():
         size = int(sizes[0])
-        return np.ascontiguousarray(cells(data, at, size).numbers(np.dtype(f"V{size}"), 0)).view(np.uint8)
+        cells = fixed_cells(data, at, size).numbers(np.dtype(f"V{size}"), 0)
+        return np.ascontiguousarray(cells).view(np.uint8)
     total = int(sizes.sum())
-    if total > _LARGE * len(at):
-        return _copied(data, at, ends, total)
-    if int(ends.max() - at.min()) > _FAR:
-        return data[expand(at, sizes)]
-    return _taken(data, at, ends)[:total]
+    if total > _LARGE_BYTES * len(at):
+        return _copy_one_by_one(data, at, ends, total)
+    if int(ends.max() - at.min()) > _FAR_BYTES:
+        return data[expand_ranges(at, sizes)]
+    return _copy_with_take(data, at, ends)[:total]
 
 
-def _copied(data: Bytes, at: Int64s, ends: Int64s, total: int) -> Bytes:
-    out = allocate(total)
-    pos = 0
+def _copy_one_by_one(data: Bytes, at: Int64s, ends: Int64s, total: int) -> Bytes:
+    copy = allocate(total)
+    position = 0
     for start, end in zip(at.tolist(), ends.tolist(), strict=True):
-        out[pos : pos + end - start] = data[start:end]
-        pos += end - start
-    return out
+        copy[position : position + end - start] = data[start:end]
+        position += end - start
+    return copy
 
 
-def _taken(data: Bytes, at: Int64s, ends: Int64s) -> Bytes:
-    """Copy by Arrow's `take`: to it the spans are every other value of one binary array over the buffer."""
+def _copy_with_take(data: Bytes, at: Int64s, ends: Int64s) -> Bytes:
+    """Copy the slices with Arrow's `take`, from a binary array over the buffer in which they are every other value."""
     picks = np.arange(0, 2 * len(at), 2)
-    if (at[1:] < ends[:-1]).any():  # not ascending, as its offsets have to be
+    if (at[1:] < ends[:-1]).any():  # the offsets of a binary array must ascend
         order = np.argsort(at, kind="stable")
         picks = np.empty_like(picks)
         picks[order] = np.arange(0, 2 * len(at), 2)
         at, ends = at[order], ends[order]
     borders = np.stack([at, ends], axis=1).reshape(-1)
-    every = array_of(pa.large_binary(), len(borders) - 1, borders, data)
-    taken = every.take(array_of(pa.int64(), len(picks), picks)).buffers()[-1]
-    return np.zeros(0, np.uint8) if taken is None else np.frombuffer(memoryview(taken), np.uint8)
+    slices = array_of(pa.large_binary(), len(borders) - 1, borders, data)
+    copy = slices.take(array_of(pa.int64(), len(picks), picks)).buffers()[-1]
+    return np.zeros(0, np.uint8) if copy is None else np.frombuffer(memoryview(copy), np.uint8)
 
 
-def offsets_of(counts: Int64s) -> NDArray[np.int32]:
-    """Return where each of the values begins that have `counts` bytes or elements, and where the last ends."""
+def list_offsets(counts: Int64s) -> NDArray[np.int32]:
+    """Return the Arrow offsets of values with `counts` bytes or elements, shape (len(counts) + 1,)."""
     offsets = np.zeros(len(counts) + 1, np.int32)
     np.cumsum(counts, out=offsets[1:])
     return offsets
@@ -224,9 +224,9 @@ def offsets_of(counts: Int64s) -> NDArray[np.int32]:
 def array_of(
     kind: pa.DataType, length: int, *buffers: NDArray[Any], children: Sequence[Array] | None = None
 ) -> Array:
-    """Return an Arrow array over the buffers that follow its validity, which no decoded value needs.
+    """Return an Arrow array without nulls over the buffers that follow the validity bitmap.
 
-    Unlike `pyarrow.array` it does not look for pandas, whose import takes longer than most batches.
+    Unlike `pyarrow.array`, this does not import pandas, which takes longer than decoding most blocks.
     """
     parts = [None, *(pa.py_buffer(buffer.data) for buffer in buffers)]
     return pa.Array.from_buffers(kind, length, parts, children=children)

@@ -1,7 +1,7 @@
-"""Locate the values of messages one message at a time, or one message per cluster of equal layouts.
+"""Locate values one message at a time, or once per group of messages with equal length words.
 
-Messages of one topic nearly always repeat the lengths of their texts and sequences. Where all length words of a
-message have the values of the one that was walked, everything in it lies where it lies there.
+Messages of one topic nearly always repeat the lengths of their texts and sequences. If all length words of a message
+equal those of a message that has been walked, the *template*, then all its values have the template's offsets.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from mosaico_ingest.decode.layout import (
     PADDING,
     WORD,
     ZEROS,
-    Block,
     Body,
+    FixedBlock,
     Layout,
     Loop,
     Run,
@@ -25,240 +25,230 @@ from mosaico_ingest.decode.layout import (
     Text,
     least_bytes,
 )
-from mosaico_ingest.decode.spans import (
-    Frame,
-    Int64s,
-    Located,
-    Place,
-    Places,
-)
+from mosaico_ingest.decode.spans import BodyOffsets, Int64s, LocatedMessages, Payloads, StepOffsets
 from mosaico_ingest.rosbag.blocks import Encoding
 
-__all__ = [
-    "Notes",
-    "Stepper",
-    "locate_clustered",
-    "locate_stepwise",
-]
+__all__ = ["MessageWalker", "OffsetRecorder", "locate_by_template", "locate_one_by_one"]
+
+_MIN_GROUP = 4
+"""Minimum number of messages per template."""
+_TEMPLATE_NS, _CHECK_NS = 120_000, 10
+_WALK_NS = 1_200
+_LOCKSTEP_NS, _LOCKSTEP_MESSAGE_NS = 15_000, 60
+"""Measured costs, of which only the ratios matter: per template, per comparison of a length word, per length word
+walked in Python, and per length word in lockstep plus per message."""
 
 
-class _Misfit(Exception):  # noqa: N818 - control flow inside this file, not an error for anyone
-    """The bytes do not fit the layout."""
+class _InvalidMessage(Exception):  # noqa: N818 - control flow inside this module
+    """The bytes do not match the layout."""
 
 
-class _Track:
-    """The places of one step, as they are found."""
+class _StepRecorder:
+    """Collects the offsets of one step."""
 
-    __slots__ = ("at", "body", "counts", "fixed", "least", "step")
+    __slots__ = ("at", "body", "counts", "fixed_count", "least", "step")
 
     def __init__(self, step: Step) -> None:
         self.step = step
         self.at: list[int] = []
         self.counts: list[int] = []
-        self.body = Notes(step.body) if isinstance(step, Loop) else None
-        self.fixed = step.count if isinstance(step, Loop) else None
+        self.body = OffsetRecorder(step.body) if isinstance(step, Loop) else None
+        self.fixed_count = step.count if isinstance(step, Loop) else None
         self.least = least_bytes(step)
 
-    def place(self) -> Place:
-        count = None if isinstance(self.step, Block) else np.array(self.counts, np.int64)
-        return Place(np.array(self.at, np.int64), count, () if self.body is None else self.body.places())
+    def offsets(self) -> StepOffsets:
+        count = None if isinstance(self.step, FixedBlock) else np.array(self.counts, np.int64)
+        return StepOffsets(
+            np.array(self.at, np.int64), count, () if self.body is None else self.body.offsets()
+        )
 
 
-class Notes:
-    """The places of a body's steps, as they are found."""
+class OffsetRecorder:
+    """Collects the offsets of a body's steps."""
 
-    __slots__ = ("tracks",)
+    __slots__ = ("steps",)
 
     def __init__(self, body: Body) -> None:
-        self.tracks = [_Track(step) for step in body.steps]
+        self.steps = [_StepRecorder(step) for step in body.steps]
 
     def __len__(self) -> int:
         """Return the number of instances."""
-        return len(self.tracks[0].at) if self.tracks else 0
+        return len(self.steps[0].at) if self.steps else 0
 
-    def forget(self, instances: int) -> None:
-        """Drop what was found after the first `instances` of the body."""
-        for track in self.tracks:
-            del track.at[instances:]
-            del track.counts[instances:]
-            if track.body is not None:
-                track.body.forget(sum(track.counts))
+    def truncate(self, instances: int) -> None:
+        """Remove all offsets after the first `instances` of the body."""
+        for step in self.steps:
+            del step.at[instances:]
+            del step.counts[instances:]
+            if step.body is not None:
+                step.body.truncate(sum(step.counts))
 
-    def places(self) -> Places:
-        """Return what was found as arrays."""
-        return tuple(track.place() for track in self.tracks)
+    def offsets(self) -> BodyOffsets:
+        """Return the offsets as arrays."""
+        return tuple(step.offsets() for step in self.steps)
 
 
-class Stepper:
-    """Walks messages of a layout in plain Python."""
+class MessageWalker:
+    """Walks messages of one layout in plain Python."""
 
-    __slots__ = ("_aligned", "_data", "_end", "_frame", "_layout", "_origin", "_word", "words")
+    __slots__ = ("_aligned", "_data", "_end", "_layout", "_origin", "_payloads", "_word", "words")
 
-    def __init__(self, layout: Layout, frame: Frame) -> None:
+    def __init__(self, layout: Layout, payloads: Payloads) -> None:
         self._layout = layout
-        self._frame = frame
-        self._data = frame.data.data
+        self._payloads = payloads
+        self._data = payloads.data.data
         self._aligned = layout.encoding is Encoding.CDR
-        self._word = Struct(f"{frame.order}I").unpack_from
+        self._word = Struct(f"{payloads.order}I").unpack_from
         self._origin = self._end = 0
         self.words: list[int] = []
-        """Where the words were that the walk depended on: lengths, and zeros behind the message."""
+        """Offsets of the words that determine the result: length words, and zeros after the message."""
 
-    def message(self, row: int, notes: Notes) -> int | None:
-        """Walk one message and return how many bytes follow it; None, and nothing noted, where it does not fit."""
-        before = len(notes)
-        fit, pos = self.elements(row, notes, pos=int(self._frame.origins[row]), count=1)
-        if fit and self._tail_fits(pos):
+    def walk_message(self, row: int, recorder: OffsetRecorder) -> int | None:
+        """Record the offsets of one message and return the number of bytes after it; None if it is invalid."""
+        before = len(recorder)
+        valid, pos = self.walk_elements(row, recorder, pos=int(self._payloads.origins[row]), count=1)
+        if valid and self._is_tail_valid(pos):
             return self._end - pos
-        notes.forget(before)
+        recorder.truncate(before)
         return None
 
-    def elements(self, row: int, notes: Notes, *, pos: int, count: int) -> tuple[int, int]:
-        """Walk `count` elements of one message's loop; return how many fit, and the position after them."""
-        self._origin, self._end = int(self._frame.origins[row]), int(self._frame.ends[row])
-        before = len(notes)
+    def walk_elements(self, row: int, recorder: OffsetRecorder, *, pos: int, count: int) -> tuple[int, int]:
+        """Record up to `count` elements of a message's loop; return the number of valid ones and the position after."""
+        self._origin, self._end = int(self._payloads.origins[row]), int(self._payloads.ends[row])
+        before = len(recorder)
         for done in range(count):
             try:
-                pos = self._walk(notes, pos)
-            except _Misfit:  # noqa: PERF203 - only the first misfit is caught, then the loop ends
-                notes.forget(before + done)
+                pos = self._walk_body(recorder, pos)
+            except _InvalidMessage:  # noqa: PERF203 - ends the loop
+                recorder.truncate(before + done)
                 return done, pos
         return count, pos
 
-    def _tail_fits(self, pos: int) -> bool:
-        left = self._end - pos
-        if not self._aligned or left <= PADDING:
-            return left == 0 or (self._aligned and left >= 0)
-        self.words += [pos, self._end - WORD]  # between them they cover the tail: where they agree, it does
-        return left <= ZEROS and not any(self._data[pos : self._end])
+    def _is_tail_valid(self, pos: int) -> bool:
+        size = self._end - pos
+        if not self._aligned or size <= PADDING:
+            return size == 0 or (self._aligned and size >= 0)
+        self.words += [pos, self._end - WORD]  # these two words cover all bytes of the tail
+        return size <= ZEROS and not any(self._data[pos : self._end])
 
-    def _walk(self, notes: Notes, pos: int) -> int:
-        """Walk one instance of a body, and return the position behind it."""
-        for track in notes.tracks:
-            step = track.step
-            if isinstance(step, Block):
+    def _walk_body(self, recorder: OffsetRecorder, pos: int) -> int:
+        """Record one instance of a body, and return the position after it."""
+        for recorded in recorder.steps:
+            step = recorded.step
+            if isinstance(step, FixedBlock):
                 pos += (self._origin - pos) % step.align
-                track.at.append(pos)
+                recorded.at.append(pos)
                 pos += step.size
                 continue
-            count = track.fixed
+            count = recorded.fixed_count
             if count is None:
-                pos, count = self._count(pos, track.least)
+                pos, count = self._read_count(pos, recorded.least)
             if isinstance(step, Text):
-                track.at.append(pos)
-                track.counts.append(count)
+                recorded.at.append(pos)
+                recorded.counts.append(count)
                 pos += count * step.unit
             else:
-                pos = self._elements(track, step, pos, count)
+                pos = self._walk_sequence(recorded, step, pos, count)
         if pos > self._end:
-            raise _Misfit
+            raise _InvalidMessage
         return pos
 
-    def _elements(self, track: _Track, step: Run | Loop, pos: int, count: int) -> int:
+    def _walk_sequence(self, recorded: _StepRecorder, step: Run | Loop, pos: int, count: int) -> int:
         if step.bound and count > step.bound:
-            raise _Misfit
+            raise _InvalidMessage
         if isinstance(step, Run) and count:
             pos += (self._origin - pos) % step.cell.align
-        track.at.append(pos)
-        track.counts.append(count)
+        recorded.at.append(pos)
+        recorded.counts.append(count)
         if isinstance(step, Run):
             return pos + (count - 1) * step.stride + step.cell.size if count else pos
-        if track.body is not None:
+        if recorded.body is not None:
             for _ in range(count):
-                pos = self._walk(track.body, pos)
+                pos = self._walk_body(recorded.body, pos)
         return pos
 
-    def _count(self, pos: int, least: int) -> tuple[int, int]:
-        """Read a length word and check it against the bytes left; return the position behind it as well."""
+    def _read_count(self, pos: int, least: int) -> tuple[int, int]:
+        """Read a length word and check it against the remaining bytes; return the position after it and the count."""
         if self._aligned:
             pos += (self._origin - pos) % WORD
         self.words.append(pos)
-        behind = pos + WORD
-        if behind > self._end:
-            raise _Misfit
+        after = pos + WORD
+        if after > self._end:
+            raise _InvalidMessage
         count: int = self._word(self._data, pos)[0]
-        if count * least > self._end - behind:
-            raise _Misfit
-        return behind, count
+        if count * least > self._end - after:
+            raise _InvalidMessage
+        return after, count
 
 
-def locate_stepwise(layout: Layout, frame: Frame) -> Located:
-    """Walk every message of the frame on its own."""
-    stepper, notes = Stepper(layout, frame), Notes(layout.body)
-    tails = {row: tail for row in range(len(frame)) if (tail := stepper.message(row, notes)) is not None}
+def locate_one_by_one(layout: Layout, payloads: Payloads) -> LocatedMessages:
+    """Walk each message individually."""
+    walker, recorder = MessageWalker(layout, payloads), OffsetRecorder(layout.body)
+    tails = {
+        row: tail for row in range(len(payloads)) if (tail := walker.walk_message(row, recorder)) is not None
+    }
     rows = np.fromiter(tails, np.int64, len(tails))
-    return Located(rows, np.fromiter(tails.values(), np.int64, len(tails)), notes.places())
+    return LocatedMessages(rows, np.fromiter(tails.values(), np.int64, len(tails)), recorder.offsets())
 
 
-_SMALLEST = 4
-"""Messages a cluster has at least."""
-
-_CLUSTER_NS, _CHECK_NS = 120_000, 10
-_STEP_NS = 1_200
-_TOGETHER_NS, _LOCKSTEP_NS = 15_000, 60
-"""What things cost: a cluster in itself, and each length word of a message that is checked; a word that is walked
-stepwise; a word of all messages in lockstep, and of each. Measured once; only their ratios matter."""
-
-
-def locate_clustered(layout: Layout, frame: Frame) -> list[Located]:
-    """Return the clusters that pay; messages in none of them are left to another way of walking."""
-    groups = list(_same_length(frame.ends - frame.origins))
+def locate_by_template(layout: Layout, payloads: Payloads) -> list[LocatedMessages]:
+    """Return the groups of messages for which a template is the cheapest method; omit all other messages."""
+    groups = list(_same_length(payloads.ends - payloads.origins))
     if not groups:
         return []
-    words = len(_Sample(layout, frame, int(groups[0][0])).words)
+    words = len(_Template(layout, payloads, int(groups[0][0])).words)
     members = sum(map(len, groups))
-    clustered = len(groups) * (_CLUSTER_NS + words * _STEP_NS) + members * words * _CHECK_NS
-    if clustered > words * min(members * _STEP_NS, _TOGETHER_NS + members * _LOCKSTEP_NS):
+    template_ns = len(groups) * (_TEMPLATE_NS + words * _WALK_NS) + members * words * _CHECK_NS
+    if template_ns > words * min(members * _WALK_NS, _LOCKSTEP_NS + members * _LOCKSTEP_MESSAGE_NS):
         return []
-    return [cluster for rows in groups for cluster in _split(layout, frame, rows)]
+    return [located for rows in groups for located in _match_templates(layout, payloads, rows)]
 
 
 def _same_length(lengths: Int64s) -> Iterator[Int64s]:
-    """Yield the positions of each length that is frequent enough."""
-    if len(lengths) < _SMALLEST:
+    """Yield the rows of each length that occurs at least `_MIN_GROUP` times."""
+    if len(lengths) < _MIN_GROUP:
         return
     order = np.argsort(lengths, kind="stable")
     borders = np.flatnonzero(np.diff(lengths[order], prepend=-1, append=-1))
-    for group in np.flatnonzero(np.diff(borders) >= _SMALLEST).tolist():
+    for group in np.flatnonzero(np.diff(borders) >= _MIN_GROUP).tolist():
         yield order[borders[group] : borders[group + 1]]
 
 
-def _split(layout: Layout, frame: Frame, rows: Int64s) -> Iterator[Located]:
-    """Yield the clusters within messages of one length, as long as each takes a good part of the rest."""
-    while len(rows) >= _SMALLEST:
-        sample = _Sample(layout, frame, int(rows[0]))
-        alike = sample.compare(frame.take(rows))
-        members = rows[alike]
+def _match_templates(layout: Layout, payloads: Payloads, rows: Int64s) -> Iterator[LocatedMessages]:
+    """Yield groups of equal layout among messages of one length, while each matches a quarter of the remainder."""
+    while len(rows) >= _MIN_GROUP:
+        template = _Template(layout, payloads, int(rows[0]))
+        matches = template.matches(payloads.take(rows))
+        members = rows[matches]
         if len(members):
-            yield sample.spread(frame, members)
+            yield template.locate(payloads, members)
         if len(members) * 4 < len(rows):
             return
-        rows = rows[~alike]
+        rows = rows[~matches]
 
 
-class _Sample:
-    """One message that was walked."""
+class _Template:
+    """One walked message, whose offsets apply to all messages with the same length words."""
 
-    __slots__ = ("_frame", "_places", "_tail", "words")
+    __slots__ = ("_offsets", "_payloads", "_tail", "words")
 
-    def __init__(self, layout: Layout, frame: Frame, row: int) -> None:
-        stepper, notes = Stepper(layout, frame), Notes(layout.body)
-        self._frame = frame.take(np.array([row]))
-        self._tail = stepper.message(row, notes)
-        self.words = np.array(stepper.words, np.int64) - frame.origins[row]
-        self._places = notes.places()
+    def __init__(self, layout: Layout, payloads: Payloads, row: int) -> None:
+        walker, recorder = MessageWalker(layout, payloads), OffsetRecorder(layout.body)
+        self._payloads = payloads.take(np.array([row]))
+        self._tail = walker.walk_message(row, recorder)
+        self.words = np.array(walker.words, np.int64) - payloads.origins[row]
+        self._offsets = recorder.offsets()
 
-    def compare(self, frame: Frame) -> NDArray[np.bool_]:
-        """Return which messages, all of the sample's length, have the words its walk depended on."""
+    def matches(self, payloads: Payloads) -> NDArray[np.bool_]:
+        """Return which messages, all of the template's length, have the same words at the offsets in `words`."""
         if self._tail is None:
-            return np.zeros(len(frame), bool)
-        words = frame.words()
-        expected = words[self._frame.origins + self.words]
-        found = words[frame.origins[:, None] + self.words]
-        return (found == expected).all(axis=1)
+            return np.zeros(len(payloads), bool)
+        words = payloads.words()
+        expected = words[self._payloads.origins + self.words]
+        return (words[payloads.origins[:, None] + self.words] == expected).all(axis=1)
 
-    def spread(self, frame: Frame, rows: Int64s) -> Located:
-        """Return the messages that compared equal, laid out like the sample."""
-        moved = frame.origins[rows] - self._frame.origins
+    def locate(self, payloads: Payloads, rows: Int64s) -> LocatedMessages:
+        """Return the offsets of messages that match."""
+        distances = payloads.origins[rows] - self._payloads.origins
         tails = np.full(len(rows), self._tail or 0)
-        return Located(rows, tails, tuple(place.spread(moved) for place in self._places))
+        return LocatedMessages(rows, tails, tuple(step.repeat_at(distances) for step in self._offsets))

@@ -15,8 +15,8 @@ from mosaico_ingest.decode import lockstep
 from mosaico_ingest.decode.decoder import Decoded
 from mosaico_ingest.decode.layout import compile_layout
 from mosaico_ingest.decode.lockstep import locate, locate_lockstep
-from mosaico_ingest.decode.spans import Frame, Located, Place
-from mosaico_ingest.decode.walk import locate_stepwise
+from mosaico_ingest.decode.spans import LocatedMessages, Payloads, StepOffsets
+from mosaico_ingest.decode.walk import locate_one_by_one
 from mosaico_ingest.rosbag.blocks import Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.model import (
     Container,
@@ -143,7 +143,7 @@ def damaged(draw: st.DrawFn, payload: bytes) -> bytes:
     return draw(st.binary(max_size=40)) if how == "anything" else payload
 
 
-def same_place(one: Place, other: Place) -> bool:
+def same_place(one: StepOffsets, other: StepOffsets) -> bool:
     return (
         one.at.tolist() == other.at.tolist()
         and one.counts.tolist() == other.counts.tolist()
@@ -152,11 +152,11 @@ def same_place(one: Place, other: Place) -> bool:
     )
 
 
-def same_located(one: Located, other: Located) -> bool:
+def same_located(one: LocatedMessages, other: LocatedMessages) -> bool:
     return (
         one.rows.tolist() == other.rows.tolist()
         and one.tails.tolist() == other.tails.tolist()
-        and all(map(same_place, one.places, other.places))
+        and all(map(same_place, one.offsets, other.offsets))
     )
 
 
@@ -172,9 +172,9 @@ def test_every_way_of_walking_finds_the_same_places(
     skip = 4 if encoding is Encoding.CDR else 0
     rows = np.flatnonzero(batch.lengths >= skip)
     origins = batch.starts[rows] + skip
-    frame = Frame(batch.data, "<", origins, batch.starts[rows] + batch.lengths[rows])
-    slow = locate_stepwise(layout, frame)
-    assert same_located(locate(layout, frame), slow)
+    payloads = Payloads(batch.data, "<", origins, batch.starts[rows] + batch.lengths[rows])
+    slow = locate_one_by_one(layout, payloads)
+    assert same_located(locate(layout, payloads), slow)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lockstep, "FEW", few)
-        assert same_located(locate_lockstep(layout, frame), slow)
+        assert same_located(locate_lockstep(layout, payloads), slow)

@@ -153,7 +153,7 @@ def test_parts_that_fit_no_column_together_ask_for_smaller_batches(
     batch = batch_of([text(b"a" * 20)] * 12)
     monkeypatch.setattr(columnar, "_LARGEST", 200)
     monkeypatch.setattr(columnar.pa, "concat_arrays", overflow)
-    with pytest.raises(DecodeError, match="read smaller batches"):
+    with pytest.raises(DecodeError, match="smaller blocks are read"):
         ColumnarDecoder(STRING, Encoding.CDR).decode(batch)
 
 

@@ -1,16 +1,16 @@
 from __future__ import annotations
 
 from mosaico_ingest.decode.layout import (
-    Block,
-    Grid,
-    Items,
+    FixedArrayColumn,
+    FixedBlock,
     Layout,
-    Leaf,
+    ListColumn,
     Loop,
-    Record,
+    NumberColumn,
     Run,
+    StructColumn,
     Text,
-    Words,
+    TextColumn,
     compile_layout,
 )
 from mosaico_ingest.job.values import Stores
@@ -36,29 +36,34 @@ def layout_of(
 def test_an_imu_message_is_two_blocks_around_a_text() -> None:
     definition = TypeResolver(Stores.ROS2_HUMBLE).resolve("sensor_msgs/msg/Imu", None, ros_version=2)
     layout = compile_layout(definition, Encoding.CDR)
-    assert layout.body.steps == (Block(8, 8), Text(1, closed=True), Block(8, 37 * 8))
+    assert layout.body.steps == (FixedBlock(8, 8), Text(1, has_nul=True), FixedBlock(8, 37 * 8))
 
 
 def test_a_new_block_begins_where_the_padding_depends_on_the_message() -> None:
     layout = layout_of(
         Field("name", "string"), Field("a", "uint8"), Field("b", "uint32"), Field("c", "uint8")
     )
-    assert layout.body.steps == (Text(1, closed=True), Block(1, 1), Block(4, 5))
-    assert layout.record == Record(
-        (Words(0, Text(1, closed=True)), Leaf(1, 0, "uint8"), Leaf(2, 0, "uint32"), Leaf(2, 4, "uint8"))
+    assert layout.body.steps == (Text(1, has_nul=True), FixedBlock(1, 1), FixedBlock(4, 5))
+    assert layout.record == StructColumn(
+        (
+            TextColumn(0, Text(1, has_nul=True)),
+            NumberColumn(1, 0, "uint8"),
+            NumberColumn(2, 0, "uint32"),
+            NumberColumn(2, 4, "uint8"),
+        )
     )
 
 
 def test_a_message_begins_aligned_so_that_its_first_block_spans_the_padding() -> None:
     layout = layout_of(Field("a", "uint8"), Field("b", "float64"))
-    assert layout.body.steps == (Block(8, 16),)
-    assert layout.record.children[1] == Leaf(0, 8, "float64")
+    assert layout.body.steps == (FixedBlock(8, 16),)
+    assert layout.record.children[1] == NumberColumn(0, 8, "float64")
 
 
 def test_ros1_has_no_padding() -> None:
     layout = layout_of(Field("a", "uint8"), Field("b", "float64"), encoding=Encoding.ROS1)
-    assert layout.body.steps == (Block(8, 9),)
-    assert layout.record.children[1] == Leaf(0, 1, "float64")
+    assert layout.body.steps == (FixedBlock(8, 9),)
+    assert layout.record.children[1] == NumberColumn(0, 1, "float64")
 
 
 def test_structs_of_fixed_size_run_and_others_loop() -> None:
@@ -70,10 +75,12 @@ def test_structs_of_fixed_size_run_and_others_loop() -> None:
         others=(point, named),
     )
     run, loop = layout.body.steps
-    assert run == Run(Block(8, 9), stride=16, bound=5)
+    assert run == Run(FixedBlock(8, 9), stride=16, bound=5)
     assert isinstance(loop, Loop)
-    assert loop.body.steps == (Text(1, closed=True),)
-    assert layout.record.children[1] == Items(1, loop, Record((Words(0, Text(1, closed=True)),)))
+    assert loop.body.steps == (Text(1, has_nul=True),)
+    assert layout.record.children[1] == ListColumn(
+        1, loop, StructColumn((TextColumn(0, Text(1, has_nul=True)),))
+    )
 
 
 def test_a_struct_whose_size_depends_on_where_it_begins_is_walked() -> None:
@@ -81,7 +88,7 @@ def test_a_struct_whose_size_depends_on_where_it_begins_is_walked() -> None:
     layout = layout_of(Field("odd", odd.name, is_message=True, container=Container.SEQUENCE), others=(odd,))
     (loop,) = layout.body.steps
     assert isinstance(loop, Loop)
-    assert loop.body.steps == (Block(1, 1), Block(8, 8))
+    assert loop.body.steps == (FixedBlock(1, 1), FixedBlock(8, 8))
 
 
 def test_arrays_of_fixed_size_are_grids_within_one_block() -> None:
@@ -89,5 +96,11 @@ def test_arrays_of_fixed_size_are_grids_within_one_block() -> None:
     layout = layout_of(
         Field("points", point.name, is_message=True, container=Container.ARRAY, size=3), others=(point,)
     )
-    assert layout.body.steps == (Block(8, 24),)
-    assert layout.record == Record((Grid(3, Record((Grid(2, Leaf(0, 0, "float32", ((3, 8), (2, 4)))),))),))
+    assert layout.body.steps == (FixedBlock(8, 24),)
+    assert layout.record == StructColumn(
+        (
+            FixedArrayColumn(
+                3, StructColumn((FixedArrayColumn(2, NumberColumn(0, 0, "float32", ((3, 8), (2, 4)))),))
+            ),
+        )
+    )

@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from mosaico_ingest.decode.layout import compile_layout
-from mosaico_ingest.decode.spans import Frame, Located
-from mosaico_ingest.decode.walk import locate_clustered
+from mosaico_ingest.decode.spans import LocatedMessages, Payloads
+from mosaico_ingest.decode.walk import locate_by_template
 from mosaico_ingest.rosbag.blocks import Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.model import (
     Container,
@@ -32,11 +32,11 @@ NAMES = Definition(
 )
 
 
-def clusters_of(batch_of: BatchOf, values: Sequence[Sequence[str]]) -> list[Located]:
+def clusters_of(batch_of: BatchOf, values: Sequence[Sequence[str]]) -> list[LocatedMessages]:
     serializer = Serializer(NAMES, Encoding.CDR)
     batch = batch_of([serializer.from_dict({"names": names}) for names in values])
-    frame = Frame(batch.data, "<", batch.starts + 4, batch.starts + batch.lengths)
-    return locate_clustered(compile_layout(NAMES, Encoding.CDR), frame)
+    payloads = Payloads(batch.data, "<", batch.starts + 4, batch.starts + batch.lengths)
+    return locate_by_template(compile_layout(NAMES, Encoding.CDR), payloads)
 
 
 def test_messages_with_equal_lengths_everywhere_are_one_cluster(batch_of: BatchOf) -> None:

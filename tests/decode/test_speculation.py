@@ -13,7 +13,7 @@ from mosaico_ingest.decode import lockstep
 from mosaico_ingest.decode.decoder import Decoded
 from mosaico_ingest.decode.layout import compile_layout
 from mosaico_ingest.decode.lockstep import locate_lockstep
-from mosaico_ingest.decode.spans import Frame
+from mosaico_ingest.decode.spans import Payloads
 from mosaico_ingest.rosbag.blocks import Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.model import (
     Container,
@@ -96,7 +96,7 @@ def test_messages_of_elements_that_are_alike_for_a_while_agree_with_rows(
         broken += [one[:at], one[:at] + bytes([data.draw(st.integers(0, 255))]) + one[at + 1 :]]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lockstep, "FEW", data.draw(st.integers(0, 3)))
-        patch.setattr(lockstep, "_MANY", 0)
+        patch.setattr(lockstep, "_MANY_ELEMENTS", 0)
         assert not assert_agree(whole * copies, ROUTES, encoding).failures
         assert_agree((whole + broken) * copies, ROUTES, encoding)
 
@@ -107,12 +107,12 @@ def test_long_sequences_of_equal_elements_take_few_steps(
     monkeypatch: pytest.MonkeyPatch, batch_of: BatchOf, messages: int, encoding: Encoding
 ) -> None:
     steps: list[int] = []
-    walk = lockstep._Walk.body
-    monkeypatch.setattr(lockstep._Walk, "body", lambda *given: steps.append(1) or walk(*given))
+    walk = lockstep._LockstepWalk.body
+    monkeypatch.setattr(lockstep._LockstepWalk, "body", lambda *given: steps.append(1) or walk(*given))
     payloads = [payload([stop("map", [])] * (500 + number), encoding) for number in range(messages)]
     batch = batch_of(payloads)
     skip = 4 if encoding is Encoding.CDR else 0
-    frame = Frame(batch.data, "<", batch.starts + skip, batch.starts + batch.lengths)
-    located = locate_lockstep(compile_layout(ROUTES, encoding), frame)
-    assert located.places[1].counts.tolist() == [500 + number for number in range(messages)]
+    payloads = Payloads(batch.data, "<", batch.starts + skip, batch.starts + batch.lengths)
+    located = locate_lockstep(compile_layout(ROUTES, encoding), payloads)
+    assert located.offsets[1].counts.tolist() == [500 + number for number in range(messages)]
     assert len(steps) < 30

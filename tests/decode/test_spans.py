@@ -9,8 +9,8 @@ from mosaico_ingest.decode import spans as gather
 from mosaico_ingest.decode.spans import (
     Cells,
     bytes_at,
-    cells,
-    spans,
+    copy_slices,
+    fixed_cells,
 )
 
 DATA = np.random.default_rng(1).integers(0, 256, 60_000).astype(np.uint8)
@@ -25,7 +25,7 @@ def slow_spans(at: list[int], sizes: list[int]) -> bytes:
 def test_spans_are_the_bytes_of_each_span_in_order(data: st.DataObject, largest: int) -> None:
     pairs = data.draw(st.lists(st.tuples(st.integers(0, 40_000), st.integers(0, largest)), max_size=20))
     at, sizes = [start for start, _ in pairs], [size for _, size in pairs]
-    found = spans(DATA, np.array(at, np.int64), np.array(sizes, np.int64))
+    found = copy_slices(DATA, np.array(at, np.int64), np.array(sizes, np.int64))
     assert found.tobytes() == slow_spans(at, sizes)
 
 
@@ -33,8 +33,8 @@ def test_spans_are_the_bytes_of_each_span_in_order(data: st.DataObject, largest:
 def test_spans_far_apart_are_found_without_reserving_what_lies_between(pairs: list[tuple[int, int]]) -> None:
     at, sizes = [start for start, _ in pairs], [size for _, size in pairs]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gather, "_FAR", 100)
-        found = spans(DATA, np.array(at, np.int64), np.array(sizes, np.int64))
+        patch.setattr(gather, "_FAR_BYTES", 100)
+        found = copy_slices(DATA, np.array(at, np.int64), np.array(sizes, np.int64))
     assert found.tobytes() == slow_spans(at, sizes)
 
 
@@ -44,7 +44,7 @@ def bytes_of(found: Cells, size: int) -> bytes:
 
 @given(at=st.lists(st.integers(0, 50_000), max_size=20), size=st.integers(1, 5000))
 def test_cells_are_the_bytes_at_each_position(at: list[int], size: int) -> None:
-    found = cells(DATA, np.array(at, np.int64), size)
+    found = fixed_cells(DATA, np.array(at, np.int64), size)
     assert bytes_of(found, size) == slow_spans(at, [size] * len(at))
 
 
@@ -53,18 +53,18 @@ def test_cells_equally_far_from_each_other_are_not_copied(
     begin: int, stride: int, count: int, size: int
 ) -> None:
     at = begin + stride * np.arange(count)
-    found = cells(DATA, at, size)
+    found = fixed_cells(DATA, at, size)
     assert np.shares_memory(found.data, DATA)
     assert bytes_of(found, size) == slow_spans(at.tolist(), [size] * count)
     assert bytes_at(DATA, at).tobytes() == DATA[at].tobytes()
-    assert spans(DATA, at, np.full(count, size)).tobytes() == bytes_of(found, size)
+    assert copy_slices(DATA, at, np.full(count, size)).tobytes() == bytes_of(found, size)
 
 
 def test_cells_without_a_byte_read_none() -> None:
-    assert cells(DATA, np.zeros(0, np.int64), 8).numbers(np.dtype("<u4"), 4).size == 0
+    assert fixed_cells(DATA, np.zeros(0, np.int64), 8).numbers(np.dtype("<u4"), 4).size == 0
 
 
 def test_spans_that_follow_each_other_are_not_copied() -> None:
-    found = spans(DATA, np.array([10, 15, 20]), np.array([5, 5, 1]))
+    found = copy_slices(DATA, np.array([10, 15, 20]), np.array([5, 5, 1]))
     assert np.shares_memory(found, DATA)
     assert found.tobytes() == DATA[10:21].tobytes()
