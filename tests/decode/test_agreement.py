@@ -162,7 +162,7 @@ def same_located(one: LocatedMessages, other: LocatedMessages) -> bool:
 
 @RELAXED
 @given(case=messages(), data=st.data(), few=st.integers(0, 3))
-def test_every_way_of_walking_finds_the_same_places(
+def test_locate_all_methods_return_equal_offsets(
     batch_of: BatchOf, case: tuple[Definition, Encoding, list[bytes]], data: st.DataObject, few: int
 ) -> None:
     definition, encoding, payloads = case

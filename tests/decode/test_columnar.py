@@ -40,7 +40,7 @@ def text(value: bytes, order: str = "<") -> bytes:
     return (LITTLE if order == "<" else BIG) + struct.pack(f"{order}I", len(value) + 1) + value + b"\0"
 
 
-def test_a_lying_length_costs_its_row_and_allocates_nothing(assert_agree: AssertAgree) -> None:
+def test_columnar_wrong_length_rejects_only_its_row(assert_agree: AssertAgree) -> None:
     numbers = message(Field("v", "float64", container=Container.SEQUENCE))
     lie = LITTLE + struct.pack("<I", 2**32 - 1)
     good = Serializer(numbers, Encoding.CDR).from_dict({"v": [1.0, 2.0]})
@@ -49,7 +49,7 @@ def test_a_lying_length_costs_its_row_and_allocates_nothing(assert_agree: Assert
     assert decoded.rows.field("v").to_pylist() == [[1.0, 2.0]] * 40
 
 
-def test_a_message_that_breaks_inside_a_loop_leaves_the_others_alone(assert_agree: AssertAgree) -> None:
+def test_columnar_invalid_loop_element_rejects_only_its_row(assert_agree: AssertAgree) -> None:
     names = message(Field("v", "string", container=Container.SEQUENCE), Field("end", "uint32"))
     serializer = Serializer(names, Encoding.CDR)
     good = [serializer.from_dict({"v": ["ab"] * (number % 7), "end": number}) for number in range(60)]
@@ -59,7 +59,7 @@ def test_a_message_that_breaks_inside_a_loop_leaves_the_others_alone(assert_agre
     assert decoded.rows.field("end").to_pylist() == list(range(60))
 
 
-def test_both_byte_orders_may_come_in_one_batch(assert_agree: AssertAgree) -> None:
+def test_columnar_both_byte_orders_in_one_block(assert_agree: AssertAgree) -> None:
     payloads = [text(b"a"), text(b"bcd", ">"), text(b""), text(b"e", ">")] * 10
     decoded = assert_agree(payloads, STRING, Encoding.CDR)
     assert decoded.rows.field("data").to_pylist() == ["a", "bcd", "", "e"] * 10
@@ -80,7 +80,7 @@ def test_both_byte_orders_may_come_in_one_batch(assert_agree: AssertAgree) -> No
     ],
 )
 @pytest.mark.parametrize("others", [2, 50])
-def test_a_bad_message_fails_by_the_rule_it_breaks(
+def test_columnar_invalid_message_has_rule(
     assert_agree: AssertAgree, payload: bytes, rule: str, others: int
 ) -> None:
     good = [text(b"x" * (number % 3)) for number in range(others)]
@@ -88,13 +88,13 @@ def test_a_bad_message_fails_by_the_rule_it_breaks(
     assert [(failure.row, failure.rule) for failure in decoded.failures] == [(others, rule)]
 
 
-def test_padding_and_a_few_zeros_after_a_message_are_no_failure(assert_agree: AssertAgree) -> None:
+def test_columnar_trailing_padding_is_accepted(assert_agree: AssertAgree) -> None:
     payloads = [text(b"a" * (number % 4)) + bytes(number % 8) for number in range(64)]
     decoded = assert_agree(payloads, STRING, Encoding.CDR)
     assert (len(decoded.rows), decoded.padded) == (64, 32)
 
 
-def test_a_tail_that_is_not_zero_is_found_among_messages_laid_out_alike(assert_agree: AssertAgree) -> None:
+def test_columnar_nonzero_tail_in_template_group_is_rejected(assert_agree: AssertAgree) -> None:
     payloads = [text(b"abc") + bytes(6)] * 40
     payloads[33] = text(b"abc") + bytes(5) + b"\1"
     payloads[34] = text(b"abc") + b"\1" + bytes(5)
@@ -102,7 +102,7 @@ def test_a_tail_that_is_not_zero_is_found_among_messages_laid_out_alike(assert_a
     assert [failure.row for failure in decoded.failures] == [33, 34]
 
 
-def test_text_outside_ascii_and_wide_text_with_surrogates_are_read(assert_agree: AssertAgree) -> None:
+def test_columnar_non_ascii_and_wide_text(assert_agree: AssertAgree) -> None:
     wide = message(Field("v", "wstring", container=Container.SEQUENCE))
     values = [["", "é"], ["𝄞 clef", "plain"], ["漢字"]] * 12
     payloads = [Serializer(wide, Encoding.CDR).from_dict({"v": value}) for value in values]
@@ -110,23 +110,23 @@ def test_text_outside_ascii_and_wide_text_with_surrogates_are_read(assert_agree:
     assert not assert_agree([text("é漢𝄞".encode())] * 20, STRING, Encoding.CDR).failures
 
 
-def test_any_byte_but_zero_is_true(assert_agree: AssertAgree) -> None:
+def test_bool_nonzero_byte_is_true(assert_agree: AssertAgree) -> None:
     flag = message(Field("v", "bool"))
     decoded = assert_agree([LITTLE + bytes([value]) for value in range(256)], flag, Encoding.CDR)
     assert decoded.rows.field("v").to_pylist() == [False] + [True] * 255
 
 
-def test_a_message_without_fields_still_counts_as_a_row(assert_agree: AssertAgree) -> None:
+def test_columnar_message_without_fields_is_a_row(assert_agree: AssertAgree) -> None:
     empty = message()
     assert len(assert_agree([LITTLE, LITTLE + b"\0", LITTLE + bytes(4)], empty, Encoding.CDR).rows) == 3
     assert len(assert_agree([b"", b"", b"\0"], empty, Encoding.ROS1).rows) == 2
 
 
-def test_an_empty_batch_has_no_rows(assert_agree: AssertAgree) -> None:
+def test_columnar_empty_block_has_no_rows(assert_agree: AssertAgree) -> None:
     assert len(assert_agree([], STRING, Encoding.CDR).rows) == 0
 
 
-def test_payloads_may_lie_in_the_buffer_in_any_order(batch_of: BatchOf) -> None:
+def test_columnar_payloads_in_any_buffer_order(batch_of: BatchOf) -> None:
     batch = batch_of([text(bytes([97 + number] * (number % 5))) for number in range(26)])
     mixed = np.random.default_rng(3).permutation(26)
     shuffled = replace(batch, starts=batch.starts[mixed], lengths=batch.lengths[mixed])
@@ -135,7 +135,7 @@ def test_payloads_may_lie_in_the_buffer_in_any_order(batch_of: BatchOf) -> None:
     assert decoder.decode(shuffled).rows.field("data").to_pylist() == expected.tolist()
 
 
-def test_a_single_blob_is_not_copied(batch_of: BatchOf) -> None:
+def test_columnar_single_blob_is_not_copied(batch_of: BatchOf) -> None:
     blob = np.random.default_rng(2).bytes(100_000)
     value = {"header": {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "c"}, "format": "jpeg", "data": blob}
     batch = batch_of([Serializer(IMAGE, Encoding.CDR).from_dict(value)])
@@ -144,9 +144,7 @@ def test_a_single_blob_is_not_copied(batch_of: BatchOf) -> None:
     assert np.shares_memory(np.frombuffer(data.buffers()[2], np.uint8), batch.data)
 
 
-def test_parts_that_fit_no_column_together_ask_for_smaller_batches(
-    batch_of: BatchOf, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_columnar_column_overflow_raises(batch_of: BatchOf, monkeypatch: pytest.MonkeyPatch) -> None:
     def overflow(_: object) -> None:
         raise pa.ArrowInvalid("offset overflow while concatenating arrays")
 
@@ -170,7 +168,7 @@ def connection(encoding: Encoding, definition: Definition | None) -> Connection:
     )
 
 
-def test_a_connection_that_cannot_be_decoded_says_why() -> None:
+def test_decoder_for_undecodable_connection_raises() -> None:
     with pytest.raises(DecodeError, match=r"/t: the messages are not in a ROS encoding \(json\)"):
         decoder_for(connection(Encoding.OTHER, STRING))
     with pytest.raises(DecodeError, match="/t: no definition of a/msg/B: no text"):
@@ -179,7 +177,7 @@ def test_a_connection_that_cannot_be_decoded_says_why() -> None:
 
 
 @pytest.mark.parametrize("largest", [40, 64, 100, 10_000])
-def test_a_batch_too_large_for_a_column_is_decoded_in_parts(
+def test_columnar_block_too_large_is_split(
     largest: int, batch_of: BatchOf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     payloads = [text(b"x" * (number % 30)) for number in range(200)]
@@ -194,7 +192,7 @@ def test_a_batch_too_large_for_a_column_is_decoded_in_parts(
     assert [failure.row for failure in whole.failures] == [60, 120]
 
 
-def test_a_message_too_large_for_a_column_costs_its_row(
+def test_columnar_message_too_large_rejects_its_row(
     batch_of: BatchOf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     batch = batch_of([text(b"ab"), text(b"x" * 500), text(b"cd")])

@@ -33,13 +33,13 @@ def layout_of(
     return compile_layout(Definition(root.name, types, Source.BAG, "", 2), encoding)
 
 
-def test_an_imu_message_is_two_blocks_around_a_text() -> None:
+def test_layout_imu_is_two_blocks_around_a_text() -> None:
     definition = TypeResolver(Stores.ROS2_HUMBLE).resolve("sensor_msgs/msg/Imu", None, ros_version=2)
     layout = compile_layout(definition, Encoding.CDR)
     assert layout.body.steps == (FixedBlock(8, 8), Text(1, has_nul=True), FixedBlock(8, 37 * 8))
 
 
-def test_a_new_block_begins_where_the_padding_depends_on_the_message() -> None:
+def test_layout_variable_padding_starts_new_block() -> None:
     layout = layout_of(
         Field("name", "string"), Field("a", "uint8"), Field("b", "uint32"), Field("c", "uint8")
     )
@@ -54,19 +54,19 @@ def test_a_new_block_begins_where_the_padding_depends_on_the_message() -> None:
     )
 
 
-def test_a_message_begins_aligned_so_that_its_first_block_spans_the_padding() -> None:
+def test_layout_first_block_includes_padding() -> None:
     layout = layout_of(Field("a", "uint8"), Field("b", "float64"))
     assert layout.body.steps == (FixedBlock(8, 16),)
     assert layout.record.children[1] == NumberColumn(0, 8, "float64")
 
 
-def test_ros1_has_no_padding() -> None:
+def test_layout_ros1_has_no_padding() -> None:
     layout = layout_of(Field("a", "uint8"), Field("b", "float64"), encoding=Encoding.ROS1)
     assert layout.body.steps == (FixedBlock(8, 9),)
     assert layout.record.children[1] == NumberColumn(0, 1, "float64")
 
 
-def test_structs_of_fixed_size_run_and_others_loop() -> None:
+def test_layout_fixed_structs_are_runs_and_others_loops() -> None:
     point = MessageType("test/msg/Point", (Field("x", "float64"), Field("ok", "bool")))
     named = MessageType("test/msg/Named", (Field("name", "string"),))
     layout = layout_of(
@@ -83,7 +83,7 @@ def test_structs_of_fixed_size_run_and_others_loop() -> None:
     )
 
 
-def test_a_struct_whose_size_depends_on_where_it_begins_is_walked() -> None:
+def test_layout_struct_with_variable_padding_is_a_loop() -> None:
     odd = MessageType("test/msg/Odd", (Field("a", "uint8"), Field("b", "float64")))
     layout = layout_of(Field("odd", odd.name, is_message=True, container=Container.SEQUENCE), others=(odd,))
     (loop,) = layout.body.steps
@@ -91,7 +91,7 @@ def test_a_struct_whose_size_depends_on_where_it_begins_is_walked() -> None:
     assert loop.body.steps == (FixedBlock(1, 1), FixedBlock(8, 8))
 
 
-def test_arrays_of_fixed_size_are_grids_within_one_block() -> None:
+def test_layout_fixed_arrays_are_inside_one_block() -> None:
     point = MessageType("test/msg/Point", (Field("xy", "float32", container=Container.ARRAY, size=2),))
     layout = layout_of(
         Field("points", point.name, is_message=True, container=Container.ARRAY, size=3), others=(point,)

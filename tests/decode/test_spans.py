@@ -22,7 +22,7 @@ def slow_spans(at: list[int], sizes: list[int]) -> bytes:
 
 @pytest.mark.parametrize("largest", [4, 300, 20_000])
 @given(data=st.data())
-def test_spans_are_the_bytes_of_each_span_in_order(data: st.DataObject, largest: int) -> None:
+def test_copy_slices_returns_bytes_in_order(data: st.DataObject, largest: int) -> None:
     pairs = data.draw(st.lists(st.tuples(st.integers(0, 40_000), st.integers(0, largest)), max_size=20))
     at, sizes = [start for start, _ in pairs], [size for _, size in pairs]
     found = copy_slices(DATA, np.array(at, np.int64), np.array(sizes, np.int64))
@@ -30,7 +30,7 @@ def test_spans_are_the_bytes_of_each_span_in_order(data: st.DataObject, largest:
 
 
 @given(pairs=st.lists(st.tuples(st.integers(0, 40_000), st.integers(0, 300)), max_size=20))
-def test_spans_far_apart_are_found_without_reserving_what_lies_between(pairs: list[tuple[int, int]]) -> None:
+def test_copy_slices_distant_slices_are_copied_without_take(pairs: list[tuple[int, int]]) -> None:
     at, sizes = [start for start, _ in pairs], [size for _, size in pairs]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gather, "_FAR_BYTES", 100)
@@ -43,15 +43,13 @@ def bytes_of(found: Cells, size: int) -> bytes:
 
 
 @given(at=st.lists(st.integers(0, 50_000), max_size=20), size=st.integers(1, 5000))
-def test_cells_are_the_bytes_at_each_position(at: list[int], size: int) -> None:
+def test_fixed_cells_returns_bytes_at_offsets(at: list[int], size: int) -> None:
     found = fixed_cells(DATA, np.array(at, np.int64), size)
     assert bytes_of(found, size) == slow_spans(at, [size] * len(at))
 
 
 @given(st.integers(0, 9000), st.integers(1, 500), st.integers(1, 90), st.integers(1, 5000))
-def test_cells_equally_far_from_each_other_are_not_copied(
-    begin: int, stride: int, count: int, size: int
-) -> None:
+def test_fixed_cells_equidistant_offsets_are_a_view(begin: int, stride: int, count: int, size: int) -> None:
     at = begin + stride * np.arange(count)
     found = fixed_cells(DATA, at, size)
     assert np.shares_memory(found.data, DATA)
@@ -60,11 +58,11 @@ def test_cells_equally_far_from_each_other_are_not_copied(
     assert copy_slices(DATA, at, np.full(count, size)).tobytes() == bytes_of(found, size)
 
 
-def test_cells_without_a_byte_read_none() -> None:
+def test_fixed_cells_of_size_zero_read_nothing() -> None:
     assert fixed_cells(DATA, np.zeros(0, np.int64), 8).numbers(np.dtype("<u4"), 4).size == 0
 
 
-def test_spans_that_follow_each_other_are_not_copied() -> None:
+def test_copy_slices_adjacent_slices_are_a_view() -> None:
     found = copy_slices(DATA, np.array([10, 15, 20]), np.array([5, 5, 1]))
     assert np.shares_memory(found, DATA)
     assert found.tobytes() == DATA[10:21].tobytes()

@@ -79,7 +79,7 @@ ENCODINGS = st.sampled_from((Encoding.CDR, Encoding.ROS1))
     encoding=ENCODINGS,
     data=st.data(),
 )
-def test_messages_of_elements_that_are_alike_for_a_while_agree_with_rows(
+def test_speculation_equal_elements_then_others_agree_with_rowwise(
     assert_agree: AssertAgree,
     messages: list[list[tuple[str, list[str], int]]],
     copies: int,
@@ -103,7 +103,7 @@ def test_messages_of_elements_that_are_alike_for_a_while_agree_with_rows(
 
 @pytest.mark.parametrize("messages", [1, 40])
 @pytest.mark.parametrize("encoding", [Encoding.CDR, Encoding.ROS1])
-def test_long_sequences_of_equal_elements_take_few_steps(
+def test_speculation_long_equal_sequences_take_few_steps(
     monkeypatch: pytest.MonkeyPatch, batch_of: BatchOf, messages: int, encoding: Encoding
 ) -> None:
     steps: list[int] = []

@@ -63,7 +63,7 @@ def types_of(distro: Stores, version: int) -> Iterator[Definition]:
     ("distro", "version", "encoding"),
     [(Stores.ROS2_HUMBLE, 2, Encoding.CDR), (Stores.ROS1_NOETIC, 1, Encoding.ROS1)],
 )
-def test_every_standard_type_decodes_the_same_both_ways(
+def test_standard_types_decode_equally_columnar_and_rowwise(
     assert_agree: AssertAgree, distro: Stores, version: int, encoding: Encoding
 ) -> None:
     for definition in types_of(distro, version):
@@ -86,9 +86,7 @@ def batches_of(corpus: Path) -> Iterator[tuple[Connection, MessageBlock]]:
 
 
 @pytest.mark.slow
-def test_every_message_of_the_real_recordings_decodes_the_same_both_ways(
-    corpus: Path, assert_same: AssertSame
-) -> None:
+def test_corpus_messages_decode_equally_columnar_and_rowwise(corpus: Path, assert_same: AssertSame) -> None:
     messages = 0
     for connection, batch in batches_of(corpus):
         try:

@@ -39,19 +39,19 @@ def clusters_of(batch_of: BatchOf, values: Sequence[Sequence[str]]) -> list[Loca
     return locate_by_template(compile_layout(NAMES, Encoding.CDR), payloads)
 
 
-def test_messages_with_equal_lengths_everywhere_are_one_cluster(batch_of: BatchOf) -> None:
+def test_template_equal_lengths_are_one_group(batch_of: BatchOf) -> None:
     (cluster,) = clusters_of(batch_of, [["left", "right"] * 5, ["LEFT", "RIGHT"] * 5] * 50)
     assert cluster.rows.tolist() == list(range(100))
 
 
-def test_messages_of_one_size_but_other_lengths_are_told_apart(batch_of: BatchOf) -> None:
+def test_template_equal_size_different_lengths_are_separate_groups(batch_of: BatchOf) -> None:
     one, other = ["ab", "abcdef"] * 5, ["abcdef", "ab"] * 5
     clusters = clusters_of(batch_of, [one, other, other] * 50)
     found = sorted(cluster.rows.tolist() for cluster in clusters)
     assert found == [list(range(0, 150, 3)), [row for row in range(150) if row % 3]]
 
 
-def test_messages_that_are_all_laid_out_differently_are_left_alone(batch_of: BatchOf) -> None:
+def test_template_different_layouts_are_omitted(batch_of: BatchOf) -> None:
     random = np.random.default_rng(4)
     values = [["x" * size for size in random.integers(0, 40, 6).tolist()] for _ in range(300)]
     assert clusters_of(batch_of, values) == []

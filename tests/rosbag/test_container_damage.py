@@ -39,7 +39,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory, recordings: Any) -> dict[str
 @pytest.mark.parametrize("kind", KINDS)
 @settings(max_examples=60, deadline=20_000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_any_damage_gives_batches_losses_or_a_bag_error(
+def test_open_any_damage_yields_blocks_or_raises_bag_error(
     tmp_path: Path, whole: dict[str, Path], recordings: Any, kind: str, data: st.DataObject
 ) -> None:
     content = bytearray(whole[kind].read_bytes())
@@ -61,7 +61,7 @@ def test_any_damage_gives_batches_losses_or_a_bag_error(
 
 
 @pytest.mark.parametrize("kind", ["mcap", "mcap plain", "mcap bare", "ros1"])
-def test_a_file_cut_off_anywhere_gives_what_is_left_and_says_so(
+def test_open_truncated_file_yields_remaining_messages_and_unreadable_range(
     tmp_path: Path, whole: dict[str, Path], recordings: Any, kind: str
 ) -> None:
     content = whole[kind].read_bytes()
@@ -80,7 +80,7 @@ def test_a_file_cut_off_anywhere_gives_what_is_left_and_says_so(
     assert most > len(everything) // 2
 
 
-def test_a_broken_chunk_costs_its_messages_and_no_others(tmp_path: Path, recordings: Any) -> None:
+def test_mcap_broken_chunk_is_unreadable_and_others_are_read(tmp_path: Path, recordings: Any) -> None:
     messages = recordings.sent(60)
     path = recordings.mcap(tmp_path / "a", messages, chunk_messages=20, compression="")
     content = bytearray(path.read_bytes())
@@ -98,7 +98,7 @@ def test_a_broken_chunk_costs_its_messages_and_no_others(tmp_path: Path, recordi
         assert lost == {message.topic for message in messages[20:40]}
 
 
-def test_an_index_that_lies_is_not_believed(tmp_path: Path, recordings: Any) -> None:
+def test_mcap_wrong_message_index_scans_chunk(tmp_path: Path, recordings: Any) -> None:
     messages = recordings.sent(60)
     path = recordings.mcap(tmp_path / "b", messages, chunk_messages=20, compression="")
     content = bytearray(path.read_bytes())
@@ -110,7 +110,7 @@ def test_an_index_that_lies_is_not_believed(tmp_path: Path, recordings: Any) -> 
         assert [loss.count for loss in recording.unreadable] == [0]
 
 
-def test_a_bag_without_index_is_read_record_by_record(tmp_path: Path, recordings: Any) -> None:
+def test_ros1_bag_without_index_is_read_completely(tmp_path: Path, recordings: Any) -> None:
     messages = recordings.sent(60, cdr=False)
     path = recordings.ros1(tmp_path / "c.bag", messages)
     content = bytearray(path.read_bytes())
@@ -124,7 +124,7 @@ def test_a_bag_without_index_is_read_record_by_record(tmp_path: Path, recordings
         assert "unreadable-range" in [finding.rule for finding in recording.findings]
 
 
-def test_a_lying_length_word_allocates_nothing(tmp_path: Path, recordings: Any) -> None:
+def test_mcap_wrong_chunk_size_is_unreadable(tmp_path: Path, recordings: Any) -> None:
     path = recordings.mcap(tmp_path / "d", recordings.sent(20), chunk_messages=20, compression="zstd")
     content = bytearray(path.read_bytes())
     chunk = content.index(b"\x06", len(b"\x89MCAP0\r\n") + 9 + 4 + 4 + 4)
@@ -136,7 +136,7 @@ def test_a_lying_length_word_allocates_nothing(tmp_path: Path, recordings: Any) 
         assert "1099511627776 bytes announced" in recording.unreadable[0].reason
 
 
-def test_damaged_database_pages_are_stepped_over(tmp_path: Path, recordings: Any) -> None:
+def test_sqlite_damaged_page_is_skipped_and_reported(tmp_path: Path, recordings: Any) -> None:
     messages = recordings.sent(600)
     folder = recordings.rosbag2(tmp_path / "e", messages, storage="sqlite3")
     path = next(folder.glob("*.db3"))
@@ -157,9 +157,7 @@ def test_damaged_database_pages_are_stepped_over(tmp_path: Path, recordings: Any
 
 
 @pytest.mark.parametrize("share", [0.5, 0.9, 0.99])
-def test_a_database_that_is_cut_off_gives_the_rows_that_are_left(
-    tmp_path: Path, recordings: Any, share: float
-) -> None:
+def test_sqlite_truncated_file_yields_remaining_rows(tmp_path: Path, recordings: Any, share: float) -> None:
     messages = recordings.sent(600)
     path = next(recordings.rosbag2(tmp_path / "l", messages, storage="sqlite3").glob("*.db3"))
     content = path.read_bytes()
@@ -171,7 +169,7 @@ def test_a_database_that_is_cut_off_gives_the_rows_that_are_left(
         assert any("rows are missing" in loss.reason for loss in recording.unreadable)
 
 
-def test_changes_still_in_the_log_are_read_and_nothing_is_written(tmp_path: Path, recordings: Any) -> None:
+def test_sqlite_pending_wal_is_replayed_on_a_copy(tmp_path: Path, recordings: Any) -> None:
     messages = recordings.sent(40)
     folder = recordings.rosbag2(tmp_path / "f", messages, storage="sqlite3")
     path = next(folder.glob("*.db3"))
@@ -190,7 +188,7 @@ def test_changes_still_in_the_log_are_read_and_nothing_is_written(tmp_path: Path
     assert {file.name: (file.read_bytes(), file.stat().st_mtime_ns) for file in live.iterdir()} == before
 
 
-def test_a_database_without_log_is_not_touched(tmp_path: Path, recordings: Any) -> None:
+def test_sqlite_read_only_file_is_not_modified(tmp_path: Path, recordings: Any) -> None:
     folder = recordings.rosbag2(tmp_path / "g", recordings.sent(40), storage="sqlite3")
     path = next(folder.glob("*.db3"))
     with sqlite3.connect(path) as writer:
@@ -210,7 +208,7 @@ def test_a_database_without_log_is_not_touched(tmp_path: Path, recordings: Any) 
         ("UPDATE messages SET topic_id = 77 WHERE id = 3", "connection 77"),
     ],
 )
-def test_a_row_that_makes_no_sense_costs_a_row(
+def test_sqlite_row_with_wrong_types_is_unreadable(
     tmp_path: Path, recordings: Any, statement: str, reason: str
 ) -> None:
     folder = recordings.rosbag2(tmp_path / "h", recordings.sent(40), storage="sqlite3")
@@ -223,7 +221,7 @@ def test_a_row_that_makes_no_sense_costs_a_row(
         assert [(loss.count, reason in loss.reason) for loss in recording.unreadable] == [(1, True)]
 
 
-def test_a_message_that_does_not_decompress_costs_a_message(tmp_path: Path, recordings: Any) -> None:
+def test_compressed_message_damaged_is_unreadable(tmp_path: Path, recordings: Any) -> None:
     messages = recordings.sent(30)
     packed = [m._replace(payload=zstandard.compress(m.payload)) for m in messages]
     packed[7] = packed[7]._replace(payload=packed[7].payload[:-5])
@@ -233,7 +231,7 @@ def test_a_message_that_does_not_decompress_costs_a_message(tmp_path: Path, reco
         assert [loss.count for loss in recording.unreadable] == [1]
 
 
-def test_times_after_2262_are_lost_messages(tmp_path: Path, recordings: Any) -> None:
+def test_log_time_beyond_int64_is_unreadable(tmp_path: Path, recordings: Any) -> None:
     messages = recordings.sent(30)
     late = messages[29]._replace(time_ns=2**63 + 5)
     path = recordings.mcap(tmp_path / "j", [*messages[:29], late], summary=False)
@@ -243,9 +241,7 @@ def test_times_after_2262_are_lost_messages(tmp_path: Path, recordings: Any) -> 
 
 
 @pytest.mark.parametrize("kind", ["mcap zstd", "mcap lz4", "mcap plain", "ros1", "ros1 lz4"])
-def test_without_index_a_hole_in_the_middle_costs_what_lies_in_it(
-    tmp_path: Path, recordings: Any, kind: str
-) -> None:
+def test_walk_zeroed_range_resumes_at_next_chunk(tmp_path: Path, recordings: Any, kind: str) -> None:
     messages, path = recordings.sent(400), tmp_path / "k"
     if kind.startswith("mcap"):
         compression = kind.split()[1].replace("plain", "")

@@ -51,41 +51,41 @@ def refused(text: str, payload: bytes, encoding: Encoding = Encoding.CDR) -> Dec
 
 
 class TestValues:
-    def test_cdr_aligns_each_field_to_its_size_counted_behind_the_header(self) -> None:
+    def test_cdr_fields_are_aligned_relative_to_header_end(self) -> None:
         body = struct.pack("<b7xdb3xi", 1, 2.5, 3, 4)
         assert cdr("int8 a\nfloat64 b\nint8 c\nint32 d", body) == {"a": 1, "b": 2.5, "c": 3, "d": 4}
 
-    def test_ros_1_is_packed(self) -> None:
+    def test_ros1_fields_are_packed(self) -> None:
         assert ros1("int8 a\nfloat64 b", struct.pack("<bd", 1, 2.5)) == {"a": 1, "b": 2.5}
 
-    def test_big_endian_is_read(self) -> None:
+    def test_cdr_big_endian_is_decoded(self) -> None:
         assert cdr("int32 a\nuint16[] b", struct.pack(">iI2H", 1, 2, 3, 4), BIG) == {"a": 1, "b": [3, 4]}
 
-    def test_byte_sequences_are_bytes_and_fixed_arrays_lists(self) -> None:
+    def test_byte_sequence_is_bytes_and_fixed_array_is_list(self) -> None:
         body = struct.pack("<I3s2B", 3, b"abc", 1, 2)
         assert cdr("uint8[] a\nuint8[2] b", body) == {"a": b"abc", "b": [1, 2]}
 
-    def test_an_empty_sequence_is_not_aligned(self) -> None:
+    def test_cdr_empty_sequence_is_not_aligned(self) -> None:
         assert cdr("float64[] a\nint32 b", struct.pack("<Ii", 0, 7)) == {"a": [], "b": 7}
 
-    def test_any_byte_but_zero_is_true(self) -> None:
+    def test_bool_nonzero_byte_is_true(self) -> None:
         assert cdr("bool a\nbool[2] b", b"\x02\x00\xff") == {"a": True, "b": [False, True]}
 
-    def test_keyword_field_names_stay(self) -> None:
+    def test_field_named_like_keyword_keeps_its_name(self) -> None:
         assert cdr("int8 from\nint8 class", b"\1\2") == {"from": 1, "class": 2}
 
-    def test_a_wide_string_is_32_bit_units(self) -> None:
+    def test_wstring_is_decoded_from_32_bit_units(self) -> None:
         units = struct.pack("<I4I", 4, ord("é"), 0xD83D, 0xDE00, ord("a"))
         assert cdr("wstring w", units) == {"w": "é😀a"}
 
-    def test_a_string_of_no_bytes_is_empty_also_without_a_terminator(self) -> None:
+    def test_string_of_size_zero_is_empty(self) -> None:
         assert cdr("string s", struct.pack("<I", 0)) == {"s": ""}
 
     @pytest.mark.parametrize("body", [b"", b"\0", b"\0\0\0\0"])
-    def test_a_message_without_fields_is_an_empty_dict(self, body: bytes) -> None:
+    def test_message_without_fields_is_empty_dict(self, body: bytes) -> None:
         assert cdr("# nothing", body) == {}
 
-    def test_a_structure_without_fields_is_one_byte_inside_a_cdr_message(self) -> None:
+    def test_cdr_nested_empty_message_takes_one_byte(self) -> None:
         text = "E e\nint8 a\n" + "=" * 80 + "\nMSG: mine/E\n"
         assert cdr(text, b"\0\5") == {"e": {}, "a": 5}
         assert ros1(text, b"\5") == {"e": {}, "a": 5}
@@ -93,21 +93,21 @@ class TestValues:
 
 class TestTails:
     @pytest.mark.parametrize("tail", [b"", b"\1", b"\1\2", b"\1\2\3"])
-    def test_up_to_three_bytes_of_padding_are_fine(self, tail: bytes) -> None:
+    def test_cdr_three_trailing_bytes_are_accepted(self, tail: bytes) -> None:
         assert cdr("int8 a", b"\5" + tail) == {"a": 5}
 
-    def test_four_to_seven_zero_bytes_are_counted(self) -> None:
+    def test_cdr_four_to_seven_trailing_zeros_are_counted(self) -> None:
         reader = Deserializer(definition("int32 a"), Encoding.CDR)
         assert reader.to_dict(LITTLE + struct.pack("<i", 5) + bytes(7)) == {"a": 5}
         assert reader.padded == 1
 
     @pytest.mark.parametrize("tail", [b"\0\0\0\1", bytes(8)])
-    def test_more_is_a_definition_shorter_than_the_data(self, tail: bytes) -> None:
+    def test_cdr_more_trailing_bytes_raise(self, tail: bytes) -> None:
         error = refused("int32 a", LITTLE + bytes(4) + tail)
         assert error.rule == "trailing-bytes"
         assert f"shorter than the data by {len(tail)} bytes" in str(error)
 
-    def test_ros_1_ends_where_its_fields_end(self) -> None:
+    def test_ros1_trailing_bytes_raise(self) -> None:
         assert refused("int8 a", b"\0\0", Encoding.ROS1).rule == "trailing-bytes"
 
 
@@ -123,7 +123,7 @@ class TestRefusals:
             (b"\0\x0b\0\0\0", "xcdr2"),
         ],
     )
-    def test_other_encapsulations_are_named(self, payload: bytes, rule: str) -> None:
+    def test_cdr_unsupported_encapsulation_raises(self, payload: bytes, rule: str) -> None:
         assert refused("int8 a", payload).rule == rule
 
     @pytest.mark.parametrize(
@@ -144,19 +144,19 @@ class TestRefusals:
             ("int8[<=2] a", struct.pack("<I3b", 3, 1, 2, 3), "sequence-bound"),
         ],
     )
-    def test_a_length_is_checked_before_it_is_believed(self, text: str, body: bytes, rule: str) -> None:
+    def test_length_beyond_payload_raises(self, text: str, body: bytes, rule: str) -> None:
         assert refused(text, LITTLE + body).rule == rule
 
-    def test_ros_1_elements_of_no_size_do_not_run_away(self) -> None:
+    def test_ros1_empty_elements_are_limited(self) -> None:
         text = "E[] e\n" + "=" * 80 + "\nMSG: mine/E\n"
         assert refused(text, struct.pack("<I", 0xFFFFFFFF), Encoding.ROS1).rule == "sequence-length"
         assert ros1(text, struct.pack("<I", 3)) == {"e": [{}, {}, {}]}
 
-    def test_the_field_is_named_with_its_path(self) -> None:
+    def test_error_names_the_path_of_the_field(self) -> None:
         error = refused("std_msgs/Header header", LITTLE + struct.pack("<iII", 0, 0, 99))
         assert str(error).startswith("header.frame_id: a string of 99 bytes")
 
-    def test_a_distro_whose_definition_the_bytes_fit_is_named(self) -> None:
+    def test_error_suggests_distro_whose_definition_matches(self) -> None:
         header = {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "f"}
         values = {"header": header, "radiation_type": 0} | dict.fromkeys(
             ("field_of_view", "min_range", "max_range", "range", "variance"), 1.5
@@ -170,13 +170,13 @@ class TestRefusals:
         with pytest.raises(DecodeError, match="they would fit the definition of ros2_humble"):
             Deserializer(jazzy, Encoding.CDR).to_dict(Serializer(humble, Encoding.CDR).from_dict(values))
 
-    def test_a_value_that_does_not_fit_cannot_be_written(self) -> None:
+    def test_serialize_invalid_value_raises(self) -> None:
         writer = Serializer(definition("uint8 a\nint8[2] b"), Encoding.CDR)
         for values in ({"a": 256, "b": [1, 2]}, {"a": 1}, {"a": 1, "b": [1]}, {"a": "x", "b": [1, 2]}):
             with pytest.raises(BagError, match="do not fit mine/msg/X"):
                 writer.from_dict(values)
 
-    def test_payloads_of_other_encodings_have_no_reader(self) -> None:
+    def test_deserializer_other_encoding_raises(self) -> None:
         with pytest.raises(BagError):
             Deserializer(definition("int8 a"), Encoding.OTHER)
 
@@ -237,7 +237,7 @@ def unpacked(message: Any, name: str, known: Definition) -> dict[str, Any]:
 @pytest.mark.parametrize("encoding", list(DISTROS))
 @settings(deadline=None, max_examples=150)
 @given(data=st.data())
-def test_what_is_written_is_read_by_us_and_by_rosbags_alike(encoding: Encoding, data: st.DataObject) -> None:
+def test_serializer_output_is_decoded_equally_by_rosbags(encoding: Encoding, data: st.DataObject) -> None:
     store, definitions = standard(encoding)
     name = data.draw(st.sampled_from(sorted(definitions)))
     known = definitions[name]
@@ -275,9 +275,7 @@ def own_definitions(draw: st.DrawFn) -> str:
 @pytest.mark.parametrize("encoding", list(DISTROS))
 @settings(deadline=None, max_examples=60)
 @given(text=own_definitions(), data=st.data())
-def test_a_message_of_any_type_reads_back_as_it_was_written(
-    encoding: Encoding, text: str, data: st.DataObject
-) -> None:
+def test_serializer_any_type_round_trips(encoding: Encoding, text: str, data: st.DataObject) -> None:
     known = definition(text, 1 if encoding is Encoding.ROS1 else 2)
     assert definition(known.text, known.ros_version).types == known.types
     values = data.draw(messages_of(known, known.root))
@@ -289,7 +287,7 @@ def test_a_message_of_any_type_reads_back_as_it_was_written(
         Deserializer(known, encoding).fits(damaged)
 
 
-def test_not_a_number_survives() -> None:
+def test_serializer_nan_round_trips() -> None:
     payload = Serializer(definition("float64 a"), Encoding.CDR).from_dict({"a": math.nan})
     assert math.isnan(cdr("float64 a", payload[4:])["a"])
 
@@ -297,7 +295,9 @@ def test_not_a_number_survives() -> None:
 @pytest.mark.parametrize("encoding", list(DISTROS))
 @settings(deadline=None, max_examples=150)
 @given(data=st.data())
-def test_any_bytes_are_a_message_or_a_decode_error(encoding: Encoding, data: st.DataObject) -> None:
+def test_deserialize_any_bytes_returns_or_raises_decode_error(
+    encoding: Encoding, data: st.DataObject
+) -> None:
     _, definitions = standard(encoding)
     known = definitions[data.draw(st.sampled_from(sorted(definitions)))]
     body = data.draw(st.binary(max_size=300) | st.just(b"\xff" * 64))

@@ -11,17 +11,17 @@ from mosaico_ingest.rosbag.definitions.idl import message_type
 
 
 @pytest.mark.parametrize("distro", Stores)
-def test_every_type_of_a_distro_is_the_one_that_rosbags_has(distro: Stores) -> None:
+def test_distro_types_equal_those_of_rosbags(distro: Stores) -> None:
     types = get_typestore(RosbagsStores(distro.value)).fielddefs
     for name in types if distro is not Stores.EMPTY else ():
         assert distro_type(distro, name) == message_type(name, types)
 
 
-def test_a_type_that_a_distro_lacks_is_not_there_though_another_has_it() -> None:
+def test_distro_type_of_another_distro_is_none() -> None:
     assert distro_type(Stores.ROS1_NOETIC, "rcl_interfaces/msg/Log") is None
     assert distro_type(Stores.EMPTY, "std_msgs/msg/Header") is None
     assert distro_type(Stores.LATEST, "Header") is None
 
 
-def test_the_file_of_types_is_up_to_date() -> None:
+def test_distros_file_is_up_to_date() -> None:
     assert FILE.read_text(encoding="utf-8") == distros_file(), "run ./dev docs"

@@ -56,7 +56,7 @@ def bag(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
     return path
 
 
-def test_messages_come_in_the_order_they_were_recorded(bag: Path) -> None:
+def test_loader_yields_messages_by_log_time(bag: Path) -> None:
     with ROSLoader(bag) as loader:
         messages = list(loader)
     times = [message.timestamp_ns for message in messages]
@@ -65,14 +65,14 @@ def test_messages_come_in_the_order_they_were_recorded(bag: Path) -> None:
     assert loader.rejected == {"/text": 1}
 
 
-def test_a_message_is_its_fields_by_name(bag: Path) -> None:
+def test_loader_message_has_fields_by_name(bag: Path) -> None:
     with ROSLoader(bag, topics="/mine") as loader:
         (message,) = loader
     assert message == ROSMessage(3 * SECOND, "/mine", "mine/msg/Own", {"blob": b"abc", "from": 7})
     assert message.header is None
 
 
-def test_the_header_is_read_where_there_is_one(bag: Path) -> None:
+def test_message_header_is_parsed_or_none(bag: Path) -> None:
     with ROSLoader(bag, topics=["/point"]) as loader:
         message = next(iter(loader))
     assert message.header == ROSHeader(stamp_ns=5, frame_id="map")
@@ -82,7 +82,7 @@ def test_the_header_is_read_where_there_is_one(bag: Path) -> None:
 
 
 @pytest.mark.parametrize("max_bytes", [1, 50, 200])
-def test_stretches_too_large_to_hold_are_halved(bag: Path, max_bytes: int) -> None:
+def test_time_slices_beyond_limit_are_halved(bag: Path, max_bytes: int) -> None:
     with open_recording(bag, resolve=TypeResolver()) as recording:
         ids = [connection.id for connection in recording.connections]
         stretches = [batches for batches in time_slices(recording, ids, max_bytes=max_bytes) if batches]
@@ -92,13 +92,13 @@ def test_stretches_too_large_to_hold_are_halved(bag: Path, max_bytes: int) -> No
         assert all(max(earlier) < min(later) for earlier, later in pairwise(times))
 
 
-def test_a_loader_can_be_iterated_again(bag: Path) -> None:
+def test_loader_iterates_repeatedly(bag: Path) -> None:
     with ROSLoader(bag) as loader:
         assert list(loader) == list(loader)
         assert loader.rejected == {"/text": 1}
 
 
-def test_it_says_what_it_holds(bag: Path) -> None:
+def test_loader_reports_topics_types_counts_and_duration(bag: Path) -> None:
     with ROSLoader(bag, topics=["!/mine"]) as loader:
         assert loader.topics == ["/point", "/text"]
         assert loader.msg_types == [POINT, STRING]
@@ -108,30 +108,30 @@ def test_it_says_what_it_holds(bag: Path) -> None:
             loader.msg_count("/mine")
 
 
-def test_patterns_that_select_nothing_name_the_nearest_topics(bag: Path) -> None:
+def test_loader_unmatched_pattern_raises_with_nearest_topics(bag: Path) -> None:
     with pytest.raises(NothingMatched, match=r"no topic matches /pint .* nearest: /point"):
         ROSLoader(bag, topics=["/pint"])
 
 
 class TestPolicies:
-    def test_raise_ends_at_the_first_broken_message(self, bag: Path) -> None:
+    def test_policy_raise_stops_at_first_invalid_message(self, bag: Path) -> None:
         with ROSLoader(bag, error_policy=LoaderErrorPolicy.RAISE) as loader:
             with pytest.raises(DecodeError, match=r"^/text at 8000000000 ns: data: ") as caught:
                 list(loader)
             assert caught.value.rule == "string-length"
 
-    def test_raise_says_what_the_bytes_would_fit(self, bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_policy_raise_keeps_the_hint(self, bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(Deserializer, "_remedy", lambda *_: "they would fit the definition of ros2_iron")
         loader = ROSLoader(bag, error_policy=LoaderErrorPolicy.RAISE)
         with loader, pytest.raises(DecodeError, match="they would fit the definition of ros2_iron"):
             list(loader)
 
-    def test_log_warn_says_so_and_goes_on(self, bag: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def test_policy_log_warn_logs_and_continues(self, bag: Path, caplog: pytest.LogCaptureFixture) -> None:
         with caplog.at_level(logging.WARNING, "mosaico_ingest.rosbag"), ROSLoader(bag) as loader:
             list(loader)
         assert "/text: 1 messages could not be read" in caplog.messages
 
-    def test_ignore_only_counts(self, bag: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def test_policy_ignore_counts_silently(self, bag: Path, caplog: pytest.LogCaptureFixture) -> None:
         with ROSLoader(bag, error_policy="ignore") as loader:
             list(loader)
         assert (caplog.messages, loader.rejected["/text"]) == ([], 1)
@@ -156,27 +156,27 @@ class TestDefinitions:
         connection.close()
         return path
 
-    def test_an_unknown_type_costs_its_topic_only(self, old_bag: Path) -> None:
+    def test_unknown_type_rejects_only_its_topic(self, old_bag: Path) -> None:
         with ROSLoader(old_bag, error_policy="ignore") as loader:
             assert [message.topic for message in loader] == ["/text"]
             assert loader.rejected == {"/mine": 1}
             assert any(finding.rule == "assumed-definition" for finding in loader.findings)
 
-    def test_under_raise_it_is_an_error_that_says_what_is_missing(self, old_bag: Path) -> None:
+    def test_unknown_type_with_policy_raise_raises(self, old_bag: Path) -> None:
         with (
             ROSLoader(old_bag, error_policy="raise") as loader,
             pytest.raises(BagError, match=r"^/mine: .*mine/msg/Own.*searched"),
         ):
             list(loader)
 
-    def test_custom_types_are_used(self, old_bag: Path) -> None:
+    def test_custom_types_define_the_type(self, old_bag: Path) -> None:
         with ROSLoader(
             old_bag, ["/mine"], Stores.ROS2_HUMBLE, custom_types={"mine/msg/Own": "int8 x"}
         ) as loader:
             assert [message.data for message in loader] == [{"x": 5}]
 
 
-def test_ros_1_is_read_the_same_way(tmp_path: Path) -> None:
+def test_loader_reads_ros1_bag(tmp_path: Path) -> None:
     path = tmp_path / "one.bag"
     store = get_typestore(RosbagsStores.ROS1_NOETIC)
     known = TypeResolver(Stores.ROS1_NOETIC).resolve("std_msgs/Header", None, ros_version=1)
@@ -188,6 +188,6 @@ def test_ros_1_is_read_the_same_way(tmp_path: Path) -> None:
         assert list(loader) == [ROSMessage(5, "/header", "std_msgs/msg/Header", values)]
 
 
-def test_what_is_no_recording_is_one_line(tmp_path: Path) -> None:
+def test_loader_missing_file_raises(tmp_path: Path) -> None:
     with pytest.raises(BagError):
         ROSLoader(tmp_path / "missing.mcap")

@@ -56,12 +56,12 @@ def opened(path: Path, resolver: TypeResolver) -> Recording:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_type_is_whole(name: str) -> None:
+def test_package_types_are_complete(name: str) -> None:
     definition = TypeResolver().resolve(name, None, ros_version=2)
     assert (definition.source, definition.root) == (Source.PACKAGE, name)
 
 
-def test_the_fields_are_those_that_ros_hashes() -> None:
+def test_package_types_have_the_hashes_of_ros2() -> None:
     assert rihs01(TypeResolver().resolve("test_msgs/msg/Strings", None, ros_version=2)) == STRINGS
 
 
@@ -86,13 +86,13 @@ def in_ros_1(name: str) -> Definition:
         ("nmea_msgs/Sentence", "9f221efc5f4b3bac7ce4af102b32308b"),
     ],
 )
-def test_the_fields_are_those_that_ros_1_hashes(name: str, digest: str) -> None:
+def test_package_types_have_the_hashes_of_ros1(name: str, digest: str) -> None:
     """The hashes are those that ROS 1 bags and generated code carry."""
     assert md5sum(in_ros_1(name)) == digest
 
 
 @pytest.mark.parametrize("distro", [None, Stores.ROS2_HUMBLE])
-def test_messages_are_read_and_said_to_be_read_so(tmp_path: Path, distro: Stores | None) -> None:
+def test_package_type_is_used_with_finding(tmp_path: Path, distro: Stores | None) -> None:
     path = recorded(tmp_path / "a.db3", "example_interfaces/msg/String")
     with ROSLoader(path, ros_distro=distro) as loader:
         assert [message.data for message in loader] == [{"data": "hi"}]
@@ -101,7 +101,7 @@ def test_messages_are_read_and_said_to_be_read_so(tmp_path: Path, distro: Stores
     assert finding.help == "if yours have other fields, give them with custom_msgs"
 
 
-def test_what_the_recording_or_the_job_defines_comes_first(tmp_path: Path) -> None:
+def test_package_type_yields_to_recording_and_job(tmp_path: Path) -> None:
     name = "example_interfaces/msg/String"
     embedded = recorded(tmp_path / "a.db3", name, definitions=((name, "string text"),))
     with ROSLoader(embedded) as loader:
@@ -111,7 +111,7 @@ def test_what_the_recording_or_the_job_defines_comes_first(tmp_path: Path) -> No
         assert not any(found.rule == "assumed-definition" for found in loader.findings)
 
 
-def test_a_definition_of_another_hash_is_not_used(tmp_path: Path) -> None:
+def test_definition_with_another_hash_is_not_used(tmp_path: Path) -> None:
     other = f"RIHS01_{'0' * 64}"
     for name in ("example_interfaces/msg/String", "std_msgs/msg/String"):
         path = recorded(tmp_path / f"{name.partition('/')[0]}.db3", name, other)
@@ -126,14 +126,14 @@ def test_a_definition_of_another_hash_is_not_used(tmp_path: Path) -> None:
         assert channel.definition, "what the job says about its own recording is believed"
 
 
-def test_one_of_the_same_hash_is(tmp_path: Path) -> None:
+def test_definition_with_same_hash_is_used(tmp_path: Path) -> None:
     path = recorded(tmp_path / "a.db3", "test_msgs/msg/Strings", STRINGS)
     (channel,) = opened(path, TypeResolver()).connections
     assert channel.definition
     assert channel.definition.source is Source.PACKAGE
 
 
-def test_events_of_a_service_are_read_by_the_definition_of_the_service(tmp_path: Path) -> None:
+def test_service_events_use_definition_of_service(tmp_path: Path) -> None:
     service = (("mine/srv/Add", "int64 a\n---\nint64 sum\n"),)
     path = recorded(tmp_path / "a.db3", "mine/srv/Add_Event", definitions=service)
     (channel,) = opened(path, TypeResolver()).connections
@@ -141,6 +141,6 @@ def test_events_of_a_service_are_read_by_the_definition_of_the_service(tmp_path:
     assert [field.name for field in channel.definition.message.fields] == ["info", "request", "response"]
 
 
-def test_no_ros_1_recording_is_read_by_them() -> None:
+def test_package_type_is_not_used_for_ros1() -> None:
     with pytest.raises(BagError, match="is not known"):
         TypeResolver().resolve("turtlesim/Pose", None, ros_version=1)

@@ -31,7 +31,7 @@ MCAP_FORMS = {
 
 @pytest.mark.parametrize("form", MCAP_FORMS)
 @pytest.mark.parametrize("big", [False, True], ids=["small", "big"])
-def test_an_mcap_of_any_form_gives_every_message_back(
+def test_mcap_any_structure_yields_every_message(
     tmp_path: Path, recordings: Any, form: str, *, big: bool
 ) -> None:
     messages = recordings.sent(big=big)
@@ -46,7 +46,7 @@ def test_an_mcap_of_any_form_gives_every_message_back(
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 @pytest.mark.parametrize("compression", ["none", "file", "message", "storage"])
-def test_a_rosbag2_directory_reads_as_rosbags_reads_it(
+def test_rosbag2_directory_yields_messages_of_rosbags(
     tmp_path: Path, recordings: Any, storage: str, compression: str
 ) -> None:
     if storage == "sqlite3" and compression == "storage":
@@ -68,7 +68,7 @@ def test_a_rosbag2_directory_reads_as_rosbags_reads_it(
 
 
 @pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])
-def test_a_ros1_bag_reads_as_rosbags_reads_it(tmp_path: Path, recordings: Any, compression: str) -> None:
+def test_ros1_bag_yields_messages_of_rosbags(tmp_path: Path, recordings: Any, compression: str) -> None:
     path = recordings.ros1(tmp_path / "c.bag", recordings.sent(big=True, cdr=False), compression=compression)
     with rosbag1.Reader(path) as reader:
         expected = sorted(
@@ -84,7 +84,7 @@ def test_a_ros1_bag_reads_as_rosbags_reads_it(tmp_path: Path, recordings: Any, c
 
 
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3", "ros1"])
-def test_channels_and_times_can_be_selected(tmp_path: Path, recordings: Any, kind: str) -> None:
+def test_message_blocks_selects_connections_and_times(tmp_path: Path, recordings: Any, kind: str) -> None:
     messages = recordings.sent()
     path = tmp_path / "d"
     if kind == "ros1":
@@ -100,7 +100,7 @@ def test_channels_and_times_can_be_selected(tmp_path: Path, recordings: Any, kin
     assert found == sorted(wanted)
 
 
-def test_parts_are_one_sequence_in_time(tmp_path: Path, recordings: Any) -> None:
+def test_splits_are_merged_by_time(tmp_path: Path, recordings: Any) -> None:
     messages = recordings.sent()
     paths = [recordings.mcap(tmp_path / f"p_{n}.mcap", messages[n::3]) for n in range(3)]
     with open_recording(paths, resolve=recordings.blind) as recording:
@@ -111,7 +111,7 @@ def test_parts_are_one_sequence_in_time(tmp_path: Path, recordings: Any) -> None
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_memory_bounds_what_is_held_and_nothing_is_lost(
+def test_message_blocks_little_memory_yields_every_message(
     tmp_path: Path, recordings: Any, storage: str
 ) -> None:
     messages = recordings.sent(big=True)
@@ -122,7 +122,7 @@ def test_memory_bounds_what_is_held_and_nothing_is_lost(
     assert sum(len(batch) for batch in batches) == len(messages)
 
 
-def test_chunks_that_overlap_in_time_come_out_in_time_order(tmp_path: Path, recordings: Any) -> None:
+def test_overlapping_chunks_are_sorted_by_time(tmp_path: Path, recordings: Any) -> None:
     messages = recordings.sent()
     shuffled = [message for n in range(7) for message in messages[n::7]]
     path = recordings.mcap(tmp_path / "f.mcap", shuffled, chunk_messages=17)
@@ -131,7 +131,7 @@ def test_chunks_that_overlap_in_time_come_out_in_time_order(tmp_path: Path, reco
         assert recordings.received(recording, max_rows=5) == sorted(messages)
 
 
-def test_small_messages_are_coalesced_and_large_ones_are_not_copied(tmp_path: Path, recordings: Any) -> None:
+def test_small_messages_are_coalesced_and_large_ones_not_copied(tmp_path: Path, recordings: Any) -> None:
     messages = recordings.sent(2000, big=True)
     path = recordings.mcap(tmp_path / "g.mcap", messages, chunk_messages=100)
     with open_recording(path, resolve=recordings.blind) as recording:
@@ -143,7 +143,7 @@ def test_small_messages_are_coalesced_and_large_ones_are_not_copied(tmp_path: Pa
     assert len(image.data) > int(image.lengths.sum())
 
 
-def test_a_topic_of_two_types_is_two_channels_and_a_finding(tmp_path: Path, recordings: Any) -> None:
+def test_topic_with_two_types_is_two_connections_and_a_finding(tmp_path: Path, recordings: Any) -> None:
     one = [
         recordings.Sent("/t", "std_msgs/msg/String", recordings.START_NS + n, b"\0\1\0\0") for n in range(3)
     ]
@@ -157,14 +157,14 @@ def test_a_topic_of_two_types_is_two_channels_and_a_finding(tmp_path: Path, reco
         assert [finding.rule for finding in recording.findings] == ["mixed-types"]
 
 
-def test_a_channel_without_definition_says_why(tmp_path: Path, recordings: Any) -> None:
+def test_connection_without_definition_has_a_problem(tmp_path: Path, recordings: Any) -> None:
     path = recordings.mcap(tmp_path / "h.mcap", recordings.sent(10))
     with open_recording(path, resolve=recordings.blind) as recording:
         assert all(channel.definition is None for channel in recording.connections)
         assert all("is not known" in str(channel.problem) for channel in recording.connections)
 
 
-def test_other_encodings_are_named_and_can_still_be_had(tmp_path: Path, recordings: Any) -> None:
+def test_other_encodings_are_listed_and_readable(tmp_path: Path, recordings: Any) -> None:
     path = recordings.mcap(tmp_path / "i.mcap", recordings.sent(10), encoding="protobuf")
     with open_recording(path, resolve=recordings.easy) as recording:
         assert {channel.encoding for channel in recording.connections} == {Encoding.OTHER}
@@ -173,7 +173,7 @@ def test_other_encodings_are_named_and_can_still_be_had(tmp_path: Path, recordin
 
 
 @pytest.mark.parametrize(("processors", "threads"), [(2, 0), (3, 1)])
-def test_reading_ahead_is_for_where_a_processor_is_left_and_leaves_no_thread(
+def test_prefetch_needs_spare_cpu_and_leaves_no_thread(
     tmp_path: Path, recordings: Any, monkeypatch: pytest.MonkeyPatch, processors: int, threads: int
 ) -> None:
     monkeypatch.setattr(pa, "cpu_count", lambda: processors)
@@ -191,7 +191,7 @@ def test_reading_ahead_is_for_where_a_processor_is_left_and_leaves_no_thread(
 
 
 @pytest.mark.parametrize("processors", [2, 3])
-def test_a_file_that_shrinks_while_it_is_read_costs_only_its_end(
+def test_file_truncated_during_read_loses_only_its_end(
     tmp_path: Path, recordings: Any, monkeypatch: pytest.MonkeyPatch, processors: int
 ) -> None:
     monkeypatch.setattr(pa, "cpu_count", lambda: processors)
@@ -205,7 +205,7 @@ def test_a_file_that_shrinks_while_it_is_read_costs_only_its_end(
         assert any("truncated" in loss.reason for loss in recording.unreadable)
 
 
-def test_parts_of_different_formats_are_refused(tmp_path: Path, recordings: Any) -> None:
+def test_splits_of_different_formats_raise(tmp_path: Path, recordings: Any) -> None:
     paths = [
         recordings.mcap(tmp_path / "l.mcap", recordings.sent(5)),
         recordings.ros1(tmp_path / "l.bag", recordings.sent(5, cdr=False)),
@@ -214,7 +214,7 @@ def test_parts_of_different_formats_are_refused(tmp_path: Path, recordings: Any)
         open_recording(paths, resolve=recordings.blind)
 
 
-def test_offsets_say_where_a_message_lies(tmp_path: Path, recordings: Any) -> None:
+def test_offsets_point_at_records(tmp_path: Path, recordings: Any) -> None:
     path = recordings.mcap(tmp_path / "m.mcap", recordings.sent(), chunked=False)
     content = path.read_bytes()
     with open_recording(path, resolve=recordings.blind) as recording:
@@ -223,7 +223,7 @@ def test_offsets_say_where_a_message_lies(tmp_path: Path, recordings: Any) -> No
             assert batch.offsets.dtype == np.int64
 
 
-def test_a_hundredth_of_the_time_reads_about_a_hundredth_of_the_file(
+def test_time_range_reads_only_its_share_of_the_file(
     tmp_path: Path, recordings: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     messages = recordings.sent(4000, big=True)
@@ -241,7 +241,7 @@ def test_a_hundredth_of_the_time_reads_about_a_hundredth_of_the_file(
 
 
 @pytest.mark.parametrize("is_read", [True, False])
-def test_what_was_decompressed_to_read_it_is_removed(
+def test_close_removes_decompressed_copy(
     tmp_path: Path, recordings: Any, monkeypatch: pytest.MonkeyPatch, *, is_read: bool
 ) -> None:
     folder = recordings.rosbag2(tmp_path / "o", recordings.sent(20), storage="sqlite3", compression="file")
@@ -255,7 +255,7 @@ def test_what_was_decompressed_to_read_it_is_removed(
     assert not list((tmp_path / "temporary").iterdir())
 
 
-def test_a_topic_that_keeps_its_last_message_is_latched(tmp_path: Path, recordings: Any) -> None:
+def test_transient_local_topic_is_latched(tmp_path: Path, recordings: Any) -> None:
     folder = recordings.rosbag2(tmp_path / "p", recordings.sent(20), storage="sqlite3")
     with sqlite3.connect(next(folder.glob("*.db3"))) as writer:
         writer.execute("UPDATE topics SET offered_qos_profiles = '- durability: 1' WHERE name = '/imu'")

@@ -20,7 +20,7 @@ def _forget() -> Iterator[None]:
     ROSTypeRegistry.reset()
 
 
-def test_a_text_a_path_and_a_name_of_a_file_are_sources(tmp_path: Path) -> None:
+def test_register_accepts_text_and_path(tmp_path: Path) -> None:
     file = tmp_path / "my messages" / "Heartbeat.msg"
     file.parent.mkdir()
     file.write_text("int8 from_file\n")
@@ -34,7 +34,7 @@ def test_a_text_a_path_and_a_name_of_a_file_are_sources(tmp_path: Path) -> None:
     }
 
 
-def test_a_distro_and_its_name_are_one_key_and_overlay_what_holds_for_all() -> None:
+def test_registry_distro_overlays_types_of_all_distros() -> None:
     ROSTypeRegistry.register("a/msg/B", "int8 for_all")
     ROSTypeRegistry.register("a/msg/B", "int8 for_humble", store="ros2_humble")
     assert ROSTypeRegistry.get_types(Stores.ROS2_HUMBLE) == {"a/msg/B": "int8 for_humble"}
@@ -42,7 +42,7 @@ def test_a_distro_and_its_name_are_one_key_and_overlay_what_holds_for_all() -> N
     assert ROSTypeRegistry.get_types() == {"a/msg/B": "int8 for_all"}
 
 
-def test_announced_types_are_found_and_come_after_the_jobs_own() -> None:
+def test_registered_types_yield_to_types_of_job() -> None:
     ROSTypeRegistry.register("a/msg/B", "int8 announced")
     found = TypeResolver().resolve("a/msg/B", None, ros_version=2)
     assert (found.message.fields[0].name, found.source) == ("announced", Source.CUSTOM)
@@ -50,7 +50,7 @@ def test_announced_types_are_found_and_come_after_the_jobs_own() -> None:
     assert own.message.fields[0].name == "own"
 
 
-def test_a_directory_is_a_package(tmp_path: Path) -> None:
+def test_register_directory_registers_every_file(tmp_path: Path) -> None:
     (tmp_path / "One.msg").write_text("Two two\n")
     (tmp_path / "Two.msg").write_text("int8 x\n")
     (tmp_path / "README").write_text("not a message")
@@ -60,7 +60,7 @@ def test_a_directory_is_a_package(tmp_path: Path) -> None:
     assert found.message.fields[0].type == "pkg/msg/Two"
 
 
-def test_a_mistake_names_file_and_line_and_announces_nothing(tmp_path: Path) -> None:
+def test_register_invalid_file_raises_with_line_and_registers_nothing(tmp_path: Path) -> None:
     (tmp_path / "Bad.msg").write_text("int8 good\nfloat64[ bad\n")
     (tmp_path / "Good.msg").write_text("int8 good\n")
     with pytest.raises(BagError, match=r"Bad\.msg:2:1: cannot read 'float64\[ bad'"):
@@ -77,11 +77,11 @@ def test_a_mistake_names_file_and_line_and_announces_nothing(tmp_path: Path) -> 
         (("pkg/msg/X", "int8 x", "ros2_humbel"), r"did you mean ros2_humble\?"),
     ],
 )
-def test_other_mistakes_are_one_line(arguments: tuple[str, ...], message: str) -> None:
+def test_register_invalid_source_raises(arguments: tuple[str, ...], message: str) -> None:
     with pytest.raises(BagError, match=message):
         ROSTypeRegistry.register(*arguments)
 
 
-def test_a_missing_directory_is_an_error(tmp_path: Path) -> None:
+def test_register_missing_directory_raises(tmp_path: Path) -> None:
     with pytest.raises(BagError, match="does not exist"):
         ROSTypeRegistry.register_directory("pkg", tmp_path / "nowhere")

@@ -85,7 +85,7 @@ def texts(recordings: Any) -> list[Any]:
     ]
 
 
-def test_every_message_is_read_with_or_without_an_index(tmp_path: Path, recordings: Any) -> None:
+def test_rosrecord_with_or_without_index_yields_every_message(tmp_path: Path, recordings: Any) -> None:
     messages = recordings.sent(300, cdr=False, big=True)
     for number, content in enumerate(
         (bag(messages), bag(messages, indexed=False), bag(messages, line=b"#ROSRECORD V1.2\r\n"))
@@ -99,7 +99,7 @@ def test_every_message_is_read_with_or_without_an_index(tmp_path: Path, recordin
             assert any("version 1.2" in finding.message for finding in recording.findings)
 
 
-def test_topics_and_times_are_selected(tmp_path: Path, recordings: Any) -> None:
+def test_rosrecord_selects_topics_and_times(tmp_path: Path, recordings: Any) -> None:
     messages = recordings.sent(300, cdr=False, big=True)
     path = tmp_path / "a.bag"
     path.write_bytes(bag(messages))
@@ -110,7 +110,7 @@ def test_topics_and_times_are_selected(tmp_path: Path, recordings: Any) -> None:
     assert found == sorted(sent for sent in messages if sent.topic == "/imu" and sent.time_ns >= middle)
 
 
-def test_the_definition_is_the_recordings(tmp_path: Path) -> None:
+def test_rosrecord_uses_definition_of_recording(tmp_path: Path) -> None:
     path = tmp_path / "a.bag"
     stamped = struct.pack("<III", 5, 1, 2) + struct.pack("<I", 3) + b"map" + struct.pack("<f", 0.5)
     path.write_bytes(
@@ -131,7 +131,7 @@ def test_the_definition_is_the_recordings(tmp_path: Path) -> None:
         }
 
 
-def test_without_a_definition_the_distros_is_taken_if_the_hash_is_its_own(tmp_path: Path) -> None:
+def test_rosrecord_uses_distro_definition_only_with_same_hash(tmp_path: Path) -> None:
     right, wrong = b"992ce8a1687cec8c8bd883ec73ca41d1", b"0" * 32
     path = tmp_path / "a.bag"
     path.write_bytes(
@@ -147,7 +147,7 @@ def test_without_a_definition_the_distros_is_taken_if_the_hash_is_its_own(tmp_pa
 
 @pytest.mark.slow
 @pytest.mark.parametrize("indexed", [False, True])
-def test_a_bag_cut_off_at_any_byte_gives_what_is_left_and_says_so(
+def test_rosrecord_truncated_yields_remaining_messages_and_unreadable_range(
     tmp_path: Path, recordings: Any, texts: list[Any], *, indexed: bool
 ) -> None:
     texts = texts[:9]
@@ -163,9 +163,7 @@ def test_a_bag_cut_off_at_any_byte_gives_what_is_left_and_says_so(
                 assert any("cut off" in loss.reason for loss in recording.unreadable)
 
 
-def test_a_bag_that_was_not_closed_says_so_and_misses_nothing(
-    tmp_path: Path, recordings: Any, texts: list[Any]
-) -> None:
+def test_rosrecord_not_closed_is_read_completely(tmp_path: Path, recordings: Any, texts: list[Any]) -> None:
     content = bag(texts)
     (end,) = struct.unpack_from("<Q", content, content.index(b"index_pos=") + 10)
     path = tmp_path / "open.bag"
@@ -175,7 +173,9 @@ def test_a_bag_that_was_not_closed_says_so_and_misses_nothing(
         assert [(loss.count, loss.reason) for loss in recording.unreadable] == [(0, "the bag was not closed")]
 
 
-def test_damage_costs_what_it_destroys(tmp_path: Path, recordings: Any, texts: list[Any]) -> None:
+def test_rosrecord_damage_loses_only_damaged_messages(
+    tmp_path: Path, recordings: Any, texts: list[Any]
+) -> None:
     content = bytearray(bag(texts))
     at = content.index(texts[10].payload) - 60
     content[at : at + 30] = b"\xff" * 30
@@ -189,7 +189,7 @@ def test_damage_costs_what_it_destroys(tmp_path: Path, recordings: Any, texts: l
 
 @settings(max_examples=80, deadline=20_000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_any_damage_gives_batches_losses_or_a_bag_error(
+def test_open_any_damage_yields_blocks_or_raises_bag_error(
     tmp_path: Path, recordings: Any, texts: list[Any], data: st.DataObject
 ) -> None:
     content = bytearray(bag(texts, indexed=data.draw(st.booleans())))

@@ -45,34 +45,34 @@ def shape_of(*fields: Field, others: tuple[MessageType, ...] = (POINT,)) -> pa.S
         (Field("v", "uint8", container=Container.ARRAY, size=16), pa.list_(pa.uint8(), 16)),
     ],
 )
-def test_a_field_has_the_arrow_type_of_its_ros_type(field: Field, expected: pa.DataType) -> None:
+def test_ros_shape_maps_ros_types_to_arrow_types(field: Field, expected: pa.DataType) -> None:
     assert shape_of(field) == pa.struct([pa.field("v", expected)])
 
 
-def test_a_list_of_messages_names_its_child_like_the_field() -> None:
+def test_ros_shape_list_of_messages_names_child_like_field() -> None:
     shape = shape_of(Field("points", "test/msg/Point", is_message=True, container=Container.SEQUENCE))
     point = pa.struct([pa.field("x", pa.float32())])
     assert shape == pa.struct([pa.field("points", pa.list_(pa.field("points", point)))])
     assert shape.field("points").type.field(0).name == "points"
 
 
-def test_stamps_are_seconds_and_nanoseconds_in_both_generations() -> None:
+def test_ros_shape_stamp_is_equal_in_ros1_and_ros2() -> None:
     stamp = pa.struct([pa.field("sec", pa.int32()), pa.field("nanosec", pa.uint32())])
     for distro, version in ((Stores.ROS1_NOETIC, 1), (Stores.ROS2_HUMBLE, 2)):
         definition = TypeResolver(distro).resolve("std_msgs/msg/Header", None, ros_version=version)
         assert ros_shape(definition).field("stamp").type == stamp
 
 
-def test_a_message_without_fields_is_a_struct_without_fields() -> None:
+def test_ros_shape_empty_message_is_empty_struct() -> None:
     assert shape_of() == pa.struct([])
 
 
-def test_a_type_that_contains_itself_is_refused() -> None:
+def test_ros_shape_recursive_type_raises() -> None:
     loop = MessageType("test/msg/Loop", (Field("next", "test/msg/Loop", is_message=True),))
     with pytest.raises(DecodeError, match="test/msg/Loop contains itself"):
         shape_of(Field("loop", "test/msg/Loop", is_message=True), others=(loop,))
 
 
-def test_an_unknown_primitive_is_named() -> None:
+def test_ros_shape_unknown_primitive_raises() -> None:
     with pytest.raises(DecodeError, match="field v has the unknown type float128"):
         shape_of(Field("v", "float128"))

@@ -28,7 +28,7 @@ def write_many(path: Path, *, payloads: int, size: int) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".mcap", ".db3"])
-def test_messages_in_many_chunks_are_found_by_the_index(tmp_path: Path, suffix: str) -> None:
+def test_writer_many_chunks_are_indexed(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"out{suffix}"
     write_many(path, payloads=90, size=100_000)
     with open_recording([path], resolve=TypeResolver()) as recording:
@@ -45,7 +45,7 @@ def test_messages_in_many_chunks_are_found_by_the_index(tmp_path: Path, suffix: 
         assert not recording.unreadable
 
 
-def test_two_definitions_of_one_type_are_two_schemas_in_mcap_and_refused_in_db3(tmp_path: Path) -> None:
+def test_writer_two_definitions_of_a_type_need_mcap(tmp_path: Path) -> None:
     other = define("std_msgs/msg/String", "string data\nint8 more\n")
     with open_writer(tmp_path / "out.mcap") as writer:
         for topic, definition in (("/a", TEXT), ("/b", other), ("/c", TEXT)):
@@ -59,7 +59,7 @@ def test_two_definitions_of_one_type_are_two_schemas_in_mcap_and_refused_in_db3(
     assert [path.name for path in tmp_path.iterdir()] == ["out.mcap"]
 
 
-def test_an_exception_leaves_what_was_there(tmp_path: Path) -> None:
+def test_writer_exception_keeps_existing_file(tmp_path: Path) -> None:
     for suffix in (".mcap", ".db3", ".bag"):
         path = tmp_path / f"out{suffix}"
         path.write_bytes(b"mine")
@@ -69,9 +69,7 @@ def test_an_exception_leaves_what_was_there(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 3
 
 
-def test_a_database_that_cannot_be_written_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_writer_unwritable_database_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise sqlite3.OperationalError("database or disk is full")
 
@@ -81,7 +79,7 @@ def test_a_database_that_cannot_be_written_is_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_recording_without_a_message_can_be_read(tmp_path: Path) -> None:
+def test_writer_recording_without_messages_is_readable(tmp_path: Path) -> None:
     with open_writer(tmp_path / "out.mcap") as writer:
         writer.add_connection("/a", TEXT)
     with open_recording([tmp_path / "out.mcap"], resolve=TypeResolver()) as recording:

@@ -62,7 +62,7 @@ def rules(path: Path, recordings: Any) -> list[str]:
         return [finding.rule for finding in recording.findings]
 
 
-def test_a_directory_and_its_metadata_are_the_same_recording(split: Path, recordings: Any) -> None:
+def test_discover_directory_equals_its_metadata_file(split: Path, recordings: Any) -> None:
     names = [f"part_{number}.mcap" for number in (8, 9, 10)]
     assert [file.name for file in discover([split]).files] == names
     assert [file.name for file in discover([split / "metadata.yaml"]).files] == names
@@ -73,7 +73,7 @@ def test_a_directory_and_its_metadata_are_the_same_recording(split: Path, record
         assert recording.findings == ()
 
 
-def test_a_part_that_is_missing_is_a_finding_and_a_loss(split: Path, recordings: Any) -> None:
+def test_discover_missing_split_is_finding_and_unreadable_range(split: Path, recordings: Any) -> None:
     (split / "part_9.mcap").unlink()
     with open_recording(split, resolve=recordings.blind) as recording:
         assert len(recordings.received(recording)) == 60
@@ -84,11 +84,11 @@ def test_a_part_that_is_missing_is_a_finding_and_a_loss(split: Path, recordings:
         ]
 
 
-def test_one_part_alone_says_that_there_are_others(split: Path, recordings: Any) -> None:
+def test_discover_single_split_reports_other_splits(split: Path, recordings: Any) -> None:
     assert rules(split / "part_9.mcap", recordings) == ["single-split"]
 
 
-def test_the_storage_decides_and_metadata_that_differ_are_findings(split: Path, recordings: Any) -> None:
+def test_open_metadata_differing_from_files_is_finding(split: Path, recordings: Any) -> None:
     info = read_info(split)
     for entry in info["topics_with_message_count"]:
         entry["topic_metadata"] |= {"type": "std_msgs/msg/Bool"}
@@ -106,16 +106,14 @@ def test_the_storage_decides_and_metadata_that_differ_are_findings(split: Path, 
 @pytest.mark.parametrize(
     "content", ["{", "[]", "rosbag2_bagfile_information: 3", "a: &a [*a]", "[" * 9000, BOMB]
 )
-def test_metadata_that_cannot_be_read_are_a_finding(split: Path, recordings: Any, content: str) -> None:
+def test_discover_unreadable_metadata_is_finding(split: Path, recordings: Any, content: str) -> None:
     (split / "metadata.yaml").write_text(content)
     with open_recording(split, resolve=recordings.blind) as recording:
         assert len(recordings.received(recording)) == 90
         assert [finding.rule for finding in recording.findings] == ["metadata-unreadable"]
 
 
-def test_old_metadata_and_listed_names_with_folder_and_suffix_are_understood(
-    tmp_path: Path, split: Path, recordings: Any
-) -> None:
+def test_discover_old_metadata_finds_listed_files(tmp_path: Path, split: Path, recordings: Any) -> None:
     old = tmp_path / "old"
     old.mkdir()
     content = (split / "part_8.mcap").read_bytes()
@@ -130,7 +128,7 @@ def test_old_metadata_and_listed_names_with_folder_and_suffix_are_understood(
         assert not any("sensor_msgs/Imu" in finding.message for finding in recording.findings)
 
 
-def test_content_decides_and_not_the_name(tmp_path: Path, recordings: Any) -> None:
+def test_open_detects_format_by_content(tmp_path: Path, recordings: Any) -> None:
     messages = recordings.sent(20)
     made = recordings.rosbag2(tmp_path / "x.bag", messages, storage="sqlite3")
     with open_recording(made, resolve=recordings.blind) as recording:
@@ -141,7 +139,7 @@ def test_content_decides_and_not_the_name(tmp_path: Path, recordings: Any) -> No
         assert recordings.received(recording) == sorted(messages)
 
 
-def test_what_is_no_recording_is_one_line_that_says_what_was_found(tmp_path: Path, recordings: Any) -> None:
+def test_open_other_file_raises_with_first_bytes(tmp_path: Path, recordings: Any) -> None:
     files = {
         "empty.bag": b"",
         "text.mcap": b"hello, world, this is text",
@@ -165,7 +163,7 @@ def test_what_is_no_recording_is_one_line_that_says_what_was_found(tmp_path: Pat
     assert "28 b5 2f fd" in found["twice.zstd"]
 
 
-def test_a_directory_without_recording_says_what_it_holds(tmp_path: Path) -> None:
+def test_discover_directory_without_recording_raises_with_entries(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("hello")
     with pytest.raises(BagError, match=r"without a recording; it holds notes\.txt"):
         discover([tmp_path])
@@ -175,7 +173,7 @@ def test_a_directory_without_recording_says_what_it_holds(tmp_path: Path) -> Non
         discover([])
 
 
-def test_metadata_that_list_nothing_that_is_there_fall_back_on_what_is(split: Path, recordings: Any) -> None:
+def test_discover_metadata_without_existing_files_uses_directory(split: Path, recordings: Any) -> None:
     info = read_info(split)
     write_metadata(split, info | {"relative_file_paths": ["gone.mcap"]})
     assert len(discover([split]).files) == 3
@@ -188,7 +186,7 @@ def test_metadata_that_list_nothing_that_is_there_fall_back_on_what_is(split: Pa
         discover([split])
 
 
-def test_a_part_that_cannot_be_opened_is_a_loss_and_a_finding(split: Path, recordings: Any) -> None:
+def test_open_damaged_split_is_unreadable_range_and_finding(split: Path, recordings: Any) -> None:
     (split / "part_10.mcap").write_bytes(b"")
     with open_recording(split, resolve=recordings.blind) as recording:
         assert len(recordings.received(recording)) == 60
@@ -203,7 +201,9 @@ def test_a_part_that_cannot_be_opened_is_a_loss_and_a_finding(split: Path, recor
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MC", b"anything"])
-def test_a_damaged_part_counts_without_metadata_too(split: Path, recordings: Any, content: bytes) -> None:
+def test_open_damaged_split_without_metadata_is_unreadable_range(
+    split: Path, recordings: Any, content: bytes
+) -> None:
     (split / "metadata.yaml").unlink()
     (split / "part_9.mcap").write_bytes(content)
     (split / "notes.txt").write_bytes(b"not mine")
@@ -216,14 +216,14 @@ def test_a_damaged_part_counts_without_metadata_too(split: Path, recordings: Any
         open_recording(split, resolve=recordings.blind)
 
 
-def test_a_digit_that_is_no_decimal_is_a_letter_among_names(split: Path) -> None:
+def test_discover_sorts_names_with_non_decimal_digits(split: Path) -> None:
     part = split / "part_10.mcap"
     part.rename(split / "part_5\N{SUPERSCRIPT TWO}1.mcap")
     (split / "metadata.yaml").unlink()
     assert len(discover([split]).files) == 3
 
 
-def test_a_hidden_file_is_no_part(split: Path) -> None:
+def test_discover_ignores_hidden_files(split: Path) -> None:
     (split / "metadata.yaml").unlink()
     (split / "._part_8.mcap").write_bytes(b"what a Mac leaves")
     assert [file.name for file in discover([split]).files] == ["part_8.mcap", "part_9.mcap", "part_10.mcap"]

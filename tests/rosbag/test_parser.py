@@ -37,7 +37,7 @@ def field_of(line: str) -> Field:
         ("@key int32 id", Field("id", "int32")),
     ],
 )
-def test_a_field_line_is_read(line: str, expected: Field) -> None:
+def test_parse_msg_field_line(line: str, expected: Field) -> None:
     assert field_of(line) == expected
 
 
@@ -56,7 +56,7 @@ def test_a_field_line_is_read(line: str, expected: Field) -> None:
         ("float32 NOTHING=nan", Constant("NOTHING", "float32", pytest.approx(float("nan"), nan_ok=True))),
     ],
 )
-def test_a_constant_line_is_read(line: str, expected: Constant) -> None:
+def test_parse_msg_constant_line(line: str, expected: Constant) -> None:
     assert parse_msg(line, "pkg/msg/Name").constants == (expected,)
 
 
@@ -67,26 +67,26 @@ def test_a_constant_line_is_read(line: str, expected: Constant) -> None:
         "int32[99999999999] x", "bool B=perhaps", "Point P=1", "@optional int32 x", "int32 a\nint32 a",
     ],
 )  # fmt: skip
-def test_a_line_that_is_neither_names_the_place(line: str) -> None:
+def test_parse_msg_invalid_line_raises_with_location(line: str) -> None:
     with pytest.raises(BagError) as caught:
         parse_msg(f"# first\n{line}", "pkg/msg/Name", where="Name.msg")
     assert str(caught.value).startswith("Name.msg")
 
 
-def test_windows_line_ends_and_a_byte_order_mark_are_no_part_of_it() -> None:
+def test_parse_msg_ignores_carriage_returns_and_byte_order_mark() -> None:
     assert [f.name for f in parse_msg("\ufeffint32 a\r\n\r\n# c\r\nint32 b\r\n", "p/msg/N").fields] == [
         "a",
         "b",
     ]
 
 
-def test_a_text_with_several_types_gives_each_its_name_and_line() -> None:
+def test_sections_have_names_and_lines() -> None:
     text = "Inner x\n" + "=" * 80 + "\nMSG: pkg/Inner\nfloat64 value\n" + "=" * 80 + "\nMSG: pkg/Empty\n"
     assert [(s.name, s.line) for s in sections(text)] == [("", 0), ("pkg/Inner", 3), ("pkg/Empty", 6)]
     assert list(read_types(text, "pkg/msg/Outer")) == ["pkg/msg/Outer", "pkg/msg/Inner", "pkg/msg/Empty"]
 
 
-def test_a_mistake_in_a_later_part_is_named_by_its_line_in_the_whole() -> None:
+def test_read_types_error_in_later_section_has_line_in_text() -> None:
     text = "Inner x\n" + "=" * 80 + "\nMSG: pkg/Inner\nfloat64 value\nnonsense\n"
     with pytest.raises(BagError, match=r"^Outer\.msg:5: "):
         read_types(text, "pkg/msg/Outer", where="Outer.msg")
@@ -107,7 +107,7 @@ module pkg { module msg {
 """
 
 
-def test_idl_is_read_also_when_one_text_has_several() -> None:
+def test_read_types_reads_several_idl_sections() -> None:
     other = "module pkg { module msg { struct Other { uint8 structure_needs_at_least_one_member; }; }; };"
     bar = "=" * 80
     types = read_types(
@@ -134,14 +134,14 @@ def test_idl_is_read_also_when_one_text_has_several() -> None:
         "module pkg { struct X { double a[2][3]; }; };",
     ],
 )
-def test_broken_idl_is_one_line(text: str) -> None:
+def test_read_idl_invalid_text_raises(text: str) -> None:
     with pytest.raises(BagError) as caught:
         read_types(text, "pkg/msg/X", where="X.idl")
     assert "\n" not in str(caught.value)
 
 
 @given(st.text(max_size=200))
-def test_any_text_is_types_or_a_bag_error(text: str) -> None:
+def test_read_types_any_text_returns_or_raises_bag_error(text: str) -> None:
     messages = list[str]()
     try:
         read_types(text, "pkg/msg/Name")

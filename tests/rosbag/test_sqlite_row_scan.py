@@ -9,7 +9,7 @@ DAMAGED = Path(__file__).parent / "data" / "damaged_rowids.db3"
 """Found by fuzzing: a page that gives other rows than the index says, so that reading seems to go on but does not."""
 
 
-def test_salvage_comes_to_an_end_where_a_damaged_page_gives_rows_out_of_order() -> None:
+def test_row_scan_rows_out_of_order_terminates() -> None:
     with open_recording(DAMAGED, resolve=TypeResolver()) as recording:
         read = sum(len(batch) for batch in recording.message_blocks())
         assert read < 1000

@@ -38,22 +38,22 @@ class TestNames:
             ("Vec3", "Vec3"),
         ],
     )
-    def test_one_type_has_one_name(self, name: str, expected: str) -> None:
+    def test_normalize_msgtype_maps_notations_to_one_name(self, name: str, expected: str) -> None:
         assert normalize_msgtype(name) == expected
 
 
 class TestOrder:
-    def test_the_recording_comes_before_all_else(self) -> None:
+    def test_resolve_prefers_recording(self) -> None:
         resolver = TypeResolver(Stores.ROS2_HUMBLE, types={"std_msgs/msg/String": "int8 custom"})
         found = resolve(resolver, "std_msgs/String", "int8 embedded")
         assert (found.message.fields[0].name, found.source) == ("embedded", Source.BAG)
 
-    def test_the_jobs_own_types_come_before_the_distro(self) -> None:
+    def test_resolve_prefers_custom_types_to_distro(self) -> None:
         resolver = TypeResolver(Stores.ROS2_HUMBLE, types={"std_msgs/msg/String": "int8 custom"})
         found = resolve(resolver, "std_msgs/msg/String")
         assert (found.message.fields[0].name, found.source) == ("custom", Source.CUSTOM)
 
-    def test_each_missing_nested_type_is_looked_for_on_its_own(self) -> None:
+    def test_resolve_searches_each_nested_type(self) -> None:
         resolver = TypeResolver(Stores.ROS2_HUMBLE, types={"mine/msg/Part": "float32 size"})
         found = resolve(
             resolver,
@@ -65,18 +65,18 @@ class TestOrder:
             "builtin_interfaces/msg/Time",
         }  # fmt: skip
 
-    def test_two_connections_of_one_type_keep_their_own_definitions(self) -> None:
+    def test_resolve_keeps_definitions_of_connections_apart(self) -> None:
         resolver = TypeResolver()
         first, second = resolve(resolver, "a/msg/B", "int8 x"), resolve(resolver, "a/msg/B", "int16 x")
         assert (first.message.fields[0].type, second.message.fields[0].type) == ("int8", "int16")
 
-    def test_a_package_may_have_a_header_of_its_own_in_ros_2_only(self) -> None:
+    def test_resolve_header_of_package_in_ros2_only(self) -> None:
         text = f"Header header\n{BAR}\nMSG: own/Header\nint8 x\n"
         assert resolve(TypeResolver(), "own/msg/T", text).message.fields[0].type == "own/msg/Header"
         ros1 = TypeResolver().resolve("own/T", Embedded("ros1msg", text), ros_version=1)
         assert [f.name for f in ros1.types["std_msgs/msg/Header"].fields] == ["seq", "stamp", "frame_id"]
 
-    def test_service_events_find_their_parts(self) -> None:
+    def test_resolve_service_event_finds_its_parts(self) -> None:
         text = (
             f"service_msgs/ServiceEventInfo info\nexample_interfaces/AddTwoInts_Request[<=1] request\n{BAR}\n"
             f"MSG: service_msgs/ServiceEventInfo\nuint8 event_type\n{BAR}\nMSG: example_interfaces/srv/AddTwoInts_Request\nint64 a\n"
@@ -84,7 +84,7 @@ class TestOrder:
         found = resolve(TypeResolver(), "example_interfaces/srv/AddTwoInts_Event", text)
         assert found.message.fields[1].type == "example_interfaces/srv/AddTwoInts_Request"
 
-    def test_a_service_event_recorded_with_its_srv_text_is_assembled(self) -> None:
+    def test_resolve_service_event_from_srv_text(self) -> None:
         text = f"int64 a\nThing thing\n---\nint64 sum\n{BAR}\nMSG: mine/Thing\nint8 x\n"
         found = resolve(TypeResolver(), "mine/srv/Add_Event", text)
         assert [(f.name, f.type, f.size) for f in found.message.fields] == [
@@ -94,7 +94,7 @@ class TestOrder:
         ]
         assert [f.type for f in found.types["mine/srv/Add_Request"].fields] == ["int64", "mine/msg/Thing"]
 
-    def test_an_empty_text_is_a_type_without_fields_unless_the_type_is_known(self) -> None:
+    def test_resolve_empty_text_is_empty_type_unless_known(self) -> None:
         assert resolve(TypeResolver(), "mine/msg/Signal", "").message.fields == ()
         for text in ("", "# a placeholder\n"):
             assert resolve(TypeResolver(), "std_msgs/msg/String", text).message.fields[0].name == "data"
@@ -103,13 +103,13 @@ class TestOrder:
 
 
 class TestWithoutADistro:
-    def test_what_all_distros_agree_on_is_used_with_a_finding(self) -> None:
+    def test_resolve_without_distro_uses_common_type_with_finding(self) -> None:
         resolver = TypeResolver()
         assert resolve(resolver, "geometry_msgs/msg/Pose").source is Source.DISTRO
         (finding,) = resolver.findings
         assert "geometry_msgs/msg/Pose" in finding.message
 
-    def test_only_what_is_taken_is_told(self) -> None:
+    def test_findings_about_omits_other_types(self) -> None:
         resolver = TypeResolver()
         for name in ("geometry_msgs/msg/Point", "std_msgs/msg/String"):
             resolve(resolver, name)
@@ -117,47 +117,47 @@ class TestWithoutADistro:
         assert finding.message.endswith(": geometry_msgs/msg/Point")
         assert resolver.findings_about(set()) == ()
 
-    def test_a_type_without_fields_leaves_no_doubt(self) -> None:
+    def test_resolve_without_distro_empty_type_has_no_finding(self) -> None:
         resolver = TypeResolver()
         assert resolve(resolver, "std_msgs/msg/Empty", "").message.fields == ()
         assert resolver.findings == ()
 
-    def test_a_recording_without_definitions_is_from_before_iron(self) -> None:
+    def test_resolve_without_definitions_assumes_distros_before_iron(self) -> None:
         resolver = TypeResolver()
         assert len(resolve(resolver, "sensor_msgs/msg/Range").message.fields) == 6
         assert any("until Humble" in finding.message for finding in resolver.findings)
         with pytest.raises(BagError, match="not known"):
             resolve(resolver, "sensor_msgs/msg/Range", "")
 
-    def test_what_they_do_not_agree_on_is_not_guessed(self) -> None:
+    def test_resolve_without_distro_ambiguous_type_raises(self) -> None:
         with pytest.raises(BagError, match=r"not known.*searched.*set ros_distro"):
             resolve(TypeResolver(), "rcl_interfaces/msg/ParameterDescriptor")
 
-    def test_an_unknown_type_says_where_was_looked_and_what_to_do(self) -> None:
+    def test_resolve_unknown_type_raises_with_searched_places(self) -> None:
         with pytest.raises(
             BagError, match=r"mine/msg/X is not known .* searched: the recording.*custom_msgs"
         ):
             resolve(TypeResolver(), "mine/msg/X")
 
-    def test_an_unknown_part_is_named_with_the_field_that_needs_it(self) -> None:
+    def test_resolve_unknown_nested_type_raises_with_field(self) -> None:
         with pytest.raises(
             BagError, match=r"^mine/msg/X\.part: the definition of mine/msg/Part is not known"
         ):
             resolve(TypeResolver(), "mine/msg/X", "Part part")
 
-    def test_a_distro_of_the_other_ros_is_named(self) -> None:
+    def test_resolve_distro_of_other_ros_version_raises(self) -> None:
         with pytest.raises(BagError, match="the recording is ROS 2, ros_distro is ros1_noetic"):
             resolve(TypeResolver(Stores.ROS1_NOETIC), "std_msgs/msg/Header")
 
 
 class TestRefusals:
-    def test_an_unreadable_text_is_its_types_problem_only(self) -> None:
+    def test_resolve_invalid_embedded_text_raises(self) -> None:
         resolver = TypeResolver()
         with pytest.raises(BagError, match="cannot be read"):
             resolve(resolver, "mine/msg/X", "no field here!")
         assert resolve(resolver, "mine/msg/Y", "int8 x").message.fields
 
-    def test_the_job_can_replace_an_unreadable_text(self) -> None:
+    def test_resolve_custom_type_replaces_invalid_embedded_text(self) -> None:
         resolver = TypeResolver(types={"mine/msg/X": "int8 good"})
         assert resolve(resolver, "mine/msg/X", "no field here!").source is Source.CUSTOM
         assert resolver.findings[0].rule == "unreadable-definition"
@@ -173,11 +173,11 @@ class TestRefusals:
         ],
         ids=["itself", "in a circle", "exponential", "deep", "wide"],
     )
-    def test_a_type_no_message_could_have_is_refused(self, text: str) -> None:
+    def test_resolve_too_large_type_raises(self, text: str) -> None:
         with pytest.raises(BagError):
             resolve(TypeResolver(), "mine/msg/X", text)
 
-    def test_other_schema_languages_are_named(self) -> None:
+    def test_resolve_other_schema_language_raises(self) -> None:
         with pytest.raises(BagError, match="'protobuf' is no ROS definition"):
             TypeResolver().resolve("X", Embedded("protobuf", "syntax"), ros_version=2)
 
@@ -188,7 +188,7 @@ class TestCustomMessages:
         (tmp_path / "Part.msg").write_text("float32 size\n")
         return tmp_path
 
-    def test_a_folder_a_file_and_a_package_are_all_fine(self, folder: Path) -> None:
+    def test_custom_msgs_accepts_folder_file_and_package(self, folder: Path) -> None:
         (folder / "msg").mkdir()
         (folder / "package").mkdir()
         (folder / "package" / "msg").mkdir()
@@ -198,21 +198,21 @@ class TestCustomMessages:
                 resolve(TypeResolver(custom=[("mine", path, None)]), "mine/msg/Part").source is Source.CUSTOM
             )
 
-    def test_they_stay_inside_their_run(self, folder: Path) -> None:
+    def test_custom_msgs_do_not_affect_other_resolvers(self, folder: Path) -> None:
         TypeResolver(custom=[("mine", folder, None)])
         with pytest.raises(BagError):
             resolve(TypeResolver(), "mine/msg/Part")
 
-    def test_those_of_another_distro_are_not_used_but_mentioned(self, folder: Path) -> None:
+    def test_custom_msgs_of_another_distro_are_mentioned_only(self, folder: Path) -> None:
         resolver = TypeResolver("ros2_jazzy", [("mine", folder, "ros2_humble")])
         with pytest.raises(BagError, match="custom_msgs has it for ros2_humble only"):
             resolve(resolver, "mine/msg/Part")
 
-    def test_a_folder_without_definitions_is_an_error(self, tmp_path: Path) -> None:
+    def test_custom_msgs_folder_without_definitions_raises(self, tmp_path: Path) -> None:
         with pytest.raises(BagError, match=r"has no \.msg or \.idl file"):
             TypeResolver(custom=[("mine", tmp_path, None)])
 
-    def test_a_resolver_goes_to_other_processes_with_what_it_knows(self, folder: Path) -> None:
+    def test_resolver_survives_pickling(self, folder: Path) -> None:
         ROSTypeRegistry.register("mine/msg/Other", "int8 x")
         try:
             resolver = TypeResolver(custom=[("mine", folder, None)])
@@ -224,7 +224,7 @@ class TestCustomMessages:
 
 
 @pytest.mark.parametrize("distro", [Stores.ROS1_NOETIC, Stores.ROS2_FOXY, Stores.ROS2_HUMBLE, Stores.LATEST])
-def test_the_text_of_every_standard_type_is_that_of_rosbags_and_reads_back(distro: Stores) -> None:
+def test_flatten_standard_types_equal_rosbags_and_round_trip(distro: Stores) -> None:
     version = ros_version(distro)
     assert version
     store, resolver = get_typestore(RosbagsStores(distro.value)), TypeResolver(distro)
