@@ -122,26 +122,33 @@ def _escape(match: re.Match[str]) -> str:
 _CREDENTIALS = re.compile(
     r"(?P<user>(?<=://)[^/@\s\"']+(?=@))"
     r"|(?P<api_key>msco_[a-z0-9]{32}_[0-9a-f]{8})"
-    r"|(?P<option>(?<=[?&])[^=&\s\"']*(?:key|password|token|secret|signature)[^=&\s\"']*=)(?P<value>[^&\s\"']+)",
+    r"|(?P<option>(?<=[?&])[^=&?\s\"']+=)(?P<value>[^&\s\"']+)",
     re.IGNORECASE,
 )
-"""User names and passwords in URLs, API keys, and URL options that contain a secret."""
+"""User names and passwords in URLs, API keys, and the options of URLs."""
+_SECRET_OPTION = re.compile("key|password|token|secret|signature", re.IGNORECASE)
 _MASK = "***"
 
 
 def has_credentials(text: str) -> bool:
     """Return whether a text contains an API key, or a URL with credentials that are not a variable."""
-    return any("${" not in (match["value"] or match[0]) for match in _CREDENTIALS.finditer(text))
+    return any(_is_secret(match) and "${" not in match[0] for match in _CREDENTIALS.finditer(text))
 
 
 def mask_credentials(text: str, *, same_length: bool = False) -> str:
     """Return the text with API keys and the credentials in URLs replaced by `***`, or by as many `*` as characters."""
 
     def mask(match: re.Match[str]) -> str:
+        if not _is_secret(match):
+            return match[0]
         option = match["option"] or ""
         return option + ("*" * (len(match[0]) - len(option)) if same_length else _MASK)
 
     return _CREDENTIALS.sub(mask, text)
+
+
+def _is_secret(match: re.Match[str]) -> bool:
+    return match["option"] is None or _SECRET_OPTION.search(match["option"]) is not None
 
 
 def join_names(names: Iterable[str], *, most: int = 8) -> str:

@@ -90,6 +90,21 @@ def test_registered_rules_are_used_in_source() -> None:
     assert [rule for rule in RULES if f'"{rule}"' not in text] == []
 
 
+def test_findings_in_source_have_the_registered_severity() -> None:
+    different = [
+        f"{path}:{node.lineno}: {node.args[0].value}"
+        for path, text in sources()
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Call)
+        and getattr(node.func, "id", "") == "Finding"
+        and isinstance(node.args[0], ast.Constant)
+        and isinstance(node.args[1], ast.Attribute)
+        and node.args[1].attr != RULES[node.args[0].value].severity.name
+    ]
+    # An unknown rule is a warning in a comment, and an error in the settings, which would otherwise have no effect.
+    assert [place.rpartition("/")[2].split(":")[0] for place in different] == ["settings.py"], different
+
+
 def test_registry_has_unique_sorted_codes_and_ids() -> None:
     codes = [rule.code for rule in RULES.values()]
     assert codes == sorted(set(codes))
