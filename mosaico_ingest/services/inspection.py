@@ -15,6 +15,7 @@ from mosaico_ingest.rosbag.blocks import Connection
 __all__ = [
     "InspectedTopic",
     "Inspection",
+    "estimate_rate_hz",
     "inspect",
 ]
 
@@ -28,7 +29,7 @@ class InspectedTopic(Part):
     count: int | None
     """How many messages the index promises."""
     rate_hz: float | None
-    """Messages a second over the recording's span."""
+    """Estimated messages per second; see `estimate_rate_hz`."""
     definition: str
     """Where the definition was found: bag, custom, distro, package or none."""
     adapter: str
@@ -92,7 +93,7 @@ def _topic(job: Job, connection: Connection, bridge: ROSBridge, duration_ns: int
         )
     rate = None
     if connection.count and connection.count > 1 and duration_ns:
-        rate = (connection.count - 1) / (duration_ns / 1e9)
+        rate = estimate_rate_hz(connection.count, duration_ns)
     source = connection.definition.source.value if connection.definition else "none"
     left = isinstance(outcome, ExcludedTopic)
     return InspectedTopic(
@@ -106,3 +107,15 @@ def _topic(job: Job, connection: Connection, bridge: ROSBridge, duration_ns: int
         ontology=None if left else outcome.ontology.tag,
         problem=outcome.why if left else None,
     )
+
+
+def estimate_rate_hz(count: int, duration_ns: int) -> float:
+    """Return the roundest rate with which `count` messages, at least two, fit the duration of the recording.
+
+    An index has no times per topic. A regular topic with n messages in d seconds has a rate between (n - 1) / d and
+    n / d, so that the digits that both have in common are what is known.
+    """
+    low, high = (count - 1) * 1e9 / duration_ns, count * 1e9 / duration_ns
+    middle = (low + high) / 2
+    candidates = (round(middle, decimals) for decimals in range(10))
+    return next((rate for rate in candidates if low <= rate <= high), middle)

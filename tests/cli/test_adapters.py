@@ -1,4 +1,4 @@
-"""`ingest adapters`: what is there, what it does, whether it does it, and a draft of what is not there yet."""
+"""`ingest adapters`: list, show, explain, test and init."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def ingest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     return run
 
 
-def test_every_built_in_adapter_is_listed(ingest: Ingest) -> None:
+def test_list_without_filter_lists_every_built_in_adapter(ingest: Ingest) -> None:
     code, out, _ = ingest("list", "--json")
     assert code == 0
     assert [one["name"] for one in json.loads(out)] == [builtin.name for builtin in BUILTIN]
@@ -65,30 +65,30 @@ def test_every_built_in_adapter_is_listed(ingest: Ingest) -> None:
 
 
 @pytest.mark.parametrize("glob", ["sensor_msgs/msg/Imu", "sensor_msgs/Im*", "Imu"])
-def test_the_list_can_be_of_one_type(ingest: Ingest, glob: str) -> None:
+def test_list_with_type_lists_adapters_of_that_type(ingest: Ingest, glob: str) -> None:
     names = [one["name"] for one in json.loads(ingest("list", "--type", glob, "--json")[1])]
     assert "IMUAdapter" in names
     assert "PoseAdapter" not in names
 
 
-def test_a_type_that_no_adapter_takes_is_said(ingest: Ingest) -> None:
+def test_list_with_unknown_type_exits_3(ingest: Ingest) -> None:
     code, out, err = ingest("list", "--type", "nowhere_msgs/*")
     assert (code, out) == (3, "")
     assert "no adapter takes 'nowhere_msgs/*'" in err
 
 
-def test_show_prints_the_file_as_it_is(ingest: Ingest) -> None:
+def test_show_built_in_adapter_prints_its_file(ingest: Ingest) -> None:
     assert ingest("show", "IMUAdapter")[1] == BY_NAME["IMUAdapter"].path.read_text()
     assert ingest("show", PACK)[1] == PACK.read_text()
 
 
-def test_an_adapter_that_is_not_there_names_the_nearest(ingest: Ingest) -> None:
+def test_show_unknown_adapter_suggests_nearest(ingest: Ingest) -> None:
     code, _, err = ingest("show", "ImuAdaptr")
     assert code == 1
     assert "did you mean" in err
 
 
-def test_every_built_in_adapter_is_explained_column_by_column() -> None:
+def test_explain_built_in_adapter_lists_every_column() -> None:
     types = DefinitionFinder()
     for builtin in BUILTIN:
         found = explain_adapter(builtin.name, types).description
@@ -99,7 +99,7 @@ def test_every_built_in_adapter_is_explained_column_by_column() -> None:
         assert all(origins[field.name] is not None for field in struct if not field.nullable)
 
 
-def test_a_type_is_explained_by_the_adapter_it_gets(ingest: Ingest) -> None:
+def test_explain_type_explains_its_default_adapter(ingest: Ingest) -> None:
     found = json.loads(ingest("explain", "sensor_msgs/PointCloud2", "--json")[1])
     assert found["description"]["name"] == "PointCloudAdapter"
     assert found["why"] == "built-in for sensor_msgs/msg/PointCloud2"
@@ -107,7 +107,7 @@ def test_a_type_is_explained_by_the_adapter_it_gets(ingest: Ingest) -> None:
     assert "Unmodeled" in ingest("explain", "std_msgs/msg/ColorRGBA")[1]
 
 
-def test_what_a_variant_adds_is_explained_for_its_type(ingest: Ingest) -> None:
+def test_explain_variant_type_lists_its_additional_columns(ingest: Ingest) -> None:
     found = json.loads(ingest("explain", "geometry_msgs/msg/PoseStamped", "--json")[1])
     origins = {column["name"]: column["origin"] for column in found["description"]["columns"]}
     assert origins["header"] == "header"
@@ -115,7 +115,7 @@ def test_what_a_variant_adds_is_explained_for_its_type(ingest: Ingest) -> None:
     assert found["description"]["takes"]["geometry_msgs/msg/PoseWithCovarianceStamped"] == "pose.pose"
 
 
-def test_fields_of_the_message_that_are_left_out_are_named(ingest: Ingest) -> None:
+def test_explain_adapter_lists_fields_without_column(ingest: Ingest) -> None:
     _, out, _ = ingest("explain", PACK, "--msg-dir", MESSAGES)
     assert "current_ma" in out
     assert "left out" not in out
@@ -124,7 +124,7 @@ def test_fields_of_the_message_that_are_left_out_are_named(ingest: Ingest) -> No
     assert "fields without a column: current_ma" in ingest("explain", "less.yaml", "--msg-dir", MESSAGES)[1]
 
 
-def test_every_topic_of_a_job_says_which_adapter_and_why(ingest: Ingest) -> None:
+def test_explain_job_lists_adapter_and_reason_per_topic(ingest: Ingest) -> None:
     topics = {one["topic"]: one for one in json.loads(ingest("explain", "--job", JOB, "--json")[1])}
     assert topics["/battery"]["adapter"] == "BatteryPackAdapter"
     assert topics["/battery"]["why"] == "loaded from quickstart/adapters/battery_pack.yaml"
@@ -132,20 +132,20 @@ def test_every_topic_of_a_job_says_which_adapter_and_why(ingest: Ingest) -> None
     assert "`topics`" in topics["/camera/image_raw"]["why"]
 
 
-def test_every_topic_of_a_recording_says_which_adapter_and_why(ingest: Ingest) -> None:
+def test_explain_bag_lists_adapter_and_reason_per_topic(ingest: Ingest) -> None:
     code, out, _ = ingest("explain", "--bag", BAG)
     assert code == 0
     assert "built-in for sensor_msgs/msg/Imu" in out
     assert "no adapter takes acme_msgs/msg/BatteryPack" in out
 
 
-def test_all_built_in_tests_pass(ingest: Ingest) -> None:
+def test_test_all_built_in_adapters_passes(ingest: Ingest) -> None:
     code, out, _ = ingest("test", "--all")
     assert code == 0
     assert f"{len(BUILTIN)} adapters" in out
 
 
-def test_a_test_that_fails_says_where_and_what_came_out(ingest: Ingest) -> None:
+def test_test_failing_test_prints_location_and_actual_value(ingest: Ingest) -> None:
     Path("pack.yaml").write_text(PACK.read_text().replace("voltage: 12.0", "voltage: 13.0"))
     code, out, _ = ingest("test", "pack.yaml", "--msg-dir", MESSAGES)
     assert code == 1
@@ -154,7 +154,7 @@ def test_a_test_that_fails_says_where_and_what_came_out(ingest: Ingest) -> None:
     assert "0 of 1 tests passed" in out
 
 
-def test_a_name_of_a_test_does_not_control_the_terminal(ingest: Ingest) -> None:
+def test_test_name_with_control_characters_is_escaped(ingest: Ingest) -> None:
     text = PACK.read_text().replace("voltage: 12.0", "voltage: 13.0")
     Path("pack.yaml").write_text(text.replace("name: discharging", r'name: "\e]0;owned\a:skull:"'))
     _, out, _ = ingest("test", "pack.yaml", "--msg-dir", MESSAGES)
@@ -162,7 +162,7 @@ def test_a_name_of_a_test_does_not_control_the_terminal(ingest: Ingest) -> None:
     assert ":skull:" in out
 
 
-def test_an_adapter_that_does_not_fit_its_type_is_shown_with_its_source(ingest: Ingest) -> None:
+def test_test_mismatched_adapter_prints_source_excerpt(ingest: Ingest) -> None:
     Path("pack.yaml").write_text(PACK.read_text().replace("soc / 100", "charge_left / 100"))
     code, out, _ = ingest("test", "pack.yaml", "--msg-dir", f"acme_msgs={MESSAGES}")
     assert code == 1
@@ -170,7 +170,7 @@ def test_an_adapter_that_does_not_fit_its_type_is_shown_with_its_source(ingest: 
     assert "charge_left" in out
 
 
-def test_a_test_can_be_a_recorded_message(ingest: Ingest, tmp_path: Path) -> None:
+def test_test_with_recorded_message_passes(ingest: Ingest, tmp_path: Path) -> None:
     text = PACK.read_text()
     test = f"tests:\n  - name: recorded\n    given: {{bag: {BAG}, topic: /battery, index: 2}}\n    expect: {{serial_number: PK-0042}}\n"
     (tmp_path / "pack.yaml").write_text(text[: text.index("tests:")] + test)
@@ -199,7 +199,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 @pytest.mark.usefixtures("package")
-def test_the_adapter_of_an_installed_package_is_listed_used_and_may_be_named(
+def test_installed_adapter_is_listed_and_usable_by_name(
     ingest: Ingest, capsys: pytest.CaptureFixture[str]
 ) -> None:
     listed = json.loads(ingest("list", "--type", "Imu", "--json")[1])
@@ -215,7 +215,7 @@ def test_the_adapter_of_an_installed_package_is_listed_used_and_may_be_named(
     assert "unknown-adapter" not in capsys.readouterr().out
 
 
-def test_a_broken_installed_package_is_named(ingest: Ingest, package: Path) -> None:
+def test_list_broken_installed_package_names_package(ingest: Ingest, package: Path) -> None:
     (package / "entry_points.txt").write_text("[mosaico_ingest.adapters]\nimu = acme_pkg_for_tests:Gone\n")
     code, _, err = ingest("list")
     assert code == 1
@@ -224,7 +224,7 @@ def test_a_broken_installed_package_is_named(ingest: Ingest, package: Path) -> N
 
 
 @pytest.mark.parametrize("ontology", [(), ("--ontology", "BatteryState")])
-def test_a_draft_of_a_recorded_message_passes_its_test_and_the_linter(
+def test_init_with_recorded_message_passes_test_and_lint(
     ingest: Ingest, capsys: pytest.CaptureFixture[str], ontology: tuple[str, ...]
 ) -> None:
     draft = (
@@ -248,7 +248,7 @@ def test_a_draft_of_a_recorded_message_passes_its_test_and_the_linter(
 
 
 @pytest.mark.parametrize("topic", ["/imu", "/lidar/points", "/odom", "/camera/image_raw/compressed"])
-def test_a_draft_made_of_a_large_message_names_it_by_its_place(ingest: Ingest, topic: str) -> None:
+def test_init_with_large_message_refers_to_recording(ingest: Ingest, topic: str) -> None:
     topics = json.loads(ingest("explain", "--bag", BAG, "--json")[1])
     chosen = next(one for one in topics if one["topic"] == topic)
     code, out, _ = ingest(
@@ -259,7 +259,7 @@ def test_a_draft_made_of_a_large_message_names_it_by_its_place(ingest: Ingest, t
     assert ingest("test", "draft.yaml")[0] == 0
 
 
-def test_a_draft_of_an_unknown_type_says_where_it_was_looked_for(ingest: Ingest) -> None:
+def test_init_unknown_type_lists_searched_sources(ingest: Ingest) -> None:
     code, _, err = ingest("init", "nosuch_msgs/Type")
     assert code == 1
     assert "searched" in err
@@ -271,7 +271,5 @@ def test_a_draft_of_an_unknown_type_says_where_it_was_looked_for(ingest: Ingest)
 @pytest.mark.parametrize(
     "arguments", [("explain",), ("test",), ("test", "IMUAdapter", "--all"), ("init", "a/B", "--record", "/x")]
 )
-def test_a_command_that_does_not_know_what_is_meant_says_so(
-    ingest: Ingest, arguments: tuple[str, ...]
-) -> None:
+def test_adapters_ambiguous_arguments_exit_2(ingest: Ingest, arguments: tuple[str, ...]) -> None:
     assert ingest(*arguments)[0] == 2

@@ -1,4 +1,4 @@
-"""A user's mistake is one line that says what, where and what to do, with the documented exit code and no traceback."""
+"""Mistakes of users: one line with problem, location and hint, the documented exit code, and no traceback."""
 
 from __future__ import annotations
 
@@ -46,61 +46,61 @@ def job(folder: Path, text: str) -> str:
 GOOD = f"version: 1\nbag: {{path: {QUICKSTART}}}\nsequence: {{name: good}}\n"
 
 
-def test_a_missing_manifest(ingest: Ingest) -> None:
+def test_run_missing_manifest_exits_2(ingest: Ingest) -> None:
     code, _, err = ingest("nowhere.yaml")
     assert code == 2
     assert "nowhere.yaml" in err
 
 
-def test_a_manifest_that_is_not_a_mapping(ingest: Ingest, tmp_path: Path) -> None:
+def test_run_manifest_not_a_mapping_exits_2_with_location(ingest: Ingest, tmp_path: Path) -> None:
     code, _, err = ingest(job(tmp_path, "- one\n- two\n"))
     assert code == 2
     assert "job.yaml:1:1" in err
 
 
-def test_an_unknown_key_names_its_place_and_the_nearest_key(ingest: Ingest, tmp_path: Path) -> None:
+def test_run_unknown_key_exits_2_with_location_and_suggestion(ingest: Ingest, tmp_path: Path) -> None:
     code, _, err = ingest(job(tmp_path, GOOD.replace("bag:", "bga:")))
     assert code == 2
     assert "job.yaml:2:1" in err
     assert "bag" in err
 
 
-def test_a_missing_recording(ingest: Ingest, tmp_path: Path) -> None:
+def test_run_missing_recording_exits_3(ingest: Ingest, tmp_path: Path) -> None:
     code, _, err = ingest(job(tmp_path, "version: 1\nbag: {path: gone.mcap}\nsequence: {name: x}\n"))
     assert code == 3
     assert "gone.mcap" in err
     assert not (tmp_path / "mosaico").exists()
 
 
-def test_an_empty_recording(ingest: Ingest, tmp_path: Path) -> None:
+def test_bag_empty_recording_exits_1(ingest: Ingest, tmp_path: Path) -> None:
     (tmp_path / "empty.bag").touch()
     code, _, err = ingest("bag", "empty.bag", "--name", "x")
     assert code == 1
     assert "empty" in err
 
 
-def test_something_that_is_no_recording(ingest: Ingest, tmp_path: Path) -> None:
+def test_bag_text_file_exits_1(ingest: Ingest, tmp_path: Path) -> None:
     (tmp_path / "text.mcap").write_text("hello, this is no recording at all\n")
     code, _, err = ingest("bag", "text.mcap", "--name", "x")
     assert code == 1
     assert "text.mcap" in err
 
 
-def test_a_directory_without_a_recording(ingest: Ingest, tmp_path: Path) -> None:
+def test_bag_directory_without_recording_exits_1(ingest: Ingest, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     code, _, err = ingest("bag", "empty", "--name", "x")
     assert code in {1, 3}
     assert "empty" in err
 
 
-def test_a_store_that_cannot_be_written(ingest: Ingest, tmp_path: Path) -> None:
+def test_bag_unwritable_store_exits_1(ingest: Ingest, tmp_path: Path) -> None:
     (tmp_path / "mosaico").write_text("a file where the store should be")
     code, _, err = ingest(job(tmp_path, GOOD))
     assert code == 1
     assert "mosaico" in err
 
 
-def test_a_store_of_a_newer_format(ingest: Ingest, tmp_path: Path) -> None:
+def test_bag_store_of_newer_format_exits_1(ingest: Ingest, tmp_path: Path) -> None:
     assert ingest(job(tmp_path, GOOD), "-q")[0] == 0
     with sqlite3.connect(tmp_path / "mosaico" / "catalog.sqlite") as db:
         db.execute("PRAGMA user_version = 99")
@@ -110,7 +110,7 @@ def test_a_store_of_a_newer_format(ingest: Ingest, tmp_path: Path) -> None:
     assert "99" in err
 
 
-def test_a_name_that_exists_leaves_the_old_sequence(ingest: Ingest, tmp_path: Path) -> None:
+def test_bag_existing_sequence_is_unchanged(ingest: Ingest, tmp_path: Path) -> None:
     assert ingest(job(tmp_path, GOOD), "-q")[0] == 0
     code, _, err = ingest(job(tmp_path, GOOD))
     assert code == 1
@@ -119,45 +119,45 @@ def test_a_name_that_exists_leaves_the_old_sequence(ingest: Ingest, tmp_path: Pa
     assert ingest("store", "show", "good")[0] == 0
 
 
-def test_an_unknown_word_names_the_nearest_command(ingest: Ingest) -> None:
+def test_main_unknown_command_suggests_nearest(ingest: Ingest) -> None:
     code, _, err = ingest("inspct")
     assert code == 2
     assert "did you mean `ingest inspect`" in err
 
 
-def test_metadata_that_is_not_an_object(ingest: Ingest) -> None:
+def test_bag_metadata_not_an_object_exits_2(ingest: Ingest) -> None:
     code, _, err = ingest("bag", str(QUICKSTART), "--name", "x", "--metadata", "[1]")
     assert code == 2
     assert "--metadata" in err
 
 
-def test_metadata_in_a_file_that_is_not_text(ingest: Ingest, tmp_path: Path) -> None:
+def test_bag_metadata_file_not_utf8_exits_2(ingest: Ingest, tmp_path: Path) -> None:
     (tmp_path / "metadata.json").write_bytes(b"\x80\xff")
     code, _, err = ingest("bag", str(QUICKSTART), "--name", "x", "--metadata", "metadata.json")
     assert code == 2
     assert "metadata.json: is not JSON" in err
 
 
-def test_a_distro_that_does_not_exist(ingest: Ingest) -> None:
+def test_bag_unknown_distro_exits_2(ingest: Ingest) -> None:
     code, _, err = ingest("bag", str(QUICKSTART), "--name", "x", "--ros-distro", "ros2_hmble")
     assert code == 2
     assert "ros2_humble" in err
 
 
-def test_a_log_level_that_does_not_exist(ingest: Ingest) -> None:
+def test_bag_unknown_log_level_exits_2(ingest: Ingest) -> None:
     code, _, err = ingest("bag", str(QUICKSTART), "--name", "x", "--log", "LOUD")
     assert code == 2
     assert "LOUD" in err
 
 
-def test_debug_shows_the_traceback(tmp_path: Path) -> None:
+def test_main_with_debug_raises_original_error(tmp_path: Path) -> None:
     from mosaico_ingest.errors import ManifestError  # noqa: PLC0415 - as the command line does
 
     with pytest.raises(ManifestError):
         main(["--debug", str(tmp_path / "nowhere.yaml")])
 
 
-def test_a_file_that_may_not_be_written(ingest: Ingest, tmp_path: Path) -> None:
+def test_bag_unwritable_report_exits_1(ingest: Ingest, tmp_path: Path) -> None:
     (tmp_path / "job.yaml").write_text("bag: {path: data/run.mcap}\ntopics: [!/cam]\n")
     (tmp_path / "job.yaml").chmod(0o400)
     refused = "(Read-only file system|Permission denied)"
@@ -168,7 +168,9 @@ def test_a_file_that_may_not_be_written(ingest: Ingest, tmp_path: Path) -> None:
         assert (code, bool(re.search(f"job.schema.json: cannot be written: {refused}", err))) == (1, True)
 
 
-def test_a_read_only_folder(ingest: Ingest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bag_read_only_folder_exits_1(
+    ingest: Ingest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     manifest = job(tmp_path, GOOD)
     with read_only(tmp_path):
         monkeypatch.chdir(tmp_path)  # what was entered before may still be written
@@ -178,15 +180,13 @@ def test_a_read_only_folder(ingest: Ingest, tmp_path: Path, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("option", ["--report", "--metrics"])
-def test_a_folder_in_place_of_a_file_to_write_is_said_before_anything_is_ingested(
-    ingest: Ingest, tmp_path: Path, option: str
-) -> None:
+def test_bag_report_is_folder_exits_before_ingestion(ingest: Ingest, tmp_path: Path, option: str) -> None:
     code, _, err = ingest(job(tmp_path, GOOD), option, ".")
     assert (code, err) == (2, "error: .: is a folder — name a file\n")
     assert not (tmp_path / "mosaico").exists()
 
 
-def test_a_file_that_cannot_be_written_costs_nothing_but_itself(ingest: Ingest, tmp_path: Path) -> None:
+def test_run_unwritable_output_keeps_other_outputs(ingest: Ingest, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     code, out, err = ingest(job(tmp_path, GOOD), "--metrics", "file/x.prom", "--report", "run.json")
     assert code == 1
@@ -195,7 +195,7 @@ def test_a_file_that_cannot_be_written_costs_nothing_but_itself(ingest: Ingest, 
     assert (tmp_path / "run.json").exists()
 
 
-def test_a_plan_that_cannot_be_written_is_said(ingest: Ingest, tmp_path: Path) -> None:
+def test_plan_unwritable_output_exits_1(ingest: Ingest, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     code, _, err = ingest("plan", job(tmp_path, GOOD), "--out", "file/plan.json")
     assert code == 1
@@ -203,7 +203,7 @@ def test_a_plan_that_cannot_be_written_is_said(ingest: Ingest, tmp_path: Path) -
     assert ingest("plan", "job.yaml", "--out", ".")[0] == 2
 
 
-def test_what_a_damaged_recording_lost_is_said_once_with_its_place(ingest: Ingest, tmp_path: Path) -> None:
+def test_bag_damaged_recording_prints_unreadable_range_once(ingest: Ingest, tmp_path: Path) -> None:
     (tmp_path / "cut.mcap").write_bytes(QUICKSTART.read_bytes()[:300_000])
     code, out, err = ingest("bag", "cut.mcap", "--name", "cut")
     assert code == 4
@@ -212,7 +212,7 @@ def test_what_a_damaged_recording_lost_is_said_once_with_its_place(ingest: Inges
     assert ", some unreadable, " in out
 
 
-def test_a_batch_says_how_many_recordings_were_skipped(ingest: Ingest, tmp_path: Path) -> None:
+def test_run_batch_prints_number_of_skipped_recordings(ingest: Ingest, tmp_path: Path) -> None:
     for name in ("a", "b", "c", "d"):
         (tmp_path / f"{name}.mcap").write_bytes(QUICKSTART.read_bytes())
     text = 'version: 1\nbag: {path: "*.mcap"}\nsequence: {if_exists: skip}\ntopics: [/battery]\n'
@@ -222,7 +222,7 @@ def test_a_batch_says_how_many_recordings_were_skipped(ingest: Ingest, tmp_path:
     assert "a: skipped\n" in err
 
 
-def test_an_inspection_of_nothing_says_so(ingest: Ingest, tmp_path: Path) -> None:
+def test_inspect_recording_without_topics_prints_no_topics(ingest: Ingest, tmp_path: Path) -> None:
     with Writer(tmp_path / "none.bag"):
         pass
     first, *rest = ingest("inspect", "none.bag")[1].splitlines()
@@ -240,15 +240,13 @@ def test_an_inspection_of_nothing_says_so(ingest: Ingest, tmp_path: Path) -> Non
         ("topic_settings: {/imu: {metadata: {a.b: 1}}}", "job.yaml:2:35: metadata key 'a.b'"),
     ],
 )
-def test_a_name_that_the_platform_refuses_is_a_mistake_of_the_manifest(
-    ingest: Ingest, tmp_path: Path, settings: str, place: str
-) -> None:
+def test_bag_invalid_sequence_name_exits_2(ingest: Ingest, tmp_path: Path, settings: str, place: str) -> None:
     code, _, err = ingest(job(tmp_path, f"bag: {{path: {QUICKSTART}}}\n{settings}\n"))
     assert (code, err.count("\n")) == (2, 1)
     assert err.startswith(f"error: {place}")
 
 
-def test_a_name_that_is_not_there_is_answered_with_the_nearest(ingest: Ingest) -> None:
+def test_store_unknown_name_suggests_nearest(ingest: Ingest) -> None:
     code, _, err = ingest("bag", str(QUICKSTART), "--name", "drive", "--topics", "gps/fx", "--topics", "imu")
     assert code == 3
     assert "no topic matches 'gps/fx', 'imu' — the nearest is /gps/fix, /imu; there are " in err
@@ -261,31 +259,31 @@ def test_a_name_that_is_not_there_is_answered_with_the_nearest(ingest: Ingest) -
     )
 
 
-def test_a_file_where_the_store_should_be_is_said(ingest: Ingest, tmp_path: Path) -> None:
+def test_store_path_is_file_exits_1(ingest: Ingest, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     code, _, err = ingest("bag", str(QUICKSTART), "--name", "drive", "--store", "file")
     assert code == 1
     assert "error: file: File exists — a file is in the way; choose another target.store\n" in err
 
 
-def test_an_adapter_file_that_is_not_there_is_named_once(ingest: Ingest) -> None:
+def test_run_missing_adapter_file_is_reported_once(ingest: Ingest) -> None:
     ingest("bag", str(QUICKSTART), "--name", "drive", "--topics", "/imu")
     err = ingest("export", "drive", "--to", "x.mcap", "--adapter", "no.yaml")[2]
     assert err == "error: no.yaml: the adapter file cannot be read: No such file or directory\n"
 
 
-def test_a_manifest_may_follow_the_options(ingest: Ingest, tmp_path: Path) -> None:
+def test_main_manifest_after_options_runs(ingest: Ingest, tmp_path: Path) -> None:
     assert ingest("-q", "--jobs", "2", job(tmp_path, GOOD)) == (0, "", "")
 
 
 @pytest.mark.parametrize("name", ["my drive.mcap", "."])
-def test_a_recording_in_place_of_a_manifest_is_answered_with_what_takes_it(ingest: Ingest, name: str) -> None:
+def test_main_recording_instead_of_manifest_suggests_bag_and_init(ingest: Ingest, name: str) -> None:
     code, _, err = ingest(name)
     assert code == 2
     assert f"`ingest init {name if name == '.' else repr(name)}`" in err
 
 
-def test_a_shard_without_a_recording_says_so(ingest: Ingest, tmp_path: Path) -> None:
+def test_run_empty_shard_exits_0_with_note(ingest: Ingest, tmp_path: Path) -> None:
     assert ingest(job(tmp_path, GOOD), "--shard", "2/2") == (
         0,
         "",
@@ -293,7 +291,7 @@ def test_a_shard_without_a_recording_says_so(ingest: Ingest, tmp_path: Path) -> 
     )
 
 
-def test_keys_that_are_not_there_or_have_expired_are_said(ingest: Ingest, tmp_path: Path) -> None:
+def test_keys_missing_file_or_past_expiry_exits_2(ingest: Ingest, tmp_path: Path) -> None:
     assert ingest("keys", "ls")[0] == 2
     new = ("keys", "new", "--permission", "read", "--expires")
     assert "is in the past" in ingest(*new, "2020-01-01T00:00:00Z")[2]
@@ -307,12 +305,12 @@ def test_keys_that_are_not_there_or_have_expired_are_said(ingest: Ingest, tmp_pa
     assert "expired 2020" in ingest("keys", "ls")[1]
 
 
-def test_a_certificate_that_cannot_be_read_is_not_the_stores_fault(ingest: Ingest) -> None:
+def test_bag_unreadable_certificate_names_file(ingest: Ingest) -> None:
     code, _, err = ingest("serve", "--tls-cert", "no.pem", "--tls-key", "no.pem")
     assert (code, err) == (1, "error: no.pem: cannot be read: No such file or directory\n")
 
 
-def test_a_manifest_of_any_name_is_expanded_where_output_is_strict(tmp_path: Path) -> None:
+def test_expand_undecodable_file_name_with_strict_stdout_succeeds(tmp_path: Path) -> None:
     name = os.fsdecode(b"job\xff.yaml")
     (tmp_path / name).write_text(
         "version: 1\nbag: {path: '{a}.mcap'}\nsequence: {name: s}\nmatrix: {a: [x, y]}\n"
@@ -338,9 +336,7 @@ def test_a_manifest_of_any_name_is_expanded_where_output_is_strict(tmp_path: Pat
     ],
 )
 @pytest.mark.slow
-def test_a_reader_that_leaves_early_changes_nothing(
-    arguments: tuple[str, ...], code: int, tmp_path: Path
-) -> None:
+def test_run_closed_pipe_keeps_exit_code(arguments: tuple[str, ...], code: int, tmp_path: Path) -> None:
     (tmp_path / "cut.mcap").write_bytes(QUICKSTART.read_bytes()[:300_000])
     command = [sys.executable, "-m", "mosaico_ingest", *arguments]
     with subprocess.Popen(  # noqa: S603 - our own command
@@ -354,7 +350,7 @@ def test_a_reader_that_leaves_early_changes_nothing(
 
 
 @pytest.mark.slow
-def test_output_that_is_closed_is_not_missed(tmp_path: Path) -> None:
+def test_run_closed_stdout_keeps_exit_code(tmp_path: Path) -> None:
     command = f"{sys.executable} -m mosaico_ingest inspect {QUICKSTART} >&-"
     done = subprocess.run(  # noqa: S602 - our own command
         command, shell=True, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60

@@ -1,4 +1,4 @@
-"""`ingest export`, as a user runs it."""
+"""`ingest export`."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_account_names_every_topic_and_the_file(folder: Path) -> None:
+def test_export_prints_every_topic_and_file(folder: Path) -> None:
     done = ingest(folder, "export", "drive", "--to", "a.mcap")
     assert done.returncode == 0, done.stderr
     assert "FrameTransformAdapter" in done.stdout
     assert "a.mcap: 2,130 messages" in done.stdout
 
 
-def test_the_account_is_json_for_programs(folder: Path) -> None:
+def test_export_with_json_prints_report(folder: Path) -> None:
     done = ingest(
         folder, "export", "drive", "--to", "b.mcap", "-t", "/imu", "--start", "+2s", "--end", "-3s", "--json"
     )
@@ -61,7 +61,7 @@ def test_the_account_is_json_for_programs(folder: Path) -> None:
     assert account["topics"][0]["messages"] == 499
 
 
-def test_what_is_left_out_is_said_and_is_exit_code_4(folder: Path) -> None:
+def test_export_excluded_topic_exits_4(folder: Path) -> None:
     job = DRIVE.parents[1] / "quickstart.yaml"
     (folder / "quickstart").symlink_to(DRIVE.parent)
     (folder / "job.yaml").write_text(job.read_text().replace("../mosaico", "mosaico"))
@@ -82,7 +82,7 @@ def test_what_is_left_out_is_said_and_is_exit_code_4(folder: Path) -> None:
         (("drive", "--to", "x.mcap", "--adapter", "Nonsense"), 1, "no adapter is called"),
     ],
 )
-def test_mistakes_are_told_in_a_line_and_leave_no_file(
+def test_export_invalid_arguments_leave_no_file(
     folder: Path, arguments: tuple[str, ...], code: int, says: str
 ) -> None:
     done = ingest(folder, "export", *arguments)

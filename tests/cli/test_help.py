@@ -1,4 +1,4 @@
-"""What `--help` says arrives whole, and the same thing has the same name everywhere."""
+"""The help texts are complete, and options have the same meaning in all commands."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ COMMANDS = dict(_commands(get_command(command_line())))
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_no_help_has_brackets_which_the_display_takes_for_markup(name: str) -> None:
+def test_help_texts_contain_no_markup_brackets(name: str) -> None:
     for parameter in COMMANDS[name].params:
         assert "[" not in (getattr(parameter, "help", None) or ""), parameter.name
 
 
-def test_a_short_option_means_the_same_in_every_command() -> None:
+def test_short_options_have_one_meaning() -> None:
     meaning: dict[str, str] = {}
     for name, command in COMMANDS.items():
         for parameter in command.params:
@@ -37,5 +37,5 @@ def test_a_short_option_means_the_same_in_every_command() -> None:
 
 
 @pytest.mark.parametrize(("command", "said"), [("init", "(stdout)"), ("bag", "(mosaico)")])
-def test_what_happens_without_an_option_is_said(command: str, said: str) -> None:
+def test_help_states_defaults(command: str, said: str) -> None:
     assert said in CliRunner().invoke(command_line(), [command, "--help"], env={"COLUMNS": "150"}).output

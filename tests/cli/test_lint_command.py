@@ -1,4 +1,4 @@
-"""`ingest lint` as it is called: its text, its codes, its words for a wrong call."""
+"""`ingest lint`: its text, exit codes and usage errors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_the_text_is_for_people(folder: Path) -> None:
+def test_lint_text_format_prints_findings_with_excerpts(folder: Path) -> None:
     result = RUN.invoke(command_line(), ["lint", "job.yaml", "--quiet"])
     assert result.exit_code == 12
     assert result.stdout == (
@@ -41,27 +41,27 @@ def test_the_text_is_for_people(folder: Path) -> None:
     assert folder
 
 
-def test_a_fix_leaves_nothing_to_say(folder: Path) -> None:
+def test_lint_fix_applies_all_changes(folder: Path) -> None:
     result = RUN.invoke(command_line(), ["lint", "--fix", "job.yaml"])
     assert (result.exit_code, result.stdout) == (0, "")
     assert "1 file, 0 findings, 2 changes made" in result.stderr
     assert '"!/cam/*"' in (folder / "job.yaml").read_text()
 
 
-def test_sarif_does_not_fail_for_findings(folder: Path) -> None:
+def test_lint_sarif_with_findings_exits_0(folder: Path) -> None:
     result = RUN.invoke(command_line(), ["lint", "--format", "sarif", "job.yaml"])
     assert result.exit_code == 0
     assert json.loads(result.stdout)["version"] == "2.1.0"
     assert folder
 
 
-def test_standard_input_is_judged(folder: Path) -> None:
+def test_lint_dash_reads_stdin(folder: Path) -> None:
     result = RUN.invoke(command_line(), ["lint", "-", "--format", "github"], input=JOB)
     assert result.stdout.startswith("::error file=-,line=3,col=15")
     assert folder
 
 
-def test_no_env_misses_no_variable(folder: Path) -> None:
+def test_lint_no_env_ignores_unset_variables(folder: Path) -> None:
     (folder / "job.yaml").write_text("bag: {path: '${NOT_SET_ANYWHERE}'}\n")
     assert RUN.invoke(command_line(), ["lint", "job.yaml"]).exit_code == 12
     assert RUN.invoke(command_line(), ["lint", "job.yaml", "--no-env"]).exit_code == 0
@@ -76,14 +76,14 @@ def test_no_env_misses_no_variable(folder: Path) -> None:
         (["--explain", "yaml-tga"], "did you mean 'yaml-tag'"),
     ],
 )
-def test_a_wrong_call_is_a_usage_error(folder: Path, arguments: list[str], words: str) -> None:
+def test_lint_invalid_arguments_exit_2(folder: Path, arguments: list[str], words: str) -> None:
     result = RUN.invoke(command_line(), ["lint", *arguments], env={"COLUMNS": "200"})
     assert result.exit_code == 2
     assert words in " ".join(result.stderr.split())
     assert folder
 
 
-def test_skipped_files_are_counted_and_listed(folder: Path) -> None:
+def test_lint_skipped_files_are_counted_and_listed(folder: Path) -> None:
     (folder / "compose.yaml").write_text("services: {}\n")
     result = RUN.invoke(command_line(), ["lint", "."], env={"COLUMNS": "200"})
     assert "1 file, 2 findings\n1 file skipped (not a manifest or an adapter): compose.yaml" in result.stderr
@@ -92,13 +92,13 @@ def test_skipped_files_are_counted_and_listed(folder: Path) -> None:
     ]
 
 
-def test_nothing_to_judge_is_three(folder: Path) -> None:
+def test_lint_without_files_exits_3(folder: Path) -> None:
     (folder / "job.yaml").unlink()
     assert RUN.invoke(command_line(), ["lint", "."]).exit_code == 3
 
 
 @pytest.mark.parametrize("word", ["yaml-tag", "ING003"])
-def test_a_rule_explains_itself(word: str) -> None:
+def test_lint_explain_prints_page_of_rule(word: str) -> None:
     result = RUN.invoke(command_line(), ["lint", "--explain", word])
     assert result.stdout.startswith("# yaml-tag (ING003)\n")
     assert "| ING003 | [yaml-tag]" in RUN.invoke(command_line(), ["lint", "--explain", "all"]).stdout

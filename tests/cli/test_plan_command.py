@@ -1,4 +1,4 @@
-"""`ingest plan` as a user runs it: what would happen, what has changed, and running exactly that."""
+"""`ingest plan`, `diff`, `expand` and `init`, and running exactly a plan."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def location(text: str, file: str = JOB) -> str:
 Ingest = Callable[..., tuple[int, str]]
 
 
-def test_a_plan_says_what_becomes_of_each_topic_and_why_and_writes_nothing(ingest: Ingest) -> None:
+def test_plan_prints_topics_with_reasons_and_writes_nothing(ingest: Ingest) -> None:
     code, said = ingest("plan", JOB)
     assert code == 0
     assert "quickstart_drive → mosaico" in said
@@ -69,7 +69,7 @@ def test_a_plan_says_what_becomes_of_each_topic_and_why_and_writes_nothing(inges
     assert not Path("mosaico").exists()
 
 
-def test_what_the_manifest_names_and_the_recording_lacks_is_pointed_at(ingest: Ingest) -> None:
+def test_plan_unmatched_patterns_are_reported_with_location(ingest: Ingest) -> None:
     edit(JOB, '["*", "!/camera/image_raw"]', '["*", /imuu]')
     edit(JOB, '"/camera/*": ignore', '"/kamera/*": ignore')
     with Path(JOB).open("a") as file:
@@ -84,7 +84,7 @@ def test_what_the_manifest_names_and_the_recording_lacks_is_pointed_at(ingest: I
     assert "topic_settings: '/gps/fixx' matches none of 10 topics — the nearest is /gps/fix" in said
 
 
-def test_an_adapter_that_is_named_is_told_with_the_line_that_does(ingest: Ingest) -> None:
+def test_plan_adapter_override_note_has_location(ingest: Ingest) -> None:
     edit(JOB, "adapters:\n", 'adapters:\n  override: {"/od*": OdometryAdapter}\n')
     with Path(JOB).open("a") as file:
         file.write("quarantine: {max: 1%}\n")
@@ -98,7 +98,7 @@ def test_an_adapter_that_is_named_is_told_with_the_line_that_does(ingest: Ingest
     assert (quarantine["path"], quarantine["max"]) == ("quarantine", 0.01)
 
 
-def test_every_adapter_that_does_not_fit_is_told_at_once(ingest: Ingest) -> None:
+def test_plan_mismatched_adapters_are_reported_together(ingest: Ingest) -> None:
     edit("configs/quickstart/adapters/battery_pack.yaml", "voltage: voltage_mv", "voltage: gone")
     edit(JOB, "adapters:\n", "adapters:\n  override: {/imu: GPSAdapter}\n")
     code, said = ingest("plan", JOB)
@@ -108,7 +108,7 @@ def test_every_adapter_that_does_not_fit_is_told_at_once(ingest: Ingest) -> None
     assert "GPSAdapter" in said
 
 
-def test_what_would_be_rejected_shows_in_the_sample(ingest: Ingest) -> None:
+def test_plan_sample_with_rejections_exits_4(ingest: Ingest) -> None:
     edit("configs/quickstart/adapters/battery_pack.yaml", "map: {0: 3, 1: 1, 2: 2}", "map: {0: 3}")
     code, said = ingest("plan", JOB)
     assert code == 4
@@ -117,7 +117,7 @@ def test_what_would_be_rejected_shows_in_the_sample(ingest: Ingest) -> None:
     assert not Path("mosaico").exists()
 
 
-def test_the_document_fits_its_schema_and_reads_back(ingest: Ingest) -> None:
+def test_plan_document_fits_schema_and_round_trips(ingest: Ingest) -> None:
     code, said = ingest("plan", JOB, "--json")
     assert code == 0
     schema = json.loads((ROOT / "schemas" / "plan.schema.json").read_text())
@@ -133,7 +133,7 @@ def test_the_document_fits_its_schema_and_reads_back(ingest: Ingest) -> None:
     assert "_ros_" not in said
 
 
-def test_a_plan_is_the_same_wherever_it_is_made_from(
+def test_plan_from_other_folder_is_equal(
     ingest: Ingest, project: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     edit(JOB, "target: {store: ../mosaico}", "target: {store: store}")
@@ -145,7 +145,7 @@ def test_a_plan_is_the_same_wherever_it_is_made_from(
     )
 
 
-def test_check_tells_what_has_changed(ingest: Ingest) -> None:
+def test_plan_check_changed_manifest_exits_1_with_differences(ingest: Ingest) -> None:
     ingest("plan", JOB, "--out", "plan.json")
     edit(JOB, '"!/camera/image_raw"', '"!/camera/image_raw", "!/odom"')
     edit(JOB, "demo-01", "demo-02")
@@ -160,7 +160,7 @@ def test_check_tells_what_has_changed(ingest: Ingest) -> None:
     assert len(lines) == 5
 
 
-def test_a_changed_adapter_is_a_drift_and_a_comment_in_it_is_none(ingest: Ingest) -> None:
+def test_plan_check_detects_changed_adapter_but_not_comments(ingest: Ingest) -> None:
     adapter = "configs/quickstart/adapters/battery_pack.yaml"
     ingest("plan", JOB, "--out", "plan.json")
     Path(adapter).write_text("# a remark\n" + Path(adapter).read_text())
@@ -171,7 +171,7 @@ def test_a_changed_adapter_is_a_drift_and_a_comment_in_it_is_none(ingest: Ingest
     assert "topic /battery adapter digest" in said
 
 
-def test_a_plan_that_fits_is_run_and_one_that_does_not_is_not(ingest: Ingest) -> None:
+def test_run_plan_runs_only_if_it_still_fits(ingest: Ingest) -> None:
     ingest("plan", JOB, "--out", "plans/plan.json")
     assert ingest("run", "--plan", "plans/plan.json", "-q")[0] == 0
     assert Store.open("mosaico").names() == ("quickstart_drive",)
@@ -184,7 +184,7 @@ def test_a_plan_that_fits_is_run_and_one_that_does_not_is_not(ingest: Ingest) ->
     assert not Path("mosaico").exists()
 
 
-def test_a_name_that_is_taken_is_said_before_the_run(ingest: Ingest) -> None:
+def test_plan_existing_sequence_states_action(ingest: Ingest) -> None:
     ingest("run", JOB, "-q")
     code, said = ingest("plan", JOB)
     assert code == 1
@@ -195,7 +195,7 @@ def test_a_name_that_is_taken_is_said_before_the_run(ingest: Ingest) -> None:
     assert "contains quickstart_drive; action: replace" in said
 
 
-def test_rows_that_cannot_join_a_topic_are_said_before_the_run(ingest: Ingest) -> None:
+def test_plan_incompatible_append_is_refused(ingest: Ingest) -> None:
     ingest("run", JOB, "-q")
     edit(JOB, "sequence:\n", "sequence:\n  if_exists: append\n")
     assert ingest("plan", JOB)[0] == 0
@@ -207,7 +207,7 @@ def test_rows_that_cannot_join_a_topic_are_said_before_the_run(ingest: Ingest) -
 
 
 @pytest.mark.slow
-def test_a_server_is_asked_only_when_told_to(ingest: Ingest) -> None:
+def test_plan_contacts_server_only_with_connect(ingest: Ingest) -> None:
     edit(JOB, "target: {store: ../mosaico}", "target: {host: 127.0.0.1, port: 1}")
     code, said = ingest("plan", JOB)
     assert code == 0
@@ -225,7 +225,7 @@ def test_a_server_is_asked_only_when_told_to(ingest: Ingest) -> None:
         (None, "cannot be read"),
     ],
 )
-def test_run_of_file_that_is_no_plan_states_path_and_keyword(
+def test_run_invalid_plan_file_states_path_and_keyword(
     ingest: Ingest, text: str | None, message: str
 ) -> None:
     if text is not None:
@@ -236,12 +236,12 @@ def test_run_of_file_that_is_no_plan_states_path_and_keyword(
     assert "ingest plan job.yaml --out" in said
 
 
-def test_run_wants_manifests_or_a_plan(ingest: Ingest) -> None:
+def test_run_without_manifest_and_plan_exits_2(ingest: Ingest) -> None:
     assert ingest("run")[0] == 2
     assert ingest("run", JOB, "--plan", "p.json")[0] == 2
 
 
-def test_diff_tells_what_another_manifest_would_do(ingest: Ingest) -> None:
+def test_diff_prints_differences_and_exits_1(ingest: Ingest) -> None:
     shutil.copy(JOB, "configs/other.yaml")
     assert ingest("diff", JOB, "configs/other.yaml") == (0, "the plans are equal\n")
     edit("configs/other.yaml", "name: quickstart_{stem}", "name: other_{stem}")
@@ -259,7 +259,7 @@ def test_diff_tells_what_another_manifest_would_do(ingest: Ingest) -> None:
     assert {"sequence", "name", "before", "after"} == set(json.loads(said)[0])
 
 
-def test_a_job_of_a_matrix_is_planned_for_each_combination(ingest: Ingest) -> None:
+def test_plan_matrix_plans_each_combination(ingest: Ingest) -> None:
     Path("night.yaml").write_text(
         "extends: configs/quickstart.yaml\nmatrix: {n: [1, 2]}\nsequence: {name: 'run_${n}'}\n"
     )
@@ -277,7 +277,7 @@ def test_a_job_of_a_matrix_is_planned_for_each_combination(ingest: Ingest) -> No
     ]
 
 
-def test_a_drafted_manifest_lints_clean_and_runs(ingest: Ingest) -> None:
+def test_init_manifest_lints_clean_and_runs(ingest: Ingest) -> None:
     code, said = ingest("init", "configs/quickstart/drive.mcap", "--out", "job.yaml")
     assert code == 0
     assert "job.yaml: 10 topics" in said
@@ -291,12 +291,12 @@ def test_a_drafted_manifest_lints_clean_and_runs(ingest: Ingest) -> None:
     assert ingest("init", "configs/quickstart/drive.mcap")[1].count("\n") > 30
 
 
-def test_a_command_that_is_suggested_can_be_copied(ingest: Ingest) -> None:
+def test_init_suggested_command_is_quoted(ingest: Ingest) -> None:
     _, said = ingest("init", "configs/quickstart/drive.mcap", "--out", "my job.yaml")
     assert "`ingest 'my job.yaml'`" in said
 
 
-def test_a_recording_of_nothing_makes_no_job(ingest: Ingest) -> None:
+def test_init_recording_without_topics_exits_3(ingest: Ingest) -> None:
     with Writer("none.bag"):
         pass
     code, said = ingest("init", "none.bag", "--out", "job.yaml")
@@ -304,7 +304,7 @@ def test_a_recording_of_nothing_makes_no_job(ingest: Ingest) -> None:
     assert not Path("job.yaml").exists()
 
 
-def test_a_plan_of_many_recordings_says_of_each_why_it_cannot_be_ingested(ingest: Ingest) -> None:
+def test_plan_several_unusable_recordings_reports_each(ingest: Ingest) -> None:
     Path("a.mcap").write_text("no recording")
     shutil.copy("configs/quickstart/drive.mcap", "b.mcap")
     with Writer("c.bag"):
@@ -321,7 +321,7 @@ def test_a_plan_of_many_recordings_says_of_each_why_it_cannot_be_ingested(ingest
     )
 
 
-def test_a_plan_of_topics_without_a_message_is_no_plan(ingest: Ingest) -> None:
+def test_plan_topics_without_messages_exits_3(ingest: Ingest) -> None:
     with Writer("quiet.bag") as writer:
         writer.add_connection("/imu", "sensor_msgs/msg/Imu", typestore=get_typestore(Stores.ROS1_NOETIC))
     Path("job.yaml").write_text("bag: {path: quiet.bag}\n")

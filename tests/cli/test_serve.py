@@ -1,4 +1,4 @@
-"""`ingest serve`, with keys, as the destination of `ingest bag`: what is written there is what the store then holds."""
+"""`ingest serve` with keys, as the destination of `ingest bag`."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Generator[dict[str, str]
         yield {"port": str(plain.port), "tls": str(secure.port), "cert": str(cert), "expired": expired}
 
 
-def test_a_recording_goes_to_the_server_and_is_in_its_store(served: tuple[Path, str, str]) -> None:
+def test_bag_to_server_is_in_its_store(served: tuple[Path, str, str]) -> None:
     folder, port, key = served
     arguments = ("bag", str(RECORDING), "--name", "drive", "--host", "127.0.0.1", "--port", port)
     done = ingest(*arguments, cwd=folder, key=key)
@@ -81,7 +81,7 @@ def test_a_recording_goes_to_the_server_and_is_in_its_store(served: tuple[Path, 
     assert sum(topic.rows for topic in topics) == 2130
 
 
-def test_a_key_that_may_only_read_is_refused_at_once(served: tuple[Path, str, str]) -> None:
+def test_bag_with_read_key_is_refused(served: tuple[Path, str, str]) -> None:
     folder, port, _ = served
     key = ingest("keys", "new", "--permission", "read", "--api-keys", "other.json", cwd=folder).stdout.strip()
     arguments = ("bag", str(RECORDING), "--name", "drive", "--host", "127.0.0.1", "--port", port)
@@ -91,7 +91,7 @@ def test_a_key_that_may_only_read_is_refused_at_once(served: tuple[Path, str, st
     assert key not in done.stdout + done.stderr
 
 
-def test_keys_are_listed_without_being_shown(served: tuple[Path, str, str]) -> None:
+def test_keys_ls_does_not_print_keys(served: tuple[Path, str, str]) -> None:
     folder, _, key = served
     listed = ingest("keys", "ls", cwd=folder).stdout
     assert "write" in listed
@@ -121,7 +121,7 @@ def test_keys_are_listed_without_being_shown(served: tuple[Path, str, str]) -> N
         (("--host", "127.0.0.1", "--port", "{port}"), "the server requires an API key"),
     ],
 )
-def test_what_keeps_a_recording_from_its_server_is_one_line(
+def test_bag_server_error_is_one_line(
     places: dict[str, str], tmp_path: Path, options: tuple[str, ...], said: str
 ) -> None:
     given = [option.format(**places) for option in options]
@@ -133,7 +133,7 @@ def test_what_keeps_a_recording_from_its_server_is_one_line(
     assert places["expired"] not in done.stderr
 
 
-def test_a_server_stops_at_once_with_an_upload_open(served: tuple[Path, str, str]) -> None:
+def test_serve_interrupt_with_open_upload_stops_immediately(served: tuple[Path, str, str]) -> None:
     """The fixture's end expects the server to leave; this client never ends its call."""
     _, port, key = served
     headers = [(b"mosaico-api-key-token", key.encode())]
@@ -154,13 +154,13 @@ def test_a_server_stops_at_once_with_an_upload_open(served: tuple[Path, str, str
     client.do_put(flight.FlightDescriptor.for_command(command), schema, options)
 
 
-def test_a_certificate_without_its_key_is_refused(tmp_path: Path) -> None:
+def test_serve_certificate_without_key_exits_2(tmp_path: Path) -> None:
     done = ingest("serve", "--tls-cert", "cert.pem", cwd=tmp_path)
     assert done.returncode == 2
     assert "--tls-key" in done.stderr
 
 
-def test_help_of_the_server_names_its_options(tmp_path: Path) -> None:
+def test_serve_help_lists_options(tmp_path: Path) -> None:
     done = ingest("serve", "--help", cwd=tmp_path)
     assert done.returncode == 0
     assert "--api-keys" in done.stdout

@@ -15,7 +15,9 @@ from mosaico_ingest.findings import Stage
 from mosaico_ingest.ontology.registry import ontology_type
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.model import Rejection, RunReport
-from mosaico_ingest.report.units import written_text
+from mosaico_ingest.report.units import rate_text, written_text
+from mosaico_ingest.services.draft import draft_manifest
+from mosaico_ingest.services.inspection import estimate_rate_hz
 
 JOB = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
 DRIVE = JOB.parent / "quickstart" / "drive.mcap"
@@ -131,3 +133,21 @@ def test_written_text_interrupted_run_states_messages_of_recording(tmp_path: Pat
     promised = sum(topic.promised or 0 for topic in topics if topic.status is not TopicStatus.EXCLUDED)
     written = stopped.totals.written
     assert written_text(stopped) == f"{written} messages written before the run stopped, of {promised:,}"
+
+
+def test_rates_of_inspect_init_and_run_agree(tmp_path: Path) -> None:
+    inspection = api.inspect_recording(DRIVE)
+    inspected = {topic.topic: rate_text(topic.rate_hz) for topic in inspection.topics}
+    (report,) = run_quickstart(tmp_path).recordings
+    stored = {topic.topic: rate_text(topic.rate_hz) for topic in report.topics if topic.written}
+    assert len(stored) > 5
+    assert stored == {topic: rate for topic, rate in inspected.items() if topic in stored}
+    manifest = draft_manifest(inspection, DRIVE, folder=tmp_path)
+    assert all(f" at {rate}" in manifest for rate in inspected.values())
+
+
+@pytest.mark.parametrize(
+    ("count", "seconds", "rate"), [(10, 9.99, 1.0), (1000, 9.99, 100.0), (2, 100, 0.01), (37, 10, 3.65)]
+)
+def test_estimate_rate_hz_returns_roundest_rate_that_fits(count: int, seconds: float, rate: float) -> None:
+    assert estimate_rate_hz(count, round(seconds * 1e9)) == pytest.approx(rate, rel=0.02)

@@ -1,4 +1,4 @@
-"""The report is the sum of the events, adds up, and survives being written."""
+"""The report is the sum of the events, and round-trips through its file."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def rejected(rule: str, count: int) -> Rejected:
 @given(
     st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9), st.sampled_from(["nan", "range"])), max_size=20)
 )
-def test_every_increment_is_in_the_sum(steps: list[tuple[int, int, str]]) -> None:
+def test_collector_sums_every_increment(steps: list[tuple[int, int, str]]) -> None:
     collector = started()
     for written, lost, rule in steps:
         collector(TopicProgress(IMU.target, read=written + lost, written=written, payload_bytes=written))
@@ -56,7 +56,7 @@ def test_every_increment_is_in_the_sum(steps: list[tuple[int, int, str]]) -> Non
     assert len(topic.rejections) <= 2
 
 
-def test_a_reason_is_that_of_the_first_message() -> None:
+def test_collector_rejection_keeps_first_reason() -> None:
     collector = started()
     collector(rejected("nan", 2))
     collector(Rejected(IMU.target, Stage.ADAPT, "nan", 3, "another text", 9, 90))
@@ -64,13 +64,13 @@ def test_a_reason_is_that_of_the_first_message() -> None:
     assert (rejection.count, rejection.reason, rejection.first_offset) == (5, "nan at first", 70)
 
 
-def test_a_topic_left_out_is_in_the_report_but_not_in_the_totals() -> None:
+def test_collector_excluded_topic_is_not_in_totals() -> None:
     report = started().report()
     assert [topic.status for topic in report.topics] == [TopicStatus.EMPTY, TopicStatus.EXCLUDED]
     assert report.totals.read == 0
 
 
-def test_rates_and_compression_are_computed() -> None:
+def test_report_computes_rate_and_compression() -> None:
     collector = started()
     collector(TopicProgress(IMU.target, read=11, written=11, start_ns=0, end_ns=1_000_000_000))
     collector(TopicClosed(IMU.target, TopicStatus.WRITTEN, stored_bytes=250))
@@ -79,7 +79,7 @@ def test_rates_and_compression_are_computed() -> None:
     assert report.compression == 0.25
 
 
-def test_what_was_taken_back_leaves_no_time_span() -> None:
+def test_collector_rows_taken_back_have_no_time_span() -> None:
     collector = started()
     collector(TopicProgress(IMU.target, read=1, written=1, start_ns=5, end_ns=5))
     collector(TopicProgress(IMU.target, written=-1))
@@ -87,7 +87,7 @@ def test_what_was_taken_back_leaves_no_time_span() -> None:
     assert (topic.written, topic.start_ns, topic.end_ns) == (0, None, None)
 
 
-def test_findings_and_losses_are_kept() -> None:
+def test_collector_keeps_findings_and_unreadable_ranges() -> None:
     collector = started()
     collector(Noted(Finding("mixed-types", Severity.WARNING, "two types")))
     collector(Unreadable(None, 3, 100, "a broken chunk"))
@@ -116,19 +116,19 @@ def recording(status: RunStatus, code: int) -> Report:
         ([3, 130], 130),
     ],
 )
-def test_the_exit_code_is_that_which_asks_most_of_whoever_reads_it(codes: list[int], expected: int) -> None:
+def test_run_report_exit_code_is_most_severe(codes: list[int], expected: int) -> None:
     reports = tuple(recording(RunStatus.COMPLETED, code) for code in codes)
     assert RunReport(tool="t", recordings=reports).exit_code == expected
 
 
-def test_a_written_report_reads_back_the_same(tmp_path: Path) -> None:
+def test_write_output_report_round_trips(tmp_path: Path) -> None:
     report = RunReport(tool="t", recordings=(recording(RunStatus.COMPLETED, 0),))
     write_output(tmp_path / "deep" / "report.json", report.model_dump_json())
     assert RunReport.model_validate_json((tmp_path / "deep" / "report.json").read_text()) == report
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["report.json"]
 
 
-def test_a_report_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+def test_write_output_unwritable_file_raises(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(SinkError, match="report"):
         write_output(tmp_path / "file" / "report.json", "{}")

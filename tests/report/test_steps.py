@@ -1,4 +1,4 @@
-"""The steps of a run account for all of its time, and the report has what a page needs to explain it."""
+"""The steps of a run account for all of its time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mosaico_ingest.report.timing import Step, Stopwatch
 DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
 
 
-def test_every_moment_belongs_to_one_step() -> None:
+def test_stopwatch_laps_add_up_to_elapsed_time() -> None:
     watch = Stopwatch()
     for step in (Step.READ, Step.DECODE, Step.READ, Step.COMMIT):
         watch.lap(step)
@@ -24,7 +24,7 @@ def test_every_moment_belongs_to_one_step() -> None:
     assert sum(watch.seconds.values()) == pytest.approx(before + 5.0)
 
 
-def test_the_steps_of_a_recording_add_up_to_its_duration(tmp_path: Path) -> None:
+def test_report_steps_add_up_to_duration(tmp_path: Path) -> None:
     (tmp_path / "job.yaml").write_text(
         f"bag: {{path: {DRIVE}}}\ntopics: [/imu, /odom]\ntarget: {{store: s}}\n"
     )

@@ -1,4 +1,4 @@
-"""A collector gets what the report says: the real command exports to an OTLP/HTTP server that decodes it."""
+"""A collector receives what the report states: the command exports to an OTLP/HTTP server that decodes it."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def ingest(folder: Path, *arguments: str, **variables: str) -> subprocess.Comple
 
 
 @pytest.mark.parametrize("jobs", ["1", "2"])
-def test_a_collector_gets_the_counts_of_the_report(jobs: str, collector: Collector, tmp_path: Path) -> None:
+def test_telemetry_exports_counts_of_report(jobs: str, collector: Collector, tmp_path: Path) -> None:
     done = ingest(tmp_path, "--jobs", jobs, OTEL_EXPORTER_OTLP_ENDPOINT=collector.url)
     assert done.returncode == 1, done.stderr
     report = read_report(tmp_path / "run.json")
@@ -145,7 +145,7 @@ def test_a_collector_gets_the_counts_of_the_report(jobs: str, collector: Collect
     assert spans["a"].end_time_unix_nano > spans["a"].start_time_unix_nano
 
 
-def test_the_standard_variables_are_heeded(collector: Collector, tmp_path: Path) -> None:
+def test_telemetry_follows_standard_variables(collector: Collector, tmp_path: Path) -> None:
     ingest(
         tmp_path,
         OTEL_EXPORTER_OTLP_METRICS_ENDPOINT=f"{collector.url}/here/metrics",
@@ -158,7 +158,7 @@ def test_the_standard_variables_are_heeded(collector: Collector, tmp_path: Path)
     assert collector.resources[0]["site"] == "oslo"
 
 
-def test_a_collector_that_is_away_costs_the_run_nothing_but_a_line(tmp_path: Path) -> None:
+def test_telemetry_unreachable_collector_prints_one_line(tmp_path: Path) -> None:
     began = time.monotonic()
     done = ingest(tmp_path, OTEL_EXPORTER_OTLP_ENDPOINT="http://127.0.0.1:9", OTEL_EXPORTER_OTLP_TIMEOUT="2")
     assert time.monotonic() - began < 60
@@ -168,7 +168,7 @@ def test_a_collector_that_is_away_costs_the_run_nothing_but_a_line(tmp_path: Pat
     assert len(read_report(tmp_path / "run.json").recordings) == 3
 
 
-def test_without_the_extra_the_error_says_what_to_install(tmp_path: Path) -> None:
+def test_telemetry_without_extra_states_package(tmp_path: Path) -> None:
     blocked = "raise ImportError('blocked')"
     (tmp_path / "opentelemetry").mkdir()
     (tmp_path / "opentelemetry" / "__init__.py").write_text(blocked)

@@ -1,4 +1,4 @@
-"""Numbers and lists for people."""
+"""Numbers and lists as text."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from mosaico_ingest.report.units import counted
 
 
 @pytest.mark.parametrize(("count", "text"), [(0, "0 rows"), (1, "1 row"), (12_345, "12,345 rows")])
-def test_one_is_singular(count: int, text: str) -> None:
+def test_counted_one_is_singular(count: int, text: str) -> None:
     assert counted(count, "row") == text
 
 
-def test_a_list_says_how_much_of_it_is_not_shown() -> None:
+def test_a_few_states_number_of_omitted_names() -> None:
     assert join_names(["b", "a"]) == "a, b"
     assert join_names("hgfedcba") == "a, b, c, d, e, f, g, h"
     assert join_names([f"/t{n:04}" for n in range(1500)], most=2) == "/t0000, /t0001 and 1,498 more"
