@@ -281,7 +281,7 @@ def init(
         raise typer.BadParameter(f"{out} exists; replace it with --force", param_hint="--out")
     inspection = api.inspect_recording(path, ros_distro=ros_distro)
     if not inspection.topics:
-        raise NothingMatched("the recording has no topic", where=path)
+        raise NothingMatched("the recording has no topics", where=path)
     folder = out.parent if out is not None else Path()
     text = draft_manifest(inspection, as_path(path), folder=folder, ros_distro=ros_distro)
     count = len({topic.topic for topic in inspection.topics if topic.problem is None})
