@@ -300,7 +300,7 @@ def test_init_recording_without_topics_exits_3(ingest: Ingest) -> None:
     with Writer("none.bag"):
         pass
     code, output = ingest("init", "none.bag", "--out", "job.yaml")
-    assert (code, output) == (3, "error: none.bag: the recording has no topic\n")
+    assert (code, output) == (3, "error: none.bag: the recording has no topics\n")
     assert not Path("job.yaml").exists()
 
 
