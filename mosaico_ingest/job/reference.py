@@ -53,13 +53,15 @@ def _or_variable(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str,
 
 
 _HEAD = """\
-<!-- made from the model of the manifest -->
+<!-- Generated from mosaico_ingest/job/model.py by `./dev docs`. -->
 
-# The job manifest, key by key
+# Manifest keys
 
-Only `bag.path` must be there. Relative paths start at the manifest's folder. `${VAR}`, `${VAR:-default}` and `${VAR:?why}` stand
-for variables of the environment wherever a value is a text or one of a few words, `$$` is a dollar. An unknown key is an error;
-`ingest lint job.yaml` says everything that is wrong at once, each thing with its place.
+After reading this page, you know every key of a job manifest. Only `bag.path` is required.
+
+* Relative paths start at the manifest's folder.
+* `${VAR}`, `${VAR:-default}` and `${VAR:?message}` insert environment variables into texts, numbers and words; `$$` is a dollar sign.
+* Unknown keys are errors. `ingest lint job.yaml` reports all problems of a manifest with their locations.
 """
 
 
@@ -90,21 +92,21 @@ def _models(
 def _section(title: str, model: dict[str, Any], schema: dict[str, Any]) -> str:
     required = model.get("required", [])
     rows = "".join(_row(key, node, key in required, schema) for key, node in model["properties"].items())
-    head = f"\n## {title}\n\n{model['description']}\n\n| key | is | default | |\n|---|---|---|---|\n"
+    head = f"\n## {title}\n\n{model['description']}\n\n| key | type | default | description |\n|---|---|---|---|\n"
     return head + rows
 
 
 def _row(key: str, node: dict[str, Any], required: bool, schema: dict[str, Any]) -> str:  # noqa: FBT001 - a row's cell
     described = node.get("description") or _resolved(node, schema).get("description", "")
     examples = node.get("examples", [])
-    example = f" As {' or '.join(_code(example) for example in examples)}." if examples else ""
+    example = f" Example: {' or '.join(_code(example) for example in examples)}." if examples else ""
     cells = (f"`{key}`", _kind(node, schema), _default(node, required), f"{described}{example}")
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
 
 
 def _default(node: dict[str, Any], required: bool) -> str:  # noqa: FBT001 - as above
     if required:
-        return "must be there"
+        return "required"
     default = node.get("default")
     return "" if default in (None, [], {}) or isinstance(default, dict) else _code(default)
 
