@@ -69,6 +69,9 @@ def condition_of(error: BaseException) -> Condition:
     if type(error) in _SPECIFIC:
         return found
     text = text_of(error).lower()
+    for condition in Condition:
+        if text.startswith(f"{condition.value.lower()}:"):
+            return condition
     return next((condition for words, condition in _BY_TEXT if words in text), found)
 
 
@@ -77,12 +80,16 @@ def text_of(error: BaseException) -> str:
     text = str(error).strip().strip("'")
     for end in (". Detail: ", ". gRPC client debug context", " Client context:", "\n"):
         text = text.partition(end)[0]
-    return text.rpartition(", with message: ")[2].strip() or type(error).__name__
+    text = text.rpartition(", with message: ")[2].removeprefix("Unknown error: ")
+    return text.strip() or type(error).__name__
 
 
-def as_flight_error(condition: Condition, text: str) -> Exception:
-    """Return the exception that a server raises so that clients see `condition`."""
-    kind = next((kind for kind, known in _BY_TYPE if known is condition), None)
-    if kind is not None:
-        return kind(text)
+def as_flight_error(condition: Condition, text: str) -> fl.FlightError:
+    """Return the exception that a server raises so that clients see `condition`.
+
+    The result is always an exception of Flight, since Arrow leaks others and sends their tracebacks to the client.
+    """
+    for kind, candidate in _BY_TYPE:
+        if candidate is condition and issubclass(kind, fl.FlightError):
+            return kind(text)
     return fl.FlightServerError(f"{condition.value}: {text}")

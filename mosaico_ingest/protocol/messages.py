@@ -21,7 +21,11 @@ from mosaico_ingest.ontology.types import SerializationFormat
 
 __all__ = [
     "ACTIONS",
+    "API_KEY_CREATE",
     "API_KEY_HEADER",
+    "API_KEY_LIST",
+    "API_KEY_REVOKE",
+    "API_KEY_STATUS",
     "DEFAULT_LIMIT_BYTES",
     "INFO",
     "JSON",
@@ -36,18 +40,28 @@ __all__ = [
     "SESSION_FINALIZE",
     "TOPIC_CREATE",
     "TOPIC_DELETE",
+    "TOPIC_FILTER_CLUSTERIZE",
+    "TOPIC_FILTER_INTERSECT",
     "TOPIC_NOTIFICATION_CREATE",
     "TOPIC_NOTIFICATION_LIST",
     "TOPIC_NOTIFICATION_PURGE",
     "VERSION",
     "Action",
     "Body",
+    "Cluster",
+    "Clusterize",
     "Codec",
     "DataInfo",
     "Empty",
     "GetInfo",
     "Info",
+    "Intersect",
     "Interval",
+    "KeyCreate",
+    "KeyCreated",
+    "KeyFingerprint",
+    "KeyList",
+    "KeyStatus",
     "Limits",
     "Located",
     "Malformed",
@@ -66,6 +80,7 @@ __all__ = [
     "SessionCreated",
     "SessionFinalize",
     "SessionInfo",
+    "TimeBounds",
     "TimeWindow",
     "TopicCreate",
     "TopicCreated",
@@ -99,6 +114,25 @@ class Body(BaseModel):
     """Anything that travels; what a newer peer adds is passed over."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", defer_build=True)
+
+
+class Permission(str, Enum):
+    """What a key may do; each includes the ones before it."""
+
+    READ = "read"
+    WRITE = "write"
+    DELETE = "delete"
+    MANAGE = "manage"
+    # The platform's own spelling, as in `APIKeyPermissionEnum.Write`; aliases are no members of their own.
+    Read = READ
+    Write = WRITE
+    Delete = DELETE
+    Manage = MANAGE
+
+    def includes(self, needed: Permission) -> bool:
+        """Return whether a key with this permission may do what needs `needed`."""
+        order = list(Permission)
+        return order.index(self) >= order.index(needed)
 
 
 class Empty(Body):
@@ -239,6 +273,74 @@ class QueryResult(Body):
     """Everything that fits."""
 
     items: list[QueryTopics]
+
+
+class TimeBounds(Body):
+    """The first and the last time stamp of a range, both inclusive."""
+
+    start_ns: int
+    end_ns: int
+
+
+class Clusterize(Body):
+    """The rows of a topic that match conditions, grouped by time."""
+
+    locator: str
+    clustering_dt_ns: int = Field(default=0, ge=0)
+    """Gaps of at least this length separate clusters; 0 returns one cluster."""
+    ontology: dict[str, Any] = Field(default_factory=dict[str, Any])
+    timestamp_range: TimeBounds | None = None
+
+
+class Intersect(Body):
+    """The times at which every topic has a cluster."""
+
+    topics: list[Clusterize] = Field(min_length=1)
+    intersect_dt_ns: int = Field(default=0, ge=0)
+    """Clusters at most this far apart count as overlapping."""
+
+
+class Cluster(Body):
+    """A range of time, with its number in the response."""
+
+    ts: TimeBounds
+    id: int
+
+
+class KeyCreate(Body):
+    """A new API key."""
+
+    permissions: Permission
+    description: str = ""
+    expires_at_ns: int | None = None
+
+
+class KeyCreated(Body):
+    """The new API key, which cannot be recovered later."""
+
+    api_key_token: str
+
+
+class KeyFingerprint(Body):
+    """The fingerprint of an API key."""
+
+    api_key_fingerprint: str
+
+
+class KeyStatus(_OmitsNone):
+    """The properties of an API key."""
+
+    api_key_fingerprint: str
+    created_at_ns: int
+    expires_at_ns: int | None = None
+    description: str | None = None
+    permissions: Permission
+
+
+class KeyList(Body):
+    """The properties of every API key."""
+
+    api_keys: list[KeyStatus]
 
 
 class Put(Body):
@@ -408,25 +510,6 @@ Question = TypeVar("Question", bound=Body)
 Answer = TypeVar("Answer", bound=Body)
 
 
-class Permission(str, Enum):
-    """What a key may do; each includes the ones before it."""
-
-    READ = "read"
-    WRITE = "write"
-    DELETE = "delete"
-    MANAGE = "manage"
-    # The platform's own spelling, as in `APIKeyPermissionEnum.Write`; aliases are no members of their own.
-    Read = READ
-    Write = WRITE
-    Delete = DELETE
-    Manage = MANAGE
-
-    def includes(self, needed: Permission) -> bool:
-        """Return whether a key with this permission may do what needs `needed`."""
-        order = list(Permission)
-        return order.index(self) >= order.index(needed)
-
-
 class Action(Struct, Generic[Question, Answer], frozen=True):
     """A call: what is asked, what is answered (`Empty`: nothing)."""
 
@@ -435,10 +518,12 @@ class Action(Struct, Generic[Question, Answer], frozen=True):
     answer: type[Answer]
     permission: Permission
     repeatable: bool = False
-    """Whether asking again after a lost answer does no harm."""
+    """Whether a repetition after a lost response has no side effect."""
+    streamed: bool = False
+    """Whether the response is a sequence of bodies, each in a result of its own."""
 
 
-_READ, _WRITE, _DELETE = Permission.READ, Permission.WRITE, Permission.DELETE
+_READ, _WRITE, _DELETE, _MANAGE = Permission
 
 INFO = Action("info", Empty, Info, _READ, repeatable=True)
 VERSION = Action("version", Empty, Version, _READ, repeatable=True)
@@ -457,6 +542,16 @@ SEQUENCE_NOTIFICATION_LIST = Action(
 SEQUENCE_NOTIFICATION_PURGE = Action("sequence_notification_purge", Located, Empty, _DELETE, repeatable=True)
 TOPIC_NOTIFICATION_CREATE = Action("topic_notification_create", NotificationCreate, Empty, _WRITE)
 TOPIC_NOTIFICATION_LIST = Action("topic_notification_list", Located, Notifications, _READ, repeatable=True)
+TOPIC_FILTER_CLUSTERIZE = Action(
+    "topic_filter_clusterize", Clusterize, Cluster, _READ, repeatable=True, streamed=True
+)
+TOPIC_FILTER_INTERSECT = Action(
+    "topic_filter_intersect", Intersect, Cluster, _READ, repeatable=True, streamed=True
+)
+API_KEY_CREATE = Action("api_key_create", KeyCreate, KeyCreated, _MANAGE)
+API_KEY_STATUS = Action("api_key_status", KeyFingerprint, KeyStatus, _MANAGE, repeatable=True)
+API_KEY_LIST = Action("api_key_list", Empty, KeyList, _MANAGE, repeatable=True)
+API_KEY_REVOKE = Action("api_key_revoke", KeyFingerprint, Empty, _MANAGE)
 TOPIC_NOTIFICATION_PURGE = Action("topic_notification_purge", Located, Empty, _DELETE, repeatable=True)
 
 ACTIONS: Mapping[str, Action[Any, Any]] = MappingProxyType(
@@ -479,6 +574,12 @@ ACTIONS: Mapping[str, Action[Any, Any]] = MappingProxyType(
             TOPIC_NOTIFICATION_CREATE,
             TOPIC_NOTIFICATION_LIST,
             TOPIC_NOTIFICATION_PURGE,
+            TOPIC_FILTER_CLUSTERIZE,
+            TOPIC_FILTER_INTERSECT,
+            API_KEY_CREATE,
+            API_KEY_STATUS,
+            API_KEY_LIST,
+            API_KEY_REVOKE,
         )
     }
 )

@@ -16,10 +16,12 @@ __all__ = [
     "check_metadata",
     "check_sequence_name",
     "check_topic_name",
+    "key_fingerprint",
     "key_problem",
     "new_key",
 ]
 
+_LONGEST_SEQUENCE_NAME, _LONGEST_TOPIC_NAME = 255, 1024
 _FORBIDDEN = re.compile(r"[^\x21-\x7e]|[!\"'*£$%&.:]")
 _MAX_DEPTH = 64
 _KEY = re.compile(r"[A-Za-z0-9 _-]+")
@@ -27,21 +29,31 @@ _NAMES = "ASCII without blanks and without ! \" ' * $ % & . :"
 
 
 def check_sequence_name(name: str) -> str:
-    """Return the name of a sequence, or raise SinkError with the first character that is not allowed."""
+    """Return the name of a sequence, or raise SinkError if it is too long or has a character that is not allowed."""
     if not name:
-        raise SinkError("a sequence needs a name", hint="set sequence.name")
+        raise SinkError("the sequence name is empty", hint="set sequence.name")
+    _check_length(name, _LONGEST_SEQUENCE_NAME, kind="sequence")
     _refuse(name, _FORBIDDEN.search(name), kind="sequence", allowed=f"{_NAMES} /")
     _refuse(name, re.search("/", name), kind="sequence", allowed=f"{_NAMES} /")
     return name
 
 
 def check_topic_name(name: str) -> str:
-    """Return the name of a topic with its leading slash, or raise SinkError with what is not allowed."""
+    """Return the name of a topic with its leading slash, or raise SinkError if it is not allowed."""
     _refuse(name, _FORBIDDEN.search(name), kind="topic", allowed=_NAMES)
+    _check_length(name, _LONGEST_TOPIC_NAME, kind="topic")
     path = name.removeprefix("/")
     if not all(path.split("/")):
         raise SinkError(f"topic name {name!r} has an empty part", hint="rename it in topic_settings")
     return f"/{path}"
+
+
+def _check_length(name: str, longest: int, *, kind: str) -> None:
+    if len(name) > longest:
+        hint = "set sequence.name" if kind == "sequence" else "rename it in topic_settings"
+        raise SinkError(
+            f"{kind} name {name[:20]!r}… has {len(name)} characters; allowed are {longest}", hint=hint
+        )
 
 
 def _refuse(name: str, bad: re.Match[str] | None, *, kind: str, allowed: str) -> None:
@@ -54,7 +66,7 @@ def _refuse(name: str, bad: re.Match[str] | None, *, kind: str, allowed: str) ->
 
 
 def check_metadata(metadata: Mapping[str, Any], *, where: str) -> str:
-    """Return the metadata as JSON, or raise SinkError with the path of the key or value that is refused."""
+    """Return the metadata as JSON, or raise SinkError with the path of an invalid key or value."""
     if _is_deeper(metadata, _MAX_DEPTH):
         raise SinkError(f"metadata is nested deeper than {_MAX_DEPTH} levels", where=where, hint="flatten it")
     for path, key in _keys(metadata, ""):
@@ -65,7 +77,7 @@ def check_metadata(metadata: Mapping[str, Any], *, where: str) -> str:
             )
     try:
         text = json.dumps(metadata, allow_nan=False)
-        json.dumps(metadata, ensure_ascii=False).encode()  # half a surrogate pair is no text to most readers
+        json.dumps(metadata, ensure_ascii=False).encode()  # most readers reject half a surrogate pair
     except (TypeError, ValueError) as err:
         raise SinkError(f"metadata is not JSON: {err}", where=where) from err
     return text
@@ -100,8 +112,13 @@ def new_key() -> str:
     return f"msco_{secret}_{_checksum(secret)}"
 
 
+def key_fingerprint(key: str) -> str:
+    """Return the last part of a key, by which clients identify it."""
+    return key.rpartition("_")[2]
+
+
 def key_problem(key: str) -> str | None:
-    """Return why this can be no key, without repeating it; None where it can."""
+    """Return why the text is not a valid key, without repeating it, or None."""
     form = _FORM.fullmatch(key)
     if form is None:
         return "it is not msco_<32 letters or digits>_<8 hex digits>"

@@ -1,36 +1,42 @@
-"""This file answers the actions, each with one function."""
+"""The actions of the protocol, each handled by one function."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import datetime, timezone
 from typing import Any
 
 from msgspec import Struct
 
 from mosaico_ingest import protocol
+from mosaico_ingest.destinations.store.errors import NotInStore
 from mosaico_ingest.destinations.store.model import Note
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.protocol.messages import Action, Body
 from mosaico_ingest.serve import query
-from mosaico_ingest.serve.errors import Refusal, checked
+from mosaico_ingest.serve.clusters import Range, clusterize, intersect
+from mosaico_ingest.serve.errors import Deadline, Refusal, refuse_invalid
 from mosaico_ingest.serve.flights import split_locator
+from mosaico_ingest.serve.keys import Keyring, StoredKey
 from mosaico_ingest.serve.uploads import Uploads
 from mosaico_ingest.version import __version__
 
-__all__ = ["ANSWERS", "Backend"]
+__all__ = ["HANDLERS", "Backend"]
 
 _PROTOCOL = messages.SemVer(major=0, minor=7, patch=0)
 _EMPTY = messages.Empty()
 
 
 class Backend(Struct, frozen=True):
-    """What answers are made from."""
+    """The state that actions read and change."""
 
     store: Store
     uploads: Uploads
+    keyring: Keyring | None = None
+    request_s: float = 60.0
+    """Time limit of a query, in seconds."""
 
 
 def _info(_: Backend, __: messages.Empty) -> messages.Info:
@@ -45,7 +51,7 @@ def _version(_: Backend, __: messages.Empty) -> messages.Version:
 
 
 def _sequence_create(backend: Backend, question: messages.SequenceCreate) -> messages.Empty:
-    with checked():
+    with refuse_invalid():
         protocol.check_sequence_name(question.locator)
         protocol.check_metadata(question.user_metadata, where=question.locator)
     backend.store.create_sequence(question.locator, question.user_metadata)
@@ -94,7 +100,7 @@ def _sequence_note(backend: Backend, question: messages.NotificationCreate) -> m
 
 def _sequence_notes(backend: Backend, question: messages.Located) -> messages.Notifications:
     notes = backend.store.sequence(_sequence(question.locator)).notes
-    return _told([note for note in notes if note.topic is None], question.locator)
+    return _notifications([note for note in notes if note.topic is None], question.locator)
 
 
 def _sequence_purge(backend: Backend, question: messages.Located) -> messages.Empty:
@@ -111,7 +117,7 @@ def _topic_note(backend: Backend, question: messages.NotificationCreate) -> mess
 def _topic_notes(backend: Backend, question: messages.Located) -> messages.Notifications:
     sequence, topic = _present(backend, question.locator)
     notes = backend.store.sequence(sequence).notes
-    return _told([note for note in notes if note.topic == topic], question.locator)
+    return _notifications([note for note in notes if note.topic == topic], question.locator)
 
 
 def _topic_purge(backend: Backend, question: messages.Located) -> messages.Empty:
@@ -121,20 +127,89 @@ def _topic_purge(backend: Backend, question: messages.Located) -> messages.Empty
 
 
 def _query(backend: Backend, question: messages.Query) -> messages.QueryResult:
-    return query.run(backend.store, question)
+    return query.run(backend.store, question, Deadline(backend.request_s))
+
+
+def _clusterize(backend: Backend, question: messages.Clusterize) -> Iterator[messages.Cluster]:
+    return _numbered(_clusters(backend, question, Deadline(backend.request_s)))
+
+
+def _intersect(backend: Backend, question: messages.Intersect) -> Iterator[messages.Cluster]:
+    deadline = Deadline(backend.request_s)
+    clusters = [_clusters(backend, topic, deadline) for topic in question.topics]
+    return _numbered(intersect(clusters, question.intersect_dt_ns))
+
+
+def _clusters(backend: Backend, question: messages.Clusterize, deadline: Deadline) -> list[Range]:
+    topic = backend.store.topic(*_topic(question.locator))
+    times = query.matching_times(backend.store, topic, question.ontology, question.timestamp_range, deadline)
+    return clusterize(times, question.clustering_dt_ns)
+
+
+def _numbered(ranges: Iterable[Range]) -> Iterator[messages.Cluster]:
+    for number, (start_ns, end_ns) in enumerate(ranges):
+        yield messages.Cluster(ts=messages.TimeBounds(start_ns=start_ns, end_ns=end_ns), id=number)
+
+
+def _key_create(backend: Backend, question: messages.KeyCreate) -> messages.KeyCreated:
+    expires = None
+    if question.expires_at_ns is not None:
+        try:
+            expires = datetime.fromtimestamp(question.expires_at_ns / 1e9, timezone.utc)
+        except (ValueError, OverflowError, OSError) as error:
+            raise Refusal(Condition.INVALID, f"expires_at_ns: {error}") from error
+    token = _keyring(backend).add(question.permissions, description=question.description, expires=expires)
+    return messages.KeyCreated(api_key_token=token)
+
+
+def _key_status(backend: Backend, question: messages.KeyFingerprint) -> messages.KeyStatus:
+    key = _keyring(backend).find(question.api_key_fingerprint)
+    if key is None:
+        raise NotInStore(f"there is no API key with the fingerprint {question.api_key_fingerprint!r}")
+    return _key_description(key)
+
+
+def _key_list(backend: Backend, _: messages.Empty) -> messages.KeyList:
+    return messages.KeyList(api_keys=[_key_description(key) for key in _keyring(backend).keys])
+
+
+def _key_revoke(backend: Backend, question: messages.KeyFingerprint) -> messages.Empty:
+    if not _keyring(backend).revoke(question.api_key_fingerprint):
+        raise NotInStore(f"there is no API key with the fingerprint {question.api_key_fingerprint!r}")
+    return _EMPTY
+
+
+def _keyring(backend: Backend) -> Keyring:
+    if backend.keyring is None:
+        raise Refusal(Condition.PRECONDITION, "this server has no API keys")
+    return backend.keyring
+
+
+def _key_description(key: StoredKey) -> messages.KeyStatus:
+    return messages.KeyStatus(
+        api_key_fingerprint=key.fingerprint,
+        created_at_ns=_ns(key.created),
+        expires_at_ns=None if key.expires is None else _ns(key.expires),
+        description=key.description,
+        permissions=key.permission,
+    )
+
+
+def _ns(time: datetime) -> int:
+    return round(time.timestamp() * 1e6) * 1000
 
 
 def _sequence(locator: str) -> str:
     sequence, topic = split_locator(locator)
     if topic is not None:
-        raise Refusal(Condition.INVALID, f"{locator!r} is no sequence")
+        raise Refusal(Condition.INVALID, f"{locator!r} is not the locator of a sequence")
     return sequence
 
 
 def _topic(locator: str) -> tuple[str, str]:
     sequence, topic = split_locator(locator)
     if topic is None:
-        raise Refusal(Condition.INVALID, f"{locator!r} is no topic")
+        raise Refusal(Condition.INVALID, f"{locator!r} is not the locator of a topic")
     return sequence, topic
 
 
@@ -145,7 +220,7 @@ def _present(backend: Backend, locator: str) -> tuple[str, str]:
     return sequence, topic
 
 
-def _told(notes: list[Note], locator: str) -> messages.Notifications:
+def _notifications(notes: list[Note], locator: str) -> messages.Notifications:
     return messages.Notifications(
         notifications=[
             messages.Notification(
@@ -159,7 +234,7 @@ def _told(notes: list[Note], locator: str) -> messages.Notifications:
     )
 
 
-ANSWERS: Mapping[Action[Any, Any], Callable[[Backend, Any], Body]] = {
+HANDLERS: Mapping[Action[Any, Any], Callable[[Backend, Any], Body | Iterator[Body]]] = {
     messages.INFO: _info,
     messages.VERSION: _version,
     messages.QUERY: _query,
@@ -176,5 +251,11 @@ ANSWERS: Mapping[Action[Any, Any], Callable[[Backend, Any], Body]] = {
     messages.TOPIC_NOTIFICATION_CREATE: _topic_note,
     messages.TOPIC_NOTIFICATION_LIST: _topic_notes,
     messages.TOPIC_NOTIFICATION_PURGE: _topic_purge,
+    messages.TOPIC_FILTER_CLUSTERIZE: _clusterize,
+    messages.TOPIC_FILTER_INTERSECT: _intersect,
+    messages.API_KEY_CREATE: _key_create,
+    messages.API_KEY_STATUS: _key_status,
+    messages.API_KEY_LIST: _key_list,
+    messages.API_KEY_REVOKE: _key_revoke,
 }
-"""Every action this server knows, with the function that answers it."""
+"""The function of every supported action; streamed actions return an iterator."""

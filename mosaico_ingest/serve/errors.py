@@ -1,8 +1,9 @@
-"""This file is the border of a call: what goes wrong behind it leaves as one of the platform's statuses."""
+"""Errors of a call, and their translation into statuses of the protocol."""
 
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Generator
 from contextlib import contextmanager
 
@@ -14,22 +15,35 @@ from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
 from mosaico_ingest.protocol.errors import Condition, as_flight_error
 from mosaico_ingest.protocol.messages import Malformed
 
-__all__ = ["Refusal", "answered", "checked"]
+__all__ = ["Deadline", "Refusal", "refuse_invalid", "translate_errors"]
 
 _LOG = logging.getLogger(__name__)
 
 
-class Refusal(Exception):  # noqa: N818 - a status, which need not be anybody's error
-    """The call is refused with one of the platform's statuses."""
+class Refusal(Exception):  # noqa: N818 - a status, which is not always an error
+    """The call is refused with a status of the protocol."""
 
     def __init__(self, condition: Condition, text: str) -> None:
         super().__init__(text)
         self.condition = condition
 
 
+class Deadline:
+    """The time limit of one call; long calls check it between their steps."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._end_s = time.monotonic() + seconds
+
+    def check(self) -> None:
+        """Refuse the call if its time limit has passed."""
+        if time.monotonic() > self._end_s:
+            raise Refusal(Condition.TIMED_OUT, f"the request exceeded its time limit of {self._seconds:g} s")
+
+
 @contextmanager
-def checked() -> Generator[None, None, None]:
-    """Refuse the call as invalid where a rule for names, metadata or columns is broken inside."""
+def refuse_invalid() -> Generator[None, None, None]:
+    """Refuse the call as invalid if a check of names, metadata or columns fails inside."""
     try:
         yield
     except (SinkError, pa.ArrowException) as err:
@@ -37,14 +51,17 @@ def checked() -> Generator[None, None, None]:
 
 
 @contextmanager
-def answered() -> Generator[None, None, None]:
-    """Turn whatever is raised inside into what Flight carries to the client."""
+def translate_errors() -> Generator[None, None, None]:
+    """Raise every error inside as the exception that Flight sends to the client.
+
+    Only Flight's own exceptions may leave a call: Arrow sends others with their traceback, which contains paths, and
+    never frees them.
+    """
     try:
         yield
     except fl.FlightError:
         raise
-    except Exception as err:  # noqa: BLE001 - the border to clients
-        # Arrow sends the traceback along: what the cause says, of other sequences too, is not for them.
+    except Exception as err:  # noqa: BLE001 - no other exception may reach Flight
         raise as_flight_error(*_condition_of(err)) from None
 
 
@@ -55,12 +72,12 @@ def _condition_of(err: Exception) -> tuple[Condition, str]:
         return Condition.NOT_FOUND, f"not found: {err.what}"
     if isinstance(err, SequenceExists):
         return Condition.EXISTS, f"{err.where} already exists"
-    known = {
+    conditions = {
         Malformed: Condition.INVALID,
         SinkUnavailable: Condition.UNAVAILABLE,
         SinkError: Condition.INTERNAL,
     }
-    for kind, condition in known.items():
+    for kind, condition in conditions.items():
         if isinstance(err, kind):
             return condition, str(err)
     _LOG.exception("a call failed")

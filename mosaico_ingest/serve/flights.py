@@ -16,8 +16,8 @@ from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.batches import with_offsets
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.protocol.messages import JSON, Body, Interval
-from mosaico_ingest.serve.errors import Refusal, checked
-from mosaico_ingest.serve.uploads import Uploads
+from mosaico_ingest.serve.errors import Refusal, refuse_invalid
+from mosaico_ingest.serve.uploads import OpenSession, OpenTopic, Uploads
 
 __all__ = [
     "Extent",
@@ -73,7 +73,7 @@ _MESSAGE_BYTES = 16 << 20
 def split_locator(locator: str) -> tuple[str, str | None]:
     """Return the sequence and, with its leading slash, the topic, or refuse a locator of something else."""
     sequence, slash, path = locator.partition("/")
-    with checked():
+    with refuse_invalid():
         protocol.check_sequence_name(sequence)
         return sequence, protocol.check_topic_name(path) if slash else None
 
@@ -102,6 +102,13 @@ class Flights:
         sequence = self._store.sequence(name)
         ended = {each.id: each for each in sequence.sessions}
         endpoints = [_endpoint(each, ended, question) for each in sequence.topics]
+        committed = {topic.name for topic in sequence.topics}
+        endpoints += [
+            _open_endpoint(opened, topic)
+            for opened in self._uploads.of_sequence(name)
+            for topic in tuple(opened.topics.values())
+            if topic.name not in committed
+        ]
         metadata = JSON.encode(self._described(sequence))
         schema = sequence_schema(sequence)
         return fl.FlightInfo(schema, descriptor, endpoints, -1, -1, app_metadata=metadata)
@@ -120,7 +127,7 @@ class Flights:
     def _topic(self, question: messages.GetInfo) -> TopicInfo:
         sequence, topic = split_locator(question.resource_locator)
         if topic is None:
-            raise Refusal(Condition.INVALID, f"{question.resource_locator!r} is no topic")
+            raise Refusal(Condition.INVALID, f"{question.resource_locator!r} is not the locator of a topic")
         return self._store.topic(sequence, topic)
 
     def _described(self, sequence: SequenceInfo) -> messages.SequenceInfo:
@@ -135,7 +142,12 @@ class Flights:
             for session in sequence.sessions
         ]
         opened = [
-            messages.SessionInfo(locator=each.locator, created_at_ns=each.session.created_ns, locked=False)
+            messages.SessionInfo(
+                locator=each.locator,
+                created_at_ns=each.session.created_ns,
+                locked=False,
+                topics=[each.topic_locator(name) for name in each.topic_names],
+            )
             for each in self._uploads.of_sequence(sequence.name)
             if each.locator not in {session.locator for session in finalized}
         ]
@@ -157,9 +169,7 @@ def _question(descriptor: fl.FlightDescriptor) -> messages.GetInfo:
 
 def _window(question: messages.GetInfo) -> Window:
     start, end = question.timestamp_ns_start, question.timestamp_ns_end
-    if start is not None and end is not None and start >= end:
-        raise Refusal(Condition.INVALID, f"the time range from {start} to {end} is empty")
-    return Window(start, end)
+    return Window(start, end)  # a reversed range selects no rows, as on the platform's server
 
 
 def _locator(topic: TopicInfo) -> str:
@@ -191,6 +201,24 @@ def _endpoint(
         time_window_info=None if window == Window() else _inside(topic, window),
     )
     return fl.FlightEndpoint(JSON.encode(ticket), [], None, JSON.encode(described))
+
+
+def _open_endpoint(opened: OpenSession, topic: OpenTopic) -> fl.FlightEndpoint:
+    """Return the endpoint of a topic whose session is open; its rows cannot be read yet."""
+    question = topic.question
+    locator = opened.topic_locator(topic.name)
+    description = OlderTopicInfo(
+        resource_locator=locator,
+        ontology_tag=question.ontology_tag,
+        serialization_format=question.serialization_format,
+        user_metadata=dict(question.user_metadata),
+        created_at_ns=opened.session.created_ns,
+        locked=False,
+        data_info=messages.DataInfo(total_row_count=0, total_bytes=0, total_chunks_count=0),
+        info=Extent(chunks_number=0, total_bytes=0, timestamp=None),
+    )
+    ticket = messages.GetInfo(resource_locator=locator)
+    return fl.FlightEndpoint(JSON.encode(ticket), [], None, JSON.encode(description))
 
 
 def _inside(topic: TopicInfo, window: Window) -> messages.TimeWindow:

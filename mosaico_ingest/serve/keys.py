@@ -1,6 +1,6 @@
 """API keys of a served store: the key file, and the check of every call.
 
-A key has 165 random bits, so its plain hash tells nobody the key.
+The file holds hashes. A key has 165 random bits, so its unsalted hash does not reveal it.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Mapping
 from datetime import datetime, timezone
 from pathlib import Path
+from threading import Lock
 
 import pyarrow.flight as fl
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -18,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.protocol.errors import Condition, as_flight_error
 from mosaico_ingest.protocol.messages import API_KEY_HEADER, Permission
-from mosaico_ingest.protocol.names import key_problem, new_key
+from mosaico_ingest.protocol.names import key_fingerprint, key_problem, new_key
 from mosaico_ingest.serve.errors import Refusal
 
 __all__ = [
@@ -29,18 +30,22 @@ __all__ = [
     "require",
 ]
 
+MIDDLEWARE = "api-key"
+
 
 class StoredKey(BaseModel):
-    """What is kept of a key."""
+    """The stored properties of a key."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     sha256: str
+    fingerprint: str = ""
+    """The last part of the key, which identifies it to clients; empty for keys of early versions."""
     permission: Permission
     description: str = ""
     created: datetime
     expires: datetime | None = None
-    """None: never."""
+    """None if the key does not expire."""
 
 
 class _File(BaseModel):
@@ -51,19 +56,23 @@ class _File(BaseModel):
 
 
 class Keyring:
-    """The keys in the file at `path`; a file that is not there holds none."""
+    """The keys in the file at `path`; a missing file contains none. Changes of the file apply immediately."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self._keys = {key.sha256: key for key in self._load().keys}
+        self._lock = Lock()
+        self._state: tuple[int, int, int] | None = None
+        self._keys: dict[str, StoredKey] = {}
+        self._reload()
 
     @property
     def keys(self) -> tuple[StoredKey, ...]:
-        """What is kept of every key."""
+        """The stored properties of every key."""
+        self._reload()
         return tuple(self._keys.values())
 
     def add(self, permission: Permission, *, description: str = "", expires: datetime | None = None) -> str:
-        """Make a key, keep its hash in the file, and return it; it cannot be recovered afterwards.
+        """Create a key, add its hash to the file, and return the key, which cannot be recovered later.
 
         Raises:
             SinkError: The file cannot be written, or `expires` has no time zone.
@@ -73,29 +82,68 @@ class Keyring:
                 f"{expires.isoformat()} has no time zone", hint="add one, as in 2026-12-31T00:00:00Z"
             )
         key = new_key()
-        now = datetime.now(timezone.utc)
         stored = StoredKey(
-            sha256=_hash(key), permission=permission, description=description, created=now, expires=expires
+            sha256=_hash(key),
+            fingerprint=key_fingerprint(key),
+            permission=permission,
+            description=description,
+            created=datetime.now(timezone.utc),
+            expires=expires,
         )
-        self._keys = {held.sha256: held for held in self._load().keys} | {stored.sha256: stored}
-        self._save()
+        with self._lock:
+            self._save((*self._load().keys, stored))
+        self._reload()
         return key
 
-    def permission_of(self, key: str) -> Permission:
-        """Return what the key may do.
+    def find(self, fingerprint: str) -> StoredKey | None:
+        """Return the key with this fingerprint, or None."""
+        return next((key for key in self.keys if fingerprint and key.fingerprint == fingerprint), None)
+
+    def revoke(self, fingerprint: str) -> bool:
+        """Remove the key with this fingerprint; return False if there is none.
 
         Raises:
-            PermissionError: It is malformed, unknown or expired; the text says which, without the key.
+            SinkError: The file cannot be written.
+        """
+        with self._lock:
+            keys = self._load().keys
+            remaining = tuple(key for key in keys if not fingerprint or key.fingerprint != fingerprint)
+            if len(remaining) < len(keys):
+                self._save(remaining)
+        self._reload()
+        return len(remaining) < len(keys)
+
+    def permission_of(self, key: str) -> Permission:
+        """Return the permission of a key.
+
+        Raises:
+            PermissionError: The key is malformed, unknown or expired; the message does not contain it.
         """
         problem = key_problem(key)
         if problem is not None:
             raise PermissionError(f"the API key is malformed: {problem}")
+        self._reload()
         stored = self._keys.get(_hash(key))
         if stored is None:
-            raise PermissionError("the API key is unknown")
+            raise PermissionError("the API key is unknown or revoked")
         if stored.expires is not None and stored.expires <= datetime.now(timezone.utc):
             raise PermissionError(f"the API key expired on {stored.expires.isoformat()}")
         return stored.permission
+
+    def _reload(self) -> None:
+        """Read the file if it has changed since it was read."""
+        with self._lock:
+            state = self._file_state()
+            if state != self._state or state is None:
+                self._keys = {key.sha256: key for key in self._load().keys}
+                self._state = state
+
+    def _file_state(self) -> tuple[int, int, int] | None:
+        try:
+            stat = self.path.stat()
+        except OSError:
+            return None
+        return stat.st_mtime_ns, stat.st_size, stat.st_ino
 
     def _load(self) -> _File:
         try:
@@ -106,15 +154,14 @@ class Keyring:
             return _File.model_validate_json(text)
         except ValidationError as err:
             first = err.errors(include_url=False, include_input=False)[0]
-            raise SinkError(f"the file is no key ring: {first['msg']}", where=str(self.path)) from err
+            raise SinkError(f"the file is not a key file: {first['msg']}", where=str(self.path)) from err
 
-    def _save(self) -> None:
-        content = _File(keys=self.keys).model_dump_json(indent=2)
+    def _save(self, keys: tuple[StoredKey, ...]) -> None:
+        content = _File(keys=keys).model_dump_json(indent=2)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            handle, name = tempfile.mkstemp(
-                dir=self.path.parent, prefix=self.path.name
-            )  # readable by its owner only
+            # `mkstemp` creates a file that only its owner can read
+            handle, name = tempfile.mkstemp(dir=self.path.parent, prefix=self.path.name)
             with os.fdopen(handle, "w", encoding="utf-8") as file:
                 file.write(content)
             Path(name).replace(self.path)
@@ -126,11 +173,8 @@ def _hash(key: str) -> str:
     return hashlib.sha256(key.encode()).hexdigest()
 
 
-MIDDLEWARE = "api-key"
-
-
 class _Granted(fl.ServerMiddleware):
-    """What the caller may do."""
+    """The permission of the caller."""
 
     def __init__(self, permission: Permission) -> None:
         super().__init__()
@@ -138,37 +182,39 @@ class _Granted(fl.ServerMiddleware):
 
 
 class KeyCheck(fl.ServerMiddlewareFactory):
-    """Lets calls in whose key is on the ring; without a ring, all of them with every permission."""
+    """Accepts calls whose key is in the key ring; without a key ring, every call has every permission."""
 
     def __init__(self, keyring: Keyring | None) -> None:
         super().__init__()
         self._keyring = keyring
 
-    def start_call(  # pyright: ignore[reportIncompatibleMethodOverride] - a list may hold both kinds of text
+    def start_call(  # pyright: ignore[reportIncompatibleMethodOverride] - a list may contain text and bytes
         self,
-        info: fl.CallInfo,  # noqa: ARG002 - Flight gives it
+        info: fl.CallInfo,  # noqa: ARG002 - Flight's signature
         headers: Mapping[str, list[str | bytes]],
     ) -> _Granted:
-        """Return what the key in the headers may do, or refuse the call."""
+        """Return the permission of the key in the headers, or refuse the call."""
         if self._keyring is None:
             return _Granted(Permission.MANAGE)
-        given = headers.get(API_KEY_HEADER)
-        if not given:
-            raise as_flight_error(Condition.UNAUTHENTICATED, "this server needs an API key")
-        key = given[0].decode("ascii", "replace") if isinstance(given[0], bytes) else given[0]
+        values = headers.get(API_KEY_HEADER)
+        if not values:
+            raise as_flight_error(Condition.UNAUTHENTICATED, "this server requires an API key")
+        key = values[0].decode("ascii", "replace") if isinstance(values[0], bytes) else values[0]
         try:
             return _Granted(self._keyring.permission_of(key))
         except PermissionError as err:
-            raise as_flight_error(Condition.UNAUTHENTICATED, str(err)) from err
+            raise as_flight_error(Condition.UNAUTHENTICATED, str(err)) from None
+        except SinkError as err:
+            raise as_flight_error(Condition.UNAVAILABLE, err.what) from None
 
 
 def require(context: fl.ServerCallContext, needed: Permission) -> None:
     """Refuse the call unless its key includes `needed`."""
     granted = context.get_middleware(MIDDLEWARE)
     if not isinstance(granted, _Granted):
-        raise Refusal(Condition.UNAUTHENTICATED, "this server needs an API key")
+        raise Refusal(Condition.UNAUTHENTICATED, "this server requires an API key")
     if not granted.permission.includes(needed):
         raise Refusal(
             Condition.PERMISSION,
-            f"permission denied: this needs a key with {needed.value}, this one has {granted.permission.value}",
+            f"permission denied: the call needs a key with {needed.value}, this key has {granted.permission.value}",
         )

@@ -10,28 +10,31 @@ import math
 import operator
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fnmatch import translate
-from functools import reduce
+from functools import lru_cache, reduce
 from operator import and_
 from typing import Any, Final, Protocol, cast
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from mosaico_ingest.destinations.store.errors import explained
 from mosaico_ingest.destinations.store.model import SegmentInfo, SequenceInfo, TopicInfo
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.errors import Condition
-from mosaico_ingest.serve.errors import Refusal
+from mosaico_ingest.serve.errors import Deadline, Refusal
 
 __all__ = [
     "MISSING",
     "Comparison",
     "Test",
+    "matching_times",
     "run",
     "tests_of",
 ]
@@ -140,7 +143,7 @@ class Glob(Struct, frozen=True):
 
     def holds(self, value: Any) -> bool:  # noqa: ANN401 - see Test
         """Return whether the value is a text of that form."""
-        return isinstance(value, str) and re.fullmatch(self._expression(), value) is not None
+        return isinstance(value, str) and _glob(self.pattern).fullmatch(value) is not None
 
     def may_hold(self, low: Any, high: Any) -> bool:  # noqa: ANN401, ARG002 - see Test
         """Return that it may."""
@@ -151,8 +154,41 @@ class Glob(Struct, frozen=True):
         return pc.match_substring_regex(column, f"^{self._expression()}$")
 
     def _expression(self) -> str:
-        """Return the pattern in words that Python and Arrow share: fnmatch alone looks ahead where there are several `*`."""
+        """Return the pattern for Arrow, whose expressions match in linear time and have no look-ahead."""
         return f"(?s:{''.join(map(_spelled, _GLOB_WORDS.findall(self.pattern)))})"
+
+
+class Like(Struct, frozen=True):
+    """`LIKE '%pattern%'` of SQL: text that contains the pattern, with `%` for any text and `_` for any character."""
+
+    pattern: str
+
+    def holds(self, value: Any) -> bool:  # noqa: ANN401 - see Test
+        """Return whether the value is a text that contains the pattern, in any case."""
+        return isinstance(value, str) and _like(self.pattern.lower()).fullmatch(value.lower()) is not None
+
+    def may_hold(self, low: Any, high: Any) -> bool:  # noqa: ANN401, ARG002 - see Test
+        """Return True."""
+        return True
+
+    def column(self, column: pc.Expression, kind: pa.DataType) -> pc.Expression:  # noqa: ARG002 - text only
+        """Return the same for a column."""
+        return pc.match_like(column, f"%{self.pattern}%", ignore_case=True)
+
+
+@lru_cache(maxsize=256)
+def _like(pattern: str) -> re.Pattern[str]:
+    glob = re.sub(r"[*?[]", r"[\g<0>]", pattern).replace("%", "*").replace("_", "?")
+    return re.compile(translate(f"*{glob}*"))
+
+
+@lru_cache(maxsize=256)
+def _glob(pattern: str) -> re.Pattern[str]:
+    """Return the pattern as `fnmatch` translates it, which never backtracks across a `*`."""
+    words = _GLOB_WORDS.findall(pattern)
+    return re.compile(
+        translate("".join("[0-9]" if word == "#" else word.replace("#", "0-9") for word in words))
+    )
 
 
 class Presence(Struct, frozen=True):
@@ -255,21 +291,29 @@ Tests = Sequence[tuple[str, Test]]
 """What is asked of which field."""
 
 
-def run(store: Store, question: messages.Query) -> messages.QueryResult:
-    """Return the topics that fit, by sequence."""
+def run(store: Store, question: messages.Query, deadline: Deadline | None = None) -> messages.QueryResult:
+    """Return the matching topics by sequence.
+
+    Raises:
+        Refusal: The query is invalid, or takes longer than the time limit.
+    """
+    deadline = deadline or Deadline(math.inf)
     ontology = dict(question.ontology)
     with_range = bool(ontology.pop(_WITH_RANGE, False)) or question.include_timestamp_range
-    about_sequence = _about(question.sequence, ("name", "created_at_ns"), "sequence")
+    about_sequence = _about(question.sequence, ("name", "locator", "created_at_ns"), "sequence")
     about_topic = _about(
-        question.topic, ("name", "created_at_ns", "ontology_tag", "serialization_format"), "topic"
+        question.topic, ("name", "locator", "created_at_ns", "ontology_tag", "serialization_format"), "topic"
     )
     groups = _by_tag(ontology)
     items: list[messages.QueryTopics] = []
     for sequence in store.sequences():
+        deadline.check()
         if not _fits(_sequence_values(sequence), sequence.metadata, about_sequence):
             continue
         topics = [each for each in sequence.topics if _fits(_topic_values(each), each.metadata, about_topic)]
-        found = _with_values(store, topics, groups, with_range=with_range) if groups else _all(topics)
+        found = (
+            _with_values(store, topics, groups, deadline, with_range=with_range) if groups else _all(topics)
+        )
         if found or not (groups or about_topic):
             items.append(messages.QueryTopics(sequence=sequence.name, topics=found))
     return messages.QueryResult(items=items)
@@ -285,11 +329,17 @@ def _about(asked: Mapping[str, Any], fields: Sequence[str], kind: str) -> Tests:
             for path, inner in cast("Mapping[str, Any]", conditions).items():  # JSON's keys are text
                 tests += [(f"user_metadata.{path}", test) for test in tests_of(inner, of=path)]
         elif field in fields:
-            tests += [(field, test) for test in tests_of(conditions, of=field)]
+            parsed = tests_of(conditions, of=field)
+            tests += [(field, _as_like(test) if field == "locator" else test) for test in parsed]
         else:
             text = f"a {kind} has no {field!r}; ask for {', '.join(fields)} or user_metadata"
             raise Refusal(Condition.INVALID, text)
     return tests
+
+
+def _as_like(test: Test) -> Test:
+    """Return `$match` on a locator as `LIKE '%text%'`, as the platform's server evaluates it; keep other tests."""
+    return Like(test.pattern) if isinstance(test, Glob) else test
 
 
 def _by_tag(ontology: Mapping[str, Any]) -> dict[str, Tests]:
@@ -303,7 +353,11 @@ def _by_tag(ontology: Mapping[str, Any]) -> dict[str, Tests]:
 
 
 def _sequence_values(sequence: SequenceInfo) -> dict[str, tuple[object, ...]]:
-    return {"name": (sequence.name,), "created_at_ns": (sequence.created_ns,)}
+    return {
+        "name": (sequence.name,),
+        "locator": (sequence.name,),
+        "created_at_ns": (sequence.created_ns,),
+    }
 
 
 def _topic_values(topic: TopicInfo) -> dict[str, tuple[object, ...]]:
@@ -311,6 +365,7 @@ def _topic_values(topic: TopicInfo) -> dict[str, tuple[object, ...]]:
     bare = topic.name.removeprefix("/")
     return {
         "name": (topic.name, bare, messages.topic_locator(topic.sequence, bare)),
+        "locator": (messages.topic_locator(topic.sequence, bare),),
         "created_at_ns": (topic.created_ns,),
         "ontology_tag": (topic.ontology.tag,),
         "serialization_format": (topic.ontology.serialization_format.value,),
@@ -339,13 +394,18 @@ def _all(topics: Iterable[TopicInfo]) -> list[messages.QueryTopic]:
 
 
 def _with_values(
-    store: Store, topics: Sequence[TopicInfo], groups: Mapping[str, Tests], *, with_range: bool
+    store: Store,
+    topics: Sequence[TopicInfo],
+    groups: Mapping[str, Tests],
+    deadline: Deadline,
+    *,
+    with_range: bool,
 ) -> list[messages.QueryTopic]:
     """Return the topics with a row that fits, or none at all where one tag has no such topic."""
     found: list[messages.QueryTopic] = []
     for tag, tests in groups.items():
         spans = {
-            topic.name: _span(store, topic, tests, whole=with_range)
+            topic.name: _span(store, topic, tests, deadline, whole=with_range)
             for topic in topics
             if topic.ontology.tag == tag
         }
@@ -361,24 +421,56 @@ def _item(topic: TopicInfo, span: tuple[int, int] | None) -> messages.QueryTopic
     return messages.QueryTopic(locator=locator, ontology_tag=topic.ontology.tag, timestamp_range=span)
 
 
-def _span(store: Store, topic: TopicInfo, tests: Tests, *, whole: bool) -> tuple[int, int] | None:
-    """Return the first and last time stamp of the rows that fit, None without one; not `whole`: of any that fit."""
+def _span(
+    store: Store, topic: TopicInfo, tests: Tests, deadline: Deadline, *, whole: bool
+) -> tuple[int, int] | None:
+    """Return the first and the last matching time stamp, or None; without `whole`, the span of any matching rows."""
+    span: tuple[int, int] | None = None
+    for times in _matching_batches(store, topic, tests, deadline):
+        low, high = int(times.min()), int(times.max())
+        span = (low, high) if span is None else (min(span[0], low), max(span[1], high))
+        if not whole:
+            return span
+    return span
+
+
+def matching_times(
+    store: Store,
+    topic: TopicInfo,
+    ontology: Mapping[str, Any],
+    bounds: messages.TimeBounds | None,
+    deadline: Deadline,
+) -> NDArray[np.int64]:
+    """Return the sorted time stamps of a topic's rows that match conditions and lie within `bounds`.
+
+    Raises:
+        Refusal: A condition is invalid or concerns another type, or the time limit passes.
+    """
+    groups = _by_tag({key: value for key, value in ontology.items() if key != _WITH_RANGE})
+    if groups.keys() - {topic.ontology.tag}:
+        raise Refusal(Condition.INVALID, f"the topic holds {topic.ontology.tag}, not {', '.join(groups)}")
+    tests: list[tuple[str, Test]] = list(groups.get(topic.ontology.tag, ()))
+    if bounds is not None:
+        time = topic.schema.names[0]
+        tests += [(time, Comparison("$geq", bounds.start_ns)), (time, Comparison("$leq", bounds.end_ns))]
+    batches = list(_matching_batches(store, topic, tests, deadline))
+    return np.sort(np.concatenate(batches)) if batches else np.array([], np.int64)
+
+
+def _matching_batches(
+    store: Store, topic: TopicInfo, tests: Tests, deadline: Deadline
+) -> Iterator[NDArray[np.int64]]:
+    """Yield the time stamps of the rows that pass all tests, segment by segment."""
     condition = _condition(topic.schema, tests)
     if condition is None:
-        return None
-    span: tuple[int, int] | None = None
+        return
     for segment in _promising(store, topic, tests):
         with explained(segment.path):
             rows = ds.dataset(str(segment.path), schema=topic.schema, format="parquet")
             for batch in rows.to_batches(columns=[topic.schema.names[0]], filter=condition):
-                if not batch.num_rows:
-                    continue
-                times = batch.column(0).to_numpy()
-                low, high = int(times.min()), int(times.max())
-                span = (low, high) if span is None else (min(span[0], low), max(span[1], high))
-                if not whole:
-                    return span
-    return span
+                deadline.check()
+                if batch.num_rows:
+                    yield batch.column(0).to_numpy()
 
 
 def _condition(schema: pa.Schema, tests: Tests) -> pc.Expression | None:

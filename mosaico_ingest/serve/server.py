@@ -16,10 +16,10 @@ from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.errors import Condition
-from mosaico_ingest.protocol.messages import ACTIONS, JSON, Permission
+from mosaico_ingest.protocol.messages import ACTIONS, JSON, Body, Permission
 from mosaico_ingest.remote import RemotePath, as_path
-from mosaico_ingest.serve.actions import ANSWERS, Backend
-from mosaico_ingest.serve.errors import Refusal, answered
+from mosaico_ingest.serve.actions import HANDLERS, Backend
+from mosaico_ingest.serve.errors import Refusal, translate_errors
 from mosaico_ingest.serve.flights import Flights
 from mosaico_ingest.serve.keys import MIDDLEWARE, KeyCheck, Keyring, require
 from mosaico_ingest.serve.uploads import Uploads
@@ -27,6 +27,7 @@ from mosaico_ingest.serve.uploads import Uploads
 __all__ = [
     "IDLE_S",
     "PORT",
+    "REQUEST_S",
     "Server",
     "Service",
     "Tls",
@@ -44,10 +45,11 @@ class Service(fl.FlightServerBase):
         *,
         keyring: Keyring | None,
         certificates: list[tuple[bytes, bytes]] | None,
+        request_s: float,
     ) -> None:
         self._uploads = Uploads(store)
         self._flights = Flights(store, self._uploads)
-        self._backend = Backend(store, self._uploads)
+        self._backend = Backend(store, self._uploads, keyring, request_s)
         middleware = {MIDDLEWARE: KeyCheck(keyring)}
         super().__init__(location, tls_certificates=certificates, middleware=middleware)  # pyright: ignore[reportArgumentType] - PEM is bytes
 
@@ -63,7 +65,7 @@ class Service(fl.FlightServerBase):
         self, context: fl.ServerCallContext, criteria: bytes
     ) -> Iterator[fl.FlightInfo]:
         """List the sequences."""
-        with answered():
+        with translate_errors():
             require(context, Permission.READ)
             if criteria not in {b"", b"/"}:
                 raise Refusal(Condition.INVALID, "list_flights takes no criteria but '/'")
@@ -73,7 +75,7 @@ class Service(fl.FlightServerBase):
         self, context: fl.ServerCallContext, descriptor: fl.FlightDescriptor
     ) -> fl.FlightInfo:
         """Describe a sequence or a topic."""
-        with answered():
+        with translate_errors():
             require(context, Permission.READ)
             return self._flights.info(descriptor)
 
@@ -81,16 +83,16 @@ class Service(fl.FlightServerBase):
         self, context: fl.ServerCallContext, descriptor: fl.FlightDescriptor
     ) -> fl.SchemaResult:
         """Return the columns of a topic."""
-        with answered():
+        with translate_errors():
             require(context, Permission.READ)
             return fl.SchemaResult(self._flights.schema(descriptor))
 
     def do_get(self, context: fl.ServerCallContext, ticket: fl.Ticket) -> fl.FlightDataStream:
         """Stream a topic's rows."""
-        with answered():
+        with translate_errors():
             require(context, Permission.READ)
             schema, batches = self._flights.rows(ticket)
-            return fl.GeneratorStream(schema, _told(batches))
+            return fl.GeneratorStream(schema, _translated(batches))
 
     def do_put(
         self,
@@ -100,40 +102,45 @@ class Service(fl.FlightServerBase):
         writer: fl.FlightMetadataWriter,  # noqa: ARG002 - nothing is sent back before the end
     ) -> None:
         """Take the rows of a topic."""
-        with answered():
+        with translate_errors():
             require(context, Permission.WRITE)
             if descriptor.descriptor_type is not fl.DescriptorType.CMD:
-                raise Refusal(Condition.INVALID, "only descriptors with a command are understood")
+                raise Refusal(Condition.INVALID, "the descriptor must have a command")
             put = JSON.decode(messages.Put, descriptor.command or b"")
             self._uploads.receive(put, reader.schema, _batches(reader))
 
     def do_action(self, context: fl.ServerCallContext, action: fl.Action) -> Iterator[bytes]:
-        """Answer an action."""
-        with answered():
+        """Execute an action."""
+        with translate_errors():
             known = ACTIONS.get(action.type)
-            if known is None or known not in ANSWERS:
+            if known is None or known not in HANDLERS:
                 raise Refusal(Condition.UNIMPLEMENTED, f"action {action.type!r} is not implemented")
             require(context, known.permission)
             question = JSON.decode(known.question, action.body.to_pybytes() or b"{}")
-            return iter([JSON.encode_answer(known, ANSWERS[known](self._backend, question))])
+            response = HANDLERS[known](self._backend, question)
+            if isinstance(response, Body):
+                return iter([JSON.encode_answer(known, response)])
+            return iter([JSON.encode_answer(known, body) + b"\n" for body in response])
 
 
-def _told(batches: Iterator[pa.RecordBatch]) -> Generator[pa.RecordBatch, None, None]:
-    with answered():
+def _translated(batches: Iterator[pa.RecordBatch]) -> Generator[pa.RecordBatch, None, None]:
+    with translate_errors():
         yield from batches
 
 
 def _batches(reader: fl.MetadataRecordBatchReader) -> Iterator[pa.RecordBatch]:
     for chunk in reader:
         if chunk.data is None:
-            raise Refusal(Condition.INVALID, "a message without rows came in the middle of an upload")
+            raise Refusal(Condition.INVALID, "the upload contains a message without rows")
         yield chunk.data
 
 
 PORT = 6726
-"""Where clients look unless told otherwise."""
+"""The default port of clients."""
 IDLE_S = 3600.0
-"""How long a session may stay open without a word from its client."""
+"""Idle time after which an open session is discarded."""
+REQUEST_S = 60.0
+"""Time limit of a query."""
 _GRACE_S = 10.0
 _TIDY_S = 30.0
 _HEARD_WITHIN_S = 0.5
@@ -198,10 +205,12 @@ def serve(
     keys: Keyring | None = None,
     tls: Tls | None = None,
     idle_s: float = IDLE_S,
+    request_s: float = REQUEST_S,
 ) -> Server:
-    """Serve the store in the folder, which is made where there is none; port 0 takes a free one.
+    """Serve the store in a folder, which is created if necessary; port 0 selects a free port.
 
-    Without `keys` every caller may do everything. A session whose client says nothing for `idle_s` is discarded.
+    Without `keys`, every caller has every permission. A session that is idle for `idle_s` is discarded, and a query
+    that takes longer than `request_s` is refused.
 
     Raises:
         SinkError: The store cannot be opened, the certificate cannot be read, or the port is taken.
@@ -209,19 +218,23 @@ def serve(
     place = as_path(store_path)
     if isinstance(place, RemotePath):
         raise SinkError(
-            "a server answers from a store on a disk", where=str(place), hint="read the store where it lies"
+            "only a store in a local folder can be served",
+            where=str(place),
+            hint="read the store through its URL",
         )
     store = Store.open(place)
     scheme = "grpc" if tls is None else "grpc+tls"
     certificates = None if tls is None else [(_read(tls.certificate), _read(tls.key))]
     try:
-        service = Service(store, f"{scheme}://{host}:{port}", keyring=keys, certificates=certificates)
+        service = Service(
+            store, f"{scheme}://{host}:{port}", keyring=keys, certificates=certificates, request_s=request_s
+        )
     except (OSError, pa.ArrowException) as err:
         text = str(err).splitlines()[0]
         raise SinkError(
             f"cannot listen: {text}",
             where=f"{host}:{port}",
-            hint="is the address this machine's, and the port free?",
+            hint="check that the address belongs to this machine and that the port is free",
         ) from err
     return Server(service, store, host, scheme=scheme, idle_s=idle_s)
 

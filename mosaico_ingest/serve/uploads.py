@@ -1,4 +1,4 @@
-"""This file is the sessions that are open: their topics, how far each upload is, and how they end."""
+"""The open sessions of a server: their topics, the state of each upload, and their end."""
 
 from __future__ import annotations
 
@@ -22,11 +22,15 @@ from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.batches import validated
 from mosaico_ingest.protocol.errors import Condition
-from mosaico_ingest.serve.errors import Refusal, checked
+from mosaico_ingest.serve.errors import Refusal, refuse_invalid
 
-__all__ = ["OpenSession", "Uploads"]
+__all__ = ["OpenSession", "OpenTopic", "Uploads"]
 
 _BUFFER_BYTES = 96 << 20
+_MAX_SESSIONS = 128
+"""Maximum number of open sessions, each of which keeps file descriptors."""
+_ABANDONED_S = 60.0
+"""Idle time after which a session may be discarded for a new one if there are too many."""
 
 
 class _State(Enum):
@@ -37,7 +41,9 @@ class _State(Enum):
 
 
 @dataclass(slots=True)
-class _Topic:
+class OpenTopic:
+    """A topic of an open session, and the state of its upload."""
+
     name: str
     question: messages.TopicCreate
     state: _State = _State.CREATED
@@ -45,30 +51,39 @@ class _Topic:
 
 @dataclass(slots=True)
 class OpenSession:
-    """A session that takes topics."""
+    """A session that accepts topics."""
 
     uuid: str
     sequence: str
     session: StoreSession
-    topics: dict[str, _Topic] = field(default_factory=dict[str, _Topic])
-    """By the UUID each upload names."""
-    heard_s: float = field(default_factory=time.monotonic)
-    """When its client last said something, on the monotonic clock."""
+    topics: dict[str, OpenTopic] = field(default_factory=dict[str, OpenTopic])
+    """By the UUID that their uploads name."""
+    last_call_s: float = field(default_factory=time.monotonic)
+    """The monotonic time of the last call of its client."""
 
     @property
     def locator(self) -> str:
-        """As `drive:01J…`."""
+        """The locator of the session, as `drive:01J…`."""
         return messages.session_locator(self.sequence, self.session.id)
+
+    @property
+    def topic_names(self) -> tuple[str, ...]:
+        """The names of its topics, sorted."""
+        return tuple(sorted(topic.name for topic in self.topics.values()))
+
+    def topic_locator(self, name: str) -> str:
+        """Return the locator of one of its topics, as `drive/imu`."""
+        return messages.topic_locator(self.sequence, name)
 
 
 class Uploads:
-    """All sessions of a server that are not in its store yet."""
+    """The sessions of a server that are not committed yet."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
         self._sessions: dict[str, OpenSession] = {}
         self._committing: dict[str, OpenSession] = {}
-        """They take nothing more, and their topics are not in the store yet."""
+        """Sessions that accept no more topics and are not in the store yet."""
         self._finalized: set[str] = set()
         self._lock = threading.RLock()
 
@@ -79,8 +94,9 @@ class Uploads:
             return tuple(each for each in waiting if each.sequence == sequence)
 
     def open(self, sequence: str) -> OpenSession:
-        """Open a session of a sequence that is there."""
+        """Open a session of an existing sequence."""
         self._store.sequence(sequence)
+        self._limit_sessions()
         session = StoreSession(
             self._store.layout,
             self._store.catalog,
@@ -88,16 +104,28 @@ class Uploads:
             "{}",
             if_exists=IfExists.APPEND,
             buffer_bytes=_BUFFER_BYTES,
+            keep_catalog_open=False,
         )
         opened = OpenSession(str(uuid4()), sequence, session)
         with self._lock:
             self._sessions[opened.uuid] = opened
         return opened
 
+    def _limit_sessions(self) -> None:
+        """Discard the session that was idle the longest if there are too many, or refuse the call."""
+        with self._lock:
+            if len(self._sessions) < _MAX_SESSIONS:
+                return
+            oldest = min(self._sessions.values(), key=lambda each: each.last_call_s)
+            if time.monotonic() - oldest.last_call_s < _ABANDONED_S:
+                text = f"{_MAX_SESSIONS} sessions are open; finalize or delete one, or try again later"
+                raise Refusal(Condition.UNAVAILABLE, text)
+            self._discard([oldest])
+
     def add_topic(self, question: messages.TopicCreate) -> str:
-        """Announce a topic and return the UUID its upload must name."""
+        """Register a topic and return the UUID that its upload must name."""
         sequence, _, path = question.locator.partition("/")
-        with checked():
+        with refuse_invalid():
             name = protocol.check_topic_name(path)
             protocol.check_metadata(question.user_metadata, where=question.locator)
         with self._lock:
@@ -107,21 +135,21 @@ class Uploads:
                 raise Refusal(
                     Condition.PERMISSION, f"the session writes {opened.sequence!r}, not {sequence!r}"
                 )
-            if name in held | self._announced(sequence):
+            if name in held | self._topic_names(sequence):
                 raise Refusal(Condition.EXISTS, f"topic {question.locator!r} already exists")
             uuid = str(uuid4())
-            opened.topics[uuid] = _Topic(name, question)
+            opened.topics[uuid] = OpenTopic(name, question)
             return uuid
 
     def receive(self, put: messages.Put, schema: pa.Schema, batches: Iterable[pa.RecordBatch]) -> None:
-        """Take the one upload of a topic."""
-        ontology_columns = _payload(schema)
+        """Write the upload of a topic; each topic has one."""
+        ontology_columns = _payload_columns(schema)
         with self._lock:
-            opened, topic, writer = self._begin(put, ontology_columns)
+            opened, topic, writer = self._start(put, ontology_columns)
         try:
             for batch in batches:
-                self._hear(opened)
-                with checked():
+                self._touch(opened)
+                with refuse_invalid():
                     rows = _rows(batch, writer.schema)
                 writer.write(rows)
             writer.close()
@@ -131,7 +159,7 @@ class Uploads:
         topic.state = _State.DONE
 
     def finalize(self, uuid: str) -> None:
-        """Make a session visible."""
+        """Commit a session, which makes its topics visible."""
         with self._lock:
             opened = self._session(uuid)
             if not opened.topics:
@@ -152,20 +180,20 @@ class Uploads:
                 del self._committing[uuid]
 
     def discard_session(self, locator: str) -> bool:
-        """Drop the open session at `locator`; return whether there is one."""
+        """Discard the open session with this locator; return whether it exists."""
         with self._lock:
             found = [each for each in self._sessions.values() if each.locator == locator]
-            return self._drop(found)
+            return self._discard(found)
 
     def discard_sequence(self, sequence: str) -> bool:
-        """Drop the open sessions of a sequence; return whether there are any."""
+        """Discard the open sessions of a sequence; return whether there were any."""
         with self._lock:
-            return self._drop(self._open(sequence))
+            return self._discard(self._open_sessions(sequence))
 
     def discard_topic(self, sequence: str, name: str) -> bool:
-        """Forget a topic that was announced and never uploaded; return whether there is one."""
+        """Remove a topic that was never uploaded; return whether it exists."""
         with self._lock:
-            for opened in self._open(sequence):
+            for opened in self._open_sessions(sequence):
                 for uuid, topic in tuple(opened.topics.items()):
                     if topic.name == name:
                         if topic.state is not _State.CREATED:
@@ -175,22 +203,22 @@ class Uploads:
         return False
 
     def has_topic(self, sequence: str, name: str) -> bool:
-        """Return whether a session has announced the topic."""
+        """Return whether an open session has the topic."""
         with self._lock:
-            return name in self._announced(sequence)
+            return name in self._topic_names(sequence)
 
     def discard_idle(self, idle_s: float) -> bool:
-        """Drop the open sessions whose clients have said nothing for so long; return whether there are any."""
+        """Discard the open sessions that are idle for `idle_s`; return whether there were any."""
         before = time.monotonic() - idle_s
         with self._lock:
-            return self._drop([each for each in self._sessions.values() if each.heard_s < before])
+            return self._discard([each for each in self._sessions.values() if each.last_call_s < before])
 
     def close(self) -> None:
-        """Drop every open session."""
+        """Discard every open session."""
         with self._lock:
-            self._drop(tuple(self._sessions.values()))
+            self._discard(tuple(self._sessions.values()))
 
-    def _begin(self, put: messages.Put, payload: pa.StructType) -> tuple[OpenSession, _Topic, StoreTopic]:
+    def _start(self, put: messages.Put, payload: pa.StructType) -> tuple[OpenSession, OpenTopic, StoreTopic]:
         owners = [each for each in self._sessions.values() if put.topic_uuid in each.topics]
         if not owners:
             raise NotInStore(f"there is no topic with the UUID {put.topic_uuid}")
@@ -200,19 +228,19 @@ class Uploads:
         if topic.state is not _State.CREATED:
             raise Refusal(Condition.PRECONDITION, f"topic {put.resource_locator!r} {topic.state.value}")
         ontology = OntologyType(topic.question.ontology_tag, payload, topic.question.serialization_format)
-        with checked():
+        with refuse_invalid():
             writer = owners[0].session.topic(topic.name, ontology, topic.question.user_metadata)
         topic.state = _State.UPLOADING
         return owners[0], topic, writer
 
-    def _open(self, sequence: str) -> tuple[OpenSession, ...]:
+    def _open_sessions(self, sequence: str) -> tuple[OpenSession, ...]:
         return tuple(each for each in self._sessions.values() if each.sequence == sequence)
 
-    def _announced(self, sequence: str) -> set[str]:
+    def _topic_names(self, sequence: str) -> set[str]:
         return {topic.name for each in self.of_sequence(sequence) for topic in each.topics.values()}
 
-    def _hear(self, opened: OpenSession) -> None:
-        opened.heard_s = time.monotonic()
+    def _touch(self, opened: OpenSession) -> None:
+        opened.last_call_s = time.monotonic()
         if opened.uuid not in self._sessions:
             raise Refusal(Condition.PRECONDITION, "the session has ended")
 
@@ -221,10 +249,10 @@ class Uploads:
             raise Refusal(Condition.PRECONDITION, "the session is finalized already")
         if uuid not in self._sessions:
             raise NotInStore(f"there is no open session {uuid}")
-        self._sessions[uuid].heard_s = time.monotonic()
+        self._sessions[uuid].last_call_s = time.monotonic()
         return self._sessions[uuid]
 
-    def _drop(self, sessions: Iterable[OpenSession]) -> bool:
+    def _discard(self, sessions: Iterable[OpenSession]) -> bool:
         dropped = False
         for opened in sessions:
             del self._sessions[opened.uuid]
@@ -247,9 +275,9 @@ def _rows(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:
     return pa.RecordBatch.from_arrays(columns, schema=schema)
 
 
-def _payload(schema: pa.Schema) -> pa.StructType:
-    """Return the columns beside the envelope's, which must be there."""
-    with checked():
+def _payload_columns(schema: pa.Schema) -> pa.StructType:
+    """Return the columns besides the envelope, or refuse a schema without it."""
+    with refuse_invalid():
         if schema.get_field_index(ENVELOPE.name) < 0 or schema.field(ENVELOPE.name).type != ENVELOPE.type:
             raise pa.ArrowInvalid("the schema has no column timestamp_ns of int64")
     return pa.struct([column for column in schema if column.name != ENVELOPE.name])

@@ -44,7 +44,7 @@ def test_a_key_may_do_what_its_permission_includes(tmp_path: Path, rows: Rows) -
 @pytest.mark.parametrize(
     ("spoil", "word"),
     [
-        (lambda _: None, "needs an API key"),
+        (lambda _: None, "requires an API key"),
         (lambda _: "secret", "malformed"),
         (lambda key: key[:-1] + ("0" if key[-1] != "0" else "1"), "checksum"),
         (lambda _: "msco_" + "a" * 32 + "_d25389d7", "malformed"),
@@ -81,7 +81,7 @@ def test_a_key_ring_keeps_hashes_and_expiry(tmp_path: Path) -> None:
     with pytest.raises(SinkError, match="time zone"):
         ring.add(Permission.READ, expires=datetime(2030, 1, 1))  # noqa: DTZ001 - what the test is about
     path.write_text('{"keys": [{}]}')
-    with pytest.raises(SinkError, match="key ring"):
+    with pytest.raises(SinkError, match="not a key file"):
         Keyring(path)
 
 

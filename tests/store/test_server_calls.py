@@ -74,8 +74,13 @@ def test_a_time_range_has_its_start_inside_and_its_end_outside(client: Client, r
     assert client.rows("drive/imu", timestamp_ns_start=98) == [98, 99]
     _, (outside,) = client.info("drive/imu", timestamp_ns_start=1000)
     assert outside["time_window_info"] == {"interval": None, "row_count": 0}
-    with refused(Condition.INVALID, "empty"):
-        client.info("drive/imu", timestamp_ns_start=5, timestamp_ns_end=5)
+    for window in (
+        {"timestamp_ns_start": 5, "timestamp_ns_end": 5},
+        {"timestamp_ns_start": 9, "timestamp_ns_end": 3},
+    ):
+        assert client.rows("drive/imu", **window) == []
+        _, (nothing,) = client.info("drive/imu", **window)
+        assert nothing["time_window_info"] == {"interval": None, "row_count": 0}
 
 
 def test_large_rows_come_in_messages_of_a_moderate_size(server: Server, client: Client) -> None:
@@ -200,8 +205,8 @@ def test_what_is_taken_missing_or_malformed_is_refused(client: Client, rows: Row
         list(client.flight.do_action(fl.Action("info", b"{")))
     with refused(Condition.INVALID):
         client.flight.do_get(fl.Ticket(b"\xff\x00")).read_all()
-    with refused(Condition.UNIMPLEMENTED, "topic_filter_clusterize"):
-        client.call("topic_filter_clusterize")
+    with refused(Condition.UNIMPLEMENTED, "topic_filter_x"):
+        client.call("topic_filter_x")
 
 
 def test_a_refusal_does_not_carry_what_caused_it(client: Client) -> None:
@@ -351,5 +356,5 @@ def test_a_session_nobody_speaks_of_any_more_is_discarded(tmp_path: Path, rows: 
 
 
 def test_a_port_that_is_taken_is_said_so(server: Server, tmp_path: Path) -> None:
-    with pytest.raises(SinkError, match=f"{server.port}.*the port free"):
+    with pytest.raises(SinkError, match=f"{server.port}.*the port is free"):
         serve(tmp_path / "another", port=server.port)

@@ -212,6 +212,7 @@ class StoreSession:
         *,
         if_exists: IfExists,
         buffer_bytes: int,
+        keep_catalog_open: bool = True,
     ) -> None:
         self.id = new_session_id()
         self.created_ns = time.time_ns()
@@ -226,7 +227,8 @@ class StoreSession:
         self._lease = layout.begin(self.id)
         self._held = ExitStack()
         try:
-            self._held.enter_context(closing(catalog.keep_open()))
+            if keep_catalog_open:
+                self._held.enter_context(closing(catalog.keep_open()))
             self._claim = catalog.claim(self.id, sequence, if_exists, is_live=layout.is_live)
         except BaseException:
             self._leave()
