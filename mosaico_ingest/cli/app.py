@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperArgument, TyperCommand, TyperGroup
 
 from mosaico_ingest.cli.process import defer_garbage_collection
 from mosaico_ingest.errors import IngestError, Interrupted
@@ -78,6 +79,7 @@ def command_line(names: Sequence[str] = NAMES) -> typer.Typer:
     """Return the command line with these commands. All of them take 27 ms to import and inspect."""
     app = typer.Typer(
         name="ingest",
+        cls=_Group,
         callback=root,
         no_args_is_help=True,
         pretty_exceptions_enable=False,
@@ -86,11 +88,42 @@ def command_line(names: Sequence[str] = NAMES) -> typer.Typer:
     for name in names:
         if name in GROUPS:
             module = import_module(f"{__package__}.{GROUPS[name]}")
-            app.add_typer(getattr(module, f"{name}_app"), name=name)
+            group: typer.Typer = getattr(module, f"{name}_app")
+            for command in group.registered_commands:
+                command.cls = _Command
+            app.add_typer(group, name=name, cls=_Group)
         else:
             module = import_module(f"{__package__}.{COMMANDS[name]}")
-            app.command(name)(getattr(module, name))
+            app.command(name, cls=_Command)(getattr(module, name))
     return app
+
+
+class _Command(TyperCommand):
+    """A command whose help shows no Python types."""
+
+    def get_params(self, ctx: Any) -> list[Any]:  # noqa: ANN401 - the context of typer or click, by version
+        return _without_types(super().get_params(ctx))
+
+
+class _Group(TyperGroup):
+    """A command group whose help shows no Python types."""
+
+    def get_params(self, ctx: Any) -> list[Any]:  # noqa: ANN401 - the context of typer or click, by version
+        return _without_types(super().get_params(ctx))
+
+
+def _without_types(parameters: Sequence[Any]) -> list[Any]:
+    """Return the parameters without the type of flags and of arguments that have a metavar, such as `<bool>`."""
+    for parameter in parameters:
+        if getattr(parameter, "is_flag", False) or (
+            isinstance(parameter, TyperArgument) and parameter.metavar
+        ):
+            parameter.display_type_rich = _no_type
+    return list(parameters)
+
+
+def _no_type(ctx: object) -> None:
+    """Return no text for the column of types."""
 
 
 def _print_version(value: bool) -> None:

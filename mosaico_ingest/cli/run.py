@@ -71,7 +71,12 @@ def run(
     jobs: Annotated[
         int | None,
         typer.Option(
-            "--jobs", "-j", min=1, max=1024, help="Recordings ingested in parallel; overrides run.jobs."
+            "--jobs",
+            "-j",
+            min=1,
+            max=1024,
+            metavar="N",
+            help="Recordings ingested in parallel; overrides run.jobs.",
         ),
     ] = None,
     executor: Annotated[
@@ -173,7 +178,10 @@ def bag(
     topics: Annotated[
         list[str] | None,
         typer.Option(
-            "--topics", "-t", help="Topic name or glob, such as /cam/*; !GLOB excludes. Repeatable."
+            "--topics",
+            "-t",
+            help="Topic name or glob, such as /cam/*; !GLOB excludes. Repeatable.",
+            metavar="GLOB",
         ),
     ] = None,
     more_topics: Annotated[
@@ -195,16 +203,28 @@ def bag(
     ] = None,
     ros_distro: Annotated[
         str | None,
-        typer.Option("--ros-distro", help="Distro of recordings without definitions, such as ros2_humble."),
+        typer.Option(
+            "--ros-distro",
+            help="Distro of recordings without definitions, such as ros2_humble.",
+            metavar="DISTRO",
+        ),
     ] = None,
     host: Annotated[
         str | None,
-        typer.Option("--host", help="Host of a Mosaico server to write to, instead of the store."),
+        typer.Option(
+            "--host", metavar="HOST", help="Host of a Mosaico server to write to, instead of the store."
+        ),
     ] = None,
-    port: Annotated[int, typer.Option("--port", help="Port of the server.")] = 6726,
+    port: Annotated[int, typer.Option("--port", metavar="PORT", help="Port of the server.")] = 6726,
     api_key: Annotated[
         str | None,
-        typer.Option("--api-key", envvar="MOSAICO_API_KEY", help="API key for the server.", show_envvar=True),
+        typer.Option(
+            "--api-key",
+            envvar="MOSAICO_API_KEY",
+            metavar="KEY",
+            help="API key for the server.",
+            show_envvar=True,
+        ),
     ] = None,
     tls_cert: Annotated[
         Path | None,

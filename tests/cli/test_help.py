@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -39,3 +40,10 @@ def test_short_options_have_one_meaning() -> None:
 @pytest.mark.parametrize(("command", "said"), [("init", "(stdout)"), ("bag", "(mosaico)")])
 def test_help_states_defaults(command: str, said: str) -> None:
     assert said in CliRunner().invoke(command_line(), [command, "--help"], env={"COLUMNS": "150"}).output
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_shows_no_python_types(name: str) -> None:
+    arguments = [*name.split()[1:], "--help"]
+    output = CliRunner().invoke(command_line(), arguments, env={"COLUMNS": "150"}).output
+    assert not re.search(r"<(bool|str|int|float|path|dir|file|list)|\b(INTEGER|FLOAT|PATH)\b", output), output
