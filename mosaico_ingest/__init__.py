@@ -48,7 +48,7 @@ __all__ = [
     "register_default_adapter",
 ]
 
-_WHERE = {
+_MODULES = {
     "IfExists": "job.values",
     "LoaderErrorPolicy": "job.values",
     "Message": "ontology",
@@ -65,15 +65,15 @@ _WHERE = {
     "TopicLevelErrorPolicy": "job.values",
     "register_default_adapter": "adapters",
 }
-"""A name is imported when it is asked for, so that `ingest --help` does not wait for Arrow."""
+"""The module of each public name; it is imported on first access, so that `ingest --help` does not load Arrow."""
 
 
 def __getattr__(name: str) -> object:
     if name == "APIKeyPermissionEnum":
         return import_module(f"{__name__}.protocol.messages").Permission
-    if name not in _WHERE:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_WHERE[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -39,7 +39,7 @@ SUCCESSFUL = {0, 4}
 """Exit codes of runs that wrote every message that could be written."""
 REPLAY_NOTES = {
     "STORED": "its messages are already in the sequence",
-    "FORGOTTEN": "the sequence does not contain the run that quarantined it; ingest the recording again",
+    "ORPHANED": "the sequence does not contain the run that quarantined it; ingest the recording again",
 }
 """Why a file of quarantined messages is not replayed."""
 
@@ -308,26 +308,26 @@ def replay(
     from mosaico_ingest.cli.console import print_line
     from mosaico_ingest.errors import NothingMatched
     from mosaico_ingest.pipeline.task import Task
-    from mosaico_ingest.services.replay import Whereabouts, alone, replays
+    from mosaico_ingest.services.replay import ReplayState, find_replays, lock_quarantine
 
     def mark_replayed(result: RunReport) -> None:
         for entry, recording in zip(waiting, result.recordings, strict=False):
             if recording.exit_code in SUCCESSFUL:
-                entry.kept.mark_replayed()
+                entry.file.mark_replayed()
 
     jobs = api.compile_job(manifest)
-    with alone(folder):
-        entries = replays(folder, jobs)
+    with lock_quarantine(folder):
+        entries = find_replays(folder, jobs)
         for entry in entries:
-            if entry.whereabouts is Whereabouts.STORED:
-                entry.kept.mark_replayed()
-            if entry.whereabouts is not Whereabouts.WAITING and not quiet:
-                note = REPLAY_NOTES[entry.whereabouts.name]
-                print_line(f"{entry.kept.messages.name}: {note}", stderr=True)
-        waiting = [entry for entry in entries if entry.whereabouts is Whereabouts.WAITING]
-        if all(entry.whereabouts is Whereabouts.FORGOTTEN for entry in entries):
+            if entry.state is ReplayState.STORED:
+                entry.file.mark_replayed()
+            if entry.state is not ReplayState.WAITING and not quiet:
+                note = REPLAY_NOTES[entry.state.name]
+                print_line(f"{entry.file.messages.name}: {note}", stderr=True)
+        waiting = [entry for entry in entries if entry.state is ReplayState.WAITING]
+        if all(entry.state is ReplayState.ORPHANED for entry in entries):
             raise NothingMatched(
-                "no message can be replayed", where=str(folder), hint=REPLAY_NOTES["FORGOTTEN"]
+                "no message can be replayed", where=str(folder), hint=REPLAY_NOTES["ORPHANED"]
             )
         run_tasks(
             [Task(entry.job) for entry in waiting],

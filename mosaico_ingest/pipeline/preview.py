@@ -31,6 +31,7 @@ from mosaico_ingest.pipeline.plan_document import (
     notes,
 )
 from mosaico_ingest.pipeline.planning import plan_recording
+from mosaico_ingest.pipeline.provenance import StoredProvenance, is_repeatable, read_provenance
 from mosaico_ingest.pipeline.run import open_job, preflight
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.pipeline.topic import TopicPipeline
@@ -52,7 +53,7 @@ __all__ = [
 
 
 def ask_destination(plan: Plan, samples: Iterable[Sample], *, connect: bool) -> DestinationState:
-    """Return the state of the destination; a server is asked only with `connect`."""
+    """Return the state of the destination; a server is contacted only with `connect`."""
     destination = destination_of(plan.destination)
     status = destination.inspect(plan.sequence.name, connect=connect)
     taken: bool | None = None if status.exists is None else status.sequence is not None
@@ -70,20 +71,22 @@ def ask_destination(plan: Plan, samples: Iterable[Sample], *, connect: bool) -> 
 
 
 def space_finding(state: DestinationState) -> Finding | None:
-    """Return a warning where the rows may not fit the disk."""
+    """Return a warning if the rows may not fit on the disk."""
     if state.free_bytes is None or state.estimated_bytes is None or state.estimated_bytes <= state.free_bytes:
         return None
     return Finding(
         "disk-space",
         Severity.WARNING,
         f"the rows take {state.estimated_bytes} bytes before compression, and {state.free_bytes} are free",
-        help="make room, or name another store in target.store",
+        help="free some space, or choose another target.store",
     )
 
 
 def _sequence_problem(plan: Plan, existing: ExistingSequence) -> str | None:
     """Return why a plan cannot write a sequence that exists, None if it can."""
     if plan.sequence.if_exists is IfExists.FAIL:
+        if is_repeatable(read_provenance(plan), StoredProvenance.of(existing)):
+            return None
         return f"there is a sequence {plan.sequence.name!r}, and sequence.if_exists is fail"
     if plan.sequence.if_exists is IfExists.APPEND:
         try:
@@ -97,7 +100,7 @@ def _sequence_problem(plan: Plan, existing: ExistingSequence) -> str | None:
 
 
 def _estimate(plan: Plan, samples: dict[str, Sample]) -> int | None:
-    """Return what all rows take uncompressed, None where the index or the sample does not say."""
+    """Return the uncompressed bytes of all rows, None if the index or the sample does not tell."""
     sizes = [_topic_bytes(topic, samples[topic.target]) for topic in plan.topics if topic.count != 0]
     if any(size is None for size in sizes):
         return None
@@ -111,7 +114,7 @@ def _topic_bytes(topic: TopicPlan, sample: Sample) -> int | None:
 
 
 def _share(plan: Plan) -> float:
-    """Return how much of the recording's time is read, from 0 to 1."""
+    """Return the share of the recording's duration that is read, from 0 to 1."""
     if plan.start_ns is None or plan.end_ns is None or plan.end_ns <= plan.start_ns:
         return 1.0
     start = max(plan.start_ns, plan.read_from_ns if plan.read_from_ns is not None else plan.start_ns)
@@ -120,84 +123,84 @@ def _share(plan: Plan) -> float:
 
 
 MESSAGES = 16
-"""How many messages of each topic are enough."""
+"""Number of messages per topic in the sample."""
 _MEMORY_BYTES = 32 << 20
-_LOOK_BYTES = 64 << 20
-"""How much is read in search of them; what the index knows of is looked up after that."""
-_LOOK_S = 5.0
+_SAMPLE_BYTES = 64 << 20
+"""Bytes read to find the messages of the sample; topics that are still missing are then read by the index."""
+_SAMPLE_S = 5.0
 
 
 def try_messages(plan: Plan, recording: Recording) -> tuple[Sample, ...]:
-    """Decode and adapt the first messages of every topic of the plan; nothing is written."""
+    """Decode and adapt the first messages of every topic of the plan, without writing."""
     with MemorySink().open(plan.sequence.name, plan.sequence.metadata) as session:
         trials = tuple(_trial(topic, recording, session) for topic in plan.topics)
         by_connection = {connection: trial for trial in trials for connection in trial.topic.plan.connections}
         with WriteBuffer(max_bytes=_MEMORY_BYTES) as buffer:
-            for block in _first(plan, recording, by_connection):
+            for block in _blocks(plan, recording, by_connection):
                 by_connection[block.connection].topic.process(block, buffer)
     stored = {topic.topic: topic for topic in session.stored()}
     return tuple(trial.sample(stored.get(trial.topic.plan.target)) for trial in trials)
 
 
 @dataclass(slots=True)
-class _Tally:
-    """An observer that keeps the rejections, by their rules."""
+class _Rejections:
+    """An observer that collects rejections by rule."""
 
-    rejections: dict[str, Rejected] = field(default_factory=dict[str, Rejected])
+    by_rule: dict[str, Rejected] = field(default_factory=dict[str, Rejected])
 
     def __call__(self, event: Event) -> None:
         if isinstance(event, Rejected):
-            known = self.rejections.get(event.rule)
-            self.rejections[event.rule] = (
-                event if known is None else replace(known, count=known.count + event.count)
+            first = self.by_rule.get(event.rule)
+            self.by_rule[event.rule] = (
+                event if first is None else replace(first, count=first.count + event.count)
             )
 
 
 class _Trial(Struct, frozen=True):
     topic: TopicPipeline
-    tally: _Tally
+    rejections: _Rejections
 
     def sample(self, stored: StoredTopic | None) -> Sample:
         rejections = tuple(
-            SampleRejection(stage=lost.stage, rule=lost.rule, count=lost.count, reason=lost.reason)
-            for lost in self.tally.rejections.values()
+            SampleRejection(stage=event.stage, rule=event.rule, count=event.count, reason=event.reason)
+            for event in self.rejections.by_rule.values()
         )
         return Sample(
             target=self.topic.plan.target,
             read=self.topic.read,
-            rejected=sum(lost.count for lost in rejections),
+            rejected=sum(rejection.count for rejection in rejections),
             row_bytes=-(-stored.stored_bytes // stored.rows) if stored and stored.rows else None,
             rejections=rejections,
         )
 
 
 def _trial(topic: TopicPlan, recording: Recording, session: Session) -> _Trial:
-    """Open a topic's stream so that a lost message costs nothing but itself."""
-    tally = _Tally()
-    patient = topic.replace(on_error=TopicLevelErrorPolicy.Ignore)
-    pipeline = TopicPipeline(patient, LoaderErrorPolicy.IGNORE, session, tally)
+    """Open a topic whose rejected messages do not end the sample."""
+    rejections = _Rejections()
+    lenient = topic.replace(on_error=TopicLevelErrorPolicy.Ignore)
+    pipeline = TopicPipeline(lenient, LoaderErrorPolicy.IGNORE, session, rejections)
     connections = {connection.id: connection for connection in recording.connections}
     for connection in topic.connections:
         pipeline.bind(connections[connection])
-    return _Trial(pipeline, tally)
+    return _Trial(pipeline, rejections)
 
 
-def _first(plan: Plan, recording: Recording, trials: dict[int, _Trial]) -> Iterator[MessageBlock]:
-    """Yield batches until every topic has enough; then, of those that had none, what the index knows of."""
-    yield from _look(plan, recording, trials, enough=MESSAGES)
-    absent = {
+def _blocks(plan: Plan, recording: Recording, trials: dict[int, _Trial]) -> Iterator[MessageBlock]:
+    """Yield message blocks until every topic has its sample; then read topics without any message by the index."""
+    yield from _sample_blocks(plan, recording, trials, enough=MESSAGES)
+    missing = {
         connection: trial
         for connection, trial in trials.items()
         if not trial.topic.read and trial.topic.plan.count
     }
-    if absent:
-        yield from _look(plan, recording, absent, enough=1)
+    if missing:
+        yield from _sample_blocks(plan, recording, missing, enough=1)
 
 
-def _look(
+def _sample_blocks(
     plan: Plan, recording: Recording, trials: dict[int, _Trial], *, enough: int
 ) -> Iterator[MessageBlock]:
-    left_bytes, until = _LOOK_BYTES, time.monotonic() + _LOOK_S
+    remaining_bytes, deadline = _SAMPLE_BYTES, time.monotonic() + _SAMPLE_S
     blocks = recording.message_blocks(
         tuple(trials),
         start_ns=plan.read_from_ns,
@@ -206,12 +209,12 @@ def _look(
         memory_bytes=_MEMORY_BYTES,
     )
     for block in blocks:
-        left_bytes -= int(block.lengths.sum())
+        remaining_bytes -= int(block.lengths.sum())
         if trials[block.connection].topic.read < enough:
             yield block
         if all(trial.topic.read >= enough for trial in trials.values()):
             return
-        if left_bytes < 0 or time.monotonic() > until:
+        if remaining_bytes < 0 or time.monotonic() > deadline:
             return
 
 
@@ -241,7 +244,7 @@ def _tried(job: Job, *, connect: bool) -> RecordingPlan | IngestError:
 
 
 def _all_of(refused: Sequence[IngestError], count: int) -> IngestError:
-    """Return one error for all of them, with the exit code that is the least."""
+    """Return one error for several recordings, with the lowest exit code."""
     findings = [
         finding
         for error in refused
@@ -254,7 +257,7 @@ def _all_of(refused: Sequence[IngestError], count: int) -> IngestError:
 
 
 def preview(job: Job, *, connect: bool) -> RecordingPlan:
-    """Open the recording, decide everything, try a few messages, ask the destination (a server only with `connect`).
+    """Plan a recording, convert a sample of its messages, and inspect the destination (a server only with `connect`).
 
     Raises:
         IngestError: The job cannot be done; the message says why.
@@ -295,7 +298,7 @@ def _unreadable(recording: Recording) -> Iterator[Finding]:
 
 
 def _chosen(job: Job, plan: Plan) -> Iterator[Finding]:
-    """Yield a note for each topic whose adapter the manifest names, with the line that does."""
+    """Yield a finding for each topic with an adapter override, with its location in the manifest."""
     for topic in plan.topics:
         glob = first_match(job.adapters.override, topic.topic)
         if glob is not None:
@@ -306,7 +309,7 @@ def _chosen(job: Job, plan: Plan) -> Iterator[Finding]:
 
 
 def _excluded(plan: Plan) -> Iterator[Finding]:
-    """Yield a note for each topic that is not read, with the line of the manifest that says so."""
+    """Yield a finding for each topic that is not read, with the location in the manifest that excludes it."""
     for topic in plan.excluded:
         severity = Severity.WARNING if topic.undefined else Severity.INFO
         yield Finding("skipped-topic", severity, f"{topic.topic}: {topic.why}", topic.span)

@@ -1,4 +1,4 @@
-"""This file is the asynchronous write buffer: batches wait here, bounded in bytes, while a thread writes them."""
+"""An asynchronous write buffer: batches wait, limited in bytes, while a thread writes them."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from mosaico_ingest.destinations.base import TopicWriter
 __all__ = ["WriteBuffer"]
 
 _INTERRUPTED_S = 20.0
-_WORTH_WAKING_BYTES = 1 << 20
-"""Batches of small topics wait for company: handing over to a thread costs more than writing one."""
+"""Seconds to wait for the writing thread after an interrupt: the destination may not respond."""
+_MIN_WAKE_BYTES = 1 << 20
+"""Queued bytes at which the thread is woken: waking it costs more than writing one small batch."""
 
 
 class WriteBuffer:
-    """Writes batches in order on one thread of its own; `put` waits while too many bytes are queued.
+    """Writes batches in order on its own thread; `put` blocks while too many bytes are queued.
 
-    As long as little is queued there is no thread; if that is all there is, it is written on leaving.
+    The thread starts when enough bytes are queued; if they never are, the exit of the context writes the batches.
 
-    The first error of a writer stops the thread; it is raised by the next `put` or when the buffer is left.
-    Leaving normally waits until everything is written; leaving by an exception too, so that rows accepted
-    before an error are not lost. Leaving by Ctrl-C waits only for so long: the destination may be stuck.
+    The first error of a writer stops the thread, and is raised by the next `put` or by the exit of the context. The exit
+    waits until everything is written, also after an exception, so that rows accepted before an error are kept. After
+    Ctrl-C it waits for a limited time.
     """
 
     def __init__(self, *, max_bytes: int) -> None:
@@ -37,7 +38,7 @@ class WriteBuffer:
         self._closed = False
         self._error: BaseException | None = None
         self.busy_s = 0.0
-        """How long the thread has been writing, in seconds."""
+        """Seconds that the thread spent writing."""
         self._thread = threading.Thread(target=self._run, name="mosaico-ingest-write", daemon=True)
         self._finished = threading.Event()
 
@@ -60,7 +61,7 @@ class WriteBuffer:
             raise self._error
 
     def _join(self, *, interrupted: bool) -> None:
-        """Wait until the thread has written everything, or after an interrupt as long as is reasonable."""
+        """Wait until the thread has written everything, after an interrupt for a limited time."""
         try:
             if not interrupted:
                 self._finished.wait()
@@ -68,24 +69,24 @@ class WriteBuffer:
             interrupted = True
             raise
         finally:
-            # an interrupted `join` takes the thread for ended before Python 3.13
+            # before Python 3.13, an interrupted `join` marks the thread as ended
             if self._finished.wait(_INTERRUPTED_S if interrupted else None):
                 self._thread.join()
             with self._changed:
                 self._queue.clear()
 
     def put(self, writer: TopicWriter, batch: pa.RecordBatch) -> None:
-        """Queue a batch, waiting for room; a batch larger than the whole buffer is let in alone."""
+        """Queue a batch, blocking until there is space; a batch larger than the buffer is queued alone."""
         size = batch.nbytes
         with self._changed:
             while self._error is None and self._queued_bytes and self._queued_bytes + size > self._max_bytes:
-                self._wake()  # what is queued may have waited for company
+                self._wake()  # the queue may still be below the wake-up size
                 self._changed.wait()
             if self._error is not None:
                 raise self._error
             self._queue.append((writer, batch, size))
             self._queued_bytes += size
-            if self._queued_bytes >= min(_WORTH_WAKING_BYTES, self._max_bytes):
+            if self._queued_bytes >= min(_MIN_WAKE_BYTES, self._max_bytes):
                 self._wake()
 
     def _wake(self) -> None:
@@ -107,16 +108,16 @@ class WriteBuffer:
                 if not self._queue:
                     return
                 writer, batch, size = self._queue.popleft()
-            began = time.perf_counter()
+            start = time.perf_counter()
             try:
                 writer.write(batch)
-            except BaseException as error:  # noqa: BLE001 - a thread's border: raised again by put or on leaving
+            except BaseException as error:  # noqa: BLE001 - `put` or the exit of the context raises it again
                 with self._changed:
                     self._error = error
                     self._queue.clear()
                     self._changed.notify_all()
                 return
             with self._changed:
-                self.busy_s += time.perf_counter() - began
+                self.busy_s += time.perf_counter() - start
                 self._queued_bytes -= size
                 self._changed.notify_all()

@@ -1,4 +1,4 @@
-"""Collect the events of one recording into its report, and find what took the most time."""
+"""Collection of the events of one recording into its report, and the time of its steps."""
 
 from __future__ import annotations
 
@@ -48,23 +48,23 @@ STEP_WORDS = {
     "wait": "waiting for the writer",
     "commit": "committing",
 }
-"""The steps that follow one another; the writer works beside them."""
+"""The steps of a run in the order of the pipeline; `write` is missing because it runs in parallel to them."""
 
 
 def step_seconds(steps: Steps) -> dict[str, float]:
-    """Return the seconds of each step that others wait for."""
+    """Return the seconds of each sequential step."""
     return {name: float(getattr(steps, name)) for name in STEP_WORDS}
 
 
 def total_seconds(recordings: Sequence[Report]) -> Mapping[str, float]:
-    """Return the seconds of each step, of all recordings; empty where none says."""
+    """Return the seconds of each step over all recordings; empty if no recording was timed."""
     timed = [step_seconds(one.steps) for one in recordings]
     sums = {name: sum(one[name] for one in timed) for name in STEP_WORDS}
     return sums if any(sums.values()) else {}
 
 
 def longest_step(steps: Steps) -> str:
-    """Return the step a recording spent most of its time on, and its share, as `reading, 62%`."""
+    """Return the longest step of a recording and its share of the time, such as `reading, 62%`."""
     seconds = step_seconds(steps)
     name = max(seconds, key=lambda step: seconds[step])
     total = sum(seconds.values())
@@ -72,7 +72,7 @@ def longest_step(steps: Steps) -> str:
 
 
 def slowest(recordings: Sequence[Report], most: int) -> list[tuple[int, Report]]:
-    """Return the recordings that took longest, with their positions; of those whose steps are known."""
+    """Return the recordings with the longest duration, with their positions; untimed recordings are excluded."""
     timed = [(at, one) for at, one in enumerate(recordings) if any(step_seconds(one.steps).values())]
     return sorted(timed, key=lambda found: -found[1].duration_s)[:most]
 
@@ -128,7 +128,7 @@ class _Sum:
 
 
 class Collector:
-    """An observer that ends as a `Report`."""
+    """An observer that collects the events of one recording into a report."""
 
     def __init__(self, watch: Stopwatch | None = None) -> None:
         self._watch = watch or Stopwatch()
@@ -141,7 +141,7 @@ class Collector:
         self._finish = RunFinished(status=RunStatus.FAILED, exit_code=1)
 
     def __call__(self, event: Event) -> None:
-        """Add one event to the sum."""
+        """Add an event."""
         match event:
             case TopicProgress() | Rejected() | TopicClosed():
                 self._sums[event.target].take(event)
@@ -166,16 +166,16 @@ class Collector:
 
     @property
     def rejected(self) -> int:
-        """How many messages were rejected so far."""
+        """Number of messages rejected so far."""
         return sum(r.count for s in self._sums.values() for r in s.rejections.values())
 
     @property
     def unreadable(self) -> bool:
-        """Whether a stretch of the recording could not be read."""
+        """True if a range of the recording could not be read."""
         return bool(self._unreadable)
 
     def report(self) -> Report:
-        """Return the sum so far; complete once the run has finished."""
+        """Return the report so far; it is complete after `RunFinished`."""
         return Report(
             sequence=self._start.sequence,
             destination=self._start.destination,

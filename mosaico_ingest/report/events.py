@@ -1,4 +1,4 @@
-"""This file is what the pipeline says while it runs; the display draws it, the report is its sum."""
+"""Events of a run: the display shows them while it runs, and `collect.Collector` turns them into the report."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ class RunStatus(str, Enum):
 
     COMPLETED = "completed"
     WITH_ERRORS = "completed_with_errors"
-    """Everything that could be ingested was, but some messages could not."""
+    """Some rows were rejected or ranges unreadable; everything else was ingested."""
     SKIPPED = "skipped"
-    """The same content is there already."""
+    """The same content is already stored, or the run was a dry run."""
     FAILED = "failed"
     INTERRUPTED = "interrupted"
 
@@ -51,17 +51,17 @@ class TopicStatus(str, Enum):
 
     WRITTEN = "written"
     EMPTY = "empty"
-    """The recording has the topic and no message of it."""
+    """The recording has no message on the topic."""
     FINALIZED = "finalized"
     """Closed early by the `finalize` policy."""
     FAILED = "failed"
-    """The destination or the adapter refused the topic; the `ignore` policy let the others go on."""
+    """The destination or the adapter refused the topic; the `ignore` policy let the run continue."""
     EXCLUDED = "excluded"
-    """Not selected, or nothing here can read it."""
+    """Not selected, or not readable: no adapter, no definition, or another encoding than ROS."""
 
 
 class Expected(Struct, frozen=True):
-    """A topic of the plan, as the display and the report need it."""
+    """A topic of the plan, for the display and the report."""
 
     topic: str
     target: str
@@ -70,12 +70,12 @@ class Expected(Struct, frozen=True):
     ontology: str
     why: str
     count: int | None
-    """How many messages the index promises."""
+    """Number of messages in the index of the recording; None if it is unknown."""
     excluded: bool = False
 
 
 class RunStarted(Struct, frozen=True):
-    """The plan stands and the work begins."""
+    """The recording is planned, and reading starts."""
 
     sequence: str
     destination: str
@@ -85,7 +85,7 @@ class RunStarted(Struct, frozen=True):
 
 
 class TopicProgress(Struct, frozen=True):
-    """More messages of one stream went through; every number is an increment."""
+    """More messages of one topic were processed; every number is an increment."""
 
     target: str
     read: int = 0
@@ -98,7 +98,7 @@ class TopicProgress(Struct, frozen=True):
 
 
 class Rejected(Struct, frozen=True):
-    """Messages of one stream that could not go on for one reason; `first_*` is about the first of them."""
+    """Messages of one topic that were rejected for the same reason; `first_*` describes the first of them."""
 
     target: str
     stage: Stage
@@ -108,34 +108,36 @@ class Rejected(Struct, frozen=True):
     first_log_time_ns: int
     first_offset: int
     quarantined: int = 0
-    """How many of them lie in the quarantine."""
+    """Number of these messages in the quarantine."""
 
 
 class Unreadable(Struct, frozen=True):
-    """A stretch of the recording that could not be read."""
+    """An unreadable range of the recording."""
 
     target: str | None
-    """None where it cannot be told which topics lost messages."""
+    """The topic in the sequence; None if the affected topics are unknown."""
     count: int | None
+    """Number of unreadable messages; None if it is unknown."""
     offset: int | None
+    """File offset or row id of the range."""
     reason: str
 
 
 class Noted(Struct, frozen=True):
-    """A finding about the recording that does not stop the run."""
+    """A finding that does not stop the run."""
 
     finding: Finding
 
 
 class Quarantined(Struct, frozen=True):
-    """Rejected messages lie in a file, from which they can be replayed."""
+    """Rejected messages were written to a file, from which they can be replayed."""
 
     messages: str
-    """Its path."""
+    """The path of the file."""
 
 
 class TopicClosed(Struct, frozen=True):
-    """A stream came to its end."""
+    """The rows of a topic were committed or discarded."""
 
     target: str
     status: TopicStatus
@@ -146,19 +148,19 @@ class TopicClosed(Struct, frozen=True):
 
 
 class Timed(Struct, frozen=True):
-    """What the recording's time was spent on, in seconds."""
+    """The seconds that each step of the run took."""
 
     seconds: Mapping[Step, float]
 
 
 class RunFinished(Struct, frozen=True):
-    """The recording is done with, one way or another."""
+    """The run of the recording ended."""
 
     status: RunStatus
     exit_code: int
     error: str | None = None
     findings: tuple[Finding, ...] = ()
-    """What the error knows of the places it is about."""
+    """Findings of the error, with their locations."""
 
 
 Event: TypeAlias = (
@@ -174,12 +176,12 @@ Event: TypeAlias = (
 )
 Observer: TypeAlias = Callable[[Event], None]
 BatchObserver: TypeAlias = Callable[[int, Event], None]
-"""Told which configuration of a batch an event is about, by its position, and the event."""
+"""Receives the position of a recording in its batch, and an event."""
 
 
 def ignore_events(_event: Event) -> None:
-    """Do nothing: the default observer."""
+    """Ignore an event: the default observer."""
 
 
 def ignore_batch(_position: int, _event: Event) -> None:
-    """Do nothing: the default observer of a batch."""
+    """Ignore an event: the default observer of a batch."""

@@ -1,4 +1,4 @@
-"""This file writes a run's sums for Prometheus: the text its node exporter's textfile collector reads."""
+"""Totals of a run in the text format of Prometheus, for the textfile collector of its node exporter."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ _PREFIX = "mosaico_ingest"
 
 
 def prometheus_text(report: RunReport) -> str:
-    """Return the sums of the last run as gauges; nothing is labelled by sequence, so they stay few."""
+    """Return the totals of a run as gauges; they have no label per sequence, which keeps their number small."""
     return "\n".join(_lines(report)) + "\n"
 
 
 def _lines(report: RunReport) -> Iterator[str]:
     states = Counter(one.status for one in report.recordings)
-    yield from _gauge("recordings", "Recordings of the last run by how they ended.")
+    yield from _gauge("recordings", "Recordings of the last run by status.")
     for state in RunStatus:
         yield f'{_PREFIX}_recordings{{status="{state.value}"}} {states[state]}'
     totals = [one.totals for one in report.recordings]
-    yield from _gauge("messages", "Messages of the last run by what became of them.")
+    yield from _gauge("messages", "Messages of the last run by outcome.")
     for fate in ("read", "written", "filtered", "downsampled", "rejected"):
         yield f'{_PREFIX}_messages{{fate="{fate}"}} {sum(getattr(one, fate) for one in totals)}'
     unread = sum(item.count or 0 for one in report.recordings for item in one.unreadable_ranges)
     yield f'{_PREFIX}_messages{{fate="unreadable"}} {unread}'
     yield from _gauge(
-        "step_seconds", "Time of the last run by what it was spent on; write goes on beside the rest."
+        "step_seconds", "Time of the last run by step; the write step runs in parallel to the others."
     )
     for step in Step:
         spent = sum(getattr(one.steps, step.value) for one in report.recordings)
@@ -39,7 +39,7 @@ def _lines(report: RunReport) -> Iterator[str]:
     ended = max((one.started_at.timestamp() + one.duration_s for one in report.recordings), default=0)
     single: tuple[tuple[str, str, float], ...] = (
         ("source_bytes", "Size of the recordings.", sum(one.source_bytes for one in report.recordings)),
-        ("stored_bytes", "Size of what is stored.", sum(one.stored_bytes for one in totals)),
+        ("stored_bytes", "Size of the stored rows.", sum(one.stored_bytes for one in totals)),
         ("working_seconds", "Time spent on recordings.", sum(one.duration_s for one in report.recordings)),
         ("last_end_timestamp_seconds", "When the last recording ended, since the epoch.", ended),
         ("exit_code", "The exit code of the run.", report.exit_code),

@@ -39,7 +39,7 @@ _GRAVEST_FIRST = (130, 5, 1, 2, 3, 4)
 
 
 class _Part(Part):
-    # What is computed is written for other readers, and left out again when a report is read back.
+    # Computed fields are written for other programs and ignored when a report is read.
     model_config = ConfigDict(extra="ignore", defer_build=True)
 
 
@@ -47,79 +47,79 @@ class Rejection(_Part):
     """Messages of one topic that were rejected for the same reason."""
 
     stage: Stage
-    """Where in the pipeline they were lost."""
+    """The stage that rejected the messages."""
     rule: str
-    """The rule they broke."""
+    """The id of the rule that the messages violate."""
     count: int
-    """How many."""
+    """Number of messages."""
     reason: str
-    """What was wrong with the first of them."""
+    """The reason for the first message."""
     first_log_time_ns: int
-    """When the first of them was recorded, ns since the epoch."""
+    """Log time of the first message, in ns since the epoch."""
     first_offset: int
-    """Where the first of them lies in the source: file offset of its record or chunk, or row id."""
+    """Location of the first message in the recording: file offset of its record or chunk, or row id."""
 
 
 class UnreadableRange(_Part):
-    """A stretch of the recording that could not be read."""
+    """A range of the recording from which messages could not be read."""
 
     topic: str | None
-    """The topic, where it can be told."""
+    """The topic; None if it is unknown."""
     count: int | None
-    """How many messages, where the index says."""
+    """Number of unreadable messages; None if it is unknown."""
     offset: int | None
-    """Where in the file."""
+    """File offset or row id; None if it is unknown."""
     reason: str
-    """What was found there."""
+    """What was expected and what the file contains."""
 
 
 class TopicReport(_Part):
-    """One topic: read = written + filtered + downsampled + rejected, always.
+    """One topic: read = written + filtered + downsampled + rejected.
 
-    Of a recording that was read to its end, promised = read + unreadable.
+    If the recording was read completely, promised = read + unreadable.
     """
 
     topic: str
-    """Its name in the recording."""
+    """The name in the recording."""
     target: str
-    """Its name in the sequence."""
+    """The name in the sequence."""
     msgtype: str
     adapter: str
     ontology: str
-    """The ontology tag its rows have."""
+    """The ontology tag of the rows."""
     why: str
-    """Why this adapter, or why the topic was left out."""
+    """The reason for the adapter, or for the exclusion of the topic."""
     status: TopicStatus
     promised: int | None
-    """How many messages the recording's index promises."""
+    """Number of messages in the index of the recording; None if it is unknown."""
     unreadable: int = 0
-    """How many of them could not be read, as far as that can be told; `unreadable_ranges` says where."""
+    """Number of messages that could not be read, as far as it is known; see `unreadable_ranges`."""
     read: int = 0
     written: int = 0
     filtered: int = 0
     downsampled: int = 0
     rejected: int = 0
     quarantined: int = 0
-    """How many of the rejected are kept in the quarantine."""
+    """Number of rejected messages in the quarantine."""
     rejections: tuple[Rejection, ...] = ()
     start_ns: int | None = None
-    """The first time stamp written, ns since the epoch."""
+    """The first timestamp of the rows, in ns since the epoch."""
     end_ns: int | None = None
-    """The last time stamp written, inclusive."""
+    """The last timestamp of the rows, in ns since the epoch, inclusive."""
     payload_bytes: int = 0
-    """Size of the messages read, as they were serialised."""
+    """Serialized bytes of the messages read."""
     stored_bytes: int = 0
-    """Size of the rows in the destination, as far as it says."""
+    """Bytes of the rows in the destination, as far as it reports them."""
     checksum: str | None = None
-    """Of the values of the rows (XXH3, 128 bits), where the destination makes one; `ingest verify` makes it anew."""
+    """XXH3 checksum (128 bits) of the row values; None if the destination has none. `ingest verify` computes it again."""
     error: str | None = None
     timeline: TimelineReport | None = None
-    """How the rows that were written spread over time."""
+    """The distribution of the written rows over time."""
 
     @computed_field
     @property
     def rate_hz(self) -> float | None:
-        """Rows a second over the topic's own span."""
+        """Rows per second between the topic's first and last row."""
         if self.start_ns is None or self.end_ns is None or self.end_ns <= self.start_ns:
             return None
         return round((self.written - 1) / ((self.end_ns - self.start_ns) / 1e9), 6)
@@ -142,26 +142,26 @@ class Totals(_Part):
 
 
 class Steps(_Part):
-    """What a recording's time was spent on, in seconds; all but `write` add up to its duration."""
+    """Seconds per step of a run; all steps but `write` add up to its duration."""
 
     prepare: float = 0
-    """Opening it, planning, asking what the destination has."""
+    """Opening and planning the recording, and inspecting the destination."""
     read: float = 0
-    """Reading and inflating, as far as the next step had to wait for it."""
+    """Reading and decompressing, as far as decoding had to wait."""
     decode: float = 0
-    """From bytes to columns."""
+    """Decoding bytes into columns of the ROS type."""
     adapt: float = 0
-    """From the message's columns to those of its ontology type."""
+    """Converting columns of the ROS type into columns of the ontology type."""
     wait: float = 0
-    """Waiting for the thread that writes."""
+    """Waiting for the writing thread."""
     commit: float = 0
-    """Closing what was written, making it visible, checking it."""
+    """Finishing, committing and verifying the sequence."""
     write: float = 0
-    """How long that thread was busy, beside all of the above."""
+    """Time that the writing thread was busy, in parallel to the other steps."""
 
 
 class Report(_Part):
-    """What became of one recording."""
+    """The result of one recording."""
 
     sequence: str
     destination: str
@@ -173,62 +173,61 @@ class Report(_Part):
     started_at: datetime
     duration_s: float
     source_bytes: int
-    """Size of the recording's files."""
+    """Bytes of the recording's files."""
     steps: Steps = Steps()
     quarantine: str | None = None
-    """The file that rejected messages were put into."""
+    """The file with the rejected messages."""
     topics: tuple[TopicReport, ...] = ()
     unreadable_ranges: tuple[UnreadableRange, ...] = ()
-    """What could not be read at all."""
     findings: tuple[str, ...] = ()
-    """What there was to say about the recording."""
+    """The findings of the run, one line each."""
 
     @computed_field
     @property
     def totals(self) -> Totals:
         """Sums over the topics that were read."""
-        taken = [topic for topic in self.topics if topic.status is not TopicStatus.EXCLUDED]
-        promised = [topic.promised for topic in taken]
+        topics = [topic for topic in self.topics if topic.status is not TopicStatus.EXCLUDED]
+        promised = [topic.promised for topic in topics]
         unreadable = [item.count for item in self.unreadable_ranges]
         return Totals(
             promised=None if None in promised else sum(count or 0 for count in promised),
             unreadable=None if None in unreadable else sum(count or 0 for count in unreadable),
-            read=sum(t.read for t in taken),
-            written=sum(t.written for t in taken),
-            filtered=sum(t.filtered for t in taken),
-            downsampled=sum(t.downsampled for t in taken),
-            rejected=sum(t.rejected for t in taken),
-            payload_bytes=sum(t.payload_bytes for t in taken),
-            stored_bytes=sum(t.stored_bytes for t in taken),
+            read=sum(t.read for t in topics),
+            written=sum(t.written for t in topics),
+            filtered=sum(t.filtered for t in topics),
+            downsampled=sum(t.downsampled for t in topics),
+            rejected=sum(t.rejected for t in topics),
+            payload_bytes=sum(t.payload_bytes for t in topics),
+            stored_bytes=sum(t.stored_bytes for t in topics),
         )
 
     @computed_field
     @property
     def compression(self) -> float | None:
-        """Stored bytes for each byte of the recording's files: below 1 it became smaller."""
+        """Stored bytes per byte of the recording's files; None if their size is unknown."""
         return round(self.totals.stored_bytes / self.source_bytes, 6) if self.source_bytes else None
 
 
 class UsedManifest(_Part):
-    """A manifest of the run, as it was when the run began."""
+    """A manifest of the run, as it was at the start."""
 
     path: str
     text: str
-    """As YAML, with what it extends and without secrets."""
+    """The manifest as YAML, with `extends` resolved and without secrets."""
 
 
 class RunReport(_Part):
-    """What one call of the tool did: a report for each recording; `version` changes when the form does."""
+    """The report of one run, with a part for each recording; `version` changes with the format."""
 
     version: int = Field(default=1, ge=1)
     tool: str
-    """Name and version of the program that wrote this."""
+    """Name and version of the program that wrote the report."""
     manifests: tuple[UsedManifest, ...] = ()
     recordings: tuple[Report, ...]
 
     @property
     def headline(self) -> str:
-        """How many recordings, what became of them, and how many messages were written."""
+        """The numbers of recordings by outcome and of written messages, in one line."""
         failed = sum(one.exit_code not in {0, 4} for one in self.recordings)
         skipped = sum(one.status is RunStatus.SKIPPED for one in self.recordings)
         written = sum(one.totals.written for one in self.recordings)
@@ -239,12 +238,12 @@ class RunReport(_Part):
     @computed_field
     @property
     def exit_code(self) -> int:
-        """That of the recordings' codes which comes first in 130, 5, 1, 2, 3, 4, 0: what another try may mend is not hidden."""
+        """The first of 130, 5, 1, 2, 3, 4, 0 that any recording produced."""
         return gravest([report.exit_code for report in self.recordings])
 
 
 def gravest(codes: Sequence[int]) -> int:
-    """Return the exit code of several recordings with these."""
+    """Return the exit code of a run whose recordings have these exit codes."""
     return next((code for code in _GRAVEST_FIRST if code in codes), max(codes, default=0))
 
 
@@ -254,7 +253,7 @@ def report_schema() -> dict[str, Any]:
 
 
 def replay_command(report: RunReport, one: Report) -> str | None:
-    """Return what to type once the manifest is mended; None where nothing was set aside."""
+    """Return the command that replays the quarantine of a recording; None if it has none."""
     if one.quarantine is None:
         return None
     manifests = [used.path for used in report.manifests]
@@ -263,7 +262,7 @@ def replay_command(report: RunReport, one: Report) -> str | None:
 
 
 def folder_link(one: Report, page_folder: Path) -> str | None:
-    """Return the link from a page in `page_folder` to the folder with the messages set aside."""
+    """Return the link from a page in `page_folder` to the folder of the quarantine; None if there is none."""
     if one.quarantine is None:
         return None
     folder = os.path.relpath(Path(one.quarantine).absolute().parent, page_folder.absolute())

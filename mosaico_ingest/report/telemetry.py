@@ -1,4 +1,4 @@
-"""This file tells an OpenTelemetry collector what a run does: metrics while it goes, a span for each recording."""
+"""OpenTelemetry metrics during a run, and a span for each recording."""
 
 from __future__ import annotations
 
@@ -51,14 +51,16 @@ class _Recording:
 
 
 class Telemetry:
-    """An observer of a batch; where it sends to is said by the standard variables of OpenTelemetry (`OTEL_…`).
+    """A batch observer that sends to the collector in OpenTelemetry's standard environment variables (`OTEL_…`).
 
-    Rows that were written are counted once their recording is done with, for an early end may take them back.
+    Written rows are counted when their recording ends, because an early end may discard them.
     """
 
     def __init__(self, *, metrics: bool = True, traces: bool = True) -> None:
         resource = Resource.create({"service.name": _SERVICE, "service.version": __version__})
-        resource = resource.merge(OTELResourceDetector().detect())  # what the environment says counts more
+        resource = resource.merge(
+            OTELResourceDetector().detect()
+        )  # attributes from the environment take precedence
         readers = [PeriodicExportingMetricReader(OTLPMetricExporter())] if metrics else []
         self._meters = MeterProvider(readers, resource)
         self._tracers = TracerProvider(resource=resource)
@@ -67,22 +69,22 @@ class Telemetry:
         self._tracer = self._tracers.get_tracer(_NAME, __version__)
         self._recordings: dict[int, _Recording] = defaultdict(_Recording)
         meter = self._meters.get_meter(_NAME, __version__)
-        self._ended = meter.create_counter(
-            f"{_NAME}.recordings", "{recording}", "Recordings by how they ended."
-        )
+        self._ended = meter.create_counter(f"{_NAME}.recordings", "{recording}", "Recordings by status.")
         self._messages = meter.create_counter(
-            f"{_NAME}.messages", "{message}", "Messages by topic and by what became of them."
+            f"{_NAME}.messages", "{message}", "Messages by topic and outcome."
         )
         self._bytes = meter.create_counter(
-            f"{_NAME}.io", "By", "Bytes of recordings opened, of messages read, of rows stored."
+            f"{_NAME}.io", "By", "Bytes of opened recordings, read messages and stored rows."
         )
-        self._duration = meter.create_histogram(f"{_NAME}.recording.duration", "s", "Time of a recording.")
+        self._duration = meter.create_histogram(
+            f"{_NAME}.recording.duration", "s", "Duration of a recording."
+        )
         self._steps = meter.create_histogram(
-            f"{_NAME}.step.duration", "s", "Time of a recording by what it was spent on."
+            f"{_NAME}.step.duration", "s", "Duration of a recording by step."
         )
 
     def __call__(self, position: int, event: Event) -> None:
-        """Take one event."""
+        """Count an event."""
         match event:
             case RunStarted():
                 self._begin(position, event)
@@ -101,7 +103,7 @@ class Telemetry:
                 pass
 
     def close(self) -> None:
-        """Send what has not been sent; a collector that does not answer is in the log."""
+        """Send the remaining data; a collector that does not respond is logged."""
         self._meters.shutdown()
         self._tracers.shutdown()
 

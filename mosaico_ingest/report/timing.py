@@ -1,4 +1,4 @@
-"""The timeline of messages per topic, and the clock of a run's steps."""
+"""The timeline of rows per topic, and the stopwatch for the steps of a run."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def _bucket_start_ns(bucket: int) -> int:
 
 
 class Step(str, Enum):
-    """What a recording's time goes into."""
+    """A step of a run whose time is measured."""
 
     PREPARE = "prepare"
     READ = "read"
@@ -175,7 +175,7 @@ class Step(str, Enum):
 
 
 class Stopwatch:
-    """Gives every moment since it was made to a step; the writing thread adds its own, beside the rest."""
+    """Assigns all elapsed time to steps; the writing thread adds its time separately, as it runs in parallel."""
 
     def __init__(self) -> None:
         self.began_at = datetime.now(timezone.utc)
@@ -184,20 +184,20 @@ class Stopwatch:
 
     @property
     def elapsed_s(self) -> float:
-        """Seconds since it was made."""
+        """Seconds since the stopwatch was created."""
         return time.perf_counter() - self._began
 
     @property
     def seconds(self) -> Mapping[Step, float]:
-        """The seconds of each step so far."""
+        """Seconds per step so far."""
         return self._seconds
 
     def lap(self, step: Step) -> None:
-        """Give the time since the last lap to a step."""
+        """Add the time since the last lap to a step."""
         now = time.perf_counter()
         self._seconds[step] += now - self._last
         self._last = now
 
     def add(self, step: Step, seconds: float) -> None:
-        """Give time to the step of another thread."""
+        """Add time that another thread measured to a step."""
         self._seconds[step] += seconds

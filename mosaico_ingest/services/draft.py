@@ -1,4 +1,4 @@
-"""This file drafts the manifest of a recording: what is in it, what becomes of it, and what one may want to change."""
+"""A draft of the manifest of a recording, with comments on its topics and on common settings."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _HEAD = (
 def draft_manifest(
     found: Inspection, recording: AnyPath, *, folder: Path, ros_distro: Stores | str | None = None
 ) -> str:
-    """Return a manifest of `recording` to be put into `folder`; it lints clean, and runs as it stands."""
+    """Return a manifest of `recording` for a file in `folder`; it has no lint findings and can be run unchanged."""
     return "\n".join(
         (
             *_HEAD,
@@ -84,7 +84,7 @@ def _bag(found: Inspection, path: str, ros_distro: Stores | str | None) -> Itera
 
 
 def _definitions(undefined: Sequence[str], ros_distro: Stores | str | None) -> Iterator[str]:
-    """Yield what to say of types that nobody defines, or on which the distros disagree."""
+    """Yield comments on types without a definition, and on types that differ between distros."""
     standard = [name for name in undefined if any(distro_type(distro, name) for distro in ROS2)]
     if standard and ros_distro is None:
         yield f"  # {', '.join(standard)} changed between distros, and the recording does not carry it; say which:"
@@ -104,7 +104,7 @@ def _known_from(topics: Sequence[InspectedTopic]) -> str:
 
 
 def _topics(found: Inspection) -> Iterator[str]:
-    """Yield the topics as a list in which each can be taken out by a #; those that cannot be ingested are."""
+    """Yield the topics as a list in which a # excludes a topic; topics that cannot be ingested are excluded."""
     topics = _merged(found.topics)
     good = [topic for topic in topics if topic.problem is None]
     width = min(44, max((len(_quoted(topic.topic)) for topic in topics), default=0))

@@ -21,27 +21,27 @@ __all__ = [
 
 
 class InspectedTopic(Part):
-    """One topic of the recording and what it would become."""
+    """One topic of the recording, with the adapter it would get."""
 
     topic: str
     msgtype: str
     encoding: str
     count: int | None
-    """How many messages the index promises."""
+    """Number of messages in the index; None if it is unknown."""
     rate_hz: float | None
     """Estimated messages per second; see `estimate_rate_hz`."""
     definition: str
-    """Where the definition was found: bag, custom, distro, package or none."""
+    """The source of the definition: bag, custom, distro, package or none."""
     adapter: str
-    """The adapter it would get."""
+    """The adapter of the topic without a manifest; empty if the topic cannot be ingested."""
     ontology: str | None
-    """The ontology tag it would have; None where it cannot be ingested."""
+    """The ontology tag of the rows; None if the topic cannot be ingested."""
     problem: str | None = None
-    """Why it cannot be ingested."""
+    """The reason why the topic cannot be ingested."""
 
 
 class Inspection(Part):
-    """A recording as its index describes it."""
+    """The content of a recording according to its index."""
 
     files: tuple[str, ...]
     container: str
@@ -61,10 +61,10 @@ class Inspection(Part):
 
 
 def inspect(job: Job) -> Inspection:
-    """Open the recording and describe it.
+    """Open a recording and return its content.
 
     Raises:
-        BagError: It cannot be opened.
+        BagError: The recording cannot be opened.
     """
     bridge = ROSBridge.for_job(job)
     with open_job(job) as (recording, _):

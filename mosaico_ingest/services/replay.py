@@ -1,4 +1,4 @@
-"""This file says what becomes of the messages in a quarantine, and makes the configurations that ingest them."""
+"""Replay of quarantined messages: the state of each file, and the job that appends its messages."""
 
 from __future__ import annotations
 
@@ -19,47 +19,49 @@ from mosaico_ingest.job.values import IfExists, SessionLevelErrorPolicy, TopicLe
 from mosaico_ingest.pipeline.provenance import content_digest, stored_provenance
 from mosaico_ingest.pipeline.quarantine import QuarantineFile, find_quarantine_files
 
-__all__ = ["Replay", "Whereabouts", "alone", "replays"]
+__all__ = ["Replay", "ReplayState", "find_replays", "lock_quarantine"]
 
 _LOCK = ".replay.lock"
 
 
-class Whereabouts(Enum):
-    """What the destination knows of kept messages."""
+class ReplayState(Enum):
+    """The state of the messages of a quarantine file in the destination."""
 
     WAITING = "waiting"
-    """The run that kept them is part of the sequence, they are not."""
+    """The sequence has the run that quarantined the messages, but not the messages."""
     STORED = "stored"
-    """A replay has brought them in, and was stopped before it could say so here."""
-    FORGOTTEN = "forgotten"
-    """The run that kept them is not part of the sequence: it was stopped, or what it made was replaced or removed."""
+    """The sequence has the messages: a replay was stopped before it could rename the file."""
+    ORPHANED = "orphaned"
+    """The sequence does not have the run that quarantined the messages: it was discarded, replaced or removed."""
 
 
 class Replay(Struct, frozen=True):
-    """QuarantineFile messages, what the destination knows of them, and the configuration that brings them in."""
+    """A quarantine file, its state in the destination, and the job that appends its messages."""
 
-    kept: QuarantineFile
-    whereabouts: Whereabouts
+    file: QuarantineFile
+    state: ReplayState
     job: Job
 
 
 @contextmanager
-def alone(folder: Path) -> Generator[None, None, None]:
-    """Hold a quarantine's lock, so that no two replays bring the same messages in.
+def lock_quarantine(folder: Path) -> Generator[None, None, None]:
+    """Hold the lock of a quarantine, so that no two replays append the same messages.
 
     Raises:
-        NothingMatched: There is no such folder.
-        SinkUnavailable: Another replay holds it.
+        NothingMatched: The folder does not exist.
+        SinkUnavailable: Another replay holds the lock.
     """
     if not folder.is_dir():
-        raise NothingMatched("there is no such folder", where=str(folder), hint="name a quarantine's folder")
+        raise NothingMatched(
+            "the folder does not exist", where=str(folder), hint="name the folder of a quarantine"
+        )
     lock = folder / _LOCK
     try:
         lease = Lease(lock)
     except sqlite3.OperationalError as error:
         busy = "locked" in str(error)
-        what = "another replay is at work here" if busy else f"cannot be written: {error}"
-        raise SinkUnavailable(what, where=str(folder), hint="wait for it" if busy else None) from error
+        what = "another replay is running" if busy else f"cannot be written: {error}"
+        raise SinkUnavailable(what, where=str(folder), hint="wait until it ends" if busy else None) from error
     try:
         yield
     finally:
@@ -68,53 +70,56 @@ def alone(folder: Path) -> Generator[None, None, None]:
         lease.release()
 
 
-def replays(folder: Path, jobs: Sequence[Job]) -> tuple[Replay, ...]:
-    """Return what lies in a quarantine, each with the configuration of its sequence.
+def find_replays(folder: Path, jobs: Sequence[Job]) -> tuple[Replay, ...]:
+    """Return the files of a quarantine, each with the job that appends its messages to its sequence.
 
     Raises:
-        NothingMatched: It is empty.
-        ManifestError: None of the configurations is for a sequence that has messages there.
-        BagError: A file there cannot be read.
+        NothingMatched: The quarantine is empty.
+        ManifestError: A file belongs to a sequence of none of the jobs.
+        BagError: A file cannot be read.
     """
-    known = {job.sequence.name: job for job in jobs}
-    return tuple(_replay(kept, known) for kept in find_quarantine_files(folder))
+    by_sequence = {job.sequence.name: job for job in jobs}
+    return tuple(_replay(file, by_sequence) for file in find_quarantine_files(folder))
 
 
-def _replay(kept: QuarantineFile, known: dict[str, Job]) -> Replay:
-    if kept.sequence not in known:
+def _replay(file: QuarantineFile, by_sequence: dict[str, Job]) -> Replay:
+    if file.sequence not in by_sequence:
         raise ManifestError(
-            f"{kept.messages.name} belongs to the sequence {kept.sequence!r}, which the manifest does not make",
-            where=next((job.origin.file for job in known.values()), None),
-            hint=f"it makes {join_names(known)}",
+            f"{file.messages.name} belongs to the sequence {file.sequence!r}, which the manifest does not define",
+            where=next((job.origin.file for job in by_sequence.values()), None),
+            hint=f"the manifest defines {join_names(by_sequence)}",
         )
-    job = known[kept.sequence]
-    return Replay(kept, _whereabouts(kept, job), _replay_job(kept, job))
+    job = by_sequence[file.sequence]
+    return Replay(file, _state(file, job), _replay_job(file, job))
 
 
-def _whereabouts(kept: QuarantineFile, job: Job) -> Whereabouts:
-    """Ask the provenances of the sequence; a server keeps that of its first session only, and adds to no topic twice."""
-    stored = stored_provenance(job.destination, kept.sequence)
+def _state(file: QuarantineFile, job: Job) -> ReplayState:
+    """Return the state of a file according to the provenance of its sequence.
+
+    A server keeps only the record of the first session, so there a file is never orphaned while the sequence exists.
+    """
+    stored = stored_provenance(job.destination, file.sequence)
     if stored is None:
-        return Whereabouts.FORGOTTEN
-    name = escape_undecodable(kept.messages.name)
-    made_from = {(source.name, source.content) for known in stored.records for source in known.sources}
-    if (name, content_digest(kept.messages)) in made_from:
-        return Whereabouts.STORED
-    provenances = stored.records if stored.has_all_sessions else ()
-    if provenances and all(known.quarantine != name for known in provenances):
-        return Whereabouts.FORGOTTEN
-    return Whereabouts.WAITING
+        return ReplayState.ORPHANED
+    name = escape_undecodable(file.messages.name)
+    sources = {(source.name, source.content) for record in stored.records for source in record.sources}
+    if (name, content_digest(file.messages)) in sources:
+        return ReplayState.STORED
+    records = stored.records if stored.has_all_sessions else ()
+    if records and all(record.quarantine != name for record in records):
+        return ReplayState.ORPHANED
+    return ReplayState.WAITING
 
 
-def _replay_job(kept: QuarantineFile, job: Job) -> Job:
+def _replay_job(file: QuarantineFile, job: Job) -> Job:
     """Return the job that appends quarantined messages to their sequence: all of them, or none.
 
     Messages that fail again are quarantined again without a limit, because the current copy is set aside.
     """
-    folder = job.quarantine.path if job.quarantine else str(kept.messages.parent)
+    folder = job.quarantine.path if job.quarantine else str(file.messages.parent)
     return job.replace(
-        bag=job.bag.replace(path=str(kept.messages), time=TimeRange()),
-        paths=(kept.messages,),
+        bag=job.bag.replace(path=str(file.messages), time=TimeRange()),
+        paths=(file.messages,),
         sequence=job.sequence.replace(if_exists=IfExists.APPEND),
         on_error=ErrorPolicy(
             session=SessionLevelErrorPolicy.Delete,

@@ -16,7 +16,7 @@ from mosaico_ingest.cli.app import main
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.pipeline.quarantine import QuarantineFile
 from mosaico_ingest.report.events import RunStatus
-from mosaico_ingest.services.replay import Whereabouts, alone, replays
+from mosaico_ingest.services.replay import ReplayState, find_replays, lock_quarantine
 
 from .conftest import CUT, RunJob, WriteBag, number
 
@@ -74,8 +74,8 @@ def values(store: Store, topic: str = "/speed") -> list[float]:
 
 def waiting(folder: Path, job: Path) -> int:
     """Return how many messages a replay would bring in, or try to."""
-    found = replays(folder, api.compile_job(job))
-    files = [one.kept.messages for one in found if one.whereabouts is Whereabouts.WAITING]
+    found = find_replays(folder, api.compile_job(job))
+    files = [one.file.messages for one in found if one.state is ReplayState.WAITING]
     return sum(len(path.with_suffix(".jsonl").read_text().splitlines()) for path in files)
 
 
@@ -153,7 +153,7 @@ def test_two_replays_do_not_work_on_one_quarantine(
     spoilt: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "quarantine"
-    with alone(folder):
+    with lock_quarantine(folder):
         assert command("replay", "-q", folder, "-m", spoilt) == 1
     assert "another replay" in capsys.readouterr().err
     assert command("replay", "-q", folder, "-m", spoilt) == 4
@@ -235,7 +235,7 @@ def test_a_folder_that_is_no_quarantine_is_one_error(
     content: str | bytes | None, spoilt: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert command("replay", "-q", tmp_path / "nowhere", "-m", spoilt) == 3
-    assert "there is no such folder" in capsys.readouterr().err
+    assert "the folder does not exist" in capsys.readouterr().err
     (index,) = (tmp_path / "quarantine").glob("*.jsonl")
     index.unlink()
     if content is not None:
@@ -253,7 +253,7 @@ def test_messages_of_a_sequence_the_manifest_does_not_make_are_named(
     assert command("replay", "-q", tmp_path / "quarantine", "-m", other) == 2
     error = capsys.readouterr().err
     assert "belongs to the sequence 'drive'" in error
-    assert "it makes other" in error
+    assert "defines other" in error
     assert waiting(tmp_path / "quarantine", spoilt) == 6
 
 

@@ -74,7 +74,9 @@ def test_run_repeated_after_interrupt_completes_sequence(
     stopped = stop_after_rows(job)
     assert (stopped.status, stopped.totals.promised) == (RunStatus.INTERRUPTED, 70_000)
     assert 0 < rows(tmp_path) < 70_000
+    assert api.plan_job(job).exit_code == 0
     assert run_job(job).status is RunStatus.COMPLETED
+    assert api.plan_job(job).exit_code == 1
     assert rows(tmp_path) == 70_000
     assert run_job(job).exit_code == 1, "a complete sequence is not replaced"
 
