@@ -116,9 +116,9 @@ def _print_export(report: ExportReport) -> None:
 def _differences(topic: TopicExport) -> list[str]:
     """Return how the exported messages differ from the original ones."""
     lines = [f"excluded: {topic.excluded}"] if topic.excluded else []
-    lines += [f"{column} cannot be inverted ({reason})" for column, reason in topic.not_undone.items()]
-    if topic.unknown:
-        lines.append(f"not in the store, written as zero or empty: {', '.join(topic.unknown)}")
+    lines += [f"{column} cannot be inverted ({reason})" for column, reason in topic.not_invertible.items()]
+    if topic.defaulted:
+        lines.append(f"not in the store, written as zero or empty: {', '.join(topic.defaulted)}")
     lines += [
         f"{column} would differ in {count:,} messages after ingestion"
         for column, count in topic.changed.items()

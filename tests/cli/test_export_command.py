@@ -68,7 +68,7 @@ def test_export_excluded_topic_exits_4(folder: Path) -> None:
     assert ingest(folder, "run", "job.yaml", "--quiet").returncode == 0
     done = ingest(folder, "export", "quickstart_drive", "--to", "c.mcap")
     assert done.returncode == 4
-    assert "/battery: excluded: no adapter known makes BatteryState" in done.stdout
+    assert "/battery: excluded: no known adapter converts acme_msgs/msg/BatteryPack" in done.stdout
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_export_excluded_topic_exits_4(folder: Path) -> None:
         (("drive", "--to", "x.mcap", "-t", "/none"), 3, "no topic matches"),
         (("nobody", "--to", "x.mcap"), 1, "no sequence 'nobody'"),
         (("drive", "--to", "x.mcap", "--start", "soon"), 2, "neither an instant"),
-        (("drive", "--to", "x.mcap", "--adapter", "Nonsense"), 1, "no adapter is called"),
+        (("drive", "--to", "x.mcap", "--adapter", "Nonsense"), 1, "there is no adapter 'Nonsense'"),
     ],
 )
 def test_export_invalid_arguments_leave_no_file(

@@ -197,8 +197,8 @@ def test_export_names_columns_that_cannot_be_inverted(ingested: Ingest, tmp_path
     source = record(tmp_path / "in.mcap", [("/t", two, 1, {"a": 1.0, "b": 2.0})])
     store = ingested(source, adapters=(str(adapter),))
     (topic,) = export_sequence(store, "s", tmp_path / "out.mcap", adapters=[str(adapter)]).topics
-    assert topic.not_undone == {"sum": "a + b"}
-    assert topic.unknown == ("b",)
+    assert topic.not_invertible == {"sum": "a + b"}
+    assert topic.defaulted == ("b",)
     assert topic.changed == {"sum": 1}
     assert not topic.faithful
 
@@ -208,7 +208,7 @@ def test_export_topic_without_message_type_is_skipped(ingested: Ingest, tmp_path
     with store.catalog.write() as db:
         db.execute("UPDATE topics SET metadata = '{}' WHERE name = '/imu'")
     report = export_sequence(store, "s", tmp_path / "out.mcap", topics=["/imu", "/joint_states"])
-    assert "does not say" in report.topics[0].excluded
+    assert "does not describe" in report.topics[0].excluded
     assert report.topics[1].messages == 500
 
 
