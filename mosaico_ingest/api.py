@@ -16,7 +16,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mosaico_ingest.adapters.bridge import ROSBridge
 from mosaico_ingest.errors import IngestError, ManifestError
 from mosaico_ingest.executors.base import choose_executor
 from mosaico_ingest.findings import Finding, Severity
@@ -101,11 +100,11 @@ def compile_job(manifest: Path) -> tuple[Job, ...]:
         AdapterError: An adapter of the manifest does not exist or has a mistake.
     """
     from mosaico_ingest.job.manifest import load_manifests
-    from mosaico_ingest.pipeline.compile import compile_manifests
+    from mosaico_ingest.pipeline.compile import check_adapters, compile_manifests
 
     jobs = compile_manifests(load_manifests(manifest))
     for _, group in groupby(jobs, key=lambda job: job.adapters):
-        ROSBridge.for_job(next(group))
+        check_adapters(next(group))
     return jobs
 
 

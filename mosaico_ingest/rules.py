@@ -170,6 +170,8 @@ _TABLE = (
     Rule("ING609", "unexpected-messages", _WARNING, "more messages than the recording's index promises"),
     Rule("ING610", "quarantined", _WARNING, "rejected messages in the quarantine"),
     Rule("ING611", "old-server", _WARNING, "a server whose own clients cannot decode the rows"),
+    Rule("ING612", "static-topic", _WARNING, "a static topic with messages before the time range"),
+    Rule("ING613", "time-range-outside", _ERROR, "a time range that selects nothing of the recording"),
     Rule("ING701", "decode", _WARNING, "bytes that do not fit their message type"),
     Rule("ING702", "definition", _WARNING, "a message type without a usable definition"),
     Rule("ING703", "encoding", _WARNING, "a message that is not in a ROS encoding"),

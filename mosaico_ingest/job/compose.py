@@ -123,8 +123,12 @@ def fill_in(source: Source, env: Mapping[str, str] | None, cell: Mapping[str, st
     The values of `cell` come first (without it, those of the first job of the document's matrix), then those of the
     environment, then the document's own `defaults`.
     """
+    matrix = source.at((MATRIX_KEY,))
     known = _Variables(
-        combinations(source.value)[0] if cell is None else cell, env, variables(source.at(("defaults",)))
+        combinations(source.value)[0] if cell is None else cell,
+        env,
+        variables(source.at(("defaults",))),
+        frozenset(map(str, matrix)) if isinstance(matrix, dict) else frozenset(),
     )
     return _filled(source, known)
 
@@ -147,6 +151,8 @@ class _Variables(Struct, frozen=True):
     env: Mapping[str, str] | None
     """None: not looked at, and nothing is missed."""
     defaults: Mapping[str, str]
+    axes: frozenset[str] = frozenset()
+    """Variables of the matrix; the model reports axes without values."""
     alone: bool = False
     """Whether nothing but the cell counts, and all else stays to be filled in later."""
 
@@ -191,7 +197,7 @@ def _text(text: str, path: KeyPath, source: Source, known: _Variables, out: Fill
         if operator == "-":
             return rest
         out.unknown.add(path)
-        if known.env is not None:
+        if known.env is not None and name not in known.axes:
             why = f": {rest}" if operator == "?" and rest else ""
             report("unset-variable", f"{name} is not set{why}", f"set {name} in the environment", match)
         return match[0]

@@ -478,6 +478,10 @@ class Job(JobSettings):
         """Return the span of a key or list item in the manifest, None if the manifest does not have it."""
         return self.origin.key_spans.get(path) or self.origin.spans.get(path)
 
+    def value_span(self, *path: str | int) -> Span | None:
+        """Return the span of a value in the manifest, None if the manifest does not have it."""
+        return self.origin.spans.get(path)
+
     def where(self, *path: str | int) -> str | None:
         """Return `file:line:column` of a value or of what contains it, or the file; None without a manifest."""
         for length in range(len(path), 0, -1):

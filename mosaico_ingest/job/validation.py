@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from difflib import get_close_matches
+from math import isfinite
 from typing import Any
 
 from msgspec import Struct
@@ -231,8 +232,10 @@ def _wrong_type(problem: _Problem, expected: str) -> Finding:
         remedy = _example(problem)
     elif expected == "text" and (_PLAIN.fullmatch(written) or _BRACED.fullmatch(written)):
         remedy, fix = f'quote it: "{written}"', Edit(problem.span, f'"{written}"')
-    elif expected == "a list" and isinstance(value, str):
-        remedy = f'write ["{value}"]'
+    elif expected == "a list":
+        remedy = _list_example(problem, node)
+    elif expected == "a whole number" and isinstance(value, float):
+        remedy = "write a whole number" + (f", such as {round(value)}" if isfinite(value) else "")
     elif expected == "a whole number" and isinstance(value, str) and value.strip().isdigit():
         remedy, fix = f"write {value.strip()} without quotes", Edit(problem.span, value.strip())
     elif expected == "a mapping":
@@ -241,11 +244,20 @@ def _wrong_type(problem: _Problem, expected: str) -> Finding:
     return problem.finding("wrong-type", message, remedy or _example(problem) or f"write {expected}", fix=fix)
 
 
+def _list_example(problem: _Problem, node: dict[str, Any]) -> str | None:
+    """Return how to write a list: with the value as its item, or with the required keys of its items."""
+    item = _resolved(_resolved(node, problem.schema).get("items", {}), problem.schema)
+    if item.get("type") != "object":
+        return f'write ["{problem.value}"]' if isinstance(problem.value, str) else None
+    examples = {key: item["properties"][key].get("examples", ["…"])[0] for key in item.get("required", ())}
+    return f"write [{{{', '.join(f'{key}: {example}' for key, example in examples.items())}}}]"
+
+
 def _example(problem: _Problem) -> str | None:
-    """Say how the value may be written, in the words of the model's examples."""
+    """Return a hint with the examples of the field."""
     examples = _node_at(problem.schema, problem.path).get("examples", ())
     shown = [str(example) for example in examples if isinstance(example, str | int | float)]
-    return f"write it as {' or '.join(shown)}" if shown else None
+    return f"write a value such as {' or '.join(shown)}" if shown else None
 
 
 def _fits(text: str, node: dict[str, Any], schema: dict[str, Any]) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from difflib import get_close_matches
 from glob import has_magic
@@ -14,10 +14,14 @@ from typing import Any
 
 from msgspec import Struct
 
-from mosaico_ingest.errors import ManifestError, NothingMatched
+from mosaico_ingest.adapters.adapter import AdapterSpec
+from mosaico_ingest.adapters.bridge import adapter_spec, installed_adapters, suggest_reference
+from mosaico_ingest.adapters.builtin import BY_NAME
+from mosaico_ingest.errors import AdapterError, ManifestError, NothingMatched
+from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.compose import PLACEHOLDERS, Placeholder, placeholders_in
 from mosaico_ingest.job.fields import FilePath, PathRole, marked_fields, replace_values
-from mosaico_ingest.job.manifest import LoadedManifest
+from mosaico_ingest.job.manifest import LoadedManifest, refusal
 from mosaico_ingest.job.model import Job, JobSettings, Manifest, Origin, SequenceSettings
 from mosaico_ingest.remote import AnyPath, RemotePath, without_options
 from mosaico_ingest.rosbag.formats import RECORDING_NAME
@@ -25,6 +29,7 @@ from mosaico_ingest.textfile import read_limited
 
 __all__ = [
     "Recording",
+    "check_adapters",
     "compile_manifest",
     "compile_manifests",
     "find_recordings",
@@ -88,6 +93,8 @@ def _fill(placeholder: Placeholder, recording: Recording) -> str:
     if placeholder.name == "date":
         changed = datetime.fromtimestamp(main.stat().st_mtime, tz=timezone.utc)
         return f"{changed:%Y-%m-%d}"
+    if main.name in {"", ".."}:  # such as `bag.path: ..`
+        main = main.resolve()
     texts = {
         "stem": RECORDING_NAME.sub("", main.name),
         "name": main.name,
@@ -250,3 +257,68 @@ def _metadata(loaded: LoadedManifest, sequence: SequenceSettings) -> dict[str, A
     if not isinstance(metadata, dict):
         raise ManifestError(f"{path} has no JSON object", where=where, hint='write {"key": "value"}')
     return {**metadata, **sequence.metadata}
+
+
+def check_adapters(job: Job) -> None:
+    """Load every adapter that a job refers to.
+
+    Raises:
+        ManifestError: A reference has no usable adapter, or two adapters take one message type; `findings` has one
+            finding per reference, with the rule and location that lint reports.
+        AdapterError: An adapter file has mistakes.
+    """
+    findings: list[Finding] = []
+    names: dict[str, AdapterSpec] = {spec.name: spec for _, spec in installed_adapters()}
+    owners: dict[str, tuple[str, AdapterSpec]] = {}
+    for position, reference in enumerate(job.adapters.load):
+        spec = _load_adapter(job, ("adapters", "load", position), reference, names, findings)
+        if spec is None:
+            continue
+        names[spec.name] = spec
+        clash = next(
+            (t for t in spec.ros_types if spec.default and owners.get(t, ("", spec))[1] != spec), None
+        )
+        if clash is not None:
+            message = f"{reference} and {owners[clash][0]} both take {clash}"
+            hint = "remove one, or set `default: false` in its file and name it in adapters.override"
+            span = job.span("adapters", "load", position)
+            findings.append(Finding("adapter-clash", Severity.ERROR, message, span, hint))
+        owners.update({t: (str(reference), spec) for t in spec.ros_types if spec.default})
+    for topic, reference in job.adapters.override.items():
+        if not isinstance(reference, str) or reference not in names:
+            _load_adapter(job, ("adapters", "override", topic), reference, names, findings)
+    if findings:
+        raise refusal(tuple(findings), job.origin.file or "adapters")
+
+
+def _load_adapter(
+    job: Job,
+    path: tuple[str | int, ...],
+    reference: object,
+    names: Mapping[str, AdapterSpec],
+    findings: list[Finding],
+) -> AdapterSpec | None:
+    """Return an adapter, or None with a finding about its reference."""
+    try:
+        return adapter_spec(reference, job.folder)
+    except AdapterError as error:
+        if error.findings:
+            raise
+        rule = _reference_rule(str(reference), error, job.folder)
+        hint = (
+            suggest_reference(str(reference), {*BY_NAME, *names}) if rule == "unknown-adapter" else error.hint
+        )
+        message = f"{error.where}: {error.what}" if error.where else error.what
+        findings.append(Finding(rule, Severity.ERROR, message, job.value_span(*path), hint))
+        return None
+
+
+def _reference_rule(reference: str, error: AdapterError, folder: Path) -> str:
+    """Return the rule that an unusable reference violates."""
+    module, colon, _ = reference.rpartition(":")
+    if not colon and not reference.endswith((".yaml", ".yml")):
+        return "unknown-adapter"
+    file = module if colon else reference
+    is_file = file.endswith((".py", ".yaml", ".yml"))
+    missing = not (folder / file).is_file() if is_file else isinstance(error.__cause__, ModuleNotFoundError)
+    return "missing-adapter" if missing else "broken-adapter"

@@ -20,6 +20,7 @@ from mosaico_ingest.findings import (
 from mosaico_ingest.job.fields import TopicGlob, marked_fields, values_at
 from mosaico_ingest.job.model import Job, JobSettings
 from mosaico_ingest.job.patterns import Selection, first_match, select
+from mosaico_ingest.job.units import format_time
 from mosaico_ingest.job.values import LoaderErrorPolicy, TimeBound, Unmodeled
 from mosaico_ingest.pipeline.memory import MemoryBudget
 from mosaico_ingest.pipeline.plan import ExcludedTopic, Plan, TopicPlan, digest_of
@@ -69,7 +70,7 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
         raise _nothing_selected(job, recording, excluded)
     read_from_ns, read_until_ns = _time_range(job, recording)
     findings += _image_settings(job, topics)
-    findings += _latched_before(job, topics, recording.start_ns, read_from_ns)
+    findings += _static_before(job, topics, recording.start_ns, read_from_ns)
     plan = Plan(
         sequence=job.sequence.replace(family=job.family),
         files=recording.files,
@@ -233,7 +234,8 @@ def _unmatched(job: Job, selection: Selection, topics: tuple[str, ...]) -> Itera
         for path, section in values_at(job, field.path):
             for glob in section if isinstance(section, dict) else ():
                 if glob != field.marker.default and not any(first_match((glob,), topic) for topic in topics):
-                    yield _unmatched_pattern(".".join(path), glob, topics, job.span(*path, glob))
+                    keys = (field.marker.default,) if field.marker.default else ()
+                    yield _unmatched_pattern(".".join(path), glob, topics, job.span(*path, glob), keys)
 
 
 def _image_settings(job: Job, topics: Iterable[TopicPlan]) -> Iterator[Finding]:
@@ -260,8 +262,10 @@ def _image_settings(job: Job, topics: Iterable[TopicPlan]) -> Iterator[Finding]:
             )
 
 
-def _unmatched_pattern(key: str, glob: str, topics: tuple[str, ...], span: Span | None) -> Finding:
-    near = get_close_matches(glob.lstrip("!"), topics, n=1, cutoff=0.5)
+def _unmatched_pattern(
+    key: str, glob: str, topics: tuple[str, ...], span: Span | None, keys: tuple[str, ...] = ()
+) -> Finding:
+    near = get_close_matches(glob.lstrip("!"), (*topics, *keys), n=1, cutoff=0.5)
     return Finding(
         "unmatched-pattern",
         Severity.WARNING,
@@ -293,12 +297,30 @@ def _nothing_selected(
         return no_topics_error(recording)
     if job.topics and all("`topics`" in topic.why for topic in excluded):
         what = f"no topic matches {', '.join(map(repr, job.topics))}"
-        hint = suggest_names({topic.topic for topic in excluded}, job.topics)
-        return NothingMatched(what, where=where, hint=hint)
+        hint = _exclusion_hint(job, excluded) or suggest_names(
+            {topic.topic for topic in excluded}, job.topics
+        )
+        span = job.span("topics")
+        if span is None:
+            return NothingMatched(what, where=where, hint=hint)
+        finding = Finding("unmatched-pattern", Severity.ERROR, what, span, hint)
+        return NothingMatched(what, where=str(span), hint=hint, findings=(finding,))
     first = excluded[0]
     return NothingMatched(
         f"none of {len(excluded)} topics can be ingested", where=where, hint=f"{first.topic}: {first.why}"
     )
+
+
+def _exclusion_hint(job: Job, excluded: list[ExcludedTopic]) -> str | None:
+    """Return a hint if the topics that a pattern selects are excluded by a later pattern."""
+    for position, pattern in enumerate(job.topics):
+        matched = [topic.topic for topic in excluded if first_match((pattern,), topic.topic)]
+        later = [glob for glob in job.topics[position + 1 :] if glob.startswith("!")]
+        for topic in matched:
+            exclusion = next((glob for glob in later if first_match((glob[1:],), topic)), None)
+            if exclusion is not None:
+                return f"put {exclusion!r} before {pattern!r}, because it excludes {topic}"
+    return None
 
 
 def _time_range(job: Job, recording: Recording) -> tuple[int | None, int | None]:
@@ -319,15 +341,50 @@ def _time_range(job: Job, recording: Recording) -> tuple[int | None, int | None]
             )
         return bound.at(recording.start_ns, recording.end_ns)
 
-    return instant(job.bag.time.start), instant(job.bag.time.end)
+    start_ns, end_ns = instant(job.bag.time.start), instant(job.bag.time.end)
+    _check_time_range(job, recording, start_ns, end_ns)
+    return start_ns, end_ns
 
 
-def _latched_before(
+def _check_time_range(job: Job, recording: Recording, start_ns: int | None, end_ns: int | None) -> None:
+    """Raise NothingMatched if a time range is outside the recording or empty."""
+    first_ns, last_ns = recording.start_ns, recording.end_ns
+    if first_ns is None or last_ns is None:
+        return
+    start = first_ns if start_ns is None else max(start_ns, first_ns)
+    end = last_ns + 1 if end_ns is None else min(end_ns, last_ns + 1)
+    if start < end:
+        return
+    first, last = format_time(TimeBound(first_ns)), format_time(TimeBound(last_ns))
+    message = f"the time range selects nothing of the recording, which lasts from {first} to {last}"
+    hint = "change bag.time, or remove it to read the complete recording"
+    span = job.span("bag", "time")
+    raise NothingMatched(
+        message,
+        where=job.where("bag", "time") or str(recording.files[0]),
+        hint=hint,
+        findings=()
+        if span is None
+        else (Finding("time-range-outside", Severity.ERROR, message, span, hint),),
+    )
+
+
+def _static_before(
     job: Job, topics: list[TopicPlan], start_ns: int | None, read_from_ns: int | None
 ) -> Iterator[Finding]:
-    """Yield a finding for each latched topic whose messages may all be before the time range."""
-    del job, topics, start_ns, read_from_ns
-    yield from ()
+    """Yield a finding for each selected static topic whose messages may all be earlier than the time range."""
+    if start_ns is None or read_from_ns is None or read_from_ns <= start_ns:
+        return
+    for topic in topics:
+        if topic.topic.rpartition("/")[2] == "tf_static":
+            yield Finding(
+                "static-topic",
+                Severity.WARNING,
+                f"the messages of {topic.topic} before the time range are not read; most recordings have them"
+                " at the start",
+                job.span("bag", "time", "start"),
+                "remove bag.time.start if the sequence needs these transforms",
+            )
 
 
 def _check_digest(plan: Plan, task: Task) -> None:

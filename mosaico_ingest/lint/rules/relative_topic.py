@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from mosaico_ingest.job.validation import nearest
+from mosaico_ingest.job.values import DEFAULT_TOPIC
 from mosaico_ingest.lint.job import Job, topic_patterns
 from mosaico_ingest.lint.rule import Check, Problem
 
@@ -14,7 +16,10 @@ def check(job: Job) -> Iterator[Problem]:
         name = pattern.removeprefix("!")
         if name[:1].isalpha():
             sign = pattern[: len(pattern) - len(name)]
-            yield Problem(f"{pattern!r} in {section} has no leading slash", span, f"write {sign}/{name}")
+            hint = f"write {sign}/{name}"
+            if section == "on_error.topic" and nearest(name, [DEFAULT_TOPIC]):
+                hint = f"did you mean {DEFAULT_TOPIC}? otherwise {hint}"
+            yield Problem(f"{pattern!r} in {section} has no leading slash", span, hint)
 
 
 CHECK = Check("relative-topic", job=check)
