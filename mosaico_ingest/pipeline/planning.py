@@ -303,7 +303,7 @@ def _nothing_selected(
         span = job.span("topics")
         if span is None:
             return NothingMatched(what, where=where, hint=hint)
-        finding = Finding("unmatched-pattern", Severity.ERROR, what, span, hint)
+        finding = Finding("unmatched-pattern", Severity.WARNING, what, span, hint)
         return NothingMatched(what, where=str(span), hint=hint, findings=(finding,))
     first = excluded[0]
     return NothingMatched(
