@@ -11,10 +11,10 @@ from object_store import ObjectStore
 
 from mosaico_ingest.destinations.base import topic_schema
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.destinations.store.catalog import NewNote, NewSession, NewTopic
 from mosaico_ingest.destinations.store.errors import NotInStore
 from mosaico_ingest.destinations.store.files import new_session_id
-from mosaico_ingest.destinations.store.protocols import Records
+from mosaico_ingest.destinations.store.model import NewNote, NewSession, NewTopic
+from mosaico_ingest.destinations.store.protocols import StoreCatalog
 from mosaico_ingest.destinations.store.segment import Segment
 from mosaico_ingest.errors import SequenceExists, SinkError
 from mosaico_ingest.job.values import IfExists
@@ -38,7 +38,7 @@ def store(request: pytest.FixtureRequest, tmp_path: Path) -> Store:
 
 
 @pytest.fixture
-def records(store: Store) -> Records:
+def records(store: Store) -> StoreCatalog:
     return store.catalog
 
 
@@ -63,7 +63,7 @@ def written(session: str, *topics: tuple[str, OntologyType], start_ns: int = 0) 
 
 
 def commit(
-    records: Records,
+    records: StoreCatalog,
     *topics: tuple[str, OntologyType],
     sequence: str = "s",
     if_exists: IfExists = IfExists.FAIL,
@@ -74,7 +74,7 @@ def commit(
     return session, records.commit(claim, written(session, *topics, start_ns=start_ns))
 
 
-def test_committed_sequence_is_read_back_equal(store: Store, records: Records) -> None:
+def test_committed_sequence_is_read_back_equal(store: Store, records: StoreCatalog) -> None:
     session, replaced = commit(records, ("/a", POINT), ("/b", FLAG))
     assert replaced == []
     assert records.names() == ["s"]
@@ -95,19 +95,19 @@ def test_committed_sequence_is_read_back_equal(store: Store, records: Records) -
     assert records.sequence("t") is None
 
 
-def test_claim_is_invisible_before_its_commit(records: Records) -> None:
+def test_claim_is_invisible_before_its_commit(records: StoreCatalog) -> None:
     records.claim(new_session_id(), "s", IfExists.FAIL, is_live=alive)
     assert records.names() == []
 
 
 @pytest.mark.parametrize("policy", [IfExists.FAIL, IfExists.SKIP])
-def test_existing_name_is_refused(records: Records, policy: IfExists) -> None:
+def test_existing_name_is_refused(records: StoreCatalog, policy: IfExists) -> None:
     commit(records, ("/a", POINT))
     with pytest.raises(SequenceExists, match="the sequence already exists"):
         records.claim(new_session_id(), "s", policy, is_live=alive)
 
 
-def test_second_writer_is_refused_while_the_first_is_alive(records: Records) -> None:
+def test_second_writer_is_refused_while_the_first_is_alive(records: StoreCatalog) -> None:
     first = new_session_id()
     records.claim(first, "s", IfExists.FAIL, is_live=alive)
     with pytest.raises(SequenceExists, match="another run is writing"):
@@ -117,7 +117,7 @@ def test_second_writer_is_refused_while_the_first_is_alive(records: Records) -> 
     records.claim(new_session_id(), "s", IfExists.FAIL, is_live=alive)
 
 
-def test_claim_of_dead_writer_does_not_block(records: Records) -> None:
+def test_claim_of_dead_writer_does_not_block(records: StoreCatalog) -> None:
     first = new_session_id()
     claim = records.claim(first, "s", IfExists.FAIL, is_live=alive)
     second = new_session_id()
@@ -130,7 +130,7 @@ def test_claim_of_dead_writer_does_not_block(records: Records) -> None:
     assert [topic.name for topic in info.topics] == ["/a"]
 
 
-def test_append_adds_to_existing_sequence(records: Records) -> None:
+def test_append_adds_to_existing_sequence(records: StoreCatalog) -> None:
     first, _ = commit(records, ("/a", POINT))
     second, replaced = commit(records, ("/a", POINT), ("/b", FLAG), if_exists=IfExists.APPEND, start_ns=100)
     assert replaced == []
@@ -141,7 +141,7 @@ def test_append_adds_to_existing_sequence(records: Records) -> None:
     assert info.topics[1].session == second
 
 
-def test_two_writers_can_append_concurrently(records: Records) -> None:
+def test_two_writers_can_append_concurrently(records: StoreCatalog) -> None:
     commit(records, ("/a", POINT))
     sessions = [new_session_id() for _ in range(2)]
     claims = [records.claim(one, "s", IfExists.APPEND, is_live=alive) for one in sessions]
@@ -152,7 +152,7 @@ def test_two_writers_can_append_concurrently(records: Records) -> None:
     assert len(info.topics[0].segments) == 3
 
 
-def test_append_of_another_type_to_a_topic_is_refused(records: Records) -> None:
+def test_append_of_another_type_to_a_topic_is_refused(records: StoreCatalog) -> None:
     commit(records, ("/a", POINT))
     with pytest.raises(SinkError, match="the topic holds Point"):
         commit(records, ("/a", FLAG), if_exists=IfExists.APPEND)
@@ -161,7 +161,7 @@ def test_append_of_another_type_to_a_topic_is_refused(records: Records) -> None:
     assert len(info.sessions) == 1
 
 
-def test_replace_exchanges_the_sequence(records: Records) -> None:
+def test_replace_exchanges_the_sequence(records: StoreCatalog) -> None:
     first, _ = commit(records, ("/a", POINT), ("/b", FLAG))
     second, replaced = commit(records, ("/c", FLAG), if_exists=IfExists.REPLACE)
     assert sorted(replaced) == [f"segments/s/{name}/{first}-0000.parquet" for name in "ab"]
@@ -171,7 +171,7 @@ def test_replace_exchanges_the_sequence(records: Records) -> None:
     assert [one.id for one in info.sessions] == [second]
 
 
-def test_replace_fails_if_the_sequence_changed_meanwhile(records: Records) -> None:
+def test_replace_fails_if_the_sequence_changed_meanwhile(records: StoreCatalog) -> None:
     commit(records, ("/a", POINT))
     session = new_session_id()
     claim = records.claim(session, "s", IfExists.REPLACE, is_live=alive)
@@ -184,7 +184,7 @@ def test_replace_fails_if_the_sequence_changed_meanwhile(records: Records) -> No
         records.commit(claim, written(session, ("/c", FLAG)))
 
 
-def test_notes_are_added_and_deleted(records: Records) -> None:
+def test_notes_are_added_and_deleted(records: StoreCatalog) -> None:
     records.create("s", '{"a": 1}')
     records.note("s", NewNote(None, "of all", 1))
     records.note("s", NewNote("/a", "of one", 2))
@@ -200,7 +200,7 @@ def test_notes_are_added_and_deleted(records: Records) -> None:
         records.create("s", "{}")
 
 
-def test_removing_a_sequence_removes_its_records(records: Records) -> None:
+def test_removing_a_sequence_removes_its_records(records: StoreCatalog) -> None:
     first, _ = commit(records, ("/a", POINT), ("/b", FLAG))
     second, _ = commit(records, ("/a", POINT), ("/c", FLAG), if_exists=IfExists.APPEND)
     records.note("s", NewNote("/b", "gone with it", 1))
@@ -226,14 +226,14 @@ def test_removing_a_sequence_removes_its_records(records: Records) -> None:
     ],
 )
 def test_removing_a_missing_sequence_is_an_error(
-    records: Records, remove: Callable[[Records], object]
+    records: StoreCatalog, remove: Callable[[StoreCatalog], object]
 ) -> None:
     commit(records, ("/a", POINT))
     with pytest.raises(NotInStore, match="there is no"):
         remove(records)
 
 
-def test_garbage_collection_removes_dead_claims_and_lists_every_path(records: Records) -> None:
+def test_garbage_collection_removes_dead_claims_and_lists_every_path(records: StoreCatalog) -> None:
     session, _ = commit(records, ("/a", POINT))
     crashed = new_session_id()
     records.claim(crashed, "t", IfExists.FAIL, is_live=alive)
@@ -244,7 +244,7 @@ def test_garbage_collection_removes_dead_claims_and_lists_every_path(records: Re
     records.claim(new_session_id(), "t", IfExists.FAIL, is_live=alive)
 
 
-def test_names_of_any_length_and_spelling_are_preserved(records: Records) -> None:
+def test_names_of_any_length_and_spelling_are_preserved(records: StoreCatalog) -> None:
     names = sorted(["a-b_c", "with(brackets)", "per,cent~", "x" * 300, "x" * 300 + "y"])
     for name in names:
         records.create(name, "{}")

@@ -172,7 +172,7 @@ def test_a_destination_that_loses_rows_fails_the_run(
     assert "found 1 rows" in str(report.error)
 
 
-@pytest.mark.parametrize(("damage", "said"), [("flip", "CRC"), ("cut", ""), ("remove", '"is not there"')])
+@pytest.mark.parametrize(("damage", "said"), [("flip", "CRC"), ("cut", ""), ("remove", '"the file does not exist"')])
 def test_verify_finds_what_changed_on_the_disk(
     damage: str,
     said: str,

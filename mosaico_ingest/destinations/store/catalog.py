@@ -1,7 +1,7 @@
-"""The SQLite catalog of a store: schema, queries, sessions and removal.
+"""The SQLite catalog of a store: tables, queries, sessions and removal.
 
-A connection lives only for one task, so threads and forked processes share nothing, and a catalog that
-was deleted is noticed instead of being written to after its end.
+Every call opens its own connection. Threads and forked processes therefore share no connection, and a catalog that was
+deleted is detected instead of written to.
 """
 
 from __future__ import annotations
@@ -18,11 +18,14 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-from msgspec import Struct
 
 from mosaico_ingest.destinations.base import check_same_type, sequence_exists
-from mosaico_ingest.destinations.store.errors import NotInStore, explained
+from mosaico_ingest.destinations.store.errors import NotInStore, explained, sequence_changed
 from mosaico_ingest.destinations.store.model import (
+    Claim,
+    NewNote,
+    NewSession,
+    NewTopic,
     Note,
     SegmentInfo,
     SequenceInfo,
@@ -35,38 +38,321 @@ from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 from mosaico_ingest.remote import AnyPath
 
-__all__ = [
-    "FORMAT",
-    "Catalog",
-    "Claim",
-    "NewNote",
-    "NewSession",
-    "NewTopic",
-    "bounds",
-    "changed",
-    "claim",
-    "commit",
-    "create",
-    "delete_notes",
-    "delete_sequence",
-    "delete_session",
-    "delete_topic",
-    "find_sequence",
-    "forget",
-    "names",
-    "note",
-    "ontology_of",
-    "release",
-]
+__all__ = ["FORMAT", "Catalog"]
+
+FORMAT = 1
+"""The version of the tables; it increases if earlier releases cannot read them."""
+
+_APPLICATION = 0x6D6F7361  # "mosa", which `file catalog.sqlite` shows
+
+_BUSY_S = 30.0
+
+_STAMPS = ("user_version", "application_id")
+
+_TABLES = """
+CREATE TABLE sequences (
+    id INTEGER PRIMARY KEY AUTOINCREMENT,
+    name TEXT NOT NULL UNIQUE,
+    metadata TEXT NOT NULL,
+    created_ns INTEGER NOT NULL
+);
+CREATE TABLE sessions (
+    id TEXT PRIMARY KEY,
+    sequence_id INTEGER NOT NULL REFERENCES sequences ON DELETE CASCADE,
+    metadata TEXT NOT NULL,
+    created_ns INTEGER NOT NULL,
+    completed_ns INTEGER NOT NULL
+);
+CREATE INDEX sessions_of_sequence ON sessions (sequence_id);
+CREATE TABLE topics (
+    id INTEGER PRIMARY KEY,
+    sequence_id INTEGER NOT NULL REFERENCES sequences ON DELETE CASCADE,
+    session_id TEXT NOT NULL,
+    name TEXT NOT NULL,
+    ontology_tag TEXT NOT NULL,
+    serialization_format TEXT NOT NULL,
+    fingerprint TEXT NOT NULL,
+    arrow_schema BLOB NOT NULL,
+    metadata TEXT NOT NULL,
+    created_ns INTEGER NOT NULL,
+    UNIQUE (sequence_id, name)
+);
+CREATE TABLE segments (
+    id INTEGER PRIMARY KEY,
+    topic_id INTEGER NOT NULL REFERENCES topics ON DELETE CASCADE,
+    session_id TEXT NOT NULL REFERENCES sessions ON DELETE CASCADE,
+    path TEXT NOT NULL UNIQUE,
+    rows INTEGER NOT NULL,
+    bytes INTEGER NOT NULL,
+    start_ns INTEGER NOT NULL,
+    end_ns INTEGER NOT NULL,
+    checksum TEXT
+);
+CREATE INDEX segments_of_topic ON segments (topic_id, start_ns);
+CREATE INDEX segments_of_session ON segments (session_id);
+CREATE TABLE bounds (
+    segment_id INTEGER NOT NULL REFERENCES segments ON DELETE CASCADE,
+    column_path TEXT NOT NULL,
+    low,
+    high,
+    PRIMARY KEY (segment_id, column_path)
+) WITHOUT ROWID;
+CREATE TABLE notes (
+    id INTEGER PRIMARY KEY,
+    sequence_id INTEGER NOT NULL REFERENCES sequences ON DELETE CASCADE,
+    topic TEXT,
+    message TEXT NOT NULL,
+    created_ns INTEGER NOT NULL
+);
+CREATE INDEX notes_of_sequence ON notes (sequence_id);
+CREATE TABLE reservations (
+    session_id TEXT PRIMARY KEY,
+    sequence TEXT NOT NULL
+);
+"""
 
 
-def names(db: sqlite3.Connection) -> list[str]:
-    """Return the names of all sequences, sorted."""
+class Catalog:
+    """The catalog in the SQLite file at `path`, which `create` creates if necessary; see `StoreCatalog`."""
+
+    def __init__(self, path: Path, *, create: bool) -> None:
+        self.path = path
+        self.root = path.parent
+        with explained(path):
+            if create:
+                path.parent.mkdir(parents=True, exist_ok=True)
+            elif not path.is_file():
+                raise SinkError("there is no store here", where=str(path.parent), hint="check the path")
+            self._prepare(create=create)
+
+    @contextmanager
+    def read(self) -> Generator[sqlite3.Connection, None, None]:
+        """Yield a connection that reads one consistent state of the catalog."""
+        with self._task("BEGIN", mode="ro") as db:
+            yield db
+
+    @contextmanager
+    def write(self, *, lasting: bool = True) -> Generator[sqlite3.Connection, None, None]:
+        """Yield a connection inside a transaction; a power cut may undo a transaction that is not `lasting`."""
+        with self._task("BEGIN IMMEDIATE", mode="rw", lasting=lasting) as db:
+            yield db
+
+    def keep_open(self) -> sqlite3.Connection:
+        """Return an idle connection, since only closing the last connection costs a checkpoint."""
+        with explained(self.path):
+            return self._connect("rw")
+
+    def claim(
+        self, session: str, sequence: str, if_exists: IfExists, *, is_live: Callable[[str], bool]
+    ) -> Claim:
+        """See `StoreCatalog.claim`; a claim need not survive a power cut, which ends its writer too."""
+        with self.write(lasting=False) as db:
+            return _claim(db, session, sequence, if_exists, is_live=is_live)
+
+    def commit(self, claimed: Claim, new: NewSession) -> list[str]:
+        """See `StoreCatalog.commit`."""
+        with self.write() as db:
+            return _commit(db, claimed, new)
+
+    def release(self, session: str, sequence: str) -> None:  # noqa: ARG002 - the session identifies the reservation
+        """See `StoreCatalog.release`."""
+        with self.write(lasting=False) as db:
+            _release(db, session)
+
+    def create(self, sequence: str, metadata: str) -> None:
+        """See `StoreCatalog.create`."""
+        with self.write() as db:
+            _create(db, sequence, metadata)
+
+    def note(self, sequence: str, new: NewNote) -> None:
+        """See `StoreCatalog.note`."""
+        with self.write() as db:
+            _note(db, sequence, new)
+
+    def names(self) -> list[str]:
+        """See `StoreCatalog.names`."""
+        with self.read() as db:
+            return _names(db)
+
+    def sequence(self, name: str) -> SequenceInfo | None:
+        """See `StoreCatalog.sequence`."""
+        with self.read() as db:
+            return _find_sequence(db, name, self.root)
+
+    def sequences(self) -> tuple[SequenceInfo, ...]:
+        """See `StoreCatalog.sequences`."""
+        with self.read() as db:
+            found = (_find_sequence(db, name, self.root) for name in _names(db))
+            return tuple(info for info in found if info is not None)
+
+    def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
+        """See `StoreCatalog.bounds`."""
+        with self.read() as db:
+            return _bounds(db, topic, columns, self.root)
+
+    def delete_sequence(self, sequence: str) -> list[str]:
+        """See `StoreCatalog.delete_sequence`."""
+        with self.write() as db:
+            return _delete_sequence(db, sequence)
+
+    def delete_topic(self, sequence: str, topic: str) -> list[str]:
+        """See `StoreCatalog.delete_topic`."""
+        with self.write() as db:
+            return _delete_topic(db, sequence, topic)
+
+    def delete_session(self, sequence: str, session: str) -> list[str]:
+        """See `StoreCatalog.delete_session`."""
+        with self.write() as db:
+            return _delete_session(db, sequence, session)
+
+    def delete_notes(self, sequence: str, topic: str | None) -> None:
+        """See `StoreCatalog.delete_notes`."""
+        with self.write() as db:
+            _delete_notes(db, sequence, topic)
+
+    def forget(self, live: Collection[str]) -> set[str]:
+        """See `StoreCatalog.forget`."""
+        with self.write() as db:
+            return _forget(db, live)
+
+    @contextmanager
+    def _task(
+        self, begin: str, *, mode: str, lasting: bool = True
+    ) -> Generator[sqlite3.Connection, None, None]:
+        with explained(self.path), closing(self._connect(mode)) as db:
+            if not lasting:
+                # The WAL stays consistent, but its last transactions may be missing after a power cut.
+                db.execute("PRAGMA synchronous = NORMAL")
+            db.execute(begin)
+            try:
+                yield db
+            except BaseException:
+                db.rollback()
+                raise
+            db.commit()
+
+    def _connect(self, mode: str) -> sqlite3.Connection:
+        try:
+            return _connect(self.path, f"mode={mode}")
+        except sqlite3.OperationalError:
+            if mode != "ro" or not self.path.is_file() or os.access(self.path.parent, os.W_OK):
+                raise
+            return _connect(self.path, "immutable=1")  # a read-only medium cannot hold the files of the WAL
+
+    def _prepare(self, *, create: bool) -> None:
+        if create and not self.path.exists():
+            self._create_atomically()
+        with closing(self._connect("rw" if create else "ro")) as db:
+            if create:
+                _initialize(db, self.path)
+            version = _format(db, self.path)
+            if create and version == FORMAT:  # a catalog of a newer format must not be changed
+                _add_missing_columns(db)
+        if version > FORMAT:
+            raise SinkError(
+                f"the store has format {version}, this version supports up to {FORMAT}",
+                where=str(self.path.parent),
+                hint="upgrade mosaico-ingest",
+            )
+        if version == 0:
+            raise SinkError("there is no store here", where=str(self.path.parent), hint="check the path")
+
+    def _create_atomically(self) -> None:
+        """Create the catalog under its name only when it is initialized, so that no process sees half of it."""
+        draft = self.path.with_name(f".{self.path.name}-{secrets.token_hex(8)}")
+        try:
+            with closing(_connect(draft, "mode=rwc")) as db:
+                _initialize(db, draft)
+            try:
+                os.link(draft, self.path)
+            except FileExistsError:
+                pass  # another process created it
+            except OSError:  # the file system has no hard links
+                if not self.path.exists():
+                    draft.replace(self.path)
+        finally:
+            for file in self.path.parent.glob(f"{draft.name}*"):
+                file.unlink(missing_ok=True)
+
+
+def _connect(path: Path, query: str) -> sqlite3.Connection:
+    uri = f"{path.absolute().as_uri()}?{query}"
+    db = sqlite3.connect(uri, uri=True, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
+    try:
+        db.row_factory = sqlite3.Row
+        db.execute("PRAGMA foreign_keys = ON")
+        db.execute("PRAGMA synchronous = FULL")
+        db.execute("SELECT count(*) FROM sqlite_master")
+    except sqlite3.Error:
+        db.close()
+        raise
+    return db
+
+
+def _format(db: sqlite3.Connection, path: Path) -> int:
+    """Return the format of a catalog, 0 for an empty file.
+
+    Raises:
+        SinkError: The file is another database.
+    """
+    version, application = (db.execute(f"PRAGMA {name}").fetchone()[0] for name in _STAMPS)
+    tables = db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
+    if application != _APPLICATION and (application or version or tables):
+        raise SinkError("the file is not the catalog of a store", where=str(path), hint="check the path")
+    return int(version)
+
+
+def _initialize(db: sqlite3.Connection, path: Path) -> None:
+    """Create the tables if the file is empty."""
+    if _format(db, path) != 0:
+        return
+    _use_wal(db)
+    db.execute("BEGIN IMMEDIATE")
+    if _format(db, path) == 0:  # another process may have been faster
+        for statement in _TABLES.split(";"):
+            db.execute(statement)
+        db.execute(f"PRAGMA application_id = {_APPLICATION}")
+        db.execute(f"PRAGMA user_version = {FORMAT}")
+    db.execute("COMMIT")
+
+
+def _use_wal(db: sqlite3.Connection) -> None:
+    deadline = time.monotonic() + _BUSY_S
+    while not _switched_to_wal(db) and time.monotonic() < deadline:
+        time.sleep(0.01)
+
+
+def _switched_to_wal(db: sqlite3.Connection) -> bool:
+    try:
+        db.execute("PRAGMA journal_mode = WAL")
+    except sqlite3.OperationalError as err:  # this pragma does not wait for others by itself
+        if "locked" not in str(err):
+            raise
+        return False
+    return True
+
+
+def _add_missing_columns(db: sqlite3.Connection) -> None:
+    """Add the columns that earlier catalogs of the same format lack."""
+    if not _has_checksums(db):
+        db.execute("BEGIN IMMEDIATE")
+        if not _has_checksums(db):  # another process may have been faster
+            db.execute("ALTER TABLE segments ADD COLUMN checksum TEXT")
+        db.execute("COMMIT")
+
+
+def _has_checksums(db: sqlite3.Connection) -> bool:
+    columns = db.execute("SELECT name FROM pragma_table_info('segments')").fetchall()
+    return not columns or ("checksum",) in map(tuple, columns)
+
+
+def _names(db: sqlite3.Connection) -> list[str]:
+    """Return the sorted names of all sequences."""
     return [row["name"] for row in db.execute("SELECT name FROM sequences ORDER BY name")]
 
 
-def find_sequence(db: sqlite3.Connection, name: str, root: Path) -> SequenceInfo | None:
-    """Return all that is known of a sequence, None where it does not exist."""
+def _find_sequence(db: sqlite3.Connection, name: str, root: Path) -> SequenceInfo | None:
+    """Return a sequence, or None."""
     row = db.execute("SELECT * FROM sequences WHERE name = ?", (name,)).fetchone()
     if row is None:
         return None
@@ -80,11 +366,11 @@ def find_sequence(db: sqlite3.Connection, name: str, root: Path) -> SequenceInfo
     )
 
 
-def bounds(
+def _bounds(
     db: sqlite3.Connection, topic: TopicInfo, columns: Collection[str], root: Path
 ) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
-    """Return the known bounds of the columns asked for, by the path of the segment."""
-    found: dict[AnyPath, dict[str, tuple[Any, Any]]] = defaultdict(dict)
+    """Return the bounds of the requested columns by segment path."""
+    result: dict[AnyPath, dict[str, tuple[Any, Any]]] = defaultdict(dict)
     rows = db.execute(
         "SELECT path, column_path, low, high FROM bounds JOIN segments ON segments.id = segment_id"
         " JOIN topics ON topics.id = topic_id JOIN sequences ON sequences.id = sequence_id"
@@ -93,8 +379,8 @@ def bounds(
     )
     for row in rows:
         if row["column_path"] in columns:
-            found[root / row["path"]][row["column_path"]] = (row["low"], row["high"])
-    return found
+            result[root / row["path"]][row["column_path"]] = (row["low"], row["high"])
+    return result
 
 
 def _session_infos(db: sqlite3.Connection, sequence_id: int) -> tuple[SessionInfo, ...]:
@@ -113,7 +399,7 @@ def _topics(db: sqlite3.Connection, sequence_id: int, name: str, root: Path) -> 
             sequence=name,
             name=row["name"],
             session=row["session_id"],
-            ontology=ontology_of(row),
+            ontology=_ontology_of(row),
             schema=pa.ipc.read_schema(pa.py_buffer(row["arrow_schema"])),
             metadata=json.loads(row["metadata"]),
             created_ns=row["created_ns"],
@@ -124,14 +410,14 @@ def _topics(db: sqlite3.Connection, sequence_id: int, name: str, root: Path) -> 
 
 
 def _segments(db: sqlite3.Connection, sequence_id: int, root: Path) -> dict[int, list[SegmentInfo]]:
-    found: dict[int, list[SegmentInfo]] = defaultdict(list)
+    segments: dict[int, list[SegmentInfo]] = defaultdict(list)
     rows = db.execute(
         "SELECT segments.* FROM segments JOIN topics ON topics.id = topic_id WHERE sequence_id = ?"
         " ORDER BY start_ns, segments.session_id, path",
         (sequence_id,),
     )
     for row in rows:
-        found[row["topic_id"]].append(
+        segments[row["topic_id"]].append(
             SegmentInfo(
                 path=root / row["path"],
                 session=row["session_id"],
@@ -139,10 +425,10 @@ def _segments(db: sqlite3.Connection, sequence_id: int, root: Path) -> dict[int,
                 stored_bytes=row["bytes"],
                 start_ns=row["start_ns"],
                 end_ns=row["end_ns"],
-                checksum=row["checksum"] if "checksum" in row.keys() else None,  # noqa: SIM118 - `in` would look among its values
+                checksum=row["checksum"] if "checksum" in row.keys() else None,  # noqa: SIM118 - `in` searches the values of a row
             )
         )
-    return found
+    return segments
 
 
 def _notes(db: sqlite3.Connection, sequence_id: int) -> tuple[Note, ...]:
@@ -150,105 +436,7 @@ def _notes(db: sqlite3.Connection, sequence_id: int) -> tuple[Note, ...]:
     return tuple(Note(row["topic"], row["message"], row["created_ns"]) for row in rows)
 
 
-def delete_sequence(db: sqlite3.Connection, name: str) -> list[str]:
-    """Remove a sequence and return the paths of its segments."""
-    owner = _sequence_id(db, name)
-    paths = _paths(db, "topic_id IN (SELECT id FROM topics WHERE sequence_id = ?)", owner)
-    db.execute("DELETE FROM sequences WHERE id = ?", (owner,))
-    return paths
-
-
-def delete_topic(db: sqlite3.Connection, sequence_name: str, name: str) -> list[str]:
-    """Remove a topic and return the paths of its segments."""
-    owner = _sequence_id(db, sequence_name)
-    row = db.execute("SELECT id FROM topics WHERE sequence_id = ? AND name = ?", (owner, name)).fetchone()
-    if row is None:
-        raise NotInStore(f"there is no topic {name!r}", where=sequence_name)
-    paths = _paths(db, "topic_id = ?", row["id"])
-    db.execute("DELETE FROM topics WHERE id = ?", (row["id"],))
-    db.execute("DELETE FROM notes WHERE sequence_id = ? AND topic = ?", (owner, name))
-    return paths
-
-
-def delete_session(db: sqlite3.Connection, sequence_name: str, session_id: str) -> list[str]:
-    """Remove a session, with the topics only it wrote to, and return the paths of its segments."""
-    owner = _sequence_id(db, sequence_name)
-    paths = _paths(db, "session_id = ?", session_id)
-    if not db.execute("DELETE FROM sessions WHERE id = ? AND sequence_id = ?", (session_id, owner)).rowcount:
-        raise NotInStore(f"there is no session {session_id!r}", where=sequence_name)
-    db.execute(
-        "DELETE FROM topics WHERE session_id = ? AND id NOT IN (SELECT topic_id FROM segments)", (session_id,)
-    )
-    return paths
-
-
-def delete_notes(db: sqlite3.Connection, sequence_name: str, topic_name: str | None) -> None:
-    """Remove the notes of a sequence, or those of one of its topics."""
-    owner = _sequence_id(db, sequence_name)
-    db.execute("DELETE FROM notes WHERE sequence_id = ? AND topic IS ?", (owner, topic_name))
-
-
-def forget(db: sqlite3.Connection, live: Collection[str]) -> set[str]:
-    """Remove the reservations of sessions that are not live and return the paths of all segments."""
-    for row in db.execute("SELECT session_id FROM reservations").fetchall():
-        if row["session_id"] not in live:
-            db.execute("DELETE FROM reservations WHERE session_id = ?", (row["session_id"],))
-    return set(_paths(db, "?", 1))
-
-
-def _sequence_id(db: sqlite3.Connection, name: str) -> int:
-    row = db.execute("SELECT id FROM sequences WHERE name = ?", (name,)).fetchone()
-    if row is None:
-        raise NotInStore(f"there is no sequence {name!r}")
-    return int(row["id"])
-
-
-def _paths(db: sqlite3.Connection, condition: str, value: int | str) -> list[str]:
-    rows = db.execute(f"SELECT path FROM segments WHERE {condition}", (value,))  # noqa: S608 - the conditions are the constants above
-    return [row["path"] for row in rows]
-
-
-class Claim(Struct, frozen=True):
-    """The sequence as it was when the session began; the commit insists on finding it so."""
-
-    sequence: str
-    if_exists: IfExists
-    sequence_id: int | None
-    sessions: tuple[str, ...]
-    types: Mapping[str, OntologyType]
-    """What its topics hold, for a session that appends to them."""
-
-
-class NewTopic(Struct, frozen=True):
-    """A topic of the session, and its segments under the paths the catalog will know them by."""
-
-    name: str
-    ontology: OntologyType
-    schema: pa.Schema
-    metadata: str
-    created_ns: int
-    segments: Mapping[str, Segment]
-
-
-class NewNote(Struct, frozen=True):
-    """An error to attach."""
-
-    topic: str | None
-    message: str
-    created_ns: int
-
-
-class NewSession(Struct, frozen=True):
-    """All a session wrote."""
-
-    id: str
-    metadata: str
-    created_ns: int
-    topics: tuple[NewTopic, ...]
-    notes: tuple[NewNote, ...]
-
-
-def claim(
+def _claim(
     db: sqlite3.Connection,
     session: str,
     sequence: str,
@@ -256,7 +444,7 @@ def claim(
     *,
     is_live: Callable[[str], bool],
 ) -> Claim:
-    """Note that a session will create or replace a sequence, or refuse because it must not or another does."""
+    """Reserve a sequence for a session that creates or replaces it; see `StoreCatalog.claim`."""
     row = db.execute("SELECT id FROM sequences WHERE name = ?", (sequence,)).fetchone()
     if row is not None and if_exists in {IfExists.FAIL, IfExists.SKIP}:
         raise sequence_exists(sequence)
@@ -268,8 +456,21 @@ def claim(
     return Claim(sequence, if_exists, row["id"], _session_ids(db, row["id"]), types)
 
 
-def create(db: sqlite3.Connection, sequence: str, metadata: str) -> None:
-    """Enter a sequence without a session."""
+def _reserve(db: sqlite3.Connection, session: str, sequence: str, is_live: Callable[[str], bool]) -> None:
+    for other in db.execute("SELECT session_id FROM reservations WHERE sequence = ?", (sequence,)).fetchall():
+        if is_live(other["session_id"]):
+            raise SequenceExists("another run is writing this sequence", where=sequence, hint="wait for it")
+        _release(db, other["session_id"])
+    db.execute("INSERT INTO reservations VALUES (?, ?)", (session, sequence))
+
+
+def _release(db: sqlite3.Connection, session: str) -> None:
+    """Delete the reservation of a session."""
+    db.execute("DELETE FROM reservations WHERE session_id = ?", (session,))
+
+
+def _create(db: sqlite3.Connection, sequence: str, metadata: str) -> None:
+    """Insert a sequence without a session."""
     if db.execute("SELECT 1 FROM sequences WHERE name = ?", (sequence,)).fetchone() is not None:
         raise sequence_exists(sequence)
     db.execute(
@@ -278,8 +479,8 @@ def create(db: sqlite3.Connection, sequence: str, metadata: str) -> None:
     )
 
 
-def note(db: sqlite3.Connection, sequence: str, new: NewNote) -> None:
-    """Attach a note to a sequence that is there."""
+def _note(db: sqlite3.Connection, sequence: str, new: NewNote) -> None:
+    """Attach a note to an existing sequence."""
     entered = db.execute(
         "INSERT INTO notes (sequence_id, topic, message, created_ns)"
         " SELECT id, ?, ?, ? FROM sequences WHERE name = ?",
@@ -289,51 +490,38 @@ def note(db: sqlite3.Connection, sequence: str, new: NewNote) -> None:
         raise NotInStore(f"there is no sequence {sequence!r}")
 
 
-def release(db: sqlite3.Connection, session: str) -> None:
-    """Give the name back."""
-    db.execute("DELETE FROM reservations WHERE session_id = ?", (session,))
-
-
-def commit(db: sqlite3.Connection, claimed: Claim, new: NewSession) -> list[str]:
-    """Enter a session and return the paths of the segments it replaces."""
+def _commit(db: sqlite3.Connection, claimed: Claim, new: NewSession) -> list[str]:
+    """Insert a session and return the paths of the segments it replaces."""
     replaced = _check_unchanged(db, claimed)
     sequence_id = _sequence(db, claimed, new)
     db.execute(
         "INSERT INTO sessions VALUES (?, ?, ?, ?, ?)",
         (new.id, sequence_id, new.metadata, new.created_ns, time.time_ns()),
     )
-    held = _types(db, sequence_id)
+    existing = _types(db, sequence_id)
     for topic in new.topics:
-        if topic.name in held:
-            check_same_type(held[topic.name], topic.ontology, where=topic.name)
+        if topic.name in existing:
+            check_same_type(existing[topic.name], topic.ontology, where=topic.name)
         _enter_segments(db, _topic(db, sequence_id, new.id, topic), new.id, topic.segments)
     db.executemany(
         "INSERT INTO notes (sequence_id, topic, message, created_ns) VALUES (?, ?, ?, ?)",
         [(sequence_id, note.topic, note.message, note.created_ns) for note in new.notes],
     )
-    release(db, new.id)
+    _release(db, new.id)
     return replaced
 
 
-def _reserve(db: sqlite3.Connection, session: str, sequence: str, is_live: Callable[[str], bool]) -> None:
-    for other in db.execute("SELECT session_id FROM reservations WHERE sequence = ?", (sequence,)).fetchall():
-        if is_live(other["session_id"]):
-            raise SequenceExists("another run is writing this sequence", where=sequence, hint="wait for it")
-        release(db, other["session_id"])
-    db.execute("INSERT INTO reservations VALUES (?, ?)", (session, sequence))
-
-
 def _check_unchanged(db: sqlite3.Connection, claimed: Claim) -> list[str]:
-    """Return the segments to be replaced, or refuse because somebody else changed the sequence meanwhile."""
+    """Return the segments to replace, or raise if another session changed the sequence since the claim."""
     row = db.execute("SELECT id FROM sequences WHERE name = ?", (claimed.sequence,)).fetchone()
     now = None if row is None else row["id"]
     replaces = claimed.if_exists is IfExists.REPLACE
     if now is not None and claimed.if_exists in {IfExists.FAIL, IfExists.SKIP}:
         raise sequence_exists(claimed.sequence)
     if claimed.sequence_id is not None and now != claimed.sequence_id:
-        raise changed(claimed.sequence)
+        raise sequence_changed(claimed.sequence)
     if replaces and now is not None and _session_ids(db, now) != claimed.sessions:
-        raise changed(claimed.sequence)
+        raise sequence_changed(claimed.sequence)
     if not replaces or now is None:
         return []
     paths = db.execute(
@@ -404,323 +592,70 @@ def _session_ids(db: sqlite3.Connection, sequence_id: int) -> tuple[str, ...]:
 
 def _types(db: sqlite3.Connection, sequence_id: int) -> dict[str, OntologyType]:
     rows = db.execute("SELECT * FROM topics WHERE sequence_id = ?", (sequence_id,))
-    return {row["name"]: ontology_of(row) for row in rows}
+    return {row["name"]: _ontology_of(row) for row in rows}
 
 
-def ontology_of(row: sqlite3.Row) -> OntologyType:
-    """Return the type a row of `topics` describes."""
+def _ontology_of(row: sqlite3.Row) -> OntologyType:
+    """Return the ontology type of a row of `topics`."""
     columns = list(pa.ipc.read_schema(pa.py_buffer(row["arrow_schema"])))[1:]
     return OntologyType(
         row["ontology_tag"], pa.struct(columns), SerializationFormat(row["serialization_format"])
     )
 
 
-def changed(sequence: str) -> SinkError:
-    """Return the error for a sequence that is not what it was when the session began."""
-    return SinkError("another run changed the sequence meanwhile", where=sequence, hint="run again")
+def _delete_sequence(db: sqlite3.Connection, name: str) -> list[str]:
+    """Remove a sequence and return the paths of its segments."""
+    owner = _sequence_id(db, name)
+    paths = _paths(db, "topic_id IN (SELECT id FROM topics WHERE sequence_id = ?)", owner)
+    db.execute("DELETE FROM sequences WHERE id = ?", (owner,))
+    return paths
 
 
-FORMAT = 1
-"""Counts up when a catalog can no longer be read by what was released before."""
-
-_APPLICATION = 0x6D6F7361  # "mosa", which `file catalog.sqlite` shows
-_BUSY_S = 30.0
-
-_TABLES = """
-CREATE TABLE sequences (
-    id INTEGER PRIMARY KEY AUTOINCREMENT,
-    name TEXT NOT NULL UNIQUE,
-    metadata TEXT NOT NULL,
-    created_ns INTEGER NOT NULL
-);
-CREATE TABLE sessions (
-    id TEXT PRIMARY KEY,
-    sequence_id INTEGER NOT NULL REFERENCES sequences ON DELETE CASCADE,
-    metadata TEXT NOT NULL,
-    created_ns INTEGER NOT NULL,
-    completed_ns INTEGER NOT NULL
-);
-CREATE INDEX sessions_of_sequence ON sessions (sequence_id);
-CREATE TABLE topics (
-    id INTEGER PRIMARY KEY,
-    sequence_id INTEGER NOT NULL REFERENCES sequences ON DELETE CASCADE,
-    session_id TEXT NOT NULL,
-    name TEXT NOT NULL,
-    ontology_tag TEXT NOT NULL,
-    serialization_format TEXT NOT NULL,
-    fingerprint TEXT NOT NULL,
-    arrow_schema BLOB NOT NULL,
-    metadata TEXT NOT NULL,
-    created_ns INTEGER NOT NULL,
-    UNIQUE (sequence_id, name)
-);
-CREATE TABLE segments (
-    id INTEGER PRIMARY KEY,
-    topic_id INTEGER NOT NULL REFERENCES topics ON DELETE CASCADE,
-    session_id TEXT NOT NULL REFERENCES sessions ON DELETE CASCADE,
-    path TEXT NOT NULL UNIQUE,
-    rows INTEGER NOT NULL,
-    bytes INTEGER NOT NULL,
-    start_ns INTEGER NOT NULL,
-    end_ns INTEGER NOT NULL,
-    checksum TEXT
-);
-CREATE INDEX segments_of_topic ON segments (topic_id, start_ns);
-CREATE INDEX segments_of_session ON segments (session_id);
-CREATE TABLE bounds (
-    segment_id INTEGER NOT NULL REFERENCES segments ON DELETE CASCADE,
-    column_path TEXT NOT NULL,
-    low,
-    high,
-    PRIMARY KEY (segment_id, column_path)
-) WITHOUT ROWID;
-CREATE TABLE notes (
-    id INTEGER PRIMARY KEY,
-    sequence_id INTEGER NOT NULL REFERENCES sequences ON DELETE CASCADE,
-    topic TEXT,
-    message TEXT NOT NULL,
-    created_ns INTEGER NOT NULL
-);
-CREATE INDEX notes_of_sequence ON notes (sequence_id);
-CREATE TABLE reservations (
-    session_id TEXT PRIMARY KEY,
-    sequence TEXT NOT NULL
-);
-"""
+def _delete_topic(db: sqlite3.Connection, sequence_name: str, name: str) -> list[str]:
+    """Remove a topic and return the paths of its segments."""
+    owner = _sequence_id(db, sequence_name)
+    row = db.execute("SELECT id FROM topics WHERE sequence_id = ? AND name = ?", (owner, name)).fetchone()
+    if row is None:
+        raise NotInStore(f"there is no topic {name!r}", where=sequence_name)
+    paths = _paths(db, "topic_id = ?", row["id"])
+    db.execute("DELETE FROM topics WHERE id = ?", (row["id"],))
+    db.execute("DELETE FROM notes WHERE sequence_id = ? AND topic = ?", (owner, name))
+    return paths
 
 
-class Catalog:
-    """The `Records` in the SQLite file at `path`; `create` makes it where it is not there."""
-
-    def __init__(self, path: Path, *, create: bool) -> None:
-        self.path = path
-        self.root = path.parent
-        with explained(path):
-            if create:
-                path.parent.mkdir(parents=True, exist_ok=True)
-            elif not path.is_file():
-                raise SinkError("there is no store here", where=str(path.parent), hint="check the path")
-            self._prepare(create=create)
-
-    @contextmanager
-    def read(self) -> Generator[sqlite3.Connection, None, None]:
-        """Give a connection that sees one state of the catalog throughout."""
-        with self._task("BEGIN", mode="ro") as db:
-            yield db
-
-    @contextmanager
-    def write(self, *, lasting: bool = True) -> Generator[sqlite3.Connection, None, None]:
-        """Give a connection inside a transaction: all of it happens, or nothing; a power cut may undo what need not last."""
-        with self._task("BEGIN IMMEDIATE", mode="rw", lasting=lasting) as db:
-            yield db
-
-    def keep_open(self) -> sqlite3.Connection:
-        """Give an idle connection: closing the last one costs a checkpoint, closing another while it is open does not."""
-        with explained(self.path):
-            return self._connect("rw")
-
-    def claim(
-        self, session: str, sequence: str, if_exists: IfExists, *, is_live: Callable[[str], bool]
-    ) -> Claim:
-        """See `Records.claim`; a claim means nothing once its writer is dead, as it is after a power cut."""
-        with self.write(lasting=False) as db:
-            return claim(db, session, sequence, if_exists, is_live=is_live)
-
-    def commit(self, claimed: Claim, new: NewSession) -> list[str]:
-        """See `Records.commit`."""
-        with self.write() as db:
-            return commit(db, claimed, new)
-
-    def release(self, session: str, sequence: str) -> None:  # noqa: ARG002 - the session says it all
-        """See `Records.release`."""
-        with self.write(lasting=False) as db:
-            release(db, session)
-
-    def create(self, sequence: str, metadata: str) -> None:
-        """See `Records.create`."""
-        with self.write() as db:
-            create(db, sequence, metadata)
-
-    def note(self, sequence: str, new: NewNote) -> None:
-        """See `Records.note`."""
-        with self.write() as db:
-            note(db, sequence, new)
-
-    def names(self) -> list[str]:
-        """See `Records.names`."""
-        with self.read() as db:
-            return names(db)
-
-    def sequence(self, name: str) -> SequenceInfo | None:
-        """See `Records.sequence`."""
-        with self.read() as db:
-            return find_sequence(db, name, self.root)
-
-    def sequences(self) -> tuple[SequenceInfo, ...]:
-        """See `Records.sequences`."""
-        with self.read() as db:
-            found = (find_sequence(db, name, self.root) for name in names(db))
-            return tuple(info for info in found if info is not None)
-
-    def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
-        """See `Records.bounds`."""
-        with self.read() as db:
-            return bounds(db, topic, columns, self.root)
-
-    def delete_sequence(self, sequence: str) -> list[str]:
-        """See `Records.delete_sequence`."""
-        with self.write() as db:
-            return delete_sequence(db, sequence)
-
-    def delete_topic(self, sequence: str, topic: str) -> list[str]:
-        """See `Records.delete_topic`."""
-        with self.write() as db:
-            return delete_topic(db, sequence, topic)
-
-    def delete_session(self, sequence: str, session: str) -> list[str]:
-        """See `Records.delete_session`."""
-        with self.write() as db:
-            return delete_session(db, sequence, session)
-
-    def delete_notes(self, sequence: str, topic: str | None) -> None:
-        """See `Records.delete_notes`."""
-        with self.write() as db:
-            delete_notes(db, sequence, topic)
-
-    def forget(self, live: Collection[str]) -> set[str]:
-        """See `Records.forget`."""
-        with self.write() as db:
-            return forget(db, live)
-
-    @contextmanager
-    def _task(
-        self, begin: str, *, mode: str, lasting: bool = True
-    ) -> Generator[sqlite3.Connection, None, None]:
-        with explained(self.path), closing(self._connect(mode)) as db:
-            if not lasting:
-                # A WAL stays whole then, and its last transactions may be missing.
-                db.execute("PRAGMA synchronous = NORMAL")
-            db.execute(begin)
-            try:
-                yield db
-            except BaseException:
-                db.rollback()
-                raise
-            db.commit()
-
-    def _connect(self, mode: str) -> sqlite3.Connection:
-        try:
-            return _connect(self.path, f"mode={mode}")
-        except sqlite3.OperationalError:
-            if mode != "ro" or not self.path.is_file() or os.access(self.path.parent, os.W_OK):
-                raise
-            return _connect(self.path, "immutable=1")  # a read-only medium cannot hold the files of the WAL
-
-    def _prepare(self, *, create: bool) -> None:
-        if create and not self.path.exists():
-            self._create_atomically()
-        with closing(self._connect("rw" if create else "ro")) as db:
-            if create:
-                _initialize(db, self.path)
-            version = _format(db, self.path)
-            if create and version == FORMAT:  # a catalog of a newer format must not be changed
-                _add_missing_columns(db)
-        if version > FORMAT:
-            raise SinkError(
-                f"the store has format {version}, this version supports up to {FORMAT}",
-                where=str(self.path.parent),
-                hint="upgrade mosaico-ingest",
-            )
-        if version == 0:
-            raise SinkError("there is no store here", where=str(self.path.parent), hint="check the path")
-
-    def _create_atomically(self) -> None:
-        """Create the catalog under its name only when it is initialized, so that no process sees half of it."""
-        draft = self.path.with_name(f".{self.path.name}-{secrets.token_hex(8)}")
-        try:
-            with closing(_connect(draft, "mode=rwc")) as db:
-                _initialize(db, draft)
-            try:
-                os.link(draft, self.path)
-            except FileExistsError:
-                pass  # another process created it
-            except OSError:  # the file system has no hard links
-                if not self.path.exists():
-                    draft.replace(self.path)
-        finally:
-            for file in self.path.parent.glob(f"{draft.name}*"):
-                file.unlink(missing_ok=True)
+def _delete_session(db: sqlite3.Connection, sequence_name: str, session_id: str) -> list[str]:
+    """Remove a session, with the topics only it wrote to, and return the paths of its segments."""
+    owner = _sequence_id(db, sequence_name)
+    paths = _paths(db, "session_id = ?", session_id)
+    if not db.execute("DELETE FROM sessions WHERE id = ? AND sequence_id = ?", (session_id, owner)).rowcount:
+        raise NotInStore(f"there is no session {session_id!r}", where=sequence_name)
+    db.execute(
+        "DELETE FROM topics WHERE session_id = ? AND id NOT IN (SELECT topic_id FROM segments)", (session_id,)
+    )
+    return paths
 
 
-_STAMPS = ("user_version", "application_id")
+def _delete_notes(db: sqlite3.Connection, sequence_name: str, topic_name: str | None) -> None:
+    """Remove the notes of a sequence, or those of one of its topics."""
+    owner = _sequence_id(db, sequence_name)
+    db.execute("DELETE FROM notes WHERE sequence_id = ? AND topic IS ?", (owner, topic_name))
 
 
-def _connect(path: Path, query: str) -> sqlite3.Connection:
-    uri = f"{path.absolute().as_uri()}?{query}"
-    db = sqlite3.connect(uri, uri=True, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
-    try:
-        db.row_factory = sqlite3.Row
-        db.execute("PRAGMA foreign_keys = ON")
-        db.execute("PRAGMA synchronous = FULL")
-        db.execute("SELECT count(*) FROM sqlite_master")
-    except sqlite3.Error:
-        db.close()
-        raise
-    return db
+def _forget(db: sqlite3.Connection, live: Collection[str]) -> set[str]:
+    """Remove the reservations of sessions that are not live and return the paths of all segments."""
+    for row in db.execute("SELECT session_id FROM reservations").fetchall():
+        if row["session_id"] not in live:
+            db.execute("DELETE FROM reservations WHERE session_id = ?", (row["session_id"],))
+    return set(_paths(db, "?", 1))
 
 
-def _format(db: sqlite3.Connection, path: Path) -> int:
-    """Return the format of a catalog, 0 for an empty file.
-
-    Raises:
-        SinkError: The file is another database.
-    """
-    version, application = (db.execute(f"PRAGMA {name}").fetchone()[0] for name in _STAMPS)
-    tables = db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
-    if application != _APPLICATION and (application or version or tables):
-        raise SinkError("the file is not the catalog of a store", where=str(path), hint="check the path")
-    return int(version)
+def _sequence_id(db: sqlite3.Connection, name: str) -> int:
+    row = db.execute("SELECT id FROM sequences WHERE name = ?", (name,)).fetchone()
+    if row is None:
+        raise NotInStore(f"there is no sequence {name!r}")
+    return int(row["id"])
 
 
-def _initialize(db: sqlite3.Connection, path: Path) -> None:
-    """Create the tables if the file is empty."""
-    if _format(db, path) != 0:
-        return
-    _use_wal(db)
-    db.execute("BEGIN IMMEDIATE")
-    if _format(db, path) == 0:  # another process may have been faster
-        for statement in _TABLES.split(";"):
-            db.execute(statement)
-        db.execute(f"PRAGMA application_id = {_APPLICATION}")
-        db.execute(f"PRAGMA user_version = {FORMAT}")
-    db.execute("COMMIT")
-
-
-def _add_missing_columns(db: sqlite3.Connection) -> None:
-    """Add the columns that earlier catalogs of the same format lack."""
-    if not _has_checksums(db):
-        db.execute("BEGIN IMMEDIATE")
-        if not _has_checksums(db):  # another process may have been faster
-            db.execute("ALTER TABLE segments ADD COLUMN checksum TEXT")
-        db.execute("COMMIT")
-
-
-def _has_checksums(db: sqlite3.Connection) -> bool:
-    columns = db.execute("SELECT name FROM pragma_table_info('segments')").fetchall()
-    return not columns or ("checksum",) in map(tuple, columns)
-
-
-def _use_wal(db: sqlite3.Connection) -> None:
-    deadline = time.monotonic() + _BUSY_S
-    while not _switched_to_wal(db) and time.monotonic() < deadline:
-        time.sleep(0.01)
-
-
-def _switched_to_wal(db: sqlite3.Connection) -> bool:
-    try:
-        db.execute("PRAGMA journal_mode = WAL")
-    except sqlite3.OperationalError as err:  # this pragma does not wait for others by itself
-        if "locked" not in str(err):
-            raise
-        return False
-    return True
+def _paths(db: sqlite3.Connection, condition: str, value: int | str) -> list[str]:
+    rows = db.execute(f"SELECT path FROM segments WHERE {condition}", (value,))  # noqa: S608 - the conditions are constants of this module
+    return [row["path"] for row in rows]

@@ -1,4 +1,4 @@
-"""This file names the content of rows: one checksum of their values, whatever files, row groups and batches they lie in."""
+"""A checksum of row values that does not depend on files, row groups and batches."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ __all__ = ["ColumnMaker", "ContentHash", "column_makers", "combined"]
 
 
 def column_makers(schema: pa.Schema) -> tuple[ColumnMaker, ...]:
-    """Return how to make the state that each column of rows is hashed with."""
+    """Return a factory of the hash state of each column."""
     return tuple(_maker(field.type) for field in schema)
 
 
 class ContentHash:
-    """XXH3 (128 bits) over the columns of rows that come one table after the other.
+    """XXH3 (128 bits) over the columns of successive tables.
 
-    Of each column count: which values are null, the lengths of lists and texts, and the bytes of what is not null. What
-    lies in memory behind a null, how rows are cut into chunks, and how they are encoded in a file do not.
+    The checksum of a column covers which values are null, the lengths of lists and texts, and the bytes of values that
+    are not null. It does not depend on the memory behind nulls, on the division into chunks, or on the file encoding.
     """
 
     def __init__(self, makers: tuple[ColumnMaker, ...]) -> None:
         self._columns = [make() for make in makers]
 
     def add(self, rows: pa.Table | pa.RecordBatch) -> None:
-        """Take the rows that come next."""
+        """Add the next rows."""
         for column, values in zip(self._columns, rows.columns, strict=True):
             for chunk in values.chunks if isinstance(values, pa.ChunkedArray) else (values,):
                 if len(chunk):
@@ -42,32 +42,32 @@ class ContentHash:
 
 
 def combined(checksums: Iterable[str | None]) -> str | None:
-    """Return one checksum for the rows of several segments, None without any or where one is not known."""
-    all_of_them = list(checksums)
-    known = [one for one in all_of_them if one is not None]
-    if not known or len(known) < len(all_of_them):
+    """Return one checksum for the rows of several segments, or None if there are none or one is missing."""
+    values = list(checksums)
+    present = [value for value in values if value is not None]
+    if not present or len(present) < len(values):
         return None
-    return known[0] if len(known) == 1 else xxh3_128("".join(known).encode()).hexdigest()
+    return present[0] if len(present) == 1 else xxh3_128("".join(present).encode()).hexdigest()
 
 
 class _Column(Protocol):
     def add(self, array: pa.Array[Any]) -> None:
-        """Take one chunk, which is not empty."""
+        """Add one chunk that is not empty."""
         ...
 
     def add_nulls(self, count: int) -> None:
-        """Take a chunk in which every value is null."""
+        """Add a chunk in which every value is null."""
         ...
 
     def digest(self) -> bytes: ...
 
 
 ColumnMaker: TypeAlias = Callable[[], _Column]
-"""Makes the state that one column is hashed with."""
+"""Creates the hash state of one column."""
 
 
 class _Bytes:
-    """Bytes that come in pieces; most columns of most files never have any, and then no state to hash with either."""
+    """A hash of bytes in pieces, created with the first piece, since many columns have no bytes."""
 
     def __init__(self) -> None:
         self._hash: Any = None
@@ -87,7 +87,7 @@ class _Bytes:
 
 
 class _Nulls:
-    """Which values are null, as the lengths of runs: first of values, then of nulls, and so on."""
+    """The positions of nulls, as the lengths of alternating runs of values and nulls."""
 
     def __init__(self) -> None:
         self._hash = _Bytes()
@@ -95,7 +95,7 @@ class _Nulls:
         self._run = 0
 
     def add(self, array: pa.Array[Any]) -> int:
-        """Take a chunk; return how many of its values are null."""
+        """Add a chunk and return its number of nulls."""
         nulls = array.null_count
         if not nulls or nulls == len(array):
             self.extend_by(len(array), valid=not nulls)
@@ -106,7 +106,7 @@ class _Nulls:
         return nulls
 
     def present(self, array: pa.Array[Any]) -> Any:  # noqa: ANN401 - any Arrow array; the stubs have no common base
-        """Take a chunk; return its values without the nulls, None where all are null."""
+        """Add a chunk and return its values without nulls, or None if all are null."""
         nulls = self.add(array)
         if nulls == len(array):
             return None
@@ -116,7 +116,7 @@ class _Nulls:
         return self._hash.digest(self._run.to_bytes(8, "little"))
 
     def extend_by(self, run: int, *, valid: bool) -> None:
-        """Append one run, as most chunks are."""
+        """Append one run; most chunks are one run."""
         if valid is self._valid:
             self._run += run
         else:
@@ -124,7 +124,7 @@ class _Nulls:
             self._valid, self._run = valid, run
 
     def _extend(self, runs: NDArray[np.int64], *, valid: bool) -> None:
-        """Append runs, the first of which is of values or not; a run is known once the next one begins."""
+        """Append alternating runs; the last one stays open because the next chunk may continue it."""
         if valid is self._valid:
             runs[0] += self._run
         else:
@@ -135,7 +135,7 @@ class _Nulls:
 
 
 class _Numbers:
-    """Values of one width."""
+    """Values of fixed width."""
 
     def __init__(self) -> None:
         self._nulls = _Nulls()
@@ -155,7 +155,7 @@ class _Numbers:
 
 
 class _Texts:
-    """Values of any length."""
+    """Values of variable length."""
 
     def __init__(self, offset: type[np.int32 | np.int64]) -> None:
         self._nulls = _Nulls()
@@ -181,7 +181,7 @@ class _Texts:
 
 
 class _Lists:
-    """Lists of any length, or of one."""
+    """Lists of variable or fixed length."""
 
     def __init__(self, items: ColumnMaker) -> None:
         self._nulls = _Nulls()
@@ -206,7 +206,7 @@ class _Lists:
 
 
 class _Structs:
-    """Fields side by side; those of a null are null."""
+    """Structs; the fields of a null struct are null."""
 
     def __init__(self, fields: tuple[ColumnMaker, ...]) -> None:
         self._nulls = _Nulls()
@@ -231,7 +231,7 @@ class _Structs:
 
 
 class _Converted:
-    """Values that count as those of another type."""
+    """Values that are hashed after a cast to another type."""
 
     def __init__(self, kind: pa.DataType, make: ColumnMaker) -> None:
         self._kind = kind
@@ -248,7 +248,7 @@ class _Converted:
 
 
 def _maker(kind: Any) -> ColumnMaker:  # noqa: ANN401 - any Arrow type; the stubs have no common base with children
-    """Return how to make the state of a column of a type."""
+    """Return the factory of the hash state for a type."""
     if isinstance(kind, pa.StructType):
         return partial(_Structs, tuple(_maker(field.type) for field in kind))
     if isinstance(kind, pa.ListType | pa.LargeListType | pa.FixedSizeListType):

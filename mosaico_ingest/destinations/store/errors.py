@@ -1,4 +1,4 @@
-"""This file turns errors of the disk, SQLite and Arrow into a SinkError of one line."""
+"""Errors of a store: the translation of disk, SQLite and Arrow errors into SinkError."""
 
 from __future__ import annotations
 
@@ -14,36 +14,41 @@ from mosaico_ingest.errors import SinkError, SinkUnavailable, Unreachable
 from mosaico_ingest.remote import AnyPath, is_transient
 from mosaico_ingest.remote import explained as unreachable
 
-__all__ = ["NotInStore", "explained"]
+__all__ = ["NotInStore", "explained", "sequence_changed"]
 
 _HINTS = {
     errno.ENOSPC: "free some space, or choose another target.store",
-    errno.EDQUOT: "the quota is used up; choose another target.store",
-    errno.EROFS: "choose a target.store that can be written",
-    errno.EACCES: "choose a target.store that can be written",
-    errno.EPERM: "choose a target.store that can be written",
-    errno.EEXIST: "a file is in the way; choose another target.store",
-    errno.ENOTDIR: "a file is in the way; choose another target.store",
+    errno.EDQUOT: "free some quota, or choose another target.store",
+    errno.EROFS: "choose a target.store that you can write to",
+    errno.EACCES: "choose a target.store that you can write to",
+    errno.EPERM: "choose a target.store that you can write to",
+    errno.EEXIST: "remove the file at this path, or choose another target.store",
+    errno.ENOTDIR: "remove the file at this path, or choose another target.store",
     errno.EMFILE: "raise the limit of open files (ulimit -n)",
-    errno.ENOENT: "the store was changed by something else; check it and run again",
+    errno.ENOENT: "check whether another program changes the store, then run again",
 }
 
 
 class NotInStore(SinkError):  # noqa: N818 - the condition, as in `errors`
-    """There is no sequence, topic or session of that name."""
+    """The store has no sequence, topic or session of this name."""
+
+
+def sequence_changed(sequence: str) -> SinkError:
+    """Return the error for a sequence that changed after the session started."""
+    return SinkError("another run changed the sequence meanwhile", where=sequence, hint="run again")
 
 
 @contextmanager
 def explained(where: AnyPath | str) -> Generator[None, None, None]:
-    """Raise SinkError, with the place and a remedy, for what the disk, SQLite or Arrow refuses inside."""
+    """Raise SinkError, with the location and a hint, for errors of the disk, SQLite or Arrow inside."""
     try:
         yield
     except Unreachable as err:
         raise SinkUnavailable(err.what, where=err.where, hint=err.hint) from err
     except OSError as err:
         if is_transient(err):
-            lost = unreachable(err, str(where))
-            raise SinkUnavailable(lost.what, where=lost.where, hint=lost.hint) from err
+            cause = unreachable(err, str(where))
+            raise SinkUnavailable(cause.what, where=cause.where, hint=cause.hint) from err
         code = err.errno or 0
         what = os.strerror(code) if code else _first_line(err)
         raise SinkError(what, where=str(err.filename or where), hint=_HINTS.get(code)) from err
@@ -52,7 +57,7 @@ def explained(where: AnyPath | str) -> Generator[None, None, None]:
     except sqlite3.OperationalError as err:
         raise _explain(err, str(where)) from err
     except sqlite3.Error as err:
-        raise SinkError(f"the catalog refuses: {_first_line(err)}", where=str(where)) from err
+        raise SinkError(f"the catalog cannot be used: {_first_line(err)}", where=str(where)) from err
 
 
 def _explain(err: sqlite3.OperationalError, where: str) -> SinkError:
@@ -63,7 +68,7 @@ def _explain(err: sqlite3.OperationalError, where: str) -> SinkError:
         return SinkError("no space left on the device", where=where, hint=_HINTS[errno.ENOSPC])
     if "readonly" in text or "unable to open" in text:
         return SinkError(f"the catalog cannot be written: {text}", where=where, hint=_HINTS[errno.EROFS])
-    return SinkError(f"the catalog refuses: {text}", where=where)
+    return SinkError(f"the catalog cannot be used: {text}", where=where)
 
 
 def _first_line(err: BaseException) -> str:

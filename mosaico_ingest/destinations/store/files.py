@@ -1,22 +1,23 @@
-"""Files of a store: paths, publication, writer leases, on a disk or behind a URL.
+"""The files of a store: paths, publication and writer leases, on a disk or behind a URL.
 
-SQLite takes the lock, because it does so on every platform, also between threads of one process, and
-without passing it on to a forked child.
+On a disk:
 
-catalog.sqlite
+    catalog.sqlite
     segments/<sequence>/<topic…>/<session>-<number>.parquet
-    staging/<session>/                       what an open session has written so far, and its lock
+    staging/<session>/                       the unpublished segments of an open session, and its lock
 
-A part of a name keeps its letters, digits, `_` and `-`; every other byte becomes `%XX`, so no name leads
-out of its folder, and a part too long for a file system ends in a hash.
+Behind a URL:
 
-store.json                               that there is a store, and its format
-    catalog/<sequence>.json                  all that is known of a sequence
+    store.json                               the format of the store
+    catalog/<sequence>.json                  the catalog entry of a sequence
     segments/<sequence>/<topic…>/<session>-<number>.parquet
-    claims/<sequence>/<session>              who is writing a sequence
-    sessions/<session>                       that a writer lives: written again and again while it does
+    claims/<sequence>/<session>              the claim of a session on a sequence
+    sessions/<session>                       rewritten regularly while the session's writer is alive
 
-Nothing can be renamed there, so segments are written in their places; only those a catalog entry names count.
+Objects cannot be renamed, so segments are written at their final paths; only segments in a catalog entry are valid.
+
+A path component keeps letters, digits, `_` and `-` of a name. Every other byte becomes `%XX`, so that no name leads out
+of its folder, and a component that is too long for a file system ends in a hash.
 """
 
 from __future__ import annotations
@@ -47,10 +48,10 @@ from mosaico_ingest.remote import AnyPath, RemotePath
 
 __all__ = [
     "MARKER",
-    "Bucket",
     "Heartbeat",
-    "Layout",
     "Lease",
+    "LocalFiles",
+    "ObjectFiles",
     "create",
     "encoded",
     "footer",
@@ -59,12 +60,15 @@ __all__ = [
     "new_session_id",
     "opened",
     "send_ahead",
-    "settle",
+    "sync",
 ]
 
 
 class Lease:
-    """An exclusive lock on the file at `path`, held until `release` or the end of the process."""
+    """An exclusive lock on the file at `path`, held until `release` or the end of the process.
+
+    SQLite's lock works on every platform and between threads of one process, and a forked child does not inherit it.
+    """
 
     def __init__(self, path: Path) -> None:
         self._db = sqlite3.connect(path, timeout=0, isolation_level=None, check_same_thread=False)
@@ -91,34 +95,34 @@ def is_live(path: Path) -> bool:
 
 
 def create(path: AnyPath) -> pa.NativeFile:
-    """Open a new file for writing; behind a URL it is sent while it is written, and there once it is closed."""
+    """Open a new file for writing; a file behind a URL exists once it is closed."""
     return path.open_output() if isinstance(path, RemotePath) else pa.OSFile(str(path), "wb")
 
 
-def send_ahead(file: pa.NativeFile, begin: int, end: int) -> None:
-    """Have the system begin to bring a stretch of a file to the disk, so that `settle` waits for less; on Linux it does."""
+def send_ahead(file: pa.NativeFile, start: int, end: int) -> None:
+    """Ask the system to start writing a range of a file to the disk, so that `sync` waits for less; has an effect on Linux."""
     if isinstance(file, pa.OSFile) and hasattr(os, "posix_fadvise"):
-        # Linux writes dirty pages when it is told that they are not needed, without anyone waiting for it. It is a
-        # hint: a file system that takes none is no reason to stop, and a disk that fails says so to `settle`.
+        # Linux starts writing dirty pages that are not needed, without blocking. This is a hint, so errors are
+        # ignored; `sync` reports errors of the disk.
         with suppress(OSError):
-            os.posix_fadvise(file.fileno(), begin, end - begin, os.POSIX_FADV_DONTNEED)
+            os.posix_fadvise(file.fileno(), start, end - start, os.POSIX_FADV_DONTNEED)
 
 
-def settle(path: AnyPath) -> None:
-    """Wait until a closed file is there to stay; a store behind a URL has said so already."""
+def sync(path: AnyPath) -> None:
+    """Wait until a closed file is on the disk; a closed file behind a URL is already stored."""
     if not isinstance(path, RemotePath):
         fsync(path)
 
 
 def opened(path: AnyPath, **options: Any) -> pq.ParquetFile:  # noqa: ANN401 - those of `pq.ParquetFile`
-    """Open a Parquet file for reading; behind a URL the column chunks of a row group are asked for together."""
+    """Open a Parquet file for reading; behind a URL, the column chunks of a row group are requested together."""
     if isinstance(path, RemotePath):
         return pq.ParquetFile(path.open_input(), pre_buffer=True, **options)
     return pq.ParquetFile(path, **options)
 
 
 def footer(path: AnyPath) -> pq.FileMetaData:
-    """Return what a Parquet file says of itself."""
+    """Return the footer of a Parquet file."""
     with opened(path) as file:
         return file.metadata
 
@@ -129,8 +133,8 @@ _ATTEMPTS = 5
 _CROCKFORD = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
 
 
-class Layout(Struct, frozen=True):
-    """The paths of the store at `root`."""
+class LocalFiles(Struct, frozen=True):
+    """The files of the store in the folder `root`; see `Files`."""
 
     root: Path
 
@@ -162,32 +166,32 @@ class Layout(Struct, frozen=True):
         parts = (sequence, *topic.strip("/").split("/"))
         return Path(self.root, "segments", *map(encoded, parts))
 
-    def staged(self, session: str, sequence: str, topic: str, number: int) -> Path:  # noqa: ARG002 - it is moved later
+    def staged(self, session: str, sequence: str, topic: str, number: int) -> Path:  # noqa: ARG002 - the file is moved later
         """Return where a session writes a segment before it is published."""
         return Path(self.root, "staging", session, f"{session}-{number:04}.parquet")
 
     def relative(self, path: AnyPath) -> str:
-        """Return how the catalog spells a segment's path."""
+        """Return a segment's path relative to the store, as in the catalog."""
         return Path(str(path)).relative_to(self.root).as_posix()
 
     def begin(self, session: str) -> Lease:
-        """Make a session's folder, and lock it for as long as its writer lives."""
+        """Create a session's folder and lock it while its writer is alive."""
         with explained(self.staging):
             self.session(session).mkdir(parents=True)
             return Lease(self.lock(session))
 
     def is_live(self, session: str) -> bool:
-        """Say whether a process holds the session's lock."""
+        """Return whether a process holds the session's lock."""
         return is_live(self.lock(session))
 
     def in_use(self, session: str, grace_s: float) -> bool:
-        """Say whether the session's lock is held, or its folder so young that it may be about to be."""
+        """Return whether the session's lock is held, or its folder is so new that it may be locked soon."""
         folder = self.session(session)
         young = folder.exists() and time.time() - folder.stat().st_mtime < grace_s
         return young or self.is_live(session)
 
     def open_sessions(self) -> list[str]:
-        """Return the sessions that have a staging folder, live or not."""
+        """Return the sessions with a staging folder, alive or not."""
         return sorted(entry.name for entry in self.staging.iterdir()) if self.staging.is_dir() else []
 
     def segment_files(self) -> Iterator[AnyPath]:
@@ -196,7 +200,7 @@ class Layout(Struct, frozen=True):
             yield from (Path(folder, name) for name in files)
 
     def publish(self, moves: Mapping[AnyPath, AnyPath]) -> None:
-        """Move finished files to their places, so that they are still there after a power cut."""
+        """Move finished files to their final paths, so that they survive a power cut."""
         changed: set[Path] = set()
         for staged, target in ((Path(str(old)), Path(str(new))) for old, new in moves.items()):
             changed.add(target.parent)
@@ -206,7 +210,7 @@ class Layout(Struct, frozen=True):
             fsync(folder)
 
     def remove(self, paths: Iterable[AnyPath]) -> None:
-        """Remove segment files and the folders that are empty then; garbage collection gets what resists."""
+        """Remove segments and empty folders; garbage collection removes files that cannot be removed now."""
         for path in (Path(str(one)) for one in paths):
             with suppress(OSError):
                 path.unlink()
@@ -219,16 +223,16 @@ class Layout(Struct, frozen=True):
             folder = folder.parent
 
     def staged_files(self, session: str) -> list[AnyPath]:
-        """Return the segments a session has begun and not published."""
+        """Return the segments that a session started and did not publish."""
         return [path for path in self.session(session).rglob("*.parquet") if path.is_file()]
 
     def discard(self, session: str) -> None:
-        """Remove what a session has staged."""
+        """Remove the staged files of a session."""
         shutil.rmtree(self.session(session), ignore_errors=True)
 
 
 def encoded(part: str) -> str:
-    """Return a part of a name as a part of a path, as the head of this file says."""
+    """Return a component of a name as a path component; see the module docstring."""
     safe = _UNSAFE.sub(lambda match: b"%%%02X" % match.group()[0], part.encode()).decode()
     if len(safe) <= _LONGEST:
         return safe
@@ -244,7 +248,7 @@ def _move(staged: Path, target: Path) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
             staged.rename(target)
-        except FileNotFoundError:  # a deletion next door may remove the empty folder just made
+        except FileNotFoundError:  # a concurrent deletion may remove the empty folder
             if not attempts_left or not staged.exists():
                 raise
         else:
@@ -270,22 +274,22 @@ MARKER = "store.json"
 
 _BEAT_S = 20.0
 _SILENT_S = 180.0
-"""A writer that has not been heard of for so long counts as dead."""
+"""Time without a heartbeat after which a writer is considered dead."""
 _LAST_BEAT_S = 5.0
-"""How long the end of a session waits for a beat under way."""
-_AT_ONCE = 8
+"""Time limit for a heartbeat that is in progress at the end of a session."""
+_THREADS = 8
 
 
-class Bucket:
-    """The `Files` of a store at `root`."""
+class ObjectFiles:
+    """The files of the store behind the URL `root`; see `Files`."""
 
     def __init__(self, root: RemotePath) -> None:
         self.root = root
-        self._begun: defaultdict[str, list[RemotePath]] = defaultdict(list)
+        self._unpublished: defaultdict[str, list[RemotePath]] = defaultdict(list)
         self._beats: dict[str, Heartbeat] = {}
 
     def is_there(self) -> bool:
-        """Say whether there is a store."""
+        """Return whether the store exists."""
         with explained(self.root):
             return (self.root / MARKER).is_file()
 
@@ -295,66 +299,64 @@ class Bucket:
         return self.root / "/".join(("segments", *(encoded(part) for part in parts)))
 
     def staged(self, session: str, sequence: str, topic: str, number: int) -> RemotePath:
-        """Return where a segment is written: in its place, and not in the catalog yet."""
+        """Return the final path of a segment, which is not in the catalog yet."""
         path = self.topic(sequence, topic) / f"{session}-{number:04}.parquet"
-        self._begun[session].append(path)
+        self._unpublished[session].append(path)
         return path
 
     def relative(self, path: AnyPath) -> str:
-        """Return how the catalog spells a segment's path."""
+        """Return a segment's path relative to the store, as in the catalog."""
         return str(path).removeprefix(f"{self.root}/")
 
     def begin(self, session: str) -> Heartbeat:
-        """Show that a session's writer lives until the lease is released."""
+        """Start the heartbeat of a session, which runs until the lease is released."""
         with explained(self.root):
             beat = self._beats[session] = Heartbeat(self._session(session))
         return beat
 
     def is_live(self, session: str) -> bool:
-        """Say whether the session's writer was heard of lately, by the clock of the store."""
+        """Return whether the session has a recent heartbeat, by the clock of the store."""
         with explained(self.root):
             try:
-                heard_ns = self._session(session).stat().st_mtime_ns
+                last_beat_ns = self._session(session).stat().st_mtime_ns
             except FileNotFoundError:
                 return False
-            return self._now_ns() - heard_ns < _SILENT_S * 1e9
+            return self._now_ns() - last_beat_ns < _SILENT_S * 1e9
 
-    def in_use(self, session: str, grace_s: float) -> bool:  # noqa: ARG002 - a session is heard of before it writes
-        """Say whether the session's writer lives."""
+    def in_use(self, session: str, grace_s: float) -> bool:  # noqa: ARG002 - the heartbeat starts before the first file
+        """Return whether the session's writer is alive."""
         return self.is_live(session)
 
     def publish(self, moves: Mapping[AnyPath, AnyPath]) -> None:
-        """Forget finished files, which are in their places already."""
-        for session, begun in list(self._begun.items()):
-            if any(path in moves for path in begun):
+        """Mark finished files, which have their final paths already, as published."""
+        for session, unpublished in list(self._unpublished.items()):
+            if any(path in moves for path in unpublished):
                 self._beats[session].check()
-                begun[:] = [path for path in begun if path not in moves]
+                unpublished[:] = [path for path in unpublished if path not in moves]
 
     def remove(self, paths: Iterable[AnyPath]) -> None:
-        """Remove segments; garbage collection gets what resists."""
-        with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="remove") as pool:
+        """Remove segments; garbage collection removes those that cannot be removed now."""
+        with ThreadPoolExecutor(_THREADS, thread_name_prefix="remove") as pool:
             list(pool.map(_remove, paths))
 
     def discard(self, session: str) -> None:
-        """Remove what a session has begun and not published; where the store does not answer, that is left to garbage collection."""
-        begun = self._begun.pop(session, [])
+        """Remove the unpublished files of a session; if the store is unavailable, garbage collection removes them."""
+        unpublished = self._unpublished.pop(session, [])
         self._beats.pop(session, None)
         try:
             self._session(session).unlink()
-        except (
-            FileNotFoundError
-        ):  # garbage collection removed it; files written since are still to be removed
+        except FileNotFoundError:  # removed by garbage collection; files written since then remain
             pass
         except (IngestError, OSError):
             return
-        self.remove(begun)
+        self.remove(unpublished)
 
     def open_sessions(self) -> list[str]:
-        """Return the sessions that have begun and not ended, live or not."""
+        """Return the sessions that were started and not ended, alive or not."""
         return [path.name for path in (self.root / "sessions").iterdir() if path.is_file()]
 
-    def staged_files(self, session: str) -> list[AnyPath]:  # noqa: ARG002 - `Files` asks it of all
-        """Return nothing: what is not in the catalog is among the files of segments."""
+    def staged_files(self, session: str) -> list[AnyPath]:  # noqa: ARG002 - the signature of `Files`
+        """Return nothing, since unpublished segments are among the segment files."""
         return []
 
     def segment_files(self) -> Iterator[AnyPath]:
@@ -366,43 +368,43 @@ class Bucket:
         return self.root / f"sessions/{session}"
 
     def _now_ns(self) -> int:
-        """Return the time by the clock that all writers share: that of the store."""
+        """Return the time of the store's clock, which all writers share."""
         clock = self.root / "clock"
         clock.write_bytes(b"")
         return clock.stat().st_mtime_ns
 
 
 class Heartbeat:
-    """Writes an object again and again, until it is released or the process ends."""
+    """Rewrites an object regularly until it is released or the process ends."""
 
     def __init__(self, path: RemotePath) -> None:
         self._path = path
         self._stop = threading.Event()
         self._path.write_bytes(b"")
-        self._heard_s = time.monotonic()
+        self._last_beat_s = time.monotonic()
         self._thread = threading.Thread(target=self._beat, name="mosaico-heartbeat", daemon=True)
         self._thread.start()
 
     def check(self) -> None:
-        """Raise where others may think that this writer is dead, and may have removed its files."""
-        if time.monotonic() - self._heard_s > _SILENT_S:
+        """Raise if other processes may consider this writer dead, and may have removed its files."""
+        if time.monotonic() - self._last_beat_s > _SILENT_S:
             raise SinkUnavailable(
-                f"the store could not be told for {_SILENT_S:.0f} s that this session lives",
+                f"no heartbeat of the session reached the store for {_SILENT_S:.0f} s",
                 where=str(self._path),
                 hint="run again",
             )
 
     def release(self) -> None:
-        """Stop; twice does no harm."""
+        """Stop; a second call has no effect."""
         self._stop.set()
         self._thread.join(_LAST_BEAT_S)
 
     def _beat(self) -> None:
         while not self._stop.wait(_BEAT_S):
-            begun_s = time.monotonic()
-            with suppress(IngestError, OSError):  # the next beat may come through
+            start_s = time.monotonic()
+            with suppress(IngestError, OSError):  # the next heartbeat may succeed
                 self._path.write_bytes(b"")
-                self._heard_s = begun_s
+                self._last_beat_s = start_s
 
 
 def _remove(path: AnyPath) -> None:

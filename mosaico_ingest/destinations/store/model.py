@@ -1,4 +1,4 @@
-"""This file is what the catalog says of sequences, sessions, topics and segments."""
+"""The content of a catalog: sequences, sessions, topics and segments, and the changes that a session makes."""
 
 from __future__ import annotations
 
@@ -9,10 +9,23 @@ import pyarrow as pa
 from msgspec import Struct
 
 from mosaico_ingest.destinations.store.checksum import combined
+from mosaico_ingest.destinations.store.segment import Segment
+from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote import AnyPath
 
-__all__ = ["Collected", "Note", "SegmentInfo", "SequenceInfo", "SessionInfo", "TopicInfo"]
+__all__ = [
+    "Claim",
+    "Collected",
+    "NewNote",
+    "NewSession",
+    "NewTopic",
+    "Note",
+    "SegmentInfo",
+    "SequenceInfo",
+    "SessionInfo",
+    "TopicInfo",
+]
 
 
 class SegmentInfo(Struct, frozen=True):
@@ -26,7 +39,7 @@ class SegmentInfo(Struct, frozen=True):
     end_ns: int
     """The largest time stamp, inclusive."""
     checksum: str | None
-    """Of the values of its rows, see `ContentHash`; None where it was written before there were any."""
+    """Checksum of the row values, see `ContentHash`; None for segments of early versions."""
 
 
 class TopicInfo(Struct, frozen=True):
@@ -42,47 +55,47 @@ class TopicInfo(Struct, frozen=True):
     metadata: Mapping[str, Any]
     created_ns: int
     segments: tuple[SegmentInfo, ...]
-    """By start, then by session."""
+    """Sorted by start, then by session."""
 
     @property
     def rows(self) -> int:
-        """The number of rows."""
+        """Number of rows."""
         return sum(segment.rows for segment in self.segments)
 
     @property
     def stored_bytes(self) -> int:
-        """The size of its files."""
+        """Size of its files in bytes."""
         return sum(segment.stored_bytes for segment in self.segments)
 
     @property
     def start_ns(self) -> int | None:
-        """The smallest time stamp; None without rows."""
+        """The smallest time stamp, or None without rows."""
         return min((segment.start_ns for segment in self.segments), default=None)
 
     @property
     def end_ns(self) -> int | None:
-        """The largest time stamp, inclusive; None without rows."""
+        """The largest time stamp, inclusive, or None without rows."""
         return max((segment.end_ns for segment in self.segments), default=None)
 
     @property
     def checksum(self) -> str | None:
-        """Of the values of its rows; None where it is not known of all of them."""
+        """Checksum of the row values, or None if a segment has none."""
         return combined(segment.checksum for segment in self.segments)
 
 
 class SessionInfo(Struct, frozen=True):
-    """One writing session that was committed."""
+    """A committed writing session."""
 
     id: str
     """A ULID: sessions sort by their start."""
     metadata: Mapping[str, Any]
-    """What the session was opened with; the sequence keeps that of its first session."""
+    """The metadata of the session; the sequence keeps the metadata of its first session."""
     created_ns: int
     completed_ns: int
 
 
 class Note(Struct, frozen=True):
-    """An error somebody attached to a sequence, or to one of its topics."""
+    """An error attached to a sequence, or to one of its topics."""
 
     topic: str | None
     message: str
@@ -90,14 +103,14 @@ class Note(Struct, frozen=True):
 
 
 class SequenceInfo(Struct, frozen=True):
-    """One sequence with everything the catalog knows of it."""
+    """One sequence with its sessions, topics and notes."""
 
     name: str
     metadata: Mapping[str, Any]
     created_ns: int
     sessions: tuple[SessionInfo, ...]
     topics: tuple[TopicInfo, ...]
-    """By name."""
+    """Sorted by name."""
     notes: tuple[Note, ...]
 
     @property
@@ -110,33 +123,73 @@ class SequenceInfo(Struct, frozen=True):
 
     @property
     def rows(self) -> int:
-        """The number of rows of all topics."""
+        """Number of rows of all topics."""
         return sum(topic.rows for topic in self.topics)
 
     @property
     def stored_bytes(self) -> int:
-        """The size of its files."""
+        """Size of its files in bytes."""
         return sum(topic.stored_bytes for topic in self.topics)
 
     @property
     def start_ns(self) -> int | None:
-        """The smallest time stamp; None without rows."""
-        return min(_known(topic.start_ns for topic in self.topics), default=None)
+        """The smallest time stamp, or None without rows."""
+        return min(_not_none(topic.start_ns for topic in self.topics), default=None)
 
     @property
     def end_ns(self) -> int | None:
-        """The largest time stamp, inclusive; None without rows."""
-        return max(_known(topic.end_ns for topic in self.topics), default=None)
+        """The largest time stamp, inclusive, or None without rows."""
+        return max(_not_none(topic.end_ns for topic in self.topics), default=None)
 
 
 class Collected(Struct, frozen=True):
-    """What garbage collection removed."""
+    """The result of a garbage collection."""
 
     sessions: int
-    """Sessions of writers that are no more."""
+    """Number of removed sessions whose writers had died."""
     files: int
     stored_bytes: int
 
 
-def _known(times: Iterable[int | None]) -> list[int]:
+class Claim(Struct, frozen=True):
+    """The state of a sequence at the start of a session; the commit fails if it has changed."""
+
+    sequence: str
+    if_exists: IfExists
+    sequence_id: int | None
+    sessions: tuple[str, ...]
+    types: Mapping[str, OntologyType]
+    """The types of its topics, for a session that appends to them."""
+
+
+class NewTopic(Struct, frozen=True):
+    """A topic of a new session, and its segments by their paths relative to the store."""
+
+    name: str
+    ontology: OntologyType
+    schema: pa.Schema
+    metadata: str
+    created_ns: int
+    segments: Mapping[str, Segment]
+
+
+class NewNote(Struct, frozen=True):
+    """A new error to attach."""
+
+    topic: str | None
+    message: str
+    created_ns: int
+
+
+class NewSession(Struct, frozen=True):
+    """Everything a new session wrote."""
+
+    id: str
+    metadata: str
+    created_ns: int
+    topics: tuple[NewTopic, ...]
+    notes: tuple[NewNote, ...]
+
+
+def _not_none(times: Iterable[int | None]) -> list[int]:
     return [time for time in times if time is not None]

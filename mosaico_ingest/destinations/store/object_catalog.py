@@ -1,8 +1,8 @@
 """The catalog of a store behind a URL: one JSON document per sequence.
 
-Such a store has no transactions, but two things to build on: an object is written whole or not at all, and a listing
-shows what was written before it. So a writer first puts its claim on a sequence, then lists the claims: of two writers
-at least one sees the other, and gives way. Who holds the claim reads the document, changes it, and writes it.
+Object stores have no transactions, but writes of objects are atomic, and listings show all earlier writes. A writer first
+writes its claim on a sequence, then lists the claims: of two writers, at least one sees the other and gives up. The
+holder of the claim reads, changes and writes the document.
 """
 
 from __future__ import annotations
@@ -22,16 +22,13 @@ import pyarrow as pa
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mosaico_ingest.destinations.base import check_same_type, sequence_exists
-from mosaico_ingest.destinations.store.catalog import (
+from mosaico_ingest.destinations.store.errors import NotInStore, explained, sequence_changed
+from mosaico_ingest.destinations.store.files import MARKER, ObjectFiles, encoded, new_session_id
+from mosaico_ingest.destinations.store.model import (
     Claim,
     NewNote,
     NewSession,
     NewTopic,
-    changed,
-)
-from mosaico_ingest.destinations.store.errors import NotInStore, explained
-from mosaico_ingest.destinations.store.files import MARKER, Bucket, encoded, new_session_id
-from mosaico_ingest.destinations.store.model import (
     Note,
     SegmentInfo,
     SequenceInfo,
@@ -46,13 +43,13 @@ from mosaico_ingest.remote import AnyPath, RemotePath
 
 __all__ = [
     "FORMAT",
-    "Documents",
+    "ObjectCatalog",
     "SequenceDocument",
     "check_unchanged",
 ]
 
 FORMAT = 1
-"""Counts up when a document can no longer be read by what was released before."""
+"""The version of the documents; it increases if earlier releases cannot read them."""
 
 
 class _Part(BaseModel):
@@ -70,7 +67,7 @@ class SegmentEntry(_Part):
     end_ns: int
     checksum: str | None = None
     bounds: tuple[tuple[str, Any, Any], ...] = ()
-    """Of each column that has an order: its path, its smallest and its largest value."""
+    """Path, smallest and largest value of each column with an order."""
 
 
 class TopicEntry(_Part):
@@ -98,7 +95,7 @@ class TopicEntry(_Part):
 
 
 class SessionEntry(_Part):
-    """One session that was committed."""
+    """A committed session."""
 
     id: str
     metadata: dict[str, Any]
@@ -107,7 +104,7 @@ class SessionEntry(_Part):
 
 
 class NoteEntry(_Part):
-    """One error that was attached."""
+    """An attached error."""
 
     topic: str | None
     message: str
@@ -132,7 +129,7 @@ class SequenceDocument(_Part):
 
     @property
     def types(self) -> dict[str, OntologyType]:
-        """What its topics hold."""
+        """The types of its topics."""
         return {topic.name: topic.ontology for topic in self.topics}
 
     @property
@@ -141,7 +138,7 @@ class SequenceDocument(_Part):
         return [segment.path for topic in self.topics for segment in topic.segments]
 
     def info(self, root: RemotePath) -> SequenceInfo:
-        """Return it as the catalog's callers know it."""
+        """Return the sequence as the model of the catalog."""
         return SequenceInfo(
             name=self.name,
             metadata=self.metadata,
@@ -157,7 +154,7 @@ class SequenceDocument(_Part):
         )
 
     def with_session(self, new: NewSession, *, completed_ns: int) -> SequenceDocument:
-        """Return the sequence with all that a session wrote."""
+        """Return the sequence with the content of a new session."""
         entry = SessionEntry(
             id=new.id,
             metadata=json.loads(new.metadata),
@@ -176,22 +173,22 @@ class SequenceDocument(_Part):
         )
 
     def with_note(self, new: NewNote) -> SequenceDocument:
-        """Return the sequence with one more note."""
+        """Return the sequence with a new note."""
         return self.model_copy(update={"notes": (*self.notes, _note(new))})
 
     def without_notes(self, topic: str | None) -> SequenceDocument:
-        """Return the sequence without its own notes, or without those of a topic."""
+        """Return the sequence without its own notes, or without the notes of a topic."""
         return self.model_copy(update={"notes": tuple(one for one in self.notes if one.topic != topic)})
 
     def without_topic(self, name: str) -> SequenceDocument:
-        """Return the sequence without a topic; NotInStore where it has none of that name."""
+        """Return the sequence without a topic; raises NotInStore if the topic does not exist."""
         rest = tuple(topic for topic in self.topics if topic.name != name)
         if len(rest) == len(self.topics):
             raise NotInStore(f"there is no topic {name!r}", where=self.name)
         return self.without_notes(name).model_copy(update={"topics": rest})
 
     def without_session(self, session: str) -> SequenceDocument:
-        """Return the sequence without what a session added; NotInStore where it has none of that name."""
+        """Return the sequence without the content of a session; raises NotInStore if the session does not exist."""
         rest = tuple(one for one in self.sessions if one.id != session)
         if len(rest) == len(self.sessions):
             raise NotInStore(f"there is no session {session!r}", where=self.name)
@@ -219,18 +216,18 @@ class SequenceDocument(_Part):
 
 
 def check_unchanged(claimed: Claim, now: SequenceDocument | None) -> None:
-    """Refuse a commit because the sequence is there by now, or is not what it was when the session began.
+    """Check that a sequence has not changed since the claim.
 
     Raises:
-        SequenceExists: It is there, and must not be.
-        SinkError: Somebody else changed it.
+        SequenceExists: The sequence exists now, but must not exist.
+        SinkError: Another session changed the sequence.
     """
     if now is not None and claimed.if_exists in {IfExists.FAIL, IfExists.SKIP}:
         raise sequence_exists(claimed.sequence)
     if claimed.sequence_id is not None and (now is None or now.created_ns != claimed.sequence_id):
-        raise changed(claimed.sequence)
+        raise sequence_changed(claimed.sequence)
     if claimed.if_exists is IfExists.REPLACE and now is not None and now.session_ids != claimed.sessions:
-        raise changed(claimed.sequence)
+        raise sequence_changed(claimed.sequence)
 
 
 def _joined(held: TopicEntry | None, session: str, new: NewTopic) -> TopicEntry:
@@ -285,16 +282,16 @@ def _note(new: NewNote) -> NoteEntry:
 
 
 _SUFFIX = ".json"
-_AT_ONCE = 16
+_THREADS = 16
 _LONGEST_NAME = 200
-"""Longer ones are not spelled out in the names of objects."""
+"""Object names do not contain longer sequence names in full."""
 _TRIES, _PAUSE_S = 8, 0.25
 
 
-class Documents:
-    """The `Records` of the store in `bucket`; `create` makes it where there is none."""
+class ObjectCatalog:
+    """The catalog of the store in `bucket`, which `create` creates if necessary; see `StoreCatalog`."""
 
-    def __init__(self, bucket: Bucket, *, create: bool) -> None:
+    def __init__(self, bucket: ObjectFiles, *, create: bool) -> None:
         self._bucket = bucket
         self._root = bucket.root
         marker = self._root / MARKER
@@ -316,13 +313,13 @@ class Documents:
             )
 
     def keep_open(self) -> BytesIO:
-        """See `Records.keep_open`; there is nothing to keep."""
+        """See `StoreCatalog.keep_open`; requests are independent, so the handle does nothing."""
         return BytesIO()
 
     def claim(
         self, session: str, sequence: str, if_exists: IfExists, *, is_live: Callable[[str], bool]
     ) -> Claim:
-        """See `Records.claim`."""
+        """See `StoreCatalog.claim`."""
         found = self._load(sequence)
         if found is not None and if_exists in {IfExists.FAIL, IfExists.SKIP}:
             raise sequence_exists(sequence)
@@ -334,25 +331,25 @@ class Documents:
         return Claim(sequence, if_exists, found.created_ns, found.session_ids, types)
 
     def commit(self, claimed: Claim, new: NewSession) -> list[str]:
-        """See `Records.commit`."""
+        """See `StoreCatalog.commit`."""
         if claimed.if_exists is IfExists.APPEND:
             with self._holding(claimed.sequence, session=new.id):
                 return self._enter(claimed, new)
         with explained(self._root):
             if not self._claim(new.id, claimed.sequence).exists():
-                raise changed(claimed.sequence)
+                raise sequence_changed(claimed.sequence)
         replaced = self._enter(claimed, new)
-        with suppress(SinkError):  # what is written counts; a claim without its session is no obstacle
+        with suppress(SinkError):  # the document is committed; a claim without a live session is ignored
             self.release(new.id, claimed.sequence)
         return replaced
 
     def release(self, session: str, sequence: str) -> None:
-        """See `Records.release`."""
+        """See `StoreCatalog.release`."""
         with explained(self._root), suppress(FileNotFoundError):
             self._claim(session, sequence).unlink()
 
     def create(self, sequence: str, metadata: str) -> None:
-        """See `Records.create`."""
+        """See `StoreCatalog.create`."""
         with self._holding(sequence):
             if self._load(sequence) is not None:
                 raise sequence_exists(sequence)
@@ -360,25 +357,25 @@ class Documents:
             self._put(SequenceDocument(name=sequence, metadata=described, created_ns=time.time_ns()))
 
     def note(self, sequence: str, new: NewNote) -> None:
-        """See `Records.note`."""
+        """See `StoreCatalog.note`."""
         with self._holding(sequence):
             self._put(self._known(sequence).with_note(new))
 
     def names(self) -> list[str]:
-        """See `Records.names`."""
+        """See `StoreCatalog.names`."""
         return sorted(self._name(path) for path in self._paths())
 
     def sequence(self, name: str) -> SequenceInfo | None:
-        """See `Records.sequence`."""
+        """See `StoreCatalog.sequence`."""
         found = self._load(name)
         return None if found is None else found.info(self._root)
 
     def sequences(self) -> tuple[SequenceInfo, ...]:
-        """See `Records.sequences`; each sequence is as it was when it was asked for."""
+        """See `StoreCatalog.sequences`; the sequences are not read at the same moment."""
         return tuple(one.info(self._root) for one in self._all())
 
     def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
-        """See `Records.bounds`."""
+        """See `StoreCatalog.bounds`."""
         found = self._load(topic.sequence)
         segments = [
             segment
@@ -394,7 +391,7 @@ class Documents:
         }
 
     def delete_sequence(self, sequence: str) -> list[str]:
-        """See `Records.delete_sequence`."""
+        """See `StoreCatalog.delete_sequence`."""
         with self._holding(sequence):
             found = self._known(sequence)
             with explained(self._root):
@@ -402,19 +399,19 @@ class Documents:
         return found.paths
 
     def delete_topic(self, sequence: str, topic: str) -> list[str]:
-        """See `Records.delete_topic`."""
+        """See `StoreCatalog.delete_topic`."""
         return self._change(sequence, lambda found: found.without_topic(topic))
 
     def delete_session(self, sequence: str, session: str) -> list[str]:
-        """See `Records.delete_session`."""
+        """See `StoreCatalog.delete_session`."""
         return self._change(sequence, lambda found: found.without_session(session))
 
     def delete_notes(self, sequence: str, topic: str | None) -> None:
-        """See `Records.delete_notes`."""
+        """See `StoreCatalog.delete_notes`."""
         self._change(sequence, lambda found: found.without_notes(topic))
 
     def forget(self, live: Collection[str]) -> set[str]:
-        """See `Records.forget`."""
+        """See `StoreCatalog.forget`."""
         with explained(self._root):
             for claim in (self._root / "claims").listing(recursive=True):
                 if claim.is_file() and claim.name not in live:
@@ -423,7 +420,7 @@ class Documents:
         return {path for one in self._all() for path in one.paths}
 
     def _enter(self, claimed: Claim, new: NewSession) -> list[str]:
-        """Write the document with the session, in which moment it becomes visible; return what it replaces."""
+        """Write the document with the session, which makes it visible; return the replaced segments."""
         now = self._load(claimed.sequence)
         check_unchanged(claimed, now)
         replaces = claimed.if_exists is IfExists.REPLACE
@@ -435,12 +432,12 @@ class Documents:
         return now.paths if now and replaces else []
 
     def _change(self, sequence: str, change: Callable[[SequenceDocument], SequenceDocument]) -> list[str]:
-        """Replace a document by what `change` makes of it; return the segments it names no longer."""
+        """Apply a change to a document; return the segments that it no longer contains."""
         with self._holding(sequence):
             found = self._known(sequence)
-            left = change(found)
-            self._put(left)
-        return sorted(set(found.paths) - set(left.paths))
+            changed = change(found)
+            self._put(changed)
+        return sorted(set(found.paths) - set(changed.paths))
 
     def _known(self, sequence: str) -> SequenceDocument:
         found = self._load(sequence)
@@ -450,7 +447,7 @@ class Documents:
 
     @contextmanager
     def _holding(self, sequence: str, *, session: str | None = None) -> Generator[None, None, None]:
-        """Hold the claim on a sequence for a moment, waiting for others who do the same."""
+        """Hold the claim on a sequence during the context, after waiting for other holders."""
         holder = session or new_session_id()
         if session is None:
             self._bucket.begin(holder).release()
@@ -471,12 +468,12 @@ class Documents:
             except SequenceExists as err:  # noqa: PERF203 - each try may find another holder
                 if not tries_left:
                     raise SinkUnavailable(err.what, where=err.where, hint=err.hint) from err
-                time.sleep(_PAUSE_S * (0.5 + random.random()))  # noqa: S311 - so that two do not meet again
+                time.sleep(_PAUSE_S * (0.5 + random.random()))  # noqa: S311 - spreads the retries of two writers
             else:
                 return
 
     def _reserve(self, session: str, sequence: str, is_live: Callable[[str], bool]) -> None:
-        """Claim a sequence, then look who else does; see the head of this file."""
+        """Claim a sequence, then check for other claims; see the module docstring."""
         own = self._claim(session, sequence)
         with explained(self._root):
             own.write_bytes(b"")
@@ -506,7 +503,7 @@ class Documents:
         return self._read(path).name if len(name) > _LONGEST_NAME else unquote(name)
 
     def _all(self) -> list[SequenceDocument]:
-        with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="catalog") as pool:
+        with ThreadPoolExecutor(_THREADS, thread_name_prefix="catalog") as pool:
             return sorted(pool.map(self._read, self._paths()), key=lambda one: one.name)
 
     def _load(self, sequence: str) -> SequenceDocument | None:
@@ -535,4 +532,4 @@ def _number(marker: bytes) -> int:
     try:
         return int(json.loads(marker)["format"])
     except (ValueError, KeyError, TypeError) as err:
-        raise SinkError(f"{MARKER} does not say what format the store has", hint="check the URL") from err
+        raise SinkError(f"{MARKER} does not contain the format of the store", hint="check the URL") from err

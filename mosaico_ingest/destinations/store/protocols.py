@@ -1,28 +1,27 @@
-"""This file is the seams of a store: `Files` hold the rows, `Records` say which of them count."""
+"""The interfaces of a store's parts: `Files` holds the segments, `StoreCatalog` records which of them are committed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any, Protocol
 
-from mosaico_ingest.destinations.store.catalog import Claim, NewNote, NewSession
-from mosaico_ingest.destinations.store.model import SequenceInfo, TopicInfo
+from mosaico_ingest.destinations.store.model import Claim, NewNote, NewSession, SequenceInfo, TopicInfo
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.remote import AnyPath
 
-__all__ = ["Closable", "Files", "Lease", "Records"]
+__all__ = ["Closable", "Files", "Lease", "StoreCatalog"]
 
 
 class Lease(Protocol):
-    """Shows that a writer lives."""
+    """Shows other processes that a writer is alive."""
 
     def release(self) -> None:
-        """Release it; releasing twice does no harm."""
+        """Release the lease; a second call has no effect."""
         ...
 
 
 class Closable(Protocol):
-    """What can be closed."""
+    """An object that can be closed."""
 
     def close(self) -> None:
         """Close it."""
@@ -30,7 +29,7 @@ class Closable(Protocol):
 
 
 class Files(Protocol):
-    """Where segments lie: `layout.Layout` on a disk, `bucket.Bucket` behind a URL."""
+    """The files of a store: `LocalFiles` on a disk, `ObjectFiles` behind a URL."""
 
     @property
     def root(self) -> AnyPath:
@@ -42,43 +41,43 @@ class Files(Protocol):
         ...
 
     def staged(self, session: str, sequence: str, topic: str, number: int) -> AnyPath:
-        """Return where a session writes a segment before it is published."""
+        """Return the path at which a session writes a segment before the commit."""
         ...
 
     def relative(self, path: AnyPath) -> str:
-        """Return how the records spell a segment's path."""
+        """Return a segment's path relative to the store, as in the catalog."""
         ...
 
     def begin(self, session: str) -> Lease:
-        """Make room for a session, and show that it lives until the lease is released."""
+        """Prepare a session and return the lease that shows that its writer is alive."""
         ...
 
     def is_live(self, session: str) -> bool:
-        """Say whether the session's writer lives."""
+        """Return whether the session's writer is alive."""
         ...
 
     def in_use(self, session: str, grace_s: float) -> bool:
-        """Say whether the session's writer lives, or may be about to begin."""
+        """Return whether the session's writer is alive or may be about to start."""
         ...
 
     def publish(self, moves: Mapping[AnyPath, AnyPath]) -> None:
-        """Move finished files to their places, so that they are there to stay."""
+        """Move finished files to their final paths, so that they survive a power cut."""
         ...
 
     def remove(self, paths: Iterable[AnyPath]) -> None:
-        """Remove segments; garbage collection gets what resists."""
+        """Remove segments; garbage collection removes those that cannot be removed now."""
         ...
 
     def discard(self, session: str) -> None:
-        """Remove what a session has staged."""
+        """Remove the staged files of a session."""
         ...
 
     def open_sessions(self) -> list[str]:
-        """Return the sessions that have begun and not ended, live or not."""
+        """Return the sessions that were started and not ended, alive or not."""
         ...
 
     def staged_files(self, session: str) -> list[AnyPath]:
-        """Return the segments a session has begun and not published."""
+        """Return the segments that a session started and did not publish."""
         ...
 
     def segment_files(self) -> Iterator[AnyPath]:
@@ -86,70 +85,74 @@ class Files(Protocol):
         ...
 
 
-class Records(Protocol):
-    """What a store knows: `catalog.Catalog` in SQLite, `documents.Documents` as JSON behind a URL.
+class StoreCatalog(Protocol):
+    """The catalog of a store: `Catalog` in SQLite, `ObjectCatalog` as JSON documents behind a URL.
 
-    Each change happens as a whole or not at all; methods that remove return the paths nobody needs then.
+    Every change is atomic. Methods that remove entries return the paths of segments that are no longer needed.
     """
 
     def keep_open(self) -> Closable:
-        """Make what follows cheaper until the answer is closed."""
+        """Return a handle that keeps the catalog open, which makes calls cheaper until it is closed."""
         ...
 
     def claim(
         self, session: str, sequence: str, if_exists: IfExists, *, is_live: Callable[[str], bool]
     ) -> Claim:
-        """Note that a session will write a sequence, or refuse because it must not or another does."""
+        """Claim a sequence for a session.
+
+        Raises:
+            SequenceExists: The sequence exists and `if_exists` forbids it, or another session writes it.
+        """
         ...
 
     def commit(self, claimed: Claim, new: NewSession) -> list[str]:
-        """Enter a session and return the paths of the segments it replaces."""
+        """Add a session and return the paths of the segments it replaces."""
         ...
 
     def release(self, session: str, sequence: str) -> None:
-        """Give the name back."""
+        """Release the claim of a session."""
         ...
 
     def create(self, sequence: str, metadata: str) -> None:
-        """Enter a sequence without a session."""
+        """Add a sequence without a session."""
         ...
 
     def note(self, sequence: str, new: NewNote) -> None:
-        """Attach a note to a sequence that is there."""
+        """Attach a note to an existing sequence."""
         ...
 
     def names(self) -> list[str]:
-        """Return the names of all sequences, sorted."""
+        """Return the sorted names of all sequences."""
         ...
 
     def sequence(self, name: str) -> SequenceInfo | None:
-        """Return all that is known of a sequence, None where there is none."""
+        """Return a sequence, or None."""
         ...
 
     def sequences(self) -> tuple[SequenceInfo, ...]:
-        """Return every sequence, by name, as they were at one moment where that can be had."""
+        """Return every sequence by name, in one consistent state if the catalog supports it."""
         ...
 
     def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
-        """Return the known bounds of columns, by the path of the segment."""
+        """Return the bounds of columns by segment path."""
         ...
 
     def delete_sequence(self, sequence: str) -> list[str]:
-        """Remove a sequence; NotInStore where there is none."""
+        """Remove a sequence; raises NotInStore if it does not exist."""
         ...
 
     def delete_topic(self, sequence: str, topic: str) -> list[str]:
-        """Remove a topic; NotInStore where there is none."""
+        """Remove a topic; raises NotInStore if it does not exist."""
         ...
 
     def delete_session(self, sequence: str, session: str) -> list[str]:
-        """Remove what a session added; NotInStore where there is none."""
+        """Remove everything a session added; raises NotInStore if it does not exist."""
         ...
 
     def delete_notes(self, sequence: str, topic: str | None) -> None:
-        """Remove the notes of a sequence itself, or those of one of its topics."""
+        """Remove the notes of a sequence itself, or of one of its topics."""
         ...
 
     def forget(self, live: Collection[str]) -> set[str]:
-        """Drop the claims of sessions that are not live and return the paths of all segments."""
+        """Remove the claims of sessions that are not alive and return the paths of all segments."""
         ...

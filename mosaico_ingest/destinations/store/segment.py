@@ -36,7 +36,7 @@ _SAMPLES = 16
 _PIECE_BYTES = _SAMPLE_BYTES // _SAMPLES
 _TOO_LITTLE = 1 << 12
 _TOO_LITTLE_A_COLUMN = 1 << 8
-"""To begin compressing so little takes longer than to write it."""
+"""Below these sizes, compression takes longer than writing the uncompressed bytes."""
 _WORTH_IT = 0.9
 
 
@@ -44,16 +44,16 @@ class Leaf(Struct, frozen=True):
     """One Parquet column: a value without children."""
 
     parquet_path: str
-    """As Parquet spells it, as `transforms.list.item.x`."""
+    """The path in Parquet, as `transforms.list.item.x`."""
     steps: tuple[str, ...]
-    """The names of the fields on the way, as `("transforms", "x")`."""
+    """The names of the fields on the path, as `("transforms", "x")`."""
     type: pa.DataType
     repeated: bool
-    """Whether it lies inside a list."""
+    """Whether the column is inside a list."""
 
     @property
     def path(self) -> str:
-        """The way as users write it, as `transforms.x`."""
+        """The path for users, as `transforms.x`."""
         return ".".join(self.steps)
 
 
@@ -61,7 +61,7 @@ class Columns:
     """The Parquet columns of one schema, and how each is written.
 
     Raises:
-        pa.ArrowInvalid: Parquet has no room for them; said before there is a file or a row.
+        pa.ArrowInvalid: Parquet cannot store the columns; raised before a file is created.
     """
 
     def __init__(self, schema: pa.Schema) -> None:
@@ -74,16 +74,15 @@ class Columns:
             for field in schema
             for leaf in _walk(Leaf(field.name, (field.name,), field.type, repeated=False))
         )
-        """In the order Parquet numbers them."""
+        """In the order of Parquet's column numbers."""
         self.makers = column_makers(schema)
         self._few = _options(self.leaves, {leaf.parquet_path for leaf in self.leaves})
 
     def writer_options(self, rows: pa.Table) -> dict[str, Any]:
-        """Return what `pq.ParquetWriter` is told: by type, and for blobs by how a sample of the first rows shrinks.
+        """Return the options of `pq.ParquetWriter`, chosen by type, and for blobs by the compression of a sample.
 
-        Splitting the bytes of floats makes them smaller and faster to write than plain or dictionary pages;
-        JPEGs and their like only cost time in a second compressor, and so do a few rows, which all but fit into
-        a block of a disk.
+        Byte stream split makes floats smaller and faster to write than plain or dictionary pages. Compressed images do
+        not shrink further, and compressing a few rows saves no disk block.
         """
         if rows.nbytes < max(_TOO_LITTLE, _TOO_LITTLE_A_COLUMN * len(self.leaves)):
             return self._few
@@ -93,7 +92,7 @@ class Columns:
 
 @cache_by_identity
 def columns_of(ontology: OntologyType) -> Columns:
-    """Return the columns of a topic; see `Columns`."""
+    """Return the columns of a topic of this type."""
     return Columns(topic_schema(ontology))
 
 
@@ -115,7 +114,7 @@ def _walk(at: Leaf) -> Iterator[Leaf]:
 
 
 def _options(columns: tuple[Leaf, ...], packed: Collection[str]) -> dict[str, Any]:
-    """Return the writer's options; `packed` are the paths of columns that no codec makes smaller."""
+    """Return the writer's options; `packed` are the paths of columns that are not compressed."""
     zstd = [leaf.parquet_path for leaf in columns if leaf.parquet_path not in packed]
     encodings = {leaf.parquet_path: "BYTE_STREAM_SPLIT" for leaf in columns if _splits(leaf.type)}
     encodings[columns[0].parquet_path] = "DELTA_BINARY_PACKED"
@@ -153,7 +152,7 @@ def _shrinks(leaf: Leaf, rows: pa.Table) -> bool:
 
 
 def _samples(leaf: Leaf, rows: pa.Table) -> Iterator[bytes]:
-    """Yield bytes from the middle of a few values, where no header flatters the result."""
+    """Yield bytes from the middle of a few values, since headers compress better than the rest."""
     for chunk in rows.column(leaf.steps[0]).chunks[:_SAMPLES]:
         values: pa.Array[Any] = chunk
         for step in leaf.steps[1:]:
@@ -174,12 +173,12 @@ def _values(array: pa.Array[Any]) -> pa.Array[Any]:
 
 
 Bounds = tuple[str, Any, Any]
-"""A column's path, its smallest and its largest value."""
+"""Path, smallest and largest value of a column."""
 
 _LONGEST_TEXT = 256
 _LARGEST_INTEGER = 1 << 63
 _SEND_BYTES = 4 << 20
-"""As much as this is not left to be brought to the disk at the end."""
+"""Number of bytes after which writing to the disk is started."""
 
 
 class Segment(Struct, frozen=True):
@@ -191,12 +190,12 @@ class Segment(Struct, frozen=True):
     start_ns: int
     end_ns: int
     checksum: str
-    """Of the values of its rows; see `ContentHash`."""
+    """Checksum of the row values; see `ContentHash`."""
     bounds: tuple[Bounds, ...]
 
 
 class SegmentWriter:
-    """Writes row groups to `path`; the columns' codecs are chosen from the first rows."""
+    """Writes row groups to `path`; the first rows determine the compression of the columns."""
 
     def __init__(self, path: AnyPath, columns: Columns, first_rows: pa.Table) -> None:
         self.path = path
@@ -209,7 +208,7 @@ class SegmentWriter:
         self._writer = pq.ParquetWriter(
             self._file,
             columns.schema,
-            use_compliant_nested_type=False,  # a list item's name is part of the type readers look for
+            use_compliant_nested_type=False,  # the name of list items is part of the type
             sorting_columns=[pq.SortingColumn(0)],
             write_batch_size=4096,
             write_page_checksum=True,
@@ -219,11 +218,11 @@ class SegmentWriter:
 
     @property
     def written_bytes(self) -> int:
-        """How much is in the file by now."""
+        """Size of the file so far, in bytes."""
         return self._file.tell()
 
     def append(self, rows: pa.Table) -> None:
-        """Write one row group; the rows are sorted, and none is earlier than what is there."""
+        """Write one row group of sorted rows that are not earlier than the previous ones."""
         self._writer.write_table(rows, row_group_size=max(1, rows.num_rows))
         written = self.written_bytes
         if written - self._sent >= _SEND_BYTES:
@@ -233,7 +232,7 @@ class SegmentWriter:
         self.end_ns = rows.column(0)[-1].as_py()
 
     def close(self) -> Segment:
-        """Finish the file; it may not be on the disk yet."""
+        """Finish the file, which need not be on the disk yet."""
         self._writer.close()
         self._file.close()
         (footer,) = self._footer
@@ -250,8 +249,8 @@ class SegmentWriter:
         )
 
     def abandon(self) -> None:
-        """Close the file without caring for its content."""
-        # a RuntimeError says that there is no footer to collect
+        """Close the file, whose content is discarded."""
+        # a RuntimeError is raised if there is no footer to collect
         with suppress(OSError, pa.ArrowException, RuntimeError):
             self._writer.close()
         with suppress(OSError, pa.ArrowException):
@@ -259,7 +258,7 @@ class SegmentWriter:
 
 
 def sorted_rows(batches: Iterable[pa.RecordBatch], schema: pa.Schema) -> pa.Table:
-    """Return the rows by time stamp; rows that are in order already are not copied, equal ones keep theirs."""
+    """Return the rows sorted by time stamp (stable); rows that are in order are not copied."""
     table = pa.Table.from_batches(batches, schema)
     times = table.column(0).to_numpy()
     if (times[1:] >= times[:-1]).all():
@@ -268,7 +267,7 @@ def sorted_rows(batches: Iterable[pa.RecordBatch], schema: pa.Schema) -> pa.Tabl
 
 
 def time_span(footer: pq.FileMetaData, group: int) -> tuple[int, int]:
-    """Return the first and the last time stamp of a row group that this file wrote."""
+    """Return the first and the last time stamp of a row group."""
     times = footer.row_group(group).column(0).statistics
     if times is None or not times.has_min_max:
         raise pa.ArrowInvalid("a row group has no statistics of timestamp_ns")
@@ -278,7 +277,7 @@ def time_span(footer: pq.FileMetaData, group: int) -> tuple[int, int]:
 
 
 def _bounds(columns: tuple[Leaf, ...], footer: pq.FileMetaData) -> Iterable[Bounds]:
-    """Yield what the footer says of each column; columns without an order, or with longer values, are left out."""
+    """Yield the bounds of each column in the footer, except for columns without an order or with long values."""
     groups = [footer.row_group(i) for i in range(footer.num_row_groups)]
     for number, leaf in enumerate(columns):
         statistics = [group.column(number).statistics for group in groups]

@@ -23,11 +23,12 @@ from mosaico_ingest.destinations.base import (
     check_same_type,
     replacement_is_incomplete,
 )
-from mosaico_ingest.destinations.store import catalog, files
+from mosaico_ingest.destinations.store import files
 from mosaico_ingest.destinations.store.checksum import combined
 from mosaico_ingest.destinations.store.errors import explained
 from mosaico_ingest.destinations.store.files import new_session_id
-from mosaico_ingest.destinations.store.protocols import Files, Records
+from mosaico_ingest.destinations.store.model import NewNote, NewSession, NewTopic
+from mosaico_ingest.destinations.store.protocols import Files, StoreCatalog
 from mosaico_ingest.destinations.store.segment import (
     Segment,
     SegmentWriter,
@@ -50,16 +51,16 @@ __all__ = [
 ]
 
 _FIRST_GROUP_BYTES, _GROUP_BYTES = 4 << 20, 32 << 20
-"""The first row group, and the largest; between them each is twice the one before, so that writing begins early."""
+"""Size of the first and the largest row group. Sizes double in between, so that writing starts early."""
 _GROUP_ROWS = 1 << 20
 _BIG_GROUP_BYTES = 8 << 20
 _BIG_ROW_BYTES = 16 << 10
-"""Rows larger than this on average gain nothing from larger groups: they are written while others are still read."""
+"""Rows that are larger on average gain nothing from larger row groups."""
 _SEGMENT_BYTES = 512 << 20
 
 
 class Staging:
-    """The topics of a session, where their segments are staged, and the memory they share."""
+    """The topics of a session, the paths of their staged segments, and their shared buffer."""
 
     def __init__(self, where: AnyPath, staged: Callable[[str, int], AnyPath], *, buffer_bytes: int) -> None:
         self.where = where
@@ -69,25 +70,25 @@ class Staging:
         self._numbers = itertools.count()
 
     def next_path(self, topic: str) -> AnyPath:
-        """Return a path no other segment of the session has."""
+        """Return a path that no other segment of the session has."""
         return self._staged(topic, next(self._numbers))
 
-    def relieve(self) -> None:
-        """Write out the topic that holds most where all of them hold too much."""
+    def enforce_limit(self) -> None:
+        """Flush the topic with the most buffered rows if all of them together exceed the limit."""
         topics = tuple(self.topics.values())
         if sum(topic.buffered_bytes for topic in topics) > self._buffer_bytes:
             max(topics, key=lambda topic: topic.buffered_bytes).flush()
 
 
 class StoreTopic:
-    """The writer of one topic; several threads may write, and an error leaves its batch out as a whole."""
+    """The writer of one topic; several threads may write, and an error rejects the complete batch."""
 
     def __init__(
         self, staging: Staging, name: str, ontology: OntologyType, metadata: str, *, folder: AnyPath
     ) -> None:
         self.name = name
         self.folder = folder
-        """Where its segments lie once they are committed."""
+        """The folder of its committed segments."""
         self.ontology = ontology
         self.metadata = metadata
         self._columns = columns_of(ontology)
@@ -98,9 +99,9 @@ class StoreTopic:
         self.segments: list[Segment] = []
         self._staging = staging
         self._batches: list[pa.RecordBatch] = []
-        self._settled = 0
+        self._synced = 0
         self._rows = 0
-        self._most_bytes = _FIRST_GROUP_BYTES
+        self._group_bytes = _FIRST_GROUP_BYTES
         self._broken = False
         self._writer: SegmentWriter | None = None
         self._lock = threading.Lock()
@@ -113,7 +114,7 @@ class StoreTopic:
         if self._has_nested_lists:
             batch = with_offsets(batch)
         with self._lock:
-            self._refuse_if_broken()
+            self._check_usable()
             self._batches.append(batch)
             self._rows += batch.num_rows
             self.buffered_bytes += batch.nbytes
@@ -121,35 +122,35 @@ class StoreTopic:
         if full:
             self.flush()
         else:
-            self._staging.relieve()
+            self._staging.enforce_limit()
 
     def _is_full(self) -> bool:
         big = self.buffered_bytes >= _BIG_ROW_BYTES * self._rows
         return (
-            self.buffered_bytes >= (_BIG_GROUP_BYTES if big else self._most_bytes)
+            self.buffered_bytes >= (_BIG_GROUP_BYTES if big else self._group_bytes)
             or self._rows >= _GROUP_ROWS
         )
 
     def flush(self) -> None:
-        """Write what is in memory as one row group."""
+        """Write the buffered rows as one row group."""
         with self._writing():
             self._flush()
 
     def close(self) -> None:
-        """Write what is in memory and finish the last segment."""
+        """Write the buffered rows and finish the last segment."""
         with self._writing():
             self._flush()
             self._finish_segment()
 
-    def settle(self) -> None:
-        """Wait until the segments finished so far are there to stay."""
-        for segment in self.segments[self._settled :]:
+    def sync(self) -> None:
+        """Wait until the finished segments are on the disk."""
+        for segment in self.segments[self._synced :]:
             with explained(self._staging.where):
-                files.settle(segment.path)
-            self._settled += 1
+                files.sync(segment.path)
+            self._synced += 1
 
     def abandon(self) -> None:
-        """Drop what is in memory, and close the open file."""
+        """Drop the buffered rows and close the open file."""
         with self._lock:
             self._batches.clear()
             if self._writer is not None:
@@ -158,14 +159,14 @@ class StoreTopic:
 
     @contextmanager
     def _writing(self) -> Generator[None, None, None]:
-        """Hold the lock; a failure inside leaves an unfinished file, so the topic can no longer be committed."""
+        """Hold the lock; after an error inside, the file is incomplete and the topic cannot be committed."""
         with self._lock, explained(self._staging.where):
-            self._refuse_if_broken()
+            self._check_usable()
             self._broken = True
             yield
             self._broken = False
 
-    def _refuse_if_broken(self) -> None:
+    def _check_usable(self) -> None:
         if self._broken:
             raise SinkError("an earlier write of the topic failed", where=self.name)
 
@@ -173,7 +174,7 @@ class StoreTopic:
         batches, self._batches = self._batches, []
         self._rows = self.buffered_bytes = 0
         if batches:
-            self._most_bytes = min(2 * self._most_bytes, _GROUP_BYTES)
+            self._group_bytes = min(2 * self._group_bytes, _GROUP_BYTES)
             self._write_group(sorted_rows(batches, self.schema))
 
     def _write_group(self, rows: pa.Table) -> None:
@@ -184,7 +185,7 @@ class StoreTopic:
         self._writer.append(rows)
         if self._writer.written_bytes >= _SEGMENT_BYTES:
             self._finish_segment()
-            self.settle()  # as much as this goes to the disk while others are still read
+            self.sync()  # large segments reach the disk before the commit
 
     def _finish_segment(self) -> None:
         if self._writer is not None:
@@ -193,11 +194,11 @@ class StoreTopic:
 
 
 _WORTH_A_THREAD_BYTES = 1 << 18
-"""A topic that holds less is written sooner than handed over, unless it goes behind a URL."""
+"""Minimum size of a topic that is closed on a thread of its own; behind a URL, every topic is."""
 _FAST_S = 0.005
-_AT_ONCE = 8
+_THREADS = 8
 _WAITING = 2
-"""How many threads may wait for the disk while others encode."""
+"""Number of additional threads, since threads that wait for the disk do not use a core."""
 
 
 class StoreSession:
@@ -206,7 +207,7 @@ class StoreSession:
     def __init__(
         self,
         layout: Files,
-        catalog: Records,
+        catalog: StoreCatalog,
         sequence: str,
         metadata: str,
         *,
@@ -219,16 +220,16 @@ class StoreSession:
         self._layout = layout
         self._catalog = catalog
         self._metadata = metadata
-        self._given: dict[str, StoreTopic] = {}
-        self._notes: list[catalog.NewNote] = []
+        self._topics: dict[str, StoreTopic] = {}
+        self._notes: list[NewNote] = []
         self._staging = Staging(
             layout.root, partial(layout.staged, self.id, sequence), buffer_bytes=buffer_bytes
         )
         self._lease = layout.begin(self.id)
-        self._held = ExitStack()
+        self._open_catalog = ExitStack()
         try:
             if keep_catalog_open:
-                self._held.enter_context(closing(catalog.keep_open()))
+                self._open_catalog.enter_context(closing(catalog.keep_open()))
             self._claim = catalog.claim(self.id, sequence, if_exists, is_live=layout.is_live)
         except BaseException:
             self._leave()
@@ -239,24 +240,24 @@ class StoreSession:
         path = protocol.check_topic_name(name)
         described = protocol.check_metadata(metadata, where=name)
         if path in self._staging.topics:
-            raise SinkError("the topic is open already", where=name)
-        held = self._claim.types.get(path)
-        if held is not None:
-            check_same_type(held, ontology, where=name)
+            raise SinkError("the topic is already open", where=name)
+        existing = self._claim.types.get(path)
+        if existing is not None:
+            check_same_type(existing, ontology, where=name)
         with explained(name):
             folder = self._layout.topic(self._claim.sequence, path)
             topic = StoreTopic(self._staging, path, ontology, described, folder=folder)
-        self._staging.topics[path] = self._given[name] = topic
+        self._staging.topics[path] = self._topics[name] = topic
         return topic
 
     def note_error(self, message: str, *, topic: str | None = None) -> None:
         """Attach an error; see `Session.note_error`."""
         path = None if topic is None else protocol.check_topic_name(topic)
-        self._notes.append(catalog.NewNote(path, message, time.time_ns()))
+        self._notes.append(NewNote(path, message, time.time_ns()))
 
     def stored(self) -> tuple[StoredTopic, ...]:
-        """Return what the footers of the committed files say; see `Session.stored`."""
-        return tuple(self._stored(name, topic) for name, topic in self._given.items())
+        """Return the content according to the footers of the committed files; see `Session.stored`."""
+        return tuple(self._stored(name, topic) for name, topic in self._topics.items())
 
     def commit(self) -> None:
         """Finish every topic, move its segments to their final paths, and enter them in the catalog atomically."""
@@ -270,47 +271,47 @@ class StoreSession:
             for segment in topic.segments
         }
         topics = tuple(map(self._placed, self._staging.topics.values()))
-        new = catalog.NewSession(self.id, self._metadata, self.created_ns, topics, tuple(self._notes))
+        new = NewSession(self.id, self._metadata, self.created_ns, topics, tuple(self._notes))
         try:
             with explained(self._layout.root):
                 self._layout.publish(moves)
             replaced = self._catalog.commit(self._claim, new)
         except BaseException:
-            if not self._may_be_entered():
+            if not self._may_be_committed():
                 self._layout.remove(moves.values())
             raise
         self._leave()
         self._layout.remove(self._layout.root / path for path in replaced)
 
     def _close_topics(self) -> None:
-        """Close large topics on threads, and small ones here meanwhile."""
-        # the largest first, so that no thread is left with it at the end
+        """Close large topics on threads, and small topics on this thread meanwhile."""
+        # the largest topic comes first, so that it does not finish long after the others
         waiting = sorted(self._staging.topics.values(), key=lambda topic: -topic.buffered_bytes)
         most = 0 if isinstance(self._layout.root, RemotePath) else _WORTH_A_THREAD_BYTES
         large = [topic for topic in waiting if topic.buffered_bytes >= most]
         small = waiting[len(large) :]
         with ThreadPoolExecutor((os.cpu_count() or 1) + _WAITING, thread_name_prefix="segment") as pool:
-            closing_large = pool.map(_close_and_settle, large)
+            closing_large = pool.map(_close_and_sync, large)
             for topic in small:
                 topic.close()
-            _settle(small)
+            _sync(small)
             list(closing_large)
 
     def discard(self) -> None:
-        """Leave no trace."""
+        """Delete everything the session wrote."""
         with ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="segment") as pool:
             list(pool.map(StoreTopic.abandon, self._staging.topics.values()))
         try:
             self._catalog.release(self.id, self._claim.sequence)
         except SinkError:
-            return  # the error that ended the session matters more, and the name is free without its lock
+            return  # the original error is more important, and the claim ends with the lease
         finally:
             self._leave()
 
-    def _may_be_entered(self) -> bool:
-        """Say whether the catalog has the session although its commit failed, as its answer may be lost.
+    def _may_be_committed(self) -> bool:
+        """Return whether the catalog may contain the session although its commit failed, since the response may be lost.
 
-        Where it cannot be read it may have: files that nobody needs go with the garbage, lost ones do not come back.
+        If the catalog cannot be read, the files are kept: garbage collection removes files that are not needed.
         """
         try:
             info = self._catalog.sequence(self._claim.sequence)
@@ -318,12 +319,10 @@ class StoreSession:
             return True
         return info is not None and any(session.id == self.id for session in info.sessions)
 
-    def _placed(self, topic: StoreTopic) -> catalog.NewTopic:
+    def _placed(self, topic: StoreTopic) -> NewTopic:
         relative = self._layout.relative(topic.folder)
         segments = {f"{relative}/{segment.path.name}": segment for segment in topic.segments}
-        return catalog.NewTopic(
-            topic.name, topic.ontology, topic.schema, topic.metadata, topic.created_ns, segments
-        )
+        return NewTopic(topic.name, topic.ontology, topic.schema, topic.metadata, topic.created_ns, segments)
 
     def _stored(self, name: str, topic: StoreTopic) -> StoredTopic:
         rows = stored_bytes = 0
@@ -342,32 +341,32 @@ class StoreSession:
         )
 
     def _leave(self) -> None:
-        self._held.close()
+        self._open_catalog.close()
         self._lease.release()
         self._layout.discard(self.id)
 
 
-def _close_and_settle(topic: StoreTopic) -> None:
+def _close_and_sync(topic: StoreTopic) -> None:
     topic.close()
-    topic.settle()
+    topic.sync()
 
 
-def _settle(topics: Sequence[StoreTopic]) -> None:
-    """Wait for the disk one topic after the other where it is fast, for several at once where it turns out not to be."""
+def _sync(topics: Sequence[StoreTopic]) -> None:
+    """Wait for the disk topic by topic, and on several threads once the disk turns out to be slow."""
     began = time.monotonic()
     for done, topic in enumerate(topics):
         if time.monotonic() - began > _FAST_S:
-            with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="fsync") as pool:
-                list(pool.map(StoreTopic.settle, topics[done:]))
+            with ThreadPoolExecutor(_THREADS, thread_name_prefix="fsync") as pool:
+                list(pool.map(StoreTopic.sync, topics[done:]))
             return
-        topic.settle()
+        topic.sync()
 
 
 _BUFFER_BYTES = 96 << 20
 
 
 class StoreSink(Struct, frozen=True):
-    """Writes sequences into a store; one session holds at most about `buffer_bytes` in memory."""
+    """Writes sequences into a store; one session buffers at most about `buffer_bytes`."""
 
     store: Store
     buffer_bytes: int = _BUFFER_BYTES

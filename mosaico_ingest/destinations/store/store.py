@@ -12,12 +12,12 @@ import pyarrow.parquet as pq
 from msgspec import Struct
 
 from mosaico_ingest import protocol
-from mosaico_ingest.destinations.store.catalog import Catalog, NewNote
+from mosaico_ingest.destinations.store.catalog import Catalog
 from mosaico_ingest.destinations.store.checksum import ContentHash, column_makers
 from mosaico_ingest.destinations.store.errors import NotInStore, explained
-from mosaico_ingest.destinations.store.files import Layout, opened
-from mosaico_ingest.destinations.store.model import Collected, SegmentInfo, SequenceInfo, TopicInfo
-from mosaico_ingest.destinations.store.protocols import Files, Records
+from mosaico_ingest.destinations.store.files import LocalFiles, opened
+from mosaico_ingest.destinations.store.model import Collected, NewNote, SegmentInfo, SequenceInfo, TopicInfo
+from mosaico_ingest.destinations.store.protocols import Files, StoreCatalog
 from mosaico_ingest.destinations.store.segment import sorted_rows, time_span
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.findings import suggest_names
@@ -34,7 +34,7 @@ __all__ = [
 
 
 class Checked(Struct, frozen=True):
-    """One segment that was read to its end, and what is wrong with it."""
+    """A segment that was read completely, and its problem, if any."""
 
     topic: str
     segment: SegmentInfo
@@ -42,7 +42,7 @@ class Checked(Struct, frozen=True):
 
 
 def verify(info: SequenceInfo) -> Iterator[Checked]:
-    """Read every segment of a sequence; a damaged page, a missing file and rows the catalog does not know are problems."""
+    """Read every segment of a sequence and compare pages, rows and checksums with the catalog."""
     for topic in info.topics:
         for segment in topic.segments:
             yield Checked(topic.name, segment, _problem(topic, segment))
@@ -52,24 +52,24 @@ def _problem(topic: TopicInfo, segment: SegmentInfo) -> str | None:
     try:
         with opened(segment.path, page_checksum_verification=True) as file:
             if not file.schema_arrow.equals(topic.schema):
-                return "its columns are not those of its topic"
+                return "its columns differ from the columns of its topic"
             content = ContentHash(column_makers(file.schema_arrow))
-            found = (segment.path.stat().st_size, *_rows_and_span(file, content))
+            actual = (segment.path.stat().st_size, *_rows_and_span(file, content))
     except FileNotFoundError:
-        return "is not there"
+        return "the file does not exist"
     except (OSError, pa.ArrowException) as error:
         return str(error).partition("\n")[0]
-    wanted = (segment.stored_bytes, segment.rows, segment.start_ns, segment.end_ns)
-    if found != wanted:
+    expected = (segment.stored_bytes, segment.rows, segment.start_ns, segment.end_ns)
+    if actual != expected:
         form = "{} bytes, {} rows in [{}, {}]"
-        return f"the catalog says {form.format(*wanted)}, the file has {form.format(*found)}"
+        return f"the catalog has {form.format(*expected)}, the file has {form.format(*actual)}"
     if segment.checksum not in {None, content.hexdigest()}:
         return f"its rows have the checksum {content.hexdigest()}, those that were written {segment.checksum}"
     return None
 
 
 def _rows_and_span(file: pq.ParquetFile, content: ContentHash) -> tuple[int, int, int]:
-    """Return how many rows the file really gives, after adding them to `content`, and the span its row groups state."""
+    """Add the rows of the file to `content`; return their count, and the time span of the row groups' statistics."""
     rows = 0
     for batch in file.iter_batches(batch_size=1 << 12):
         content.add(batch)
@@ -82,25 +82,25 @@ _BATCH_ROWS = 1 << 16
 
 
 class Window(Struct, frozen=True):
-    """A span of time, its start in, its end out; None is open."""
+    """A time range with inclusive start and exclusive end; None is unbounded."""
 
     start_ns: int | None = None
     end_ns: int | None = None
 
     def overlaps(self, start_ns: int, end_ns: int) -> bool:
-        """Return whether rows from `start_ns` to `end_ns`, both in, may be inside."""
+        """Return whether rows from `start_ns` to `end_ns`, both inclusive, may be inside."""
         early = self.start_ns is not None and end_ns < self.start_ns
         late = self.end_ns is not None and start_ns >= self.end_ns
         return not early and not late
 
     def covers(self, start_ns: int, end_ns: int) -> bool:
-        """Return whether rows from `start_ns` to `end_ns`, both in, are all inside."""
+        """Return whether all rows from `start_ns` to `end_ns`, both inclusive, are inside."""
         early = self.start_ns is not None and start_ns < self.start_ns
         late = self.end_ns is not None and end_ns >= self.end_ns
         return not early and not late
 
     def cut(self, batch: pa.RecordBatch) -> pa.RecordBatch:
-        """Return the rows inside; the batch is sorted and is not copied."""
+        """Return the rows inside without copying them; the batch is sorted."""
         times = batch.column(0).to_numpy()
         start = 0 if self.start_ns is None else int(np.searchsorted(times, self.start_ns))
         end = len(times) if self.end_ns is None else int(np.searchsorted(times, self.end_ns))
@@ -108,7 +108,7 @@ class Window(Struct, frozen=True):
 
 
 def scan(segments: Sequence[SegmentInfo], schema: pa.Schema, window: Window) -> Iterator[pa.RecordBatch]:
-    """Yield the rows of the columns in `schema`, whose first is `timestamp_ns`, sorted by it."""
+    """Yield the rows of the columns in `schema`, sorted by `timestamp_ns`, its first column."""
     wanted = [segment for segment in segments if window.overlaps(segment.start_ns, segment.end_ns)]
     for together in _overlapping(wanted):
         streams = [_read(segment, schema, window) for segment in together]
@@ -118,7 +118,7 @@ def scan(segments: Sequence[SegmentInfo], schema: pa.Schema, window: Window) -> 
 def count(
     segments: Sequence[SegmentInfo], schema: pa.Schema, window: Window
 ) -> tuple[int, int | None, int | None]:
-    """Return how many rows are inside, and the first and the last of their time stamps."""
+    """Return the number of rows inside the window, and their first and last time stamp."""
     times = pa.schema([schema.field(0)])
     rows, stamps = 0, list[int]()
     for segment in segments:
@@ -133,7 +133,7 @@ def count(
 
 
 def _overlapping(segments: Iterable[SegmentInfo]) -> Iterator[list[SegmentInfo]]:
-    """Yield groups of segments, in time order, that have no time in common with another group."""
+    """Yield groups of segments in time order; the time ranges of different groups do not overlap."""
     group: list[SegmentInfo] = []
     end_ns = 0
     for segment in sorted(segments, key=lambda each: each.start_ns):
@@ -158,7 +158,7 @@ def _read(segment: SegmentInfo, schema: pa.Schema, window: Window) -> Iterator[p
 
 
 def _merge(streams: Sequence[Iterator[pa.RecordBatch]], schema: pa.Schema) -> Iterator[pa.RecordBatch]:
-    """Yield the rows of sorted streams in order; one batch of each is in memory at a time."""
+    """Yield the rows of sorted streams in order, with one batch of each stream in memory."""
     heads = [next(stream, None) for stream in streams]
     while live := [head for head in heads if head is not None]:
         horizon = min(head.column(0)[-1].as_py() for head in live)
@@ -176,46 +176,46 @@ _GRACE_S = 10.0
 
 
 class Store(Struct, frozen=True):
-    """A folder of Parquet segments and the catalog that says what they are; made by `Store.open`."""
+    """Parquet segments and their catalog; opened by `Store.open`."""
 
     layout: Files
-    catalog: Records
+    catalog: StoreCatalog
 
     @classmethod
     def open(cls, path: str | AnyPath, *, create: bool = True) -> Store:
-        """Open the store in the folder or behind the URL `path`; it is made where there is none, unless `create` is off.
+        """Open the store in a folder or behind a URL, and create it if necessary and `create` is set.
 
         Raises:
-            SinkError: There is no store, it cannot be written, or a newer version made it.
+            SinkError: The store does not exist, cannot be opened, or was created by a newer version.
         """
         place = as_path(path)
         if isinstance(place, RemotePath):
-            from mosaico_ingest.destinations.store.files import Bucket  # noqa: PLC0415 - only stores behind URLs need it
-            from mosaico_ingest.destinations.store.object_catalog import Documents  # noqa: PLC0415 - the same
+            from mosaico_ingest.destinations.store.files import ObjectFiles  # noqa: PLC0415 - only stores behind URLs need it
+            from mosaico_ingest.destinations.store.object_catalog import ObjectCatalog  # noqa: PLC0415 - the same
 
-            bucket = Bucket(place)
-            return cls(bucket, Documents(bucket, create=create))
-        layout = Layout(place)
+            bucket = ObjectFiles(place)
+            return cls(bucket, ObjectCatalog(bucket, create=create))
+        layout = LocalFiles(place)
         return cls(layout, Catalog(layout.catalog, create=create))
 
     @classmethod
     def find(cls, path: AnyPath) -> Store | None:
-        """Open the store in a folder or behind a URL; None where there is none."""
+        """Open the store in a folder or behind a URL, or return None if it does not exist."""
         if isinstance(path, RemotePath):
-            from mosaico_ingest.destinations.store.files import Bucket  # noqa: PLC0415 - only stores behind URLs need it
+            from mosaico_ingest.destinations.store.files import ObjectFiles  # noqa: PLC0415 - only stores behind URLs need it
 
-            is_there = Bucket(path).is_there()
+            is_there = ObjectFiles(path).is_there()
         else:
-            is_there = Layout(path).catalog.is_file()
+            is_there = LocalFiles(path).catalog.is_file()
         return cls.open(path, create=False) if is_there else None
 
     @property
     def path(self) -> AnyPath:
-        """The folder."""
+        """The folder or URL of the store."""
         return self.layout.root
 
     def sequences(self) -> tuple[SequenceInfo, ...]:
-        """Return every sequence, by name."""
+        """Return every sequence, sorted by name."""
         return self.catalog.sequences()
 
     def names(self) -> tuple[str, ...]:
@@ -223,18 +223,18 @@ class Store(Struct, frozen=True):
         return tuple(self.catalog.names())
 
     def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
-        """Return the smallest and largest value of columns, as `pose.x`, by segment, where they are known."""
+        """Return the smallest and largest value of columns (`pose.x`) by segment path, if they are known."""
         return self.catalog.bounds(topic, columns)
 
     def find_sequence(self, name: str) -> SequenceInfo | None:
-        """Return one sequence, None where there is none of that name."""
+        """Return a sequence, or None."""
         return self.catalog.sequence(name)
 
     def sequence(self, name: str) -> SequenceInfo:
         """Return one sequence.
 
         Raises:
-            SinkError: There is none of that name; the error lists those there are.
+            SinkError: It does not exist; the hint names existing ones.
         """
         info = self.catalog.sequence(name)
         if info is None:
@@ -245,10 +245,10 @@ class Store(Struct, frozen=True):
         return info
 
     def topic(self, sequence: str, topic: str) -> TopicInfo:
-        """Return one topic; its leading slash may be left out.
+        """Return one topic; its leading slash is optional.
 
         Raises:
-            SinkError: There is none of that name; the error lists those there are.
+            SinkError: It does not exist; the hint names existing ones.
         """
         topics = {info.name: info for info in self.sequence(sequence).topics}
         name = f"/{topic.removeprefix('/')}"
@@ -259,10 +259,10 @@ class Store(Struct, frozen=True):
         return topics[name]
 
     def create_sequence(self, sequence: str, metadata: Mapping[str, Any]) -> None:
-        """Enter a sequence that sessions will be added to; a `StoreSink` does it with its first session.
+        """Create a sequence without sessions; a `StoreSink` creates sequences itself.
 
         Raises:
-            SequenceExists: There is one of that name.
+            SequenceExists: The sequence exists.
             SinkError: The name or the metadata is refused.
         """
         described = protocol.check_metadata(metadata, where=sequence)
@@ -273,7 +273,7 @@ class Store(Struct, frozen=True):
         self.catalog.note(sequence, NewNote(topic, message, time.time_ns()))
 
     def delete_notes(self, sequence: str, *, topic: str | None = None) -> None:
-        """Remove the notes of a sequence itself, or those of one topic."""
+        """Remove the notes of a sequence itself, or of one topic."""
         self.catalog.delete_notes(sequence, topic)
 
     def paths(self, sequence: str, topic: str) -> tuple[AnyPath, ...]:
@@ -289,9 +289,9 @@ class Store(Struct, frozen=True):
         end_ns: int | None = None,
         columns: Sequence[str] | None = None,
     ) -> pa.RecordBatchReader:
-        """Read a topic's rows sorted by `timestamp_ns`, from `start_ns` up to but without `end_ns`.
+        """Read a topic's rows sorted by `timestamp_ns`, from `start_ns` (inclusive) to `end_ns` (exclusive).
 
-        `columns` names top-level columns; `timestamp_ns` always comes, and comes first.
+        `columns` selects top-level columns; `timestamp_ns` is always the first column.
         """
         info = self.topic(sequence, topic)
         schema = info.schema
@@ -302,21 +302,21 @@ class Store(Struct, frozen=True):
         )
 
     def delete_sequence(self, sequence: str) -> None:
-        """Remove a sequence with all it holds; SinkError where there is none."""
+        """Remove a sequence; raises SinkError if it does not exist."""
         self._remove(self.catalog.delete_sequence(sequence))
 
     def delete_topic(self, sequence: str, topic: str) -> None:
-        """Remove one topic; SinkError where there is none."""
+        """Remove a topic; raises SinkError if it does not exist."""
         self._remove(self.catalog.delete_topic(sequence, f"/{topic.removeprefix('/')}"))
 
     def delete_session(self, sequence: str, session: str) -> None:
-        """Remove what one session added; SinkError where there is none."""
+        """Remove the content of a session; raises SinkError if it does not exist."""
         self._remove(self.catalog.delete_session(sequence, session))
 
     def collect_garbage(self, *, grace_s: float = _GRACE_S) -> Collected:
-        """Remove what crashed writers and interrupted deletions left; live sessions are not touched.
+        """Remove files that crashed writers and interrupted deletions left behind.
 
-        A staging folder younger than `grace_s` may belong to a session that is about to take its lock.
+        Live sessions are kept, and so are staging folders younger than `grace_s`, which may be locked soon.
         """
         with explained(self.path):
             files = list(self.layout.segment_files())
