@@ -176,7 +176,7 @@ def test_a_segment_deleted_under_way_is_said_so(
 def test_a_folder_that_cannot_be_written_is_said_so(store: Store) -> None:
     with read_only(store.path):
         assert Store.open(store.path, create=False).sequences() == ()
-        with pytest.raises(SinkError, match="Read-only|write to"), StoreSink(store).open("s", {}):
+        with pytest.raises(SinkError, match=r"Read-only|write to"), StoreSink(store).open("s", {}):
             pytest.fail("the session opened")
 
 
