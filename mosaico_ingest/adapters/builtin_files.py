@@ -1,67 +1,69 @@
-"""Generate `catalog.json` and the table of built-in adapters in docs/adapters.md."""
+"""Generate `catalog.json` and the table of built-in adapters in docs/adapters.md from the adapter files."""
 
 from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mosaico_ingest.adapters.builtin import BUILTIN, CATALOG_FILE, Builtin, find_builtin
+from mosaico_ingest.adapters.builtin import CATALOG, CATALOG_FILE, Builtin, builtins_of, find_builtin
 from mosaico_ingest.adapters.mapping.loader import load_adapter
 
-__all__ = [
-    "catalog_file",
-    "catalog_table",
-    "with_catalog",
-]
+__all__ = ["catalog_file", "read_catalog", "with_catalog"]
+
+_BEGIN, _END = "<!-- catalog: generated from its files -->\n", "<!-- end of catalog -->\n"
 
 
-def catalog_file() -> str:
-    """Return the content of `catalog.json`: one line per adapter.
+def read_catalog() -> dict[str, Any]:
+    """Return the content of each adapter file by the stem of its name, in the order of the adapters' names.
 
     Raises:
         AdapterError: An adapter file has a mistake.
     """
-    sources = {builtin.stem: load_adapter(builtin.path, adapters=find_builtin).source for builtin in BUILTIN}
-    lines = (f'"{stem}": {json.dumps(_plain(source.value))}' for stem, source in sources.items())
+    sources = [load_adapter(path, adapters=find_builtin).source for path in CATALOG.glob("*.yaml")]
+    by_name = sorted(sources, key=lambda source: str(source.at(("adapter",))).lower())
+    return {Path(source.file).stem: source.value for source in by_name}
+
+
+def catalog_file(catalog: dict[str, Any]) -> str:
+    """Return the content of `catalog.json`: one line per adapter."""
+    lines = (f'"{stem}": {json.dumps(_with_text_keys(file))}' for stem, file in catalog.items())
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
-def _plain(value: Any) -> Any:  # noqa: ANN401 - whatever YAML can say
+def with_catalog(text: str, catalog: dict[str, Any]) -> str:
+    """Return a document with the table between its two markers regenerated."""
+    before, rest = text.split(_BEGIN)
+    return f"{before}{_BEGIN}\n{_tables(builtins_of(catalog))}\n{_END}{rest.split(_END)[1]}"
+
+
+def _with_text_keys(value: Any) -> Any:  # noqa: ANN401 - any YAML value
+    """Return a value for JSON: a mapping with keys that are not text becomes a list of pairs."""
     if isinstance(value, list):
-        return [_plain(item) for item in value]
+        return [_with_text_keys(item) for item in value]
     if not isinstance(value, dict):
         return value
-    pairs = [(key, _plain(item)) for key, item in value.items()]
+    pairs = [(key, _with_text_keys(item)) for key, item in value.items()]
     return dict(pairs) if all(isinstance(key, str) for key in value) else {"": pairs}
 
 
-_BEGIN, _END = "<!-- catalog: made from its files -->\n", "<!-- end of catalog -->\n"
+def _tables(builtins: Sequence[Builtin]) -> str:
+    defaults = _table([builtin for builtin in builtins if builtin.default])
+    others = _table([builtin for builtin in builtins if not builtin.default])
+    return f"{defaults}\nThese adapters apply only to topics whose override names them:\n\n{others}"
 
 
-def catalog_table() -> str:
-    """Return Markdown tables of the built-in adapters: first the defaults, then those that need an override."""
-    used = _table([builtin for builtin in BUILTIN if builtin.default])
-    named = _table([builtin for builtin in BUILTIN if not builtin.default])
-    return f"{used}\nOnly where an override names them:\n\n{named}"
-
-
-def with_catalog(text: str) -> str:
-    """Return a document with the table between its two markers regenerated."""
-    before, rest = text.split(_BEGIN)
-    return f"{before}{_BEGIN}\n{catalog_table()}\n{_END}{rest.split(_END)[1]}"
-
-
-def _table(builtins: list[Builtin]) -> str:
+def _table(builtins: Sequence[Builtin]) -> str:
     rows = "".join(
-        f"| `{builtin.name}` | {_types(builtin.ros_types)} | `{builtin.tag}` | {builtin.mapping.model.description} |\n"
+        f"| `{builtin.name}` | {_grouped(builtin.ros_types)} | `{builtin.tag}` | {builtin.description} |\n"
         for builtin in builtins
     )
     return f"| adapter | ROS types | ontology | |\n|---|---|---|---|\n{rows}"
 
 
-def _types(names: tuple[str, ...]) -> str:
+def _grouped(names: Sequence[str]) -> str:
     """Return type names grouped by package, such as `sensor_msgs: Imu`."""
     packages: dict[str, list[str]] = {}
     for name in names:
@@ -71,6 +73,7 @@ def _types(names: tuple[str, ...]) -> str:
 
 
 if __name__ == "__main__":
-    CATALOG_FILE.write_text(catalog_file(), encoding="utf-8")
-    path = Path(sys.argv[1])
-    path.write_text(with_catalog(path.read_text("utf-8")), "utf-8")
+    content = read_catalog()
+    CATALOG_FILE.write_text(catalog_file(content), encoding="utf-8")
+    page = Path(sys.argv[1])
+    page.write_text(with_catalog(page.read_text("utf-8"), content), "utf-8")
