@@ -31,7 +31,6 @@ COMMANDS = {
 GROUPS = {"adapters": "adapters", "store": "store", "keys": "serve"}
 """The module in `cli` that defines each command group, as the Typer application `<name>_app`."""
 NAMES = (*COMMANDS, *GROUPS)
-RECORDING_SUFFIXES = (".bag", ".db3", ".mcap", ".zstd")
 MANIFEST_SUFFIXES = (".yaml", ".yml")
 
 
@@ -149,7 +148,9 @@ def _add_command(words: list[str]) -> list[str]:
     is_option_value = first != words[0] and any(word.endswith(MANIFEST_SUFFIXES) for word in words)
     if first.endswith(MANIFEST_SUFFIXES) or is_option_value:
         return ["run", *words]
-    if first.endswith(RECORDING_SUFFIXES) or Path(first).is_dir():
+    from mosaico_ingest.rosbag.formats import RECORDING_NAME
+
+    if RECORDING_NAME.search(first) or Path(first).is_dir():
         bag = shlex.quote(first)
         hint = f"ingest it with `ingest bag {bag}`, or draft a manifest with `ingest init {bag}`"
         raise _usage_error(f"{first} is a recording, not a manifest", hint)

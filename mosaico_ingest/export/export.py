@@ -28,8 +28,9 @@ from mosaico_ingest.rosbag.blocks import Encoding
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.formats import ROS_VERSIONS
 from mosaico_ingest.rosbag.serialization import Serializer
-from mosaico_ingest.rosbag.writers import ROS_VERSIONS, RecordingWriter, open_writer
+from mosaico_ingest.rosbag.writers import RecordingWriter, open_writer
 
 __all__ = [
     "ExportReport",

@@ -12,6 +12,7 @@ from msgspec import Struct
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.remote import AnyPath
+from mosaico_ingest.rosbag.formats import SUFFIX_LIST, SUFFIXES, ZSTD_SUFFIX
 from mosaico_ingest.rosbag.opening import is_recording
 from mosaico_ingest.textfile import read_limited
 
@@ -25,22 +26,26 @@ __all__ = [
 ]
 
 FILE_NAME = "metadata.yaml"
-_LIMIT_BYTES = 16 << 20
+_MAX_BYTES = 16 << 20
+_SPLIT_NAME = re.compile(
+    rf"(?P<stem>.*)_\d+(?P<suffix>(?:{'|'.join(map(re.escape, SUFFIXES))})(?:{re.escape(ZSTD_SUFFIX)})?)"
+)
+"""The file name of a numbered split."""
 
 
 class MetadataTopic(Struct, frozen=True):
-    """What the metadata say of a topic."""
+    """The entry of a topic in the metadata."""
 
     topic: str
     msgtype: str
     count: int
     serialization_format: str
     qos: str
-    """As the storage spells it; empty where this version of the metadata has another form."""
+    """The QoS profiles as text; empty if this version of the metadata stores them in another form."""
 
 
 class Metadata(Struct, frozen=True):
-    """The parts of `metadata.yaml` that can be compared with the storage."""
+    """The content of a `metadata.yaml` that can be compared with the files."""
 
     path: AnyPath
     files: tuple[str, ...]
@@ -53,13 +58,13 @@ def read_metadata(path: AnyPath) -> Metadata:
     """Read a `metadata.yaml` of any version.
 
     Raises:
-        BagError: It is no YAML, or not of rosbag2's shape.
+        BagError: The file is not YAML, or does not have the structure of rosbag2's metadata.
     """
     import yaml  # noqa: PLC0415 - slow to import, and few recordings come with metadata
 
     try:
-        if path.stat().st_size > _LIMIT_BYTES:
-            raise BagError(f"larger than {_LIMIT_BYTES} bytes", where=str(path))
+        if path.stat().st_size > _MAX_BYTES:
+            raise BagError(f"larger than {_MAX_BYTES} bytes", where=str(path))
         content = yaml.load(read_limited(path), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))  # noqa: S506 - both are safe loaders, one is fast
         info = content["rosbag2_bagfile_information"]
         return Metadata(
@@ -72,93 +77,89 @@ def read_metadata(path: AnyPath) -> Metadata:
     except OSError as err:
         raise BagError(f"cannot be read: {err.strerror}", where=str(path)) from err
     except yaml.YAMLError as err:
-        raise BagError(f"no YAML: {' '.join(str(err).split())}", where=str(path)) from err
+        raise BagError(f"not valid YAML: {' '.join(str(err).split())}", where=str(path)) from err
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as err:
-        raise BagError(f"not of the shape of rosbag2's metadata: {err}", where=str(path)) from err
+        raise BagError(f"does not have the structure of rosbag2's metadata: {err}", where=str(path)) from err
 
 
 def _topic(entry: dict[str, Any]) -> MetadataTopic:
-    about = entry.get("topic_metadata") or entry["topic_and_type"]
-    qos = about.get("offered_qos_profiles")
+    topic = entry.get("topic_metadata") or entry["topic_and_type"]
+    qos = topic.get("offered_qos_profiles")
     return MetadataTopic(
-        _text(about["name"]),
-        _text(about["type"]),
+        _text(topic["name"]),
+        _text(topic["type"]),
         int(entry.get("message_count") or 0),
-        _text(about.get("serialization_format")),
+        _text(topic.get("serialization_format")),
         qos if isinstance(qos, str) else "",
     )
 
 
 def _text(value: object) -> str:
-    """Return a scalar as text; a list would be spelled out with all that its aliases stand for."""
+    """Return a scalar as text. A list is refused, because formatting it would expand all of its aliases."""
     if value is None or isinstance(value, (str, int, float)):
         return "" if value is None else str(value)
-    raise ValueError(f"a text expected, a {type(value).__name__} found")
-
-
-_SUFFIX = ".zstd"
-_NAMED = (".bag", ".db3", ".mcap")
+    raise ValueError(f"a string expected, a {type(value).__name__} found")
 
 
 class RecordingFiles(Struct, frozen=True):
-    """The files of one recording, the metadata that describe all of them, and what is odd about either."""
+    """The files of one recording, the metadata that describes all of them, and findings about both."""
 
     files: tuple[AnyPath, ...]
     metadata: Metadata | None
     findings: tuple[Finding, ...]
     missing: tuple[AnyPath, ...] = ()
-    """Parts that the metadata list beside others that are there."""
+    """Splits that the metadata lists and that do not exist, if others do."""
 
 
 def discover(paths: Sequence[AnyPath]) -> RecordingFiles:
-    """Return the files that `paths` stand for, each once.
+    """Return the files of the recording at `paths`: files, directories or `metadata.yaml` files. Deduplicate them.
 
     Raises:
-        BagError: A path does not exist, or holds no recording.
+        BagError: A path does not exist, or contains no recording.
     """
     if not paths:
         raise BagError("no path given", hint="name a recording, a directory or a metadata.yaml")
-    found = [_one(path) for path in paths]
-    files = tuple(dict.fromkeys(file for one in found for file in one.files))
-    findings = tuple(finding for one in found for finding in one.findings)
-    missing = tuple(file for one in found for file in one.missing)
-    return RecordingFiles(files, found[0].metadata if len(found) == 1 else None, findings, missing)
+    parts = [_discover_path(path) for path in paths]
+    files = tuple(dict.fromkeys(file for part in parts for file in part.files))
+    findings = tuple(finding for part in parts for finding in part.findings)
+    missing = tuple(file for part in parts for file in part.missing)
+    return RecordingFiles(files, parts[0].metadata if len(parts) == 1 else None, findings, missing)
 
 
-def _one(path: AnyPath) -> RecordingFiles:
+def _discover_path(path: AnyPath) -> RecordingFiles:
     if not path.exists():
         raise BagError("does not exist", where=str(path), hint="check the path")
     if path.is_dir():
-        return _directory(path)
+        return _discover_directory(path)
     if path.name == FILE_NAME:
-        return _listed(read_metadata(path))
-    return _file(path)
+        return _discover_listed(read_metadata(path))
+    return _discover_file(path)
 
 
-def _file(path: AnyPath) -> RecordingFiles:
-    """A file is itself; the metadata beside it count where they speak of this file alone."""
-    beside = path.parent / FILE_NAME
-    if not beside.is_file():
+def _discover_file(path: AnyPath) -> RecordingFiles:
+    """Return a single file, with the metadata next to it if it describes only this file."""
+    metadata_path = path.parent / FILE_NAME
+    if not metadata_path.is_file():
         return RecordingFiles((path,), None, ())
     try:
-        metadata = read_metadata(beside)
+        metadata = read_metadata(metadata_path)
     except BagError as err:
         return RecordingFiles((path,), None, (_unreadable(err),))
     names = [Path(name).name for name in metadata.files]
-    if not {path.name, path.name.removesuffix(_SUFFIX)} & set(names):
+    if not {path.name, path.name.removesuffix(ZSTD_SUFFIX)} & set(names):
         return RecordingFiles((path,), None, ())
     if len(names) == 1:
         return RecordingFiles((path,), metadata, ())
-    part = Finding(
+    finding = Finding(
         "single-split",
         Severity.INFO,
-        f"{path.name} is one of the {len(names)} parts that {beside} lists",
+        f"{path.name} is one of {len(names)} splits that {metadata_path} lists",
         help=f"name {path.parent} to read all of them",
     )
-    return RecordingFiles((path,), None, (part,))
+    return RecordingFiles((path,), None, (finding,))
 
 
-def _directory(path: AnyPath) -> RecordingFiles:
+def _discover_directory(path: AnyPath) -> RecordingFiles:
     listing = path / FILE_NAME
     findings: tuple[Finding, ...] = ()
     if listing.is_file():
@@ -167,19 +168,19 @@ def _directory(path: AnyPath) -> RecordingFiles:
         except BagError as err:
             findings = (_unreadable(err),)
         else:
-            return _listed(metadata)
+            return _discover_listed(metadata)
     files = _recordings(path)
     if not files:
-        held = ", ".join(sorted(entry.name for entry in _entries(path))[:5])
+        entries = ", ".join(sorted(entry.name for entry in _entries(path))[:5])
         raise BagError(
-            f"a directory without a recording; it holds {held or 'nothing'}",
+            f"a directory without a recording; it holds {entries or 'nothing'}",
             where=str(path),
-            hint="name a .bag, .db3 or .mcap file, or a directory with a metadata.yaml",
+            hint=f"name a recording ({SUFFIX_LIST}), or a directory with a metadata.yaml",
         )
     return RecordingFiles(tuple(files), None, findings)
 
 
-def _listed(metadata: Metadata) -> RecordingFiles:
+def _discover_listed(metadata: Metadata) -> RecordingFiles:
     folder = metadata.path.parent
     files: list[AnyPath] = []
     missing: list[str] = []
@@ -189,23 +190,23 @@ def _listed(metadata: Metadata) -> RecordingFiles:
             missing.append(name)
         else:
             files.append(file)
-    gone = tuple(folder / name for name in missing) if files else ()
+    missing_files = tuple(folder / name for name in missing) if files else ()
     unlisted = _unlisted_splits(folder, files)
     files += unlisted
     if not files:
         files = _recordings(folder)
         if not files:
             raise BagError(
-                f"none of the files it lists is there: {', '.join(metadata.files) or 'it lists none'}",
+                f"none of the listed files exists: {', '.join(metadata.files) or 'the list is empty'}",
                 where=str(metadata.path),
-                hint="restore the files beside it",
+                hint="restore the files next to it",
             )
     findings = tuple(
         Finding(
             "missing-split",
             Severity.WARNING,
-            f"{metadata.path} lists {name}, which is not there",
-            help="restore it, or accept that its messages are missing",
+            f"{metadata.path} lists {name}, which does not exist",
+            help="restore the file; its messages are missing",
         )
         for name in missing
     )
@@ -218,10 +219,9 @@ def _listed(metadata: Metadata) -> RecordingFiles:
         )
         for file in unlisted
     )
-    return RecordingFiles(tuple(sorted(files, key=_natural) if unlisted else files), metadata, findings, gone)
-
-
-_SPLIT_NAME = re.compile(r"(?P<stem>.*)_\d+(?P<suffix>\.(?:db3|mcap)(?:\.zstd)?)")
+    return RecordingFiles(
+        tuple(sorted(files, key=_natural_order) if unlisted else files), metadata, findings, missing_files
+    )
 
 
 def _unlisted_splits(folder: AnyPath, files: Sequence[AnyPath]) -> list[AnyPath]:
@@ -235,16 +235,18 @@ def _unlisted_splits(folder: AnyPath, files: Sequence[AnyPath]) -> list[AnyPath]
 
 
 def _recordings(folder: AnyPath) -> list[AnyPath]:
-    """Return what is a recording, and what is only called so: a part that is empty or damaged is a loss, not nothing.
+    """Return the files whose content or name is that of a recording: an empty or damaged split must not be ignored.
 
-    Hidden files are no parts: copying programs leave them.
+    Hidden files are ignored, because copying programs leave temporary ones.
     """
     files = (entry for entry in _entries(folder) if entry.is_file() and not entry.name.startswith("."))
-    return sorted((file for file in files if _is_named(file) or is_recording(file)), key=_natural)
+    return sorted(
+        (file for file in files if _has_recording_name(file) or is_recording(file)), key=_natural_order
+    )
 
 
-def _is_named(file: AnyPath) -> bool:
-    return file.name.removesuffix(_SUFFIX).endswith(_NAMED)
+def _has_recording_name(file: AnyPath) -> bool:
+    return file.name.removesuffix(ZSTD_SUFFIX).endswith(SUFFIXES)
 
 
 def _entries(folder: AnyPath) -> list[AnyPath]:
@@ -255,21 +257,19 @@ def _entries(folder: AnyPath) -> list[AnyPath]:
 
 
 def _candidates(folder: AnyPath, name: str) -> Iterator[AnyPath]:
-    """Yield where a listed file may be: old versions wrote a directory, or left off the compression's suffix."""
-    for part in dict.fromkeys((name, Path(name).name)):
-        yield folder / part
-        yield folder / f"{part}{_SUFFIX}"
-        yield folder / part.removesuffix(_SUFFIX)
+    """Yield the possible paths of a listed file: old versions include a directory, or omit the suffix of compressed files."""
+    for relative in dict.fromkeys((name, Path(name).name)):
+        yield folder / relative
+        yield folder / f"{relative}{ZSTD_SUFFIX}"
+        yield folder / relative.removesuffix(ZSTD_SUFFIX)
 
 
-def _natural(path: AnyPath) -> list[tuple[int, str]]:
-    """Sort `part_10` behind `part_9`."""
-    return [
-        (int(extent), "") if extent.isdecimal() else (-1, extent) for extent in re.split(r"(\d+)", path.name)
-    ]
+def _natural_order(path: AnyPath) -> list[tuple[int, str]]:
+    """Return a sort key that orders `split_10` after `split_9`."""
+    return [(int(token), "") if token.isdecimal() else (-1, token) for token in re.split(r"(\d+)", path.name)]
 
 
 def _unreadable(err: BagError) -> Finding:
     return Finding(
-        "metadata-unreadable", Severity.WARNING, str(err), help="the storage alone decides what is read"
+        "metadata-unreadable", Severity.WARNING, str(err), help="all recordings in the folder are read"
     )

@@ -24,6 +24,7 @@ __all__ = [
     "MCAP",
     "RECORDING_NAME",
     "ROSRECORD",
+    "ROS_VERSIONS",
     "SUFFIXES",
     "SUFFIX_LIST",
     "ZSTD",
@@ -90,6 +91,8 @@ CONTAINERS = (
 """All container formats; the first whose magic matches is used."""
 
 SUFFIXES = tuple(dict.fromkeys(container.suffix for container in CONTAINERS))
+ROS_VERSIONS = {container.suffix: container.ros_versions for container in CONTAINERS}
+"""The versions of ROS whose messages a container stores, by suffix."""
 SUFFIX_LIST = f"{', '.join(SUFFIXES[:-1])} and {SUFFIXES[-1]}"
 """The suffixes as they appear in messages."""
 RECORDING_NAME = re.compile(

@@ -1,16 +1,18 @@
-"""Decode and encode one message at a time; the oracle of the columnar decoder.
+"""Deserialize and serialize one message at a time; the reference of the columnar decoder.
 
-The rules a message can break, which failures are counted by:
+The rule ids of deserialization errors:
 
-* `encapsulation`, `pl-cdr`, `xcdr2`: the first four bytes do not announce plain CDR.
-* `truncated`: a field needs more bytes than are left.
-* `string-length`, `string-terminator`, `utf8`, `utf16`: a string ends outside the message, a CDR string does not
-  end in NUL, text is not Unicode. Text is never repaired: a wrong byte is lost data or a wrong definition.
-* `sequence-length`, `sequence-bound`: more elements than the bytes left could hold, or than the definition allows.
-* `trailing-bytes`: bytes remain. CDR may end in up to 3 bytes of padding, and in 4 to 7 if they are zero.
+* `encapsulation`, `pl-cdr`, `xcdr2`: the first four bytes are not the header of plain CDR.
+* `truncated`: a field needs more bytes than the message has.
+* `string-length`, `string-terminator`, `utf8`, `utf16`: a string extends beyond the message, a CDR string has no
+  terminating NUL, or a text is not valid Unicode. Text is never repaired, because a wrong byte means that data is
+  damaged or that the definition is wrong.
+* `sequence-length`, `sequence-bound`: a sequence has more elements than the remaining bytes or the definition allow.
+* `trailing-bytes`: bytes remain after the last field. CDR messages may end with up to 3 bytes of padding, or with 4 to
+  7 zero bytes.
 
-A definition is walked once, when a serializer is made. Values of fixed size that follow each other are one `_Block`,
-whatever the structs they belong to, and are packed together; texts and sequences are written one by one.
+A serializer compiles its definition once. Consecutive values of fixed size form one `_Block`, even across nested
+structs, and are packed together; texts and sequences are written individually.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ FORMATS: Mapping[str, str] = {
     "bool": "B", "byte": "B", "char": "B", "uint8": "B", "int8": "b", "uint16": "H", "int16": "h",
     "uint32": "I", "int32": "i", "uint64": "Q", "int64": "q", "float32": "f", "float64": "d",
 }  # fmt: skip
-"""The `struct` letter of each primitive of a fixed size; any non-zero `bool` is true."""
+"""The `struct` format of each primitive of fixed size; any nonzero byte is a true `bool`."""
 
 _SIZES = {kind: Struct(f"<{letter}").size for kind, letter in FORMATS.items()}
 _MAX_EMPTY = 1 << 16
@@ -55,7 +57,7 @@ _XCDR2 = {6: "CDR2", 7: "CDR2", 8: "D_CDR2", 9: "D_CDR2", 10: "PL_CDR2", 11: "PL
 
 
 class _Cursor:
-    """A position in the bytes behind the encapsulation header, from which CDR counts its alignment."""
+    """A position in the bytes after the encapsulation header, from which CDR counts alignment."""
 
     __slots__ = ("cdr", "data", "order", "pos")
 
@@ -71,11 +73,11 @@ class _Cursor:
 
     @property
     def offset(self) -> int:
-        """Where in the payload the cursor is."""
+        """The position in the payload, including the encapsulation header."""
         return self.pos + 4 * self.cdr
 
     def take(self, size: int, align: int, path: str) -> int:
-        """Step over `size` bytes behind the padding, and return where they begin."""
+        """Skip the padding and `size` bytes; return the position of the bytes."""
         start = (self.pos + align - 1) & -align if self.cdr else self.pos
         self.pos = start
         if start + size > len(self.data):
@@ -95,23 +97,23 @@ _Read = Callable[[_Cursor], Any]
 
 
 class Deserializer:
-    """Reads messages of one definition; fixed arrays and sequences become lists, sequences of bytes `bytes`."""
+    """Decodes messages of one definition. Arrays and sequences become lists, sequences of `uint8`, `byte` and `char` `bytes`."""
 
     def __init__(self, definition: Definition, encoding: Encoding) -> None:
         if encoding is Encoding.OTHER:
-            raise BagError(f"{definition.root}: only CDR and ROS 1 payloads can be read")
+            raise BagError(f"{definition.root}: only CDR and ROS 1 payloads can be decoded")
         self._definition = definition
         self._encoding = encoding
         self._cdr = encoding is Encoding.CDR
         self._read = _message(definition.message, "", definition.types, cdr=self._cdr)
         self.padded = 0
-        """How many messages ended in 4 to 7 zero bytes that the definition does not account for."""
+        """Number of messages that ended in 4 to 7 zero bytes that the definition does not explain."""
 
     def to_dict(self, payload: bytes) -> dict[str, Any]:
         """Return the message's fields by name.
 
         Raises:
-            DecodeError: The bytes do not fit the definition; `rule` says how.
+            DecodeError: The bytes do not match the definition; `rule` is the rule id.
         """
         try:
             return self._values(payload)
@@ -120,7 +122,7 @@ class Deserializer:
             raise
 
     def fits(self, payload: bytes) -> bool:
-        """Say whether a payload can be read."""
+        """Return whether a payload matches the definition."""
         try:
             self._values(payload)
         except DecodeError:
@@ -139,14 +141,14 @@ class Deserializer:
         return values
 
     def _remedy(self, payload: bytes) -> str | None:
-        """Name a distro whose definition of the type the bytes would fit."""
-        known = self._definition
-        others = _distro_readers(known.root, known.ros_version, self._encoding)
-        fitting = (
-            distro for distro, types, reader in others if types != known.types and reader.fits(payload)
+        """Return a hint that names a distro whose definition of the type matches the bytes."""
+        definition = self._definition
+        others = _distro_readers(definition.root, definition.ros_version, self._encoding)
+        matching = (
+            distro for distro, types, reader in others if types != definition.types and reader.fits(payload)
         )
-        distro = next(fitting, None)
-        return f"they would fit the definition of {distro}" if distro else None
+        distro = next(matching, None)
+        return f"use the definition of {distro}, which matches the bytes" if distro else None
 
     def _check_tail(self, cursor: _Cursor) -> None:
         left = cursor.left
@@ -156,8 +158,8 @@ class Deserializer:
             self.padded += 1
             return
         raise DecodeError(
-            f"the definition of {self._definition.root} is shorter than the data by {left} bytes; "
-            f"it came from {_ORIGINS[self._definition.source.value]}",
+            f"{left} bytes remain after the last field of {self._definition.root}, whose definition is from "
+            f"{_ORIGINS[self._definition.source.value]}",
             rule="trailing-bytes",
         )
 
@@ -175,8 +177,8 @@ _ORIGINS = {"bag": "the recording", "custom": "a custom definition", "distro": "
 
 
 def _byte_order(payload: bytes) -> str:
-    """Return `<` or `>` as the encapsulation header says."""
-    if len(payload) >= 4 and payload[0] == 0:  # noqa: PLR2004 - the header's size, as CDR defines it
+    """Return `<` or `>` according to the encapsulation header."""
+    if len(payload) >= 4 and payload[0] == 0:  # noqa: PLR2004 - size of the CDR header
         kind = payload[1]
         if kind <= 1:
             return "<" if kind else ">"
@@ -193,7 +195,7 @@ def _byte_order(payload: bytes) -> str:
 
 
 def min_size(kind: str, types: Mapping[str, MessageType], *, cdr: bool) -> int:
-    """Return the fewest bytes a value of the type takes, without padding; 0 is possible in ROS 1 only."""
+    """Return the minimum size of a value in bytes, without padding; 0 is possible in ROS 1 only."""
     if kind in _SIZES:
         return _SIZES[kind]
     if kind in {"string", "wstring"}:
@@ -216,7 +218,7 @@ def _message(message: MessageType, path: str, types: Mapping[str, MessageType], 
         return lambda cursor: {name: read(cursor) for name, read in readers}
 
     def read_empty(cursor: _Cursor) -> dict[str, Any]:
-        cursor.take(1, 1, path)  # a structure without members is one unused byte in ROS 2
+        cursor.take(1, 1, path)  # ROS 2 represents an empty struct by one unused byte
         return {}
 
     return read_empty
@@ -257,7 +259,7 @@ def _number(kind: str, path: str) -> _Read:
 
 
 def _numbers(field: Field, path: str) -> _Read:
-    """Return a reader of a sequence or array of numbers; an empty one is not aligned."""
+    """Return a reader of a sequence or array of numbers. Empty ones are not aligned."""
     kind, size, letter = field.type, _SIZES[field.type], FORMATS[field.type]
     fixed = field.size if field.container is Container.ARRAY else None
 
@@ -273,7 +275,7 @@ def _numbers(field: Field, path: str) -> _Read:
 
 
 def _count(cursor: _Cursor, field: Field, path: str, least: int) -> int:
-    """Read how many elements follow, and check that they can."""
+    """Read the number of elements, and check it against the remaining bytes and the bound."""
     count = cursor.word(path)
     if count * least > cursor.left or (not least and count > _MAX_EMPTY):
         raise DecodeError(
@@ -309,7 +311,7 @@ def _string(cursor: _Cursor, path: str) -> str:
 
 
 def _wstring(cursor: _Cursor, path: str) -> str:
-    """Read UTF-16 code units, which every ROS 2 middleware writes as 32-bit words without a terminator."""
+    """Read UTF-16 code units, which all ROS 2 middlewares write as 32-bit words without a terminator."""
     count = cursor.word(path)
     if count * 4 > cursor.left:
         raise DecodeError(
@@ -325,15 +327,15 @@ def _wstring(cursor: _Cursor, path: str) -> str:
 
 
 _Path = tuple[str, ...]
-"""The names on the way to a value."""
+"""The field names that lead to a value."""
 
 
 class Serializer:
-    """Writes messages of one definition, little-endian unless told otherwise."""
+    """Encodes messages of one definition, little-endian by default."""
 
     def __init__(self, definition: Definition, encoding: Encoding, *, big_endian: bool = False) -> None:
         if encoding is Encoding.OTHER or (encoding is Encoding.ROS1 and big_endian):
-            raise BagError(f"{definition.root}: only CDR and little-endian ROS 1 payloads can be written")
+            raise BagError(f"{definition.root}: only CDR and little-endian ROS 1 payloads can be encoded")
         self._definition = definition
         self._cdr = encoding is Encoding.CDR
         self._order = ">" if big_endian else "<"
@@ -342,21 +344,21 @@ class Serializer:
         self._steps = self._steps_of(definition.root)
 
     def from_dict(self, values: Mapping[str, Any]) -> bytes:
-        """Return the payload of a message given as `Deserializer.to_dict` gives it.
+        """Return the payload of a message in the form that `Deserializer.to_dict` returns.
 
         Raises:
-            BagError: A value is missing or does not fit its field.
+            BagError: A value is missing or does not match its field.
         """
         out = bytearray()
         try:
             for step in self._steps:
                 step.write(out, values)
         except (struct.error, KeyError, TypeError, ValueError, AttributeError) as error:
-            raise BagError(f"the values do not fit {self._definition.root}: {error!r}") from error
+            raise BagError(f"the values do not match {self._definition.root}: {error!r}") from error
         return self._header + bytes(out)
 
     def _steps_of(self, msgtype: str) -> list[_Step]:
-        """Return how a message of this type is written; a type may be inside a sequence of its own."""
+        """Return the cached steps that write a message of this type."""
         if msgtype not in self._known:
             steps = self._known[msgtype] = []
             self._add_message(steps, msgtype, ())
@@ -404,7 +406,7 @@ class Serializer:
 
 class _Step(Protocol):
     def write(self, out: bytearray, values: Mapping[str, Any]) -> None:
-        """Append what the step is about, found in the values of its message."""
+        """Append the step's value from the values of its message."""
         ...
 
 
@@ -415,14 +417,14 @@ class _Elements(Protocol):
 
 
 class _Nothing:
-    """A message without fields, which CDR gives one byte."""
+    """A message without fields, which CDR represents by one byte."""
 
-    def write(self, out: bytearray, values: Mapping[str, Any]) -> None:  # noqa: ARG002 - there are none
+    def write(self, out: bytearray, values: Mapping[str, Any]) -> None:  # noqa: ARG002 - the message has no values
         out.append(0)
 
 
 class _Block:
-    """Numbers that follow each other; the padding between them depends on where the first one begins."""
+    """Consecutive numbers; the padding between them depends on the position of the first one."""
 
     def __init__(self, order: str, *, aligned: bool) -> None:
         self._order = order
@@ -431,7 +433,7 @@ class _Block:
         self._packers: dict[int, struct.Struct] = {}
 
     def add(self, path: _Path, letter: str, count: int | None) -> None:
-        """Append a number, or an array of so many."""
+        """Append a number, or an array of `count` numbers."""
         self._parts.append((path, letter, count))
 
     def write(self, out: bytearray, values: Mapping[str, Any]) -> None:
@@ -460,7 +462,7 @@ class _Block:
 
 
 class _Words:
-    """Numbers of one kind, any number of them."""
+    """A sequence of numbers of one type."""
 
     def __init__(self, order: str, letter: str, *, aligned: bool) -> None:
         self._order = order
@@ -474,7 +476,7 @@ class _Words:
 
 
 class _Texts:
-    """Texts: a length word, and UTF-8 that CDR ends in NUL, or UTF-16 units of four bytes."""
+    """Strings: a length word and UTF-8, which CDR terminates with NUL, or UTF-16 units of four bytes."""
 
     def __init__(self, words: _Words, *, wide: bool, ended: bool) -> None:
         self._words = words
@@ -495,7 +497,7 @@ class _Texts:
 
 
 class _Text:
-    """One text."""
+    """One string."""
 
     def __init__(self, path: _Path, texts: _Texts) -> None:
         self._path = path
@@ -506,7 +508,7 @@ class _Text:
 
 
 class _Many:
-    """An array or a sequence; the latter has its length before it."""
+    """An array, or a sequence with its length word."""
 
     def __init__(self, path: _Path, field: Field, length: _Words, elements: _Elements) -> None:
         self._path = path

@@ -22,7 +22,7 @@ from rosbags.rosbag2 import Writer as Rosbag2
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.definitions.hashes import md5sum, rihs01
 from mosaico_ingest.rosbag.definitions.model import Definition, short_msgtype
-from mosaico_ingest.rosbag.formats import MCAP
+from mosaico_ingest.rosbag.formats import MCAP, SUFFIX_LIST
 from mosaico_ingest.rosbag.mcap.records import (
     RECORD,
     Op,
@@ -33,7 +33,6 @@ from mosaico_ingest.rosbag.mcap.records import (
 from mosaico_ingest.version import __version__
 
 __all__ = [
-    "ROS_VERSIONS",
     "McapWriter",
     "RecordingWriter",
     "Ros1Writer",
@@ -43,13 +42,13 @@ __all__ = [
 
 
 class RecordingWriter(Protocol):
-    """Takes messages by log time; those of ROS 1 definitions in ROS 1's encoding, others as little-endian CDR."""
+    """Writes messages in log-time order: ROS 1 messages in the ROS 1 encoding, others as little-endian CDR."""
 
     def add_connection(self, topic: str, definition: Definition) -> int:
-        """Open a channel and return its number.
+        """Add a connection and return its number.
 
         Raises:
-            BagError: The container cannot hold it.
+            BagError: The container cannot store it.
         """
         ...
 
@@ -58,11 +57,11 @@ class RecordingWriter(Protocol):
         ...
 
     def finish(self) -> None:
-        """Write what comes last."""
+        """Write the index and close the file."""
         ...
 
     def abandon(self) -> None:
-        """Close the file, which stays unfinished."""
+        """Close the unfinished file."""
         ...
 
 
@@ -73,11 +72,11 @@ _MAX_CHANNELS = 65535
 
 @dataclass(slots=True)
 class _Chunk:
-    """What is gathered for one chunk."""
+    """The content of the chunk being written."""
 
     data: bytearray = field(default_factory=bytearray)
     index: dict[int, bytearray] = field(default_factory=dict[int, bytearray])
-    """By channel: time and offset of each message."""
+    """Log time and offset of each message, by channel."""
     start_ns: int = 0
     end_ns: int = 0
 
@@ -89,7 +88,7 @@ class McapWriter:
         self._file = path.open("xb")
         self._schemas: dict[tuple[str, int, str], int] = {}
         self._records: list[bytes] = []
-        """Schemas and channels; they stand before the first chunk that may need them, and in the summary."""
+        """Schema and channel records, which precede the first chunk that refers to them and are repeated in the summary."""
         self._versions: list[int] = []
         self._counts: dict[int, int] = {}
         self._pending: list[bytes] = []
@@ -98,7 +97,7 @@ class McapWriter:
         self._start_ns: int | None = None
         self._end_ns = 0
         self._file.write(MCAP)
-        self._began = False
+        self._has_header = False
 
     def add_connection(
         self,
@@ -110,7 +109,7 @@ class McapWriter:
     ) -> int:
         """Add a connection; two definitions of one type are two schemas. Without `embed` the schema has no text."""
         if len(self._versions) == _MAX_CHANNELS:
-            raise BagError(f"MCAP has room for {_MAX_CHANNELS} channels", where=topic)
+            raise BagError(f"an MCAP file can have at most {_MAX_CHANNELS} channels", where=topic)
         number, version = len(self._versions) + 1, definition.ros_version
         self._versions.append(version)
         encoding = "ros1" if version == 1 else "cdr"
@@ -121,8 +120,8 @@ class McapWriter:
         return number
 
     def write(self, channel: int, log_ns: int, payload: bytes) -> None:
-        """Append a message; it was published when it was recorded, as far as is known."""
-        self._begin()
+        """Append a message; its publish time is unknown, so the log time is used."""
+        self._write_pending()
         chunk = self._chunk
         if not chunk.data:
             chunk.start_ns = chunk.end_ns = log_ns
@@ -139,7 +138,7 @@ class McapWriter:
 
     def finish(self) -> None:
         """Write the last chunk and the summary."""
-        self._begin()
+        self._write_pending()
         self._flush()
         self._put(Op.DATA_END, struct.pack("<I", 0))
         start = self._file.tell()
@@ -153,8 +152,8 @@ class McapWriter:
         for op, records in groups:
             group = b"".join(records)
             if group:
-                place = struct.pack("<BQQ", op, start + len(summary), len(group))
-                offsets += record_bytes(Op.SUMMARY_OFFSET, place)
+                entry = struct.pack("<BQQ", op, start + len(summary), len(group))
+                offsets += record_bytes(Op.SUMMARY_OFFSET, entry)
                 summary += group
         footer = RECORD.pack(Op.FOOTER, 20) + struct.pack("<QQ", start, start + len(summary))
         checked = summary + offsets + footer
@@ -162,16 +161,16 @@ class McapWriter:
         self._file.close()
 
     def abandon(self) -> None:
-        """Close the file as it is."""
+        """Close the unfinished file."""
         self._file.close()
 
-    def _begin(self) -> None:
-        """Write the header, once it is known which versions of ROS there are, and what was opened since."""
-        if not self._began:
+    def _write_pending(self) -> None:
+        """Write the header, which depends on the ROS versions of the channels, and the channels added since."""
+        if not self._has_header:
             versions = set(self._versions)
             profile = f"ros{versions.pop()}" if len(versions) == 1 else ""
             self._put(Op.HEADER, text_bytes(profile) + text_bytes(f"mosaico-ingest {__version__}"))
-            self._began = True
+            self._has_header = True
         for record in self._pending:
             self._file.write(record)
         self._pending.clear()
@@ -193,7 +192,7 @@ class McapWriter:
         self._pending.append(record)
 
     def _put(self, op: int, content: bytes) -> int:
-        """Write a record and return where it begins."""
+        """Write a record and return its offset."""
         at = self._file.tell()
         self._file.write(record_bytes(op, content))
         return at
@@ -208,11 +207,13 @@ class McapWriter:
         head = span + struct.pack("<QI", len(data), zlib.crc32(data)) + text_bytes("zstd")
         at = self._put(Op.CHUNK, head + struct.pack("<Q", len(packed)) + packed)
         length = self._file.tell() - at
-        places = b""
+        index_offsets = b""
         for channel, entries in chunk.index.items():
-            where = self._put(Op.MESSAGE_INDEX, struct.pack("<HI", channel, len(entries)) + entries)
-            places += struct.pack("<HQ", channel, where)
-        content = span + struct.pack("<QQ", at, length) + struct.pack("<I", len(places)) + places
+            offset = self._put(Op.MESSAGE_INDEX, struct.pack("<HI", channel, len(entries)) + entries)
+            index_offsets += struct.pack("<HQ", channel, offset)
+        content = (
+            span + struct.pack("<QQ", at, length) + struct.pack("<I", len(index_offsets)) + index_offsets
+        )
         content += struct.pack("<Q", self._file.tell() - at - length) + text_bytes("zstd")
         content += struct.pack("<QQ", len(packed), len(data))
         self._chunk_indexes.append(record_bytes(Op.CHUNK_INDEX, content))
@@ -242,16 +243,16 @@ class SqliteWriter:
         self._texts: dict[str, str] = {}
 
     def add_connection(self, topic: str, definition: Definition) -> int:
-        """Open a channel; a `.db3` file holds one definition of a type, and none of ROS 1."""
+        """Add a connection; a `.db3` file stores one definition per type, and only ROS 2 types."""
         if definition.ros_version == 1:
-            raise BagError(f"{definition.root} is of ROS 1", where=topic, hint="write .mcap or .bag")
+            raise BagError(f"{definition.root} is a ROS 1 type", where=topic, hint="write .mcap or .bag")
         if self._texts.setdefault(definition.root, definition.text) != definition.text:
-            what = f"there is another definition of {definition.root}, and .db3 holds one"
+            what = f"the recording has another definition of {definition.root}, and .db3 stores one per type"
             raise BagError(what, where=topic, hint="write .mcap")
         try:
             digest = rihs01(definition)
         except BagError as error:
-            raise BagError(f"{error.what}, as .db3 wants it", where=topic, hint="write .mcap") from error
+            raise BagError(f"{error.what}, which .db3 requires", where=topic, hint="write .mcap") from error
         opened = self._bag.add_connection(topic, definition.root, msgdef=definition.text, rihs01=digest)
         self._connections.append(opened)
         return len(self._connections) - 1
@@ -261,12 +262,12 @@ class SqliteWriter:
         self._bag.write(self._connections[channel], log_ns, payload)
 
     def finish(self) -> None:
-        """Close the database and take it out of its folder."""
+        """Close the database and move it out of its folder."""
         self._bag.close()
         next(self._bag.path.glob("*.db3")).replace(self._path)
 
     def abandon(self) -> None:
-        """Close the database as it is."""
+        """Close the unfinished database."""
         self._bag.abort()
 
 
@@ -280,9 +281,9 @@ class Ros1Writer:
         self._connections: list[RosbagsConnection] = []
 
     def add_connection(self, topic: str, definition: Definition) -> int:
-        """Open a channel; a bag holds no definitions of ROS 2."""
+        """Add a connection; a bag stores only ROS 1 types."""
         if definition.ros_version != 1:
-            raise BagError(f"{definition.root} is of ROS 2", where=topic, hint="write .mcap or .db3")
+            raise BagError(f"{definition.root} is a ROS 2 type", where=topic, hint="write .mcap or .db3")
         try:
             digest = md5sum(definition)
         except BagError as error:
@@ -300,12 +301,9 @@ class Ros1Writer:
         self._bag.close()
 
     def abandon(self) -> None:
-        """Close the file as it is."""
+        """Close the unfinished file."""
         self._bag.abort()
 
-
-ROS_VERSIONS = {".mcap": (1, 2), ".db3": (2,), ".bag": (1,)}
-"""By suffix: the versions of ROS whose messages the container holds."""
 
 _WRITERS: dict[str, Callable[[Path], RecordingWriter]] = {
     ".mcap": McapWriter,
@@ -316,18 +314,18 @@ _WRITERS: dict[str, Callable[[Path], RecordingWriter]] = {
 
 @contextmanager
 def open_writer(path: Path, *, replace: bool = False) -> Generator[RecordingWriter]:
-    """Open a writer for `.mcap`, `.db3` or `.bag`; an exception leaves no file behind.
+    """Open a writer for the container of the file's suffix; an exception leaves no file behind.
 
     Raises:
-        BagError: The name says no container, the file is there already, or it cannot be written.
+        BagError: The suffix is unknown, the file exists, or it cannot be written.
     """
     make = _WRITERS.get(path.suffix)
     if make is None:
-        raise BagError("no container has this suffix", where=str(path), hint="write .mcap, .db3 or .bag")
+        raise BagError("no container has this suffix", where=str(path), hint=f"use one of {SUFFIX_LIST}")
     if path.exists() and not replace:
-        raise BagError("is there already", where=str(path), hint="choose another name, or give --force")
+        raise BagError("the file exists", where=str(path), hint="choose another name, or use --force")
     if path.is_dir():
-        raise BagError("is a folder", where=str(path), hint="choose another name")
+        raise BagError("it is a folder", where=str(path), hint="choose another name")
     try:
         folder = Path(tempfile.mkdtemp(prefix=f".{path.stem}-", dir=path.parent))
     except OSError as error:

@@ -74,8 +74,8 @@ def test_export_excluded_topic_exits_4(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "says"),
     [
-        (("drive", "--to", "x.txt"), 1, "write .mcap, .db3 or .bag"),
-        (("drive", "--to", "x.bag"), 3, "is of ROS 2"),
+        (("drive", "--to", "x.txt"), 1, "use one of .bag, .db3 and .mcap"),
+        (("drive", "--to", "x.bag"), 3, "is a ROS 2 type"),
         (("drive", "--to", "x.mcap", "-t", "/none"), 3, "no topic matches"),
         (("nobody", "--to", "x.mcap"), 1, "no sequence 'nobody'"),
         (("drive", "--to", "x.mcap", "--start", "soon"), 2, "neither an instant"),

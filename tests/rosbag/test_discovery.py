@@ -182,7 +182,7 @@ def test_discover_metadata_without_existing_files_uses_directory(split: Path, re
         assert recording.unreadable == ()
     for file in split.glob("*.mcap"):
         file.unlink()
-    with pytest.raises(BagError, match=r"none of the files it lists is there: gone\.mcap"):
+    with pytest.raises(BagError, match=r"none of the listed files exists: gone\.mcap"):
         discover([split])
 
 

@@ -121,9 +121,9 @@ class TestPolicies:
             assert caught.value.rule == "string-length"
 
     def test_policy_raise_keeps_the_hint(self, bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(Deserializer, "_remedy", lambda *_: "they would fit the definition of ros2_iron")
+        monkeypatch.setattr(Deserializer, "_remedy", lambda *_: "use the definition of ros2_iron")
         loader = ROSLoader(bag, error_policy=LoaderErrorPolicy.RAISE)
-        with loader, pytest.raises(DecodeError, match="they would fit the definition of ros2_iron"):
+        with loader, pytest.raises(DecodeError, match="use the definition of ros2_iron"):
             list(loader)
 
     def test_policy_log_warn_logs_and_continues(self, bag: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 from mosaico_ingest.lint.job import Job, recording_paths
 from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.rosbag.formats import ROS_VERSIONS
 
-_VERSIONS = {".bag": "ros1", ".db3": "ros2"}
+_VERSIONS = {suffix: f"ros{versions[0]}" for suffix, versions in ROS_VERSIONS.items() if len(versions) == 1}
+"""The ROS version of containers that store only one."""
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -16,7 +19,7 @@ def check(job: Job) -> Iterator[Problem]:
     if distro is None or not distro.value.startswith("ros"):
         return
     for _, text in recording_paths(job):
-        version = _VERSIONS.get(text[-4:].lower())
+        version = _VERSIONS.get(Path(text).suffix.lower())
         if version is not None and not distro.value.startswith(version) and not job.resolve(text).is_dir():
             message = f"{text} is a {version.upper()} recording, and {distro.value} is not a {version.upper()} distribution"
             yield Problem(

@@ -7,14 +7,13 @@ from pathlib import Path
 
 from mosaico_ingest.lint.job import Job, recording_paths
 from mosaico_ingest.lint.rule import Check, Problem
-
-_SUFFIXES = frozenset({".bag", ".db3", ".mcap"})
+from mosaico_ingest.rosbag.formats import SUFFIXES
 
 
 def check(job: Job) -> Iterator[Problem]:
     """Report the first split whose suffix differs from the suffix of the first split."""
     splits = [(path, text, Path(text).suffix.lower()) for path, text in recording_paths(job)]
-    splits = [split for split in splits if split[2] in _SUFFIXES]
+    splits = [split for split in splits if split[2] in SUFFIXES]
     for path, text, suffix in splits[1:]:
         if suffix != splits[0][2]:
             message = f"{text} has another format than {splits[0][1]}"

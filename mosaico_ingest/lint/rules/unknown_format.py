@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mosaico_ingest.lint.job import Job, is_glob, recording_paths
 from mosaico_ingest.lint.rule import Check, Problem
-from mosaico_ingest.rosbag.formats import RECORDING_NAME
+from mosaico_ingest.rosbag.formats import RECORDING_NAME, SUFFIX_LIST
 
 
 def check(job: Job) -> Iterator[Problem]:
@@ -16,7 +16,7 @@ def check(job: Job) -> Iterator[Problem]:
         suffix = Path(text).suffix
         is_recording = RECORDING_NAME.search(text) or text.lower().endswith("metadata.yaml")
         if suffix and not is_glob(suffix) and not is_recording and not job.resolve(text).is_dir():
-            hint = "name a .bag, .db3 or .mcap file, or a rosbag2 directory"
+            hint = f"name a recording ({SUFFIX_LIST}), or a rosbag2 directory"
             yield Problem(f"{text} does not look like a recording", job.source.span(path), hint)
 
 
