@@ -119,7 +119,7 @@ def test_definition_with_another_hash_is_not_used(tmp_path: Path) -> None:
         assert channel.definition is None
         assert channel.problem
         assert (
-            f"the known definition of {name} differs from the recorded one: the recording's is {other}"
+            f"the known definition of {name} differs from the recorded one: the recorded hash is {other}"
             in channel.problem
         )
         (channel,) = opened(path, TypeResolver(types={name: "string data"})).connections

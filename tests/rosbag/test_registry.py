@@ -63,7 +63,7 @@ def test_register_directory_registers_every_file(tmp_path: Path) -> None:
 def test_register_invalid_file_raises_with_line_and_registers_nothing(tmp_path: Path) -> None:
     (tmp_path / "Bad.msg").write_text("int8 good\nfloat64[ bad\n")
     (tmp_path / "Good.msg").write_text("int8 good\n")
-    with pytest.raises(BagError, match=r"Bad\.msg:2:1: cannot read 'float64\[ bad'"):
+    with pytest.raises(BagError, match=r"Bad\.msg:2:1: cannot parse 'float64\[ bad'"):
         ROSTypeRegistry.register_directory("pkg", tmp_path)
     assert ROSTypeRegistry.get_types() == {}
 

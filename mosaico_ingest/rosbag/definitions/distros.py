@@ -1,8 +1,9 @@
 """Definitions shipped with the package: ROS distros and public packages.
 
-The file says of each type which distros have it in which form, as `.msg` text with full names.
+`distros.json` maps each type name to its forms (`.msg` text with full names) and the distros that use each form. It is
+generated from the type stores of rosbags, because importing those at run time is slow.
 
-`packages/` holds the fields of each package as its public repository declares them; licences are in `packages/README.md`.
+`packages/` contains the fields of public packages; their licenses are listed in `packages/README.md`.
 """
 
 from __future__ import annotations
@@ -33,26 +34,26 @@ __all__ = [
 FILE = Path(__file__).with_name("distros.json")
 _PARTS = (Field("sec", "int32"), Field("nanosec", "uint32"))
 BUILTIN: Mapping[str, MessageType] = {name: MessageType(name, _PARTS) for name in (TIME, DURATION)}
-"""The types every distro has and a ROS 1 text spells `time` and `duration`."""
+"""The types that every distro has, and that ROS 1 calls `time` and `duration`."""
 
 
 ROS1 = (Stores.ROS1_NOETIC,)
 BEFORE_IRON = (
     Stores.ROS2_DASHING, Stores.ROS2_ELOQUENT, Stores.ROS2_FOXY, Stores.ROS2_GALACTIC, Stores.ROS2_HUMBLE,
 )  # fmt: skip
-"""The distros whose recordings hold no definitions."""
+"""The distros whose recordings contain no definitions."""
 ROS2 = (*BEFORE_IRON, Stores.ROS2_IRON, Stores.ROS2_JAZZY, Stores.ROS2_KILTED, Stores.ROS2_LYRICAL)
 
 
 def ros_version(distro: Stores) -> int | None:
-    """Return 1 or 2; None for the store without a distro."""
+    """Return the ROS version of a distro, 1 or 2; None for `Stores.EMPTY`."""
     if distro is Stores.EMPTY:
         return None
     return 1 if distro.value.startswith("ros1") else 2
 
 
 def distro_type(distro: Stores, name: str) -> MessageType | None:
-    """Return a distro's type by full name, None where it has none."""
+    """Return a distro's type by full name, None if the distro does not have it."""
     forms = _distro_types().get(name, {})
     text = next((text for having, text in forms.items() if distro.value in having.split()), None)
     return None if text is None else _form(name, text)
@@ -60,9 +61,9 @@ def distro_type(distro: Stores, name: str) -> MessageType | None:
 
 @lru_cache(maxsize=4096)
 def agreed_type(name: str, distros: tuple[Stores, ...]) -> MessageType | None:
-    """Return the type if all of the distros that have it agree on its fields; the last one's form."""
-    found = [known for distro in distros if (known := distro_type(distro, name))]
-    return found[-1] if found and all(known.fields == found[0].fields for known in found) else None
+    """Return the newest form of a type if all distros that have it agree on its fields, else None."""
+    forms = [form for distro in distros if (form := distro_type(distro, name))]
+    return forms[-1] if forms and all(form.fields == forms[0].fields for form in forms) else None
 
 
 @cache
@@ -79,7 +80,7 @@ _FOLDER = Path(__file__).parent / "packages"
 
 
 def package_type(name: str) -> MessageType | None:
-    """Return a ROS 2 type by full name, None where no known package has it."""
+    """Return a ROS 2 type of a public package by full name, None if no shipped package has it."""
     return _types(name.partition("/")[0]).get(name)
 
 
@@ -97,8 +98,8 @@ def _types(package: str) -> Mapping[str, MessageType]:
 
 
 def distro_definitions(msgtype: str, ros_version: int) -> tuple[tuple[str, Definition], ...]:
-    """Return the definitions that the distros of a ROS version have of a type, each with the newest that has it."""
-    found = dict[str, tuple[str, Definition]]()
+    """Return the distinct definitions of a type in the distros of a ROS version, each with the newest distro that has it."""
+    definitions = dict[str, tuple[str, Definition]]()
     for distro in ROS1 if ros_version == 1 else ROS2:
         root = distro_type(distro, msgtype)
         if root:
@@ -109,5 +110,5 @@ def distro_definitions(msgtype: str, ros_version: int) -> tuple[tuple[str, Defin
                 hint="",
             )
             text = flatten(msgtype, types, ros_version=ros_version)
-            found[text] = distro.value, Definition(msgtype, types, Source.DISTRO, text, ros_version)
-    return tuple(found.values())
+            definitions[text] = distro.value, Definition(msgtype, types, Source.DISTRO, text, ros_version)
+    return tuple(definitions.values())

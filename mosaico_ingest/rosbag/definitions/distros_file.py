@@ -1,4 +1,4 @@
-"""This file writes `distros.json` from the types that rosbags has of each distro."""
+"""Generates `distros.json` from the type stores of rosbags."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ __all__ = ["distros_file"]
 
 
 def distros_file() -> str:
-    """Return the file: a line for each form of a type, with the distros that have it."""
+    """Return the content of the file: per type, its forms and the distros that have each form."""
     forms: dict[str, dict[str, list[str]]] = {}
     for distro in Stores:
         types = get_typestore(RosbagsStores(distro.value)).fielddefs
         for name in types if distro is not Stores.EMPTY else ():
             forms.setdefault(name, {}).setdefault(spell(message_type(name, types)), []).append(distro.value)
-    known = {
-        name: {" ".join(having): text for text, having in of_one.items()}
-        for name, of_one in sorted(forms.items())
+    content = {
+        name: {" ".join(distros): text for text, distros in texts.items()}
+        for name, texts in sorted(forms.items())
     }
-    return json.dumps(known, indent=1) + "\n"
+    return json.dumps(content, indent=1) + "\n"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""This file computes the hashes that recordings carry of message types: RIHS01 in ROS 2, MD5 in ROS 1."""
+"""The hashes of message types in recordings: RIHS01 in ROS 2, MD5 in ROS 1."""
 
 from __future__ import annotations
 
@@ -14,42 +14,42 @@ if TYPE_CHECKING:
 __all__ = ["definition_difference", "md5sum", "rihs01"]
 
 _ANY = "*"
-"""What a ROS 1 subscriber writes that takes every form of a type."""
+"""The MD5 sum that a ROS 1 subscriber writes to accept every form of a type."""
 
 
 def rihs01(definition: Definition) -> str:
-    """Return the hash that ROS 2 gives a type.
+    """Return the ROS 2 hash of a type.
 
     Raises:
-        BagError: The type has what the hash does not describe here.
+        BagError: rosbags cannot hash the type.
     """
     try:
         return _store(definition).hash_rihs01(definition.root)
-    except KeyError as error:  # how rosbags says that it does not know wstring, nor the events of services
+    except KeyError as error:  # rosbags raises KeyError for wstring and for service events
         raise BagError(f"{definition.root} needs {error}, which has no hash") from error
 
 
 def md5sum(definition: Definition) -> str:
-    """Return the hash that ROS 1 gives a type.
+    """Return the ROS 1 MD5 sum of a type.
 
     Raises:
-        BagError: The type cannot be spelled in ROS 1.
+        BagError: The type cannot be written in ROS 1.
     """
     return _store(definition).generate_msgdef(definition.root, ros_version=1)[1]
 
 
 def definition_difference(definition: Definition, attributes: Mapping[str, str]) -> str | None:
-    """Return how a definition differs from the hash a connection carries; None where it does not, or nothing is known."""
+    """Return how the hash of a definition differs from the recorded one; None if they are equal or unknown."""
     if definition.ros_version == 1:
         recorded, compute = attributes.get("md5sum", _ANY), md5sum
     else:
         recorded = attributes.get("type_description_hash") or attributes.get("topic_type_hash") or _ANY
         compute = rihs01
     try:
-        known = recorded if recorded == _ANY else compute(definition)
+        computed = recorded if recorded == _ANY else compute(definition)
     except BagError:
         return None
-    return None if known == recorded else f"the recording's is {recorded}, that of the known one is {known}"
+    return None if computed == recorded else f"the recorded hash is {recorded}, the known one is {computed}"
 
 
 def _store(definition: Definition) -> Typestore:

@@ -25,28 +25,28 @@ _IDL_ERRORS = (
     ArithmeticError,
     RecursionError,
 )
-"""What rosbags' IDL parser raises on text that is not IDL."""
+"""Exceptions that the parser of rosbags raises for invalid IDL."""
 
 
 def read_idl(text: str, *, where: str) -> list[MessageType]:
-    """Return every type that `text` defines; `where` names its place in messages.
+    """Return every type that `text` defines; `where` is its location in error messages.
 
     Raises:
-        BagError: It cannot be read.
+        BagError: The text is not valid IDL.
     """
     if "<<" in _NOT_CODE.sub("", text):
-        # No ROS message shifts, and one line of it could ask for all memory there is.
-        raise BagError("shifts in IDL constants are not read", where=where)
+        # No ROS message uses shifts, and one line with a large shift could exhaust the memory.
+        raise BagError("shifts in IDL constants are not supported", where=where)
     try:
         types = get_types_from_idl(text)
     except _IDL_ERRORS as error:
         reason = " ".join(str(error).split())[-200:]
-        raise BagError(f"cannot read the IDL: {reason}", where=where) from None
+        raise BagError(f"cannot parse the IDL: {reason}", where=where) from None
     return [message_type(name, types) for name in types]
 
 
 def message_type(name: str, types: Typesdict) -> MessageType:
-    """Return one of rosbags' types in our form."""
+    """Convert a type of rosbags."""
     constants, fields = types[name]
     return MessageType(
         name,

@@ -33,10 +33,12 @@ _MAX_LEAVES = 20_000
 def link(
     root: MessageType, find: Callable[[str], MessageType | None], *, ros_version: int, hint: str
 ) -> dict[str, MessageType]:
-    """Return `root` and all it needs by full name, their fields' types spelled in full; `hint` says how to add one.
+    """Return `root` and all types that it refers to, by full name, with the full names of field types.
+
+    `find` returns a type by full name. `hint` is the hint of the error for an unknown type.
 
     Raises:
-        BagError: A type is not known, is no ROS type, contains itself, or is too large to be one.
+        BagError: A type is unknown, not a ROS type, recursive, or too large.
     """
     linked = dict[str, MessageType]()
     waiting = [root]
@@ -45,7 +47,7 @@ def link(
         fields = list[Field]()
         for field in message.fields:
             if not field.is_message and field.type not in PRIMITIVES:
-                raise BagError(f"{field.name} is of type {field.type}, which is not read", where=message.name)
+                raise BagError(f"{field.name} has the unsupported type {field.type}", where=message.name)
             needed = _needed(field, message.name, find, ros_version, hint) if field.is_message else None
             if needed and needed.name not in linked:
                 waiting.append(needed)
@@ -58,17 +60,17 @@ def link(
 def _needed(
     field: Field, owner: str, find: Callable[[str], MessageType | None], ros_version: int, hint: str
 ) -> MessageType:
-    names = _spellings(field.type, owner, ros_version)
-    found = next((known for name in names if (known := find(name))), None)
-    if found is None:
+    names = _candidate_names(field.type, owner, ros_version)
+    message = next((message for name in names if (message := find(name))), None)
+    if message is None:
         raise BagError(
             f"the definition of {names[-1]} is not known", where=f"{owner}.{field.name}", hint=hint
         )
-    return found
+    return message
 
 
-def _spellings(name: str, owner: str, ros_version: int) -> list[str]:
-    """Return the full names that `name` may stand for in the text of `owner`, the likeliest first."""
+def _candidate_names(name: str, owner: str, ros_version: int) -> list[str]:
+    """Return the full names that `name` may mean in the text of `owner`, the most likely first."""
     namespace = owner.rpartition("/")[0]
     if "/" in name:
         package, _, short = name.rpartition("/")
@@ -83,7 +85,7 @@ def _spellings(name: str, owner: str, ros_version: int) -> list[str]:
 
 
 def _leaves(name: str, types: Mapping[str, MessageType], known: dict[str, int], *, depth: int) -> int:
-    """Count the columns of a type, to stop a few lines of text from becoming millions of them."""
+    """Return the number of columns of a type; a few lines of nested arrays could define millions of them."""
     if depth > _MAX_DEPTH or known.get(name) == 0:
         reason = "contains itself" if known.get(name) == 0 else f"is nested more than {_MAX_DEPTH} deep"
         raise BagError(f"{name} {reason}", where=name)
@@ -94,7 +96,7 @@ def _leaves(name: str, types: Mapping[str, MessageType], known: dict[str, int], 
             each = _leaves(field.type, types, known, depth=depth + 1) if field.is_message else 1
             count += each * (field.size if field.container is Container.ARRAY and field.is_message else 1)
         if count > _MAX_LEAVES:
-            raise BagError(f"{count} fields are more than a message can have", where=name)
+            raise BagError(f"{count} fields exceed the limit of {_MAX_LEAVES}", where=name)
         known[name] = count
     return known[name]
 
@@ -114,16 +116,16 @@ NUMBERS = {
     "float32": "f4",
     "float64": "f8",
 }
-"""The numpy type of every primitive but the texts, in the bytes and in the column."""
+"""The numpy type of every primitive except strings, in the payload and in the column."""
 
 TEXTS = frozenset({"string", "wstring"})
 
 
 def ros_shape(definition: Definition) -> pa.StructType:
-    """Return the Arrow type of a message's rows; every field is nullable, constants are not columns.
+    """Return the Arrow type of a message's rows. All fields are nullable; constants are not columns.
 
     Raises:
-        DecodeError: A type contains itself, or a primitive is unknown.
+        DecodeError: A type is recursive, or a primitive is unknown.
     """
     return _struct(definition, definition.message, ())
 

@@ -37,9 +37,9 @@ _RENAMED = {
 
 
 def normalize_msgtype(name: str) -> str:
-    """Return `pkg/msg/Name` for `pkg/Name`, for DDS's `pkg::msg::dds_::Name_`, and for names ROS has given up.
+    """Return `pkg/msg/Name` for `pkg/Name`, for DDS's `pkg::msg::dds_::Name_`, and for renamed types.
 
-    Service and action parts keep their kind (`pkg/srv/Name_Request`), a name without a package stays as it is.
+    Service and action parts keep their kind (`pkg/srv/Name_Request`). A name without a package is returned unchanged.
     """
     parts = [part for part in name.strip().replace("::", "/").split("/") if part]
     if "dds_" in parts:
@@ -84,9 +84,9 @@ class Field(Struct, frozen=True):
     is_message: bool = False
     container: Container = Container.SCALAR
     size: int = 0
-    """The length of an array, the bound of a sequence (0: unbounded)."""
+    """The length of an array, or the bound of a sequence (0: unbounded)."""
     string_bound: int = 0
-    """What `string<=N` says (0: unbounded); the bytes do not depend on it."""
+    """The bound N of `string<=N` (0: unbounded); it does not affect the bytes."""
 
 
 class Constant(Struct, frozen=True):
@@ -106,37 +106,37 @@ class MessageType(Struct, frozen=True):
 
 
 class Definition(Struct, frozen=True):
-    """A message type with every type it needs, and where it came from."""
+    """A message type with all types that it refers to, and their source."""
 
     root: str
     types: Mapping[str, MessageType]
     source: Source
     text: str
-    """The flattened `.msg` text: nested types follow 80 `=` and `MSG: pkg/Name`."""
+    """The flattened `.msg` text: each nested type follows 80 `=` and a line `MSG: pkg/Name`."""
     ros_version: int
-    """1 or 2: the form of `time` and of the header."""
+    """1 or 2; determines the form of `time` and of the header."""
 
     @property
     def message(self) -> MessageType:
-        """The type this definition is about."""
+        """The root type."""
         return self.types[self.root]
 
 
 class Embedded(Struct, frozen=True):
-    """The definition text a recording carries for a type, as it stands there."""
+    """The definition of a type as embedded in a recording."""
 
     encoding: str
-    """`ros1msg`, `ros2msg`, `ros2idl`, or what else the recording calls it."""
+    """`ros1msg`, `ros2msg`, `ros2idl`, or another name that the recording uses."""
     text: str
 
 
 class Resolver(Protocol):
-    """Finds the definition of a type: embedded first, then the caller's own, then the distro's and known packages'."""
+    """Finds the definition of a type: embedded, custom, of the distro, or of a public package, in this order."""
 
     def resolve(self, msgtype: str, embedded: Embedded | None, *, ros_version: int) -> Definition:
-        """Return the definition of `msgtype`, any spelling of the name.
+        """Return the definition of `msgtype`, in any notation of the name.
 
         Raises:
-            BagError: None is known, or the one in the recording cannot be read; the text says which.
+            BagError: The type is unknown, or the embedded definition is invalid.
         """
         ...

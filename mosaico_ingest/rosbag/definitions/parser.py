@@ -42,10 +42,10 @@ PRIMITIVES = frozenset(
         "int64", "uint64", "float32", "float64", "string", "wstring",
     }
 )  # fmt: skip
-"""The types that are not messages; `time` and `duration` are read as messages of two fields."""
+"""The types that are not messages; `time` and `duration` are parsed as messages with two fields."""
 
 BYTES = frozenset({"byte", "char", "uint8"})
-"""The primitives whose sequences are one binary value, `bytes` in Python."""
+"""The primitives whose sequences are binary values: `bytes` in Python."""
 
 _SEPARATOR_LINE = re.compile(r"^={10,}[ \t\r]*(?:\n|\Z)", re.MULTILINE)
 _HEAD = re.compile(r"\s*(?P<kind>MSG|IDL):[ \t]*(?P<name>\S+)[ \t\r]*(?:\n|\Z)")
@@ -60,18 +60,18 @@ _BUILTIN = {"time": TIME, "duration": DURATION}
 
 
 class Section(Struct, frozen=True):
-    """The text of one type among several; the first may have no name of its own."""
+    """The text of one type in a text with several; the first section may have no head."""
 
     kind: str
-    """`MSG`, `IDL`, or empty where there is no head."""
+    """`MSG`, `IDL`, or empty if there is no head."""
     name: str
     text: str
     line: int
-    """How many lines of the whole come before it."""
+    """Number of lines of the complete text before the section."""
 
 
 def sections(text: str) -> Iterator[Section]:
-    """Split a text at its `===` lines; empty text is one section, an empty part before a separator none."""
+    """Split a text at its `===` lines. An empty text is one section; an empty part before a separator is none."""
     separators = list(_SEPARATOR_LINE.finditer(text))
     starts = [0, *(separator.end() for separator in separators)]
     ends = [*(separator.start() for separator in separators), len(text)]
@@ -84,12 +84,12 @@ def sections(text: str) -> Iterator[Section]:
 
 
 def parse_msg(text: str, name: str, *, where: str | None = None, line: int = 0) -> MessageType:
-    """Return the one type that `text` defines; types its fields refer to keep the spelling of the text.
+    """Return the type that `text` defines; field types keep the notation of the text.
 
-    `where` names the source and `line` the lines before the text in it, for messages.
+    `where` is the source of the text, and `line` the number of lines before it, for error messages.
 
     Raises:
-        BagError: A line is no field, no constant and no comment.
+        BagError: A line is not a field, constant or comment.
     """
     fields, constants = list[Field](), list[Constant]()
     for number, raw in enumerate(text.lstrip("\ufeff").split("\n"), start=line + 1):
@@ -99,21 +99,22 @@ def parse_msg(text: str, name: str, *, where: str | None = None, line: int = 0) 
         try:
             item = _item(content)
         except ValueError as error:
-            place = f"{where or name}:{number}"
-            hint = "a line is `type name`, `type NAME=value` or a `#` comment"
-            raise BagError(f"cannot read {content!r}: {error}", where=place, hint=hint) from None
+            hint = "write `type name`, `type NAME=value` or a `#` comment"
+            raise BagError(
+                f"cannot parse {content!r}: {error}", where=f"{where or name}:{number}", hint=hint
+            ) from None
         if isinstance(item, Field):
             fields.append(item)
         elif item:
             constants.append(item)
-    _refuse_twins(fields, where or name)
+    _check_unique(fields, where or name)
     return MessageType(name, tuple(fields), tuple(constants))
 
 
 def _item(content: str) -> Field | Constant | None:
     while annotation := _ANNOTATION.match(content):
         if annotation["name"] == "optional":
-            raise ValueError("optional fields have no place in plain CDR")
+            raise ValueError("plain CDR has no optional fields")
         content = content[annotation.end() :]
     if not content or content.startswith("#"):
         return None
@@ -122,9 +123,9 @@ def _item(content: str) -> Field | Constant | None:
         raise ValueError("not a field or constant")
     kind = match["type"]
     if match["bound"] and kind not in {"string", "wstring"}:
-        raise ValueError(f"{kind} cannot be bounded")
+        raise ValueError(f"{kind} cannot have a bound")
     if match["default"] and kind not in PRIMITIVES:
-        raise ValueError(f"a default for {kind}")
+        raise ValueError(f"{kind} cannot have a default")
     if match["value"] is not None:
         return Constant(match["name"], kind, _value(kind, match["value"].strip()))
     container, size = _container(match["array"])
@@ -145,14 +146,14 @@ def _container(array: str | None) -> tuple[Container, int]:
     digits = array.strip("[<=]")
     size = int(digits or 0)
     if size > _MAX_SIZE or (bounded and not digits):
-        raise ValueError(f"{array} is no size")
+        raise ValueError(f"{array} is not a valid size")
     return (Container.SEQUENCE if bounded or not digits else Container.ARRAY), size
 
 
 def _value(kind: str, text: str) -> str | bool | int | float:
-    """Return a constant's value; a string's runs to the end of the line unless it is quoted."""
+    """Return the value of a constant. An unquoted string extends to the end of the line."""
     if kind not in PRIMITIVES:
-        raise ValueError(f"a constant of type {kind}")
+        raise ValueError(f"{kind} cannot be the type of a constant")
     quoted = _QUOTED.fullmatch(text)
     if quoted:
         return quoted[1] if quoted[1] is not None else quoted[2]
@@ -172,15 +173,15 @@ def _integer(text: str) -> int:
     return int(text, 8 if octal else 0)
 
 
-def _refuse_twins(fields: list[Field], where: str) -> None:
+def _check_unique(fields: list[Field], where: str) -> None:
     counts = Counter(field.name for field in fields)
-    twin = next((name for name, count in counts.items() if count > 1), None)
-    if twin:
-        raise BagError(f"the field {twin!r} is defined twice", where=where)
+    duplicate = next((name for name, count in counts.items() if count > 1), None)
+    if duplicate:
+        raise BagError(f"the field {duplicate!r} is defined twice", where=where)
 
 
 def flatten(root: str, types: Mapping[str, MessageType], *, ros_version: int) -> str:
-    """Return the text of `root`, then of each type it needs, after a separator, in the order they are met."""
+    """Return the text of `root`, followed by the types that it refers to in depth-first order, each after a separator."""
     order = dict[str, None]()
     _collect(types[root], types, order, hidden=_hidden(ros_version))
     order.pop(root, None)
@@ -215,7 +216,7 @@ def _own_text(message: MessageType, ros_version: int) -> str:
 
 
 def spell(message: MessageType) -> str:
-    """Return the text of one type, its fields' types spelled as they are."""
+    """Return the `.msg` text of one type, with the field types as they are."""
     lines = [f"{constant.type} {constant.name}={constant.value}" for constant in message.constants]
     for field in message.fields:
         bound = f"<={field.string_bound}" if field.string_bound else ""
@@ -239,19 +240,19 @@ _EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 
 @lru_cache(maxsize=4096)
 def read_types(text: str, root: str, *, where: str | None = None) -> Mapping[str, MessageType]:
-    """Return every type that `text` defines by full name; `root` names the part that has no name of its own.
+    """Return every type that `text` defines by full name; `root` is the name of a section without head.
 
-    Field types keep the spelling of the text.
+    Field types keep the notation of the text.
 
     Raises:
-        BagError: A part cannot be read; names `where` (or the type) and the line.
+        BagError: A section is invalid; its location is `where` (or the type) and the line.
     """
     types, parts = dict[str, MessageType](), list(sections(text))
     for part in parts:
         for message in _read_section(part, root, where):
             types.setdefault(message.name, message)
     if all(part.kind == "MSG" for part in parts) and not text.partition(SEPARATOR)[0].strip():
-        types.setdefault(root, MessageType(root, ()))  # nothing before the other parts: it has no fields
+        types.setdefault(root, MessageType(root, ()))  # an empty first section defines a type without fields
     return types
 
 
@@ -268,7 +269,7 @@ def _read_section(section: Section, root: str, where: str | None) -> list[Messag
 
 
 def _read_service(name: str, section: Section, dashes: re.Match[str], where: str) -> list[MessageType]:
-    """Return request, response and event of a service; recorders keep the `.srv` text for its events."""
+    """Return request, response and event of a service, for whose events recorders store the `.srv` text."""
     request, response = section.text[: dashes.start()], section.text[dashes.end() :]
     later = section.line + section.text.count("\n", 0, dashes.end())
     parts = [
