@@ -28,7 +28,7 @@ def check(job: Job) -> Iterator[Problem]:
         # If a loaded adapter cannot be read, another rule reports it, and it may have the name.
         exists = loaded is None or reference in names or _is_installed(reference)
         if reference.endswith(".py") or not exists:
-            message = f"no adapter is named {reference!r}"
+            message = f"there is no adapter {reference!r}"
             yield Problem(message, job.source.span(path), suggest_reference(reference, names))
 
 
