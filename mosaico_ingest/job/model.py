@@ -37,7 +37,7 @@ from mosaico_ingest.job.fields import (
     Secret,
     TopicGlob,
 )
-from mosaico_ingest.job.patterns import first_match
+from mosaico_ingest.job.patterns import first_match, is_glob
 from mosaico_ingest.job.units import format_time, parse_limit, parse_size, parse_time
 from mosaico_ingest.job.values import (
     DEFAULT_MESSAGE_BYTES,
@@ -527,7 +527,7 @@ class Job(JobSettings):
 
 
 def _check_one_topic(topic: str, name: str) -> None:
-    if any(character in topic for character in "*?["):
+    if is_glob(topic):
         raise SinkError(
             f"every topic that {topic!r} matches would be renamed to {name!r}", hint="name one topic"
         )

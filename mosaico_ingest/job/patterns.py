@@ -7,7 +7,7 @@ from fnmatch import fnmatchcase
 
 from msgspec import Struct
 
-__all__ = ["Selection", "first_match", "select"]
+__all__ = ["Selection", "first_match", "is_glob", "select"]
 
 
 class Selection(Struct, frozen=True):
@@ -47,3 +47,8 @@ def first_match(patterns: Iterable[str], topic: str) -> str | None:
     if topic in globs:
         return topic
     return next((glob for glob in globs if fnmatchcase(topic, glob)), None)
+
+
+def is_glob(pattern: str) -> bool:
+    """Return whether a pattern can match several names."""
+    return any(character in pattern for character in "*?[")

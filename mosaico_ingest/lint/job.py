@@ -32,7 +32,6 @@ __all__ = [
     "adapter_references",
     "covers",
     "find_module",
-    "is_glob",
     "is_mapping_file",
     "key_paths_below",
     "keyed_patterns",
@@ -139,11 +138,6 @@ def keyed_patterns(job: Job) -> Iterator[tuple[str, str, Span]]:
             for key in mapping if isinstance(mapping, dict) else ():
                 if isinstance(key, str) and key != field.marker.default:
                     yield ".".join(path), key, job.key_span(*path, key)
-
-
-def is_glob(pattern: str) -> bool:
-    """Return whether a pattern can match several names."""
-    return any(character in pattern for character in "*?[")
 
 
 def covers(general: str, special: str) -> bool:

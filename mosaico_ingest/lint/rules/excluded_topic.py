@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.job.patterns import select
-from mosaico_ingest.lint.job import Job, is_glob, keyed_patterns
+from mosaico_ingest.job.patterns import is_glob, select
+from mosaico_ingest.lint.job import Job, keyed_patterns
 from mosaico_ingest.lint.rule import Check, Problem
 
 

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.adapters.image import IMAGE_TAG
-from mosaico_ingest.job.patterns import first_match
-from mosaico_ingest.lint.job import Job, is_glob
+from mosaico_ingest.job.patterns import first_match, is_glob
+from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.rule import Check, Problem
 
 

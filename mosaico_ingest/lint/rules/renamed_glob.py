@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.lint.job import Job, is_glob
+from mosaico_ingest.job.patterns import is_glob
+from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.rule import Check, Problem
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.lint.job import Job, covers, is_glob, keyed_patterns
+from mosaico_ingest.job.patterns import is_glob
+from mosaico_ingest.lint.job import Job, covers, keyed_patterns
 from mosaico_ingest.lint.rule import Check, Problem
 
 
