@@ -104,7 +104,7 @@ def outcome(folder: Path) -> list[dict[str, Any]]:
     return [recording.model_dump(mode="json", exclude=timed) for recording in report.recordings]
 
 
-def test_a_cluster_does_what_one_machine_does(cluster: Any, tmp_path: Path) -> None:
+def test_ray_cluster_gives_the_same_result_as_one_machine(cluster: Any, tmp_path: Path) -> None:
     here, there = tmp_path / "here", tmp_path / "there"
     for folder in (here, there):
         make_job(folder, "abcd")
@@ -125,7 +125,7 @@ def test_a_cluster_does_what_one_machine_does(cluster: Any, tmp_path: Path) -> N
     assert not list((there / "store").glob(".run-*"))
 
 
-def test_an_interrupt_leaves_what_the_policy_says_and_130(cluster: Any, tmp_path: Path) -> None:
+def test_run_interrupted_follows_session_policy_and_exits_130(cluster: Any, tmp_path: Path) -> None:
     make_job(tmp_path, "abcd", wait_for="never")
     process = ingest(tmp_path, "--executor", "ray", "--address", cluster.address, "--log-format", "json")
     assert process.stderr is not None
@@ -142,7 +142,7 @@ def test_an_interrupt_leaves_what_the_policy_says_and_130(cluster: Any, tmp_path
     assert Store.open(tmp_path / "store").names() == ()
 
 
-def test_a_node_that_goes_costs_no_recording(cluster: Any, tmp_path: Path) -> None:
+def test_ray_lost_node_restarts_its_recording(cluster: Any, tmp_path: Path) -> None:
     """It takes the node, so it comes last of those who use the cluster."""
     jobs = compile_job(make_job(tmp_path, "ab", wait_for="go"))
     begun: list[int] = []
@@ -160,21 +160,21 @@ def test_a_node_that_goes_costs_no_recording(cluster: Any, tmp_path: Path) -> No
     assert [one.rows for one in Store.open(tmp_path / "store").sequences()] == [1000, 1000]
 
 
-def test_without_an_address_ray_is_started_here(tmp_path: Path) -> None:
+def test_ray_without_address_starts_on_this_machine(tmp_path: Path) -> None:
     make_job(tmp_path, "ab")
     code, said = ended(ingest(tmp_path, "--executor", "ray", "--jobs", "1"))
     assert code == 0, said
     assert Store.open(tmp_path / "store").names() == ("a", "b")
 
 
-def test_no_cluster_at_an_address_is_said(tmp_path: Path) -> None:
+def test_ray_unreachable_address_fails(tmp_path: Path) -> None:
     make_job(tmp_path, "a")
     code, said = ended(ingest(tmp_path, "--executor", "ray", "--address", "127.0.0.1:9"))
     assert code == 1
     assert "127.0.0.1:9: cannot connect to Ray" in " ".join(said.split())
 
 
-def test_what_a_node_cannot_reach_is_said_and_never_made_anew_there(tmp_path: Path) -> None:
+def test_ray_node_without_access_to_files_fails(tmp_path: Path) -> None:
     job = compile_job(make_job(tmp_path, "a"))[0]
     here = Setting(Registrations.current(), 0, ".run-1", machine())
     (tmp_path / "store").mkdir()

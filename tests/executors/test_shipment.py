@@ -59,9 +59,7 @@ def job(tmp_path: Path) -> Path:
     return jobs / "job.yaml"
 
 
-def test_the_plan_is_the_same_where_only_the_shipment_and_the_recording_are(
-    job: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_plan_of_packed_job_is_equal(job: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(job.parent.parent)
     tasks = [Task(one) for one in compile_job(Path("jobs/job.yaml"))]
     planned = make_plan(tasks[0]).document(folder=tasks[0].job.folder)
@@ -75,7 +73,7 @@ def test_the_plan_is_the_same_where_only_the_shipment_and_the_recording_are(
     assert make_plan(sent[0]).document(folder=sent[0].job.folder) == planned
 
 
-def test_nothing_but_code_and_definitions_is_sent(job: Path, tmp_path: Path) -> None:
+def test_pack_copies_only_code_and_definitions(job: Path, tmp_path: Path) -> None:
     (tmp_path / "box").mkdir()
     pack([absolute(Task(one)) for one in compile_job(job)], tmp_path / "box")
     sent = {path.name for path in (tmp_path / "box").rglob("*") if path.is_file()}
@@ -92,7 +90,7 @@ def test_nothing_but_code_and_definitions_is_sent(job: Path, tmp_path: Path) -> 
     }
 
 
-def test_without_ray_the_command_says_how_to_get_it(
+def test_ray_not_installed_hints_at_extra(
     job: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)

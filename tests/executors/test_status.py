@@ -63,13 +63,13 @@ def test_shards_together_ingest_everything_once(job: Path) -> None:
     assert "3 recordings" in page.read_text()
 
 
-def test_a_shard_without_recordings_is_done_at_once(job: Path) -> None:
+def test_shard_without_recordings_exits_0(job: Path) -> None:
     report = job.parent / "r.json"
     assert ingest("run", job, "--shard", "9/9", "--report", report).exit_code == 0
     assert RunReport.model_validate_json(report.read_text()).recordings == ()
 
 
-def test_json_lines_and_metrics_say_how_it_went(job: Path) -> None:
+def test_json_lines_and_metrics_report_the_run(job: Path) -> None:
     metrics = job.parent / "ingest.prom"
     done = ingest("run", job, "--log-format", "json", "--metrics", metrics)
     events = [json.loads(line) for line in done.stderr.splitlines()]
@@ -84,13 +84,13 @@ def test_json_lines_and_metrics_say_how_it_went(job: Path) -> None:
 
 
 @given(st.lists(st.integers()), st.integers(1, 12))
-def test_shards_are_a_partition(items: list[int], count: int) -> None:
+def test_shards_partition_the_recordings(items: list[int], count: int) -> None:
     parts = [take_shard(items, f"{number}/{count}") for number in range(1, count + 1)]
     assert sorted(item for part in parts for item in part) == sorted(items)
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
 
 
 @pytest.mark.parametrize("text", ["0/2", "3/2", "1", "a/b", "1/0", ""])
-def test_a_shard_is_written_one_way(text: str) -> None:
+def test_shard_accepts_only_one_notation(text: str) -> None:
     with pytest.raises(ManifestError, match=r"1/8"):
         take_shard([1], text)

@@ -26,7 +26,7 @@ DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.
 JOB = 'bag: {path: "nothing/*.mcap"}\ntopics: [/imu]\ntarget: {store: store}\n'
 
 
-def test_a_file_is_given_out_once_when_it_rests_and_again_when_it_changes(tmp_path: Path) -> None:
+def test_arrivals_file_settles_once_until_it_changes(tmp_path: Path) -> None:
     arrivals = Arrivals(tmp_path, rest_s=5)
     file = tmp_path / "a.mcap"
     file.write_bytes(b"1")
@@ -40,7 +40,7 @@ def test_a_file_is_given_out_once_when_it_rests_and_again_when_it_changes(tmp_pa
     assert arrivals.settled(35) == (file,)
 
 
-def test_hidden_empty_and_other_files_are_passed_over(tmp_path: Path) -> None:
+def test_arrivals_hidden_empty_and_other_files_are_ignored(tmp_path: Path) -> None:
     (tmp_path / ".a.mcap.Xy12").write_bytes(b"1")
     (tmp_path / "b.mcap").touch()
     (tmp_path / "notes.txt").write_bytes(b"1")
@@ -50,14 +50,14 @@ def test_hidden_empty_and_other_files_are_passed_over(tmp_path: Path) -> None:
     assert arrivals.settled(1) == (tmp_path / "a.mcap",)
 
 
-def test_a_link_that_leads_back_is_not_followed(tmp_path: Path) -> None:
+def test_arrivals_link_to_parent_folder_is_ignored(tmp_path: Path) -> None:
     (tmp_path / "day").mkdir()
     (tmp_path / "day" / "a.mcap").write_bytes(b"1")
     (tmp_path / "day" / "back").symlink_to(tmp_path, target_is_directory=True)
     assert Arrivals(tmp_path, rest_s=0).settled(0) == (tmp_path / "day" / "a.mcap",)
 
 
-def test_a_rosbag2_directory_is_one_recording_once_its_metadata_is_there(tmp_path: Path) -> None:
+def test_arrivals_rosbag2_directory_settles_with_its_metadata(tmp_path: Path) -> None:
     folder = tmp_path / "deep" / "drive"
     folder.mkdir(parents=True)
     (folder / "drive_0.mcap").write_bytes(b"1")
@@ -70,7 +70,7 @@ def test_a_rosbag2_directory_is_one_recording_once_its_metadata_is_there(tmp_pat
 @pytest.mark.skipif(
     not hasattr(fcntl, "F_SETLEASE"), reason="only Linux reports files that are open for writing"
 )
-def test_a_file_that_is_open_for_writing_is_not_at_rest(tmp_path: Path) -> None:
+def test_arrivals_file_open_for_writing_does_not_settle(tmp_path: Path) -> None:
     file = tmp_path / "a.mcap"
     arrivals = Arrivals(tmp_path, rest_s=0)
     with file.open("wb") as writing:
@@ -81,7 +81,7 @@ def test_a_file_that_is_open_for_writing_is_not_at_rest(tmp_path: Path) -> None:
     assert arrivals.settled(10) == (file,)
 
 
-def test_what_failed_is_given_out_again_later_and_later(tmp_path: Path) -> None:
+def test_arrivals_failed_recording_settles_again_with_doubled_delay(tmp_path: Path) -> None:
     file = tmp_path / "a.mcap"
     file.write_bytes(b"1")
     arrivals = Arrivals(tmp_path, rest_s=0)
@@ -163,7 +163,7 @@ def watch_once(folder: Path, code: int = 0) -> list[str]:
 
 
 @pytest.mark.slow
-def test_the_command_ingests_what_is_there_and_knows_it_again(tmp_path: Path) -> None:
+def test_watch_once_ingests_recordings_and_skips_them_again(tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     (tmp_path / "job.yaml").write_text(JOB)
     shutil.copy(DRIVE, tmp_path / "in" / "a.mcap")
@@ -178,7 +178,7 @@ def test_the_command_ingests_what_is_there_and_knows_it_again(tmp_path: Path) ->
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
-def test_a_file_of_any_name_neither_ends_the_watch_nor_controls_the_terminal(tmp_path: Path) -> None:
+def test_watch_file_with_unprintable_name_is_ingested_and_escaped(tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     (tmp_path / "job.yaml").write_text(JOB)
     for name in (b"bad\xff.mcap", b"red\x1b[31m.mcap"):

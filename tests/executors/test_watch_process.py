@@ -82,7 +82,7 @@ def children(pid: int) -> list[int]:
     return []
 
 
-def test_what_is_renamed_into_place_is_taken_and_a_slow_copy_not_before_it_rests(watch: Watch) -> None:
+def test_watch_ingests_renamed_file_at_once_and_slow_copy_after_rest(watch: Watch) -> None:
     whole = DRIVE.read_bytes()
     watch.start()
     (watch.folder / "in" / ".a.mcap.part").write_bytes(whole)
@@ -101,7 +101,7 @@ def test_what_is_renamed_into_place_is_taken_and_a_slow_copy_not_before_it_rests
     assert set(watch.names()) == {"a", "slow"}
 
 
-def test_a_request_to_stop_ends_it_with_0(watch: Watch) -> None:
+def test_watch_stopped_by_signal_exits_0(watch: Watch) -> None:
     process = watch.start()
     process.send_signal(signal.SIGTERM)
     assert process.wait(PATIENCE_S) == 0
@@ -109,7 +109,7 @@ def test_a_request_to_stop_ends_it_with_0(watch: Watch) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="finds the process at work in /proc")
-def test_what_was_in_work_when_it_was_killed_is_done_after_a_restart_and_nothing_twice(watch: Watch) -> None:
+def test_watch_restarted_after_kill_ingests_interrupted_recording_exactly_once(watch: Watch) -> None:
     shutil.copy(DRIVE, watch.folder / "in" / "a.mcap")
     first = watch.start()
     watch.until(lambda: "a.mcap: completed" in watch.said())
@@ -133,7 +133,7 @@ def test_what_was_in_work_when_it_was_killed_is_done_after_a_restart_and_nothing
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not here")
-def test_systemd_takes_the_unit(tmp_path: Path) -> None:
+def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
     text = UNIT.read_text().replace("/srv/ingest/.venv/bin/ingest", sys.executable)
     (tmp_path / UNIT.name).write_text(text)
     done = subprocess.run(  # noqa: S603 - the unit is ours

@@ -45,16 +45,16 @@ def draft(
         ("package", "(it carries no definitions; they are read as in public packages)"),
     ],
 )
-def test_it_says_whose_definitions_are_used(definition: str, said: str) -> None:
+def test_draft_manifest_states_source_of_definitions(definition: str, said: str) -> None:
     assert said in draft(definition)
 
 
-def test_it_asks_for_the_definitions_of_ros_messages_only() -> None:
+def test_draft_manifest_asks_for_definitions_of_ros_messages_only() -> None:
     assert "custom_msgs: [{package: own_msgs" in draft("none")
     assert "custom_msgs" not in draft("none", "other")
 
 
-def test_it_asks_for_the_distro_where_distros_differ() -> None:
+def test_draft_manifest_asks_for_distro_if_distros_differ() -> None:
     marker = "visualization_msgs/msg/Marker"
     said = draft("none", msgtype=marker)
     assert f"# {marker} changed between distros" in said
@@ -63,11 +63,11 @@ def test_it_asks_for_the_distro_where_distros_differ() -> None:
     assert "custom_msgs" in draft("none", msgtype=marker, ros_distro="ros2_dashing")
 
 
-def test_its_head_is_for_people() -> None:
+def test_draft_manifest_starts_with_summary() -> None:
     assert "# sqlite3, 2.0 kB, 1 message, 0.00 s\n" in draft("bag")
 
 
-def test_a_recording_behind_a_url_keeps_it() -> None:
+def test_absolute_keeps_url_of_recording() -> None:
     found = Inspection(
         files=("s3://fleet/a/my drive.mcap",),
         container="mcap",

@@ -47,7 +47,7 @@ def said(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     return [str(one) for one in differences([old], [new])]
 
 
-def test_a_plan_does_not_differ_from_itself() -> None:
+def test_differences_of_equal_plans_are_empty() -> None:
     assert differences([plan()], [plan()]) == ()
 
 
@@ -64,11 +64,11 @@ def test_a_plan_does_not_differ_from_itself() -> None:
         ({"on_error": {"session": "delete", "message": "log_warn"}}, "s: on_error session: report → delete"),
     ],
 )  # fmt: skip
-def test_each_difference_is_a_line(changes: dict[str, Any], line: str) -> None:
+def test_differences_have_one_line_each(changes: dict[str, Any], line: str) -> None:
     assert said(plan(), plan(**changes)) == [line]
 
 
-def test_recordings_are_told_by_their_names_then_by_their_files() -> None:
+def test_differences_match_recordings_by_name_then_files() -> None:
     def at(name: str, file: str) -> dict[str, Any]:
         return plan(name=name, files=[{"path": file, "size_bytes": 1}])
 
@@ -101,7 +101,7 @@ CHANGES = st.fixed_dictionaries(
 
 
 @given(CHANGES, CHANGES)
-def test_plans_differ_exactly_where_their_digests_do(one: dict[str, Any], other: dict[str, Any]) -> None:
+def test_differences_exist_exactly_if_digests_differ(one: dict[str, Any], other: dict[str, Any]) -> None:
     old, new = plan(**one), plan(**other)
 
     def unordered(document: dict[str, Any]) -> dict[str, Any]:

@@ -144,7 +144,7 @@ MESSAGES = st.lists(st.sampled_from([1.0, 2.0, -1.0, None]), max_size=20)
     st.sampled_from(list(LoaderErrorPolicy)),
     st.integers(1, 3),
 )
-def test_stream_result_does_not_depend_on_batch_size(
+def test_topic_result_does_not_depend_on_batch_size(
     values: list[float | None], topic: TopicLevelErrorPolicy, message: LoaderErrorPolicy, every: int
 ) -> None:
     single = run(values, topic=topic, message=message, every=every)
@@ -155,14 +155,14 @@ def test_stream_result_does_not_depend_on_batch_size(
         assert str(several[2]) == str(single[2])
 
 
-def test_stream_policy_ignore_rejects_only_the_bad_message() -> None:
+def test_topic_policy_ignore_rejects_only_the_bad_message() -> None:
     session, collector, error = run([1.0, -1.0, 2.0])
     assert error is None
     assert session.values == [1.0, 2.0]
     assert counts(collector) == (3, 2, 0, 1)
 
 
-def test_stream_policy_finalize_keeps_earlier_rows_and_rejects_later_ones() -> None:
+def test_topic_policy_finalize_keeps_earlier_rows_and_rejects_later_ones() -> None:
     session, collector, error = run([1.0, -1.0, 2.0, 3.0], topic=TopicLevelErrorPolicy.Finalize)
     assert error is None
     assert session.values == [1.0]
@@ -170,7 +170,7 @@ def test_stream_policy_finalize_keeps_earlier_rows_and_rejects_later_ones() -> N
     assert rules == {"negative": 1, "topic-closed": 2}
 
 
-def test_stream_policy_raise_keeps_earlier_rows_and_names_the_offset() -> None:
+def test_topic_policy_raise_keeps_earlier_rows_and_names_the_offset() -> None:
     session, collector, error = run([1.0, -1.0, 2.0], topic=TopicLevelErrorPolicy.Raise)
     assert isinstance(error, AdapterError)
     assert "offset 10" in str(error)
@@ -179,7 +179,7 @@ def test_stream_policy_raise_keeps_earlier_rows_and_names_the_offset() -> None:
     assert session.notes
 
 
-def test_stream_undecodable_message_follows_the_message_policy() -> None:
+def test_topic_undecodable_message_follows_the_message_policy() -> None:
     session, collector, error = run([1.0, None, 2.0], topic=TopicLevelErrorPolicy.Raise)
     assert error is None
     assert session.values == [1.0, 2.0]
@@ -190,14 +190,14 @@ def test_stream_undecodable_message_follows_the_message_policy() -> None:
 
 
 @pytest.mark.parametrize("every", [1, 2, 3])
-def test_stream_every_keeps_the_first_message_of_each_group(every: int) -> None:
+def test_topic_every_keeps_the_first_message_of_each_group(every: int) -> None:
     values = [float(value) for value in range(10)]
     session, collector, _ = run(values, size=4, every=every)
     assert session.values == values[::every]
     assert counts(collector)[2] == 10 - len(values[::every])
 
 
-def test_stream_topic_refused_by_destination_follows_the_topic_policy() -> None:
+def test_topic_topic_refused_by_destination_follows_the_topic_policy() -> None:
     session, collector, error = run([1.0, 2.0, 3.0], size=2, refuse=True)
     assert error is None
     assert session.values == []

@@ -56,7 +56,7 @@ def missing(
     return check_counts(wanted, recording, streams, events.append), events
 
 
-def test_messages_nobody_can_account_for_are_a_difference() -> None:
+def test_check_counts_unexplained_difference_is_returned() -> None:
     wrong, events = missing(10, 8, [UnreadableRange(0, "bad", 7, 1, "f")])
     assert wrong == [
         "/t: the index promises 10 messages, 8 were read and no unreadable range explains the difference"
@@ -64,26 +64,26 @@ def test_messages_nobody_can_account_for_are_a_difference() -> None:
     assert not events
 
 
-def test_messages_in_a_stretch_nobody_can_read_are_accounted_for() -> None:
+def test_check_counts_unknown_unreadable_range_explains_difference() -> None:
     wrong, events = missing(10, 8, [UnreadableRange(0, "bad", file="f")])
     assert not wrong
     assert events == [Unreadable("/t", 2, None, "the messages are in unreadable ranges")]
     assert missing(10, 8, [UnreadableRange(0, "bad", 7, 2, "f")]) == ([], [])
 
 
-def test_more_than_promised_is_no_loss() -> None:
+def test_check_counts_more_messages_than_promised_is_a_warning() -> None:
     wrong, (event,) = missing(10, 12, [])
     assert not wrong
     assert isinstance(event, Noted)
     assert event.finding.rule == "unexpected-messages"
 
 
-def test_part_of_a_recording_owes_nothing() -> None:
+def test_check_counts_ignores_time_range_and_unknown_count() -> None:
     assert missing(10, 1, [], read_from_ns=5) == ([], [])
     assert missing(None, 1, []) == ([], [])
 
 
-def test_the_sums_of_a_damaged_recording_hold(tmp_path: Path) -> None:
+def test_counts_of_damaged_recording_add_up(tmp_path: Path) -> None:
     data = bytearray(DRIVE.read_bytes())
     middle = len(data) // 2
     data[middle : middle + 60_000] = bytes(60_000)
@@ -130,7 +130,7 @@ def undefined(tmp_path: Path) -> Path:
     return bag
 
 
-def test_messages_of_a_type_nobody_defines_are_lost_and_not_left_out_on_purpose(undefined: Path) -> None:
+def test_run_with_undefined_type_counts_its_messages_as_unreadable(undefined: Path) -> None:
     config = ROSInjectionConfig(undefined, "old", ros_distro="ros2_humble", store=undefined.parent / "store")
     (report,) = api.run([config]).recordings
     assert (report.status, report.exit_code) == (RunStatus.WITH_ERRORS, 4)
@@ -146,7 +146,7 @@ def test_messages_of_a_type_nobody_defines_are_lost_and_not_left_out_on_purpose(
     assert chosen.exit_code == 0
 
 
-def test_a_type_nobody_defines_ends_a_run_that_shall_lose_nothing(undefined: Path) -> None:
+def test_run_with_undefined_type_and_raise_policy_fails(undefined: Path) -> None:
     config = ROSInjectionConfig(
         undefined, "old", store=undefined.parent / "store", messages_on_error=LoaderErrorPolicy.RAISE
     )
@@ -155,7 +155,7 @@ def test_a_type_nobody_defines_ends_a_run_that_shall_lose_nothing(undefined: Pat
     api.RosbagInjector(replace(config, topics=("/known",))).run()
 
 
-def test_a_destination_that_loses_rows_fails_the_run(
+def test_run_with_rows_missing_in_destination_fails_verification(
     write_bag: WriteBag, write_job: WriteJob, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_bag({"/speed": [number(1), number(2)]})
@@ -172,8 +172,10 @@ def test_a_destination_that_loses_rows_fails_the_run(
     assert "found 1 rows" in str(report.error)
 
 
-@pytest.mark.parametrize(("damage", "said"), [("flip", "CRC"), ("cut", ""), ("remove", '"the file does not exist"')])
-def test_verify_finds_what_changed_on_the_disk(
+@pytest.mark.parametrize(
+    ("damage", "said"), [("flip", "CRC"), ("cut", ""), ("remove", '"the file does not exist"')]
+)
+def test_verify_detects_damaged_file(
     damage: str,
     said: str,
     *,
@@ -204,7 +206,7 @@ def test_verify_finds_what_changed_on_the_disk(
 
 
 @pytest.mark.parametrize("table", [{}, {"timestamp_ns": []}, {"timestamp_ns": ["a"], "data": [1.0]}, None])
-def test_verify_finds_another_file_in_the_place_of_one(
+def test_verify_detects_replaced_file(
     table: dict[str, list[object]] | None,
     write_bag: WriteBag,
     write_job: WriteJob,
@@ -224,7 +226,7 @@ def test_verify_finds_another_file_in_the_place_of_one(
     assert ended.value.code == 5
 
 
-def test_verify_finds_rows_that_are_not_those_that_were_written(
+def test_verify_detects_changed_rows(
     write_bag: WriteBag,
     write_job: WriteJob,
     run_job: RunJob,
@@ -249,14 +251,14 @@ def test_verify_finds_rows_that_are_not_those_that_were_written(
     assert f"those that were written {told.checksum}" in said
 
 
-def test_the_same_recording_has_the_same_checksums_in_every_store(tmp_path: Path) -> None:
+def test_checksums_of_same_recording_are_equal_in_every_store(tmp_path: Path) -> None:
     jobs = [ROSInjectionConfig(DRIVE, "drive", store=tmp_path / name) for name in ("one", "other")]
     one, other = ({t.target: t.checksum for t in report.topics} for report in api.run(jobs).recordings)
     assert one == other
     assert len(set(one.values())) == len(one), "each topic has its own"
 
 
-def test_a_catalog_from_before_there_were_checksums_is_read_and_added_to(
+def test_run_into_catalog_without_checksums_adds_the_column(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(1)]})
@@ -284,7 +286,7 @@ def interrupt_commits(monkeypatch: pytest.MonkeyPatch, *, signals: int) -> None:
 
 @pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("signals", [1, 2])
-def test_a_commit_is_finished_before_an_interrupt_is_heeded_unless_it_is_repeated(
+def test_run_interrupted_during_commit_finishes_it_unless_interrupted_twice(
     signals: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     interrupt_commits(monkeypatch, signals=signals)
@@ -299,7 +301,7 @@ def test_a_commit_is_finished_before_an_interrupt_is_heeded_unless_it_is_repeate
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_an_interrupt_that_is_ignored_is_not_heeded_after_a_commit_either(
+def test_run_with_ignored_interrupt_during_commit_completes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     interrupt_commits(monkeypatch, signals=1)
@@ -309,7 +311,7 @@ def test_an_interrupt_that_is_ignored_is_not_heeded_after_a_commit_either(
 
 
 @pytest.mark.parametrize("handed_over", [0, 1, 7])
-def test_the_sums_of_an_interrupted_run_hold(
+def test_counts_of_interrupted_run_add_up(
     handed_over: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     put, calls = WriteBuffer.put, count()

@@ -63,7 +63,7 @@ def noise() -> list[bytes]:
 
 
 @pytest.mark.slow
-def test_a_full_disk_is_said_leaves_the_old_and_the_next_run_completes_it(
+def test_replacing_run_on_full_disk_names_cause_and_keeps_old_sequence(
     write_bag: WriteBag, write_job: WriteJob, disk: Path, noise: list[bytes]
 ) -> None:
     store = disk / "store"
@@ -86,7 +86,7 @@ def test_a_full_disk_is_said_leaves_the_old_and_the_next_run_completes_it(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("left_bytes", [0, 4096, 40_000, 200_000])
-def test_a_first_run_that_found_no_room_leaves_nothing_that_can_be_seen(
+def test_first_run_on_full_disk_publishes_nothing(
     left_bytes: int, write_bag: WriteBag, write_job: WriteJob, disk: Path, noise: list[bytes]
 ) -> None:
     store = disk / "store"
@@ -102,7 +102,7 @@ def test_a_first_run_that_found_no_room_leaves_nothing_that_can_be_seen(
 
 
 @pytest.mark.slow
-def test_a_store_that_may_only_be_read_is_said_and_can_be_read(
+def test_read_only_store_refuses_writes_and_allows_reads(
     write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
 ) -> None:
     store = tmp_path / "store"
@@ -126,7 +126,7 @@ def test_a_store_that_may_only_be_read_is_said_and_can_be_read(
     assert speeds(store) == [2.0]
 
 
-def test_a_quarantine_without_room_is_an_error_and_no_message_is_lost_in_silence(
+def test_run_with_full_quarantine_disk_fails_and_publishes_nothing(
     write_bag: WriteBag, write_job: WriteJob, disk: Path, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(1), CUT, number(2)]})
@@ -140,7 +140,7 @@ def test_a_quarantine_without_room_is_an_error_and_no_message_is_lost_in_silence
     assert speeds(tmp_path / "store") == [1.0, 2.0]
 
 
-def test_a_report_without_room_is_an_error_after_the_commit(
+def test_run_with_full_report_disk_fails_after_commit(
     write_bag: WriteBag, write_job: WriteJob, disk: Path, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(1)]})
@@ -151,7 +151,7 @@ def test_a_report_without_room_is_an_error_after_the_commit(
     assert speeds(tmp_path / "store") == [1.0]
 
 
-def test_a_temporary_folder_without_room_is_said(
+def test_run_with_full_temporary_folder_names_tmpdir(
     write_bag: WriteBag, write_job: WriteJob, disk: Path, tmp_path: Path, noise: list[bytes]
 ) -> None:
     packed = tmp_path / "packed.db3.zstd"

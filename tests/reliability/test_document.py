@@ -13,10 +13,10 @@ NAMED = sorted(set(re.findall(r"(?:tests/[\w/]*|\b)test_\w+\.py|tests/[\w/]+", D
 
 
 @pytest.mark.parametrize("name", NAMED)
-def test_a_test_that_is_named_is_there(name: str) -> None:
+def test_document_names_existing_tests(name: str) -> None:
     assert (ROOT / name).exists() or (Path(__file__).parent / name).exists()
 
 
-def test_every_file_of_these_is_named() -> None:
+def test_document_names_every_reliability_test_file() -> None:
     own = {path.name for path in Path(__file__).parent.glob("test_*.py")} - {Path(__file__).name}
     assert own <= {Path(name).name for name in NAMED}

@@ -58,7 +58,7 @@ def kill_and_look(write_bag: WriteBag, job: Path, store: Path, rounds: int) -> i
     return through
 
 
-def test_a_killed_job_leaves_the_old_or_the_new_and_the_next_completes_it(
+def test_replacing_run_killed_leaves_old_or_new_and_next_run_completes(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     job = write_job(sequence=REPLACE)
@@ -70,7 +70,7 @@ def test_a_killed_job_leaves_the_old_or_the_new_and_the_next_completes_it(
 
 
 @pytest.mark.slow
-def test_a_killed_job_leaves_the_old_or_the_new_200_times(
+def test_replacing_run_killed_200_times_leaves_old_or_new_sequence(
     write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
 ) -> None:
     through = kill_and_look(write_bag, write_job(sequence=REPLACE), tmp_path / "store", 200)
@@ -79,7 +79,7 @@ def test_a_killed_job_leaves_the_old_or_the_new_200_times(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number_of_signal", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_stops_a_job_within_a_second_or_two(
+def test_run_stops_within_seconds_of_a_signal(
     number_of_signal: signal.Signals, write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(1)] * 200_000})
@@ -96,7 +96,7 @@ def test_a_signal_stops_a_job_within_a_second_or_two(
 
 
 @pytest.mark.parametrize("in_the_way", ["store", "store/catalog.sqlite"])
-def test_something_else_where_the_store_should_be_is_said(
+def test_run_with_other_file_at_store_path_fails(
     in_the_way: str, write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(1)]})
@@ -122,7 +122,7 @@ def interrupted_by(job: Path, act: Callable[[], object]) -> tuple[RunStatus, int
     return report.status, report.exit_code, str(report.error)
 
 
-def test_a_store_that_is_deleted_under_way_is_said(
+def test_run_with_store_deleted_during_run_fails(
     write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(1)] * 70_000})
@@ -131,7 +131,7 @@ def test_a_store_that_is_deleted_under_way_is_said(
     assert "store" in said
 
 
-def test_a_recording_that_is_cut_off_while_it_is_read_loses_nothing_in_silence(
+def test_run_of_recording_truncated_during_reading_reports_it(
     write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
 ) -> None:
     bag = write_bag({"/speed": [number(1)] * 500_000})
@@ -142,7 +142,7 @@ def test_a_recording_that_is_cut_off_while_it_is_read_loses_nothing_in_silence(
         assert code in {1, 4, 5}, said
 
 
-def test_two_jobs_write_two_sequences_of_one_store_at_once(
+def test_two_runs_write_two_sequences_of_one_store(
     write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(1)] * 20_000})
@@ -153,7 +153,9 @@ def test_two_jobs_write_two_sequences_of_one_store_at_once(
     assert [info.rows for info in store.sequences()] == [20_000] * 2
 
 
-def test_one_of_two_jobs_gets_the_name(write_bag: WriteBag, write_job: WriteJob, tmp_path: Path) -> None:
+def test_two_runs_of_one_sequence_let_one_win(
+    write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
+) -> None:
     write_bag({"/speed": [number(1)] * 20_000})
     job = write_job()
     running = [start(job), start(job)]
@@ -163,7 +165,7 @@ def test_one_of_two_jobs_gets_the_name(write_bag: WriteBag, write_job: WriteJob,
     assert len(speeds(Store.open(tmp_path / "store"))) == 20_000
 
 
-def test_stamps_that_repeat_or_go_back_keep_every_message(
+def test_run_with_repeated_or_decreasing_log_times_keeps_every_message(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     import sqlite3  # noqa: PLC0415 - for this one

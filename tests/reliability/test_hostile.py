@@ -48,18 +48,18 @@ def told(report: RunReport) -> None:
 
 
 @given(st.sampled_from(MAGIC), st.binary(max_size=400))
-def test_any_bytes_are_a_recording_or_an_error(magic: bytes, rest: bytes) -> None:
+def test_run_of_random_bytes_succeeds_or_fails_with_error(magic: bytes, rest: bytes) -> None:
     told(ingest(magic + rest))
 
 
 @settings(max_examples=settings().max_examples // 10)
 @given(st.integers(0, len(DRIVE) - 1), st.binary(min_size=1, max_size=40))
-def test_a_recording_with_any_bytes_changed_is_ingested_or_refused(at: int, change: bytes) -> None:
+def test_run_of_mutated_recording_is_ingested_or_refused(at: int, change: bytes) -> None:
     told(ingest(DRIVE[:at] + change + DRIVE[at + len(change) :]))
 
 
 @given(st.lists(YAML_WORDS | st.text(max_size=6), max_size=40).map("".join))
-def test_any_text_is_a_manifest_or_findings(text: str) -> None:
+def test_manifest_of_random_text_is_loaded_or_has_findings(text: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         job = Path(folder, "job.yaml")
         job.write_text(text, encoding="utf-8", errors="replace")
@@ -68,7 +68,7 @@ def test_any_text_is_a_manifest_or_findings(text: str) -> None:
         assert [path.name for path in Path(folder).iterdir()] == ["job.yaml"]
 
 
-def test_an_alias_bomb_is_refused_at_once(tmp_path: Path) -> None:
+def test_manifest_alias_bomb_is_refused_quickly(tmp_path: Path) -> None:
     lines = ["a0: &a0 [x]", *(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 30))]
     job = tmp_path / "job.yaml"
     job.write_text("\n".join(lines))
@@ -77,7 +77,7 @@ def test_an_alias_bomb_is_refused_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["..", ".", "../out", "a/../../out", "/out", "a\x00b", "a\\..\\b", ""])
-def test_no_sequence_name_leaves_the_store(
+def test_sequence_name_stays_inside_the_store(
     name: str, write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(1)]})
@@ -92,7 +92,7 @@ def test_no_sequence_name_leaves_the_store(
 @pytest.mark.parametrize(
     "topic", ["/std/../../../out", "/std/..", "/std//x", "/std/ü", "/std/a b", "/std/" + "x" * 300]
 )
-def test_no_topic_name_leaves_the_store(
+def test_topic_name_stays_inside_the_store(
     topic: str, write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     write_bag({topic: [number(1)], "/speed": [number(2)]})
@@ -106,7 +106,7 @@ def test_no_topic_name_leaves_the_store(
     )
 
 
-def test_no_code_is_run_that_the_manifest_does_not_load(
+def test_run_executes_no_code_beside_the_manifest(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     (tmp_path / "evil.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")

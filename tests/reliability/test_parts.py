@@ -59,7 +59,7 @@ DAMAGE = {
 
 @pytest.mark.parametrize("listed", [True, False], ids=["metadata", "no metadata"])
 @pytest.mark.parametrize("damage", DAMAGE)
-def test_one_bad_part_is_said_and_costs_itself(
+def test_run_with_one_unreadable_split_ingests_the_others(
     damage: str, *, listed: bool, parts: Path, ingest: Ingest, tmp_path: Path
 ) -> None:
     DAMAGE[damage](parts / "part_1.db3")
@@ -76,7 +76,7 @@ def test_one_bad_part_is_said_and_costs_itself(
     assert sorted(rows["data"].to_pylist()) == [0, 1, 4, 5]
 
 
-def test_a_part_that_is_gone_is_said_and_no_success(parts: Path, ingest: Ingest) -> None:
+def test_run_with_missing_split_reports_it_and_exits_4(parts: Path, ingest: Ingest) -> None:
     (parts / "part_1.db3").unlink()
     listing(parts, 3)
     code, out, err = ingest("bag", "parts", "--name", "drive", "--store", "store")
@@ -86,7 +86,7 @@ def test_a_part_that_is_gone_is_said_and_no_success(parts: Path, ingest: Ingest)
 
 @pytest.mark.parametrize("listed", [True, False], ids=["metadata", "no metadata"])
 @pytest.mark.parametrize("damage", DAMAGE)
-def test_nothing_but_bad_parts_is_one_error(
+def test_run_with_only_unreadable_splits_fails_with_one_error(
     damage: str, *, listed: bool, parts: Path, ingest: Ingest, tmp_path: Path
 ) -> None:
     for part in parts.glob("*.db3"):
@@ -102,7 +102,7 @@ def test_nothing_but_bad_parts_is_one_error(
     assert not (tmp_path / "store").exists() or Store.open(tmp_path / "store").names() == ()
 
 
-def test_an_empty_folder_is_one_error(ingest: Ingest, tmp_path: Path) -> None:
+def test_run_of_empty_folder_fails_with_one_error(ingest: Ingest, tmp_path: Path) -> None:
     (tmp_path / "nothing").mkdir()
     for arguments in (("inspect", "nothing"), ("bag", "nothing", "--name", "drive")):
         code, _, err = ingest(*arguments)

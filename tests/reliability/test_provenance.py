@@ -21,7 +21,7 @@ WriteJob = Callable[..., Path]
 SKIP = {"name": "drive", "if_exists": "skip"}
 
 
-def test_the_same_job_again_does_nothing(
+def test_server_skip_of_same_job_does_nothing(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(1)]})
@@ -34,7 +34,7 @@ def test_the_same_job_again_does_nothing(
     assert Store.open(tmp_path / "store").sequence("drive") == before
 
 
-def test_a_job_that_did_not_say_skip_is_recognised_too(
+def test_skip_recognizes_sequence_of_job_without_skip(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     bag = write_bag({"/speed": [number(1)]})
@@ -47,7 +47,7 @@ def test_a_job_that_did_not_say_skip_is_recognised_too(
     assert run_job(job).status is RunStatus.SKIPPED
 
 
-def test_other_content_under_the_same_name_is_refused(
+def test_skip_refuses_other_content(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(1)]})
@@ -65,7 +65,7 @@ def test_other_content_under_the_same_name_is_refused(
     assert Store.open(tmp_path / "store").scan("drive", "/speed").read_all()["data"].to_pylist() == [2]
 
 
-def test_another_job_for_the_same_recording_is_refused(
+def test_skip_refuses_same_recording_of_other_job(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob
 ) -> None:
     write_bag({"/speed": [number(1), number(2)]})
@@ -75,7 +75,7 @@ def test_another_job_for_the_same_recording_is_refused(
     assert "by another job" in str(report.error)
 
 
-def test_a_sequence_nobody_noted_anything_about_is_not_taken_for_the_same(
+def test_skip_refuses_sequence_without_provenance(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(1)]})
@@ -83,7 +83,7 @@ def test_a_sequence_nobody_noted_anything_about_is_not_taken_for_the_same(
     assert "no provenance record" in str(run_job(write_job(sequence=SKIP)).error)
 
 
-def test_what_an_interrupt_left_is_completed_by_the_next_run(
+def test_skip_completes_interrupted_sequence(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(value) for value in range(70_000)]})
@@ -107,7 +107,7 @@ def test_what_an_interrupt_left_is_completed_by_the_next_run(
     assert run_job(job).status is RunStatus.SKIPPED
 
 
-def test_messages_that_were_rejected_do_not_make_a_sequence_incomplete(
+def test_skip_treats_sequence_with_rejected_rows_as_complete(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob
 ) -> None:
     write_bag({"/speed": [number(1), CUT]})
@@ -125,7 +125,7 @@ def rewritten(bag: Path, value: float, other: float) -> None:
     os.utime(bag, ns=(was.st_atime_ns, was.st_mtime_ns))
 
 
-def test_a_long_file_that_was_changed_between_its_samples_is_noticed(
+def test_skip_detects_change_between_samples_of_long_file(
     write_bag: WriteBag,
     write_job: WriteJob,
     run_job: RunJob,
@@ -147,7 +147,7 @@ def test_a_long_file_that_was_changed_between_its_samples_is_noticed(
     assert run_job(job).status is RunStatus.SKIPPED
 
 
-def test_a_long_file_with_the_time_it_had_is_not_read_again(
+def test_skip_does_not_read_long_file_with_same_modification_time(
     write_bag: WriteBag,
     write_job: WriteJob,
     run_job: RunJob,
@@ -163,7 +163,7 @@ def test_a_long_file_with_the_time_it_had_is_not_read_again(
 
 
 @pytest.mark.parametrize("at", [0, 1 << 20, (3 << 20) - 1])
-def test_every_byte_of_a_file_counts(at: int, tmp_path: Path) -> None:
+def test_content_digest_depends_on_every_byte(at: int, tmp_path: Path) -> None:
     data = bytearray(3 << 20)
     path = tmp_path / "recording"
     path.write_bytes(data)

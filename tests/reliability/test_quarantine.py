@@ -37,7 +37,7 @@ def kept(folder: Path) -> list[dict[str, object]]:
     return entries
 
 
-def test_a_rejected_message_is_kept_with_its_bytes_and_its_reason(
+def test_quarantine_keeps_bytes_and_reason_of_rejected_message(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(1), CUT, number(3)]})
@@ -54,7 +54,7 @@ def test_a_rejected_message_is_kept_with_its_bytes_and_its_reason(
     assert Path(report.quarantine).resolve() in (tmp_path / "quarantine").resolve().iterdir()
 
 
-def test_nothing_is_made_where_nothing_is_rejected(
+def test_quarantine_without_rejected_messages_creates_no_file(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(1)]})
@@ -63,7 +63,7 @@ def test_nothing_is_made_where_nothing_is_rejected(
 
 
 @pytest.mark.parametrize("case", [(2, 2), ("0.5%", 1), ("20 %", 4), (0, 0)])
-def test_beyond_the_limit_the_topics_policy_applies(
+def test_quarantine_beyond_limit_applies_topic_policy(
     case: tuple[object, int], write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     limit, aside = case
@@ -76,7 +76,7 @@ def test_beyond_the_limit_the_topics_policy_applies(
     assert len(kept(folder)) == aside
 
 
-def test_a_limit_for_the_run_counts_all_topics(
+def test_quarantine_run_limit_counts_all_topics(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     write_bag({"/a": [number(1), CUT, CUT], "/b": [number(1), CUT, CUT]})
@@ -87,7 +87,7 @@ def test_a_limit_for_the_run_counts_all_topics(
 
 
 @pytest.mark.parametrize("policy", ["ignore", "finalize"])
-def test_a_topic_that_fails_from_its_start_is_stopped(
+def test_quarantine_topic_failing_from_its_start_ends(
     policy: str, write_bag: WriteBag, write_job: WriteJob, run_job: RunJob
 ) -> None:
     write_bag({"/bad": [CUT] * 30, "/good": [number(1)] * 5})
@@ -99,7 +99,7 @@ def test_a_topic_that_fails_from_its_start_is_stopped(
     assert (good.written, good.rejected) == (5, 0)
 
 
-def test_what_is_kept_comes_in_once_the_definition_is_mended(
+def test_replay_with_fixed_definition_appends_messages(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(value) for value in range(5)], "/std/speed": [number(1)]})
@@ -119,7 +119,7 @@ def test_what_is_kept_comes_in_once_the_definition_is_mended(
     assert store.sequence("drive").rows == 6
 
 
-def test_what_fails_again_stays(
+def test_replay_keeps_messages_that_fail_again(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(0), CUT], "/std/speed": [number(1)]})
@@ -135,7 +135,7 @@ def test_what_fails_again_stays(
     assert Store.open(tmp_path / "store").sequence("drive").rows == 2
 
 
-def test_a_replacement_leaves_nothing_of_the_old_to_replay(
+def test_replacing_run_retires_quarantine_of_old_sequence(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(1), CUT]})
@@ -147,7 +147,7 @@ def test_a_replacement_leaves_nothing_of_the_old_to_replay(
     assert len(list((tmp_path / "quarantine").glob("drive*.mcap"))) == 1
 
 
-def test_an_empty_quarantine_says_so(
+def test_replay_of_empty_quarantine_exits_3(
     write_bag: WriteBag, write_job: WriteJob, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_bag({"/speed": [number(1)]})

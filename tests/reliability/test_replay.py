@@ -90,7 +90,7 @@ def spoilt(write_bag: WriteBag, write_job: WriteJob, run_job: RunJob) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("moment", MOMENTS)
-def test_a_replay_killed_at_any_step_brings_each_message_in_once(
+def test_replay_killed_at_any_step_appends_each_message_once(
     moment: str, spoilt: Path, tmp_path: Path
 ) -> None:
     folder, store = tmp_path / "quarantine", Store.open(tmp_path / "store")
@@ -107,7 +107,7 @@ def test_a_replay_killed_at_any_step_brings_each_message_in_once(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("moment", ["before the commit", "segments moved, not entered", "committed"])
-def test_what_a_killed_run_kept_comes_in_only_where_the_run_did(
+def test_replay_after_killed_run_appends_only_to_its_sequence(
     moment: str, write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": list(map(number, range(5))), "/std/speed": [number(1)]})
@@ -119,7 +119,7 @@ def test_what_a_killed_run_kept_comes_in_only_where_the_run_did(
     assert values(Store.open(store)) == list(range(5))
 
 
-def test_a_replay_stopped_before_it_could_say_so_is_not_done_again(
+def test_replay_stopped_before_marking_file_is_not_repeated(
     spoilt: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, store = tmp_path / "quarantine", Store.open(tmp_path / "store")
@@ -132,7 +132,7 @@ def test_a_replay_stopped_before_it_could_say_so_is_not_done_again(
     assert (values(store), waiting(folder, spoilt)) == (list(range(5)), 1)
 
 
-def test_messages_of_a_run_that_is_not_in_the_store_are_left_alone(
+def test_replay_of_orphaned_file_appends_nothing(
     spoilt: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, store = tmp_path / "quarantine", Store.open(tmp_path / "store")
@@ -149,7 +149,7 @@ def test_messages_of_a_run_that_is_not_in_the_store_are_left_alone(
     assert (values(store), waiting(folder, spoilt)) == (list(range(5)), 0)
 
 
-def test_two_replays_do_not_work_on_one_quarantine(
+def test_replay_of_locked_quarantine_is_refused(
     spoilt: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "quarantine"
@@ -160,7 +160,7 @@ def test_two_replays_do_not_work_on_one_quarantine(
     assert not list(folder.glob(".replay*"))
 
 
-def test_a_replay_keeps_all_that_fails_again_whatever_the_limits(
+def test_replay_quarantines_failing_messages_without_limit(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [*[CUT] * 9, *map(number, range(5))], "/std/speed": [number(1)]})
@@ -172,7 +172,7 @@ def test_a_replay_keeps_all_that_fails_again_whatever_the_limits(
     assert waiting(folder, strict) == 9
 
 
-def test_a_mended_mapping_brings_its_messages_in(
+def test_replay_with_fixed_mapping_appends_messages(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     adapter = tmp_path / "speed.yaml"
@@ -198,7 +198,7 @@ def test_a_mended_mapping_brings_its_messages_in(
     assert command("verify", "drive", "--store", store.path) == 0
 
 
-def test_a_mapping_with_other_columns_leaves_everything_as_it_was(
+def test_replay_with_other_columns_changes_nothing(
     write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(1), CUT], "/std/speed": [number(1)]})
@@ -210,7 +210,7 @@ def test_a_mapping_with_other_columns_leaves_everything_as_it_was(
     assert waiting(folder, other) == 1
 
 
-def test_messages_that_cannot_be_marked_are_said_and_not_brought_in_again(
+def test_replay_that_cannot_rename_file_fails_and_appends_once(
     spoilt: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, store = tmp_path / "quarantine", Store.open(tmp_path / "store")
@@ -231,7 +231,7 @@ def test_messages_that_cannot_be_marked_are_said_and_not_brought_in_again(
 @pytest.mark.parametrize(
     "content", [None, '{"sequence": "drive"\n', "[1]\n", '{"topic": "/speed"}\n', b"\xff\xfe\n"]
 )
-def test_a_folder_that_is_no_quarantine_is_one_error(
+def test_replay_of_folder_without_quarantine_fails_with_one_error(
     content: str | bytes | None, spoilt: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert command("replay", "-q", tmp_path / "nowhere", "-m", spoilt) == 3
@@ -246,7 +246,7 @@ def test_a_folder_that_is_no_quarantine_is_one_error(
     assert str(index) in error
 
 
-def test_messages_of_a_sequence_the_manifest_does_not_make_are_named(
+def test_replay_of_sequence_not_in_manifest_names_it(
     spoilt: Path, write_job: WriteJob, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = write_job(quarantine={}, sequence={"name": "other"}, file="other.yaml")
@@ -257,13 +257,13 @@ def test_messages_of_a_sequence_the_manifest_does_not_make_are_named(
     assert waiting(tmp_path / "quarantine", spoilt) == 6
 
 
-def test_a_run_killed_before_it_kept_a_message_leaves_nothing_to_replay(spoilt: Path, tmp_path: Path) -> None:
+def test_replay_after_run_killed_before_first_message_finds_nothing(spoilt: Path, tmp_path: Path) -> None:
     (index,) = (tmp_path / "quarantine").glob("*.jsonl")
     index.write_text('{"sequence": "dr')
     assert command("replay", "-q", tmp_path / "quarantine", "-m", spoilt) == 3
 
 
-def test_messages_of_a_sequence_that_was_removed_are_left_alone(
+def test_replay_of_removed_sequence_appends_nothing(
     spoilt: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Store.open(tmp_path / "store").delete_sequence("drive")

@@ -38,7 +38,7 @@ def session(write_bag: WriteBag, write_job: WriteJob, run_job: RunJob) -> Sessio
     return ingest
 
 
-def test_fail_refuses_with_the_lines_that_differ(session: Session, tmp_path: Path) -> None:
+def test_schema_change_fail_lists_differing_lines(session: Session, tmp_path: Path) -> None:
     assert session("one", "float32", "fail").status is RunStatus.COMPLETED
     assert session("two", "float32", "fail").status is RunStatus.COMPLETED
     report = session("three", "float64", "fail")
@@ -48,7 +48,7 @@ def test_fail_refuses_with_the_lines_that_differ(session: Session, tmp_path: Pat
     assert Store.open(tmp_path / "store").names() == ("one", "two")
 
 
-def test_evolve_says_so_once_and_stores_the_new_columns(session: Session, tmp_path: Path) -> None:
+def test_schema_change_evolve_warns_and_stores_new_columns(session: Session, tmp_path: Path) -> None:
     session("one", "float32")
     report = session("two", "float64", "evolve")
     assert report.status is RunStatus.COMPLETED
@@ -59,7 +59,7 @@ def test_evolve_says_so_once_and_stores_the_new_columns(session: Session, tmp_pa
     assert not session("three", "float64", "evolve").findings
 
 
-def test_new_topic_stores_it_under_the_same_new_name_each_time(session: Session, tmp_path: Path) -> None:
+def test_schema_change_new_topic_has_stable_name(session: Session, tmp_path: Path) -> None:
     session("one", "float32", "new_topic")
     session("two", "float64", "new_topic")
     session("three", "float32", "new_topic")
@@ -71,14 +71,14 @@ def test_new_topic_stores_it_under_the_same_new_name_each_time(session: Session,
     assert names["two"].startswith("/speed/v_")
 
 
-def test_new_topic_lets_sessions_join_one_sequence(session: Session, tmp_path: Path) -> None:
+def test_schema_change_new_topic_allows_appending(session: Session, tmp_path: Path) -> None:
     joined = {"sequence": {"name": "all", "if_exists": "append"}}
     session("one", "float32", "new_topic", **joined)
     assert session("two", "float64", "new_topic", **joined).status is RunStatus.COMPLETED
     assert len(Store.open(tmp_path / "store").sequence("all").topics) == 2
 
 
-def test_other_families_and_jobs_that_do_not_ask_are_left_alone(session: Session) -> None:
+def test_schema_change_ignores_other_families_and_jobs_without_policy(session: Session) -> None:
     session("one", "float32")
     assert not session("two", "float64").findings
     other = {"sequence": {"name": "{stem}", "family": "others"}}

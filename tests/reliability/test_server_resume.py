@@ -78,7 +78,7 @@ def speeds(folder: Path, topic: str = "/speed") -> list[float]:
     return Store.open(folder / "served").scan("drive", topic).read_all()["data"].to_pylist()
 
 
-def test_the_same_job_again_does_nothing_and_says_so(
+def test_skip_of_same_job_reports_skipped(
     write_bag: WriteBag, write_job: WriteJob, tmp_path: Path, port: int
 ) -> None:
     write_bag({"/speed": [number(1), number(2)]})
@@ -91,7 +91,7 @@ def test_the_same_job_again_does_nothing_and_says_so(
     assert Store.open(tmp_path / "served").sequence("drive") == before
 
 
-def test_changed_content_is_refused_and_replaced_when_told_to(
+def test_changed_content_is_refused_by_skip_and_replaced_by_replace(
     write_bag: WriteBag, write_job: WriteJob, tmp_path: Path, port: int
 ) -> None:
     write_bag({"/speed": [number(1)]})
@@ -111,7 +111,7 @@ def test_changed_content_is_refused_and_replaced_when_told_to(
     assert speeds(tmp_path) == [2]
 
 
-def test_append_brings_new_topics_and_no_row_twice(
+def test_server_append_adds_new_topics_once(
     write_bag: WriteBag, write_job: WriteJob, tmp_path: Path, port: int
 ) -> None:
     write_bag({"/speed": [number(1)], "/height": [number(3)]})
@@ -157,7 +157,7 @@ def kill_and_look(job: Path, folder: Path, rounds: int) -> tuple[int, int]:
     return whole, nothing
 
 
-def test_a_killed_client_leaves_all_or_nothing_and_the_next_run_completes_it(
+def test_server_run_killed_leaves_all_or_nothing_and_next_run_completes(
     write_bag: WriteBag, write_job: WriteJob, tmp_path: Path, port: int
 ) -> None:
     write_bag({"/speed": [number(1)] * ROWS})
@@ -165,7 +165,7 @@ def test_a_killed_client_leaves_all_or_nothing_and_the_next_run_completes_it(
     assert nothing, "the moments were not where they matter"
 
 
-def test_a_killed_server_costs_the_run_and_the_next_one_completes_it(
+def test_run_with_killed_server_fails_and_next_run_completes(
     write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(1)] * ROWS})
@@ -221,7 +221,7 @@ class Forgetful(Proxy):
     ("if_exists", "word"),
     [("skip", b"sequence_create"), *((each, b"session_finalize") for each in ("skip", "append", "replace"))],
 )
-def test_a_lost_answer_is_looked_up_and_nothing_is_written_twice(
+def test_server_run_with_lost_response_writes_nothing_twice(
     if_exists: str, *, word: bytes, write_bag: WriteBag, write_job: WriteJob, tmp_path: Path, port: int
 ) -> None:
     write_bag({"/speed": [number(1), number(2)]})
@@ -234,7 +234,7 @@ def test_a_lost_answer_is_looked_up_and_nothing_is_written_twice(
 
 
 @pytest.mark.parametrize("if_exists", ["skip", "append", "replace"])
-def test_a_client_that_dies_before_it_hears_that_all_is_there(
+def test_run_killed_before_response_to_commit_is_skipped_by_the_next(
     if_exists: str, write_bag: WriteBag, write_job: WriteJob, tmp_path: Path, port: int
 ) -> None:
     write_bag({"/speed": [number(1), number(2)]})
@@ -252,7 +252,7 @@ def test_a_client_that_dies_before_it_hears_that_all_is_there(
     assert speeds(tmp_path) == [1, 2]
 
 
-def test_a_replay_brings_a_topic_of_which_nothing_was_good_once(
+def test_replay_of_topic_without_rows_appends_it_once(
     write_bag: WriteBag, write_job: WriteJob, tmp_path: Path, port: int
 ) -> None:
     write_bag({"/speed": [number(1), number(2)], "/std/speed": [number(3)]})

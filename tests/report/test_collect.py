@@ -79,7 +79,7 @@ def test_report_computes_rate_and_compression() -> None:
     assert report.compression == 0.25
 
 
-def test_collector_rows_taken_back_have_no_time_span() -> None:
+def test_collector_discarded_rows_have_no_time_range() -> None:
     collector = started()
     collector(TopicProgress(IMU.target, read=1, written=1, start_ns=5, end_ns=5))
     collector(TopicProgress(IMU.target, written=-1))

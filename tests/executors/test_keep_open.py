@@ -19,7 +19,7 @@ def task(folder: Path, name: str) -> Task:
     return Task(config.job)
 
 
-def test_the_log_of_the_catalog_is_there_between_recordings_only(tmp_path: Path) -> None:
+def test_in_process_executor_keeps_catalog_open_between_recordings(tmp_path: Path) -> None:
     log = tmp_path / "store/catalog.sqlite-wal"
     there = [log.exists() for _ in InProcess().map([task(tmp_path, name) for name in "abc"], lambda *_: None)]
     assert there == [False, True, True]
@@ -27,7 +27,7 @@ def test_the_log_of_the_catalog_is_there_between_recordings_only(tmp_path: Path)
     assert Store.open(tmp_path / "store", create=False).names() == ("a", "b", "c")
 
 
-def test_a_store_that_is_removed_meanwhile_is_made_anew(tmp_path: Path) -> None:
+def test_keep_open_store_removed_between_runs_is_created_again(tmp_path: Path) -> None:
     """Letting go of the old catalog must not take the files of the new one."""
     with keep_destinations_open() as keep_open:
         for name in "ab":
@@ -41,7 +41,7 @@ def test_a_store_that_is_removed_meanwhile_is_made_anew(tmp_path: Path) -> None:
     assert Store.open(tmp_path / "store", create=False).names() == ("b",)
 
 
-def test_where_there_is_no_store_nothing_is_held_or_made(tmp_path: Path) -> None:
+def test_keep_open_without_store_creates_nothing(tmp_path: Path) -> None:
     with keep_destinations_open() as keep_open:
         keep_open(task(tmp_path, "a").job.destination)
     assert list(tmp_path.iterdir()) == []

@@ -40,14 +40,14 @@ def sample(plan: RecordingPlan, topic: str) -> Sample:
     return next(one for one in plan.samples if one.target == topic)
 
 
-def test_only_the_first_messages_are_tried(tmp_path: Path) -> None:
+def test_sample_has_only_first_messages(tmp_path: Path) -> None:
     plan = planned(recording(tmp_path, {"/a": [FLOAT] * 500}))
     assert trial.MESSAGES <= sample(plan, "/a").read <= 2 * trial.MESSAGES
     assert sample(plan, "/a").rejected == 0
     assert plan.rejected == 0
 
 
-def test_bytes_that_do_not_fit_are_counted_with_the_reason(tmp_path: Path) -> None:
+def test_sample_counts_undecodable_messages_with_reason(tmp_path: Path) -> None:
     plan = planned(recording(tmp_path, {"/a": [FLOAT, FLOAT[:-3], FLOAT], "/b": [FLOAT]}))
     tried = sample(plan, "/a")
     assert (tried.read, tried.rejected, tried.rejections[0].count) == (3, 1, 1)
@@ -56,7 +56,7 @@ def test_bytes_that_do_not_fit_are_counted_with_the_reason(tmp_path: Path) -> No
     assert plan.rejected == 1
 
 
-def test_a_topic_that_comes_late_is_tried_too(tmp_path: Path) -> None:
+def test_sample_includes_topic_that_starts_late(tmp_path: Path) -> None:
     late = [FLOAT] * 400
     path = recording(tmp_path, {"/a": late, "/late": []})
     assert sample(planned(path), "/late").read == 0
@@ -71,20 +71,20 @@ def test_a_topic_that_comes_late_is_tried_too(tmp_path: Path) -> None:
     assert sample(planned(tmp_path / "more" / "bag"), "/rare").read == 1
 
 
-def test_only_the_part_of_the_recording_that_is_read_is_tried(tmp_path: Path) -> None:
+def test_sample_respects_time_range(tmp_path: Path) -> None:
     path = recording(tmp_path, {"/a": [FLOAT[:-1]] * 5 + [FLOAT] * 5})
     window = TimeRange(start=TimeBound(5 * 10**9, relative=True))
     assert sample(planned(path, time_range=window), "/a").rejected == 0
 
 
-def test_an_error_policy_is_for_the_run_not_for_the_trial(tmp_path: Path) -> None:
+def test_sample_ignores_error_policies(tmp_path: Path) -> None:
     path = recording(tmp_path, {"/a": [FLOAT[:-1]] * 3})
     plan = planned(path, messages_on_error="raise", on_error="delete")
     assert sample(plan, "/a").rejected == 3
     assert plan.plan["on_error"]["message"] == "raise"
 
 
-def test_room_is_judged_by_the_rows_that_will_be_read(tmp_path: Path) -> None:
+def test_estimated_bytes_depend_on_selected_rows(tmp_path: Path) -> None:
     path = recording(tmp_path, {"/a": [FLOAT] * 100})
     whole = planned(path).destination.estimated_bytes
     assert whole is not None
@@ -94,7 +94,7 @@ def test_room_is_judged_by_the_rows_that_will_be_read(tmp_path: Path) -> None:
     assert planned(path, time_range=half).destination.estimated_bytes == whole // 2
 
 
-def test_the_digest_names_the_decisions_and_nothing_else(tmp_path: Path) -> None:
+def test_plan_digest_depends_only_on_decisions(tmp_path: Path) -> None:
     path = recording(tmp_path, {"/a": [FLOAT] * 3})
     plan = planned(path)
     assert planned(path).digest == plan.digest
