@@ -1,4 +1,4 @@
-"""List, explain, test and draft adapters."""
+"""Tools for adapters: list, explain, test and draft them."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ _ROWS = 64
 
 
 def definition_in(path: Path, msgtype: str, *, resolve: Resolver) -> Definition:
-    """Return a type's definition as a recording has it.
+    """Return the definition of a type from a recording.
 
     Raises:
         BagError: The recording cannot be opened, or its definition of the type is not known.
@@ -75,7 +75,7 @@ def definition_in(path: Path, msgtype: str, *, resolve: Resolver) -> Definition:
 def message_in(
     path: Path, topic: str, index: int = 0, *, resolve: Resolver
 ) -> tuple[Definition, pa.StructArray]:
-    """Return the definition of a topic's message, and the message as the only row in its ROS shape.
+    """Return the definition of a topic's message, and the message as a single row in its ROS shape.
 
     Raises:
         BagError: The recording cannot be opened, has fewer messages, or the message cannot be decoded.
@@ -133,11 +133,11 @@ def _row(connection: Connection, batch: MessageBlock, row: int) -> pa.StructArra
 
 
 class Known(Struct, frozen=True):
-    """An adapter that can be named."""
+    """An adapter that a manifest can name."""
 
     name: str
     origin: str
-    """`built-in`, or the entry point it comes from."""
+    """`built-in`, or the entry point of the adapter."""
     default: bool
     ontology: str
     ros_types: tuple[str, ...]
@@ -145,44 +145,44 @@ class Known(Struct, frozen=True):
 
 
 class Explained(Struct, frozen=True):
-    """An adapter in words, and what is known of the type it was explained for."""
+    """The explanation of an adapter for one message type."""
 
     description: Description
     msgtype: str
     why: str
-    """Which rule gives the type this adapter; empty where the adapter was asked for."""
+    """The rule that selects the adapter for the type; empty if the adapter itself was requested."""
     unread: tuple[str, ...]
-    """Fields of the message that no expression names."""
+    """Fields of the message that no expression uses."""
     others: tuple[str, ...]
-    """Adapters that take the type where they are named for a topic."""
+    """Other adapters that accept the type if a topic names them."""
 
 
 class TopicChoice(Struct, frozen=True):
-    """Which adapter a topic gets, and why."""
+    """The adapter of a topic, and the reason for it."""
 
     recording: str
     topic: str
     msgtype: str
     adapter: str
-    """Empty for a topic that is left out."""
+    """Empty for an excluded topic."""
     ontology: str
     why: str
 
 
 class TestResult(Struct, frozen=True):
-    """What testing one adapter file showed."""
+    """The result of testing one adapter file."""
 
     name: str
     file: str
     findings: tuple[Finding, ...]
-    """Where it does not fit a message type it takes."""
+    """Locations where the adapter does not fit one of its message types."""
     unknown: tuple[str, ...]
-    """Types it takes whose definition is not known here, so that it could not be held against them."""
+    """Message types without a known definition, against which the adapter could not be checked."""
     outcomes: tuple[CaseResult, ...]
 
     @property
     def passed(self) -> bool:
-        """Whether it fits, and every test came out as it says."""
+        """True if the adapter fits its types and every test has its expected result."""
         return not self.findings and all(outcome.passed for outcome in self.outcomes)
 
 
@@ -197,7 +197,7 @@ def find_adapter(reference: str) -> AdapterSpec:
 
 
 def known_adapters(takes: str | None = None) -> tuple[Known, ...]:
-    """Return the installed and the built-in adapters, those for some message types if `takes` (a glob) is given.
+    """Return the installed and built-in adapters, limited to those for message types that match the glob `takes`.
 
     Raises:
         AdapterError: An installed package offers something that is no adapter.
@@ -212,13 +212,13 @@ def _known(origin: str, spec: AdapterSpec) -> Known:
 
 
 def _takes(spec: AdapterSpec, glob: str) -> bool:
-    """Whether a glob matches one of an adapter's types, in any of the spellings people use."""
+    """Return whether a glob matches one of the adapter's types in its full, short or bare name."""
     spellings = ((name, short_msgtype(name), name.rpartition("/")[2]) for name in spec.ros_types)
     return any(fnmatchcase(spelling, glob) for names in spellings for spelling in names)
 
 
 def source_text(spec: AdapterSpec) -> str:
-    """Return an adapter's file as it is written.
+    """Return the text of an adapter file.
 
     Raises:
         AdapterError: It is written in Python.
@@ -233,7 +233,7 @@ def source_text(spec: AdapterSpec) -> str:
 
 
 def explain_adapter(given: str, types: DefinitionFinder) -> Explained:
-    """Explain an adapter, or the one that a message type gets without a job.
+    """Explain an adapter, or the default adapter of a message type.
 
     Raises:
         AdapterError: There is no such adapter, or a type without one.
@@ -271,7 +271,7 @@ def _unread(spec: AdapterSpec, msgtype: str, types: DefinitionFinder) -> tuple[s
 def explain_topics(
     *, job: Path | None, bag: Path | None, distro: str | None = None, custom: Sequence[CustomMessages] = ()
 ) -> tuple[TopicChoice, ...]:
-    """Return which adapter each topic of a job's recordings, or of one recording, gets, and why.
+    """Return the adapter of each topic of a job's recordings or of one recording, with the reason.
 
     Raises:
         IngestError: The job cannot be done; the message says why.
@@ -298,7 +298,7 @@ def _choices(job: Job) -> Iterator[TopicChoice]:
 
 
 def run_adapter_tests(spec: AdapterSpec, types: DefinitionFinder) -> TestResult:
-    """Hold an adapter file against the types it takes, and run its tests; recordings are read from its folder.
+    """Check an adapter file against its message types, and run its tests; paths of recordings start at its folder.
 
     Raises:
         AdapterError: It is written in Python.
@@ -337,7 +337,7 @@ def draft_adapter(
     ontology: str | None = None,
     folder: Path = Path(),
 ) -> str:
-    """Return a first draft of an adapter file that is going to lie in `folder`.
+    """Return a draft of an adapter file for `folder`.
 
     The type's definition is the recording's if `bag` is given; `record` names a topic whose first message is tested.
 
@@ -364,7 +364,7 @@ def draft_adapter(
 
 
 def _in_distros(definition: Definition) -> bool:
-    """Whether a distro has the very same type, so that a file need not hold it."""
+    """Return whether a distro has the same type, so that the adapter file does not need to embed it."""
     try:
         known = DefinitionFinder().find(definition.root)
     except BagError:
