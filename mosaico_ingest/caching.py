@@ -1,6 +1,7 @@
 """Identity-keyed caching for arguments that are as expensive to hash as the result is to compute.
 
 Arrow types and schemas are such arguments: they are hashed by their text.
+`functools.lru_cache` would hash them, and `cachetools.cached(key=id)` would not keep them alive, so ids could be reused.
 """
 
 from __future__ import annotations

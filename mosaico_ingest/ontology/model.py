@@ -5,7 +5,7 @@ class Sonar(Serializable):
     beams: list[Float32]                            # list<item: float> not null
     gain: Float32 | None = None                     # float
     rotation: Annotated[list[Float64], FixedSize(9)]  # fixed_size_list<item: double>[9] not null
-    payload: Annotated[bytes, pa.large_binary()]    # any Arrow type, taken as it is
+    payload: Annotated[bytes, pa.large_binary()]    # any Arrow type, used unchanged
 ```
 """
 
@@ -249,8 +249,8 @@ class Serializable(BaseModel):
             return cls.model_validate({name: _without_empty(value) for name, value in row.items()})
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
-            place = ".".join((cls.__ontology_tag__, *map(str, first["loc"])))
-            raise AdapterError(f"{first['msg']}, found {first['input']!r:.80}", where=place) from error
+            location = ".".join((cls.__ontology_tag__, *map(str, first["loc"])))
+            raise AdapterError(f"{first['msg']}, found {first['input']!r:.80}", where=location) from error
 
     def to_row(self) -> dict[str, Any]:
         """Return the values of the columns."""
