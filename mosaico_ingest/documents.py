@@ -172,7 +172,7 @@ class Part(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _spell_texts(cls, values: Any) -> Any:  # noqa: ANN401 - whatever stands for a part
-        """Look at all fields at once: a validator for each made every part slow to build."""
+        """Escape undecodable file names in all fields; one validator per field would make the models slow to build."""
         return (
             {name: _encodable(value) for name, value in values.items()}
             if isinstance(values, dict)

@@ -57,14 +57,14 @@ class Placeholder(Struct, frozen=True):
 
     @property
     def known(self) -> bool:
-        """Whether something can stand for it; only `index` has a width."""
+        """Whether the placeholder exists; only `index` has a width."""
         return self.name in PLACEHOLDERS and (
             not self.width or (self.name == "index" and _WIDTH.fullmatch(self.width) is not None)
         )
 
 
 def placeholders_in(template: str) -> Iterator[Placeholder]:
-    """Yield what stands in braces."""
+    """Yield every `{…}` of a name."""
     for match in _BRACED.finditer(template):
         name, _, width = match[1].partition(":")
         yield Placeholder(match.start(), match.end(), name, width)
@@ -74,10 +74,10 @@ MATRIX_KEY = "matrix"
 
 
 def combinations(document: Value) -> list[dict[str, str]]:
-    """Return the variables of each job a document stands for; a single one without any where it has no matrix.
+    """Return the matrix variables of each job of a document; one job without variables if it has no matrix.
 
-    A mapping of lists is every combination of their values, a list is its items. What the model refuses counts as
-    not there, and beyond `MAX_JOBS` there is none.
+    A mapping of lists stands for every combination of their values, a list for its items. Values that the model refuses
+    are ignored, and more than `MAX_JOBS` combinations count as none.
     """
     matrix = document.get(MATRIX_KEY) if isinstance(document, dict) else None
     if isinstance(matrix, list):
@@ -95,7 +95,7 @@ def combinations(document: Value) -> list[dict[str, str]]:
 
 
 def variables(mapping: Value) -> dict[str, str]:
-    """Return the variables a mapping gives values to; what is no text or number counts as not there."""
+    """Return the variables of a mapping as text; values that are neither text nor numbers are ignored."""
     if not isinstance(mapping, dict):
         return {}
     return {str(name): str(value) for name, value in mapping.items() if isinstance(value, str | int)}
@@ -112,9 +112,9 @@ class Filled:
     value: Value
     findings: list[Finding] = field(default_factory=list[Finding])
     changed: set[KeyPath] = field(default_factory=set[KeyPath])
-    """Where a variable was; what stands there now may be a secret."""
+    """The key paths that had a variable; their values may be secret."""
     unknown: set[KeyPath] = field(default_factory=set[KeyPath])
-    """Where it could not be filled in; the text stands there as written."""
+    """The key paths with a variable that is not set; their text is as written."""
 
 
 def fill_in(source: Source, env: Mapping[str, str] | None, cell: Mapping[str, str] | None = None) -> Filled:
@@ -215,17 +215,17 @@ MAX_FILES = 100
 
 
 def extended(source: Source, *, folder: File) -> Source:
-    """Return a document with everything of the files it extends that it does not say itself.
+    """Return a document merged with the files it extends.
 
-    Mappings are joined key by key, the document's own keys first; anything else it says stands for itself, and an
-    empty value takes a key away. Paths of another file are rewritten to start in `folder`, the document's own.
-    What is wrong with the other files is among the findings.
+    Mappings are merged key by key, and the document's own values take precedence. An empty value removes a key. Relative
+    paths of other files are rewritten to start at `folder`, the document's folder. The findings include those of the
+    other files.
     """
     return _extended(source, folder, (), count(1))
 
 
 def bases_of(source: Source, *, folder: File) -> Iterator[tuple[File, Span]]:
-    """Yield the files a document names to be extended, and where it does; later ones count more."""
+    """Yield the files that a document extends with their spans; later files take precedence."""
     named = source.at((EXTENDS_KEY,))
     for position, name in enumerate(named if isinstance(named, list) else [named]):
         if isinstance(name, str) and name:
@@ -246,7 +246,7 @@ def _extended(source: Source, folder: File, chain: tuple[File, ...], read: Itera
 
 
 def _base(path: File, span: Span, chain: tuple[File, ...], read: Iterator[int]) -> Source | Finding:
-    """Read a file to extend, with all it extends itself; a finding at `span` where that cannot be done."""
+    """Return a file that is extended at `span`, merged with its own bases, or a finding if that fails."""
     here = path.resolve()
     if here in chain:
         names = " → ".join(file.name for file in (*chain[chain.index(here) :], here))
@@ -270,7 +270,7 @@ def _finding(message: str, span: Span, remedy: str) -> Finding:
 
 @dataclass(slots=True)
 class _Join:
-    """Joins two values, and records which paths came from the base and which the document removed."""
+    """A merge of two values that records the key paths taken from the base and those removed."""
 
     taken: set[KeyPath] = field(default_factory=set[KeyPath])
     dropped: set[KeyPath] = field(default_factory=set[KeyPath])
@@ -314,7 +314,7 @@ def _joined(own: Source, base: Source) -> Source:
 
 
 def _moved(source: Source, way: str) -> Source:
-    """Return a document whose relative paths start elsewhere; `way` leads from there to where they started."""
+    """Return a document with its relative paths prefixed by `way`."""
     if way == ".":
         return source
     value = source.value
@@ -336,5 +336,5 @@ def is_adapter_path(text: str) -> bool:
 
 
 def _is_relative(text: str) -> bool:
-    """Say whether a path starts at the manifest's folder; one that starts with a variable is left as it is."""
+    """Return whether a path starts at the manifest's folder; one that starts with a variable may be absolute."""
     return text != "" and not text.startswith(("/", "~", "${")) and not is_url(text)

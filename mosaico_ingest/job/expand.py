@@ -12,12 +12,14 @@ from msgspec import Struct
 
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.compose import EXTENDS_KEY, combinations
+from mosaico_ingest.job.fields import Secret, marked_fields
 from mosaico_ingest.job.manifest import (
     check_manifest,
     read_manifest,
     refusal,
     stand_alone,
 )
+from mosaico_ingest.job.model import Manifest
 from mosaico_ingest.job.yaml_source import KeyPath, Scalar, Source, Value, resolve_plain
 
 __all__ = [
@@ -31,7 +33,7 @@ __all__ = [
 ]
 
 Remark: TypeAlias = Callable[[KeyPath], "str | None"]
-"""What to say beside the value at a path; None: nothing."""
+"""Returns the comment beside the value at a key path, or None."""
 
 _PLAIN = re.compile(r"[A-Za-z0-9_./~+-]([A-Za-z0-9_./~+:-]*[A-Za-z0-9_./~+-])?")
 _UNPRINTABLE = re.compile(r"[\x7f-\x9f\u2028\u2029\ufeff\ud800-\udfff\ufffe\uffff]")
@@ -39,7 +41,7 @@ _WIDTH = 100
 
 
 def plain(value: Scalar) -> str:
-    """Return a scalar, quoted where it would not be read as the same value by everybody."""
+    """Return a scalar as YAML, quoted if YAML readers would disagree about its value."""
     if not isinstance(value, str):
         return _number(value) if isinstance(value, float) else json.dumps(value)
     if _PLAIN.fullmatch(value) and resolve_plain(value) == (value, None) and value[0] not in "-~":
@@ -49,7 +51,7 @@ def plain(value: Scalar) -> str:
 
 
 def to_yaml(value: Value, remark: Remark = lambda _: None) -> str:
-    """Return a document in block style; lists of single values that are short stay on a line."""
+    """Return a document in block style, with short lists of scalars on one line."""
     if isinstance(value, dict | list) and value:
         return "".join(f"{line}\n" for line in _lines(value, (), remark))
     return f"{_flow(value)}\n"
@@ -115,7 +117,7 @@ class Expanded(Struct, frozen=True):
     value: Value
 
     def remark(self, path: KeyPath) -> str | None:
-        """Return the place of a value that another file says, None where it is the manifest's own."""
+        """Return the file and line of a value that comes from another file, or None."""
         span = self.source.span(path)
         return None if span.file == self.source.file else f"{span.file}:{span.line}"
 
@@ -137,17 +139,19 @@ def expand_manifest(path: File) -> tuple[Expanded, ...]:
 
 
 MASK = "***"
-_SECRET = re.compile(r"api_?key|password|token|secret", re.IGNORECASE)
+_SECRET_KEYS = frozenset(str(field.path[-1]) for field in marked_fields(Manifest, Secret))
+_SECRET = re.compile(rf"{'|'.join(sorted(_SECRET_KEYS))}|api_?key|password|token|secret", re.IGNORECASE)
+"""Keys of secrets: those that the model marks, and usual names in metadata and variables."""
 _IN_TEXT = re.compile(
     r"(?<=://)[^/@\s]+(?=@)|msco_\w+|(?<=[?&])([^=&\s]*(?:key|password|token|secret)[^=&\s]*=)[^&\s]+",
     re.IGNORECASE,
 )
-"""Keys of our own form, and what a URL says before an `@` and in its query."""
+"""API keys, credentials of URLs, and secret options of URLs."""
 _VARIABLE = re.compile(r"\$\{(\w+)(?:[^{}]*)\}")
 
 
 def manifest_text(path: File) -> str:
-    """Return a manifest that has what it extends; variables stay, and a comment says what is another file's.
+    """Return a manifest merged with the files it extends; comments name the file of each value from another file.
 
     Raises:
         ManifestError: It cannot be read.
@@ -170,7 +174,7 @@ def _without_secrets(value: Value) -> Value:
 
 
 def _secrets(value: Value) -> Iterator[str]:
-    """Yield the texts of a document whose keys say that they are secret."""
+    """Yield the texts of a document below keys that indicate secrets."""
     if isinstance(value, list):
         for inner in value:
             yield from _secrets(inner)
@@ -183,7 +187,7 @@ def _secrets(value: Value) -> Iterator[str]:
 
 
 def _masked(value: Value, hidden: frozenset[str], *, secret: bool = False) -> Value:
-    """Mask texts below a key that says so, whatever a variable of such a text defaults to, and what looks like a key."""
+    """Mask texts below keys that indicate secrets, defaults of variables in such texts, and texts that look like keys."""
     if isinstance(value, list):
         return [_masked(inner, hidden, secret=secret) for inner in value]
     if isinstance(value, dict):

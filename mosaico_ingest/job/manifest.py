@@ -95,14 +95,14 @@ class LoadedManifest(Struct, frozen=True):
 
 
 def load_manifest(path: Path | str, *, env: Mapping[str, str] | None = os.environ) -> LoadedManifest:
-    """Load a job manifest, of a matrix the first job; see `load_manifests`."""
+    """Load a job manifest, or the first job of its matrix; see `load_manifests`."""
     return load_manifests(path, env=env)[0]
 
 
 def load_manifests(
     path: Path | str, *, env: Mapping[str, str] | None = os.environ
 ) -> tuple[LoadedManifest, ...]:
-    """Load every job of a manifest with what it extends; `env=None` judges it without looking at the environment.
+    """Load every job of a manifest, merged with its bases; `env=None` ignores the environment.
 
     Raises:
         ManifestError: The file cannot become a job; `findings` has one entry for each mistake.
@@ -122,7 +122,7 @@ def load_manifests(
 
 
 def read_manifest(path: Path) -> Source:
-    """Read a manifest's text and that of what it extends, joined; what is wrong with them is in the findings.
+    """Read a manifest merged with the files it extends; `findings` has the mistakes of all of them.
 
     Raises:
         ManifestError: The file cannot be read.
@@ -198,7 +198,7 @@ def read_text(path: Path) -> str:
 
 
 def refusal(findings: tuple[Finding, ...], where: str) -> ManifestError:
-    """Return the error that says why a manifest cannot become a job."""
+    """Return the error of a manifest that has mistakes."""
     if not findings:
         return ManifestError(
             "there is no job without its variables", where=where, hint="set them in the environment"
@@ -253,7 +253,7 @@ def _validate(source: Source, filled: Filled) -> tuple[Manifest | None, list[Fin
 
 def _attempt(source: Source, value: Value) -> tuple[Manifest | None, list[tuple[KeyPath, Finding]]]:
     try:
-        # As JSON, so that strict means: no text for a number, and lists and names for what they are.
+        # In JSON mode, `strict` refuses text for numbers and accepts lists for tuples and words for enumerations.
         return Manifest.model_validate_json(json.dumps(value), strict=True), []
     except ValidationError as error:
         return None, explain(error, source=source, schema=_schema())

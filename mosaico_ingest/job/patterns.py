@@ -1,4 +1,4 @@
-"""This file decides which topics a list of patterns selects, and which pattern decided."""
+"""Topic globs: the selection of topics, and the pattern that applies to a topic."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["Selection", "first_match", "is_glob", "select"]
 
 
 class Selection(Struct, frozen=True):
-    """The topics that are in, and for every topic the position of the pattern that decided (None: the default)."""
+    """The selected topics, and for each topic the position of the deciding pattern (None: the default)."""
 
     selected: tuple[str, ...]
     decided_by: dict[str, int | None]
@@ -20,25 +20,25 @@ class Selection(Struct, frozen=True):
 
 
 def select(patterns: Sequence[str], topics: Iterable[str]) -> Selection:
-    """Apply `patterns` in order: a plain one adds what it matches, one with a leading `!` removes it.
+    """Apply `patterns` in order: a plain one selects the topics it matches, one with a leading `!` excludes them.
 
-    `*` also crosses `/`, `?` and `[…]` work, a pattern covers the whole name, case counts. Without a plain
-    pattern the start is every topic, otherwise none.
+    A pattern matches the complete name and is case-sensitive; `*` also matches `/`. If every pattern excludes, all other
+    topics are selected.
     """
     names = tuple(topics)
     default = all(pattern.startswith("!") for pattern in patterns)
-    taken = dict.fromkeys(names, default)
+    is_selected = dict.fromkeys(names, default)
     decided: dict[str, int | None] = dict.fromkeys(names)
     unused: list[int] = []
     for position, pattern in enumerate(patterns):
         glob = pattern.removeprefix("!")
         matched = [name for name in names if fnmatchcase(name, glob)]
         for name in matched:
-            taken[name] = not pattern.startswith("!")
+            is_selected[name] = not pattern.startswith("!")
             decided[name] = position
         if not matched:
             unused.append(position)
-    return Selection(tuple(name for name in names if taken[name]), decided, tuple(unused))
+    return Selection(tuple(name for name in names if is_selected[name]), decided, tuple(unused))
 
 
 def first_match(patterns: Iterable[str], topic: str) -> str | None:

@@ -32,7 +32,10 @@ def job_schema() -> dict[str, Any]:
             del model["properties"]
     definitions["Variable"] = _VARIABLE
     required = schema.pop("required")
-    schema["anyOf"] = [{"required": required}, {"required": [EXTENDS]}]  # what is extended may say the rest
+    schema["anyOf"] = [
+        {"required": required},
+        {"required": [EXTENDS]},
+    ]  # the bases may have the required keys
     return {"$schema": DIALECT, "title": "mosaico-ingest job", **schema, "$defs": definitions}
 
 
@@ -112,7 +115,7 @@ def _default(node: dict[str, Any], required: bool) -> str:  # noqa: FBT001 - as 
 
 
 def _kind(node: dict[str, Any], schema: dict[str, Any]) -> str:
-    """Say what a value is, in a word or the words that are allowed."""
+    """Return the type of a value, or the words that are allowed."""
     branches = cast("list[dict[str, Any]]", node.get("anyOf") or node.get("oneOf") or [])
     if branches:
         kinds = (_kind(branch, schema) for branch in branches if branch.get("$ref") != "#/$defs/Variable")

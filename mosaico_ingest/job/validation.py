@@ -1,4 +1,4 @@
-"""This file turns what pydantic says of a document into findings a person would have written."""
+"""Conversion of pydantic's validation errors to findings with locations, hints and fixes."""
 
 from __future__ import annotations
 
@@ -90,12 +90,12 @@ def explain(
 
 
 def _any_below(path: KeyPath, problems: Iterable[_Problem]) -> bool:
-    """Say whether something inside a value is wrong: a list is then short only of what was refused."""
+    """Return whether a value inside has a problem: then a list is too short only because its items were refused."""
     return any(problem.path[: len(path)] == path and problem.path != path for problem in problems)
 
 
 def place_of(location: KeyPath, value: Value) -> KeyPath:
-    """Follow an error's location through the document; what is not there (a union's branch) is no part of the path."""
+    """Return the key path of an error's location, without the parts that the document does not have (union tags)."""
     path: KeyPath = ()
     for part in location:
         with suppress(LookupError):
@@ -130,7 +130,7 @@ def _node_at(schema: dict[str, Any], path: KeyPath) -> dict[str, Any]:
 
 
 def _name(path: KeyPath) -> str:
-    """Return a path as a person would say it: `bag.custom_msgs[0].path`."""
+    """Return a key path as text, such as `bag.custom_msgs[0].path`."""
     return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path).lstrip(".")
 
 
@@ -152,7 +152,7 @@ def _descend(node: dict[str, Any], part: object) -> dict[str, Any]:
 
 
 def _resolved(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
-    """Follow references, and of alternatives take the one that is a mapping or a list."""
+    """Follow references, and choose the alternative that is a mapping or a list."""
     while "$ref" in node:
         node = schema["$defs"][node["$ref"].rsplit("/", 1)[-1]]
     for branch in node.get("anyOf", node.get("oneOf", ())):
@@ -202,10 +202,10 @@ def _unknown_key(problem: _Problem) -> Finding:
 
 
 def _elsewhere(word: str, schema: dict[str, Any]) -> str:
-    """Say which section has the key that is not allowed here."""
+    """Return a hint with the section that has a key which is not allowed here."""
     for section in keys_at(schema, ()):
         if word in keys_at(schema, (section,)):
-            return f"it belongs into {section!r}; "
+            return f"move it to {section!r}; "
     return ""
 
 
@@ -261,7 +261,7 @@ def _example(problem: _Problem) -> str | None:
 
 
 def _fits(text: str, node: dict[str, Any], schema: dict[str, Any]) -> bool:
-    """Say whether a text could be what the schema wants, as far as it says by a pattern."""
+    """Return whether a text matches the patterns of the schema, if it has any."""
     branches = [_resolved(branch, schema) for branch in node.get("anyOf", [node])]
     patterns = [branch["pattern"] for branch in branches if "pattern" in branch]
     return not patterns or any(re.search(pattern, text) for pattern in patterns)
@@ -317,7 +317,7 @@ def _empty(problem: _Problem) -> Finding:
 
 
 def _contradiction(problem: _Problem) -> Finding:
-    """A section refuses two keys together; the error says which of them to point at."""
+    """Return the finding for two keys of a section that exclude each other; the error names the key to point at."""
     key = problem.error.get("ctx", {}).get("key", "")
     span = problem.source.key_span((*problem.path, key))
     return problem.finding("conflicting-keys", problem.error["msg"], "keep one of the two", span)

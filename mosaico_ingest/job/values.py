@@ -1,4 +1,4 @@
-"""The types of a job: policies, time ranges, limits and destinations."""
+"""The values of a job's options: policies, distros, time bounds, limits and targets."""
 
 from __future__ import annotations
 
@@ -39,44 +39,44 @@ DEFAULT_PORT = 6726
 DEFAULT_MESSAGE_BYTES = 10_000_000
 """Larger upload messages gain no throughput, and may become chunks that no client can read back."""
 DEFAULT_TOPIC = "default"
-"""The key of `topics_on_error` for every topic that no other key matches."""
+"""The key of `on_error.topic` for topics that no other key matches."""
 PROVENANCE_KEY = "mosaico_ingest"
-"""The key of a sequence's metadata, and of each of its sessions, that says what it was made from."""
+"""The metadata key of a sequence, and of each of its sessions, for its provenance."""
 
 
 class SessionLevelErrorPolicy(str, Enum):
-    """What an error that ends the run leaves behind."""
+    """The action after an error that ends the run."""
 
     Report = "report"
-    """Keep what was accepted, attach the error to the sequence, close the session."""
+    """Keep the accepted rows, attach the error to the sequence, and close the session."""
     Delete = "delete"
-    """Leave no trace of the session."""
+    """Delete the session."""
 
 
 class TopicLevelErrorPolicy(str, Enum):
-    """What an error in one topic does to the rest."""
+    """The action after an error in a topic."""
 
     Raise = "raise"
-    """End the run; the session policy decides what stays."""
+    """End the run; the session policy applies."""
     Ignore = "ignore"
-    """Reject the message, note it, go on with the topic."""
+    """Reject the message and continue the topic."""
     Finalize = "finalize"
-    """Close the topic with the rows it has, go on with the others."""
+    """Close the topic with its accepted rows and continue the other topics."""
 
 
 class LoaderErrorPolicy(str, Enum):
-    """What happens to a message whose bytes do not fit its type."""
+    """The action for a message that cannot be decoded."""
 
     IGNORE = "ignore"
-    """Count it."""
+    """Count the message."""
     LOG_WARN = "log_warn"
-    """Count it and say so."""
+    """Count the message and log a warning."""
     RAISE = "raise"
     """End the run."""
 
 
 class IfExists(str, Enum):
-    """What to do when the sequence's name is taken."""
+    """The action if the sequence exists."""
 
     FAIL = "fail"
     SKIP = "skip"
@@ -85,26 +85,26 @@ class IfExists(str, Enum):
 
 
 class OnSchemaChange(str, Enum):
-    """What to do when a topic's message definition is not what it was in its family of sequences."""
+    """The action if a topic's definition differs from that of earlier sequences of the family."""
 
     FAIL = "fail"
     EVOLVE = "evolve"
-    """Say so and store the topic with its new columns."""
+    """Warn and store the topic with its new columns."""
     NEW_TOPIC = "new_topic"
-    """Store it under a name of its own."""
+    """Store the topic under another name."""
 
 
 class Unmodeled(str, Enum):
-    """What to do with a topic whose type has no adapter."""
+    """The action for a topic whose type has no adapter."""
 
     KEEP = "keep"
-    """Store it in its ROS shape."""
+    """Store the topic in its ROS shape."""
     SKIP = "skip"
     FAIL = "fail"
 
 
 class Stores(str, Enum):
-    """The distros whose standard message definitions are known; the values are those of rosbags."""
+    """The distros with known standard message definitions; the values are those of rosbags."""
 
     EMPTY = "empty"
     LATEST = "latest"
@@ -121,7 +121,7 @@ class Stores(str, Enum):
 
 
 class TimeBound(Struct, frozen=True):
-    """A moment: ns since the epoch, or ns from the recording's first message (negative: back from its last)."""
+    """An instant in ns since the epoch, or an offset in ns from the first message (negative: from the last one)."""
 
     ns: int
     relative: bool = False
@@ -134,7 +134,7 @@ class TimeBound(Struct, frozen=True):
 
 
 class Limit(Struct, frozen=True):
-    """At most so many messages, or at most this share of them, from 0 to 1; one of the two is None."""
+    """A maximum number of messages, or their maximum share from 0 to 1; the other one is None."""
 
     count: int | None = None
     share: float | None = None

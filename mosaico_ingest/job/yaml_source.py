@@ -1,4 +1,8 @@
-"""YAML text with the position of every value."""
+"""YAML text with the position of every value.
+
+PyYAML's events are composed here instead of by `yaml.compose`, because its nodes lose the spans of aliases and merge
+keys, resolve YAML 1.1 scalars such as `no`, and stop at the first error; lint reports every mistake of a file.
+"""
 
 from __future__ import annotations
 
@@ -95,16 +99,16 @@ def _number(text: str) -> tuple[Scalar, Trap | None]:
 def _trap(text: str) -> Trap | None:
     if _OCTAL.fullmatch(text) and text.lstrip("+-") != "0":
         digits = str(int(text.replace("o", ""), 8))
-        says = f"{text} is {digits} to some YAML readers (octal) and something else to others"
+        message = f"{text} is {digits} to some YAML readers (octal) and something else to others"
     elif _PADDED.fullmatch(text):
         digits = str(int(text))
-        says = f"{text} is {digits} to some YAML readers and text to others"
+        message = f"{text} is {digits} to some YAML readers and text to others"
     elif _OTHER_NUMBER.fullmatch(text):
         digits = "the digits alone"
-        says = f"{text} is a number to some YAML readers and text to others"
+        message = f"{text} is a number to some YAML readers and text to others"
     else:
         return None
-    return Trap("yaml-number", says, f'write {digits}, or "{text}" for the text')
+    return Trap("yaml-number", message, f'write {digits}, or "{text}" for the text')
 
 
 Key: TypeAlias = Scalar
@@ -122,9 +126,9 @@ _QUOTABLE = re.compile(r"[^\s\"\\:#]*[^\s\"\\:#\],]")
 """Texts that quotes can be put around without a second look."""
 
 MAX_DEPTH = 40
-"""How deep values may nest."""
+"""Maximum nesting depth."""
 MAX_NODES = 50_000
-"""How many values there may be, each alias counted with all it stands for."""
+"""Maximum number of values, including those of aliases."""
 
 
 def member(value: Value, part: Key) -> Value:
@@ -141,7 +145,7 @@ def member(value: Value, part: Key) -> Value:
 
 
 class LimitExceeded(Exception):  # noqa: N818 - a signal inside this package, never seen outside
-    """The document is larger than any manifest; `finding` says where."""
+    """The document exceeds a limit; `finding` has the location."""
 
     def __init__(self, finding: Finding) -> None:
         super().__init__(finding.message)
@@ -150,7 +154,7 @@ class LimitExceeded(Exception):  # noqa: N818 - a signal inside this package, ne
 
 @dataclass(slots=True)
 class _Node:
-    """A value, its place, and the places of what is inside it, by path relative to it."""
+    """A value, its span, and the spans of the values inside it, by relative key path."""
 
     value: Value
     span: Span
@@ -167,10 +171,10 @@ class _Node:
 
 
 class Composer:
-    """Reads the events of one document; what is wrong goes to `findings` and the reading goes on."""
+    """The composer of one document; it adds mistakes to `findings` and continues."""
 
     def __init__(self, events: Iterator[yaml.Event], *, file: str, text: str, original: str) -> None:
-        """`text` is what was parsed: `original` with some characters replaced by others."""
+        """Initialize with the events of `text`, which is `original` with some characters replaced."""
         self._events = events
         self._file = file
         self._masked = [i for i, (a, b) in enumerate(zip(text, original, strict=True)) if a != b and a == "_"]
@@ -222,7 +226,7 @@ class Composer:
     def _count(self, node: _Node, event: yaml.Event, *, size: int | None = None) -> _Node:
         self._nodes += node.size if size is None else size
         if self._nodes > MAX_NODES:
-            message = f"more than {MAX_NODES} values, aliases counted with what they stand for"
+            message = f"more than {MAX_NODES} values, including the values of aliases"
             raise LimitExceeded(self._finding("yaml-size", message, self._span(event), "use fewer aliases"))
         return node
 
@@ -270,7 +274,7 @@ class Composer:
         return _Node(written, span)
 
     def _tag(self, event: yaml.ScalarEvent | yaml.CollectionStartEvent) -> str | None:
-        """Report a tag and return it as written, None where there is none that matters."""
+        """Report a tag and return it as written; None without a tag that has an effect."""
         tag: str | None = event.tag
         if tag is None or tag in {"!", "tag:yaml.org,2002:str"}:
             return None
@@ -379,7 +383,7 @@ def _part(node: _Node, key: Key) -> _Node:
 
 
 MAX_CHARACTERS = 1_000_000
-"""How long a document may be; it also bounds the time a hostile one takes."""
+"""Maximum length of a document; it also bounds the time for hostile input."""
 
 _MAX_RECOVERIES = 100
 # The C parser is ten times faster and reads the same language.
@@ -393,7 +397,7 @@ _REMEDIES = (
         "quote the value, or check the indentation",
     ),
     ("expected key", "this does not line up with the keys above", "keys of one mapping start in one column"),
-    ("expected <block end>", "this does not line up with what is above", "check the indentation"),
+    ("expected <block end>", "this does not line up with the lines above", "check the indentation"),
     ("unexpected end of stream", "the quote that opens here is never closed", "close it"),
     ("expected ',' or ']'", "the list [ … is not closed", "close it, and quote what contains , [ ] { }"),
     ("expected ',' or '}'", "the mapping { … is not closed", "close it, and quote what contains , [ ] { }"),
@@ -412,7 +416,7 @@ _UNPRINTABLE = re.compile(r"[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010
 
 
 class Source(Struct, frozen=True):
-    """A YAML document: its value, the place of everything in it, and what is wrong with its writing.
+    """A YAML document: its value, the span of each value and key, and its syntax findings.
 
     Paths are tuples of keys and list positions; `()` is the whole document.
     """
@@ -420,12 +424,12 @@ class Source(Struct, frozen=True):
     file: str
     text: str
     value: Value
-    """Plain values, also where there are findings, so that a second look can find the rest."""
+    """The value as far as it can be read, so that later checks find the other mistakes."""
     findings: tuple[Finding, ...] = ()
     spans: dict[KeyPath, Span] = msgspec.field(default_factory=dict[KeyPath, Span])
     key_spans: dict[KeyPath, Span] = msgspec.field(default_factory=dict[KeyPath, Span])
     others: dict[str, str] = msgspec.field(default_factory=dict[str, str])
-    """The texts of the other files that places are in, by their names."""
+    """The texts of the other files that spans refer to, by name."""
 
     def span(self, path: KeyPath) -> Span:
         """Return the place of the value at `path`, or of the nearest thing around it that is written."""
@@ -456,7 +460,7 @@ class Source(Struct, frozen=True):
         return lines[span.line - 1] if 0 < span.line <= len(lines) else ""
 
     def at(self, path: KeyPath) -> Value:
-        """Return the value at `path`, None where there is none."""
+        """Return the value at `path`, or None."""
         value = self.value
         try:
             for part in path:
@@ -467,7 +471,7 @@ class Source(Struct, frozen=True):
 
 
 def load_source(text: str, *, file: str) -> Source:
-    """Read YAML; never raises: what is wrong is in the findings, and the value is what could be read."""
+    """Read YAML without raising; mistakes are in the findings, and the value is as complete as possible."""
     text = text.removeprefix("\ufeff")
     if len(text) > MAX_CHARACTERS:
         message = f"the document has {len(text)} characters; {MAX_CHARACTERS} are allowed"

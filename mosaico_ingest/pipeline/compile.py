@@ -68,7 +68,7 @@ def find_recordings(loaded: LoadedManifest) -> tuple[Recording, ...]:
 
 
 def sequence_name(loaded: LoadedManifest, recording: Recording) -> str:
-    """Fill in the placeholders of `sequence.name`; in what they stand for, `_` replaces what no name may have.
+    """Return `sequence.name` with its placeholders filled in; `_` replaces characters that names cannot have.
 
     Raises:
         ManifestError: There is no such placeholder.
@@ -120,7 +120,7 @@ def _matches(loaded: LoadedManifest, pattern: str, place: tuple[str | int, ...])
 
 
 def _glob(path: AnyPath) -> Iterator[AnyPath]:
-    """Yield what a pattern matches; what is hidden, as copying programs leave it, only where the pattern has such a name."""
+    """Yield the matches of a pattern; hidden files, such as those of copying programs, only if the pattern names them."""
     found: Iterator[tuple[AnyPath, str]]
     if isinstance(path, RemotePath):
         above = next(parent for parent in path.above if not has_magic(parent.key))
@@ -159,7 +159,7 @@ def _any_recording(paths: Iterable[AnyPath]) -> bool:
 
 
 def _nearby(path: AnyPath) -> str:
-    """Say what is there instead: the part of the path that exists, and the nearest name in it."""
+    """Return a hint with the existing part of a path and the nearest name in it."""
     folder = path.parent
     while not folder.is_dir() and folder != folder.parent:
         path, folder = folder, folder.parent
