@@ -1,4 +1,8 @@
-"""Paths behind URLs: a subset of `pathlib.Path` over pyarrow file systems, and their errors."""
+"""Paths behind URLs: a subset of `pathlib.Path` over pyarrow file systems, and their errors.
+
+pyarrow's file systems need no further package, and Parquet reads and writes them natively; obstore or fsspec would be
+a second client, and would still need a class with these methods of `pathlib.Path`.
+"""
 
 from __future__ import annotations
 
@@ -55,11 +59,11 @@ _SDK = re.compile(r"^.*?AWS Error |\s*\(Request ID: [^)]*\)")
 
 @contextmanager
 def reaching(where: str) -> Generator[None, None, None]:
-    """Raise our own error for what goes wrong on the way to `where`; a missing object stays a FileNotFoundError.
+    """Raise IngestError for errors of a file system; a missing object remains a FileNotFoundError.
 
     Raises:
-        Unreachable: Nobody answers, or not in time; the client has tried several times.
-        IngestError: Access is refused, or something else is wrong with the request.
+        Unreachable: The service did not respond in time, after several attempts.
+        IngestError: Access is refused, or the request is invalid.
     """
     try:
         yield
@@ -70,27 +74,29 @@ def reaching(where: str) -> Generator[None, None, None]:
 
 
 def explained(err: OSError, where: str) -> IngestError:
-    """Return the error of ours for one of a file system, about `where`."""
-    said = _SDK.sub("", str(err).strip().splitlines()[0] if str(err).strip() else type(err).__name__)
+    """Return the IngestError for an error of a file system at `where`."""
+    message = _SDK.sub("", str(err).strip().splitlines()[0] if str(err).strip() else type(err).__name__)
     if is_transient(err):
-        return Unreachable(f"does not answer: {said}", where=where, hint="check the address and the network")
+        return Unreachable(
+            f"does not respond: {message}", where=where, hint="check the address and the network"
+        )
     if _REFUSED.search(str(err)):
         hint = "check the credentials: the environment, the client's configuration, or the machine's role"
-        return IngestError(f"access is refused: {said}", where=where, hint=hint)
+        return IngestError(f"access is refused: {message}", where=where, hint=hint)
     if _NO_BUCKET.search(str(err)):
         return IngestError(
-            "there is no such bucket", where=where, hint="check the URL; buckets are not made here"
+            "the bucket does not exist", where=where, hint="check the URL; buckets are not created"
         )
-    return IngestError(said, where=where)
+    return IngestError(message, where=where)
 
 
 def is_transient(err: OSError) -> bool:
-    """Say whether trying again later may help."""
+    """Return whether a later retry may succeed."""
     return isinstance(err, ConnectionError | TimeoutError) or _TRANSIENT.search(str(err)) is not None
 
 
 _ATTEMPTS = 5
-"""How often a request is made, with a pause that doubles, before its failure is believed."""
+"""Maximum number of attempts per request, with a delay that doubles."""
 _CONNECT_S, _REQUEST_S = 5.0, 30.0
 _RETRY_S = 30.0
 
@@ -99,7 +105,7 @@ def filesystem(root: str, options: str) -> FileSystem:
     """Return the file system of `s3://bucket`, one for each process and set of options.
 
     Raises:
-        IngestError: The scheme or an option is not known.
+        IngestError: The scheme or an option is unknown.
         Unreachable: The bucket's region could not be asked for.
     """
     return _made(root, options, os.getpid())  # a connection must not cross a fork
@@ -158,14 +164,14 @@ SCHEMES: dict[str, tuple[_Make, tuple[str, ...]]] = {
     "s3": (_s3, ("endpoint_override", "scheme", "region", "anonymous")),
     "gs": (_gs, ("endpoint_override", "scheme", "anonymous")),
 }
-"""What is understood, with the options each may have behind `?`."""
+"""The supported schemes, with the options that are allowed after `?`."""
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/(?=[^/])|([A-Za-z][A-Za-z0-9+.-]+)://")
-"""With one slash too: that is what is left of a URL that went through `Path`."""
+"""One slash is accepted too, since `Path` reduces the two slashes of a URL."""
 
 
 class RemoteStat(Struct, frozen=True):
-    """What is known of an object without reading it; named as in `os.stat_result`."""
+    """The properties of an object, named as in `os.stat_result`."""
 
     st_mode: int
     st_size: int
@@ -173,13 +179,13 @@ class RemoteStat(Struct, frozen=True):
 
     @property
     def st_mtime(self) -> float:
-        """When it was written, in seconds since the epoch."""
+        """Modification time in seconds since the epoch."""
         return self.st_mtime_ns / 1e9
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class RemotePath:
-    """`s3://bucket/a/b?region=…`, as root, key and options; what a listing said of it is kept with it."""
+    """A path such as `s3://bucket/a/b?region=…`, as root, key and options, with the properties from a listing."""
 
     root: str
     key: str
@@ -191,7 +197,7 @@ class RemotePath:
         return f"{self.root}/{self.key}".rstrip("/")
 
     def __truediv__(self, name: str) -> RemotePath:
-        """Return what lies below."""
+        """Return the path below."""
         return replace(self, key="/".join(part for part in (self.key, name.strip("/")) if part), listed=None)
 
     @property
@@ -211,22 +217,22 @@ class RemotePath:
 
     @property
     def parent(self) -> RemotePath:
-        """The folder it lies in; a bucket is its own."""
+        """The parent folder; a bucket is its own parent."""
         return replace(self, key=self.key.rpartition("/")[0], listed=None)
 
     @property
     def filesystem(self) -> FileSystem:
-        """What serves it."""
+        """The file system of the path."""
         return filesystem(self.root, self.options)
 
     @property
     def place(self) -> str:
-        """How its file system spells it."""
+        """The path within its file system."""
         return f"{self.root.partition('://')[2]}/{self.key}".rstrip("/")
 
     @property
     def above(self) -> Iterator[RemotePath]:
-        """The folders it lies in, up to the bucket."""
+        """The parent folders, up to the bucket."""
         path = self
         while path.key:
             path = path.parent
@@ -237,24 +243,24 @@ class RemotePath:
         return self
 
     def exists(self) -> bool:
-        """Say whether there is such an object, or one below it."""
+        """Return whether the object, or an object below it, exists."""
         return self._look() is not None
 
     def is_file(self) -> bool:
-        """Say whether it is an object."""
+        """Return whether it is an object."""
         found = self._look()
         return found is not None and found.st_mode & S_IFREG == S_IFREG
 
     def is_dir(self) -> bool:
-        """Say whether there are objects below it."""
+        """Return whether there are objects below it."""
         found = self._look()
         return found is not None and found.st_mode & S_IFREG != S_IFREG
 
     def stat(self) -> RemoteStat:
-        """Return what the listing said that it came from, or what its file system says now.
+        """Return the properties from the listing that produced the path, or the current ones.
 
         Raises:
-            FileNotFoundError: There is none.
+            FileNotFoundError: The object does not exist.
         """
         found = self._look()
         if found is None:
@@ -262,15 +268,15 @@ class RemotePath:
         return found
 
     def now(self) -> RemotePath:
-        """Return the path without what a listing said of it, so that its file system is asked again."""
+        """Return the path without the properties from a listing, so that they are requested again."""
         return replace(self, listed=None)
 
     def iterdir(self) -> Iterator[RemotePath]:
-        """Yield what lies in this folder, nothing where it is not there."""
+        """Yield the entries of this folder, none if it does not exist."""
         return self.listing(recursive=False)
 
     def listing(self, *, recursive: bool) -> Iterator[RemotePath]:
-        """Yield what lies below, in the order of the names."""
+        """Yield the entries below, sorted by name."""
         from pyarrow.fs import FileSelector  # noqa: PLC0415 - slow to import, and only jobs with URLs need it
 
         selector = FileSelector(self.place, allow_not_found=True, recursive=recursive)
@@ -281,7 +287,7 @@ class RemotePath:
             yield replace(self, key=info.path.removeprefix(f"{bucket}/"), listed=_stat(info))
 
     def glob(self, pattern: str) -> Iterator[RemotePath]:
-        """Yield what matches, as `Path.glob`: `*` within a part of the name, `**` across parts."""
+        """Yield the matching paths, as `Path.glob`: `*` matches within a component, `**` across components."""
         first, _, rest = pattern.strip("/").partition("/")
         if first == "**":
             folders = [self, *(one for one in self.listing(recursive=True) if one.is_dir())]
@@ -299,7 +305,7 @@ class RemotePath:
         """Open for reading from the start to the end (`rb`).
 
         Raises:
-            FileNotFoundError: There is none.
+            FileNotFoundError: The object does not exist.
         """
         if mode != "rb":
             raise ValueError(f"a file behind a URL is opened with 'rb', not {mode!r}")
@@ -312,15 +318,15 @@ class RemotePath:
             return self.filesystem.open_input_file(self.place)
 
     def open_output(self) -> pa.NativeFile:
-        """Open for writing; what is written is there once the file is closed."""
+        """Open for writing; the object exists once the file is closed."""
         with reaching(str(self)):
             return self.filesystem.open_output_stream(self.place, compression=None)
 
     def version(self, file: pa.NativeFile | None = None) -> str:
-        """Return what changes when the object does: its size, and its tag or else the time it was written.
+        """Return the version of the content: its size, and its tag or modification time.
 
         Raises:
-            FileNotFoundError: There is none.
+            FileNotFoundError: The object does not exist.
         """
         with reaching(str(self)):
             opened = file or self.open_input()
@@ -329,12 +335,12 @@ class RemotePath:
             return f"{opened.size()} {tag or self.now().stat().st_mtime_ns}"
 
     def read_bytes(self) -> bytes:
-        """Return the whole content."""
+        """Return the content."""
         with reaching(str(self)), self.open() as file:
             return bytes(file.read())
 
     def write_bytes(self, content: bytes) -> None:
-        """Write the whole content, at once."""
+        """Write the content atomically."""
         with reaching(str(self)), self.open_output() as file:
             file.write(content)
 
@@ -342,7 +348,7 @@ class RemotePath:
         """Remove the object.
 
         Raises:
-            FileNotFoundError: There is none.
+            FileNotFoundError: The object does not exist.
         """
         with reaching(str(self)):
             self.filesystem.delete_file(self.place)
@@ -358,20 +364,20 @@ AnyPath: TypeAlias = "Path | RemotePath"
 
 
 def is_url(text: str) -> bool:
-    """Say whether a text is a URL, and no path of a disk."""
+    """Return whether a text is a URL."""
     return _URL.match(text) is not None
 
 
 def without_options(text: str) -> str:
-    """Return a URL without what stands behind `?`; a path as it is."""
+    """Return a URL without its options; other text is returned unchanged."""
     return text.partition("?")[0] if is_url(text) else text
 
 
 def as_path(given: str | Path | RemotePath) -> AnyPath:
-    """Return what a text stands for: a path, or what lies behind a URL; `file://` is a path.
+    """Return the path or remote path of a text; `file://` is a path.
 
     Raises:
-        IngestError: The URL's scheme is not known, it has no bucket, or it carries a password.
+        IngestError: The URL has an unknown scheme, no bucket, or a password.
     """
     if isinstance(given, RemotePath) or not is_url(str(given)):
         return Path(given) if isinstance(given, str) else given

@@ -268,7 +268,7 @@ def test_unavailable_server_is_an_error_and_not_an_unreadable_range(
     (report,) = api.run([config]).recordings
     assert report.exit_code == 1
     assert report.error is not None
-    assert "does not answer" in report.error
+    assert "does not respond" in report.error
     assert Store.open(store).names() == ()
 
 

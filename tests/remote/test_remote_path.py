@@ -84,10 +84,10 @@ def test_filesystem_of_gs_url_is_the_google_client() -> None:
 @pytest.mark.parametrize(
     ("error", "kind", "said"),
     [
-        (OSError("When reading: AWS Error NETWORK_CONNECTION during HeadObject operation: curlCode: 7"), Unreachable, "does not answer: NETWORK_CONNECTION"),
+        (OSError("When reading: AWS Error NETWORK_CONNECTION during HeadObject operation: curlCode: 7"), Unreachable, "does not respond: NETWORK_CONNECTION"),
         (OSError("AWS Error SLOW_DOWN during GetObject operation"), Unreachable, "SLOW_DOWN"),
         (OSError("AWS Error ACCESS_DENIED during HeadObject operation"), IngestError, "access is refused"),
-        (OSError("AWS Error NO_SUCH_BUCKET during CreateMultipartUpload (Request ID: x)"), IngestError, "no such bucket"),
+        (OSError("AWS Error NO_SUCH_BUCKET during CreateMultipartUpload (Request ID: x)"), IngestError, "bucket does not exist"),
         (FileNotFoundError(2, "gone"), FileNotFoundError, "gone"),
     ],
 )  # fmt: skip

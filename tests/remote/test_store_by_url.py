@@ -216,7 +216,7 @@ def test_store_that_becomes_unavailable_ends_the_run(
     own_objects.fail_after(0, containing="PUT /bucket/store/segments")
     done = ingest("run", job(tmp_path, str(recording), store), cwd=tmp_path)
     assert done.returncode == 1
-    assert "does not answer" in done.stderr
+    assert "does not respond" in done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "s3:").exists()
 
@@ -256,7 +256,7 @@ def test_run_whose_last_request_is_lost_fails(
     own_objects.fail_after(0, containing="PUT /bucket/store/catalog")
     done = ingest("run", job(tmp_path, str(recording), own_objects.url("store")), cwd=tmp_path)
     assert done.returncode == 1
-    assert "does not answer" in done.stderr
+    assert "does not respond" in done.stderr
 
 
 def test_two_writers_of_one_name_exclude_each_other(url: str) -> None:
