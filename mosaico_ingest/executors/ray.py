@@ -8,7 +8,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from os.path import relpath
 from pathlib import Path
 from typing import Any
@@ -223,7 +223,7 @@ class _Run:
             files = tuple(map(relpath, files))
         if isinstance(message, Report):
             return message.model_copy(update={"files": files, "destination": destination})
-        return replace(message, files=files, destination=destination)
+        return structs.replace(message, files=files, destination=destination)
 
 
 def _died(error: ray_errors.RayError, attempts: int) -> IngestError:

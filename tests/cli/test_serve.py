@@ -102,13 +102,13 @@ def test_keys_ls_does_not_print_keys(served: tuple[Path, str, str]) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--host", "no-such-host.invalid"), "no host is called 'no-such-host.invalid'"),
-        (("--host", "grpc://127.0.0.1:{port}"), "is neither a name nor an address"),
+        (("--host", "no-such-host.invalid"), "'no-such-host.invalid' cannot be resolved"),
+        (("--host", "grpc://127.0.0.1:{port}"), "is neither a host name nor an IP address"),
         (
             ("--host", "127.0.0.1", "--port", "{port}", "--tls-cert", "{cert}"),
-            "the server does not speak TLS",
+            "the server does not use TLS",
         ),
-        (("--host", "127.0.0.1", "--port", "{tls}"), "the server speaks TLS only"),
+        (("--host", "127.0.0.1", "--port", "{tls}"), "accepts only TLS connections"),
         (("--host", "127.0.0.1", "--port", "{tls}", "--tls-cert", "{cert}"), "the certificate is not for"),
         (
             ("--host", "127.0.0.1", "--port", "{port}", "--api-key", "{expired}"),
