@@ -23,43 +23,8 @@ REPLACED = tuple(
     for term in re.findall(r"`(\w+)`", row)
 )
 """Terms that no name may contain, in snake case; plurals with `s` count too."""
-PENDING = frozenset({"lost", "place", "room", "said", "taken", "told"})
+PENDING = frozenset({"place"})
 """Replaced terms that some names still use."""
-
-OLD_DOCSTRINGS = {
-    "adapters/builtin.py",
-    "adapters/image.py",
-    "adapters/mapping/conversion.py",
-    "adapters/mapping/functions/reference.py",
-    "adapters/mapping/testing.py",
-    "decode/layout.py",
-    "destinations/server/errors.py",
-    "destinations/server/session.py",
-    "destinations/store/checksum.py",
-    "destinations/store/errors.py",
-    "destinations/store/model.py",
-    "destinations/store/protocols.py",
-    "job/config.py",
-    "job/patterns.py",
-    "job/sections.py",
-    "job/units.py",
-    "job/validation.py",
-    "ontology/columns_file.py",
-    "pipeline/write_buffer.py",
-    "protocol/errors.py",
-    "report/events.py",
-    "report/metrics.py",
-    "report/telemetry.py",
-    "rosbag/definitions/distros_file.py",
-    "rosbag/definitions/hashes.py",
-    "serve/actions.py",
-    "serve/errors.py",
-    "serve/uploads.py",
-    "services/draft.py",
-    "services/replay.py",
-    "services/watch.py",
-}
-"""Modules whose docstrings still start with "This file"."""
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -148,7 +113,7 @@ def test_docstrings_do_not_start_with_this_file() -> None:
         f"{path.relative_to(ROOT)}:{line}"
         for path in FILES
         for docstring, line in docstrings(path)
-        if docstring.startswith("This file") and path.relative_to(PACKAGE).as_posix() not in OLD_DOCSTRINGS
+        if docstring.startswith("This file")
     ]
     assert not uses
 

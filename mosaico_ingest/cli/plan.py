@@ -183,7 +183,7 @@ def _print_destination(state: DestinationState, sequence: Mapping[str, Any], des
         return
     if not state.exists:
         action = "will be created"
-    elif state.taken:
+    elif state.has_sequence:
         action = f"contains {sequence['name']}; action: {sequence['if_exists']}"
     else:
         action = "ready"

@@ -272,7 +272,7 @@ def _finding(message: str, span: Span, remedy: str) -> Finding:
 class _Join:
     """A merge of two values that records the key paths taken from the base and those removed."""
 
-    taken: set[KeyPath] = field(default_factory=set[KeyPath])
+    inherited: set[KeyPath] = field(default_factory=set[KeyPath])
     dropped: set[KeyPath] = field(default_factory=set[KeyPath])
 
     def value(self, own: Value, base: Value, path: KeyPath) -> Value:
@@ -286,13 +286,13 @@ class _Join:
                 joined[key] = self.value(value, base[key], (*path, key)) if key in base else value
         for key in base:
             if key not in own and (*path, key) != (EXTENDS_KEY,):
-                self.taken.add((*path, key))
+                self.inherited.add((*path, key))
                 joined[key] = base[key]
         return joined
 
     def places(self, own: dict[KeyPath, Span], base: dict[KeyPath, Span]) -> dict[KeyPath, Span]:
         kept = {path: span for path, span in own.items() if not _below(path, self.dropped)}
-        return {**kept, **{path: span for path, span in base.items() if _below(path, self.taken)}}
+        return {**kept, **{path: span for path, span in base.items() if _below(path, self.inherited)}}
 
 
 def _below(path: KeyPath, roots: set[KeyPath]) -> bool:

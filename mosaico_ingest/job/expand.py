@@ -68,8 +68,8 @@ def _lines(value: Value, path: KeyPath, remark: Remark) -> Iterator[str]:
 
 def _entry(head: str, value: Value, path: KeyPath, remark: Remark) -> Iterator[str]:
     if _is_short(value):
-        said = remark(path)
-        yield f"{head} {_flow(value)}" + (f"  # {said}" if said else "")
+        comment = remark(path)
+        yield f"{head} {_flow(value)}" + (f"  # {comment}" if comment else "")
     else:
         yield head
         yield from (f"  {line}" for line in _lines(value, path, remark))

@@ -74,7 +74,7 @@ class DestinationState(Part):
     """`store`, `server`, or the type of an installed destination."""
     exists: bool | None
     """Whether the store exists or the server responds."""
-    taken: bool | None
+    has_sequence: bool | None
     """Whether the destination has a sequence of this name."""
     problem: str | None
     """The reason why the sequence cannot be written."""

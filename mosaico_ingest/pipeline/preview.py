@@ -56,14 +56,14 @@ def ask_destination(plan: Plan, samples: Iterable[Sample], *, connect: bool) -> 
     """Return the state of the destination; a server is contacted only with `connect`."""
     destination = destination_of(plan.destination)
     status = destination.inspect(plan.sequence.name, connect=connect)
-    taken: bool | None = None if status.exists is None else status.sequence is not None
+    has_sequence: bool | None = None if status.exists is None else status.sequence is not None
     problem = status.problem
     if problem is None and status.sequence is not None:
         problem = _sequence_problem(plan, status.sequence)
     return DestinationState(
         kind=destination.kind,
         exists=status.exists,
-        taken=taken if status.problem is None else None,
+        has_sequence=has_sequence if status.problem is None else None,
         problem=problem,
         free_bytes=status.free_bytes,
         estimated_bytes=_estimate(plan, {sample.target: sample for sample in samples}),

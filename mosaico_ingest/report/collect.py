@@ -194,8 +194,8 @@ class Collector:
         )
 
     def _unread(self, expected: Expected) -> _Sum:
-        lost = (item.count or 0 for item in self._unreadable if item.topic == expected.topic)
-        return _Sum(unreadable=sum(lost))
+        counts = (item.count or 0 for item in self._unreadable if item.topic == expected.topic)
+        return _Sum(unreadable=sum(counts))
 
     def _topic(self, expected: Expected) -> TopicReport:
         total = self._sums[expected.target] if not expected.excluded else self._unread(expected)

@@ -44,12 +44,12 @@ class OlderTopicInfo(messages.TopicInfo):
 
 
 def sequence_schema(sequence: SequenceInfo) -> pa.Schema:
-    """Return no columns, and what is said of the sequence."""
+    """Return a schema without columns, with the metadata of the sequence."""
     return _with(pa.schema([]), {"context": "sequence", "user_metadata": sequence.metadata})
 
 
 def topic_schema(topic: TopicInfo) -> pa.Schema:
-    """Return the topic's columns, and what is said of it."""
+    """Return the columns of the topic, with its metadata."""
     properties = {
         "ontology_tag": topic.ontology.tag,
         "serialization_format": topic.ontology.serialization_format.value,
@@ -59,12 +59,12 @@ def topic_schema(topic: TopicInfo) -> pa.Schema:
     )
 
 
-def _with(schema: pa.Schema, said: Mapping[str, Any]) -> pa.Schema:
-    spelled = {
+def _with(schema: pa.Schema, metadata: Mapping[str, Any]) -> pa.Schema:
+    encoded = {
         f"mosaico:{key}": value if isinstance(value, str) else json.dumps(value)
-        for key, value in said.items()
+        for key, value in metadata.items()
     }
-    return schema.with_metadata(spelled)
+    return schema.with_metadata(encoded)
 
 
 _MESSAGE_BYTES = 16 << 20

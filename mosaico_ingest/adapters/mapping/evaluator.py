@@ -115,7 +115,7 @@ class Evaluation:
         def refuse(bad: Mask, rule: str, says: Callable[[int], str]) -> None:
             count = self.count(axes)
             is_literal = len(bad) != count
-            rejected = self._in_taken_branches(np.broadcast_to(bad, count), axes)
+            rejected = self._in_selected_branches(np.broadcast_to(bad, count), axes)
             if not rejected.any():
                 return
             prefix = "" if text is None else f"{target}: " if text == target else f"{target}: `{text}`: "
@@ -131,7 +131,7 @@ class Evaluation:
 
         return refuse
 
-    def _in_taken_branches(self, bad: Mask, axes: tuple[Axis, ...]) -> Mask:
+    def _in_selected_branches(self, bad: Mask, axes: tuple[Axis, ...]) -> Mask:
         for condition in self._branch_conditions:
             if len(condition.axes) <= len(axes) and all(map(Axis.matches, condition.axes, axes)):
                 values = condition.broadcast_to(axes).array(len(bad))
