@@ -330,8 +330,8 @@ class RemotePath:
         """
         with reaching(str(self)):
             opened = file or self.open_input()
-            said = {str(name).lower(): bytes(value).decode() for name, value in opened.metadata().items()}
-            tag = next((said[name] for name in ("etag", "generation") if said.get(name)), None)
+            metadata = {str(name).lower(): bytes(value).decode() for name, value in opened.metadata().items()}
+            tag = next((metadata[name] for name in ("etag", "generation") if metadata.get(name)), None)
             return f"{opened.size()} {tag or self.now().stat().st_mtime_ns}"
 
     def read_bytes(self) -> bytes:
