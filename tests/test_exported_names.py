@@ -12,7 +12,10 @@ def test_every_exported_name_exists() -> None:
     for name in mosaico_ingest.__all__:
         assert getattr(mosaico_ingest, name) is not None
     assert mosaico_ingest.__all__ == sorted(mosaico_ingest.__all__)
-    assert set(mosaico_ingest._MODULES) == set(mosaico_ingest.__all__) - {"APIKeyPermissionEnum", "__version__"}
+    assert set(mosaico_ingest._MODULES) == set(mosaico_ingest.__all__) - {
+        "APIKeyPermissionEnum",
+        "__version__",
+    }
 
 
 def test_api_key_permissions_are_spelled_as_in_the_sdk() -> None:

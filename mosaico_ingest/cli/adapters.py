@@ -11,15 +11,14 @@ import typer
 from rich.text import Text
 
 from mosaico_ingest.cli.console import (
-    STANDARD_OUTPUT,
     PlainTable,
     Terminal,
     print_json,
     print_line,
     read_sources,
     render_findings,
-    write_output,
 )
+from mosaico_ingest.cli.output import STANDARD_OUTPUT, write_output
 from mosaico_ingest.report.units import counted
 
 if TYPE_CHECKING:

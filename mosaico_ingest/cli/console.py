@@ -21,7 +21,6 @@ from rich.text import Text
 from mosaico_ingest.findings import Finding, Severity, Span, mask_credentials, one_line
 
 __all__ = [
-    "STANDARD_OUTPUT",
     "PlainTable",
     "Terminal",
     "print_error",
@@ -29,11 +28,8 @@ __all__ = [
     "print_line",
     "read_sources",
     "render_findings",
-    "write_output",
 ]
 
-STANDARD_OUTPUT = Path("-")
-"""The path that output options accept for standard output."""
 FILE_WIDTH = 240
 """Columns of output that goes to a file or a pipe, where long lines do no harm."""
 EXCERPT_WIDTH = 160
@@ -116,24 +112,6 @@ def print_line(line: str, *, style: str = "", stderr: bool = False) -> None:
 def print_json(value: object, *, default: Callable[[Any], object] = str) -> None:
     """Print a value as indented JSON; `default` converts members that JSON cannot represent."""
     sys.stdout.write(json.dumps(value, indent=2, ensure_ascii=False, default=default) + "\n")
-
-
-def write_output(path: Path, text: str, *, announce: bool = False) -> None:
-    """Write the text of an output option: to a file, or to standard output if the path is `-`.
-
-    With `announce`, print the name of the file to standard error.
-
-    Raises:
-        SinkError: The file cannot be written.
-    """
-    from mosaico_ingest.textfile import write_atomically
-
-    if path == STANDARD_OUTPUT:
-        sys.stdout.write(text)
-        return
-    write_atomically(path, text)
-    if announce:
-        print_line(f"wrote {path}", stderr=True)
 
 
 def print_error(error: str, findings: Sequence[Finding]) -> None:

@@ -11,13 +11,12 @@ import typer
 from rich.text import Text
 
 from mosaico_ingest.cli.console import (
-    STANDARD_OUTPUT,
     PlainTable,
     Terminal,
     print_json,
     print_line,
-    write_output,
 )
+from mosaico_ingest.cli.output import STANDARD_OUTPUT, write_output
 from mosaico_ingest.findings import Severity
 from mosaico_ingest.remote import is_url
 from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text, time_text

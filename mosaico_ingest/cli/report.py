@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.text import Text
 
-from mosaico_ingest.cli.console import PlainTable, Terminal, print_line, write_output
+from mosaico_ingest.cli.console import PlainTable, Terminal, print_line
+from mosaico_ingest.cli.output import write_output
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.units import (
     bytes_text,

@@ -117,7 +117,7 @@ def run(
 ) -> None:
     """Ingest the recordings of job manifests, or exactly the decisions of a plan."""
     from mosaico_ingest import api
-    from mosaico_ingest.cli.console import STANDARD_OUTPUT, print_line, write_output
+    from mosaico_ingest.cli.output import STANDARD_OUTPUT, write_output
     from mosaico_ingest.executors.base import choose_executor
     from mosaico_ingest.pipeline.task import Task
     from mosaico_ingest.report.metrics import prometheus_text
@@ -137,6 +137,8 @@ def run(
     if shard is not None:
         total, tasks = len(tasks), take_shard(tasks, shard)
         if not tasks and not quiet and log_format is LogFormat.TEXT:
+            from mosaico_ingest.cli.console import print_line
+
             print_line(f"shard {shard} is empty: the job has {counted(total, 'recording')}", stderr=True)
     if metrics is not None and metrics != STANDARD_OUTPUT:
         check_output_file(metrics)
@@ -360,7 +362,7 @@ def run_tasks(
         typer.Exit: The exit code is not 0.
     """
     from mosaico_ingest import api
-    from mosaico_ingest.cli.console import STANDARD_OUTPUT, print_error
+    from mosaico_ingest.cli.output import STANDARD_OUTPUT
     from mosaico_ingest.executors.base import choose_executor
     from mosaico_ingest.textfile import check_output_file
 
@@ -394,11 +396,13 @@ def run_tasks(
         from mosaico_ingest.cli.report import print_report
 
         print_report(result, stderr=STANDARD_OUTPUT in report_files)
-    if not as_json:
-        for failure in failures:
-            print_error(failure.error or "", failure.findings)
-    for error in write_errors:
-        print_error(str(error), error.findings)
+    errors = [] if as_json else [(failure.error or "", failure.findings) for failure in failures]
+    errors += [(str(error), error.findings) for error in write_errors]
+    if errors:
+        from mosaico_ingest.cli.console import print_error
+
+        for error, findings in errors:
+            print_error(error, findings)
     code = SinkError.exit_code if write_errors and result.exit_code in SUCCESSFUL else result.exit_code
     if code:
         raise typer.Exit(code)
@@ -418,7 +422,7 @@ def _write_results(
     result: RunReport, report_files: set[Path], on_finish: Callable[[RunReport], None]
 ) -> Iterator[SinkError]:
     """Call `on_finish` and write the report files; yield the errors."""
-    from mosaico_ingest.cli.console import write_output
+    from mosaico_ingest.cli.output import write_output
 
     text = result.model_dump_json(indent=2) + "\n"
     for write in (partial(on_finish, result), *(partial(write_output, file, text) for file in report_files)):

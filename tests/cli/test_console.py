@@ -12,8 +12,8 @@ from mosaico_ingest.cli.console import (
     print_line,
     read_sources,
     render_findings,
-    write_output,
 )
+from mosaico_ingest.cli.output import write_output
 from mosaico_ingest.findings import Finding, Severity, Span
 
 
