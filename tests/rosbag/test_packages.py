@@ -97,8 +97,8 @@ def test_package_type_is_used_with_finding(tmp_path: Path, distro: Stores | None
     with ROSLoader(path, ros_distro=distro) as loader:
         assert [message.data for message in loader] == [{"data": "hi"}]
         (finding,) = [found for found in loader.findings if found.rule == "assumed-definition"]
-    assert "the public package example_interfaces: example_interfaces/msg/String" in finding.message
-    assert finding.help == "if yours have other fields, give them with custom_msgs"
+    assert "the public package example_interfaces are used: example_interfaces/msg/String" in finding.message
+    assert finding.help == "if your types have other fields, provide them with custom_msgs"
 
 
 def test_package_type_yields_to_recording_and_job(tmp_path: Path) -> None:

@@ -153,7 +153,7 @@ class TestWithoutADistro:
 class TestRefusals:
     def test_resolve_invalid_embedded_text_raises(self) -> None:
         resolver = TypeResolver()
-        with pytest.raises(BagError, match="cannot be read"):
+        with pytest.raises(BagError, match="is invalid"):
             resolve(resolver, "mine/msg/X", "no field here!")
         assert resolve(resolver, "mine/msg/Y", "int8 x").message.fields
 
@@ -178,7 +178,7 @@ class TestRefusals:
             resolve(TypeResolver(), "mine/msg/X", text)
 
     def test_resolve_other_schema_language_raises(self) -> None:
-        with pytest.raises(BagError, match="'protobuf' is no ROS definition"):
+        with pytest.raises(BagError, match="'protobuf' is not a ROS definition"):
             TypeResolver().resolve("X", Embedded("protobuf", "syntax"), ros_version=2)
 
 

@@ -52,7 +52,7 @@ _SUFFIXES = (".msg", ".idl")
 
 
 class Registered(Struct, frozen=True):
-    """A definition text somebody gave: the type it is for, and every type it defines."""
+    """A registered or custom definition: its type, its text, and every type that the text defines."""
 
     msgtype: str
     text: str
@@ -62,13 +62,13 @@ class Registered(Struct, frozen=True):
 
 
 class ROSTypeRegistry:
-    """Message types valid in this process, for all distros or for one; nothing of it needs an instance."""
+    """The message types registered in this process, for all distros or for one. All methods are class methods."""
 
     _scopes: ClassVar[dict[Stores | None, dict[str, Registered]]] = {}
 
     @classmethod
     def register(cls, msg_type: str, source: Path | str, store: Stores | str | None = None) -> None:
-        """Announce one type: `source` is its text, or the path of a `.msg` or `.idl` file; the last one wins.
+        """Register one type: `source` is its text, or the path of a `.msg` or `.idl` file. A later registration replaces it.
 
         Raises:
             BagError: The file or its text cannot be read; names the file and the line.
@@ -80,52 +80,52 @@ class ROSTypeRegistry:
     def register_directory(
         cls, package_name: str, dir_path: Path | str, store: Stores | str | None = None
     ) -> None:
-        """Announce every `.msg` and `.idl` file of a directory as `<package_name>/msg/<file name>`.
+        """Register every `.msg` and `.idl` file of a directory as `<package_name>/msg/<file name>`.
 
         Raises:
-            BagError: There is no such directory, it has none of them, or one cannot be read; then none is announced.
+            BagError: The directory does not exist or has no such files, or a file is invalid. No type is registered then.
         """
         entries = {entry.msgtype: entry for entry in directory_types(package_name, Path(dir_path))}
         cls._scopes.setdefault(store_of(store), {}).update(entries)
 
     @classmethod
     def get_types(cls, store: Stores | str | None = None) -> dict[str, str]:
-        """Return the text of every announced type: those of all distros, overlaid by those of `store`."""
+        """Return the text of every registered type: those for all distros, overlaid by those for `store`."""
         return {name: entry.text for name, entry in cls.entries(store).items()}
 
     @classmethod
     def entries(cls, store: Stores | str | None = None) -> dict[str, Registered]:
-        """Return what `get_types` returns, read."""
+        """Return the parsed definitions of the types that `get_types` returns."""
         scope = store_of(store)
         return {**cls._scopes.get(None, {}), **(cls._scopes.get(scope, {}) if scope else {})}
 
     @classmethod
     def snapshot(cls) -> dict[Stores | None, dict[str, Registered]]:
-        """Return everything announced so far, to be restored in another process."""
+        """Return all registered types, for `restore` in another process."""
         return {scope: dict(entries) for scope, entries in cls._scopes.items()}
 
     @classmethod
     def restore(cls, snapshot: Mapping[Stores | None, Mapping[str, Registered]]) -> None:
-        """Announce what a snapshot holds, and nothing else."""
+        """Replace all registered types by those of a snapshot."""
         cls._scopes.clear()
         cls._scopes.update({scope: dict(entries) for scope, entries in snapshot.items()})
 
     @classmethod
     def reset(cls) -> None:
-        """Forget every announced type."""
+        """Remove all registered types."""
         cls._scopes.clear()
 
 
 def store_of(store: Stores | str | None) -> Stores | None:
-    """Return the distro a name stands for.
+    """Return the distro with a name.
 
     Raises:
-        BagError: There is no such distro; names the nearest.
+        BagError: The distro is unknown; the hint names the nearest.
     """
     if store is None:
         return None
     try:
-        # rosbags has an enumeration of its own
+        # members of the enumeration of rosbags are accepted too
         return Stores(store.value if isinstance(store, Enum) else store)
     except ValueError:
         known = [known.value for known in Stores]
@@ -135,14 +135,14 @@ def store_of(store: Stores | str | None) -> Stores | None:
 
 
 def register_source(msg_type: str, source: Path | str) -> Registered:
-    """Read one definition, from a file or as text.
+    """Parse one definition, from a file or text.
 
     Raises:
-        BagError: The file or its text cannot be read.
+        BagError: The file cannot be read, or its text is invalid.
     """
     name = normalize_msgtype(msg_type)
     if name.count("/") != 2:  # noqa: PLR2004 - pkg/msg/Name
-        raise BagError(f"{msg_type!r} is no message type", hint="write it as pkg/msg/Name")
+        raise BagError(f"{msg_type!r} is not the name of a message type", hint="write it as pkg/msg/Name")
     text, where = (source, f"definition of {name}") if _is_text(source) else _read(Path(source))
     file = None if _is_text(source) else Path(source)
     try:
@@ -202,7 +202,7 @@ def suggest_type(msgtype: str) -> str:
 
 
 def _is_text(source: Path | str) -> bool:
-    """Say whether a source is a definition; one line that ends like a definition's file name is a path."""
+    """Return whether a source is a definition. A single line that ends with `.msg` or `.idl` is a path."""
     if isinstance(source, Path) or not source.endswith(_SUFFIXES) or "\n" in source:
         return isinstance(source, str)
     return len(source.split()) > 1 and not Path(source).is_file()
@@ -217,10 +217,10 @@ def _read(path: Path) -> tuple[str, str]:
 
 
 def directory_types(package: str, path: Path) -> Iterator[Registered]:
-    """Read the definitions of a package: those in a directory, in its `msg` folder, or the one a file holds.
+    """Parse the definitions of a package: the files in a directory or its `msg` folder, or a single file.
 
     Raises:
-        BagError: There are none, or one cannot be read.
+        BagError: There are no files, or one is invalid.
     """
     files = definition_files(path)
     if not files:
@@ -228,14 +228,14 @@ def directory_types(package: str, path: Path) -> Iterator[Registered]:
         raise BagError(
             f"{path} {there}",
             where=f"messages of {package}",
-            hint="give a directory of .msg files or one file",
+            hint="name a directory with .msg files, or one file",
         )
     for file in files:
         yield register_source(f"{package.removesuffix('/msg')}/msg/{file.stem}", file)
 
 
 def definition_files(path: Path) -> list[Path]:
-    """Return the definition files of a directory, of its `msg` folder, or the one file itself."""
+    """Return the definition files in a directory or its `msg` folder, or the file itself."""
     if path.is_file():
         return [path]
     for folder in (path, path / "msg"):
@@ -247,16 +247,16 @@ def definition_files(path: Path) -> list[Path]:
 
 
 CustomMessages = tuple[str, Path, Stores | str | None]
-"""A package, the directory of its `.msg` files (or one file), and the distro it is for (None: all)."""
+"""A package, the directory of its `.msg` files (or one file), and the distro that it applies to (None: all)."""
 
 _PACKAGE = "the public package "
-_GIVE_IT = "if yours have other fields, give them with custom_msgs"
-_UNSAID = frozenset({"unknown", ""})
-_LANGUAGES = frozenset({"ros1msg", "ros2msg", "ros2idl", "omgidl", "idl", "msg"}) | _UNSAID
+_OVERRIDE_HINT = "if your types have other fields, provide them with custom_msgs"
+_UNSPECIFIED = frozenset({"unknown", ""})
+_LANGUAGES = frozenset({"ros1msg", "ros2msg", "ros2idl", "omgidl", "idl", "msg"}) | _UNSPECIFIED
 
 
-class _Place(Struct, frozen=True):
-    """One place where types are looked for."""
+class _TypeSource(Struct, frozen=True):
+    """One of the sources that are searched for types."""
 
     label: str
     source: Source
@@ -264,10 +264,10 @@ class _Place(Struct, frozen=True):
 
 
 class TypeResolver:
-    """Finds definitions: in the recording, then the run's own, then announced ones, then the distro's, then known packages'.
+    """Finds definitions: embedded in the recording, custom, registered, of the distro, of public packages, in this order.
 
-    Each nested type is looked for on its own in the same order. Without a distro a standard type is taken where all
-    distros of the ROS version agree on it, with a finding. What the registry holds is copied when a resolver is made.
+    Nested types are searched individually in the same order. Without a distro, a standard type is used if all distros
+    of the ROS version agree on its fields, with a finding. A resolver copies the registered types when it is created.
     """
 
     def __init__(
@@ -278,10 +278,10 @@ class TypeResolver:
         types: Mapping[str, Path | str] | None = None,
         registry: type[ROSTypeRegistry] = ROSTypeRegistry,
     ) -> None:
-        """Read the run's own definitions: `custom` by package, `types` one by one, as text or file.
+        """Parse the custom definitions: `custom` by package, `types` individually, as text or file.
 
         Raises:
-            BagError: One of them cannot be read.
+            BagError: A definition is invalid.
         """
         store = store_of(distro)
         self.distro = None if store is Stores.EMPTY else store
@@ -296,7 +296,7 @@ class TypeResolver:
                 own += entries
         own += [register_source(name, source) for name, source in (types or {}).items()]
         self.custom_texts: Mapping[str, str] = {entry.msgtype: entry.text for entry in own}
-        """The run's own definitions by type, as text."""
+        """The custom definitions by type, as text."""
         self._custom = _by_name(own)
         self._registered = _by_name(registry.entries(self.distro).values())
         _check_local_types(own, {*self._custom, *self._registered, *self._other_distros})
@@ -309,11 +309,11 @@ class TypeResolver:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What was decided without being asked for, so far."""
+        """The assumptions made so far."""
         return self.findings_about({*self._replaced, *self._assumed})
 
     def findings_about(self, types: AbstractSet[str]) -> tuple[Finding, ...]:
-        """Return those of `findings` that are about some of these types."""
+        """Return the findings about the given types."""
         findings = [
             Finding(
                 "unreadable-definition", Severity.WARNING, f"{root}: the job's definition is used; {problem}"
@@ -324,16 +324,18 @@ class TypeResolver:
         assumed = {name: who for name, who in self._assumed.items() if name in types}
         for who in dict.fromkeys(assumed.values()):
             names = ", ".join(name for name, known in assumed.items() if known == who)
-            message = f"the recording does not define these types, they are read as in {who}: {names}"
-            remedy = _GIVE_IT if who.startswith(_PACKAGE) else "set ros_distro to be sure"
+            message = f"the recording does not define these types; the definitions of {who} are used: {names}"
+            remedy = (
+                _OVERRIDE_HINT if who.startswith(_PACKAGE) else "set ros_distro to select the definitions"
+            )
             findings.append(Finding("assumed-definition", Severity.INFO, message, help=remedy))
         return tuple(findings)
 
     def resolve(self, msgtype: str, embedded: Embedded | None, *, ros_version: int) -> Definition:
-        """Return the definition of `msgtype`, any spelling of the name.
+        """Return the definition of `msgtype`, in any notation of the name.
 
         Raises:
-            BagError: It or a type it needs is not known, or the text in the recording cannot be read.
+            BagError: The type or a nested type is unknown, or the embedded definition is invalid.
         """
         key = (msgtype, embedded, ros_version)
         if key not in self._resolved:
@@ -357,43 +359,45 @@ class TypeResolver:
         types = link(message, find, ros_version=version, hint=hint)
         return Definition(root, types, source, flatten(root, types, ros_version=version), version)
 
-    def _places(self, root: str, embedded: Embedded | None, version: int) -> list[_Place]:
+    def _places(self, root: str, embedded: Embedded | None, version: int) -> list[_TypeSource]:
         places = [
-            _Place("the recording", Source.BAG, self._embedded(root, embedded).get),
-            _Place("custom_msgs", Source.CUSTOM, self._custom.get),
-            _Place("the type registry", Source.CUSTOM, self._registered.get),
+            _TypeSource("the recording", Source.BAG, self._embedded(root, embedded).get),
+            _TypeSource("custom_msgs", Source.CUSTOM, self._custom.get),
+            _TypeSource("the type registry", Source.CUSTOM, self._registered.get),
         ]
         distro = self.distro
         if distro is None:
             places += self._agreements(embedded, version)
         elif ros_version(distro) == version:
-            places.append(_Place(distro.value, Source.DISTRO, lambda name: distro_type(distro, name)))
-        if version == 2:  # noqa: PLR2004 - a ROS 1 recording always has its definitions
-            places.append(_Place("the packages this tool knows", Source.PACKAGE, self._package))
-        if embedded and embedded.encoding not in _UNSAID and _is_empty(embedded.text):
-            # A text without fields is such a type, unless a distro knows the type: recorders that lack a definition
-            # write an empty one, or a comment.
+            places.append(_TypeSource(distro.value, Source.DISTRO, lambda name: distro_type(distro, name)))
+        if version == 2:  # noqa: PLR2004 - a ROS 1 recording always has definitions
+            places.append(_TypeSource("the packages this tool knows", Source.PACKAGE, self._package))
+        if embedded and embedded.encoding not in _UNSPECIFIED and _is_empty(embedded.text):
+            # An empty text is a type without fields, unless a distro has the type: recorders without the definition
+            # write an empty text, or a comment.
             known = any(distro_type(distro, root) for distro in (ROS1 if version == 1 else ROS2))
             empty = {} if known else {root: MessageType(root, ())}
-            places.append(_Place("the recording's empty text", Source.BAG, empty.get))
+            places.append(_TypeSource("the recording's empty text", Source.BAG, empty.get))
         return places
 
     def _embedded(self, root: str, embedded: Embedded | None) -> Mapping[str, MessageType]:
         if embedded is None or _is_empty(embedded.text):
             return {}
         if embedded.encoding.lower() not in _LANGUAGES:
-            raise BagError(f"a schema in {embedded.encoding!r} is no ROS definition", where=root)
+            raise BagError(f"a schema in {embedded.encoding!r} is not a ROS definition", where=root)
         try:
             return read_types(embedded.text, root)
         except BagError as error:
             if root not in self._custom and root not in self._registered:
-                problem = f"the definition in the recording cannot be read: {error.what}"
-                raise BagError(problem, where=error.where, hint="give the type with custom_msgs") from error
+                problem = f"the definition in the recording is invalid: {error.what}"
+                raise BagError(
+                    problem, where=error.where, hint="provide the type with custom_msgs"
+                ) from error
             self._replaced[root] = error.what
             return {}
 
-    def _agreements(self, embedded: Embedded | None, version: int) -> list[_Place]:
-        """Return what can be known without a distro: a recording that holds no definition at all is an old one."""
+    def _agreements(self, embedded: Embedded | None, version: int) -> list[_TypeSource]:
+        """Return the sources without a distro. A recording without definitions is older than ROS 2 Iron."""
         places = [self._agreement(f"all ROS {version} distros", ROS1 if version == 1 else ROS2)]
         if embedded is None and version != 1:
             places.append(
@@ -401,16 +405,16 @@ class TypeResolver:
             )
         return places
 
-    def _agreement(self, who: str, distros: tuple[Stores, ...]) -> _Place:
+    def _agreement(self, who: str, distros: tuple[Stores, ...]) -> _TypeSource:
         def find(name: str) -> MessageType | None:
             if name in BUILTIN:
-                return BUILTIN[name]  # embedded texts never define them; loading the distros takes a while
+                return BUILTIN[name]  # embedded texts never define them; loading the distros is slow
             known = agreed_type(name, distros)
-            if known and known.fields:  # of one without fields nothing can be assumed wrongly
+            if known and known.fields:  # a type without fields needs no assumption
                 self._assumed.setdefault(name, who)
             return known
 
-        return _Place(f"what {who.partition(',')[0]} agree on", Source.DISTRO, find)
+        return _TypeSource(f"what {who.partition(',')[0]} agree on", Source.DISTRO, find)
 
     def _package(self, name: str) -> MessageType | None:
         known = package_type(name)
@@ -418,11 +422,13 @@ class TypeResolver:
             self._assumed.setdefault(name, f"{_PACKAGE}{name.partition('/')[0]}")
         return known
 
-    def _hint(self, places: list[_Place], version: int) -> str:
+    def _hint(self, places: list[_TypeSource], version: int) -> str:
         searched = f"searched: {', '.join(place.label for place in places)}"
         if self.distro and ros_version(self.distro) != version:
             return f"{searched}; the recording is ROS {version}, ros_distro is {self.distro.value}; set the right one"
-        remedy = "give it with custom_msgs" if self.distro else "set ros_distro, or give it with custom_msgs"
+        remedy = (
+            "provide it with custom_msgs" if self.distro else "set ros_distro, or provide it with custom_msgs"
+        )
         return f"{searched}; {remedy}"
 
 
@@ -431,7 +437,7 @@ def _is_empty(text: str) -> bool:
 
 
 def _by_name(entries: Iterable[Registered]) -> dict[str, MessageType]:
-    """Return all types by name; one given under its own name wins over the same inside another's text."""
+    """Return all types by name; a definition of its own takes precedence over one nested in another text."""
     chosen = list(entries)
     types = {name: message for entry in reversed(chosen) for name, message in entry.types.items()}
     return types | {entry.msgtype: entry.types[entry.msgtype] for entry in chosen}
