@@ -17,7 +17,7 @@ from mosaico_ingest.adapters.image import PngImageSpec
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.documents import Part, Unchecked
-from mosaico_ingest.findings import Finding, Span
+from mosaico_ingest.findings import Finding, Span, escape_undecodable
 from mosaico_ingest.job.model import (
     ErrorPolicy,
     QuarantineSettings,
@@ -107,7 +107,8 @@ def _describe_destination(target: Target, info: SerializationInfo) -> str:
 
 
 def _relative(path: Path | RemotePath, info: SerializationInfo) -> str:
-    return str(path) if isinstance(path, RemotePath) else Path(relpath(path, _folder(info))).as_posix()
+    text = str(path) if isinstance(path, RemotePath) else Path(relpath(path, _folder(info))).as_posix()
+    return escape_undecodable(text)
 
 
 def _folder(info: SerializationInfo) -> Path:

@@ -21,7 +21,7 @@ __all__ = [
     "new_key",
 ]
 
-_LONGEST_SEQUENCE_NAME, _LONGEST_TOPIC_NAME = 255, 1024
+_LONGEST_SEQUENCE_NAME, _LONGEST_TOPIC_NAME = 255, 4096
 _FORBIDDEN = re.compile(r"[^\x21-\x7e]|[!\"'*£$%&.:]")
 _MAX_DEPTH = 64
 _KEY = re.compile(r"[A-Za-z0-9 _-]+")
