@@ -226,7 +226,7 @@ class RemotePath:
         return filesystem(self.root, self.options)
 
     @property
-    def place(self) -> str:
+    def filesystem_path(self) -> str:
         """The path within its file system."""
         return f"{self.root.partition('://')[2]}/{self.key}".rstrip("/")
 
@@ -279,7 +279,7 @@ class RemotePath:
         """Yield the entries below, sorted by name."""
         from pyarrow.fs import FileSelector  # noqa: PLC0415 - slow to import, and only jobs with URLs need it
 
-        selector = FileSelector(self.place, allow_not_found=True, recursive=recursive)
+        selector = FileSelector(self.filesystem_path, allow_not_found=True, recursive=recursive)
         with reaching(str(self)):
             found = self.filesystem.get_file_info(selector)
         bucket = self.root.partition("://")[2]
@@ -310,17 +310,17 @@ class RemotePath:
         if mode != "rb":
             raise ValueError(f"a file behind a URL is opened with 'rb', not {mode!r}")
         with reaching(str(self)):
-            return self.filesystem.open_input_stream(self.place, compression=None)
+            return self.filesystem.open_input_stream(self.filesystem_path, compression=None)
 
     def open_input(self) -> pa.NativeFile:
         """Open for reading by position."""
         with reaching(str(self)):
-            return self.filesystem.open_input_file(self.place)
+            return self.filesystem.open_input_file(self.filesystem_path)
 
     def open_output(self) -> pa.NativeFile:
         """Open for writing; the object exists once the file is closed."""
         with reaching(str(self)):
-            return self.filesystem.open_output_stream(self.place, compression=None)
+            return self.filesystem.open_output_stream(self.filesystem_path, compression=None)
 
     def version(self, file: pa.NativeFile | None = None) -> str:
         """Return the version of the content: its size, and its tag or modification time.
@@ -351,13 +351,13 @@ class RemotePath:
             FileNotFoundError: The object does not exist.
         """
         with reaching(str(self)):
-            self.filesystem.delete_file(self.place)
+            self.filesystem.delete_file(self.filesystem_path)
 
     def _look(self) -> RemoteStat | None:
         if self.listed is not None:
             return self.listed
         with reaching(str(self)):
-            return _stat(self.filesystem.get_file_info(self.place))
+            return _stat(self.filesystem.get_file_info(self.filesystem_path))
 
 
 AnyPath: TypeAlias = "Path | RemotePath"

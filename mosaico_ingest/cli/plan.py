@@ -166,7 +166,7 @@ def _sample_text(sample: Sample) -> Text:
 
 def _print_notes(notes: Sequence[Note]) -> None:
     for note in notes:
-        location = f"{note.place}: " if note.place else ""
+        location = f"{note.location}: " if note.location else ""
         hint = f" — {note.help}" if note.help else ""
         line = f"{location}{note.severity.value}[{note.rule}] {note.message}{hint}"
         print_line(line, style=NOTE_STYLES[note.severity])

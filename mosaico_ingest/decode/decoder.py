@@ -163,7 +163,7 @@ class ColumnarDecoder:
         if self._layout.encoding is Encoding.ROS1:
             return [("<", np.arange(len(block)))] if len(block) else []
         rows = np.flatnonzero(block.lengths >= _HEADER)
-        first, second = (bytes_at(block.data, block.starts[rows] + place) for place in range(2))
+        first, second = (bytes_at(block.data, block.starts[rows] + offset) for offset in range(2))
         groups = [(order, rows[(first == 0) & (second == kind)]) for order, kind in _ORDERS.items()]
         return [(order, members) for order, members in groups if len(members)]
 

@@ -165,7 +165,7 @@ class _Draft:
     steps: list[Step] = field(default_factory=list[Step])
     open_block: FixedBlock | None = None
 
-    def place(self, align: int, size: int) -> tuple[int, int]:
+    def allocate(self, align: int, size: int) -> tuple[int, int]:
         """Add a value of `size` bytes; return the number of its step and its offset in the block."""
         block = self.open_block
         if block is None or align > block.align:
@@ -196,7 +196,7 @@ class _Compiler(Struct, frozen=True):
 
     def struct(self, message: MessageType, draft: _Draft) -> StructColumn:
         if self.aligned and not message.fields:
-            draft.place(1, 1)  # CDR represents an empty struct by one unused byte
+            draft.allocate(1, 1)  # CDR represents an empty struct by one unused byte
         return StructColumn(tuple(self._field(field, draft) for field in message.fields))
 
     def _field(self, field: Field, draft: _Draft) -> Column:
@@ -215,7 +215,7 @@ class _Compiler(Struct, frozen=True):
         if not field.size:
             return FixedArrayColumn(0, item)
         stride = _stride(cell)
-        step, offset = draft.place(cell.align, stride * (field.size - 1) + cell.size)
+        step, offset = draft.allocate(cell.align, stride * (field.size - 1) + cell.size)
         return FixedArrayColumn(field.size, _moved(item, step, offset, (field.size, stride)))
 
     def _item(self, field: Field, draft: _Draft) -> Column:
@@ -225,7 +225,7 @@ class _Compiler(Struct, frozen=True):
             text = Text(_UNITS[field.type], has_nul=self.aligned and field.type == "string")
             return TextColumn(draft.add(text), text)
         size = np.dtype(NUMBERS[field.type]).itemsize
-        step, offset = draft.place(size if self.aligned else 1, size)
+        step, offset = draft.allocate(size if self.aligned else 1, size)
         return NumberColumn(step, offset, field.type)
 
 

@@ -90,13 +90,13 @@ class _Box(Struct, frozen=True):
         if isinstance(reference, type):
             self._add_module(reference.__module__, base_dir)
         elif isinstance(reference, (str, Path)) and str(reference) not in BY_NAME:
-            place, colon, _ = str(reference).rpartition(":")
+            source, colon, _ = str(reference).rpartition(":")
             if Path(reference).suffix in _YAML:
                 self._add_all(_beside(base_dir / reference, _YAML))
-            elif place.endswith(".py"):
-                self._add_all(_beside(base_dir / place, _CODE))
+            elif source.endswith(".py"):
+                self._add_all(_beside(base_dir / source, _CODE))
             elif colon:
-                self._add_module(place, base_dir)
+                self._add_module(source, base_dir)
 
     def _add_module(self, name: str, base_dir: Path) -> None:
         """Copy a module with its package unless it is installed: into the import path, or below `base_dir`."""
@@ -148,5 +148,5 @@ def _copy(source: Path, to: Path) -> None:
 
 
 def _is_installed(file: Path) -> bool:
-    places = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
-    return any(file.is_relative_to(place) for place in places)
+    folders = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
+    return any(file.is_relative_to(folder) for folder in folders)

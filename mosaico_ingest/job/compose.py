@@ -229,8 +229,8 @@ def bases_of(source: Source, *, folder: File) -> Iterator[tuple[File, Span]]:
     named = source.at((EXTENDS_KEY,))
     for position, name in enumerate(named if isinstance(named, list) else [named]):
         if isinstance(name, str) and name:
-            place = (EXTENDS_KEY, position) if isinstance(named, list) else (EXTENDS_KEY,)
-            yield File(normpath(folder / File(name).expanduser())), source.span(place)
+            key_path = (EXTENDS_KEY, position) if isinstance(named, list) else (EXTENDS_KEY,)
+            yield File(normpath(folder / File(name).expanduser())), source.span(key_path)
 
 
 def _extended(source: Source, folder: File, chain: tuple[File, ...], read: Iterator[int]) -> Source:
@@ -290,7 +290,7 @@ class _Join:
                 joined[key] = base[key]
         return joined
 
-    def places(self, own: dict[KeyPath, Span], base: dict[KeyPath, Span]) -> dict[KeyPath, Span]:
+    def spans(self, own: dict[KeyPath, Span], base: dict[KeyPath, Span]) -> dict[KeyPath, Span]:
         kept = {path: span for path, span in own.items() if not _below(path, self.dropped)}
         return {**kept, **{path: span for path, span in base.items() if _below(path, self.inherited)}}
 
@@ -307,8 +307,8 @@ def _joined(own: Source, base: Source) -> Source:
         own.text,
         value,
         (*own.findings, *base.findings),
-        join.places(own.spans, base.spans),
-        join.places(own.key_spans, base.key_spans),
+        join.spans(own.spans, base.spans),
+        join.spans(own.key_spans, base.key_spans),
         {**base.others, base.file: base.text, **own.others},
     )
 

@@ -161,8 +161,8 @@ def manifest_text(path: File) -> str:
     if isinstance(value, dict):
         value = {key: inner for key, inner in value.items() if key != EXTENDS_KEY}
 
-    def remark(place: KeyPath) -> str | None:
-        span = source.span(place)
+    def remark(key_path: KeyPath) -> str | None:
+        span = source.span(key_path)
         return None if span.file == source.file else f"{span.file}:{span.line}"
 
     return to_yaml(_without_secrets(value), remark)

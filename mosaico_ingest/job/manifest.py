@@ -146,7 +146,7 @@ def check_manifest(
     known = {finding.span for finding in findings}
     if any(finding.rule == "missing-base" for finding in findings):
         mistakes = [finding for finding in mistakes if finding.rule != "missing-key"]
-    findings += [finding for finding in mistakes if finding.span not in known]  # one word for one place
+    findings += [finding for finding in mistakes if finding.span not in known]  # one mistake for each span
     ordered = tuple(sorted(findings, key=lambda finding: finding.span or Span("", 0, 0, 0, 0)))
     return (None if ordered else manifest), ordered
 
@@ -243,12 +243,12 @@ def _with_text_keys(value: Value, path: KeyPath, source: Source, findings: list[
 def _validate(source: Source, filled: Filled) -> tuple[Manifest | None, list[Finding]]:
     """Validate; a filled-in text may have to be a number, and what an unknown variable would be is not judged."""
     manifest, mistakes = _attempt(source, filled.value)
-    retry = [place for place, _ in mistakes if place in filled.changed]
+    retry = [key_path for key_path, _ in mistakes if key_path in filled.changed]
     if retry:
-        for place in dict.fromkeys(retry):
-            _reread(filled, place)
+        for key_path in dict.fromkeys(retry):
+            _reread(filled, key_path)
         manifest, mistakes = _attempt(source, filled.value)
-    return manifest, [finding for place, finding in mistakes if place not in filled.unknown]
+    return manifest, [finding for key_path, finding in mistakes if key_path not in filled.unknown]
 
 
 def _attempt(source: Source, value: Value) -> tuple[Manifest | None, list[tuple[KeyPath, Finding]]]:
@@ -259,17 +259,17 @@ def _attempt(source: Source, value: Value) -> tuple[Manifest | None, list[tuple[
         return None, explain(error, source=source, schema=_schema())
 
 
-def _reread(filled: Filled, place: KeyPath) -> None:
+def _reread(filled: Filled, key_path: KeyPath) -> None:
     """Read a filled-in text as YAML would read it unquoted; take it out if its value is not known."""
     parent = filled.value
-    for part in place[:-1]:
+    for part in key_path[:-1]:
         parent = member(parent, part)
     if isinstance(parent, dict):
-        value = parent[place[-1]]
-        if place in filled.unknown:
-            del parent[place[-1]]
+        value = parent[key_path[-1]]
+        if key_path in filled.unknown:
+            del parent[key_path[-1]]
         elif isinstance(value, str):
-            parent[place[-1]] = resolve_plain(value)[0]
+            parent[key_path[-1]] = resolve_plain(value)[0]
 
 
 @cache

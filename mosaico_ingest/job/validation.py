@@ -26,7 +26,7 @@ from mosaico_ingest.job.yaml_source import (
     member,
 )
 
-__all__ = ["explain", "keys_at", "nearest", "place_of"]
+__all__ = ["explain", "key_path_of", "keys_at", "nearest"]
 
 _EXPECTED = {
     "string_type": "text",
@@ -58,7 +58,7 @@ class _Problem(Struct, frozen=True):
 
     @property
     def span(self) -> Span:
-        """The value's place."""
+        """The value's span."""
         return self.source.span(self.path)
 
     @property
@@ -94,7 +94,7 @@ def _any_below(path: KeyPath, problems: Iterable[_Problem]) -> bool:
     return any(problem.path[: len(path)] == path and problem.path != path for problem in problems)
 
 
-def place_of(location: KeyPath, value: Value) -> KeyPath:
+def key_path_of(location: KeyPath, value: Value) -> KeyPath:
     """Return the key path of an error's location, without the parts that the document does not have (union tags)."""
     path: KeyPath = ()
     for part in location:
@@ -139,7 +139,7 @@ def _plain(word: str) -> str:
 
 
 def _problem(details: ErrorDetails, source: Source, schema: dict[str, Any]) -> _Problem:
-    path = place_of(details["loc"], source.value)
+    path = key_path_of(details["loc"], source.value)
     return _Problem(details, path, source.at(path), source, schema)
 
 

@@ -478,7 +478,7 @@ def load_source(text: str, *, file: str) -> Source:
         return Source(file, text[:1000], None, (_finding("yaml-size", message, Span(file, 1, 1, 1, 1)),))
     unprintable = _UNPRINTABLE.search(text)
     if unprintable is not None:
-        span = _place(text, unprintable.start(), file)
+        span = _span_at(text, unprintable.start(), file)
         message = f"the character U+{ord(unprintable.group()):04X} is not allowed in YAML"
         return Source(file, text, None, (_finding("yaml-character", message, span, "remove it"),))
     return _Reader(text, file).read()
@@ -569,14 +569,14 @@ class _Reader:
             error.context_mark if "never closed" in message or "not closed" in message else error.problem_mark
         )
         index = 0 if mark is None else mark.index
-        return [_finding("yaml-syntax", message, _place(self._original, index, self._file), remedy)]
+        return [_finding("yaml-syntax", message, _span_at(self._original, index, self._file), remedy)]
 
 
 def _finding(rule: str, message: str, span: Span, remedy: str | None = None) -> Finding:
     return Finding(rule, Severity.ERROR, message, span, remedy)
 
 
-def _place(text: str, index: int, file: str) -> Span:
+def _span_at(text: str, index: int, file: str) -> Span:
     before = text[:index]
     line = before.count("\n") + 1
     column = index - (before.rfind("\n") + 1) + 1

@@ -21,7 +21,7 @@ from mosaico_ingest.job.compose import fill_in
 from mosaico_ingest.job.fields import AdapterRef, FilePath, PathRole, TopicGlob, marked_fields, values_at
 from mosaico_ingest.job.manifest import check_manifest
 from mosaico_ingest.job.model import JobSettings, Manifest
-from mosaico_ingest.job.validation import place_of
+from mosaico_ingest.job.validation import key_path_of
 from mosaico_ingest.job.yaml_source import KeyPath, Source, Value, load_source, member
 from mosaico_ingest.remote import without_options
 from mosaico_ingest.textfile import read_limited
@@ -114,7 +114,7 @@ def _validate(value: Value) -> tuple[Manifest | None, list[ErrorDetails]]:
 
 def _repair(value: Value, location: KeyPath, *, missing: bool) -> None:
     """Remove the value at an error's location, empty the list that contains it, or add a placeholder if it is missing."""
-    path = place_of(location, value)
+    path = key_path_of(location, value)
     parent = reduce(member, path if missing else path[:-1], value)
     if missing and isinstance(parent, dict):
         parent[location[-1]] = {"path": _PLACEHOLDER} if location == ("bag",) else _PLACEHOLDER

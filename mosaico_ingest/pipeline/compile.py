@@ -103,12 +103,12 @@ def _fill(placeholder: Placeholder, recording: Recording) -> str:
     return _REFUSED.sub("_", texts[placeholder.name]).strip("_")
 
 
-def _matches(loaded: LoadedManifest, pattern: str, place: tuple[str | int, ...]) -> list[AnyPath]:
+def _matches(loaded: LoadedManifest, pattern: str, key_path: tuple[str | int, ...]) -> list[AnyPath]:
     """Return the file or directory `pattern` names, or the recordings it matches, sorted."""
-    path = loaded.resolve_or_url(pattern, *place)
+    path = loaded.resolve_or_url(pattern, *key_path)
     if path.exists():
         return [path]
-    where = loaded.where(*place)
+    where = loaded.where(*key_path)
     if not has_magic(without_options(pattern)):
         raise NothingMatched(f"no such file or directory: {path}", where=where, hint=_nearby(path))
     found: list[AnyPath] = sorted(_glob(path))

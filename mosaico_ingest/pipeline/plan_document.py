@@ -41,7 +41,7 @@ class Note(Part):
     severity: Severity
     rule: str
     message: str
-    place: str | None
+    location: str | None
     """The location, such as `job.yaml:3:5`."""
     help: str | None
 
@@ -163,7 +163,7 @@ def notes(findings: Iterable[Finding]) -> tuple[Note, ...]:
             severity=finding.severity,
             rule=finding.rule,
             message=finding.message,
-            place=str(finding.span) if finding.span else None,
+            location=str(finding.span) if finding.span else None,
             help=finding.help,
         )
         for finding in findings

@@ -302,9 +302,9 @@ def _chosen(job: Job, plan: Plan) -> Iterator[Finding]:
     for topic in plan.topics:
         glob = first_match(job.adapters.override, topic.topic)
         if glob is not None:
-            place = job.span("adapters", "override", glob)
+            span = job.span("adapters", "override", glob)
             yield Finding(
-                "adapter-override", Severity.INFO, f"{topic.topic}: {topic.adapter.name} by {glob!r}", place
+                "adapter-override", Severity.INFO, f"{topic.topic}: {topic.adapter.name} by {glob!r}", span
             )
 
 

@@ -499,8 +499,8 @@ def _validate(kind: type[_Model], data: bytes) -> _Model:
 
 def _first(error: ValidationError) -> str:
     first = error.errors(include_url=False, include_context=False)[0]
-    place = ".".join(map(str, first["loc"]))
-    return f"{place}: {first['msg']}" if place else first["msg"]
+    field = ".".join(map(str, first["loc"]))
+    return f"{field}: {first['msg']}" if field else first["msg"]
 
 
 API_KEY_HEADER = "mosaico-api-key-token"

@@ -215,14 +215,14 @@ def serve(
     Raises:
         SinkError: The store cannot be opened, the certificate cannot be read, or the port is taken.
     """
-    place = as_path(store_path)
-    if isinstance(place, RemotePath):
+    path = as_path(store_path)
+    if isinstance(path, RemotePath):
         raise SinkError(
             "only a store in a local folder can be served",
-            where=str(place),
+            where=str(path),
             hint="read the store through its URL",
         )
-    store = Store.open(place)
+    store = Store.open(path)
     scheme = "grpc" if tls is None else "grpc+tls"
     certificates = None if tls is None else [(_read(tls.certificate), _read(tls.key))]
     try:

@@ -311,8 +311,8 @@ def run_adapter_tests(spec: AdapterSpec, types: DefinitionFinder) -> TestResult:
         )
     folder = Path(mapping.source.file).parent
 
-    def recorded(place: RecordedMessage) -> tuple[Definition, pa.StructArray]:
-        return message_in(folder / place.bag, place.topic, place.index, resolve=types)
+    def recorded(message: RecordedMessage) -> tuple[Definition, pa.StructArray]:
+        return message_in(folder / message.bag, message.topic, message.index, resolve=types)
 
     findings: dict[Finding, None] = {}
     unknown: list[str] = []
@@ -354,8 +354,8 @@ def draft_adapter(
         definition, example = definition_in(bag, name, resolve=types), None
     else:
         definition, row = message_in(bag, record, resolve=types)
-        place = {"bag": relpath(bag, folder), "topic": record, "index": 0}
-        example = RecordedExample(row, place)
+        reference = {"bag": relpath(bag, folder), "topic": record, "index": 0}
+        example = RecordedExample(row, reference)
         if definition.root != name:
             raise AdapterError(
                 f"it carries {definition.root}, not {name}", where=record, hint="name another topic"

@@ -98,8 +98,8 @@ def _definitions(undefined: Sequence[str], ros_distro: Stores | str | None) -> I
 
 def _known_from(topics: Sequence[InspectedTopic]) -> str:
     assumed = sorted({topic.definition for topic in topics} - {Source.BAG.value})
-    places = {Source.DISTRO.value: "as in all distros", Source.PACKAGE.value: "as in public packages"}
-    how = " or ".join(places[source] for source in assumed)
+    phrases = {Source.DISTRO.value: "as in all distros", Source.PACKAGE.value: "as in public packages"}
+    how = " or ".join(phrases[source] for source in assumed)
     return f"it carries no definitions; they are read {how}" if assumed else "it carries its definitions"
 
 

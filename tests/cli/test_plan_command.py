@@ -93,7 +93,7 @@ def test_plan_adapter_override_note_has_location(ingest: Ingest) -> None:
     (recording,) = PlanDocument.model_validate_json(output).recordings
     (note,) = (note for note in recording.notes if note.rule == "adapter-override")
     assert note.message == "/odom: OdometryAdapter by '/od*'"
-    assert note.place == location('"/od*"')
+    assert note.location == location('"/od*"')
     quarantine = recording.plan["quarantine"]
     assert (quarantine["path"], quarantine["max"]) == ("quarantine", 0.01)
 

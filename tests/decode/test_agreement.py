@@ -143,12 +143,12 @@ def damaged(draw: st.DrawFn, payload: bytes) -> bytes:
     return draw(st.binary(max_size=40)) if how == "anything" else payload
 
 
-def same_place(one: StepOffsets, other: StepOffsets) -> bool:
+def same_offsets(one: StepOffsets, other: StepOffsets) -> bool:
     return (
         one.at.tolist() == other.at.tolist()
         and one.counts.tolist() == other.counts.tolist()
         and len(one.body) == len(other.body)
-        and all(map(same_place, one.body, other.body))
+        and all(map(same_offsets, one.body, other.body))
     )
 
 
@@ -156,7 +156,7 @@ def same_located(one: LocatedMessages, other: LocatedMessages) -> bool:
     return (
         one.rows.tolist() == other.rows.tolist()
         and one.tails.tolist() == other.tails.tolist()
-        and all(map(same_place, one.offsets, other.offsets))
+        and all(map(same_offsets, one.offsets, other.offsets))
     )
 
 

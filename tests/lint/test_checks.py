@@ -162,4 +162,4 @@ def test_plan_reports_png_setting_for_topic_that_is_not_an_image(project: Path) 
     plan = RUN.invoke(command_line(), ["plan", str(job), "--json"])
     (recording,) = json.loads(plan.stdout)["recordings"]
     (note,) = [note for note in recording["notes"] if note["rule"] == "image-setting"]
-    assert (note["severity"], note["place"].rpartition("job.yaml")[2]) == ("warning", ":3:11")
+    assert (note["severity"], note["location"].rpartition("job.yaml")[2]) == ("warning", ":3:11")

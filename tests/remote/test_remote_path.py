@@ -18,7 +18,7 @@ from mosaico_ingest.remote import RemotePath, as_path, filesystem, is_url, reach
 def test_remote_path_has_the_parts_of_a_path() -> None:
     path = as_path("s3://bucket/drives/a.mcap?region=eu-west-1")
     assert isinstance(path, RemotePath)
-    assert (path.name, path.suffix, path.place) == ("a.mcap", ".mcap", "bucket/drives/a.mcap")
+    assert (path.name, path.suffix, path.filesystem_path) == ("a.mcap", ".mcap", "bucket/drives/a.mcap")
     assert str(path) == "s3://bucket/drives/a.mcap"
     assert str(path.parent / "b" / "c.bag") == "s3://bucket/drives/b/c.bag"
     assert [str(one) for one in path.above] == ["s3://bucket/drives", "s3://bucket"]

@@ -188,14 +188,14 @@ class Store(Struct, frozen=True):
         Raises:
             SinkError: The store does not exist, cannot be opened, or was created by a newer version.
         """
-        place = as_path(path)
-        if isinstance(place, RemotePath):
+        root = as_path(path)
+        if isinstance(root, RemotePath):
             from mosaico_ingest.destinations.store.files import ObjectFiles  # noqa: PLC0415 - only stores behind URLs need it
             from mosaico_ingest.destinations.store.object_catalog import ObjectCatalog  # noqa: PLC0415 - the same
 
-            bucket = ObjectFiles(place)
+            bucket = ObjectFiles(root)
             return cls(bucket, ObjectCatalog(bucket, create=create))
-        layout = LocalFiles(place)
+        layout = LocalFiles(root)
         return cls(layout, Catalog(layout.catalog, create=create))
 
     @classmethod

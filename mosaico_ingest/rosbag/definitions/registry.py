@@ -343,9 +343,11 @@ class TypeResolver:
         return self._resolved[key]
 
     def _resolve(self, root: str, embedded: Embedded | None, version: int) -> Definition:
-        places = self._places(root, embedded, version)
-        found = next(((known, place.source) for place in places if (known := place.find(root))), None)
-        hint = self._hint(places, version)
+        sources = self._sources(root, embedded, version)
+        found = next(
+            ((known, candidate.source) for candidate in sources if (known := candidate.find(root))), None
+        )
+        hint = self._hint(sources, version)
         if not found:
             elsewhere = self._other_distros.get(root)
             limited = f"; custom_msgs has it for {elsewhere} only" if elsewhere else ""
@@ -353,32 +355,32 @@ class TypeResolver:
         message, source = found
 
         def find(name: str) -> MessageType | None:
-            known = (place.find(name) for place in places)
+            known = (candidate.find(name) for candidate in sources)
             return next((message for message in known if message), BUILTIN.get(name))
 
         types = link(message, find, ros_version=version, hint=hint)
         return Definition(root, types, source, flatten(root, types, ros_version=version), version)
 
-    def _places(self, root: str, embedded: Embedded | None, version: int) -> list[_TypeSource]:
-        places = [
+    def _sources(self, root: str, embedded: Embedded | None, version: int) -> list[_TypeSource]:
+        sources = [
             _TypeSource("the recording", Source.BAG, self._embedded(root, embedded).get),
             _TypeSource("custom_msgs", Source.CUSTOM, self._custom.get),
             _TypeSource("the type registry", Source.CUSTOM, self._registered.get),
         ]
         distro = self.distro
         if distro is None:
-            places += self._agreements(embedded, version)
+            sources += self._agreements(embedded, version)
         elif ros_version(distro) == version:
-            places.append(_TypeSource(distro.value, Source.DISTRO, lambda name: distro_type(distro, name)))
+            sources.append(_TypeSource(distro.value, Source.DISTRO, lambda name: distro_type(distro, name)))
         if version == 2:  # noqa: PLR2004 - a ROS 1 recording always has definitions
-            places.append(_TypeSource("the packages this tool knows", Source.PACKAGE, self._package))
+            sources.append(_TypeSource("the packages this tool knows", Source.PACKAGE, self._package))
         if embedded and embedded.encoding not in _UNSPECIFIED and _is_empty(embedded.text):
             # An empty text is a type without fields, unless a distro has the type: recorders without the definition
             # write an empty text, or a comment.
             known = any(distro_type(distro, root) for distro in (ROS1 if version == 1 else ROS2))
             empty = {} if known else {root: MessageType(root, ())}
-            places.append(_TypeSource("the recording's empty text", Source.BAG, empty.get))
-        return places
+            sources.append(_TypeSource("the recording's empty text", Source.BAG, empty.get))
+        return sources
 
     def _embedded(self, root: str, embedded: Embedded | None) -> Mapping[str, MessageType]:
         if embedded is None or _is_empty(embedded.text):
@@ -398,12 +400,12 @@ class TypeResolver:
 
     def _agreements(self, embedded: Embedded | None, version: int) -> list[_TypeSource]:
         """Return the sources without a distro. A recording without definitions is older than ROS 2 Iron."""
-        places = [self._agreement(f"all ROS {version} distros", ROS1 if version == 1 else ROS2)]
+        sources = [self._agreement(f"all ROS {version} distros", ROS1 if version == 1 else ROS2)]
         if embedded is None and version != 1:
-            places.append(
+            sources.append(
                 self._agreement("all distros until Humble, the last to record no definitions", BEFORE_IRON)
             )
-        return places
+        return sources
 
     def _agreement(self, who: str, distros: tuple[Stores, ...]) -> _TypeSource:
         def find(name: str) -> MessageType | None:
@@ -422,8 +424,8 @@ class TypeResolver:
             self._assumed.setdefault(name, f"{_PACKAGE}{name.partition('/')[0]}")
         return known
 
-    def _hint(self, places: list[_TypeSource], version: int) -> str:
-        searched = f"searched: {', '.join(place.label for place in places)}"
+    def _hint(self, sources: list[_TypeSource], version: int) -> str:
+        searched = f"searched: {', '.join(candidate.label for candidate in sources)}"
         if self.distro and ros_version(self.distro) != version:
             return f"{searched}; the recording is ROS {version}, ros_distro is {self.distro.value}; set the right one"
         remedy = (
