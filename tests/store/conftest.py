@@ -1,4 +1,4 @@
-"""A store to write to, and rows that are quick to make."""
+"""Fixtures of the store tests: a store, its sink and server, and small batches of rows."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def make_rows(times: Sequence[int], source: int = 0) -> pa.RecordBatch:
 
 @pytest.fixture(scope="session")
 def rows() -> Rows:
-    """Make rows of `sample` from their time stamps."""
+    """Return the function that builds a batch of type `sample` from timestamps."""
     return make_rows
 
 
 @pytest.fixture(scope="session")
 def sample() -> OntologyType:
-    """The type of those rows."""
+    """The ontology type of the batches built by `rows`."""
     return SAMPLE
 
 

@@ -1,4 +1,4 @@
-"""The checksum of rows is of their values: not of how they are cut, nor of what a file makes of them."""
+"""Checksums of rows depend on their values only, not on batch boundaries or the storage format."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def through_parquet(table: pa.Table, rows: int) -> list[pa.RecordBatch]:
 
 @settings(max_examples=30)
 @given(st.lists(ROW, min_size=2, max_size=20), st.data())
-def test_it_does_not_depend_on_how_the_rows_are_cut_and_survives_a_file(
+def test_checksum_of_slices_or_parquet_batches_equals_that_of_table(
     rows: list[dict[str, Any]], data: st.DataObject
 ) -> None:
     table = pa.Table.from_pylist(rows, SCHEMA)
@@ -72,9 +72,13 @@ def test_it_does_not_depend_on_how_the_rows_are_cut_and_survives_a_file(
 
 @settings(max_examples=30)
 @given(st.lists(ROW, min_size=1, max_size=8), st.lists(ROW, min_size=1, max_size=8))
-def test_other_values_have_another_checksum(one: list[dict[str, Any]], other: list[dict[str, Any]]) -> None:
+def test_checksum_is_equal_only_for_equal_values(
+    one: list[dict[str, Any]], other: list[dict[str, Any]]
+) -> None:
     tables = [pa.Table.from_pylist(rows, SCHEMA) for rows in (one, other)]
-    files = [through_parquet(table, 100) for table in tables]  # what no file tells apart is the same
+    files = [
+        through_parquet(table, 100) for table in tables
+    ]  # values that Parquet does not distinguish are equal
     same = [pa.Table.from_batches(file, SCHEMA) for file in files]
     assert (checksum(*tables[:1]) == checksum(*tables[1:])) == (
         repr(same[0].to_pylist()) == repr(same[1].to_pylist())
@@ -85,19 +89,19 @@ def test_other_values_have_another_checksum(one: list[dict[str, Any]], other: li
     ("kind", "values"),
     [
         (pa.dictionary(pa.int32(), pa.string()), ["a", None, "b", "a"]),
-        (pa.string_view(), ["a", None, "", "a long text that is no part of its view"]),
+        (pa.string_view(), ["a", None, "", "a long text that is not stored in its view"]),
         (pa.timestamp("ns"), [1, None, 2, 3]),
         (pa.binary(4), [b"abcd", None, b"aaaa", b"bbbb"]),
         (pa.null(), [None] * 4),
     ],
 )
-def test_rarer_columns_count_by_their_values(kind: pa.DataType, values: list[object]) -> None:
+def test_checksum_of_rare_column_type_depends_on_values_only(kind: pa.DataType, values: list[object]) -> None:
     table = pa.table({"column": pa.array(values, kind)})
     assert checksum(table.slice(0, 1), table.slice(1)) == checksum(table)
     assert checksum(table.slice(0, 3)) != checksum(table)
 
 
-def test_what_lies_behind_a_null_does_not_count() -> None:
+def test_checksum_ignores_bytes_of_null_values() -> None:
     valid = pa.py_buffer(b"\x05")
     behind = [pa.py_buffer(bytes([1, middle, 3])) for middle in (2, 9)]
     one, other = (pa.Array.from_buffers(pa.uint8(), 3, [valid, values]) for values in behind)
@@ -105,12 +109,12 @@ def test_what_lies_behind_a_null_does_not_count() -> None:
     assert checksum(pa.table({"c": one})) != checksum(pa.table({"c": pa.array([1, 3, None], pa.uint8())}))
 
 
-def test_order_counts() -> None:
+def test_checksum_depends_on_row_order() -> None:
     table = pa.table({"c": [1, 2, 3]})
     assert checksum(table) != checksum(table.take([0, 2, 1]))
 
 
-def test_segments_together_are_known_where_each_of_them_is() -> None:
+def test_combined_with_missing_checksum_is_none() -> None:
     assert combined([]) is None
     assert combined(["a"]) == "a"
     assert combined(["a", None]) is None

@@ -20,7 +20,7 @@ Rows = Callable[..., pa.RecordBatch]
 
 @pytest.fixture
 def folder(store: Store, sink: StoreSink, rows: Rows, sample: OntologyType) -> Path:
-    """A store with a complete sequence, one whose run ended early, and one that no session was added to."""
+    """A store with a complete sequence, a sequence whose run ended early, and a sequence without sessions."""
     for name in ("complete", "stopped"):
         with sink.open(name, {}) as session:
             session.topic("/t", sample, {}).write(rows([1, 2]))

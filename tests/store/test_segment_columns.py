@@ -39,7 +39,7 @@ def written(path: Path, name: str, values: pa.Array) -> pq.ColumnChunkMetaData:
 
 @pytest.mark.parametrize(("kind", "codec"), [("packed", "UNCOMPRESSED"), ("loose", "ZSTD")])
 @pytest.mark.parametrize("shape", ["binary", "large binary", "bytes in a list", "binary in a struct"])
-def test_blobs_are_compressed_only_where_they_shrink(
+def test_segment_blobs_are_compressed_only_if_compressible(
     tmp_path: Path, shape: str, kind: str, codec: str
 ) -> None:
     blobs = BLOBS[kind]
@@ -55,7 +55,7 @@ def test_blobs_are_compressed_only_where_they_shrink(
 
 
 @pytest.mark.parametrize("knows_how", [True, False])
-def test_a_large_segment_is_on_its_way_to_the_disk_before_it_is_finished(
+def test_segment_large_file_is_flushed_while_it_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, knows_how: bool
 ) -> None:
     sent: list[tuple[int, int]] = []
@@ -74,11 +74,13 @@ def test_a_large_segment_is_on_its_way_to_the_disk_before_it_is_finished(
     size = writer.close().stored_bytes
     assert pq.read_table(tmp_path / "s.parquet").num_rows == 16
     ends = [begin + length for begin, length in sent]
-    assert [begin for begin, _ in sent] == [0, *ends][: len(sent)]  # each from where the last ended
+    assert [begin for begin, _ in sent] == [0, *ends][
+        : len(sent)
+    ]  # each range starts at the end of the previous one
     assert (size - ends[-1] < 5 << 20 and len(sent) > 1) if knows_how else not sent
 
 
-def test_floats_are_split_and_text_gets_a_dictionary(tmp_path: Path) -> None:
+def test_segment_floats_use_byte_stream_split_and_text_a_dictionary(tmp_path: Path) -> None:
     floats = written(tmp_path, "x", pa.array(np.arange(ROWS) / 3))
     assert floats.compression == "ZSTD"
     assert "BYTE_STREAM_SPLIT" in floats.encodings
@@ -87,12 +89,12 @@ def test_floats_are_split_and_text_gets_a_dictionary(tmp_path: Path) -> None:
     assert not written(tmp_path, "i", pa.array(np.arange(ROWS))).has_dictionary_page
 
 
-def test_an_all_null_column_and_a_name_with_a_dot_are_written(tmp_path: Path) -> None:
+def test_segment_all_null_column_and_dotted_name_round_trip(tmp_path: Path) -> None:
     written(tmp_path, "data", pa.array([None] * ROWS, pa.binary()))
     written(tmp_path, "da.ta", pa.array([b"x" * 4000] * ROWS))
 
 
-def test_the_catalog_knows_the_bounds_of_every_column_that_has_some(store: Store, sink: StoreSink) -> None:
+def test_catalog_bounds_cover_columns_with_exact_bounds_only(store: Store, sink: StoreSink) -> None:
     pose = pa.struct([pa.field("x", pa.float64()), pa.field("tags", pa.list_(pa.string()))])
     kind = OntologyType(
         "T",

@@ -1,4 +1,4 @@
-"""Who may call a server, and over what."""
+"""Access to a server: API keys, permissions and TLS."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mosaico_ingest.serve import Keyring, Tls, serve
 Rows = Callable[..., pa.RecordBatch]
 
 
-def test_a_key_may_do_what_its_permission_includes(tmp_path: Path, rows: Rows) -> None:
+def test_key_permits_only_actions_of_its_permission(tmp_path: Path, rows: Rows) -> None:
     ring = Keyring(tmp_path / "keys.json")
     keys = {permission: ring.add(permission) for permission in Permission}
     with serve(tmp_path / "served", port=0, keys=Keyring(tmp_path / "keys.json")) as running:
@@ -51,7 +51,7 @@ def test_a_key_may_do_what_its_permission_includes(tmp_path: Path, rows: Rows) -
     ],
     ids=["none", "no key at all", "a typing mistake", "somebody else's"],
 )
-def test_a_call_without_a_good_key_is_refused(
+def test_call_without_valid_key_is_unauthenticated(
     tmp_path: Path, spoil: Callable[[str], str | None], word: str
 ) -> None:
     ring = Keyring(tmp_path / "keys.json")
@@ -66,7 +66,7 @@ def test_a_call_without_a_good_key_is_refused(
             client.info("drive")
 
 
-def test_a_key_ring_keeps_hashes_and_expiry(tmp_path: Path) -> None:
+def test_keyring_stores_hashes_and_refuses_expired_key(tmp_path: Path) -> None:
     path = tmp_path / "keys.json"
     now = datetime.now(timezone.utc)
     good = Keyring(path).add(Permission.READ, description="dashboard", expires=now + timedelta(days=1))
@@ -85,7 +85,7 @@ def test_a_key_ring_keeps_hashes_and_expiry(tmp_path: Path) -> None:
         Keyring(path)
 
 
-def test_a_server_with_a_certificate_speaks_tls_only(tmp_path: Path, rows: Rows) -> None:
+def test_server_with_certificate_accepts_tls_only(tmp_path: Path, rows: Rows) -> None:
     certificate, key = tmp_path / "cert.pem", tmp_path / "key.pem"
     made = [
         "openssl",

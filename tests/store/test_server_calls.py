@@ -1,4 +1,4 @@
-"""Every call a client makes, and the status of every one that is refused."""
+"""Calls of a client, and the status of each refused call."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from mosaico_ingest.serve import Server, serve
 Rows = Callable[..., pa.RecordBatch]
 
 
-def test_the_handshake_says_what_is_spoken_and_what_fits(client: Client) -> None:
+def test_info_returns_version_and_message_limit(client: Client) -> None:
     info = client.call("info")
     assert info["semver"] == {"major": 0, "minor": 7, "patch": 0, "pre": None}
     assert info["config"]["grpc_max_decode_message_size"] == 50_000_000
     assert client.call("version") == {"version": "0.7.0"}
 
 
-def test_a_sequence_is_written_listed_described_and_read(client: Client, rows: Rows) -> None:
+def test_uploaded_sequence_is_listed_described_and_read(client: Client, rows: Rows) -> None:
     assert client.call("sequence_create", locator="drive", user_metadata={"car": [7]}) is None
     session = client.call("session_create", locator="drive")
     assert set(session) == {"uuid", "locator"}
@@ -63,7 +63,7 @@ def test_a_sequence_is_written_listed_described_and_read(client: Client, rows: R
     assert schema.equals(rows([]).schema)
 
 
-def test_a_time_range_has_its_start_inside_and_its_end_outside(client: Client, rows: Rows) -> None:
+def test_time_range_includes_start_and_excludes_end(client: Client, rows: Rows) -> None:
     client.call("sequence_create", locator="drive", user_metadata={})
     client.upload("drive", "/imu", rows(range(100)))
     window = {"timestamp_ns_start": 10, "timestamp_ns_end": 13}
@@ -83,7 +83,7 @@ def test_a_time_range_has_its_start_inside_and_its_end_outside(client: Client, r
         assert nothing["time_window_info"] == {"interval": None, "row_count": 0}
 
 
-def test_large_rows_come_in_messages_of_a_moderate_size(server: Server, client: Client) -> None:
+def test_do_get_large_rows_are_sent_in_small_batches(server: Server, client: Client) -> None:
     store = Store.open(server.store_path)
     raw = OntologyType("Raw", pa.struct([pa.field("data", pa.binary())]))
     with StoreSink(store).open("s", {}) as session:
@@ -98,7 +98,7 @@ def test_large_rows_come_in_messages_of_a_moderate_size(server: Server, client: 
     assert max(sizes) <= 16
 
 
-def test_notifications_are_kept_listed_and_purged(client: Client, rows: Rows) -> None:
+def test_notifications_are_stored_listed_and_purged(client: Client, rows: Rows) -> None:
     client.call("sequence_create", locator="drive", user_metadata={})
     session = client.call("session_create", locator="drive")
     uuid = client.create_topic(session["uuid"], "drive/imu")
@@ -121,7 +121,9 @@ def test_notifications_are_kept_listed_and_purged(client: Client, rows: Rows) ->
     assert client.call("sequence_notification_list", locator="drive")["notifications"] == []
 
 
-def test_sessions_topics_and_sequences_are_deleted(server: Server, client: Client, rows: Rows) -> None:
+def test_delete_removes_sessions_topics_sequences_and_files(
+    server: Server, client: Client, rows: Rows
+) -> None:
     client.call("sequence_create", locator="drive", user_metadata={})
     client.upload("drive", "/a", rows([1]))
     client.upload("drive", "/b", rows([1]))
@@ -141,7 +143,7 @@ def test_sessions_topics_and_sequences_are_deleted(server: Server, client: Clien
     assert list(Path(server.store_path).rglob("*.parquet")) == []
 
 
-def test_a_topic_that_was_announced_only_can_be_taken_back(client: Client, rows: Rows) -> None:
+def test_topic_delete_before_upload_allows_new_upload(client: Client, rows: Rows) -> None:
     client.call("sequence_create", locator="drive", user_metadata={})
     session = client.call("session_create", locator="drive")["uuid"]
     client.create_topic(session, "drive/a")
@@ -156,7 +158,7 @@ def test_a_topic_that_was_announced_only_can_be_taken_back(client: Client, rows:
     client.call("session_finalize", session_uuid=session)
 
 
-def test_what_is_taken_missing_or_malformed_is_refused(client: Client, rows: Rows) -> None:
+def test_request_with_existing_missing_or_invalid_name_is_refused(client: Client, rows: Rows) -> None:
     client.call("sequence_create", locator="drive", user_metadata={})
     client.call("sequence_create", locator="other", user_metadata={})
     client.upload("drive", "/imu", rows([1]))
@@ -209,7 +211,7 @@ def test_what_is_taken_missing_or_malformed_is_refused(client: Client, rows: Row
         client.call("topic_filter_x")
 
 
-def test_a_refusal_does_not_carry_what_caused_it(client: Client) -> None:
+def test_refusal_contains_no_cause_and_no_other_names(client: Client) -> None:
     client.call("sequence_create", locator="somebody_elses", user_metadata={})
     for call in (
         lambda: client.info("nobodys"),
@@ -222,7 +224,7 @@ def test_a_refusal_does_not_carry_what_caused_it(client: Client) -> None:
         assert "somebody_elses" not in str(told.value)
 
 
-def test_a_topic_is_put_once_by_its_uuid_with_a_time_column(client: Client, rows: Rows) -> None:
+def test_do_put_requires_uuid_and_time_column_and_is_accepted_once(client: Client, rows: Rows) -> None:
     client.call("sequence_create", locator="drive", user_metadata={})
     session = client.call("session_create", locator="drive")["uuid"]
     uuid = client.create_topic(session, "drive/imu")
@@ -242,7 +244,7 @@ def test_a_topic_is_put_once_by_its_uuid_with_a_time_column(client: Client, rows
         client.create_topic(session, "drive/gps")
 
 
-def test_a_session_that_could_not_be_finalized_is_not_called_final(
+def test_session_with_failed_commit_is_not_finalized(
     client: Client, rows: Rows, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def busy(*_: object) -> list[str]:
@@ -259,7 +261,7 @@ def test_a_session_that_could_not_be_finalized_is_not_called_final(
         client.call("session_finalize", session_uuid=session)
 
 
-def test_a_topic_is_taken_while_its_session_is_being_finalized(
+def test_topic_of_session_being_finalized_already_exists(
     client: Client, rows: Rows, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def announced_again(*arguments: Any) -> Any:
@@ -280,7 +282,7 @@ def test_a_topic_is_taken_while_its_session_is_being_finalized(
     assert client.rows("drive/imu") == [1]
 
 
-def test_columns_are_put_in_order_and_the_time_column_may_be_nullable(client: Client) -> None:
+def test_do_put_reorders_columns_and_accepts_nullable_time_column(client: Client) -> None:
     client.call("sequence_create", locator="drive", user_metadata={})
     client.upload("drive", "/imu", pa.record_batch({"x": [1.5, 2.5], "timestamp_ns": [2, 1]}))
     schema = client.flight.get_schema(descriptor_of(resource_locator="drive/imu")).schema
@@ -294,7 +296,7 @@ def test_columns_are_put_in_order_and_the_time_column_may_be_nullable(client: Cl
         client.call("session_finalize", session_uuid=session)
 
 
-def test_a_signal_is_heard_that_another_thread_was_given(server: Server) -> None:
+def test_wait_signal_sent_to_other_thread_is_handled(server: Server) -> None:
     def heard(*_: object) -> None:
         raise InterruptedError
 
@@ -315,7 +317,7 @@ def test_a_signal_is_heard_that_another_thread_was_given(server: Server) -> None
         signal.signal(signal.SIGUSR1, before)
 
 
-def test_many_clients_write_and_read_at_once(server: Server, rows: Rows) -> None:
+def test_concurrent_clients_write_and_read_their_own_rows(server: Server, rows: Rows) -> None:
     start = threading.Barrier(6)
 
     def work(number: int) -> list[int]:
@@ -330,7 +332,7 @@ def test_many_clients_write_and_read_at_once(server: Server, rows: Rows) -> None
     assert found == [[step * 10 + number for step in range(20)] for number in range(6)]
 
 
-def test_what_was_not_finalized_goes_with_the_server(tmp_path: Path, rows: Rows) -> None:
+def test_server_shutdown_discards_open_sessions(tmp_path: Path, rows: Rows) -> None:
     with serve(tmp_path / "served", port=0) as running, Client(running) as client:
         client.call("sequence_create", locator="drive", user_metadata={})
         session = client.call("session_create", locator="drive")["uuid"]
@@ -340,11 +342,11 @@ def test_what_was_not_finalized_goes_with_the_server(tmp_path: Path, rows: Rows)
     assert list(store.path.rglob("*.parquet")) == []
 
 
-def test_a_session_nobody_speaks_of_any_more_is_discarded(tmp_path: Path, rows: Rows) -> None:
+def test_session_idle_beyond_limit_is_discarded(tmp_path: Path, rows: Rows) -> None:
     with serve(tmp_path / "store", port=0, idle_s=0.4) as server, Client(server) as client:
         client.call("sequence_create", locator="drive", user_metadata={})
         session = client.call("session_create", locator="drive")
-        for number in range(4):  # longer than the limit, but never silent for so long
+        for number in range(4):  # longer than the limit in total, but never idle for the limit
             uuid = client.create_topic(session["uuid"], f"drive/{number}")
             client.put(f"drive/{number}", uuid, rows([1]))
             time.sleep(0.15)
@@ -355,6 +357,6 @@ def test_a_session_nobody_speaks_of_any_more_is_discarded(tmp_path: Path, rows: 
         assert list((tmp_path / "store").rglob("*.parquet")) == []
 
 
-def test_a_port_that_is_taken_is_said_so(server: Server, tmp_path: Path) -> None:
+def test_serve_on_used_port_raises_with_port(server: Server, tmp_path: Path) -> None:
     with pytest.raises(SinkError, match=f"{server.port}.*the port is free"):
         serve(tmp_path / "another", port=server.port)

@@ -1,4 +1,4 @@
-"""Whatever comes over the wire is answered or refused, and never an accident inside."""
+"""Any request returns a response or a refusal, never an internal error."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def refused_or_answered(call: Callable[[], object]) -> None:
 
 @settings(max_examples=150)
 @given(name=st.sampled_from(sorted(set(ACTIONS) - {"sequence_delete", "topic_delete"})), body=BODIES)
-def test_any_body_of_an_action(caller: Client, name: str, body: dict[str, Any]) -> None:
+def test_action_with_any_body_has_no_internal_error(caller: Client, name: str, body: dict[str, Any]) -> None:
     refused_or_answered(lambda: caller.call(name, **body))
 
 
@@ -86,7 +86,7 @@ def test_any_body_of_an_action(caller: Client, name: str, body: dict[str, Any]) 
 @given(
     body=st.binary(max_size=40) | st.just(b"[" * 5000) | st.just(b'{"locator":"\\ud800","user_metadata":{}}')
 )
-def test_any_bytes(caller: Client, body: bytes) -> None:
+def test_request_of_any_bytes_has_no_internal_error(caller: Client, body: bytes) -> None:
     for name in ("sequence_create", "query", "topic_create"):
         refused_or_answered(lambda name=name: list(caller.flight.do_action(fl.Action(name, body))))
     refused_or_answered(lambda: caller.flight.get_flight_info(fl.FlightDescriptor.for_command(body)))
@@ -99,14 +99,18 @@ def test_any_bytes(caller: Client, body: bytes) -> None:
     operator=OPERATORS,
     operand=ANYTHING | st.lists(st.integers() | st.floats(), min_size=2, max_size=2),
 )
-def test_any_condition(caller: Client, path: str, operator: str, operand: Any) -> None:
+def test_query_with_any_condition_has_no_internal_error(
+    caller: Client, path: str, operator: str, operand: Any
+) -> None:
     refused_or_answered(lambda: caller.call("query", ontology={f"Sample.{path}": {operator: operand}}))
     refused_or_answered(lambda: caller.call("query", topic={"name": {operator: operand}}))
 
 
 @settings(max_examples=60)
 @given(start=st.none() | st.integers(), end=st.none() | st.integers())
-def test_any_time_range(caller: Client, start: int | None, end: int | None) -> None:
+def test_do_get_with_any_time_range_returns_its_rows_or_is_refused(
+    caller: Client, start: int | None, end: int | None
+) -> None:
     bounds = {"timestamp_ns_start": start, "timestamp_ns_end": end}
     asked = {name: bound for name, bound in bounds.items() if bound is not None}
 

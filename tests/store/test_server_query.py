@@ -1,4 +1,4 @@
-"""A query finds the topics whose rows a scan finds."""
+"""Queries return exactly the topics whose rows match in a scan."""
 
 from __future__ import annotations
 
@@ -118,7 +118,9 @@ ALL = [f"{drive}/{topic}" for drive in ("drive_1", "drive_2") for topic in ("emp
     ],
     ids=str,
 )
-def test_conditions_select_topics(filled: Store, question: Mapping[str, Any], locators: list[str]) -> None:
+def test_query_returns_topics_that_match_all_conditions(
+    filled: Store, question: Mapping[str, Any], locators: list[str]
+) -> None:
     assert sorted(found(filled, **question)) == sorted(locators)
 
 
@@ -127,7 +129,12 @@ SPANS = {"$gt": operator.gt, "$geq": operator.ge, "$lt": operator.lt, "$leq": op
 
 @settings(max_examples=40, deadline=None)
 @given(name=st.sampled_from(sorted(SPANS)), bound=st.integers(-10, 1310), even=st.booleans())
-def test_the_range_is_that_of_the_rows_a_scan_finds(filled: Store, name: str, bound: int, even: bool) -> None:  # noqa: FBT001 - hypothesis gives it by name
+def test_query_time_range_equals_that_of_matching_rows_in_scan(
+    filled: Store,
+    name: str,
+    bound: int,
+    even: bool,  # noqa: FBT001 - hypothesis gives it by name
+) -> None:
     expected: dict[str, tuple[int, int]] = {}
     for drive in ("drive_1", "drive_2"):
         rows = filled.scan(drive, "/front/pose").read_all().to_pylist()
@@ -162,9 +169,7 @@ def counted(tmp_path_factory: pytest.TempPathFactory) -> Store:
 
 @pytest.mark.parametrize("bound", [-1, 0, 0.5, 2.0**53, 2**53 + 1, 2**63, 2**64 - 1, 2.0**64, 1e300], ids=str)
 @pytest.mark.parametrize("name", [*SPANS, "$neq", "$in", "$outside"])
-def test_whole_numbers_no_float_can_hold_are_compared_exactly(
-    counted: Store, name: str, bound: float
-) -> None:
+def test_query_large_integers_are_compared_exactly(counted: Store, name: str, bound: float) -> None:
     compare = {
         **SPANS,
         "$neq": operator.ne,
@@ -180,7 +185,7 @@ def test_whole_numbers_no_float_can_hold_are_compared_exactly(
     assert set(found(counted, ontology={"Counter.count": {name: asked}})) == expected
 
 
-def test_time_stamps_may_be_asked_for_as_floats(counted: Store) -> None:
+def test_query_timestamp_accepts_float_bounds(counted: Store) -> None:
     assert len(found(counted, ontology={"Counter.timestamp_ns": {"$between": [1.6e18, 1.8e18]}})) == 5
     assert found(counted, ontology={"Counter.timestamp_ns": {"$lt": 1.7e18}}) == {}
 
@@ -190,14 +195,14 @@ NAMED = pa.table({"name": NAMES})
 
 
 @given(pattern=st.text("ab*?[]!-\\^.ż&|", max_size=8))
-def test_a_glob_is_that_of_the_shell_for_values_and_for_columns(pattern: str) -> None:
+def test_glob_any_pattern_matches_values_and_columns_like_fnmatch(pattern: str) -> None:
     expected = [name for name in NAMES if fnmatchcase(name, pattern)]
     assert [name for name in NAMES if Glob(pattern).holds(name)] == expected
     column = Glob(pattern).column(pc.field("name"), pa.string())
     assert NAMED.filter(column)["name"].to_pylist() == expected
 
 
-def test_segments_the_bounds_rule_out_are_not_opened(filled: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_query_segments_outside_bounds_are_not_opened(filled: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     def opened(*_: object, **__: object) -> None:
         pytest.fail("a segment was opened")
 
@@ -222,7 +227,7 @@ def test_segments_the_bounds_rule_out_are_not_opened(filled: Store, monkeypatch:
     ],
     ids=str,
 )
-def test_a_query_that_makes_no_sense_is_refused(
+def test_query_with_invalid_condition_is_refused(
     server: Server, client: Client, question: Mapping[str, Any]
 ) -> None:
     store = Store.open(server.store_path)
@@ -232,7 +237,7 @@ def test_a_query_that_makes_no_sense_is_refused(
         client.call("query", **question)
 
 
-def test_a_query_goes_over_the_wire(server: Server, client: Client) -> None:
+def test_query_action_returns_matching_locators(server: Server, client: Client) -> None:
     store = Store.open(server.store_path)
     with StoreSink(store).open("drive", {}) as session:
         session.topic("/pose", POSE, {}).write(poses(range(10), 0))

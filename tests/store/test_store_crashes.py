@@ -1,4 +1,4 @@
-"""A writer is killed at random moments; what is left is the old state or the new one."""
+"""Writers killed at random moments leave either the old or the new sequence."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def writer(
 
 
 def sources(store: Store, sequence: str) -> set[int]:
-    """Return who wrote the rows, after a look at whether all of them are there."""
+    """Check that the sequence is complete, and return the numbers of the writers of its rows."""
     info = store.sequence(sequence)
     assert [topic.name for topic in info.topics] == ["/t0", "/t1", "/t2", "/t3"]
     found: set[int] = set()
@@ -51,7 +51,7 @@ def sources(store: Store, sequence: str) -> set[int]:
 
 
 def assert_tidy(store: Store) -> None:
-    """Nothing is staged, and the files below segments are those of the catalog."""
+    """Check that no staged files remain, and that the segment files equal those in the catalog."""
     store.collect_garbage(grace_s=0)
     known = {
         path
@@ -81,16 +81,16 @@ def kill_and_look(store: Store, moments: random.Random, rounds: int) -> None:
     assert sources(store, "drive") == {current}
 
 
-def test_a_killed_writer_leaves_the_old_or_the_new(store: Store) -> None:
+def test_replace_by_killed_writer_leaves_old_or_new_sequence(store: Store) -> None:
     kill_and_look(store, random.Random(), rounds=3)  # noqa: S311 - any moment will do
 
 
 @pytest.mark.slow
-def test_a_killed_writer_leaves_the_old_or_the_new_200_times(store: Store) -> None:
+def test_replace_by_writer_killed_200_times_leaves_old_or_new_sequence(store: Store) -> None:
     kill_and_look(store, random.Random(), rounds=200)  # noqa: S311 - any moment will do
 
 
-def test_the_name_of_a_killed_writer_is_free_again(store: Store) -> None:
+def test_sequence_name_after_killed_writer_is_available(store: Store) -> None:
     with writer(store, "drive") as process:
         assert process.stdout is not None
         assert [process.stdout.readline() for _ in range(2)] == ["ready\n", "open\n"]
@@ -100,7 +100,7 @@ def test_the_name_of_a_killed_writer_is_free_again(store: Store) -> None:
     assert sources(store, "drive") == {1}
 
 
-def test_garbage_collection_spares_the_living(
+def test_collect_garbage_keeps_open_sessions_and_recent_files(
     store: Store, sink: StoreSink, rows: Rows, sample: OntologyType
 ) -> None:
     with sink.open("drive", {}) as session:
@@ -119,13 +119,13 @@ def test_garbage_collection_spares_the_living(
     assert not orphan.exists()
 
 
-def test_two_writers_write_two_sequences_at_once(store: Store) -> None:
+def test_concurrent_writers_of_two_sequences_succeed(store: Store) -> None:
     with writer(store, "a", source=1) as one, writer(store, "b", source=2) as two:
         assert (one.wait(30), two.wait(30)) == (0, 0)
     assert (sources(store, "a"), sources(store, "b")) == ({1}, {2})
 
 
-def test_only_one_of_two_writers_gets_the_name(
+def test_concurrent_session_of_same_name_raises_sequence_exists(
     sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
 ) -> None:
     with sink.open("drive", {}) as session:
@@ -135,7 +135,7 @@ def test_only_one_of_two_writers_gets_the_name(
     assert store.sequence("drive").rows == 1
 
 
-def test_two_sessions_append_to_a_new_sequence_at_once(
+def test_concurrent_append_sessions_create_one_sequence(
     sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
 ) -> None:
     with sink.open("drive", {}, if_exists=IfExists.APPEND) as one:
@@ -146,7 +146,7 @@ def test_two_sessions_append_to_a_new_sequence_at_once(
     assert len(store.sequence("drive").sessions) == 2
 
 
-def test_a_replacement_does_not_swallow_a_session_added_meanwhile(
+def test_replace_after_concurrent_append_fails_and_keeps_its_rows(
     sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
 ) -> None:
     with sink.open("drive", {}) as session:
@@ -160,7 +160,7 @@ def test_a_replacement_does_not_swallow_a_session_added_meanwhile(
     assert store.sequence("drive").rows == 2
 
 
-def test_a_sequence_deleted_meanwhile_is_not_revived_by_an_append(
+def test_append_to_concurrently_deleted_sequence_fails(
     sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
 ) -> None:
     with sink.open("drive", {}) as session:
@@ -171,7 +171,7 @@ def test_a_sequence_deleted_meanwhile_is_not_revived_by_an_append(
     assert_tidy(store)
 
 
-def test_what_is_deleted_takes_its_files_along(
+def test_delete_session_topic_or_sequence_removes_its_files(
     sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
 ) -> None:
     for times in ([1, 2], [3]):
@@ -196,7 +196,7 @@ def test_what_is_deleted_takes_its_files_along(
 
 
 @pytest.mark.parametrize("disk_s", [0, 0.01], ids=["fast", "slow"])
-def test_what_the_catalog_names_is_on_the_disk_before_it_is_named(
+def test_commit_syncs_files_and_folders_before_catalog(
     store: Store,
     sink: StoreSink,
     rows: Rows,
@@ -205,7 +205,7 @@ def test_what_the_catalog_names_is_on_the_disk_before_it_is_named(
     *,
     disk_s: float,
 ) -> None:
-    """A power cut cannot be had in a test; that files, then their folders, are settled before the commit can."""
+    """Check the order of fsync calls, since a test cannot cut the power."""
     names = ("/a", "/b/c", "/d", "/e", "/f")
     done: list[tuple[str, Path]] = []
     settle, move, enter = layout.fsync, layout._move, Catalog.commit

@@ -1,4 +1,4 @@
-"""What the ground under a store does to it: each costs one line, and leaves nothing half written."""
+"""Faults of disks, files and locks under a store: each raises one error and leaves no partial sequence."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from mosaico_ingest.ontology.types import OntologyType
 Rows = Callable[..., pa.RecordBatch]
 
 
-def test_a_store_that_is_not_there_is_said_so(tmp_path: Path) -> None:
+def test_open_missing_store_without_create_raises_and_creates_nothing(tmp_path: Path) -> None:
     with pytest.raises(SinkError, match="there is no store here"):
         Store.open(tmp_path / "nowhere", create=False)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_newer_store_is_left_alone(store: Store) -> None:
+def test_open_store_of_newer_format_raises_and_changes_nothing(store: Store) -> None:
     with closing(sqlite3.connect(store.layout.catalog)) as db:
         db.execute(f"PRAGMA user_version = {FORMAT + 1}")
         db.execute("ALTER TABLE segments DROP COLUMN checksum")
@@ -47,14 +47,14 @@ def test_a_newer_store_is_left_alone(store: Store) -> None:
         assert db.execute("SELECT sql FROM sqlite_master").fetchall() == before
 
 
-def test_a_catalog_that_is_still_empty_is_no_store_to_read(tmp_path: Path) -> None:
+def test_open_empty_catalog_without_create_raises(tmp_path: Path) -> None:
     (tmp_path / "catalog.sqlite").touch()
     with pytest.raises(SinkError, match="there is no store here"):
         Store.open(tmp_path, create=False)
 
 
-def test_a_store_is_made_once_another_lets_go_of_its_file(tmp_path: Path) -> None:
-    """The switch to the write-ahead log does not wait for a lock by itself."""
+def test_open_locked_new_catalog_waits_for_lock(tmp_path: Path) -> None:
+    """SQLite does not wait for a lock when it switches to the write-ahead log."""
     held = sqlite3.connect(tmp_path / "catalog.sqlite", isolation_level=None, check_same_thread=False)
     with closing(held):
         held.execute("BEGIN EXCLUSIVE")
@@ -66,13 +66,13 @@ def test_a_store_is_made_once_another_lets_go_of_its_file(tmp_path: Path) -> Non
 
 
 def open_catalogs(store: Store) -> int:
-    """Return how many handles of its catalog this process has."""
+    """Return the number of open file descriptors of the catalog in this process."""
     catalog = store.layout.catalog.resolve()
     return sum(link.exists() and link.resolve() == catalog for link in Path("/proc/self/fd").iterdir())
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="open files are listed in /proc")
-def test_a_session_holds_the_catalog_open_and_nobody_off(
+def test_session_keeps_catalog_open_and_allows_other_sessions(
     sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
 ) -> None:
     log = store.layout.catalog.with_name("catalog.sqlite-wal")
@@ -81,15 +81,15 @@ def test_a_session_holds_the_catalog_open_and_nobody_off(
         assert open_catalogs(store)
         with sink.open("other", {}) as other:
             other.topic("/t", sample, {}).write(rows([1]))
-        assert log.stat().st_size, "its end was no checkpoint, as somebody is left"
+        assert log.stat().st_size, "closing a session does not checkpoint while another is open"
     assert open_catalogs(store) == 0
-    assert not log.exists() or not log.stat().st_size, "the last one's end was"
+    assert not log.exists() or not log.stat().st_size, "closing the last session checkpoints"
     with pytest.raises(SinkError, match="exists"), sink.open("s", {}):
         pytest.fail("the session opened")
     assert open_catalogs(store) == 0
 
 
-def test_files_stay_where_nobody_can_say_whether_they_were_entered(
+def test_session_with_unknown_commit_result_keeps_files(
     sink: StoreSink, store: Store, rows: Rows, sample: OntologyType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     entered = Catalog.commit
@@ -109,7 +109,7 @@ def test_files_stay_where_nobody_can_say_whether_they_were_entered(
     assert store.scan("s", "/t").read_all().num_rows == 1
 
 
-def test_another_programs_file_is_left_alone(tmp_path: Path) -> None:
+def test_open_foreign_file_at_catalog_path_raises(tmp_path: Path) -> None:
     with closing(sqlite3.connect(tmp_path / "catalog.sqlite")) as db:
         db.execute("CREATE TABLE theirs (x)")
     with pytest.raises(SinkError, match="not the catalog of a store"):
@@ -119,13 +119,13 @@ def test_another_programs_file_is_left_alone(tmp_path: Path) -> None:
         Store.open(tmp_path)
 
 
-def test_a_file_in_the_way_is_said_so(tmp_path: Path) -> None:
+def test_open_file_at_store_path_raises_with_path(tmp_path: Path) -> None:
     (tmp_path / "mosaico").write_text("a file")
     with pytest.raises(SinkError, match="mosaico"):
         Store.open(tmp_path / "mosaico")
 
 
-def test_a_catalog_left_empty_by_a_crash_is_made_anew(tmp_path: Path) -> None:
+def test_open_empty_catalog_initializes_it(tmp_path: Path) -> None:
     (tmp_path / "catalog.sqlite").touch()
     assert Store.open(tmp_path).sequences() == ()
 
@@ -135,13 +135,13 @@ def _open(path: Path) -> int:
 
 
 @pytest.mark.slow
-def test_many_processes_may_make_the_same_store(tmp_path: Path) -> None:
+def test_open_new_store_in_many_processes_succeeds(tmp_path: Path) -> None:
     with ProcessPoolExecutor(8, mp_context=get_context("spawn")) as pool:
         for attempt in range(5):
             assert list(pool.map(_open, [tmp_path / str(attempt)] * 16)) == [0] * 16
 
 
-def test_a_store_deleted_under_way_fails_the_session(
+def test_session_with_store_deleted_fails(
     sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
 ) -> None:
     with pytest.raises(SinkError, match=r"mosaico.*No such file"), sink.open("s", {}) as session:
@@ -150,7 +150,7 @@ def test_a_store_deleted_under_way_fails_the_session(
     assert not store.path.exists() or list(store.path.rglob("*.parquet")) == []
 
 
-def test_a_catalog_deleted_under_way_fails_the_session(
+def test_session_with_catalog_deleted_fails(
     sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
 ) -> None:
     with pytest.raises(SinkError, match=r"catalog"), sink.open("s", {}) as session:
@@ -160,7 +160,7 @@ def test_a_catalog_deleted_under_way_fails_the_session(
     assert list(store.layout.segment_files()) == []
 
 
-def test_a_segment_deleted_under_way_is_said_so(
+def test_scan_and_stored_with_deleted_segment_raise_with_its_path(
     sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
 ) -> None:
     with sink.open("s", {}) as session:
@@ -173,7 +173,7 @@ def test_a_segment_deleted_under_way_is_said_so(
         session.stored()
 
 
-def test_a_folder_that_cannot_be_written_is_said_so(store: Store) -> None:
+def test_session_in_read_only_store_raises(store: Store) -> None:
     with read_only(store.path):
         assert Store.open(store.path, create=False).sequences() == ()
         with pytest.raises(SinkError, match=r"Read-only|write to"), StoreSink(store).open("s", {}):
@@ -187,7 +187,7 @@ def little_space(tmp_path: Path) -> Iterator[Path]:
         yield folder
 
 
-def test_a_full_disk_fails_the_session_and_leaves_nothing(
+def test_session_on_full_disk_fails_and_leaves_no_files(
     little_space: Path, sample: OntologyType, rows: Rows
 ) -> None:
     store = Store.open(little_space / "mosaico")
@@ -206,7 +206,7 @@ def test_a_full_disk_fails_the_session_and_leaves_nothing(
     assert store.sequence("s").rows == 1
 
 
-def test_a_topic_that_failed_once_cannot_be_committed(
+def test_session_with_failed_topic_write_is_not_committed(
     sink: StoreSink, store: Store, rows: Rows, sample: OntologyType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:
@@ -241,7 +241,7 @@ except SinkError as err:
 """
 
 
-def test_a_file_that_may_not_grow_fails_the_session(store: Store) -> None:
+def test_session_beyond_file_size_limit_fails_and_leaves_no_files(store: Store) -> None:
     done = subprocess.run(  # noqa: S603 - this interpreter, our own script
         [sys.executable, "-c", FULL, str(store.path), str(Path(__file__).parent)],
         capture_output=True,
@@ -255,12 +255,12 @@ def test_a_file_that_may_not_grow_fails_the_session(store: Store) -> None:
     assert list(store.path.rglob("*.parquet")) == []
 
 
-def test_a_busy_catalog_may_be_tried_again() -> None:
+def test_explained_locked_database_raises_sink_unavailable() -> None:
     with pytest.raises(SinkUnavailable, match="busy"), explained("store"):
         raise sqlite3.OperationalError("database is locked")
 
 
-def test_a_lease_is_live_until_it_is_released(tmp_path: Path) -> None:
+def test_lease_is_live_until_released(tmp_path: Path) -> None:
     path = tmp_path / "lock"
     assert not is_live(path)
     lease = Lease(path)

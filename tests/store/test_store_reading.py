@@ -30,7 +30,7 @@ TIMES = st.lists(st.lists(st.integers(0, 60), max_size=8), max_size=6)
     window=st.tuples(st.none() | st.integers(-5, 65), st.none() | st.integers(-5, 65)),
     flushed=st.integers(0, 1),
 )
-def test_a_scan_is_a_sort_and_a_filter(  # noqa: PLR0917 - fixtures and hypothesis name them
+def test_scan_any_sessions_returns_sorted_rows_of_time_range(  # noqa: PLR0917 - fixtures and hypothesis name them
     tmp_path_factory: pytest.TempPathFactory,
     rows: Rows,
     sample: OntologyType,
@@ -55,7 +55,7 @@ def test_a_scan_is_a_sort_and_a_filter(  # noqa: PLR0917 - fixtures and hypothes
     assert store.scan("s", "t", start_ns=start, end_ns=end).read_all()["timestamp_ns"].to_pylist() == expected
 
 
-def test_every_segment_is_sorted_whatever_the_order_of_writing(
+def test_segments_of_unordered_writes_are_sorted_by_time(
     sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
 ) -> None:
     with sink.open("s", {}) as session:
@@ -69,7 +69,7 @@ def test_every_segment_is_sorted_whatever_the_order_of_writing(
     assert [(segment.start_ns, segment.end_ns) for segment in segments] == [(1, 1), (3, 7), (6, 9)]
 
 
-def test_only_the_columns_asked_for_are_read(
+def test_scan_with_columns_returns_timestamp_and_those_columns(
     sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
 ) -> None:
     with sink.open("s", {}) as session:
@@ -79,7 +79,7 @@ def test_only_the_columns_asked_for_are_read(
         store.scan("s", "t", columns=["x"])
 
 
-def test_a_wrong_name_lists_the_right_ones(
+def test_unknown_sequence_or_topic_raises_with_existing_names(
     sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
 ) -> None:
     with sink.open("drive", {}) as session:
@@ -90,7 +90,7 @@ def test_a_wrong_name_lists_the_right_ones(
         store.topic("drive", "gps")
 
 
-def test_duckdb_polars_and_a_glob_read_a_topic(
+def test_topic_files_are_readable_by_duckdb_polars_and_glob(
     sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
 ) -> None:
     with sink.open("drive", {}) as session:
@@ -102,7 +102,7 @@ def test_duckdb_polars_and_a_glob_read_a_topic(
     assert store.paths("drive", "front/imu") == tuple(store.path.glob("segments/drive/front/imu/*.parquet"))
 
 
-def test_the_type_comes_back_with_every_name_and_nullability(sink: StoreSink, store: Store) -> None:
+def test_ontology_type_round_trip_keeps_names_and_nullability(sink: StoreSink, store: Store) -> None:
     inner = pa.struct([pa.field("x", pa.float32(), nullable=False), pa.field("label", pa.string())])
     odd = OntologyType(
         "Odd",
@@ -135,7 +135,7 @@ def test_the_type_comes_back_with_every_name_and_nullability(sink: StoreSink, st
     assert reader.read_all().to_pylist() == [row]
 
 
-def test_what_parquet_cannot_hold_is_refused_before_a_row(sink: StoreSink) -> None:
+def test_topic_of_type_unsupported_by_parquet_raises_on_creation(sink: StoreSink) -> None:
     empty = OntologyType("Empty", pa.struct([pa.field("nothing", pa.struct([]))]))
     twice = OntologyType("Twice", pa.struct([pa.field("a", pa.int8()), pa.field("a", pa.int8())]))
     with sink.open("s", {}) as session:
@@ -144,7 +144,7 @@ def test_what_parquet_cannot_hold_is_refused_before_a_row(sink: StoreSink) -> No
                 session.topic("/t", ontology, {})
 
 
-def test_a_session_holds_no_more_than_its_buffer(tmp_path: Path, rows: Rows, sample: OntologyType) -> None:
+def test_staging_buffered_bytes_stay_within_limit(tmp_path: Path, rows: Rows, sample: OntologyType) -> None:
     staging = Staging(tmp_path, lambda _, number: tmp_path / f"{number}.parquet", buffer_bytes=100_000)
     topics = [StoreTopic(staging, f"/{i}", sample, "{}", folder=tmp_path) for i in range(5)]
     staging.topics = {topic.name: topic for topic in topics}
@@ -156,7 +156,7 @@ def test_a_session_holds_no_more_than_its_buffer(tmp_path: Path, rows: Rows, sam
     assert sum(segment.rows for topic in topics for segment in topic.segments) == 20_000
 
 
-def test_a_merge_holds_one_batch_of_each_segment(
+def test_scan_of_interleaved_segments_returns_limited_sorted_batches(
     sink: StoreSink, store: Store, rows: Rows, sample: OntologyType
 ) -> None:
     for source in range(3):

@@ -1,4 +1,4 @@
-"""A process that writes one sequence and may be killed: `python writer_process.py STORE SEQUENCE IF_EXISTS N`."""
+"""A process that writes one sequence until it completes or is killed: `python writer_process.py STORE SEQUENCE IF_EXISTS N`."""
 
 from __future__ import annotations
 
