@@ -1,4 +1,4 @@
-"""Measure a batch without offsets, received as it is or validated; the former crashes the process."""
+"""Measure a batch without offsets, unchanged or validated; the unchanged batch crashes the process."""
 
 from __future__ import annotations
 

@@ -182,7 +182,7 @@ def test_validated_batch_without_offsets_can_be_measured(ontology: OntologyType,
 
 
 def test_batch_without_offsets_crashes_unless_validated() -> None:
-    """Without this the other tests of such batches would prove nothing."""
+    """Prove that the batches of the other tests crash without validation."""
     script = Path(__file__).with_name("measure_hollow_batch.py")
     outcomes = [
         subprocess.run([sys.executable, script, how], check=False).returncode  # noqa: S603 - our own script

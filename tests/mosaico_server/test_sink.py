@@ -57,7 +57,7 @@ def write(server: Mosaicod, *times: int, if_exists: IfExists = IfExists.FAIL, to
         session.topic(topic, NUMBER, {"unit": "m"}).write(numbers(*times))
 
 
-def test_the_calls_are_those_of_the_protocol_in_its_order(server: Mosaicod) -> None:
+def test_sink_upload_sends_protocol_calls_in_order(server: Mosaicod) -> None:
     write(server, 1, 2)
     assert server.calls == [
         "info",
@@ -87,7 +87,7 @@ def test_the_calls_are_those_of_the_protocol_in_its_order(server: Mosaicod) -> N
     assert server.topics["seq/n"].table().to_batches() == [numbers(1, 2)]
 
 
-def test_the_server_is_asked_what_it_holds(server: Mosaicod) -> None:
+def test_stored_returns_rows_and_time_range_of_server(server: Mosaicod) -> None:
     with ServerSink(target(server)).open("seq", {}) as session:
         session.topic("/n", NUMBER, {}).write(numbers(3, 1, 2))
         session.topic("/empty", NUMBER, {})
@@ -97,7 +97,7 @@ def test_the_server_is_asked_what_it_holds(server: Mosaicod) -> None:
     assert server.topics["seq/empty"].state == "final"
 
 
-def test_small_batches_travel_together_and_large_ones_in_parts() -> None:
+def test_upload_coalesces_small_batches_and_splits_large_ones() -> None:
     with running(Mosaicod(message_bytes=100_000)) as server:
         with ServerSink(target(server)).open("seq", {}) as session:
             few = session.topic("/few", NUMBER, {})
@@ -109,7 +109,7 @@ def test_small_batches_travel_together_and_large_ones_in_parts() -> None:
         assert [chunk.num_rows for chunk in server.topics["seq/many"].chunks] == [2, 2, 2, 1]
 
 
-def test_a_row_no_message_can_hold_is_refused_and_the_topic_goes_on() -> None:
+def test_write_row_above_message_limit_raises_and_topic_continues() -> None:
     with running(Mosaicod(message_bytes=100_000)) as server:
         with ServerSink(target(server)).open("seq", {}) as session:
             writer = session.topic("/b", BLOB, {})
@@ -122,7 +122,7 @@ def test_a_row_no_message_can_hold_is_refused_and_the_topic_goes_on() -> None:
         assert server.topics["seq/b"].table().column("data").to_pylist() == [b"x" * 6]
 
 
-def test_what_waits_in_memory_is_bounded_over_all_topics(server: Mosaicod) -> None:
+def test_session_buffered_bytes_of_all_topics_stay_within_limit(server: Mosaicod) -> None:
     with ServerSink(target(server), buffer_bytes=10_000).open("seq", {}) as session:
         writers = [session.topic(f"/t{n}", BLOB, {}) for n in range(4)]
         for _ in range(10):
@@ -132,7 +132,7 @@ def test_what_waits_in_memory_is_bounded_over_all_topics(server: Mosaicod) -> No
     assert all(len(topic.chunks) > 1 for topic in server.topics.values())
 
 
-def test_topics_can_be_written_from_several_threads(server: Mosaicod) -> None:
+def test_session_topics_written_in_threads_store_every_row(server: Mosaicod) -> None:
     with ServerSink(target(server), buffer_bytes=20_000).open("seq", {}) as session:
         writers = [session.topic(f"/t{n}", NUMBER, {}) for n in range(6)]
         threads = [
@@ -145,7 +145,7 @@ def test_topics_can_be_written_from_several_threads(server: Mosaicod) -> None:
     assert [topic.rows for topic in session.stored()] == [300] * 6
 
 
-def test_an_exception_leaves_no_trace(server: Mosaicod) -> None:
+def test_session_exception_deletes_new_sequence(server: Mosaicod) -> None:
     with pytest.raises(ZeroDivisionError), ServerSink(target(server)).open("seq", {}) as session:
         session.topic("/n", NUMBER, {}).write(numbers(1))
         raise ZeroDivisionError
@@ -153,7 +153,7 @@ def test_an_exception_leaves_no_trace(server: Mosaicod) -> None:
     write(server, 1)
 
 
-def test_an_exception_in_an_added_session_keeps_the_sequence(server: Mosaicod) -> None:
+def test_append_session_exception_keeps_sequence(server: Mosaicod) -> None:
     write(server, 1)
     sink = ServerSink(target(server))
     with pytest.raises(ZeroDivisionError), sink.open("seq", {}, if_exists=IfExists.APPEND) as session:
@@ -162,7 +162,7 @@ def test_an_exception_in_an_added_session_keeps_the_sequence(server: Mosaicod) -
     assert list(server.topics) == ["seq/n"]
 
 
-def test_a_session_without_topics_is_never_begun(server: Mosaicod) -> None:
+def test_session_without_topics_creates_sequence_only(server: Mosaicod) -> None:
     with ServerSink(target(server)).open("seq", META) as session:
         pass
     assert server.sequences == {"seq": META}
@@ -170,7 +170,7 @@ def test_a_session_without_topics_is_never_begun(server: Mosaicod) -> None:
     assert session.stored() == ()
 
 
-def test_append_adds_new_topics_and_refuses_known_ones(server: Mosaicod) -> None:
+def test_append_adds_new_topics_and_refuses_existing_ones(server: Mosaicod) -> None:
     write(server, 1)
     write(server, 2, if_exists=IfExists.APPEND, topic="/m")
     assert set(server.topics) == {"seq/n", "seq/m"}
@@ -179,13 +179,13 @@ def test_append_adds_new_topics_and_refuses_known_ones(server: Mosaicod) -> None
     assert server.topics["seq/n"].table().num_rows == 1
 
 
-def test_replace_deletes_the_old_sequence(server: Mosaicod) -> None:
+def test_replace_deletes_old_sequence(server: Mosaicod) -> None:
     write(server, 1)
     write(server, 2, 3, if_exists=IfExists.REPLACE, topic="/m")
     assert set(server.topics) == {"seq/m"}
 
 
-def test_a_replacement_that_cannot_begin_says_that_the_old_is_gone(server: Mosaicod) -> None:
+def test_replace_with_refused_create_reports_deleted_sequence(server: Mosaicod) -> None:
     write(server, 1)
     server.faults.refuse["sequence_create"] = [pa.ArrowInvalid("odd name")]
     with pytest.raises(
@@ -194,13 +194,13 @@ def test_a_replacement_that_cannot_begin_says_that_the_old_is_gone(server: Mosai
         write(server, 2, if_exists=IfExists.REPLACE)
 
 
-def test_a_name_taken_meanwhile_is_taken(server: Mosaicod) -> None:
+def test_open_sequence_created_concurrently_raises_sequence_exists(server: Mosaicod) -> None:
     server.faults.refuse["sequence_create"] = [exists("sequence seq")]
     with pytest.raises(SequenceExists, match=r"^seq: "):
         write(server, 1)
 
 
-def test_names_and_metadata_are_checked_before_the_first_byte() -> None:
+def test_open_invalid_name_or_metadata_raises_before_connecting() -> None:
     nowhere = ServerSink(ServerTarget("127.0.0.1", 1))
     with pytest.raises(SinkError, match="sequence name"), nowhere.open("a b", {}):
         pytest.fail("opened")
@@ -208,7 +208,7 @@ def test_names_and_metadata_are_checked_before_the_first_byte() -> None:
         pytest.fail("opened")
 
 
-def test_errors_go_to_their_topic_or_to_the_sequence(server: Mosaicod) -> None:
+def test_note_error_is_stored_for_topic_or_sequence(server: Mosaicod) -> None:
     with ServerSink(target(server)).open("seq", {}) as session:
         session.topic("/n", NUMBER, {})
         session.note_error("stopped")
@@ -217,7 +217,7 @@ def test_errors_go_to_their_topic_or_to_the_sequence(server: Mosaicod) -> None:
     assert server.notes == {"seq": ["stopped", "/x: never opened"], "seq/n": ["one row lost"]}
 
 
-def test_an_older_server_is_spoken_to_and_counted_by_reading(server: Mosaicod) -> None:
+def test_stored_on_older_server_counts_rows_by_reading(server: Mosaicod) -> None:
     server.faults.version = "0.6.1"
     with connect(target(server)) as client:
         assert client.version == "0.6.1"
@@ -229,7 +229,7 @@ def test_an_older_server_is_spoken_to_and_counted_by_reading(server: Mosaicod) -
 
 
 class TestFaults:
-    def test_a_refused_topic_leaves_the_others(self, server: Mosaicod) -> None:
+    def test_topic_refused_by_server_keeps_other_topics(self, server: Mosaicod) -> None:
         server.faults.refuse["topic_create"] = [pa.ArrowInvalid("bad schema")]
         with ServerSink(target(server)).open("seq", {}) as session:
             with pytest.raises(SinkError, match="topic_create is refused: bad schema"):
@@ -237,7 +237,7 @@ class TestFaults:
             session.topic("/good", NUMBER, {}).write(numbers(1))
         assert list(server.topics) == ["seq/good"]
 
-    def test_a_broken_upload_loses_its_topic_and_leaves_the_others(self, server: Mosaicod) -> None:
+    def test_upload_refused_fails_its_topic_and_keeps_others(self, server: Mosaicod) -> None:
         def refuse(topic: str, _: int) -> None:
             if topic == "seq/bad":
                 raise pa.ArrowInvalid("no such column")
@@ -255,7 +255,7 @@ class TestFaults:
                 bad.write(numbers(3))
         assert [(topic.topic, topic.rows) for topic in session.stored()] == [("/good", 2), ("/bad", 0)]
 
-    def test_a_session_whose_only_topic_broke_is_taken_back(self, server: Mosaicod) -> None:
+    def test_session_with_only_failed_topic_is_deleted(self, server: Mosaicod) -> None:
         server.faults.refuse["do_put"] = [pa.ArrowInvalid("no room")]
         with ServerSink(target(server), buffer_bytes=0).open("seq", META) as session:
             writer = session.topic("/n", NUMBER, {})
@@ -266,7 +266,7 @@ class TestFaults:
         assert (server.sequences, server.sessions, server.topics) == ({"seq": META}, {}, {})
         assert [topic.rows for topic in session.stored()] == [0]
 
-    def test_a_refusal_at_the_end_discards_everything(self, server: Mosaicod) -> None:
+    def test_upload_refused_at_close_deletes_sequence(self, server: Mosaicod) -> None:
         def refuse(topic: str, _: int) -> None:
             raise pa.ArrowInvalid(f"{topic} is odd")
 
@@ -275,31 +275,31 @@ class TestFaults:
             write(server, 1)
         assert (server.sequences, server.topics) == ({}, {})
 
-    def test_a_refused_finalize_discards_everything(self, server: Mosaicod) -> None:
+    def test_finalize_refused_deletes_sequence(self, server: Mosaicod) -> None:
         server.faults.refuse["session_finalize"] = [precondition("not now")]
         with pytest.raises(SinkError, match="session_finalize is refused: failed precondition: not now"):
             write(server, 1)
         assert (server.sequences, server.topics) == ({}, {})
 
     @pytest.mark.parametrize("action", ["sequence_create", "session_finalize"])
-    def test_a_lost_answer_is_looked_up_before_asking_again(self, server: Mosaicod, action: str) -> None:
+    def test_action_with_lost_response_is_not_repeated(self, server: Mosaicod, action: str) -> None:
         server.faults.lose_response[action] = 1
         write(server, 1, 2)
         assert server.topics["seq/n"].state == "final"
         assert server.calls.count(action) == 1
 
     @pytest.mark.parametrize("action", ["sequence_create", "session_finalize"])
-    def test_an_action_that_did_not_happen_is_asked_again(self, server: Mosaicod, action: str) -> None:
+    def test_action_unavailable_is_retried(self, server: Mosaicod, action: str) -> None:
         server.faults.refuse[action] = [fl.FlightUnavailableError("away")]
         write(server, 1, 2)
         assert server.topics["seq/n"].state == "final"
 
-    def test_a_handshake_is_repeated_while_the_server_starts(self, server: Mosaicod) -> None:
+    def test_connect_to_starting_server_retries_handshake(self, server: Mosaicod) -> None:
         server.faults.refuse["info"] = [fl.FlightUnavailableError("starting")] * 2
         write(server, 1)
         assert server.calls.count("info") == 3
 
-    def test_a_slow_server_is_given_up(self, server: Mosaicod) -> None:
+    def test_connect_to_slow_server_raises_after_timeout(self, server: Mosaicod) -> None:
         server.faults.response_delay_s = 0.5
         begin = time.monotonic()
         with (
@@ -309,7 +309,7 @@ class TestFaults:
             pytest.fail("connected")
         assert time.monotonic() - begin < 2
 
-    def test_a_line_cut_in_the_middle_is_one_error_that_may_be_tried_again(
+    def test_upload_with_lost_connection_raises_retryable_error(
         self, server: Mosaicod, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr("mosaico_ingest.destinations.server.client._DELAYS_S", (0.01,))
@@ -328,7 +328,7 @@ class TestFaults:
         assert caught.value.retryable
         assert "an unfinished session of seq may remain on the server" in str(caught.value)
 
-    def test_upload_continues_after_the_connection_is_restored(self, server: Mosaicod) -> None:
+    def test_connect_retries_until_connection_is_restored(self, server: Mosaicod) -> None:
         proxy = Proxy(server.port)
         proxy.cut()
         threading.Timer(0.5, proxy.restore).start()
@@ -338,7 +338,7 @@ class TestFaults:
 
 
 class TestKeys:
-    def test_the_key_is_sent_and_let_in(self, server: Mosaicod) -> None:
+    def test_session_with_valid_key_stores_rows(self, server: Mosaicod) -> None:
         server.keys[make_key("w")] = "write"
         with ServerSink(target(server, api_key=make_key("w"))).open("seq", {}) as session:
             session.topic("/n", NUMBER, {}).write(numbers(1))
@@ -356,7 +356,7 @@ class TestKeys:
             ),
         ],
     )
-    def test_a_key_that_is_not_let_in_is_one_error_at_once(
+    def test_session_with_refused_key_raises_without_retry(
         self, server: Mosaicod, key: str | None, reason: str
     ) -> None:
         server.keys.update({make_key("w"): "write", make_key("r"): "read"})
@@ -371,7 +371,7 @@ class TestKeys:
             assert key not in str(caught.value)
             assert key not in repr(caught.value.__cause__)
 
-    def test_a_key_is_in_no_repr_and_no_pickle_of_an_error(self, server: Mosaicod) -> None:
+    def test_key_is_absent_from_repr_and_pickled_error(self, server: Mosaicod) -> None:
         server.keys[make_key("w")] = "write"
         key = make_key("wrong")
         sink = ServerSink(target(server, api_key=key))
@@ -381,7 +381,7 @@ class TestKeys:
         assert key.encode() not in pickle.dumps(caught.value)
 
     @pytest.mark.parametrize("key", ["msco_ü", "msco_\n", "a b"])
-    def test_a_key_that_cannot_be_sent_is_refused_here(self, key: str) -> None:
+    def test_key_with_invalid_characters_raises_before_connecting(self, key: str) -> None:
         sink = ServerSink(ServerTarget("127.0.0.1", 1, api_key=key))
         with (
             pytest.raises(SinkError, match="the API key contains characters that are not allowed") as caught,
@@ -393,7 +393,7 @@ class TestKeys:
     @pytest.mark.parametrize(
         ("permission", "warned"), [("write", True), ("delete", False), ("manage", False)]
     )
-    def test_a_key_that_may_not_delete_is_known_beforehand(
+    def test_preflight_key_without_delete_permission_warns(
         self, server: Mosaicod, permission: str, *, warned: bool
     ) -> None:
         server.keys[make_key("k")] = permission
@@ -402,14 +402,14 @@ class TestKeys:
         assert [finding.rule for finding in findings] == ["delete-permission"] * warned
         assert server.calls == ["info", "session_delete"]
 
-    def test_a_key_nobody_knows_is_no_warning_but_an_error(self, server: Mosaicod) -> None:
+    def test_preflight_unknown_key_raises(self, server: Mosaicod) -> None:
         server.keys[make_key("k")] = "write"
         with pytest.raises(SinkError, match="the API key is refused"):
             ServerDestination(target(server, api_key=make_key("other"))).preflight(
                 "seq", SessionLevelErrorPolicy.Delete
             )
 
-    def test_a_session_that_may_not_be_deleted_is_told(self, server: Mosaicod) -> None:
+    def test_session_without_delete_permission_reports_remaining_session(self, server: Mosaicod) -> None:
         server.keys[make_key("w")] = "write"
         sink = ServerSink(target(server, api_key=make_key("w")))
         with (
@@ -422,14 +422,14 @@ class TestKeys:
             raise SinkError("enough")
 
 
-def test_a_sequence_that_exists_is_refused(server: Mosaicod) -> None:
+def test_open_existing_sequence_raises_sequence_exists(server: Mosaicod) -> None:
     write(server, 1)
     for choice in (IfExists.FAIL, IfExists.SKIP):
         with pytest.raises(SequenceExists, match=r"^seq: "):
             write(server, 2, if_exists=choice)
 
 
-def test_another_flight_server_is_told_apart() -> None:
+def test_connect_to_other_flight_server_raises() -> None:
     with (
         fl.FlightServerBase("grpc://127.0.0.1:0") as other,
         pytest.raises(SinkError, match="the Flight server at this address is not a Mosaico server"),
@@ -439,13 +439,13 @@ def test_another_flight_server_is_told_apart() -> None:
 
 
 class Babbling(Mosaicod):
-    """Answers the handshake in another language."""
+    """A server whose handshake response is not JSON."""
 
     def do_action(self, context: fl.ServerCallContext, action: fl.Action) -> Iterator[bytes]:  # noqa: ARG002 - Flight's signature
         yield b"\x0a\x05hello"
 
 
-def test_an_answer_in_another_language_is_told() -> None:
+def test_connect_undecodable_response_raises() -> None:
     with (
         running(Babbling()) as server,
         pytest.raises(SinkError, match="the response to info cannot be decoded: Invalid JSON"),
@@ -454,22 +454,22 @@ def test_an_answer_in_another_language_is_told() -> None:
         pytest.fail("connected")
 
 
-def test_an_address_is_spelled_as_a_url() -> None:
+def test_address_str_is_url_without_key() -> None:
     assert str(Address("::1", 6726, tls=True, key="secret")) == "grpc+tls://[::1]:6726"
     assert "secret" not in repr(Address("::1", 6726, tls=True, key="secret"))
 
 
-def test_nothing_is_logged(server: Mosaicod, caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+def test_sink_upload_logs_nothing(server: Mosaicod, caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
     with caplog.at_level(logging.DEBUG):
         write(server, 1)
     assert not caplog.records
     assert not list(tmp_path.iterdir())
 
 
-def test_a_server_that_never_takes_an_upload_ends_it(
+def test_upload_to_stuck_server_raises_after_timeout_and_deletes_sequence(
     server: Mosaicod, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is stuck costs its limit once, and the rest is cleared away."""
+    """The timeout applies once, not once per topic."""
     monkeypatch.setattr("mosaico_ingest.destinations.server.upload._UPLOAD_S", 0.3)
     monkeypatch.setattr("mosaico_ingest.destinations.server.upload._LOCK_S", 0.2)
     going_on = threading.Event()
@@ -486,8 +486,8 @@ def test_a_server_that_never_takes_an_upload_ends_it(
     going_on.set()
 
 
-def test_an_interrupt_is_heard_while_the_server_does_not_answer() -> None:
-    # A shell's background job is started deaf to Ctrl-C, and so is what it starts.
+def test_connect_interrupted_while_waiting_raises_keyboard_interrupt() -> None:
+    # Background jobs of a shell ignore SIGINT, and their child processes inherit this.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         _interrupt_a_handshake()

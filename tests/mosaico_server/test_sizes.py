@@ -46,7 +46,7 @@ ROWS = st.lists(
 
 @settings(deadline=None, max_examples=60)
 @given(rows=ROWS, most=st.integers(64, 6000), cut=st.tuples(st.integers(0, 5), st.integers(0, 40)))
-def test_pieces_cover_every_row_and_fit_into_a_message(
+def test_row_spans_cover_every_row_and_fit_into_message(
     rows: list[dict[str, Any]], most: int, cut: tuple[int, int]
 ) -> None:
     batch = pa.RecordBatch.from_pylist(rows, SCHEMA).slice(*cut)
@@ -60,7 +60,7 @@ def test_pieces_cover_every_row_and_fit_into_a_message(
         assert encoded <= size + framing_bytes(SCHEMA)
 
 
-def test_the_estimate_is_near_the_truth() -> None:
+def test_row_spans_sizes_approximate_encoded_size() -> None:
     rows = [
         {"text": "x" * 50, "list": ["ab"] * 4, "points": [{"x": 1.0, "name": "n"}], "fixed": [1, 2, 3]}
     ] * 4000
@@ -72,7 +72,7 @@ def test_the_estimate_is_near_the_truth() -> None:
     assert sum(parts) == pytest.approx(whole, rel=0.12)
 
 
-def test_lists_of_millions_of_values_cost_no_memory_to_measure() -> None:
+def test_row_spans_large_lists_allocate_little_memory() -> None:
     grids = pa.array([np.zeros(4_000_000, np.int8)] * 4, pa.list_(pa.int8()))
     tracemalloc.start()
     spans = row_spans(pa.record_batch({"grid": grids}), max_bytes=9_000_000)
@@ -82,13 +82,13 @@ def test_lists_of_millions_of_values_cost_no_memory_to_measure() -> None:
     assert peak_bytes < 100_000
 
 
-def test_pieces_are_as_few_as_there_can_be() -> None:
+def test_row_spans_fixed_width_rows_fill_each_span() -> None:
     batch = pa.record_batch({"a": pa.array(range(1000), pa.int64())})
     spans = row_spans(batch, max_bytes=8 * 99)
     assert [count for _, count, _ in spans] == [99] * 10 + [10]
 
 
-def test_a_row_that_is_larger_is_a_piece_of_its_own() -> None:
+def test_row_spans_row_above_limit_is_a_single_span() -> None:
     batch = pa.record_batch({"a": [b"x", b"y" * 5000, b"z"]})
     assert [(first, count) for first, count, _ in row_spans(batch, max_bytes=100)] == [
         (0, 1),
@@ -97,6 +97,6 @@ def test_a_row_that_is_larger_is_a_piece_of_its_own() -> None:
     ]
 
 
-def test_a_type_without_a_fixed_width_shares_its_bytes_out_evenly() -> None:
+def test_row_spans_string_view_splits_rows_evenly() -> None:
     batch = pa.record_batch({"a": pa.array(["x" * 100] * 10, pa.string_view())})
     assert [count for _, count, _ in row_spans(batch, max_bytes=batch.nbytes // 2)] == [5, 5]
