@@ -1,7 +1,7 @@
 """Paths behind URLs: a subset of `pathlib.Path` over pyarrow file systems, and their errors.
 
-pyarrow's file systems need no further package, and Parquet reads and writes them natively; obstore or fsspec would be
-a second client, and would still need a class with these methods of `pathlib.Path`.
+pyarrow's file systems need no additional dependency, and its Parquet reader and writer support them directly. obstore
+or fsspec would add a second client, and would still need a class with these methods of `pathlib.Path`.
 """
 
 from __future__ import annotations
@@ -24,8 +24,6 @@ from msgspec import Struct
 
 from mosaico_ingest.errors import IngestError, Unreachable
 
-if TYPE_CHECKING:
-    from pyarrow.fs import FileSystem
 if TYPE_CHECKING:
     import pyarrow as pa
     from pyarrow.fs import FileInfo, FileSystem
@@ -96,78 +94,80 @@ def is_transient(err: OSError) -> bool:
 
 
 _ATTEMPTS = 5
-"""Maximum number of attempts per request, with a delay that doubles."""
+"""Maximum number of attempts per S3 request, with a delay that doubles."""
 _CONNECT_S, _REQUEST_S = 5.0, 30.0
+"""Timeouts of a connection and of a request to S3, in seconds."""
 _RETRY_S = 30.0
+"""Time limit for all attempts of a GCS request, in seconds."""
 
 
 def filesystem(root: str, options: str) -> FileSystem:
-    """Return the file system of `s3://bucket`, one for each process and set of options.
+    """Return the file system of a root such as `s3://bucket`, cached per process and options.
 
     Raises:
         IngestError: The scheme or an option is unknown.
-        Unreachable: The bucket's region could not be asked for.
+        Unreachable: The region of the bucket cannot be determined.
     """
-    return _made(root, options, os.getpid())  # a connection must not cross a fork
+    return _cached_filesystem(root, options, os.getpid())  # a connection must not cross a fork
 
 
 @lru_cache(maxsize=64)
-def _made(root: str, options: str, _process: int) -> FileSystem:
+def _cached_filesystem(root: str, options: str, _process: int) -> FileSystem:
     scheme, _, bucket = root.partition("://")
-    make, known = SCHEMES[scheme]
-    return make(bucket, _options(root, options, known))
+    create, option_names = SCHEMES[scheme]
+    return create(bucket, _options(root, options, option_names))
 
 
-def _options(root: str, options: str, known: tuple[str, ...]) -> dict[str, str]:
+def _options(root: str, options: str, names: tuple[str, ...]) -> dict[str, str]:
     """Return the options of a URL. The error never contains their values, because they may be secret."""
     values = {name: values[-1] for name, values in parse_qs(options, keep_blank_values=True).items()}
     for name in values:
-        if name not in known:
+        if name not in names:
             raise IngestError(
-                f"unknown URL option {name!r}", where=root, hint=f"the options are {', '.join(known)}"
+                f"unknown URL option {name!r}", where=root, hint=f"the options are {', '.join(names)}"
             )
     return values
 
 
-def _s3(bucket: str, given: dict[str, str]) -> FileSystem:
+def _s3(bucket: str, options: dict[str, str]) -> FileSystem:
     from pyarrow import fs  # noqa: PLC0415 - slow to import, and only jobs with URLs need it
 
-    region = given.get("region")
-    if region is None and "endpoint_override" not in given:
+    region = options.get("region")
+    if region is None and "endpoint_override" not in options:
         with reaching(f"s3://{bucket}"):
             region = fs.resolve_s3_region(bucket)
     return fs.S3FileSystem(
         region=region,
-        scheme=given.get("scheme", "https"),
-        endpoint_override=given.get("endpoint_override"),
-        anonymous=given.get("anonymous") == "true",
+        scheme=options.get("scheme", "https"),
+        endpoint_override=options.get("endpoint_override"),
+        anonymous=options.get("anonymous") == "true",
         connect_timeout=_CONNECT_S,
         request_timeout=_REQUEST_S,
         retry_strategy=fs.AwsStandardS3RetryStrategy(max_attempts=_ATTEMPTS),
-        allow_delayed_open=True,  # pyright: ignore[reportCallIssue] - the stubs are older; small objects are sent with one request
+        allow_delayed_open=True,  # pyright: ignore[reportCallIssue] - the stubs are older; the option sends small objects in one request
     )
 
 
-def _gs(_bucket: str, given: dict[str, str]) -> FileSystem:
+def _gs(_bucket: str, options: dict[str, str]) -> FileSystem:
     from pyarrow import fs  # noqa: PLC0415 - slow to import, and only jobs with URLs need it
 
     return fs.GcsFileSystem(
-        anonymous=given.get("anonymous") == "true",
-        scheme=given.get("scheme", "https"),
-        endpoint_override=given.get("endpoint_override"),
+        anonymous=options.get("anonymous") == "true",
+        scheme=options.get("scheme", "https"),
+        endpoint_override=options.get("endpoint_override"),
         retry_time_limit=timedelta(seconds=_RETRY_S),
     )
 
 
-_Make = Callable[[str, dict[str, str]], "FileSystem"]
-SCHEMES: dict[str, tuple[_Make, tuple[str, ...]]] = {
+_Factory = Callable[[str, dict[str, str]], "FileSystem"]
+SCHEMES: dict[str, tuple[_Factory, tuple[str, ...]]] = {
     "s3": (_s3, ("endpoint_override", "scheme", "region", "anonymous")),
     "gs": (_gs, ("endpoint_override", "scheme", "anonymous")),
 }
 """The supported schemes, with the options that are allowed after `?`."""
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/(?=[^/])|([A-Za-z][A-Za-z0-9+.-]+)://")
-"""One slash is accepted too, since `Path` reduces the two slashes of a URL."""
+"""A URL; one slash is accepted too, because `Path` merges the two slashes of a URL."""
 
 
 class RemoteStat(Struct, frozen=True):
@@ -197,22 +197,22 @@ class RemotePath:
         return f"{self.root}/{self.key}".rstrip("/")
 
     def __truediv__(self, name: str) -> RemotePath:
-        """Return the path below."""
+        """Return the path of an entry of this folder."""
         return replace(self, key="/".join(part for part in (self.key, name.strip("/")) if part), listed=None)
 
     @property
     def url(self) -> str:
-        """The URL with its options, from which `as_path` makes the same path."""
+        """The URL with its options; `as_path` converts it back to the same path."""
         return f"{self}?{self.options}" if self.options else str(self)
 
     @property
     def name(self) -> str:
-        """The last part."""
+        """The last component of the path, or the bucket."""
         return self.key.rpartition("/")[2] or self.root.rpartition("/")[2]
 
     @property
     def suffix(self) -> str:
-        """What follows the last dot of the name, with it."""
+        """The file extension of the name, with its dot."""
         return Path(self.name).suffix
 
     @property
@@ -239,22 +239,22 @@ class RemotePath:
             yield path
 
     def resolve(self) -> RemotePath:
-        """Return the path itself: there are no links."""
+        """Return the path itself, because object stores have no links."""
         return self
 
     def exists(self) -> bool:
         """Return whether the object, or an object below it, exists."""
-        return self._look() is not None
+        return self._stat_or_none() is not None
 
     def is_file(self) -> bool:
-        """Return whether it is an object."""
-        found = self._look()
-        return found is not None and found.st_mode & S_IFREG == S_IFREG
+        """Return whether the path is an object."""
+        stat = self._stat_or_none()
+        return stat is not None and stat.st_mode & S_IFREG == S_IFREG
 
     def is_dir(self) -> bool:
-        """Return whether there are objects below it."""
-        found = self._look()
-        return found is not None and found.st_mode & S_IFREG != S_IFREG
+        """Return whether the path is a folder: objects exist below it."""
+        stat = self._stat_or_none()
+        return stat is not None and stat.st_mode & S_IFREG != S_IFREG
 
     def stat(self) -> RemoteStat:
         """Return the properties from the listing that produced the path, or the current ones.
@@ -262,37 +262,37 @@ class RemotePath:
         Raises:
             FileNotFoundError: The object does not exist.
         """
-        found = self._look()
-        if found is None:
+        stat = self._stat_or_none()
+        if stat is None:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self))
-        return found
+        return stat
 
     def now(self) -> RemotePath:
         """Return the path without the properties from a listing, so that they are requested again."""
         return replace(self, listed=None)
 
     def iterdir(self) -> Iterator[RemotePath]:
-        """Yield the entries of this folder, none if it does not exist."""
+        """Yield the entries of this folder, sorted by path; a missing folder has no entries."""
         return self.listing(recursive=False)
 
     def listing(self, *, recursive: bool) -> Iterator[RemotePath]:
-        """Yield the entries below, sorted by name."""
+        """Yield the entries of this folder, with `recursive` also those of its subfolders, sorted by path."""
         from pyarrow.fs import FileSelector  # noqa: PLC0415 - slow to import, and only jobs with URLs need it
 
         selector = FileSelector(self.filesystem_path, allow_not_found=True, recursive=recursive)
         with reaching(str(self)):
-            found = self.filesystem.get_file_info(selector)
+            infos = self.filesystem.get_file_info(selector)
         bucket = self.root.partition("://")[2]
-        for info in sorted(found, key=lambda one: one.path):
+        for info in sorted(infos, key=lambda info: info.path):
             yield replace(self, key=info.path.removeprefix(f"{bucket}/"), listed=_stat(info))
 
     def glob(self, pattern: str) -> Iterator[RemotePath]:
         """Yield the matching paths, as `Path.glob`: `*` matches within a component, `**` across components."""
         first, _, rest = pattern.strip("/").partition("/")
         if first == "**":
-            folders = [self, *(one for one in self.listing(recursive=True) if one.is_dir())]
-            seen = (match for folder in folders for match in folder.glob(rest or "*"))
-            yield from dict.fromkeys(seen)
+            folders = [self, *(entry for entry in self.listing(recursive=True) if entry.is_dir())]
+            matches = (match for folder in folders for match in folder.glob(rest or "*"))
+            yield from dict.fromkeys(matches)
             return
         for entry in self.iterdir():
             if fnmatchcase(entry.name, first):
@@ -301,24 +301,24 @@ class RemotePath:
                 elif entry.is_dir():
                     yield from entry.glob(rest)
 
-    def open(self, mode: str = "rb") -> Any:  # noqa: ANN401 - a file of pyarrow's, whose stubs have no common class
-        """Open for reading from the start to the end (`rb`).
+    def open(self, mode: str = "rb") -> Any:  # noqa: ANN401 - a file of pyarrow, whose stubs have no common class
+        """Open the object for sequential reading; the only mode is `rb`.
 
         Raises:
             FileNotFoundError: The object does not exist.
         """
         if mode != "rb":
-            raise ValueError(f"a file behind a URL is opened with 'rb', not {mode!r}")
+            raise ValueError(f"mode {mode!r} is not supported for URLs; use 'rb'")
         with reaching(str(self)):
             return self.filesystem.open_input_stream(self.filesystem_path, compression=None)
 
     def open_input(self) -> pa.NativeFile:
-        """Open for reading by position."""
+        """Open the object for random access."""
         with reaching(str(self)):
             return self.filesystem.open_input_file(self.filesystem_path)
 
     def open_output(self) -> pa.NativeFile:
-        """Open for writing; the object exists once the file is closed."""
+        """Open the object for writing; it becomes visible when the file is closed."""
         with reaching(str(self)):
             return self.filesystem.open_output_stream(self.filesystem_path, compression=None)
 
@@ -335,12 +335,12 @@ class RemotePath:
             return f"{opened.size()} {tag or self.now().stat().st_mtime_ns}"
 
     def read_bytes(self) -> bytes:
-        """Return the content."""
+        """Return the content of the object."""
         with reaching(str(self)), self.open() as file:
             return bytes(file.read())
 
     def write_bytes(self, content: bytes) -> None:
-        """Write the content atomically."""
+        """Write the content of the object atomically."""
         with reaching(str(self)), self.open_output() as file:
             file.write(content)
 
@@ -353,7 +353,7 @@ class RemotePath:
         with reaching(str(self)):
             self.filesystem.delete_file(self.filesystem_path)
 
-    def _look(self) -> RemoteStat | None:
+    def _stat_or_none(self) -> RemoteStat | None:
         if self.listed is not None:
             return self.listed
         with reaching(str(self)):
@@ -374,7 +374,7 @@ def without_options(text: str) -> str:
 
 
 def as_path(given: str | Path | RemotePath) -> AnyPath:
-    """Return the path or remote path of a text; `file://` is a path.
+    """Return the local or remote path of a text; `file://` URLs are local paths.
 
     Raises:
         IngestError: The URL has an unknown scheme, no bucket, or a password.
@@ -382,26 +382,26 @@ def as_path(given: str | Path | RemotePath) -> AnyPath:
     if isinstance(given, RemotePath) or not is_url(str(given)):
         return Path(given) if isinstance(given, str) else given
     text = str(given)
-    if "://" not in text:  # it went through `Path`
+    if "://" not in text:  # `Path` has merged the slashes
         text = text.replace(":/", ":///" if text.startswith("file:") else "://", 1)
     try:
-        url = urlsplit(text, allow_fragments=False)  # an object's name may have a #
+        url = urlsplit(text, allow_fragments=False)  # names of objects may contain #
     except ValueError as error:
-        raise IngestError(f"the URL cannot be read: {error}", where=str(given)) from error
+        raise IngestError(f"the URL is invalid: {error}", where=str(given)) from error
     if url.scheme == "file":
         return Path(unquote(url.path))
     if url.scheme not in SCHEMES:
-        known = ", ".join(f"{scheme}://" for scheme in (*SCHEMES, "file"))
+        schemes = ", ".join(f"{scheme}://" for scheme in (*SCHEMES, "file"))
         raise IngestError(
-            f"the scheme {url.scheme}:// is not known", where=str(given), hint=f"known are {known}"
+            f"unknown URL scheme {url.scheme}://", where=str(given), hint=f"use one of {schemes}"
         )
     if not url.netloc:
-        raise IngestError("the URL names no bucket", where=str(given))
+        raise IngestError("the URL has no bucket", where=str(given), hint=f"write {url.scheme}://BUCKET/PATH")
     if "@" in url.netloc:
         raise IngestError(
-            "a URL is no place for a password",
+            "the URL contains credentials",
             where=f"{url.scheme}://…@{url.netloc.rpartition('@')[2]}",
-            hint="credentials are taken from the environment, the client's configuration or the machine's role",
+            hint="remove them; set credentials in the environment, the client's configuration or the machine's role",
         )
     return RemotePath(f"{url.scheme}://{url.netloc}", url.path.strip("/"), url.query)
 
@@ -410,7 +410,7 @@ _ONE_SLASH = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/(?!/)")
 
 
 def parse_url(text: str) -> AnyPath:
-    """Return the path that a URL in a manifest stands for. In contrast to `as_path`, check the slashes and the options.
+    """Return the path of a URL in a manifest; in contrast to `as_path`, check the slashes and the options.
 
     Raises:
         IngestError: The URL has one slash after its scheme, an unknown scheme or option, no bucket, or a password.

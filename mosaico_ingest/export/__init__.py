@@ -1,6 +1,6 @@
-"""Exports: a sequence of the store in, one recording and a report of its fidelity out.
+"""Export of a sequence of the store to a recording, with a report of its fidelity.
 
-Every batch of messages is adapted again and compared with the stored rows; the report lists each difference and each
+The export adapts every restored batch of messages again and compares it with the stored rows. The report lists each difference and each
 excluded topic. The package must not depend on the pipeline.
 """
 

@@ -1,4 +1,4 @@
-"""Export a sequence as a recording: restore the messages of each topic and write them by time."""
+"""Export of a sequence: restores the messages of each topic and writes them to a recording in time order."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def origin_of(topic: TopicInfo) -> Origin | None:
 
 def version_of(origin: Origin, others: Sequence[Origin], possible: Collection[int]) -> int:
     """Return the version of ROS of a topic: that of its definition, or of another topic of the same recording."""
-    versions = [one.version for one in (origin, *others) if one.source_file == origin.source_file]
+    versions = [each.version for each in (origin, *others) if each.source_file == origin.source_file]
     version = next((version for version in versions if version is not None), None)
     if version is None:
         version = 1 if PurePath(origin.source_file).suffix == ".bag" else 2
@@ -177,9 +177,8 @@ class Restorer:
                 envelope = Envelope(self.info.name, self.definition.root, times)
                 restored = self.inverse.restore(rows, envelope)
                 self._count(restored)
-                values: Any = cast(
-                    "Any", restored.rows
-                ).to_pylist()  # the stubs lack to_pylist of struct arrays
+                array: Any = restored.rows  # the stubs lack to_pylist of struct arrays
+                values = array.to_pylist()
                 yield from zip(times.tolist(), map(serializer.from_dict, values), strict=True)
 
     def result(self) -> TopicExport:
@@ -221,7 +220,7 @@ def restorer_for(info: TopicInfo, definition: Definition, specs: Sequence[Adapte
             return Restorer(info, definition, spec.name, inverse)
     raise AdapterError(
         f"no known adapter converts {definition.root} to {info.ontology.tag}",
-        hint=mismatches[0] if mismatches else "name the adapter that did with --adapter",
+        hint=mismatches[0] if mismatches else "select the adapter of the topic with --adapter",
     )
 
 
@@ -257,8 +256,8 @@ def export_sequence(
     exclusive.
 
     Raises:
-        NothingMatched: No topic or message is selected, or no topic can be written.
-        BagError: The file exists already, or cannot be written.
+        NothingMatched: No topic or message is selected, or no topic can be exported.
+        BagError: The file already exists, or it cannot be written.
         SinkError: The sequence does not exist or cannot be read.
         AdapterError: One of `adapters` cannot be loaded.
     """
@@ -276,7 +275,9 @@ def export_sequence(
                 restorers.append(outcome)
         if not restorers:
             raise NothingMatched(
-                f"none of {len(excluded)} topics can be written", where=sequence, hint=_first(excluded)
+                f"none of the {len(excluded)} selected topics can be exported",
+                where=sequence,
+                hint=_first_reason(excluded),
             )
         messages = [
             _messages(store, connection, restorer, start_ns, end_ns) for connection, restorer in restorers
@@ -284,9 +285,11 @@ def export_sequence(
         for log_ns, connection, payload in heapq.merge(*messages, key=lambda message: message[0]):
             writer.write(connection, log_ns, payload)
         if not any(restorer.messages for _, restorer in restorers):
-            raise NothingMatched("no message is selected", where=sequence, hint="check --start and --end")
+            raise NothingMatched(
+                "no message is in the selected time range", where=sequence, hint="check --start and --end"
+            )
     results = [*(restorer.result() for _, restorer in restorers), *excluded]
-    results.sort(key=lambda one: one.topic)
+    results.sort(key=lambda result: result.topic)
     return ExportReport(sequence=sequence, path=str(path), bytes=path.stat().st_size, topics=tuple(results))
 
 
@@ -294,9 +297,11 @@ def _selected(sequence: SequenceInfo, patterns: Sequence[str]) -> tuple[TopicInf
     names = [topic.name for topic in sequence.topics]
     selection = select(patterns, names)
     if not selection.selected:
-        what = f"no topic matches {', '.join(map(repr, patterns))}" if names else "the sequence has no topics"
+        problem = (
+            f"no topic matches {', '.join(map(repr, patterns))}" if names else "the sequence has no topics"
+        )
         raise NothingMatched(
-            what, where=sequence.name, hint=suggest_names(names, patterns) if names else None
+            problem, where=sequence.name, hint=suggest_names(names, patterns) if names else None
         )
     return tuple(topic for topic in sequence.topics if topic.name in selection.selected)
 
@@ -325,7 +330,7 @@ def _excluded(info: TopicInfo, msgtype: str, reason: str) -> TopicExport:
     return TopicExport(topic=info.name, msgtype=msgtype, ontology=info.ontology.tag, excluded=reason)
 
 
-def _first(excluded: Sequence[TopicExport]) -> str:
+def _first_reason(excluded: Sequence[TopicExport]) -> str:
     return f"{excluded[0].topic}: {excluded[0].excluded}"
 
 

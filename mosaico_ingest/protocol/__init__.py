@@ -1,4 +1,4 @@
-"""The Mosaico protocol: typed requests and responses in, their encoded form out, and the reverse.
+"""The Mosaico protocol: typed requests and responses, and their encoding.
 
 Client (`destinations.server`) and server (`serve`) share the rules for names, the message bodies, actions with their
 permissions, and error conditions. The package must not depend on either side. Importing it loads the rules for names only.

@@ -1,6 +1,6 @@
 """Record batches from other processes: validation, and buffers that are safe to measure.
 
-Writers such as arrow-rs leave out the offsets of zero-length arrays. pyarrow accepts such arrays, but `nbytes`,
+Writers such as arrow-rs omit the offsets of zero-length arrays. pyarrow accepts such arrays, but `nbytes`,
 `get_total_buffer_size` and `offsets` read past the end of the missing buffer, which crashes the process.
 """
 
@@ -17,7 +17,7 @@ def validated(batch: pa.RecordBatch) -> pa.RecordBatch:
     """Return a received batch that is safe to process.
 
     Raises:
-        pa.ArrowInvalid: Its buffers contradict each other, for example through offsets out of range.
+        pa.ArrowInvalid: The buffers are inconsistent, for example because offsets are out of range.
     """
     batch.validate(full=True)
     return with_offsets(batch)
@@ -33,7 +33,7 @@ def with_offsets(batch: pa.RecordBatch) -> pa.RecordBatch:
 
 def has_nested_lists(schema: pa.Schema) -> bool:
     """Return whether a column has a list inside a list, so that its batches may lack offsets."""
-    return any(_lists(field.type) > 1 for field in schema)
+    return any(_list_depth(field.type) > 1 for field in schema)
 
 
 def _with_offsets(array: Any) -> Any:  # noqa: ANN401 - any array class
@@ -66,7 +66,7 @@ def _complete_list(array: Any) -> Any:  # noqa: ANN401 - a list or map array
     return pa.Array.from_buffers(array.type, len(array), buffers, array.null_count, array.offset, [complete])
 
 
-def _lists(kind: Any) -> int:  # noqa: ANN401 - any Arrow type
-    """Return how many list types are nested in each other at most."""
-    inner = max((_lists(kind.field(i).type) for i in range(kind.num_fields)), default=0)
+def _list_depth(kind: Any) -> int:  # noqa: ANN401 - any Arrow type
+    """Return the maximum number of nested list types."""
+    inner = max((_list_depth(kind.field(i).type) for i in range(kind.num_fields)), default=0)
     return inner + (not isinstance(kind, pa.StructType) and kind.num_fields > 0)

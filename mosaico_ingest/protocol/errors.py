@@ -1,6 +1,6 @@
 """The statuses of the protocol, and their mapping to and from exceptions of Flight.
 
-Flight for Python has no exception for some statuses; their text starts with the name of the status.
+Flight for Python has no exception for some statuses. Messages of these statuses start with the name of the status.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _BY_TYPE: tuple[tuple[type[Exception], Condition], ...] = (
     (pa.ArrowKeyError, Condition.NOT_FOUND),
     (pa.ArrowNotImplementedError, Condition.UNIMPLEMENTED),
     (pa.ArrowInvalid, Condition.INVALID),
-    (OSError, Condition.UNAVAILABLE),  # a stream that the server ended without a status
+    (OSError, Condition.UNAVAILABLE),  # the server closed a stream without a status
 )
 _BY_TEXT: tuple[tuple[str, Condition], ...] = (
     ("already exist", Condition.EXISTS),
@@ -64,15 +64,15 @@ _SPECIFIC = frozenset({fl.FlightUnauthenticatedError, fl.FlightUnauthorizedError
 
 
 def condition_of(error: BaseException) -> Condition:
-    """Return the status of an error; if Flight's type is too coarse, the text decides."""
-    found = next((condition for kind, condition in _BY_TYPE if isinstance(error, kind)), Condition.INTERNAL)
+    """Return the status of an error, from its type or, if several statuses share the type, from its message."""
+    by_type = next((condition for kind, condition in _BY_TYPE if isinstance(error, kind)), Condition.INTERNAL)
     if type(error) in _SPECIFIC:
-        return found
+        return by_type
     text = text_of(error).lower()
     for condition in Condition:
         if text.startswith(f"{condition.value.lower()}:"):
             return condition
-    return next((condition for words, condition in _BY_TEXT if words in text), found)
+    return next((condition for words, condition in _BY_TEXT if words in text), by_type)
 
 
 def text_of(error: BaseException) -> str:
@@ -87,7 +87,7 @@ def text_of(error: BaseException) -> str:
 def as_flight_error(condition: Condition, text: str) -> fl.FlightError:
     """Return the exception that a server raises so that clients see `condition`.
 
-    The result is always an exception of Flight, since Arrow leaks others and sends their tracebacks to the client.
+    The result is always an exception of Flight, because Arrow leaks other exceptions and sends their tracebacks to the client.
     """
     for kind, candidate in _BY_TYPE:
         if candidate is condition and issubclass(kind, fl.FlightError):

@@ -1,4 +1,4 @@
-"""Messages of the Mosaico protocol: bodies, actions, permissions and their encoding."""
+"""Messages of the Mosaico protocol: bodies, actions and permissions, and their encoding."""
 
 from __future__ import annotations
 
@@ -96,57 +96,57 @@ DEFAULT_LIMIT_BYTES = 50_000_000
 
 
 def topic_locator(sequence: str, topic: str) -> str:
-    """Return `seq/imu` of `seq` and `/imu`."""
+    """Return the locator of a topic: `seq/imu` for `seq` and `/imu`."""
     return f"{sequence}/{topic.removeprefix('/')}"
 
 
 def topic_name(locator: str) -> str:
-    """Return `/imu` of `seq/imu`."""
+    """Return the topic of a locator: `/imu` for `seq/imu`."""
     return f"/{locator.partition('/')[2]}"
 
 
 def session_locator(sequence: str, ulid: str) -> str:
-    """Return `seq:01J…`."""
+    """Return the locator of a session: `seq:01J…`."""
     return f"{sequence}:{ulid}"
 
 
 class Body(BaseModel):
-    """Anything that travels; what a newer peer adds is passed over."""
+    """A message body; unknown fields from newer peers are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", defer_build=True)
 
 
 class Permission(str, Enum):
-    """What a key may do; each includes the ones before it."""
+    """The permission of an API key; each permission includes the previous ones."""
 
     READ = "read"
     WRITE = "write"
     DELETE = "delete"
     MANAGE = "manage"
-    # The platform's own spelling, as in `APIKeyPermissionEnum.Write`; aliases are no members of their own.
+    # Aliases with the platform's spelling, as in `APIKeyPermissionEnum.Write`.
     Read = READ
     Write = WRITE
     Delete = DELETE
     Manage = MANAGE
 
     def includes(self, needed: Permission) -> bool:
-        """Return whether a key with this permission may do what needs `needed`."""
+        """Return whether this permission includes `needed`."""
         order = list(Permission)
         return order.index(self) >= order.index(needed)
 
 
 class Empty(Body):
-    """Nothing to say."""
+    """An empty body."""
 
 
 class Located(Body):
-    """One sequence, session or topic."""
+    """The locator of a sequence, session or topic."""
 
     locator: str
 
 
 class SemVer(Body):
-    """A version in parts."""
+    """A semantic version."""
 
     major: int
     minor: int
@@ -155,7 +155,7 @@ class SemVer(Body):
 
 
 class Limits(Body):
-    """What fits into one message."""
+    """The limits of one message, in bytes."""
 
     grpc_max_decode_message_size: int = DEFAULT_LIMIT_BYTES
     grpc_max_encode_message_size: int = DEFAULT_LIMIT_BYTES
@@ -163,7 +163,7 @@ class Limits(Body):
 
 
 class Info(Body):
-    """The answer to the handshake."""
+    """The response to the handshake."""
 
     version: str
     semver: SemVer
@@ -171,24 +171,24 @@ class Info(Body):
 
 
 class Version(Body):
-    """The answer to the handshake of a server that does not know `info`."""
+    """The response to the handshake of servers that do not support `info`."""
 
     version: str = "unknown"
 
 
 class SequenceCreate(Body):
-    """A new sequence; its metadata is fixed from then on."""
+    """A new sequence, whose metadata cannot be changed later."""
 
     locator: str
     user_metadata: dict[str, Any]
 
 
 class SessionCreated(Body):
-    """A session that topics can be written in."""
+    """A new session, which accepts topics."""
 
     uuid: str
     locator: str = ""
-    """`seq:01J…`; empty from servers before 0.5."""
+    """`seq:01J…`; empty in responses of servers before 0.5."""
 
 
 class TopicCreate(Body):
@@ -202,19 +202,19 @@ class TopicCreate(Body):
 
 
 class TopicCreated(Body):
-    """A topic that can be put, once."""
+    """A new topic, which accepts one upload."""
 
     uuid: str
 
 
 class SessionFinalize(Body):
-    """The end of a session: its topics become visible."""
+    """The commit of a session, which makes its topics visible."""
 
     session_uuid: str
 
 
 class NotificationCreate(Body):
-    """Something to know about a sequence or a topic."""
+    """A new notification about a sequence or a topic."""
 
     locator: str
     notification_type: str = "error"
@@ -222,24 +222,24 @@ class NotificationCreate(Body):
 
 
 class Notification(Body):
-    """Something that is known about a sequence or a topic."""
+    """A notification about a sequence or a topic."""
 
     name: str
-    """The locator."""
+    """The locator of the sequence or topic."""
     notification_type: str
     msg: str
     created_datetime: str
-    """ISO 8601, UTC."""
+    """The time of creation in ISO 8601, UTC."""
 
 
 class Notifications(Body):
-    """All that is known about a sequence or a topic."""
+    """All notifications about a sequence or a topic."""
 
     notifications: list[Notification]
 
 
 class Query(Body):
-    """Filters that must all hold; each is `{key: {operator: value}}`."""
+    """The filters of a query, all of which must match; each is `{key: {operator: value}}`."""
 
     sequence: dict[str, Any] = Field(default_factory=dict[str, Any])
     topic: dict[str, Any] = Field(default_factory=dict[str, Any])
@@ -254,29 +254,29 @@ class _OmitsNone(Body):
 
 
 class QueryTopic(_OmitsNone):
-    """A topic that fits."""
+    """A topic that matches a query."""
 
     locator: str
     ontology_tag: str
     timestamp_range: tuple[int, int] | None = None
-    """First and last time stamp that fit, where it was asked for."""
+    """First and last timestamp of the matching rows, in nanoseconds; None unless the query requests it."""
 
 
 class QueryTopics(Body):
-    """The topics of one sequence that fit."""
+    """A sequence that matches a query, with its matching topics."""
 
     sequence: str
     topics: list[QueryTopic]
 
 
 class QueryResult(Body):
-    """Everything that fits."""
+    """The sequences and topics that match a query."""
 
     items: list[QueryTopics]
 
 
 class TimeBounds(Body):
-    """The first and the last time stamp of a range, both inclusive."""
+    """The first and the last timestamp of a time range, both inclusive."""
 
     start_ns: int
     end_ns: int
@@ -351,7 +351,7 @@ class Put(Body):
 
 
 class GetInfo(_OmitsNone):
-    """The descriptor of a question about a sequence or a topic; the start is in, the end is out."""
+    """The descriptor of a request for a sequence or a topic; the start is inclusive, the end exclusive."""
 
     resource_locator: str
     timestamp_ns_start: int | None = None
@@ -359,19 +359,19 @@ class GetInfo(_OmitsNone):
 
 
 class SessionInfo(Body):
-    """A session as a sequence's application metadata tells it; older servers say less."""
+    """A session in the application metadata of a sequence; older servers omit fields."""
 
     locator: str = ""
     created_at_ns: int = 0
     locked: bool = False
-    """Whether it is finalized."""
+    """Whether the session is finalized."""
     completed_at_ns: int | None = None
     topics: list[str] = Field(default_factory=list[str])
-    """Their locators."""
+    """The locators of the topics."""
 
 
 class SequenceInfo(Body):
-    """A sequence's application metadata; older servers say less."""
+    """The application metadata of a sequence; older servers omit fields."""
 
     resource_locator: str = ""
     created_at_ns: int = 0
@@ -380,31 +380,31 @@ class SequenceInfo(Body):
 
 
 class Interval(Body):
-    """The first and the last time stamp, both of them in."""
+    """The first and the last timestamp of a topic, both inclusive."""
 
     start_ns: int
     end_ns: int
 
 
 class DataInfo(Body):
-    """How much a topic holds."""
+    """The size and the time interval of a topic."""
 
     interval: Interval | None = None
-    """null of an empty topic."""
+    """None if the topic is empty."""
     total_row_count: int
     total_bytes: int
     total_chunks_count: int
 
 
 class TimeWindow(Body):
-    """How much of a topic lies in the range that was asked for."""
+    """The part of a topic that lies in the requested time range."""
 
     interval: Interval | None = None
     row_count: int
 
 
 class TopicInfo(Body):
-    """A topic's application metadata, on its endpoint."""
+    """The application metadata of a topic, on its endpoint."""
 
     resource_locator: str
     ontology_tag: str
@@ -420,40 +420,40 @@ class TopicInfo(Body):
 _Body = TypeVar("_Body", bound=Body)
 
 
-class Malformed(ValueError):  # noqa: N818 - the condition, as in `errors`
-    """Bytes that are not the body they should be; says what is wrong in one line."""
+class Malformed(ValueError):  # noqa: N818 - named after the condition
+    """Bytes that are not the expected body; the text is the reason in one line."""
 
 
 class Codec(Protocol):
-    """How bodies travel."""
+    """The encoding of message bodies."""
 
     def encode(self, body: Body) -> bytes:
-        """Return the bytes of a question, a descriptor or application metadata."""
+        """Return the encoded request, descriptor or application metadata."""
         ...
 
     def decode(self, kind: type[_Body], data: bytes) -> _Body:
-        """Return the body.
+        """Return the decoded body.
 
         Raises:
-            Malformed: The bytes are no `kind`.
+            Malformed: The bytes are not a valid `kind`.
         """
         ...
 
     def encode_answer(self, action: Action[Any, Any], answer: Body) -> bytes:
-        """Return the bytes of an action's result."""
+        """Return the encoded response to an action."""
         ...
 
     def decode_answer(self, action: Action[Any, _Body], data: bytes) -> _Body:
-        """Return what an action's results say, joined.
+        """Return the decoded response to an action, from the joined results of the call.
 
         Raises:
-            Malformed: The bytes are no answer to `action`.
+            Malformed: The bytes are not a valid response to `action`.
         """
         ...
 
 
 class _Envelope(BaseModel):
-    """What JSON answers are wrapped in; an action without an answer may call itself `empty`."""
+    """The envelope of JSON responses; the action may be `empty` if the response has no fields."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -462,7 +462,7 @@ class _Envelope(BaseModel):
 
 
 class _Json:
-    """Bodies as UTF-8 JSON, answers with the name of their action."""
+    """The codec for UTF-8 JSON, with responses in an `_Envelope`."""
 
     def encode(self, body: Body) -> bytes:
         return body.model_dump_json().encode()
@@ -477,15 +477,15 @@ class _Json:
     def decode_answer(self, action: Action[Any, _Body], data: bytes) -> _Body:
         envelope = _validate(_Envelope, data or b"{}")
         if envelope.action not in {action.name, "empty"}:
-            raise Malformed(f"an answer to {envelope.action!r} instead of {action.name!r}")
+            raise Malformed(f"the response is for {envelope.action!r} instead of {action.name!r}")
         try:
             return action.answer.model_validate(envelope.response or {})
         except ValidationError as error:
-            raise Malformed(_first(error)) from error
+            raise Malformed(_first_problem(error)) from error
 
 
 JSON: Codec = _Json()
-"""What servers up to 0.7 speak."""
+"""The encoding of servers up to version 0.7."""
 
 _Model = TypeVar("_Model", bound=BaseModel)
 
@@ -494,10 +494,10 @@ def _validate(kind: type[_Model], data: bytes) -> _Model:
     try:
         return kind.model_validate_json(data)
     except ValidationError as error:
-        raise Malformed(_first(error)) from error
+        raise Malformed(_first_problem(error)) from error
 
 
-def _first(error: ValidationError) -> str:
+def _first_problem(error: ValidationError) -> str:
     first = error.errors(include_url=False, include_context=False)[0]
     field = ".".join(map(str, first["loc"]))
     return f"{field}: {first['msg']}" if field else first["msg"]
@@ -511,7 +511,7 @@ Answer = TypeVar("Answer", bound=Body)
 
 
 class Action(Struct, Generic[Question, Answer], frozen=True):
-    """A call: what is asked, what is answered (`Empty`: nothing)."""
+    """An action of the protocol, with the types of its request and its response."""
 
     name: str
     question: type[Question]
@@ -520,7 +520,7 @@ class Action(Struct, Generic[Question, Answer], frozen=True):
     repeatable: bool = False
     """Whether a repetition after a lost response has no side effect."""
     streamed: bool = False
-    """Whether the response is a sequence of bodies, each in a result of its own."""
+    """Whether the response is a sequence of bodies, each in its own result."""
 
 
 _READ, _WRITE, _DELETE, _MANAGE = Permission
@@ -583,4 +583,4 @@ ACTIONS: Mapping[str, Action[Any, Any]] = MappingProxyType(
         )
     }
 )
-"""Every call by name."""
+"""Every action by name."""

@@ -1,7 +1,7 @@
-"""The embedded store as a Mosaico server: Flight calls in, sequences of the store listed, read, queried and written.
+"""The embedded store as a Mosaico server, which lists, reads, queries and writes sequences over Arrow Flight.
 
-`Store` and `StoreSession` do the work; the server keeps no state except open sessions, which end with it. The package
-must not depend on recordings or on the pipeline.
+`Store` and `StoreSession` do the work; the server keeps no state except open sessions, which are discarded at shutdown. The
+package must not depend on recordings or on the pipeline.
 """
 
 from __future__ import annotations

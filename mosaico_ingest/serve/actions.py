@@ -25,7 +25,7 @@ from mosaico_ingest.version import __version__
 
 __all__ = ["HANDLERS", "Backend"]
 
-_PROTOCOL = messages.SemVer(major=0, minor=7, patch=0)
+_PROTOCOL_VERSION = messages.SemVer(major=0, minor=7, patch=0)
 _EMPTY = messages.Empty()
 
 
@@ -40,14 +40,16 @@ class Backend(Struct, frozen=True):
 
 
 def _info(_: Backend, __: messages.Empty) -> messages.Info:
-    version = f"{_PROTOCOL.major}.{_PROTOCOL.minor}.{_PROTOCOL.patch}"
+    version = f"{_PROTOCOL_VERSION.major}.{_PROTOCOL_VERSION.minor}.{_PROTOCOL_VERSION.patch}"
     return messages.Info(
-        version=f"{version}+mosaico-ingest.{__version__}", semver=_PROTOCOL, config=messages.Limits()
+        version=f"{version}+mosaico-ingest.{__version__}", semver=_PROTOCOL_VERSION, config=messages.Limits()
     )
 
 
 def _version(_: Backend, __: messages.Empty) -> messages.Version:
-    return messages.Version(version=f"{_PROTOCOL.major}.{_PROTOCOL.minor}.{_PROTOCOL.patch}")
+    return messages.Version(
+        version=f"{_PROTOCOL_VERSION.major}.{_PROTOCOL_VERSION.minor}.{_PROTOCOL_VERSION.patch}"
+    )
 
 
 def _sequence_create(backend: Backend, question: messages.SequenceCreate) -> messages.Empty:
@@ -109,19 +111,19 @@ def _sequence_purge(backend: Backend, question: messages.Located) -> messages.Em
 
 
 def _topic_note(backend: Backend, question: messages.NotificationCreate) -> messages.Empty:
-    sequence, topic = _present(backend, question.locator)
+    sequence, topic = _existing_topic(backend, question.locator)
     backend.store.add_note(sequence, question.msg, topic=topic)
     return _EMPTY
 
 
 def _topic_notes(backend: Backend, question: messages.Located) -> messages.Notifications:
-    sequence, topic = _present(backend, question.locator)
+    sequence, topic = _existing_topic(backend, question.locator)
     notes = backend.store.sequence(sequence).notes
     return _notifications([note for note in notes if note.topic == topic], question.locator)
 
 
 def _topic_purge(backend: Backend, question: messages.Located) -> messages.Empty:
-    sequence, topic = _present(backend, question.locator)
+    sequence, topic = _existing_topic(backend, question.locator)
     backend.store.delete_notes(sequence, topic=topic)
     return _EMPTY
 
@@ -166,11 +168,11 @@ def _key_status(backend: Backend, question: messages.KeyFingerprint) -> messages
     key = _keyring(backend).find(question.api_key_fingerprint)
     if key is None:
         raise NotInStore(f"there is no API key with the fingerprint {question.api_key_fingerprint!r}")
-    return _key_description(key)
+    return _key_status_of(key)
 
 
 def _key_list(backend: Backend, _: messages.Empty) -> messages.KeyList:
-    return messages.KeyList(api_keys=[_key_description(key) for key in _keyring(backend).keys])
+    return messages.KeyList(api_keys=[_key_status_of(key) for key in _keyring(backend).keys])
 
 
 def _key_revoke(backend: Backend, question: messages.KeyFingerprint) -> messages.Empty:
@@ -181,21 +183,21 @@ def _key_revoke(backend: Backend, question: messages.KeyFingerprint) -> messages
 
 def _keyring(backend: Backend) -> Keyring:
     if backend.keyring is None:
-        raise Refusal(Condition.PRECONDITION, "this server has no API keys")
+        raise Refusal(Condition.PRECONDITION, "this server does not use API keys")
     return backend.keyring
 
 
-def _key_description(key: StoredKey) -> messages.KeyStatus:
+def _key_status_of(key: StoredKey) -> messages.KeyStatus:
     return messages.KeyStatus(
         api_key_fingerprint=key.fingerprint,
-        created_at_ns=_ns(key.created),
-        expires_at_ns=None if key.expires is None else _ns(key.expires),
+        created_at_ns=_nanoseconds(key.created),
+        expires_at_ns=None if key.expires is None else _nanoseconds(key.expires),
         description=key.description,
         permissions=key.permission,
     )
 
 
-def _ns(time: datetime) -> int:
+def _nanoseconds(time: datetime) -> int:
     return round(time.timestamp() * 1e6) * 1000
 
 
@@ -213,7 +215,8 @@ def _topic(locator: str) -> tuple[str, str]:
     return sequence, topic
 
 
-def _present(backend: Backend, locator: str) -> tuple[str, str]:
+def _existing_topic(backend: Backend, locator: str) -> tuple[str, str]:
+    """Return the sequence and the topic of a locator, or raise NotInStore if the topic is neither stored nor open."""
     sequence, topic = _topic(locator)
     if not backend.uploads.has_topic(sequence, topic):
         backend.store.topic(sequence, topic)

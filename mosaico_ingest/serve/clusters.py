@@ -1,4 +1,4 @@
-"""Clusters of time stamps, and their intersections."""
+"""Clusters of timestamps, and their intersections."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 __all__ = ["Range", "clusterize", "intersect"]
 
 Range: TypeAlias = tuple[int, int]
-"""The first and the last time stamp, ns, both inclusive."""
+"""The first and the last timestamp in nanoseconds, both inclusive."""
 
 
 def clusterize(times: NDArray[np.int64], gap_ns: int) -> list[Range]:
-    """Return the ranges of sorted time stamps that gaps of at least `gap_ns` separate; 0 separates none."""
+    """Return the ranges of sorted timestamps that gaps of at least `gap_ns` separate; 0 returns one range."""
     if not len(times):
         return []
     ends = np.flatnonzero(np.diff(times) >= gap_ns) if gap_ns else np.array([], np.int64)
@@ -35,6 +35,7 @@ def intersect(clusters: Sequence[Sequence[Range]], tolerance_ns: int) -> list[Ra
 
 
 def _intersect(first: Sequence[Range], second: Sequence[Range], tolerance_ns: int) -> list[Range]:
+    """Return the sorted intersections of two sorted lists of ranges."""
     ranges: set[Range] = set()
     start = 0
     for low, high in first:

@@ -1,4 +1,4 @@
-"""Errors of a call, and their translation into statuses of the protocol."""
+"""Errors of a call, and their translation to statuses of the protocol."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ __all__ = ["Deadline", "Refusal", "refuse_invalid", "translate_errors"]
 _LOG = logging.getLogger(__name__)
 
 
-class Refusal(Exception):  # noqa: N818 - a status, which is not always an error
-    """The call is refused with a status of the protocol."""
+class Refusal(Exception):  # noqa: N818 - named after the status that it carries
+    """The refusal of a call with a status of the protocol."""
 
     def __init__(self, condition: Condition, text: str) -> None:
         super().__init__(text)
@@ -29,7 +29,7 @@ class Refusal(Exception):  # noqa: N818 - a status, which is not always an error
 
 
 class Deadline:
-    """The time limit of one call; long calls check it between their steps."""
+    """The time limit of one call, which long calls check between their steps."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
@@ -43,7 +43,7 @@ class Deadline:
 
 @contextmanager
 def refuse_invalid() -> Generator[None, None, None]:
-    """Refuse the call as invalid if a check of names, metadata or columns fails inside."""
+    """Refuse the call as invalid if a check of names, metadata or columns fails in the block."""
     try:
         yield
     except (SinkError, pa.ArrowException) as err:
@@ -52,10 +52,10 @@ def refuse_invalid() -> Generator[None, None, None]:
 
 @contextmanager
 def translate_errors() -> Generator[None, None, None]:
-    """Raise every error inside as the exception that Flight sends to the client.
+    """Raise every error of the block as the exception that Flight sends to the client.
 
-    Only Flight's own exceptions may leave a call: Arrow sends others with their traceback, which contains paths, and
-    never frees them.
+    Only exceptions of Flight may leave a call. Arrow sends the traceback of other exceptions, which contains paths, to
+    the client, and never frees them.
     """
     try:
         yield

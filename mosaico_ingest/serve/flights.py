@@ -1,4 +1,4 @@
-"""Flight information: sequences and topics, their endpoints, tickets and rows; fields for clients before 0.7."""
+"""Flight information of sequences and topics: endpoints, tickets and rows, with the fields of clients before 0.7."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = [
 
 
 class Extent(Body):
-    """How much a topic holds, under the older names."""
+    """The size of a topic, with the field names of clients before 0.7."""
 
     chunks_number: int
     total_bytes: int
@@ -38,28 +38,28 @@ class Extent(Body):
 
 
 class OlderTopicInfo(messages.TopicInfo):
-    """A topic's application metadata, for clients of either time."""
+    """The application metadata of a topic, for clients of all versions."""
 
     info: Extent
 
 
 def sequence_schema(sequence: SequenceInfo) -> pa.Schema:
     """Return a schema without columns, with the metadata of the sequence."""
-    return _with(pa.schema([]), {"context": "sequence", "user_metadata": sequence.metadata})
+    return _with_metadata(pa.schema([]), {"context": "sequence", "user_metadata": sequence.metadata})
 
 
 def topic_schema(topic: TopicInfo) -> pa.Schema:
-    """Return the columns of the topic, with its metadata."""
+    """Return the schema of the topic, with its metadata."""
     properties = {
         "ontology_tag": topic.ontology.tag,
         "serialization_format": topic.ontology.serialization_format.value,
     }
-    return _with(
+    return _with_metadata(
         topic.schema, {"context": "topic", "properties": properties, "user_metadata": topic.metadata}
     )
 
 
-def _with(schema: pa.Schema, metadata: Mapping[str, Any]) -> pa.Schema:
+def _with_metadata(schema: pa.Schema, metadata: Mapping[str, Any]) -> pa.Schema:
     encoded = {
         f"mosaico:{key}": value if isinstance(value, str) else json.dumps(value)
         for key, value in metadata.items()
@@ -68,10 +68,15 @@ def _with(schema: pa.Schema, metadata: Mapping[str, Any]) -> pa.Schema:
 
 
 _MESSAGE_BYTES = 16 << 20
+"""Target size of one response message, in bytes."""
 
 
 def split_locator(locator: str) -> tuple[str, str | None]:
-    """Return the sequence and, with its leading slash, the topic, or refuse a locator of something else."""
+    """Return the sequence and the topic of a locator; the topic has a leading slash, or is None for a sequence.
+
+    Raises:
+        Refusal: A name is not valid.
+    """
     sequence, slash, path = locator.partition("/")
     with refuse_invalid():
         protocol.check_sequence_name(sequence)
@@ -79,29 +84,29 @@ def split_locator(locator: str) -> tuple[str, str | None]:
 
 
 class Flights:
-    """Answers from the store, and from the sessions that are open."""
+    """The responses to read calls, from the store and from open sessions."""
 
     def __init__(self, store: Store, uploads: Uploads) -> None:
         self._store = store
         self._uploads = uploads
 
     def listed(self) -> Iterator[fl.FlightInfo]:
-        """Yield every sequence by its name."""
+        """Yield one entry per sequence of the store."""
         for name in self._store.names():
             yield fl.FlightInfo(pa.schema([]), fl.FlightDescriptor.for_path(name), [], -1, -1)
 
     def info(self, descriptor: fl.FlightDescriptor) -> fl.FlightInfo:
-        """Return a sequence with an endpoint for each topic, or one topic with its endpoint."""
+        """Return a sequence with one endpoint per topic, or a topic with its endpoint."""
         question = _question(descriptor)
         name, topic = split_locator(question.resource_locator)
         if topic is not None:
             info = self._store.topic(name, topic)
-            ended = {each.id: each for each in self._store.sequence(name).sessions}
-            endpoint = _endpoint(info, ended, question)
+            sessions = {each.id: each for each in self._store.sequence(name).sessions}
+            endpoint = _endpoint(info, sessions, question)
             return fl.FlightInfo(topic_schema(info), descriptor, [endpoint], -1, -1)
         sequence = self._store.sequence(name)
-        ended = {each.id: each for each in sequence.sessions}
-        endpoints = [_endpoint(each, ended, question) for each in sequence.topics]
+        sessions = {each.id: each for each in sequence.sessions}
+        endpoints = [_endpoint(each, sessions, question) for each in sequence.topics]
         committed = {topic.name for topic in sequence.topics}
         endpoints += [
             _open_endpoint(opened, topic)
@@ -109,20 +114,20 @@ class Flights:
             for topic in tuple(opened.topics.values())
             if topic.name not in committed
         ]
-        metadata = JSON.encode(self._described(sequence))
+        metadata = JSON.encode(self._sequence_info(sequence))
         schema = sequence_schema(sequence)
         return fl.FlightInfo(schema, descriptor, endpoints, -1, -1, app_metadata=metadata)
 
     def schema(self, descriptor: fl.FlightDescriptor) -> pa.Schema:
-        """Return the columns of a topic."""
+        """Return the schema of a topic, without its metadata."""
         return self._topic(_question(descriptor)).schema
 
     def rows(self, ticket: fl.Ticket) -> tuple[pa.Schema, Iterator[pa.RecordBatch]]:
-        """Return a topic's columns and its rows in time order, in messages of a moderate size."""
+        """Return the schema of a topic, and its rows in time order as batches of about `_MESSAGE_BYTES` or less."""
         question = JSON.decode(messages.GetInfo, ticket.ticket)
         topic = self._topic(question)
         rows = scan(topic.segments, topic.schema, _window(question))
-        return topic_schema(topic), _messages(rows)
+        return topic_schema(topic), _slices(rows)
 
     def _topic(self, question: messages.GetInfo) -> TopicInfo:
         sequence, topic = split_locator(question.resource_locator)
@@ -130,7 +135,7 @@ class Flights:
             raise Refusal(Condition.INVALID, f"{question.resource_locator!r} is not the locator of a topic")
         return self._store.topic(sequence, topic)
 
-    def _described(self, sequence: SequenceInfo) -> messages.SequenceInfo:
+    def _sequence_info(self, sequence: SequenceInfo) -> messages.SequenceInfo:
         finalized = [
             messages.SessionInfo(
                 locator=messages.session_locator(sequence.name, session.id),
@@ -161,7 +166,7 @@ class Flights:
 
 def _question(descriptor: fl.FlightDescriptor) -> messages.GetInfo:
     if descriptor.descriptor_type is not fl.DescriptorType.CMD:
-        raise Refusal(Condition.INVALID, "only descriptors with a command are understood")
+        raise Refusal(Condition.INVALID, "the descriptor has no command; send a command descriptor")
     question = JSON.decode(messages.GetInfo, descriptor.command or b"")
     _window(question)
     return question
@@ -177,13 +182,13 @@ def _locator(topic: TopicInfo) -> str:
 
 
 def _endpoint(
-    topic: TopicInfo, ended: Mapping[str, SessionInfo], question: messages.GetInfo
+    topic: TopicInfo, sessions: Mapping[str, SessionInfo], question: messages.GetInfo
 ) -> fl.FlightEndpoint:
     window = _window(question)
     ticket = question.model_copy(update={"resource_locator": _locator(topic)})
-    session = ended.get(topic.session)
+    session = sessions.get(topic.session)
     interval = _interval(topic.start_ns, topic.end_ns)
-    described = OlderTopicInfo(
+    description = OlderTopicInfo(
         resource_locator=_locator(topic),
         ontology_tag=topic.ontology.tag,
         serialization_format=topic.ontology.serialization_format,
@@ -198,9 +203,9 @@ def _endpoint(
             total_chunks_count=len(topic.segments),
         ),
         info=Extent(chunks_number=len(topic.segments), total_bytes=topic.stored_bytes, timestamp=interval),
-        time_window_info=None if window == Window() else _inside(topic, window),
+        time_window_info=None if window == Window() else _time_window(topic, window),
     )
-    return fl.FlightEndpoint(JSON.encode(ticket), [], None, JSON.encode(described))
+    return fl.FlightEndpoint(JSON.encode(ticket), [], None, JSON.encode(description))
 
 
 def _open_endpoint(opened: OpenSession, topic: OpenTopic) -> fl.FlightEndpoint:
@@ -221,7 +226,7 @@ def _open_endpoint(opened: OpenSession, topic: OpenTopic) -> fl.FlightEndpoint:
     return fl.FlightEndpoint(JSON.encode(ticket), [], None, JSON.encode(description))
 
 
-def _inside(topic: TopicInfo, window: Window) -> messages.TimeWindow:
+def _time_window(topic: TopicInfo, window: Window) -> messages.TimeWindow:
     rows, start_ns, end_ns = count(topic.segments, topic.schema, window)
     return messages.TimeWindow(interval=_interval(start_ns, end_ns), row_count=rows)
 
@@ -232,8 +237,8 @@ def _interval(start_ns: int | None, end_ns: int | None) -> messages.Interval | N
     return messages.Interval(start_ns=start_ns, end_ns=end_ns)
 
 
-def _messages(batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
-    """Cut batches so that one message stays well below what a client takes, if rows allow."""
+def _slices(batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
+    """Slice batches so that one message stays well below the limit of clients, unless one row exceeds it."""
     for batch in map(with_offsets, batches):
         rows = max(1, batch.num_rows * _MESSAGE_BYTES // max(1, batch.nbytes))
         for start in range(0, batch.num_rows, rows):

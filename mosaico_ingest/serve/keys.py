@@ -31,6 +31,7 @@ __all__ = [
 ]
 
 MIDDLEWARE = "api-key"
+"""The name under which Flight stores the result of the key check."""
 
 
 class StoredKey(BaseModel):
@@ -40,7 +41,7 @@ class StoredKey(BaseModel):
 
     sha256: str
     fingerprint: str = ""
-    """The last part of the key, which identifies it to clients; empty for keys of early versions."""
+    """The last part of the key, by which clients identify it; empty for keys of early versions."""
     permission: Permission
     description: str = ""
     created: datetime
@@ -48,7 +49,7 @@ class StoredKey(BaseModel):
     """None if the key does not expire."""
 
 
-class _File(BaseModel):
+class _KeyFile(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     version: int = 1
@@ -56,7 +57,7 @@ class _File(BaseModel):
 
 
 class Keyring:
-    """The keys in the file at `path`; a missing file contains none. Changes of the file apply immediately."""
+    """The API keys in the file at `path`, which is reloaded when it changes; a missing file contains no keys."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -145,19 +146,19 @@ class Keyring:
             return None
         return stat.st_mtime_ns, stat.st_size, stat.st_ino
 
-    def _load(self) -> _File:
+    def _load(self) -> _KeyFile:
         try:
             text = self.path.read_text("utf-8") if self.path.exists() else "{}"
         except OSError as err:
-            raise SinkError(f"cannot be read: {err.strerror}", where=str(self.path)) from err
+            raise SinkError(f"the key file cannot be read: {err.strerror}", where=str(self.path)) from err
         try:
-            return _File.model_validate_json(text)
+            return _KeyFile.model_validate_json(text)
         except ValidationError as err:
             first = err.errors(include_url=False, include_input=False)[0]
             raise SinkError(f"the file is not a key file: {first['msg']}", where=str(self.path)) from err
 
     def _save(self, keys: tuple[StoredKey, ...]) -> None:
-        content = _File(keys=keys).model_dump_json(indent=2)
+        content = _KeyFile(keys=keys).model_dump_json(indent=2)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             # `mkstemp` creates a file that only its owner can read
@@ -166,7 +167,7 @@ class Keyring:
                 file.write(content)
             Path(name).replace(self.path)
         except OSError as err:
-            raise SinkError(f"cannot be written: {err.strerror}", where=str(self.path)) from err
+            raise SinkError(f"the key file cannot be written: {err.strerror}", where=str(self.path)) from err
 
 
 def _hash(key: str) -> str:
@@ -182,7 +183,7 @@ class _Granted(fl.ServerMiddleware):
 
 
 class KeyCheck(fl.ServerMiddlewareFactory):
-    """Accepts calls whose key is in the key ring; without a key ring, every call has every permission."""
+    """The check that accepts calls with a key of the key ring; without a key ring, every call has every permission."""
 
     def __init__(self, keyring: Keyring | None) -> None:
         super().__init__()
@@ -209,7 +210,7 @@ class KeyCheck(fl.ServerMiddlewareFactory):
 
 
 def require(context: fl.ServerCallContext, needed: Permission) -> None:
-    """Refuse the call unless its key includes `needed`."""
+    """Refuse the call unless the permission of its key includes `needed`."""
     granted = context.get_middleware(MIDDLEWARE)
     if not isinstance(granted, _Granted):
         raise Refusal(Condition.UNAUTHENTICATED, "this server requires an API key")

@@ -1,4 +1,4 @@
-"""The Flight server over a store: permission checks, dispatch, start and stop."""
+"""The Flight server of a store: permission checks, dispatch, start and shutdown."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ __all__ = [
 
 
 class Service(fl.FlightServerBase):
-    """Serves one store; Flight calls each method on a thread of its own."""
+    """The Flight service of one store; Flight runs each call on its own thread."""
 
     def __init__(
         self,
@@ -54,21 +54,24 @@ class Service(fl.FlightServerBase):
         super().__init__(location, tls_certificates=certificates, middleware=middleware)  # pyright: ignore[reportArgumentType] - PEM is bytes
 
     def drop_idle(self, idle_s: float) -> None:
-        """Discard sessions whose clients have said nothing for so long."""
+        """Discard the sessions without a call for `idle_s` seconds."""
         self._uploads.discard_idle(idle_s)
 
     def drop_uploads(self) -> None:
-        """Discard what was never finalized."""
+        """Discard the sessions that are not finalized."""
         self._uploads.close()
 
-    def list_flights(  # pyright: ignore[reportIncompatibleMethodOverride] - the criteria come as bytes
+    def list_flights(  # pyright: ignore[reportIncompatibleMethodOverride] - Flight passes the criteria as bytes
         self, context: fl.ServerCallContext, criteria: bytes
     ) -> Iterator[fl.FlightInfo]:
         """List the sequences."""
         with translate_errors():
             require(context, Permission.READ)
             if criteria not in {b"", b"/"}:
-                raise Refusal(Condition.INVALID, "list_flights takes no criteria but '/'")
+                raise Refusal(
+                    Condition.INVALID,
+                    f"the criteria {criteria!r} are not supported; list flights with '/' or without criteria",
+                )
             return iter(list(self._flights.listed()))
 
     def get_flight_info(
@@ -79,51 +82,51 @@ class Service(fl.FlightServerBase):
             require(context, Permission.READ)
             return self._flights.info(descriptor)
 
-    def get_schema(  # pyright: ignore[reportIncompatibleMethodOverride] - Flight takes this wrapping only
+    def get_schema(  # pyright: ignore[reportIncompatibleMethodOverride] - Flight requires a SchemaResult
         self, context: fl.ServerCallContext, descriptor: fl.FlightDescriptor
     ) -> fl.SchemaResult:
-        """Return the columns of a topic."""
+        """Return the schema of a topic."""
         with translate_errors():
             require(context, Permission.READ)
             return fl.SchemaResult(self._flights.schema(descriptor))
 
     def do_get(self, context: fl.ServerCallContext, ticket: fl.Ticket) -> fl.FlightDataStream:
-        """Stream a topic's rows."""
+        """Stream the rows of a topic."""
         with translate_errors():
             require(context, Permission.READ)
             schema, batches = self._flights.rows(ticket)
-            return fl.GeneratorStream(schema, _translated(batches))
+            return fl.GeneratorStream(schema, _with_translated_errors(batches))
 
     def do_put(
         self,
         context: fl.ServerCallContext,
         descriptor: fl.FlightDescriptor,
         reader: fl.MetadataRecordBatchReader,
-        writer: fl.FlightMetadataWriter,  # noqa: ARG002 - nothing is sent back before the end
+        writer: fl.FlightMetadataWriter,  # noqa: ARG002 - no metadata is sent during an upload
     ) -> None:
-        """Take the rows of a topic."""
+        """Receive the rows of a topic."""
         with translate_errors():
             require(context, Permission.WRITE)
             if descriptor.descriptor_type is not fl.DescriptorType.CMD:
-                raise Refusal(Condition.INVALID, "the descriptor must have a command")
+                raise Refusal(Condition.INVALID, "the descriptor has no command; send a command descriptor")
             put = JSON.decode(messages.Put, descriptor.command or b"")
             self._uploads.receive(put, reader.schema, _batches(reader))
 
     def do_action(self, context: fl.ServerCallContext, action: fl.Action) -> Iterator[bytes]:
         """Execute an action."""
         with translate_errors():
-            known = ACTIONS.get(action.type)
-            if known is None or known not in HANDLERS:
+            definition = ACTIONS.get(action.type)
+            if definition is None or definition not in HANDLERS:
                 raise Refusal(Condition.UNIMPLEMENTED, f"action {action.type!r} is not implemented")
-            require(context, known.permission)
-            question = JSON.decode(known.question, action.body.to_pybytes() or b"{}")
-            response = HANDLERS[known](self._backend, question)
+            require(context, definition.permission)
+            question = JSON.decode(definition.question, action.body.to_pybytes() or b"{}")
+            response = HANDLERS[definition](self._backend, question)
             if isinstance(response, Body):
-                return iter([JSON.encode_answer(known, response)])
-            return iter([JSON.encode_answer(known, body) + b"\n" for body in response])
+                return iter([JSON.encode_answer(definition, response)])
+            return iter([JSON.encode_answer(definition, body) + b"\n" for body in response])
 
 
-def _translated(batches: Iterator[pa.RecordBatch]) -> Generator[pa.RecordBatch, None, None]:
+def _with_translated_errors(batches: Iterator[pa.RecordBatch]) -> Generator[pa.RecordBatch, None, None]:
     with translate_errors():
         yield from batches
 
@@ -136,25 +139,28 @@ def _batches(reader: fl.MetadataRecordBatchReader) -> Iterator[pa.RecordBatch]:
 
 
 PORT = 6726
-"""The default port of clients."""
+"""The default port of Mosaico clients."""
 IDLE_S = 3600.0
-"""Idle time after which an open session is discarded."""
+"""Idle time after which an open session is discarded, in seconds."""
 REQUEST_S = 60.0
-"""Time limit of a query."""
+"""Time limit of a query, in seconds."""
 _GRACE_S = 10.0
-_TIDY_S = 30.0
-_HEARD_WITHIN_S = 0.5
+"""Time for calls in progress to finish during a shutdown, in seconds."""
+_CLEANUP_INTERVAL_S = 30.0
+"""Maximum time between two checks for idle sessions, in seconds."""
+_SIGNAL_INTERVAL_S = 0.5
+"""Maximum delay of the response to a signal, in seconds."""
 
 
 class Tls(Struct, frozen=True):
-    """The PEM files of the certificate chain a server shows, and of its private key."""
+    """The PEM files of the certificate chain of a server and of its private key."""
 
     certificate: Path
     key: Path
 
 
 class Server:
-    """A running server; leaving it as a context shuts it down."""
+    """A running server; as a context manager, it shuts down at the end of the block."""
 
     def __init__(self, service: Service, store: Store, host: str, *, scheme: str, idle_s: float) -> None:
         self._service = service
@@ -163,19 +169,21 @@ class Server:
         self.host = host
         self.port = service.port
         self.location = f"{scheme}://{host}:{self.port}"
-        """What a Flight client connects to."""
-        threading.Thread(target=self._tidy, args=(idle_s,), name="mosaico-ingest-tidy", daemon=True).start()
+        """The location for Flight clients, such as `grpc://127.0.0.1:6726`."""
+        threading.Thread(
+            target=self._discard_idle_sessions, args=(idle_s,), name="mosaico-ingest-tidy", daemon=True
+        ).start()
 
     def wait(self) -> None:
-        """Block until the server is shut down; unlike Flight's own way to wait, signals are heard."""
-        while not self._stopped.wait(_HEARD_WITHIN_S):
-            pass  # a signal that the system gave to another thread does not end a wait
+        """Block until the server is shut down; in contrast to Flight's own method, signals interrupt the wait."""
+        while not self._stopped.wait(_SIGNAL_INTERVAL_S):
+            pass  # a signal that another thread receives does not interrupt an unlimited wait
 
     def shutdown(self, *, grace_s: float = _GRACE_S) -> bool:
-        """Stop taking calls, wait for those under way, and discard what was never finalized.
+        """Refuse new calls, wait up to `grace_s` seconds for calls in progress, and discard the sessions not finalized.
 
-        Returns whether all calls ended in time. Flight cannot end the call of a client that says nothing, nor
-        can a process that has one end normally.
+        Return whether all calls ended in time. Flight cannot abort the call of a silent client, and a process with
+        such a call cannot exit normally.
         """
         stopping = threading.Thread(target=self._service.shutdown, name="mosaico-ingest-stop", daemon=True)
         stopping.start()
@@ -184,8 +192,8 @@ class Server:
         self._stopped.set()
         return not stopping.is_alive()
 
-    def _tidy(self, idle_s: float) -> None:
-        while not self._stopped.wait(min(idle_s / 4, _TIDY_S)):
+    def _discard_idle_sessions(self, idle_s: float) -> None:
+        while not self._stopped.wait(min(idle_s / 4, _CLEANUP_INTERVAL_S)):
             self._service.drop_idle(idle_s)
 
     def __enter__(self) -> Self:
@@ -213,7 +221,7 @@ def serve(
     that takes longer than `request_s` is refused.
 
     Raises:
-        SinkError: The store cannot be opened, the certificate cannot be read, or the port is taken.
+        SinkError: The store cannot be opened, the certificate cannot be read, or the port is in use.
     """
     path = as_path(store_path)
     if isinstance(path, RemotePath):
@@ -243,4 +251,4 @@ def _read(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise SinkError(f"cannot be read: {error.strerror}", where=str(path)) from error
+        raise SinkError(f"the PEM file cannot be read: {error.strerror}", where=str(path)) from error

@@ -1,4 +1,4 @@
-"""The open sessions of a server: their topics, the state of each upload, and their end."""
+"""The open sessions of a server, with their topics and the state of each upload."""
 
 from __future__ import annotations
 
@@ -27,16 +27,17 @@ from mosaico_ingest.serve.errors import Refusal, refuse_invalid
 __all__ = ["OpenSession", "OpenTopic", "Uploads"]
 
 _BUFFER_BYTES = 96 << 20
+"""Maximum size of the buffered rows per session, in bytes."""
 _MAX_SESSIONS = 128
 """Maximum number of open sessions, each of which keeps file descriptors."""
 _ABANDONED_S = 60.0
-"""Idle time after which a session may be discarded for a new one if there are too many."""
+"""Idle time in seconds after which a session may be discarded for a new one if the limit is reached."""
 
 
 class _State(Enum):
     CREATED = "was never uploaded"
     UPLOADING = "is still being uploaded"
-    BROKEN = "broke off in the middle of its upload"
+    BROKEN = "has an interrupted upload"
     DONE = "is uploaded"
 
 
@@ -57,41 +58,41 @@ class OpenSession:
     sequence: str
     session: StoreSession
     topics: dict[str, OpenTopic] = field(default_factory=dict[str, OpenTopic])
-    """By the UUID that their uploads name."""
+    """The topics by the UUID that their uploads name."""
     last_call_s: float = field(default_factory=time.monotonic)
-    """The monotonic time of the last call of its client."""
+    """The monotonic time of the client's last call, in seconds."""
 
     @property
     def locator(self) -> str:
-        """The locator of the session, as `drive:01J…`."""
+        """The locator of the session, such as `drive:01J…`."""
         return messages.session_locator(self.sequence, self.session.id)
 
     @property
     def topic_names(self) -> tuple[str, ...]:
-        """The names of its topics, sorted."""
+        """The sorted names of the topics."""
         return tuple(sorted(topic.name for topic in self.topics.values()))
 
     def topic_locator(self, name: str) -> str:
-        """Return the locator of one of its topics, as `drive/imu`."""
+        """Return the locator of a topic of the session, such as `drive/imu`."""
         return messages.topic_locator(self.sequence, name)
 
 
 class Uploads:
-    """The sessions of a server that are not committed yet."""
+    """The sessions of a server that are not committed."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
         self._sessions: dict[str, OpenSession] = {}
         self._committing: dict[str, OpenSession] = {}
-        """Sessions that accept no more topics and are not in the store yet."""
+        """Sessions that accept no more topics and are not in the store yet, by UUID."""
         self._finalized: set[str] = set()
         self._lock = threading.RLock()
 
     def of_sequence(self, sequence: str) -> tuple[OpenSession, ...]:
         """Return the sessions of a sequence that are open or being committed."""
         with self._lock:
-            waiting = (*self._sessions.values(), *self._committing.values())
-            return tuple(each for each in waiting if each.sequence == sequence)
+            sessions = (*self._sessions.values(), *self._committing.values())
+            return tuple(each for each in sessions if each.sequence == sequence)
 
     def open(self, sequence: str) -> OpenSession:
         """Open a session of an existing sequence."""
@@ -112,7 +113,7 @@ class Uploads:
         return opened
 
     def _limit_sessions(self) -> None:
-        """Discard the session that was idle the longest if there are too many, or refuse the call."""
+        """If the limit is reached, discard the session with the longest idle time, or refuse the call if none is idle."""
         with self._lock:
             if len(self._sessions) < _MAX_SESSIONS:
                 return
@@ -129,13 +130,13 @@ class Uploads:
             name = protocol.check_topic_name(path)
             protocol.check_metadata(question.user_metadata, where=question.locator)
         with self._lock:
-            held = {topic.name for topic in self._store.sequence(sequence).topics}
+            stored_names = {topic.name for topic in self._store.sequence(sequence).topics}
             opened = self._session(question.session_uuid)
             if opened.sequence != sequence:
                 raise Refusal(
-                    Condition.PERMISSION, f"the session writes {opened.sequence!r}, not {sequence!r}"
+                    Condition.PERMISSION, f"the session belongs to {opened.sequence!r}, not to {sequence!r}"
                 )
-            if name in held | self._topic_names(sequence):
+            if name in stored_names | self._topic_names(sequence):
                 raise Refusal(Condition.EXISTS, f"topic {question.locator!r} already exists")
             uuid = str(uuid4())
             opened.topics[uuid] = OpenTopic(name, question)
@@ -148,7 +149,7 @@ class Uploads:
             opened, topic, writer = self._start(put, ontology_columns)
         try:
             for batch in batches:
-                self._touch(opened)
+                self._record_call(opened)
                 with refuse_invalid():
                     rows = _rows(batch, writer.schema)
                 writer.write(rows)
@@ -182,8 +183,8 @@ class Uploads:
     def discard_session(self, locator: str) -> bool:
         """Discard the open session with this locator; return whether it exists."""
         with self._lock:
-            found = [each for each in self._sessions.values() if each.locator == locator]
-            return self._discard(found)
+            sessions = [each for each in self._sessions.values() if each.locator == locator]
+            return self._discard(sessions)
 
     def discard_sequence(self, sequence: str) -> bool:
         """Discard the open sessions of a sequence; return whether there were any."""
@@ -209,9 +210,9 @@ class Uploads:
 
     def discard_idle(self, idle_s: float) -> bool:
         """Discard the open sessions that are idle for `idle_s`; return whether there were any."""
-        before = time.monotonic() - idle_s
+        limit_s = time.monotonic() - idle_s
         with self._lock:
-            return self._discard([each for each in self._sessions.values() if each.last_call_s < before])
+            return self._discard([each for each in self._sessions.values() if each.last_call_s < limit_s])
 
     def close(self) -> None:
         """Discard every open session."""
@@ -224,7 +225,7 @@ class Uploads:
             raise NotInStore(f"there is no topic with the UUID {put.topic_uuid}")
         topic = owners[0].topics[put.topic_uuid]
         if topic.question.locator != put.resource_locator:
-            raise Refusal(Condition.PERMISSION, f"the UUID is that of {topic.question.locator!r}")
+            raise Refusal(Condition.PERMISSION, f"the UUID belongs to topic {topic.question.locator!r}")
         if topic.state is not _State.CREATED:
             raise Refusal(Condition.PRECONDITION, f"topic {put.resource_locator!r} {topic.state.value}")
         ontology = OntologyType(topic.question.ontology_tag, payload, topic.question.serialization_format)
@@ -239,34 +240,34 @@ class Uploads:
     def _topic_names(self, sequence: str) -> set[str]:
         return {topic.name for each in self.of_sequence(sequence) for topic in each.topics.values()}
 
-    def _touch(self, opened: OpenSession) -> None:
+    def _record_call(self, opened: OpenSession) -> None:
         opened.last_call_s = time.monotonic()
         if opened.uuid not in self._sessions:
             raise Refusal(Condition.PRECONDITION, "the session has ended")
 
     def _session(self, uuid: str) -> OpenSession:
         if uuid in self._committing or uuid in self._finalized:
-            raise Refusal(Condition.PRECONDITION, "the session is finalized already")
+            raise Refusal(Condition.PRECONDITION, "the session is already finalized")
         if uuid not in self._sessions:
             raise NotInStore(f"there is no open session {uuid}")
         self._sessions[uuid].last_call_s = time.monotonic()
         return self._sessions[uuid]
 
     def _discard(self, sessions: Iterable[OpenSession]) -> bool:
-        dropped = False
+        discarded = False
         for opened in sessions:
             del self._sessions[opened.uuid]
             opened.session.discard()
-            dropped = True
-        return dropped
+            discarded = True
+        return discarded
 
 
 def _rows(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:
-    """Return a client's batch in the order of a topic's columns.
+    """Return a client's batch with the columns in the order of `schema`.
 
     Raises:
         pa.ArrowInvalid: The batch is malformed.
-        SinkError: A row has no time stamp.
+        SinkError: A row has no timestamp.
     """
     complete = validated(batch)
     columns = [complete.column(name) for name in schema.names]
@@ -276,8 +277,8 @@ def _rows(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:
 
 
 def _payload_columns(schema: pa.Schema) -> pa.StructType:
-    """Return the columns besides the envelope, or refuse a schema without it."""
+    """Return the columns except the envelope, or refuse a schema without the envelope."""
     with refuse_invalid():
         if schema.get_field_index(ENVELOPE.name) < 0 or schema.field(ENVELOPE.name).type != ENVELOPE.type:
-            raise pa.ArrowInvalid("the schema has no column timestamp_ns of int64")
+            raise pa.ArrowInvalid("the schema has no column timestamp_ns with the type int64")
     return pa.struct([column for column in schema if column.name != ENVELOPE.name])

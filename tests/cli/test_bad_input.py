@@ -234,9 +234,9 @@ def test_inspect_recording_without_topics_prints_no_topics(ingest: Ingest, tmp_p
 @pytest.mark.parametrize(
     ("settings", "place"),
     [
-        ("sequence: {name: a/b}", "job.yaml:2:18: sequence name 'a/b' has '/'"),
+        ("sequence: {name: a/b}", "job.yaml:2:18: sequence name 'a/b' contains '/'"),
         ("sequence: {metadata: {a.b: 1}}", "job.yaml:2:22: metadata key 'a.b'"),
-        ('topic_settings: {/imu: {rename: "/a b"}}', "job.yaml:2:33: topic name '/a b' has ' '"),
+        ('topic_settings: {/imu: {rename: "/a b"}}', "job.yaml:2:33: topic name '/a b' contains ' '"),
         ("topic_settings: {/imu: {metadata: {a.b: 1}}}", "job.yaml:2:35: metadata key 'a.b'"),
     ],
 )
@@ -263,7 +263,7 @@ def test_store_path_is_file_exits_1(ingest: Ingest, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     code, _, err = ingest("bag", str(QUICKSTART), "--name", "drive", "--store", "file")
     assert code == 1
-    assert "error: file: File exists — a file is in the way; choose another target.store\n" in err
+    assert "error: file: File exists — remove the file at this path, or choose another target.store\n" in err
 
 
 def test_run_missing_adapter_file_is_reported_once(ingest: Ingest) -> None:
@@ -298,8 +298,11 @@ def test_keys_missing_file_or_past_expiry_exits_2(ingest: Ingest, tmp_path: Path
     assert "has no time zone" in ingest(*new, "2999-01-01")[2]
     assert ingest(*new, "2999-01-01T00:00:00Z")[0] == 0
     assert "expires 2999" in ingest("keys", "ls")[1]
-    assert ingest("keys", "ls", "--api-keys", ".")[2] == "error: .: cannot be read: Is a directory\n"
-    assert "api_keys.json/x: cannot be " in ingest(*new[:-1], "--api-keys", "api_keys.json/x")[2]
+    assert (
+        ingest("keys", "ls", "--api-keys", ".")[2]
+        == "error: .: the key file cannot be read: Is a directory\n"
+    )
+    assert "api_keys.json/x: the key file cannot be " in ingest(*new[:-1], "--api-keys", "api_keys.json/x")[2]
     ring = tmp_path / "api_keys.json"
     ring.write_text(ring.read_text().replace("2999", "2020"))
     assert "expired 2020" in ingest("keys", "ls")[1]
@@ -307,7 +310,7 @@ def test_keys_missing_file_or_past_expiry_exits_2(ingest: Ingest, tmp_path: Path
 
 def test_bag_unreadable_certificate_names_file(ingest: Ingest) -> None:
     code, _, err = ingest("serve", "--tls-cert", "no.pem", "--tls-key", "no.pem")
-    assert (code, err) == (1, "error: no.pem: cannot be read: No such file or directory\n")
+    assert (code, err) == (1, "error: no.pem: the PEM file cannot be read: No such file or directory\n")
 
 
 def test_expand_undecodable_file_name_with_strict_stdout_succeeds(tmp_path: Path) -> None:

@@ -85,7 +85,7 @@ def test_response_with_unknown_keys_is_decoded() -> None:
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (b'{"action": "info", "response": {}}', "an answer to 'info' instead of 'topic_create'"),
+        (b'{"action": "info", "response": {}}', "'info' instead of 'topic_create'"),
         (b'{"action": "topic_create", "response": null}', "uuid: Field required"),
         (b"{", "Invalid JSON"),
         (b"\xff", "Invalid JSON"),
@@ -127,7 +127,7 @@ def test_api_key_new_is_valid_and_mistyped_is_not() -> None:
     key = new_key()
     assert key_problem(key) is None
     wrong = key[:5] + ("a" if key[5] != "a" else "b") + key[6:]
-    assert key_problem(wrong) == "its checksum does not fit, so a character is wrong"
+    assert key_problem(wrong) == "its checksum does not match, so at least one character is wrong"
     assert "msco_<" in str(key_problem("secret"))
     assert "secret" not in str(key_problem("secret"))
 

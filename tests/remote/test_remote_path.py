@@ -56,11 +56,11 @@ def test_as_path_other_text_is_a_local_path(given: str) -> None:
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ("ftp://host/a.mcap", "the scheme ftp:// is not known — known are s3://, gs://, file://"),
+        ("ftp://host/a.mcap", "unknown URL scheme ftp:// — use one of s3://, gs://, file://"),
         ("https://host/a.mcap", "https://"),
         ("s3:///a.mcap", "no bucket"),
-        ("s3://[bucket/a.mcap", "cannot be read: Invalid IPv6 URL"),
-        ("s3://key:secret@bucket/a.mcap", "no place for a password"),
+        ("s3://[bucket/a.mcap", "the URL is invalid: Invalid IPv6 URL"),
+        ("s3://key:secret@bucket/a.mcap", "the URL contains credentials"),
     ],
 )
 def test_as_path_invalid_url_is_refused(given: str, said: str) -> None:
@@ -106,7 +106,7 @@ def test_config_accepts_urls() -> None:
 def test_manifest_with_invalid_url_reports_its_location(tmp_path: Path) -> None:
     job = tmp_path / "job.yaml"
     job.write_text('version: 1\nbag: {path: "ftp://host/a.mcap"}\n')
-    with pytest.raises(ManifestError, match=r"job.yaml:2:13: ftp://host/a.mcap: the scheme"):
+    with pytest.raises(ManifestError, match=r"job.yaml:2:13: ftp://host/a.mcap: unknown URL scheme"):
         compile_manifest(load_manifest(job))
 
 

@@ -292,7 +292,7 @@ def test_do_put_reorders_columns_and_accepts_nullable_time_column(client: Client
     uuid = client.create_topic(session, "drive/bad")
     with refused(Condition.INVALID, "timestamp_ns"):
         client.put("drive/bad", uuid, pa.record_batch({"timestamp_ns": pa.array([None], pa.int64())}))
-    with refused(Condition.PRECONDITION, "broke off"):
+    with refused(Condition.PRECONDITION, "has an interrupted upload"):
         client.call("session_finalize", session_uuid=session)
 
 
