@@ -162,7 +162,7 @@ def test_config_repr_hides_api_key() -> None:
         ({"store": "s", "host": "h"}, "store and host are two destinations"),
         ({"store": "s", "plugin": PluginTarget("lake")}, "store and type are two destinations"),
         ({"port": 0}, "port is 0"),
-        ({"mosaico_api_key": "k"}, "host is not set"),
+        ({"mosaico_api_key": "k"}, "requires host"),
         ({"update_if_exists": True, "if_exists": "replace"}, "if_exists is 'replace'"),
         ({"every": {"/a": 0}}, "every\\['/a'\\] is 0"),
         ({"every": {"/a": 10**30}}, "every\\['/a'\\] is 1000"),

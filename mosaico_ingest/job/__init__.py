@@ -1,5 +1,5 @@
-"""Jobs: a manifest or the arguments of `ROSInjectionConfig` in, a validated job out.
+"""Jobs, validated and built from a manifest or from the arguments of `ROSInjectionConfig`.
 
-The package defines the sections of a job, composes manifests (`extends`, `matrix`) and knows the location of every value.
+The package defines the sections of a job, composes manifests (`extends`, `matrix`) and records the span of every value.
 It must not open recordings or destinations.
 """

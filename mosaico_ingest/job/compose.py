@@ -48,7 +48,7 @@ _BRACED = re.compile(r"\{([^{}]*)\}")
 
 
 class Placeholder(Struct, frozen=True):
-    """`{index:03}` at `start:end` of a name."""
+    """A placeholder such as `{index:03}` in the characters `start:end` of a name."""
 
     start: int
     end: int
@@ -57,14 +57,14 @@ class Placeholder(Struct, frozen=True):
 
     @property
     def known(self) -> bool:
-        """Whether the placeholder exists; only `index` has a width."""
+        """True if the placeholder exists and its width is valid; only `index` has a width."""
         return self.name in PLACEHOLDERS and (
             not self.width or (self.name == "index" and _WIDTH.fullmatch(self.width) is not None)
         )
 
 
 def placeholders_in(template: str) -> Iterator[Placeholder]:
-    """Yield every `{…}` of a name."""
+    """Yield every `{…}` in a name, including unknown ones."""
     for match in _BRACED.finditer(template):
         name, _, width = match[1].partition(":")
         yield Placeholder(match.start(), match.end(), name, width)
@@ -76,8 +76,8 @@ MATRIX_KEY = "matrix"
 def combinations(document: Value) -> list[dict[str, str]]:
     """Return the matrix variables of each job of a document; one job without variables if it has no matrix.
 
-    A mapping of lists stands for every combination of their values, a list for its items. Values that the model refuses
-    are ignored, and more than `MAX_JOBS` combinations count as none.
+    A mapping of lists defines every combination of their values; a list defines one job per item. Values that the model
+    refuses are ignored. More than `MAX_JOBS` combinations are treated like a document without a matrix.
     """
     matrix = document.get(MATRIX_KEY) if isinstance(document, dict) else None
     if isinstance(matrix, list):
@@ -107,21 +107,21 @@ _INSIDE = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)(?::([-?])(.*))?", re.DOTALL)
 
 @dataclass(slots=True)
 class Filled:
-    """The document with its variables filled in."""
+    """A document whose variables are replaced by their values."""
 
     value: Value
     findings: list[Finding] = field(default_factory=list[Finding])
     changed: set[KeyPath] = field(default_factory=set[KeyPath])
-    """The key paths that had a variable; their values may be secret."""
+    """Key paths whose text contained a variable; their values may be secret."""
     unknown: set[KeyPath] = field(default_factory=set[KeyPath])
-    """The key paths with a variable that is not set; their text is as written."""
+    """Key paths whose text contains an unset variable; the text is unchanged."""
 
 
 def fill_in(source: Source, env: Mapping[str, str] | None, cell: Mapping[str, str] | None = None) -> Filled:
-    """Fill in the variables of every text; without `env` only those with a default, and none is missed.
+    """Replace the variables in every text; without `env`, unset variables are not reported.
 
-    The values of `cell` come first (without it, those of the first job of the document's matrix), then those of the
-    environment, then the document's own `defaults`.
+    A variable's value is looked up in `cell`, then in the environment, then in the document's `defaults`. `cell` defaults
+    to the first job of the document's matrix.
     """
     matrix = source.at((MATRIX_KEY,))
     known = _Variables(
@@ -134,7 +134,7 @@ def fill_in(source: Source, env: Mapping[str, str] | None, cell: Mapping[str, st
 
 
 def fill_in_cell(source: Source, cell: Mapping[str, str]) -> Filled:
-    """Fill in the variables of a matrix and leave every other one as it is written."""
+    """Replace only the variables of a matrix; all others stay as written."""
     return _filled(source, _Variables(cell, None, {}, alone=True))
 
 
@@ -145,16 +145,16 @@ def _filled(source: Source, known: _Variables) -> Filled:
 
 
 class _Variables(Struct, frozen=True):
-    """The values of variables; of several sources the first that has one wins."""
+    """The values of variables from several sources; the first source that has a value takes precedence."""
 
     cell: Mapping[str, str]
     env: Mapping[str, str] | None
-    """None: not looked at, and nothing is missed."""
+    """None ignores the environment, and unset variables are not reported."""
     defaults: Mapping[str, str]
     axes: frozenset[str] = frozenset()
     """Variables of the matrix; the model reports axes without values."""
     alone: bool = False
-    """Whether nothing but the cell counts, and all else stays to be filled in later."""
+    """True to replace only the variables of `cell` and to keep all others for a later pass."""
 
     def get(self, name: str) -> str | None:
         if name in self.cell:
@@ -185,7 +185,7 @@ def _text(text: str, path: KeyPath, source: Source, known: _Variables, out: Fill
         if inside is None:
             report(
                 "variable-syntax",
-                f"{'${' if match[0] == '$' else match[0]} is no variable",
+                f"{'${' if match[0] == '$' else match[0]} is not a variable",
                 "write ${NAME}, or $$ for a dollar",
                 match,
             )
@@ -211,7 +211,7 @@ def _text(text: str, path: KeyPath, source: Source, known: _Variables, out: Fill
 
 EXTENDS_KEY = "extends"
 MAX_FILES = 100
-"""How many files one document may extend, each counted as often as it is named."""
+"""Maximum number of files that one document may extend; a file counts each time it is named."""
 
 
 def extended(source: Source, *, folder: File) -> Source:
@@ -226,10 +226,10 @@ def extended(source: Source, *, folder: File) -> Source:
 
 def bases_of(source: Source, *, folder: File) -> Iterator[tuple[File, Span]]:
     """Yield the files that a document extends with their spans; later files take precedence."""
-    named = source.at((EXTENDS_KEY,))
-    for position, name in enumerate(named if isinstance(named, list) else [named]):
+    names = source.at((EXTENDS_KEY,))
+    for position, name in enumerate(names if isinstance(names, list) else [names]):
         if isinstance(name, str) and name:
-            key_path = (EXTENDS_KEY, position) if isinstance(named, list) else (EXTENDS_KEY,)
+            key_path = (EXTENDS_KEY, position) if isinstance(names, list) else (EXTENDS_KEY,)
             yield File(normpath(folder / File(name).expanduser())), source.span(key_path)
 
 
@@ -250,7 +250,7 @@ def _base(path: File, span: Span, chain: tuple[File, ...], read: Iterator[int]) 
     here = path.resolve()
     if here in chain:
         names = " → ".join(file.name for file in (*chain[chain.index(here) :], here))
-        return _finding(f"files extend one another: {names}", span, "take one of them out")
+        return _finding(f"files extend one another: {names}", span, "remove one of them")
     if next(read) > MAX_FILES:
         return _finding(f"{path} is one of more than {MAX_FILES} files", span, "extend fewer files")
     try:
@@ -260,7 +260,7 @@ def _base(path: File, span: Span, chain: tuple[File, ...], read: Iterator[int]) 
         return _finding(f"{path} cannot be extended: {why}", span, "name a manifest, or a part of one")
     source = load_source(text, file=str(path))
     if not isinstance(source.value, dict) and not source.findings:
-        return _finding(f"{path} cannot be extended: it holds no mapping", span, "name a part of a manifest")
+        return _finding(f"{path} cannot be extended: it is not a mapping", span, "name a part of a manifest")
     return _extended(source, path.parent, (*chain, here), read)
 
 
@@ -270,7 +270,7 @@ def _finding(message: str, span: Span, remedy: str) -> Finding:
 
 @dataclass(slots=True)
 class _Join:
-    """A merge of two values that records the key paths taken from the base and those removed."""
+    """A merge of two values that records inherited and removed key paths."""
 
     inherited: set[KeyPath] = field(default_factory=set[KeyPath])
     dropped: set[KeyPath] = field(default_factory=set[KeyPath])
@@ -313,9 +313,9 @@ def _joined(own: Source, base: Source) -> Source:
     )
 
 
-def _moved(source: Source, way: str) -> Source:
-    """Return a document with its relative paths prefixed by `way`."""
-    if way == ".":
+def _moved(source: Source, prefix: str) -> Source:
+    """Return a document with its relative paths prefixed by the folder `prefix`."""
+    if prefix == ".":
         return source
     value = source.value
     for marked in (*marked_fields(Manifest, FilePath), *marked_fields(Manifest, AdapterRef)):
@@ -324,17 +324,17 @@ def _moved(source: Source, way: str) -> Source:
         def rebase(_: KeyPath, text: str, *, is_path: bool = is_path) -> str:
             if not _is_relative(text) or not (is_path or is_adapter_path(text)):
                 return text
-            return File(normpath(File(way, text))).as_posix()
+            return File(normpath(File(prefix, text))).as_posix()
 
         value = replace_values(value, marked.path, rebase)
     return replace(source, value=value)
 
 
 def is_adapter_path(text: str) -> bool:
-    """Return whether a reference to an adapter is or begins with the path of a file."""
+    """Return whether a reference to an adapter names a file: a YAML file or `file.py:Class`."""
     return text.endswith((".yaml", ".yml")) or ".py:" in text
 
 
 def _is_relative(text: str) -> bool:
-    """Return whether a path starts at the manifest's folder; one that starts with a variable may be absolute."""
+    """Return whether a path is relative to the manifest's folder; a path that starts with a variable may be absolute."""
     return text != "" and not text.startswith(("/", "~", "${")) and not is_url(text)

@@ -46,7 +46,7 @@ def _key(path: str) -> dict[str, tuple[str, ...]]:
 
 @dataclass(frozen=True, slots=True)
 class ROSInjectionConfig:
-    """The ingestion of one recording; `job` holds it in the form that the pipeline uses.
+    """The configuration for ingesting one recording; `job` is the form that the pipeline uses.
 
     Without `store` and `host`, the destination is the embedded store `./mosaico`. None stands for the default of any
     argument.
@@ -73,7 +73,7 @@ class ROSInjectionConfig:
     custom_msgs: Sequence[tuple[str, Path | str, Stores | str | None]] | None = field(
         default=None, metadata=_key("bag.custom_msgs")
     )
-    """Package, directory of `.msg` files or one file, and distro (None stands for every distro)."""
+    """Package, directory of `.msg` files or one file, and distro (None means every distro)."""
     topics: Sequence[str] | str | None = field(default=None, metadata=_key("topics"))
     """Topic names and globs; a leading `!` excludes. Defaults to every topic."""
     adapter_override: Mapping[str, AdapterReference] | None = field(
@@ -93,13 +93,13 @@ class ROSInjectionConfig:
     )
     """Metadata by topic name or glob."""
     update_if_exists: bool = False
-    """Stands for `if_exists=IfExists.APPEND`."""
+    """True is equivalent to `if_exists=IfExists.APPEND`."""
     serialization_formats: Mapping[str, str] | None = field(
         default=None, metadata=_key("adapters.serialization_formats")
     )
     """Serialization format by message type, for types without an adapter."""
     dry_run: bool = False
-    """Whether `RosbagInjector.run` plans and writes nothing."""
+    """True if `RosbagInjector.run` only plans and writes nothing."""
     registry: Any = None
     """The `ROSTypeRegistry` for definitions; defaults to the process-wide one."""
     store: AnyPath | str | None = field(default=None, metadata=_key("target.store"))
@@ -126,15 +126,15 @@ class ROSInjectionConfig:
     jobs: int = field(default=1, metadata=_key("run.jobs"))
     """Maximum number of recordings to ingest at the same time."""
     quarantine: QuarantineSettings | None = field(default=None, metadata=_key("quarantine"))
-    """The quarantine of rejected messages; without one they are only counted."""
+    """The quarantine of rejected messages; without a quarantine, they are only counted."""
     family: str | None = field(default=None, metadata=_key("sequence.family"))
     """The name that sequences with the same message definitions share; defaults to `sequence_name`."""
     on_schema_change: OnSchemaChange | str | None = field(default=None, metadata=_key("on_schema_change"))
     """Action if a topic's definition differs from that of the family; if omitted, definitions are not compared."""
     message_bytes: int = field(default=DEFAULT_MESSAGE_BYTES, metadata=_key("target.message_size"))
-    """The size up to which rows are combined into one upload message to a server, in bytes."""
+    """Maximum size, in bytes, up to which rows are combined into one upload message to a server."""
     plugin: PluginTarget | None = None
-    """A destination that an installed package provides, in place of `store` and `host`."""
+    """A destination that an installed package provides, instead of `store` and `host`."""
     job: Job = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -160,19 +160,19 @@ class ROSInjectionConfig:
         object.__setattr__(self, "job", job.check())  # frozen after its construction
 
     def _document(self) -> dict[str, Any]:
-        """Return the arguments as a manifest has them."""
+        """Return the arguments in the structure of a manifest."""
         document: dict[str, Any] = {"bag": {}}
-        for one in fields(self):
-            path, value = one.metadata.get(_KEY), getattr(self, one.name, None)
-            if path is None or value is None or value == one.default:
+        for argument in fields(self):
+            path, value = argument.metadata.get(_KEY), getattr(self, argument.name, None)
+            if path is None or value is None or value == argument.default:
                 continue
             if _TOPIC in path:
                 if not isinstance(value, Mapping):
-                    raise ManifestError(f"{one.name} is {value!r:.80}", hint="give a mapping")
+                    raise ManifestError(f"{argument.name} is {value!r:.80}", hint="give a mapping")
                 for topic, setting in value.items():
                     _put(document, tuple(topic if part == _TOPIC else part for part in path), setting)
             else:
-                _put(document, path, self._plain(one.name, value))
+                _put(document, path, self._plain(argument.name, value))
         if self.plugin is not None:
             _put(document, ("target", "type"), self.plugin.kind)
             _put(document, ("target", "options"), dict(self.plugin.options))
@@ -183,7 +183,7 @@ class ROSInjectionConfig:
         return document
 
     def _plain(self, name: str, value: Any) -> Any:  # noqa: ANN401 - any argument
-        """Return an argument's value as the model has it."""
+        """Convert an argument's value to the form that the model accepts."""
         if name == "custom_msgs":
             return tuple(map(_custom_messages, value))
         if name == "topics" and isinstance(value, str):
@@ -212,12 +212,12 @@ class ROSInjectionConfig:
         return IfExists.APPEND
 
     def _refusal(self, error: ErrorDetails) -> ManifestError:
-        """Return the error that names the argument which the model refuses."""
+        """Return an error that names the argument that the model refuses."""
         location, context = error["loc"], error.get("ctx", {})
         allowed = context.get("expected")
         hint = f"allowed: {allowed}" if allowed else error["msg"].removeprefix("Value error, ")
-        for one in fields(self):
-            path = one.metadata.get(_KEY, ())
+        for argument in fields(self):
+            path = argument.metadata.get(_KEY, ())
             if (
                 path
                 and len(location) >= len(path)
@@ -225,9 +225,11 @@ class ROSInjectionConfig:
             ):
                 topic = next((key for part, key in zip(path, location, strict=False) if part == _TOPIC), None)
                 inner = [
-                    key for key in (topic, *location[len(path) :]) if key in _keys_of(getattr(self, one.name))
+                    key
+                    for key in (topic, *location[len(path) :])
+                    if key in _keys_of(getattr(self, argument.name))
                 ]
-                name = one.name + "".join(f"[{key!r}]" for key in inner)
+                name = argument.name + "".join(f"[{key!r}]" for key in inner)
                 return ManifestError(f"{name} is {error['input']!r:.80}", hint=hint)
         return ManifestError(error["msg"], hint="see the documentation of ROSInjectionConfig")
 
@@ -239,7 +241,7 @@ def _put(document: dict[str, Any], path: tuple[str, ...], value: object) -> None
 
 
 def _enumerated(value: Any) -> Any:  # noqa: ANN401 - any argument
-    """Return the value of an enumeration's member: rosbags and the SDK have their own enumerations."""
+    """Return the value of an enumeration's member, because rosbags and the SDK have their own enumerations."""
     if isinstance(value, Enum):
         return value.value
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Write composed manifests as YAML, without secrets."""
+"""Writes composed manifests as YAML, without secrets."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 Remark: TypeAlias = Callable[[KeyPath], "str | None"]
-"""Returns the comment beside the value at a key path, or None."""
+"""A function that returns the comment for the value at a key path, or None."""
 
 _PLAIN = re.compile(r"[A-Za-z0-9_./~+-]([A-Za-z0-9_./~+:-]*[A-Za-z0-9_./~+-])?")
 _UNPRINTABLE = re.compile(r"[\x7f-\x9f\u2028\u2029\ufeff\ud800-\udfff\ufffe\uffff]")
@@ -104,7 +104,7 @@ def _number(value: float) -> str:
         return ".nan"
     mantissa, exponent, power = repr(value).partition("e")
     if exponent and "." not in mantissa:
-        mantissa += ".0"  # without it, it is a text to some readers
+        mantissa += ".0"  # some YAML readers read 1e3 as text
     return {float("inf"): ".inf", float("-inf"): "-.inf"}.get(value, f"{mantissa}{exponent}{power}")
 
 
@@ -113,7 +113,7 @@ class Expanded(Struct, frozen=True):
 
     source: Source
     cell: Mapping[str, str]
-    """The values of the matrix that make it this job."""
+    """The values of the matrix variables for this job."""
     value: Value
 
     def remark(self, path: KeyPath) -> str | None:
@@ -123,7 +123,7 @@ class Expanded(Struct, frozen=True):
 
 
 def expand_manifest(path: File) -> tuple[Expanded, ...]:
-    """Return every job of a manifest, with environment variables in place and secrets masked.
+    """Return every job of a manifest, with its environment variables unreplaced and its secrets masked.
 
     Raises:
         ManifestError: The manifest has mistakes; `findings` has one entry for each.
@@ -141,7 +141,7 @@ def expand_manifest(path: File) -> tuple[Expanded, ...]:
 MASK = "***"
 _SECRET_KEYS = frozenset(str(field.path[-1]) for field in marked_fields(Manifest, Secret))
 _SECRET = re.compile(rf"{'|'.join(sorted(_SECRET_KEYS))}|api_?key|password|token|secret", re.IGNORECASE)
-"""Keys of secrets: those that the model marks, and usual names in metadata and variables."""
+"""Keys of secrets: keys that the model marks, and common names in metadata and variables."""
 _IN_TEXT = re.compile(
     r"(?<=://)[^/@\s]+(?=@)|msco_\w+|(?<=[?&])([^=&\s]*(?:key|password|token|secret)[^=&\s]*=)[^&\s]+",
     re.IGNORECASE,
@@ -154,7 +154,7 @@ def manifest_text(path: File) -> str:
     """Return a manifest merged with the files it extends; comments name the file of each value from another file.
 
     Raises:
-        ManifestError: It cannot be read.
+        ManifestError: The manifest cannot be read.
     """
     source = read_manifest(path)
     value = source.value
@@ -198,4 +198,4 @@ def _masked(value: Value, hidden: frozenset[str], *, secret: bool = False) -> Va
     if secret and value is not None:
         names = _VARIABLE.findall(value) if isinstance(value, str) else []
         return "".join(f"${{{name}}}" for name in names) or MASK
-    return _IN_TEXT.sub(lambda found: (found[1] or "") + MASK, value) if isinstance(value, str) else value
+    return _IN_TEXT.sub(lambda match: (match[1] or "") + MASK, value) if isinstance(value, str) else value

@@ -1,4 +1,4 @@
-"""Annotations that state what a field of a job is, and the functions that find and change the fields that have one.
+"""Annotations that describe the fields of a job, and functions that find and change annotated fields.
 
 `extends`, lint, the removal of secrets, shipping to a cluster, JSON Schema and docs/manifest.md are derived from these
 annotations, so a new key needs no entry in a list.
@@ -39,15 +39,15 @@ ANY = None
 
 
 class PathRole(Enum):
-    """What a job does with a file or folder."""
+    """How a job uses a file or folder."""
 
     RECORDING = "recording"
     BASE = "base"
     """Another manifest."""
     INPUT = "input"
-    """A file that the manifest's machine reads when it loads the job."""
+    """A file that is read when the job is loaded, by the machine that has the manifest."""
     WORKER_FILE = "worker file"
-    """A file that the machine reads that ingests the recording."""
+    """A file that is read by the machine that ingests the recording."""
     DEFINITIONS = "definitions"
     """A `.msg` file or a folder of them, read by the machine that ingests the recording."""
     STORE = "store"
@@ -56,7 +56,7 @@ class PathRole(Enum):
 
 
 class FilePath(Struct, frozen=True):
-    """The text is a path; a relative one starts at the manifest's folder."""
+    """The text is a path; relative paths start at the manifest's folder."""
 
     role: PathRole
 
@@ -65,7 +65,7 @@ class AdapterRef(Struct, frozen=True):
     """The text is the name of an adapter, `module:Class`, `file.py:Class` or the path of a YAML file."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401 - a type
-        """Accept text in manifests; accept classes and specs too in Python."""
+        """Accept text in manifests; in Python, also accept classes and specs."""
         del source, handler
         return core_schema.json_or_python_schema(
             json_schema=core_schema.str_schema(min_length=1, strict=True),
@@ -86,7 +86,7 @@ class TopicGlob(Struct, frozen=True):
     excludes: bool = False
     """Whether a leading `!` excludes topics."""
     default: str | None = None
-    """The key that is no topic and applies to topics that no other key matches."""
+    """The key that is not a topic and applies to topics that no other key matches."""
 
 
 class Secret(Struct, frozen=True):
@@ -98,18 +98,18 @@ class Literally(Struct, frozen=True):
 
 
 class Parsed(Struct, frozen=True):
-    """A value that manifests write as text in a notation of its own, such as `512MiB`."""
+    """A value that manifests write as text in a special notation, such as `512MiB`."""
 
     parse: Callable[[str], Any]
     """Returns the value; raises ValueError."""
     pattern: str
-    """What JSON Schema can express of the notation."""
+    """The regular expression for JSON Schema; it may accept more than `parse`."""
     whole_numbers: bool = False
     """Whether a manifest may write a whole number without quotes."""
     to_json: Callable[[Any], Any] = str
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401 - a type
-        """Accept the notation in manifests; accept the value too in Python."""
+        """Accept the notation in manifests; in Python, also accept the value."""
         del handler
         text: CoreSchema = core_schema.str_schema(min_length=1, strict=True)
         if self.whole_numbers:
@@ -137,12 +137,12 @@ def _number_as_text(value: object) -> object:
 
 
 class MarkedField(Struct, frozen=True):
-    """A place in a model whose annotation has a marker."""
+    """A key path in a model whose annotation has a marker."""
 
     path: PathPattern
     marker: Any
     is_key: bool = False
-    """Whether the marker is on the keys of the mapping at `path` and not on the value."""
+    """True if the marker applies to the keys of the mapping at `path` instead of the value."""
 
 
 @cache
@@ -213,7 +213,7 @@ def replace_values(
     change: Callable[[tuple[Any, ...], str], Any],
     path: tuple[Any, ...] = (),
 ) -> Any:  # noqa: ANN401 - as `value`
-    """Return a model or document with `change(key path, text)` for each text at a pattern; `value` stays as it is."""
+    """Return a model or document with `change(key path, text)` for each text at a pattern; `value` is not modified."""
     if not pattern:
         return change(path, value) if isinstance(value, str) else value
     children = dict(_children(value, pattern[0]))

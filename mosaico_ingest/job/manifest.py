@@ -1,4 +1,4 @@
-"""Load a job manifest: YAML text, environment variables and model; report all findings together."""
+"""Loads job manifests from YAML text and environment variables, and reports all findings together."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class LoadedManifest(Struct, frozen=True):
         return replace(self, manifest=self.manifest.replace(bag=bag))
 
     def resolve(self, path: str, *key_path: str | int) -> Path:
-        """Return a path that starts at the current folder instead of the manifest's.
+        """Return a path of the manifest as a path relative to the current folder.
 
         Raises:
             ManifestError: The path is a URL; the error's location is that of `key_path`.
@@ -77,7 +77,7 @@ class LoadedManifest(Struct, frozen=True):
         return self.path.parent / Path(path).expanduser()
 
     def resolve_or_url(self, path: str, *key_path: str | int) -> AnyPath:
-        """Return a path that starts at the current folder instead of the manifest's, or that of a URL.
+        """Return a path of the manifest as a path relative to the current folder, or the remote path of a URL.
 
         Raises:
             ManifestError: The URL is invalid; the error's location is that of `key_path`.
@@ -102,7 +102,7 @@ def load_manifest(path: Path | str, *, env: Mapping[str, str] | None = os.enviro
 def load_manifests(
     path: Path | str, *, env: Mapping[str, str] | None = os.environ
 ) -> tuple[LoadedManifest, ...]:
-    """Load every job of a manifest, merged with its bases; `env=None` ignores the environment.
+    """Load every job of a manifest, merged with the files it extends; `env=None` ignores the environment.
 
     Raises:
         ManifestError: The file cannot become a job; `findings` has one entry for each mistake.
@@ -133,9 +133,9 @@ def read_manifest(path: Path) -> Source:
 def check_manifest(
     source: Source, *, env: Mapping[str, str] | None, cell: Mapping[str, str] | None = None
 ) -> tuple[Manifest | None, tuple[Finding, ...]]:
-    """Return the model, None if there are mistakes, and the findings in the order of the text.
+    """Return the model (None if the manifest has mistakes) and the findings in the order of the text.
 
-    `cell` has the values of one combination of its matrix; without it they are those of the first.
+    `cell` contains the values of one combination of the matrix and defaults to the first combination.
     """
     if not isinstance(source.value, dict):
         return None, source.findings or (_not_a_job(source),)
@@ -143,44 +143,44 @@ def check_manifest(
     findings = [*source.findings, *filled.findings]
     filled.value = _with_text_keys(filled.value, (), source, findings)
     manifest, mistakes = _validate(source, filled)
-    known = {finding.span for finding in findings}
+    reported = {finding.span for finding in findings}
     if any(finding.rule == "missing-base" for finding in findings):
         mistakes = [finding for finding in mistakes if finding.rule != "missing-key"]
-    findings += [finding for finding in mistakes if finding.span not in known]  # one mistake for each span
+    findings += [finding for finding in mistakes if finding.span not in reported]
     ordered = tuple(sorted(findings, key=lambda finding: finding.span or Span("", 0, 0, 0, 0)))
     return (None if ordered else manifest), ordered
 
 
 def stand_alone(source: Source, cell: Mapping[str, str]) -> Value:
-    """Return one job of a manifest as a document of its own: nothing to extend, no matrix, its variables filled in.
+    """Return one job of a manifest as a document without `extends` and `matrix`, with the matrix variables replaced.
 
-    Those of the environment stay, and with them the defaults they may need.
+    Environment variables stay as written, together with the defaults that they may need.
     """
     filled = fill_in_cell(source, cell)
-    _validate(source, filled)  # finds the texts that have to be numbers
+    _validate(source, filled)  # converts the texts that have to be numbers
     if not isinstance(filled.value, dict):
         return filled.value
     defaults = filled.value.get("defaults")
-    left = {key: value for key, value in filled.value.items() if key not in {"extends", "defaults", "matrix"}}
+    job = {key: value for key, value in filled.value.items() if key not in {"extends", "defaults", "matrix"}}
     if isinstance(defaults, dict) and (unfilled := {k: v for k, v in defaults.items() if k not in cell}):
-        return {"defaults": unfilled, **left}
-    return left
+        return {"defaults": unfilled, **job}
+    return job
 
 
 _RECORDINGS = frozenset({".bag", ".db3", ".mcap"})
-_QUICKLY = "`ingest bag RECORDING --name NAME` does without one, `ingest init RECORDING` drafts one"
+_WITHOUT_MANIFEST = "run `ingest bag RECORDING --name NAME`, or draft a manifest with `ingest init RECORDING`"
 
 
 def read_text(path: Path) -> str:
     """Return the text of a file.
 
     Raises:
-        ManifestError: It is not there, not readable, or not UTF-8.
+        ManifestError: The file does not exist, is not readable, or is not UTF-8.
     """
     if path.is_dir() or path.suffix in _RECORDINGS:
-        what = "a folder" if path.is_dir() else "a recording"
+        kind = "a folder" if path.is_dir() else "a recording"
         finding = Finding(
-            "unreadable-file", Severity.ERROR, f"{path} is {what}, not a manifest", help=_QUICKLY
+            "unreadable-file", Severity.ERROR, f"{path} is {kind}, not a manifest", help=_WITHOUT_MANIFEST
         )
         raise refusal((finding,), str(path))
     try:
@@ -198,10 +198,12 @@ def read_text(path: Path) -> str:
 
 
 def refusal(findings: tuple[Finding, ...], where: str) -> ManifestError:
-    """Return the error of a manifest that has mistakes."""
+    """Return the error for a manifest with these findings, or for a manifest that is incomplete without its variables."""
     if not findings:
         return ManifestError(
-            "there is no job without its variables", where=where, hint="set them in the environment"
+            "the manifest is incomplete without its environment variables",
+            where=where,
+            hint="set them in the environment",
         )
     first = findings[0]
     if len(findings) == 1:
@@ -217,13 +219,13 @@ def _not_a_job(source: Source) -> Finding:
     span = source.span(())
     if source.value is None:
         return Finding(
-            "empty-manifest", Severity.ERROR, "there is nothing in it", span, "start with bag: {path: …}"
+            "empty-manifest", Severity.ERROR, "the manifest is empty", span, "start with bag: {path: …}"
         )
     return Finding("not-a-mapping", Severity.ERROR, "a job is a mapping", span, "start with bag: {path: …}")
 
 
 def _with_text_keys(value: Value, path: KeyPath, source: Source, findings: list[Finding]) -> Value:
-    """Report keys that are not text, and leave them out."""
+    """Report keys that are not text, and return the value without them."""
     if isinstance(value, list):
         return [_with_text_keys(item, (*path, i), source, findings) for i, item in enumerate(value)]
     if not isinstance(value, dict):
@@ -241,7 +243,7 @@ def _with_text_keys(value: Value, path: KeyPath, source: Source, findings: list[
 
 
 def _validate(source: Source, filled: Filled) -> tuple[Manifest | None, list[Finding]]:
-    """Validate; a filled-in text may have to be a number, and what an unknown variable would be is not judged."""
+    """Validate a document: convert replaced texts to numbers if required, and ignore values with unset variables."""
     manifest, mistakes = _attempt(source, filled.value)
     retry = [key_path for key_path, _ in mistakes if key_path in filled.changed]
     if retry:
@@ -260,7 +262,7 @@ def _attempt(source: Source, value: Value) -> tuple[Manifest | None, list[tuple[
 
 
 def _reread(filled: Filled, key_path: KeyPath) -> None:
-    """Read a filled-in text as YAML would read it unquoted; take it out if its value is not known."""
+    """Convert a replaced text to the value of an unquoted YAML scalar, or remove it if its variable is not set."""
     parent = filled.value
     for part in key_path[:-1]:
         parent = member(parent, part)

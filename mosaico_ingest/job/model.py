@@ -1,4 +1,4 @@
-"""The sections of a job, each defined once: manifests are parsed to them, pipelines and plans use them."""
+"""The sections of a job, which manifests, pipelines and plans share."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def _shape(value: Any) -> str:  # noqa: ANN401 - any YAML value
 
 def _check_variable(value: Any) -> str | int:  # noqa: ANN401 - any YAML value
     if isinstance(value, bool) or not isinstance(value, str | int):
-        raise ValueError("a variable's value is a text or a whole number")  # noqa: TRY004 - validators raise ValueError
+        raise ValueError("a variable's value must be text or a whole number")  # noqa: TRY004 - validators raise ValueError
     return value
 
 
@@ -340,10 +340,10 @@ class DestinationSettings(_Section):
         if len(kinds) > 1:
             raise _conflict(f"{kinds[0]} and {kinds[1]} are two destinations", kinds[1])
         if self.options and self.type is None:
-            raise _conflict("options are set, and type is not", "options")
+            raise _conflict("options are set, but type is not", "options")
         server_only = sorted(self.model_fields_set - {"store", "host", "type", "options"})
         if self.host is None and server_only:
-            raise _conflict(f"{server_only[0]} is for a server, and host is not set", server_only[0])
+            raise _conflict(f"{server_only[0]} requires host, which is not set", server_only[0])
         return self
 
     def target(self, folder: Path) -> Target:
@@ -377,7 +377,7 @@ class RunOptions(_Section):
 
 
 class _Composition(_Section):
-    """The keys that are resolved before there is a job."""
+    """The keys that are resolved before the job is built."""
 
     version: Annotated[int, Field(ge=1, le=VERSION)] = VERSION
     """The version of the manifest language."""
@@ -424,7 +424,7 @@ class JobSettings(_Section):
     """Action if a topic's message definition differs from that of earlier sequences of the family: fail, evolve (warn and
     store the new columns), new_topic (store it under another name). If omitted, definitions are not compared."""
     quarantine: QuarantineSettings | None = None
-    """Where rejected messages are kept; without this section they are only counted."""
+    """Where rejected messages are kept; without this section, they are only counted."""
     target: DestinationSettings = DestinationSettings()
     """Where sequences are written."""
     run: RunOptions = RunOptions()
@@ -439,7 +439,7 @@ class Origin(Struct, frozen=True):
     """The manifest that a job comes from."""
 
     file: str | None = None
-    """Its path; None for a job that a program has built."""
+    """Its path; None for a job built in Python."""
     folder: Path = Path()
     """The folder where the relative paths of adapters start."""
     spans: Mapping[KeyPath, Span] = {}
@@ -457,7 +457,7 @@ class Job(JobSettings):
     """The recording's splits."""
     origin: SkipValidation[Origin] = Field(default=Origin(), repr=False)
     registry: SkipValidation[Any] = Field(default=None, repr=False)
-    """The `ROSTypeRegistry` for definitions; None stands for the process-wide one."""
+    """The `ROSTypeRegistry` for definitions; None selects the process-wide registry."""
 
     @property
     def folder(self) -> Path:
@@ -491,7 +491,7 @@ class Job(JobSettings):
         return self.origin.file
 
     def settings_of(self, topic: str) -> TopicSettings:
-        """Return the settings of a topic: for each, that of its name, else of the first glob that defines it."""
+        """Return the settings of a topic, each from the topic's name or else from the first glob that defines the setting."""
         values: dict[str, Any] = {}
         for name in TopicSettings.model_fields:
             globs = (glob for glob, entry in self.topic_settings.items() if name in entry.model_fields_set)
@@ -535,7 +535,7 @@ def _check_one_topic(topic: str, name: str) -> None:
 
 @contextmanager
 def _located(job: Job, *path: str) -> Generator[None]:
-    """Raise what the platform refuses as a mistake at a key path of the job."""
+    """Convert a `SinkError` to a `ManifestError` with the location of a key path."""
     try:
         yield
     except SinkError as error:

@@ -17,11 +17,11 @@ __all__ = [
     "manifest_reference",
 ]
 
-_VARIABLE = {"type": "string", "pattern": r"\$\{[^{}]+\}", "description": "A variable of the environment."}
+_VARIABLE = {"type": "string", "pattern": r"\$\{[^{}]+\}", "description": "An environment variable."}
 
 
 def job_schema() -> dict[str, Any]:
-    """Return the schema (draft 2020-12) that editors complete and check manifests with."""
+    """Return the JSON Schema (draft 2020-12) with which editors complete and check manifests."""
     schema = tidy(schema_of(Manifest))
     definitions: dict[str, Any] = schema.pop("$defs")
     for model in [schema, *definitions.values()]:
@@ -35,7 +35,7 @@ def job_schema() -> dict[str, Any]:
     schema["anyOf"] = [
         {"required": required},
         {"required": [EXTENDS]},
-    ]  # the bases may have the required keys
+    ]  # the extended files may provide the required keys
     return {"$schema": DIALECT, "title": "mosaico-ingest job", **schema, "$defs": definitions}
 
 
@@ -44,7 +44,7 @@ def _properties(model: dict[str, Any]) -> dict[str, Any]:
 
 
 def _or_variable(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:
-    """Allow `${VAR}` where the value is a number or one of a few words; in a text it is allowed anyway."""
+    """Allow `${VAR}` for numbers and enumerations; texts allow it already."""
     target = definitions[node["$ref"].rsplit("/", 1)[-1]] if "$ref" in node else node
     if "enum" not in target and target.get("type") not in ("integer", "boolean"):
         return node
@@ -69,7 +69,7 @@ After reading this page, you know every key of a job manifest. Only `bag.path` i
 
 
 def manifest_reference() -> str:
-    """Return the page: a section for each part of the manifest, a row for each key."""
+    """Return docs/manifest.md, with a section for each part of the manifest and a row for each key."""
     schema = job_schema()
     sections = [_section("The manifest", schema, schema)]
     for path, model in _models(schema["properties"], (), schema):
@@ -80,7 +80,7 @@ def manifest_reference() -> str:
 def _models(
     properties: dict[str, Any], path: tuple[str, ...], schema: dict[str, Any]
 ) -> Iterator[tuple[tuple[str, ...], dict[str, Any]]]:
-    """Yield every mapping with keys of its own below these properties, in their order."""
+    """Yield the path and schema of every mapping with defined keys below these properties, in order."""
     for key, node in properties.items():
         name, inner = key, _resolved(node, schema)
         if "items" in inner:
@@ -115,7 +115,7 @@ def _default(node: dict[str, Any], required: bool) -> str:  # noqa: FBT001 - as 
 
 
 def _kind(node: dict[str, Any], schema: dict[str, Any]) -> str:
-    """Return the type of a value, or the words that are allowed."""
+    """Return the type of a value, or its allowed words."""
     branches = cast("list[dict[str, Any]]", node.get("anyOf") or node.get("oneOf") or [])
     if branches:
         kinds = (_kind(branch, schema) for branch in branches if branch.get("$ref") != "#/$defs/Variable")

@@ -33,11 +33,11 @@ _INSTANT = re.compile(
 _LIMIT = re.compile(r"([0-9]{1,18})|([0-9]{1,18}(?:\.[0-9]{1,18})?) ?%")
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _INT64 = range(-(2**63), 2**63)
-"""Nanoseconds that a time in a recording can have."""
+"""Range of times in a recording, in nanoseconds."""
 
 
 def parse_size(text: str) -> int:
-    """Return the number of bytes that `512MiB`, `2 GB` or `100kB` stands for.
+    """Parse a size such as `512MiB`, `2 GB` or `100kB`; return bytes.
 
     Raises:
         ValueError: The text is not a size.
@@ -49,10 +49,10 @@ def parse_size(text: str) -> int:
 
 
 def parse_limit(text: str) -> Limit:
-    """Return the limit that a number (`100`) or a share (`0.1%`) stands for.
+    """Parse a limit: a number (`100`) or a share (`0.1%`).
 
     Raises:
-        ValueError: The text is neither, or the share is more than 100%.
+        ValueError: The text is neither a number nor a share, or the share is more than 100%.
     """
     match = _LIMIT.fullmatch(text)
     if match is None:
@@ -68,10 +68,10 @@ def parse_limit(text: str) -> Limit:
 
 
 def parse_time(text: str) -> TimeBound:
-    """Return the instant (`2026-03-01T12:00:00Z`) or offset (`+10s`, `-5min`) that a text stands for.
+    """Parse an instant (`2026-03-01T12:00:00Z`) or an offset (`+10s`, `-5min`).
 
     Raises:
-        ValueError: The text is neither.
+        ValueError: The text is neither an instant nor an offset.
     """
     if text[:1] in {"+", "-"}:
         return TimeBound(parse_offset(text), relative=True)
@@ -79,7 +79,7 @@ def parse_time(text: str) -> TimeBound:
 
 
 def format_time(bound: TimeBound) -> str:
-    """Return a bound as a manifest writes it."""
+    """Format a bound in the notation of manifests."""
     if bound.relative:
         seconds, rest = divmod(abs(bound.ns), 1_000_000_000)
         fraction = f".{rest:09}".rstrip("0") if rest else ""
@@ -91,10 +91,10 @@ def format_time(bound: TimeBound) -> str:
 
 
 def parse_offset(text: str) -> int:
-    """Return the nanoseconds of `+10s` or `-1.5min`; units are ns, us, ms, s, min and h.
+    """Parse an offset such as `+10s` or `-1.5min` in ns, us, ms, s, min or h; return nanoseconds.
 
     Raises:
-        ValueError: The text is not an offset, or more than 292 years.
+        ValueError: The text is not an offset, or the offset exceeds 292 years.
     """
     match = _OFFSET.fullmatch(text)
     if match is None:
@@ -110,7 +110,7 @@ def parse_offset(text: str) -> int:
 
 
 def parse_instant(text: str) -> int:
-    """Return the nanoseconds since the epoch of an ISO 8601 date, or date and time; the time zone defaults to UTC.
+    """Parse an ISO 8601 date, or date and time (UTC by default); return nanoseconds since the epoch.
 
     Raises:
         ValueError: The text is not an instant, or is not between 1678 and 2262.

@@ -53,7 +53,7 @@ class _Problem(Struct, frozen=True):
 
     @property
     def name(self) -> str:
-        """The value's name for a person."""
+        """The value's key path as text."""
         return _name(self.path) or "the document"
 
     @property
@@ -63,7 +63,7 @@ class _Problem(Struct, frozen=True):
 
     @property
     def secret(self) -> bool:
-        """Whether the value must not be shown."""
+        """True if the value must not be shown."""
         return _node_at(self.schema, self.path).get("writeOnly", False)
 
     def finding(
@@ -75,7 +75,9 @@ class _Problem(Struct, frozen=True):
 def explain(
     error: ValidationError, *, source: Source, schema: dict[str, Any]
 ) -> list[tuple[KeyPath, Finding]]:
-    """Return one finding for each mistake, with the path of the value; values are quoted as written, so never a secret.
+    """Return one finding for each mistake, with the key path of the value.
+
+    Values are quoted as written, so the values of variables, which may be secret, never appear.
 
     `schema` is the JSON Schema of the model that refused the document.
     """
@@ -90,7 +92,7 @@ def explain(
 
 
 def _any_below(path: KeyPath, problems: Iterable[_Problem]) -> bool:
-    """Return whether a value inside has a problem: then a list is too short only because its items were refused."""
+    """Return whether a value below `path` has a problem; a list is then too short only because its items were refused."""
     return any(problem.path[: len(path)] == path and problem.path != path for problem in problems)
 
 
@@ -105,7 +107,7 @@ def key_path_of(location: KeyPath, value: Value) -> KeyPath:
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
-    """Return the known word that `word` was probably meant to be: same letters, a missing prefix, or a slip."""
+    """Return the known word that is closest to `word`: the same letters, a missing prefix, or a typo; None if none is close."""
     words = list(known)
     plain = {_plain(candidate): candidate for candidate in words}
     if _plain(word) in plain:
@@ -118,7 +120,7 @@ def nearest(word: str, known: Iterable[str]) -> str | None:
 
 
 def keys_at(schema: dict[str, Any], path: KeyPath) -> list[str]:
-    """Return the keys that a JSON Schema allows in the mapping at `path`; none where any key is."""
+    """Return the keys that a JSON Schema allows in the mapping at `path`; empty if every key is allowed."""
     return list(_resolved(_node_at(schema, path), schema).get("properties", {}))
 
 
@@ -152,7 +154,7 @@ def _descend(node: dict[str, Any], part: object) -> dict[str, Any]:
 
 
 def _resolved(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
-    """Follow references, and choose the alternative that is a mapping or a list."""
+    """Follow references, and select the alternative that is a mapping or a list."""
     while "$ref" in node:
         node = schema["$defs"][node["$ref"].rsplit("/", 1)[-1]]
     for branch in node.get("anyOf", node.get("oneOf", ())):
@@ -174,7 +176,7 @@ def _describe(problem: _Problem) -> Finding:
 
 
 def _suggestion(problem: _Problem) -> str | None:
-    """Return the key that an unknown one was probably meant to be."""
+    """Return the allowed key that is closest to an unknown key, or None."""
     if problem.error["type"] != "extra_forbidden":
         return None
     return nearest(str(problem.path[-1]), keys_at(problem.schema, problem.path[:-1]))
@@ -202,7 +204,7 @@ def _unknown_key(problem: _Problem) -> Finding:
 
 
 def _elsewhere(word: str, schema: dict[str, Any]) -> str:
-    """Return a hint with the section that has a key which is not allowed here."""
+    """Return a hint with the section that allows the key, or an empty text."""
     for section in keys_at(schema, ()):
         if word in keys_at(schema, (section,)):
             return f"move it to {section!r}; "
@@ -245,7 +247,7 @@ def _wrong_type(problem: _Problem, expected: str) -> Finding:
 
 
 def _list_example(problem: _Problem, node: dict[str, Any]) -> str | None:
-    """Return how to write a list: with the value as its item, or with the required keys of its items."""
+    """Return a hint with a list that has the value as its item, or items with their required keys."""
     item = _resolved(_resolved(node, problem.schema).get("items", {}), problem.schema)
     if item.get("type") != "object":
         return f'write ["{problem.value}"]' if isinstance(problem.value, str) else None
@@ -305,7 +307,7 @@ def _not_a_choice(problem: _Problem) -> Finding:
 def _out_of_range(problem: _Problem) -> Finding:
     bounds = problem.error.get("ctx", {})
     if problem.path == ("version",) and "le" in bounds:
-        message = f"version {problem.value} is newer than this tool, which reads {bounds['le']}"
+        message = f"version {problem.value} is newer than {bounds['le']}, the newest supported version"
         return problem.finding("newer-version", message, "upgrade mosaico-ingest")
     words = {"ge": "at least", "le": "at most", "gt": "more than", "lt": "less than"}
     limit = next(f"{words[key]} {bounds[key]}" for key in words if key in bounds)
@@ -317,7 +319,7 @@ def _empty(problem: _Problem) -> Finding:
 
 
 def _contradiction(problem: _Problem) -> Finding:
-    """Return the finding for two keys of a section that exclude each other; the error names the key to point at."""
+    """Return the finding for two keys of a section that exclude each other; the span is that of the key in the error."""
     key = problem.error.get("ctx", {}).get("key", "")
     span = problem.source.key_span((*problem.path, key))
     return problem.finding("conflicting-keys", problem.error["msg"], "keep one of the two", span)

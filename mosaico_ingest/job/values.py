@@ -37,7 +37,7 @@ __all__ = [
 DEFAULT_STORE = Path("mosaico")
 DEFAULT_PORT = 6726
 DEFAULT_MESSAGE_BYTES = 10_000_000
-"""Larger upload messages gain no throughput, and may become chunks that no client can read back."""
+"""Default size of an upload message. Larger messages gain no throughput and may become chunks that clients cannot read."""
 DEFAULT_TOPIC = "default"
 """The key of `on_error.topic` for topics that no other key matches."""
 PROVENANCE_KEY = "mosaico_ingest"
@@ -121,20 +121,20 @@ class Stores(str, Enum):
 
 
 class TimeBound(Struct, frozen=True):
-    """An instant in ns since the epoch, or an offset in ns from the first message (negative: from the last one)."""
+    """An instant in ns since the epoch, or an offset in ns from the first message (from the last message if negative)."""
 
     ns: int
     relative: bool = False
 
     def at(self, start_ns: int, end_ns: int) -> int:
-        """Return ns since the epoch, given the recording's first and last log time."""
+        """Return the bound in ns since the epoch, for a recording with this first and last log time."""
         if not self.relative:
             return self.ns
         return (end_ns if self.ns < 0 else start_ns) + self.ns
 
 
 class Limit(Struct, frozen=True):
-    """A maximum number of messages, or their maximum share from 0 to 1; the other one is None."""
+    """A maximum number of messages, or their maximum share from 0 to 1; the other attribute is None."""
 
     count: int | None = None
     share: float | None = None
@@ -158,7 +158,7 @@ class ServerTarget:
     tls_cert: Path | None = None
     tls: bool = False
     message_bytes: int = DEFAULT_MESSAGE_BYTES
-    """The size up to which rows are combined into one upload message."""
+    """Maximum size, in bytes, up to which rows are combined into one upload message."""
 
 
 class PluginTarget(Struct, frozen=True):
@@ -168,7 +168,7 @@ class PluginTarget(Struct, frozen=True):
     """The name of its entry point."""
     options: Mapping[str, Any] = {}
     base_dir: Path = Path()
-    """The folder that relative paths of `options` start from."""
+    """The folder where the relative paths of `options` start."""
 
 
 Target: TypeAlias = StoreTarget | ServerTarget | PluginTarget

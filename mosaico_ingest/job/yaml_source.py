@@ -1,7 +1,7 @@
-"""YAML text with the position of every value.
+"""YAML documents with the span of every value.
 
 PyYAML's events are composed here instead of by `yaml.compose`, because its nodes lose the spans of aliases and merge
-keys, resolve YAML 1.1 scalars such as `no`, and stop at the first error; lint reports every mistake of a file.
+keys, resolve YAML 1.1 scalars such as `no`, and stop at the first error; lint must report every mistake of a file.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ _OTHER_NUMBER = re.compile(
 
 
 class Trap(Struct, frozen=True):
-    """A scalar that YAML readers understand differently."""
+    """A scalar that YAML readers interpret differently."""
 
     rule: str
     message: str
@@ -70,7 +70,7 @@ class Trap(Struct, frozen=True):
 
 
 def resolve_plain(text: str) -> tuple[Scalar, Trap | None]:
-    """Return the value of an unquoted scalar, and why it should not be written like this, if so."""
+    """Return the value of an unquoted scalar, and a trap if YAML readers interpret the scalar differently."""
     if text in _CONSTANTS:
         return _CONSTANTS[text], None
     meant = _OLD_BOOLEANS.get(text.lower()) if text in {text.lower(), text.upper(), text.title()} else None
@@ -121,9 +121,9 @@ _INDICATORS = {
     "&": ("yaml-anchor", "an unquoted & starts a YAML anchor"),
 }
 _NOWHERE = yaml.Mark("", 0, 0, 0, None, 0)
-"""What an event without a mark gets; PyYAML's own always have one."""
+"""Default mark for events without a mark; PyYAML's events always have one."""
 _QUOTABLE = re.compile(r"[^\s\"\\:#]*[^\s\"\\:#\],]")
-"""Texts that quotes can be put around without a second look."""
+"""Texts that a fix can quote without escaping."""
 
 MAX_DEPTH = 40
 """Maximum nesting depth."""
@@ -132,10 +132,10 @@ MAX_NODES = 50_000
 
 
 def member(value: Value, part: Key) -> Value:
-    """Return what a mapping or list holds under a key or at a position.
+    """Return the value of a mapping's key or at a list's position.
 
     Raises:
-        LookupError: There is nothing.
+        LookupError: The key or position does not exist.
     """
     if isinstance(value, dict):
         return value[part]
@@ -144,7 +144,7 @@ def member(value: Value, part: Key) -> Value:
     raise LookupError(part)
 
 
-class LimitExceeded(Exception):  # noqa: N818 - a signal inside this package, never seen outside
+class LimitExceeded(Exception):  # noqa: N818 - a signal inside this package that never leaves it
     """The document exceeds a limit; `finding` has the location."""
 
     def __init__(self, finding: Finding) -> None:
@@ -163,7 +163,7 @@ class _Node:
     size: int = 1
 
     def adopt(self, key: Key, child: _Node) -> None:
-        """Take over the places of a value inside this one."""
+        """Add the spans of a child value."""
         self.inner[(key,)] = child.span
         self.inner.update({(key, *path): span for path, span in child.inner.items()})
         self.keys.update({(key, *path): span for path, span in child.keys.items()})
@@ -192,7 +192,7 @@ class Composer:
                 documents += 1
                 if documents > 1:
                     self._report(
-                        "yaml-documents", "a second document starts here", event, "one file, one job"
+                        "yaml-documents", "a second document starts here", event, "write one job per file"
                     )
                     break
             elif isinstance(event, yaml.NodeEvent):
@@ -206,7 +206,7 @@ class Composer:
                     "yaml-depth",
                     f"values nest deeper than {MAX_DEPTH} levels",
                     self._span(event),
-                    "flatten it",
+                    "reduce the nesting",
                 )
             )
         if isinstance(event, yaml.AliasEvent):
@@ -235,7 +235,7 @@ class Composer:
         if before is not None:
             self._report(
                 "yaml-anchor",
-                f"anchor &{name} hides the one of line {before.span.line}",
+                f"anchor &{name} redefines the anchor in line {before.span.line}",
                 event,
                 "give each anchor its own name",
             )
@@ -265,7 +265,7 @@ class Composer:
         return _Node(value, span)
 
     def _indicator(self, written: str, span: Span) -> _Node:
-        """Report a text that YAML gives a meaning which was hardly meant, and return it as the text."""
+        """Report an unquoted text that YAML interprets as an indicator, and return it as text."""
         rule, message = _INDICATORS.get(written[0], ("yaml-syntax", f"a text cannot start with {written[0]}"))
         if "{" in written and written[0] not in _INDICATORS:
             rule, message = "yaml-brace", "an unquoted { starts a YAML mapping here"
@@ -274,7 +274,7 @@ class Composer:
         return _Node(written, span)
 
     def _tag(self, event: yaml.ScalarEvent | yaml.CollectionStartEvent) -> str | None:
-        """Report a tag and return it as written; None without a tag that has an effect."""
+        """Report a tag; return it as written if it was probably meant as text, else None."""
         tag: str | None = event.tag
         if tag is None or tag in {"!", "tag:yaml.org,2002:str"}:
             return None
@@ -283,7 +283,7 @@ class Composer:
         if shown[:2] != "!!" and isinstance(event, yaml.ScalarEvent) and not event.value:
             self._indicator(self._original[slice(*_indices(event))], span)
             return shown
-        self._report("yaml-tag", f"the YAML tag {shown} means nothing here", event, "remove the tag")
+        self._report("yaml-tag", f"the YAML tag {shown} has no effect here", event, "remove the tag")
         return None
 
     def _sequence(self, event: yaml.Event, *, depth: int) -> _Node:
@@ -327,13 +327,13 @@ class Composer:
             return False
         if key.value in values:
             first = node.keys[(key.value,)]
-            message = f"duplicate key {key.value!r}, first given in line {first.line}"
+            message = f"duplicate key {key.value!r}, first set in line {first.line}"
             self.findings.append(self._finding("duplicate-key", message, key.span, "remove one of the two"))
             return False
         return True
 
     def _merge(self, merge: _Node, values: dict[Key, Value], node: _Node) -> None:
-        """Take the keys of a `<<` that the mapping does not have itself; the first of several wins."""
+        """Add the keys of a `<<` that the mapping does not have itself; the first of several mappings takes precedence."""
         if isinstance(merge.value, list):
             parts = [_part(merge, position) for position in range(len(merge.value))]
         else:
@@ -376,7 +376,7 @@ def _as_key(value: Value) -> Key:
 
 
 def _part(node: _Node, key: Key) -> _Node:
-    """Return what `node` holds under `key` as a node of its own."""
+    """Return the value of `node` under `key` as a separate node."""
     inner = {path[1:]: span for path, span in node.inner.items() if path[0] == key and len(path) > 1}
     keys = {path[1:]: span for path, span in node.keys.items() if path[0] == key and len(path) > 1}
     return _Node(member(node.value, key), node.inner[(key,)], inner, keys, 1 + len(inner))
@@ -386,7 +386,7 @@ MAX_CHARACTERS = 1_000_000
 """Maximum length of a document; it also bounds the time for hostile input."""
 
 _MAX_RECOVERIES = 100
-# The C parser is ten times faster and reads the same language.
+# The C parser is ten times faster and accepts the same language.
 _LOADER: type[yaml.SafeLoader] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _RESERVED = "@`%"
 _TAG_ERRORS = ("scanning a tag", "parsing a tag", "scanning an alias", "scanning an anchor")
@@ -418,13 +418,13 @@ _UNPRINTABLE = re.compile(r"[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010
 class Source(Struct, frozen=True):
     """A YAML document: its value, the span of each value and key, and its syntax findings.
 
-    Paths are tuples of keys and list positions; `()` is the whole document.
+    Paths are tuples of keys and list positions; `()` is the complete document.
     """
 
     file: str
     text: str
     value: Value
-    """The value as far as it can be read, so that later checks find the other mistakes."""
+    """The value, as complete as possible, so that later checks can find further mistakes."""
     findings: tuple[Finding, ...] = ()
     spans: dict[KeyPath, Span] = msgspec.field(default_factory=dict[KeyPath, Span])
     key_spans: dict[KeyPath, Span] = msgspec.field(default_factory=dict[KeyPath, Span])
@@ -432,29 +432,29 @@ class Source(Struct, frozen=True):
     """The texts of the other files that spans refer to, by name."""
 
     def span(self, path: KeyPath) -> Span:
-        """Return the place of the value at `path`, or of the nearest thing around it that is written."""
+        """Return the span of the value at `path`, or of the nearest enclosing value if the document does not have it."""
         for length in range(len(path), -1, -1):
             if path[:length] in self.spans:
                 return self.spans[path[:length]]
         return Span(self.file, 1, 1, 1, 1)
 
     def key_span(self, path: KeyPath) -> Span:
-        """Return the place of the key that `path` ends with, or the place of its value (a list has no keys)."""
+        """Return the span of the last key of `path`, or the span of the value if it is a list item."""
         return self.key_spans.get(path) or self.span(path)
 
     def inner_span(self, path: KeyPath, start: int, end: int) -> Span:
-        """Return the place of the characters `start:end` of the string at `path`, or of all of it if it is folded."""
-        whole = self.span(path)
-        line = self.line(whole)
-        written = line[whole.column - 1 : whole.end_column - 1] if whole.line == whole.end_line else ""
+        """Return the span of the characters `start:end` of the text at `path`, or of the complete text if it is folded or escaped."""
+        span = self.span(path)
+        line = self.line(span)
+        written = line[span.column - 1 : span.end_column - 1] if span.line == span.end_line else ""
         value = written[1:-1] if written[:1] in {'"', "'"} else written
         if not value or self.at(path) != value:
-            return whole
-        first = whole.column + (len(written) - len(value)) // 2
-        return Span(whole.file, whole.line, first + start, whole.line, first + end)
+            return span
+        first = span.column + (len(written) - len(value)) // 2
+        return Span(span.file, span.line, first + start, span.line, first + end)
 
     def line(self, span: Span) -> str:
-        """Return the line in which a place begins, without its end; empty beyond the last."""
+        """Return the first line of a span without its line break; empty if the text has no such line."""
         text = self.text if span.file == self.file else self.others.get(span.file, "")
         lines = text.splitlines()
         return lines[span.line - 1] if 0 < span.line <= len(lines) else ""
@@ -485,7 +485,7 @@ def load_source(text: str, *, file: str) -> Source:
 
 
 class _Reader:
-    """Reads again with the faulty characters blanked out, until the whole document has been seen."""
+    """The reader of one document; it masks invalid characters and reads again until it reaches the end."""
 
     def __init__(self, text: str, file: str) -> None:
         self._original = text
@@ -511,27 +511,27 @@ class _Reader:
         return self._failed([])
 
     def _events(self) -> Iterator[yaml.Event]:
-        yield from yaml.parse(self._text, Loader=_LOADER)  # lazily, so that every error comes while composing
+        yield from yaml.parse(self._text, Loader=_LOADER)  # lazily, so that the composer raises every error
 
     def _failed(self, findings: list[Finding]) -> Source:
         return Source(self._file, self._original, None, (*self._findings, *findings))
 
     def _recover(self, error: yaml.MarkedYAMLError) -> bool:
-        """Blank out what the error is about, if that leaves the rest of the document as it was meant."""
+        """Mask the characters that cause the error; return False if the document cannot be read without them."""
         mark = error.problem_mark
         if mark is None:
             return False
         here = self._text[mark.index : mark.index + 1]
         if error.context_mark is not None and any(kind in (error.context or "") for kind in _TAG_ERRORS):
-            return self._blank(error.context_mark.index)
+            return self._mask(error.context_mark.index)
         if here == "\t":
             return self._untab(mark)
         if here and here in _RESERVED:
-            return self._blank(mark.index)
+            return self._mask(mark.index)
         return self._unbrace(mark.index)
 
-    def _blank(self, *indices: int) -> bool:
-        """Put an underscore in place of characters; False if that was done before."""
+    def _mask(self, *indices: int) -> bool:
+        """Replace characters by underscores; return False if one of them is already an underscore."""
         if any(self._text[index] == "_" for index in indices):
             return False
         for index in indices:
@@ -546,7 +546,7 @@ class _Reader:
         return True
 
     def _unbrace(self, index: int) -> bool:
-        """Blank out the braces of `{stem}_x` and of a `${VAR}` inside `{ }`, which were meant as text."""
+        """Mask the braces of `{stem}_x`, and of `${VAR}` inside `{ }`, which are meant as text."""
         if self._text[index - 1 : index + 1] == "${":
             opening, closing = index, self._text.find("}", index)
         elif self._text[index - 1 : index] == "}":
@@ -555,12 +555,12 @@ class _Reader:
             return False
         inside = self._text[opening + 1 : closing]
         return (
-            0 <= opening < closing and inside.isprintable() and inside != "" and self._blank(opening, closing)
+            0 <= opening < closing and inside.isprintable() and inside != "" and self._mask(opening, closing)
         )
 
     def _syntax(self, error: yaml.MarkedYAMLError) -> list[Finding]:
         if any(finding.rule == "yaml-tab" for finding in self._findings):
-            return []  # what follows a tab is said by the tab
+            return []  # the tab causes the later syntax errors
         problem = error.problem or "this is not YAML"
         message, remedy = next(
             ((text, remedy) for part, text, remedy in _REMEDIES if part in problem), (problem, None)

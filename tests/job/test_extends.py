@@ -109,7 +109,7 @@ def test_a_mistake_is_shown_in_the_file_that_holds_it(folder: Path) -> None:
         ("extends: [../fleet/base.yaml, gone.yaml]", "version: 1", "job.yaml:1:31", "no such file"),
         ("extends: job.yaml", "", "job.yaml:1:10", "extend one another: job.yaml → job.yaml"),
         ("extends: ../fleet/base.yaml", "extends: ../jobs/job.yaml", "job.yaml:1:10", "extend one another"),
-        ("extends: ../fleet/base.yaml", "[1]", "job.yaml:1:10", "holds no mapping"),
+        ("extends: ../fleet/base.yaml", "[1]", "job.yaml:1:10", "is not a mapping"),
         ("extends: ../fleet", "", "job.yaml:1:10", "cannot be extended"),
     ],
 )

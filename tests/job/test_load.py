@@ -75,7 +75,7 @@ run: {jobs: 2, memory: 512MiB, report: report.json, log_level: INFO}
 @pytest.mark.parametrize(
     ("text", "place", "rule", "message"),
     [
-        ("", "1:1", "empty-manifest", "there is nothing in it"),
+        ("", "1:1", "empty-manifest", "the manifest is empty"),
         ("- a", "1:1", "not-a-mapping", "a job is a mapping"),
         ("sequence: {name: x}", "1:1", "missing-key", "the document needs the key 'bag'"),
         ("bag: {pth: x}", "1:7", "unknown-key", "unknown key 'pth' in bag"),
@@ -110,8 +110,8 @@ run: {jobs: 2, memory: 512MiB, report: report.json, log_level: INFO}
         ("bag: {path: x}\nros_distro: ros2_humble", "2:1", "unknown-key", None),
         ("bag: {path: x}\nsequence: {name: {stem}}", "2:18", "wrong-type", None),
         ("bag: {path: x}\nsequence: {metadata: {1: a}}", "2:23", "yaml-key", "the key 1 is not text"),
-        ('bag: {path: "${}"}', "1:14", "variable-syntax", "${} is no variable"),
-        ('bag: {path: "a${b"}', "1:15", "variable-syntax", "${ is no variable"),
+        ('bag: {path: "${}"}', "1:14", "variable-syntax", "${} is not a variable"),
+        ('bag: {path: "a${b"}', "1:15", "variable-syntax", "${ is not a variable"),
     ],
 )
 def test_a_mistake_is_said_once_where_it_is(text: str, place: str, rule: str, message: str | None) -> None:
@@ -160,7 +160,7 @@ def test_a_variable_in_the_place_of_a_section_is_not_judged_without_an_environme
     assert check_manifest(source, env=None) == (None, ())
     file = tmp_path / "job.yaml"
     file.write_text(source.text)
-    with pytest.raises(ManifestError, match="no job without its variables"):
+    with pytest.raises(ManifestError, match="incomplete without"):
         load_manifest(file, env=None)
 
 
