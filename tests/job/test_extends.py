@@ -1,4 +1,4 @@
-"""A manifest has what it extends: joined, in order, with paths that still lead to their files and places that are true."""
+"""Composition of manifests: merge order, rewritten paths, variables, matrices and spans."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def findings(file: Path) -> list[tuple[str, str]]:
     ]
 
 
-def test_mappings_are_joined_and_the_rest_is_replaced(folder: Path) -> None:
+def test_extends_merges_mappings_and_replaces_other_values(folder: Path) -> None:
     text = "extends: ../fleet/base.yaml\nbag: {path: x.bag}\ntopics: [/d]\nadapters: {override: {/lidar: L}}"
     manifest = load_manifest(job(folder, text)).manifest
     assert manifest.bag.path == "x.bag"
@@ -61,7 +61,7 @@ def test_mappings_are_joined_and_the_rest_is_replaced(folder: Path) -> None:
     assert manifest.target.port == 1
 
 
-def test_paths_of_another_file_lead_where_they_led(folder: Path) -> None:
+def test_extends_relative_paths_are_rewritten(folder: Path) -> None:
     manifest = load_manifest(job(folder, "extends: ../fleet/base.yaml\nbag: {path: x.bag}")).manifest
     assert manifest.bag.custom_msgs[0].path == "../fleet/msgs"
     assert manifest.adapters.load == (
@@ -73,13 +73,13 @@ def test_paths_of_another_file_lead_where_they_led(folder: Path) -> None:
     assert manifest.run.report == "/var/report.json"
 
 
-def test_an_empty_value_takes_a_key_away(folder: Path) -> None:
+def test_extends_empty_value_removes_key(folder: Path) -> None:
     text = "extends: ../fleet/base.yaml\nbag: {path: x.bag}\ntarget: {host: null, port: null, store: s}"
     target = load_manifest(job(folder, text)).manifest.target
     assert (target.host, target.store) == (None, "s")
 
 
-def test_later_files_count_more_and_files_extend_files(folder: Path) -> None:
+def test_extends_later_file_takes_precedence(folder: Path) -> None:
     (folder / "fleet" / "night.yaml").write_text("extends: dark.yaml\ntopics: [/night]")
     (folder / "fleet" / "dark.yaml").write_text("on_error: {topic: ignore}\ntopics: [/dark]")
     text = "extends: [../fleet/base.yaml, ../fleet/night.yaml]\nbag: {path: x.bag}"
@@ -89,7 +89,7 @@ def test_later_files_count_more_and_files_extend_files(folder: Path) -> None:
     assert manifest.target.host == "h"
 
 
-def test_a_mistake_is_shown_in_the_file_that_holds_it(folder: Path) -> None:
+def test_extends_mistake_is_located_in_its_file(folder: Path) -> None:
     (folder / "fleet" / "base.yaml").write_text(
         "on_error: {topic: finalise}\nrun: {jobs: '2'}\nsequence: {nam: x}"
     )
@@ -103,7 +103,7 @@ def test_a_mistake_is_shown_in_the_file_that_holds_it(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "base", "place", "message"),
+    ("text", "base", "location", "message"),
     [
         ("extends: gone.yaml", "", "job.yaml:1:10", "no such file"),
         ("extends: [../fleet/base.yaml, gone.yaml]", "version: 1", "job.yaml:1:31", "no such file"),
@@ -113,24 +113,24 @@ def test_a_mistake_is_shown_in_the_file_that_holds_it(folder: Path) -> None:
         ("extends: ../fleet", "", "job.yaml:1:10", "cannot be extended"),
     ],
 )
-def test_what_cannot_be_extended_is_the_only_thing_said(
-    folder: Path, text: str, base: str, place: str, message: str
+def test_extends_invalid_base_is_only_finding(
+    folder: Path, text: str, base: str, location: str, message: str
 ) -> None:
     (folder / "fleet" / "base.yaml").write_text(base)
     file = job(folder, text)
-    assert set(findings(file)) == {("missing-base", place)}
+    assert set(findings(file)) == {("missing-base", location)}
     with pytest.raises(ManifestError, match=message):
         load_manifests(file)
 
 
-def test_syntax_errors_of_a_base_are_shown_there(folder: Path) -> None:
+def test_extends_syntax_error_is_located_in_base(folder: Path) -> None:
     (folder / "fleet" / "base.yaml").write_text("topics: [!/a]\n")
     assert findings(job(folder, "extends: ../fleet/base.yaml\nbag: {path: x}")) == [
         ("yaml-tag", "base.yaml:1:10")
     ]
 
 
-def test_defaults_give_way_to_the_environment_and_that_to_the_matrix(folder: Path) -> None:
+def test_variables_matrix_overrides_environment_and_defaults(folder: Path) -> None:
     text = (
         "defaults: {A: a, B: b, C: c}\nmatrix: {C: [x, 7]}\nbag: {path: '${A}${B}${C}'}\nrun: {jobs: '${C}'}"
     )
@@ -140,7 +140,7 @@ def test_defaults_give_way_to_the_environment_and_that_to_the_matrix(folder: Pat
     assert [one.cell for one in load_manifests(file, env=None)] == [{"C": "x"}, {"C": "7"}]
 
 
-def test_a_matrix_is_every_combination_or_those_given(folder: Path) -> None:
+def test_matrix_expands_to_all_or_listed_combinations(folder: Path) -> None:
     axes = job(folder, "matrix: {v: [a, b], d: [1, 2]}\nbag: {path: '${v}/${d}'}\nrun: {jobs: '${d}'}")
     assert [(one.manifest.bag.path, one.manifest.run.jobs) for one in load_manifests(axes, env={})] == [
         ("a/1", 1), ("a/2", 2), ("b/1", 1), ("b/2", 2),
@@ -150,7 +150,7 @@ def test_a_matrix_is_every_combination_or_those_given(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("matrix", "place"),
+    ("matrix", "location"),
     [
         ("{v: a}", "job.yaml:1:13"),
         ("{v: []}", "job.yaml:1:13"),
@@ -162,17 +162,17 @@ def test_a_matrix_is_every_combination_or_those_given(folder: Path) -> None:
         (f"{{a: {list(range(50))}, b: {list(range(50))}}}", "job.yaml:1:9"),
     ],
 )
-def test_a_wrong_matrix_is_one_finding(folder: Path, matrix: str, place: str) -> None:
+def test_matrix_invalid_value_is_one_located_finding(folder: Path, matrix: str, location: str) -> None:
     found = findings(job(folder, f"matrix: {matrix}\nbag: {{path: x}}"))
-    assert [where for _, where in found] == [place]
+    assert [where for _, where in found] == [location]
 
 
-def test_the_findings_of_all_combinations_are_told_once(folder: Path) -> None:
+def test_matrix_findings_of_all_combinations_are_deduplicated(folder: Path) -> None:
     text = "matrix: {v: [1, 2]}\nbag: {path: x}\nsequence: {nam: x}\nrun: {jobs: '${v}x'}"
     assert findings(job(folder, text)) == [("unknown-key", "job.yaml:3:12"), ("wrong-type", "job.yaml:4:13")]
 
 
-def test_what_is_expanded_is_the_same_jobs_without_anything_to_extend(folder: Path) -> None:
+def test_expand_manifest_expanded_documents_load_as_same_jobs(folder: Path) -> None:
     file = job(
         folder,
         "extends: ../fleet/base.yaml\nmatrix: {v: ['a$', b], n: [2]}\ndefaults: {S: s, n: 1}\n"
@@ -188,7 +188,7 @@ def test_what_is_expanded_is_the_same_jobs_without_anything_to_extend(folder: Pa
         assert "base.yaml:3" in alone.read_text()
 
 
-def test_lines_of_another_file_are_read_from_it(folder: Path) -> None:
+def test_line_of_extended_file_is_read_from_that_file(folder: Path) -> None:
     source = read_manifest(job(folder, "extends: ../fleet/base.yaml\nbag: {path: x}"))
     assert source.line(source.span(("target", "host"))) == "target: {host: h, port: 1}"
     assert source.inner_span(("target", "host"), 0, 1).file.endswith("base.yaml")
@@ -206,7 +206,7 @@ VALUES = st.recursive(
 
 
 @given(VALUES)
-def test_written_yaml_reads_back_as_the_same_values_for_everybody(value: Value) -> None:
+def test_to_yaml_any_value_round_trips_in_all_readers(value: Value) -> None:
     text = to_yaml(value)
     read = load_source(text, file="x")
     assert not read.findings

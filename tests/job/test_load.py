@@ -1,4 +1,4 @@
-"""A manifest is loaded whole or refused with every mistake, each where a person would look for it."""
+"""Loading of manifests: values, variables, and findings with locations."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def check(text: str, env: dict[str, str] | None = None) -> list[tuple[str, str, 
     return [(str(finding.span)[2:], finding.rule, finding.message) for finding in findings]
 
 
-def test_a_full_manifest_loads(tmp_path: Path) -> None:
+def test_load_manifest_full_manifest_returns_model(tmp_path: Path) -> None:
     file = tmp_path / "job.yaml"
     file.write_text(FULL)
     loaded = load_manifest(file, env={"MOSAICO_API_KEY": "k"})
@@ -73,7 +73,7 @@ run: {jobs: 2, memory: 512MiB, report: report.json, log_level: INFO}
 
 
 @pytest.mark.parametrize(
-    ("text", "place", "rule", "message"),
+    ("text", "location", "rule", "message"),
     [
         ("", "1:1", "empty-manifest", "the manifest is empty"),
         ("- a", "1:1", "not-a-mapping", "a job is a mapping"),
@@ -114,16 +114,18 @@ run: {jobs: 2, memory: 512MiB, report: report.json, log_level: INFO}
         ('bag: {path: "a${b"}', "1:15", "variable-syntax", "${ is not a variable"),
     ],
 )
-def test_a_mistake_is_said_once_where_it_is(text: str, place: str, rule: str, message: str | None) -> None:
+def test_check_manifest_one_mistake_is_one_located_finding(
+    text: str, location: str, rule: str, message: str | None
+) -> None:
     first, *rest = check(text)
-    assert (first[0], first[1]) == (place, rule)
+    assert (first[0], first[1]) == (location, rule)
     assert message is None or first[2] == message
     assert rest == []
 
 
-def test_all_mistakes_come_at_once_in_the_order_of_the_text() -> None:
+def test_check_manifest_several_mistakes_are_in_text_order() -> None:
     text = "bag:\n  path: x\n  ros_distro: humble\ntopics: [!/cam]\nrun: {jobs: 0}\nruns: {}\n"
-    assert [(place, rule) for place, rule, _ in check(text)] == [
+    assert [(location, rule) for location, rule, _ in check(text)] == [
         ("3:15", "wrong-value"),
         ("4:10", "yaml-tag"),
         ("5:13", "wrong-value"),
@@ -131,11 +133,11 @@ def test_all_mistakes_come_at_once_in_the_order_of_the_text() -> None:
     ]
 
 
-def test_a_slip_of_the_key_is_not_also_a_missing_key() -> None:
+def test_check_manifest_misspelled_required_key_is_not_also_missing() -> None:
     assert [rule for _, rule, _ in check("bagg: {path: x}")] == ["unknown-key"]
 
 
-def test_variables_are_filled_in(tmp_path: Path) -> None:
+def test_load_manifest_variables_are_replaced(tmp_path: Path) -> None:
     file = tmp_path / "job.yaml"
     file.write_text(
         "bag: {path: '${DIR}/a$$b.bag'}\ntarget:\n  host: ${HOST:-localhost}\n  port: ${PORT}\n  tls: ${TLS}\n"
@@ -145,16 +147,16 @@ def test_variables_are_filled_in(tmp_path: Path) -> None:
     assert (manifest.target.host, manifest.target.port, manifest.target.tls) == ("localhost", 12, True)
 
 
-def test_a_variable_that_is_not_set_is_a_mistake_that_says_why_it_is_needed() -> None:
+def test_check_manifest_unset_variable_is_finding_with_its_message() -> None:
     text = "bag: {path: x}\ntarget:\n  host: h\n  api_key: ${KEY:?a key with write permission}\n"
     assert check(text, env={}) == [("4:12", "unset-variable", "KEY is not set: a key with write permission")]
 
 
-def test_without_an_environment_no_variable_is_missed() -> None:
+def test_check_manifest_without_environment_ignores_unset_variables() -> None:
     assert check("bag: {path: '${A}'}\ntarget:\n  host: ${B}\n  port: ${C}\n  tls: ${D:?why}\n") == []
 
 
-def test_a_variable_in_the_place_of_a_section_is_not_judged_without_an_environment(tmp_path: Path) -> None:
+def test_load_manifest_section_variable_without_environment_raises_without_findings(tmp_path: Path) -> None:
     assert check("bag: ${A}\n", env={}) == [("1:6", "unset-variable", "A is not set")]
     source = load_source("bag: ${A}\n", file="j")
     assert check_manifest(source, env=None) == (None, ())
@@ -164,7 +166,7 @@ def test_a_variable_in_the_place_of_a_section_is_not_judged_without_an_environme
         load_manifest(file, env=None)
 
 
-def test_a_message_never_shows_what_a_variable_holds() -> None:
+def test_check_manifest_invalid_variable_value_is_not_shown() -> None:
     text = (
         "bag: {path: x, ros_distro: '${A}'}\nsequence:\n  if_exists: ${A}\ntarget:\n  host: h\n  port: ${A}\n"
     )
@@ -173,7 +175,7 @@ def test_a_message_never_shows_what_a_variable_holds() -> None:
     assert all("s3cret" not in str(finding) for finding in findings)
 
 
-def test_a_key_of_the_wrong_type_is_not_shown() -> None:
+def test_check_manifest_api_key_of_wrong_type_is_not_shown() -> None:
     _, findings = check_manifest(
         load_source("bag: {path: x}\ntarget: {host: h, api_key: 123456}\n", file="j"), env={}
     )
@@ -182,7 +184,7 @@ def test_a_key_of_the_wrong_type_is_not_shown() -> None:
     ]
 
 
-def test_a_key_is_not_shown_by_the_model() -> None:
+def test_manifest_repr_hides_api_key() -> None:
     text = "bag: {path: x}\ntarget: {host: h, api_key: s3cret}\n"
     manifest, _ = check_manifest(load_source(text, file="j"), env={})
     assert manifest is not None
@@ -192,7 +194,9 @@ def test_a_key_is_not_shown_by_the_model() -> None:
 @pytest.mark.parametrize(
     ("content", "rule"), [(None, "unreadable-file"), (b"\xff\xfe", "not-utf8"), (b"", "empty-manifest")]
 )
-def test_a_file_that_is_no_text_is_one_finding(tmp_path: Path, content: bytes | None, rule: str) -> None:
+def test_load_manifest_unreadable_file_is_one_finding(
+    tmp_path: Path, content: bytes | None, rule: str
+) -> None:
     file = tmp_path / "job.yaml"
     if content is not None:
         file.write_bytes(content)
@@ -203,15 +207,15 @@ def test_a_file_that_is_no_text_is_one_finding(tmp_path: Path, content: bytes | 
     assert "\n" not in str(caught.value)
 
 
-def test_a_directory_is_no_manifest(tmp_path: Path) -> None:
+def test_load_manifest_directory_raises(tmp_path: Path) -> None:
     with pytest.raises(ManifestError, match="directory"):
         load_manifest(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["drive.mcap", "drive.db3", "drive.bag"])
-def test_a_recording_given_as_a_manifest_is_told_what_takes_it(tmp_path: Path, name: str) -> None:
+def test_load_manifest_recording_raises_with_hint(tmp_path: Path, name: str) -> None:
     file = tmp_path / name
     file.write_bytes(b"\x89MCAP0\r\n")
-    with pytest.raises(ManifestError, match="is a recording, not a manifest") as told:
+    with pytest.raises(ManifestError, match="is a recording, not a manifest") as caught:
         load_manifest(file)
-    assert "ingest bag" in str(told.value.findings[0].help)
+    assert "ingest bag" in str(caught.value.findings[0].help)

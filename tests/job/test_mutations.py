@@ -1,4 +1,4 @@
-"""Every key misspelt, every value of the wrong type: one finding, at the right place, with the right remedy."""
+"""Findings for manifests with one misspelled key or one wrong value."""
 
 from __future__ import annotations
 
@@ -100,14 +100,14 @@ def findings_of(text: str) -> list[tuple[str, int, int, str]]:
     return [(f.rule, f.span.line, f.span.column, f.help or "") for f in findings if f.span is not None]
 
 
-def test_the_manifest_that_is_mutated_is_good() -> None:
+def test_check_manifest_unmutated_manifest_has_no_findings() -> None:
     assert findings_of(GOOD) == []
     SCHEMA.validate(SOURCE.value)
 
 
 @pytest.mark.parametrize("path", KEYS, ids=name)
 @pytest.mark.parametrize("slip", ["double", "drop", "upper"])
-def test_a_misspelt_key_is_pointed_at_and_the_right_one_named(path: KeyPath, slip: str) -> None:
+def test_check_manifest_misspelled_key_is_located_and_corrected(path: KeyPath, slip: str) -> None:
     key = str(path[-1])
     wrong = {"double": key + key[-1], "drop": key[:-1], "upper": key.upper()}[slip]
     span = SOURCE.key_span(path)
@@ -137,7 +137,7 @@ def schema_refuses(path: KeyPath, value: object) -> bool:
 @pytest.mark.parametrize(
     ("path", "written"), list(cases()), ids=lambda part: name(part) if isinstance(part, tuple) else part
 )
-def test_a_value_that_is_wrong_is_pointed_at_once(path: KeyPath, written: str) -> None:
+def test_check_manifest_wrong_value_is_one_located_finding(path: KeyPath, written: str) -> None:
     span = SOURCE.span(path)
     text = replaced((span.line, span.column), (span.end_line, span.end_column), written)
     found = findings_of(text)
@@ -151,7 +151,7 @@ def test_a_value_that_is_wrong_is_pointed_at_once(path: KeyPath, written: str) -
 
 @pytest.mark.parametrize("path", LEAVES, ids=name)
 @pytest.mark.parametrize("written", [written for written, _ in WRONG])
-def test_the_schema_and_the_tool_agree(path: KeyPath, written: str) -> None:
+def test_check_manifest_mutated_value_agrees_with_json_schema(path: KeyPath, written: str) -> None:
     span = SOURCE.span(path)
     text = replaced((span.line, span.column), (span.end_line, span.end_column), written)
     source = load_source(text, file="j")
@@ -160,5 +160,5 @@ def test_the_schema_and_the_tool_agree(path: KeyPath, written: str) -> None:
 
 
 def is_about_one_another(source: Source) -> bool:
-    """What JSON Schema is not asked to say: a text's inner language beyond its pattern."""
+    """Return whether a document has a text that JSON Schema cannot check beyond its pattern."""
     return bool(re.search("zzz", json.dumps(source.value)))

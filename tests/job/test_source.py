@@ -1,4 +1,4 @@
-"""YAML text becomes plain values with a place for each; what a reader could misread is a finding."""
+"""YAML documents: values, spans, and findings for ambiguous text."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ def read(text: str) -> Source:
     return load_source(text, file="job.yaml")
 
 
-def said(source: Source) -> list[tuple[str, str]]:
+def rules_and_locations(source: Source) -> list[tuple[str, str]]:
     return [(finding.rule, str(finding.span)[len("job.yaml:") :]) for finding in source.findings]
 
 
-def test_every_value_and_key_has_a_place() -> None:
+def test_load_source_valid_document_has_span_of_every_value_and_key() -> None:
     source = read("bag:\n  path: 'a.mcap'\ntopics: [/imu, \"/cam\"]\n")
     assert source.value == {"bag": {"path": "a.mcap"}, "topics": ["/imu", "/cam"]}
     assert source.span(("bag", "path")) == Span("job.yaml", 2, 9, 2, 17)
@@ -27,12 +27,12 @@ def test_every_value_and_key_has_a_place() -> None:
     assert source.span(("topics", 1)) == Span("job.yaml", 3, 16, 3, 22)
 
 
-def test_the_place_of_what_is_missing_is_that_of_what_surrounds_it() -> None:
+def test_span_missing_value_is_that_of_enclosing_value() -> None:
     source = read("bag:\n  path: a\n")
     assert source.span(("bag", "ros_distro")) == source.span(("bag",))
 
 
-def test_a_place_inside_a_text_is_exact_where_the_text_is_written_as_it_is() -> None:
+def test_inner_span_unfolded_text_is_exact() -> None:
     source = read('a: "foo bar"\nb: [x.y + 1]\nc: >\n  folded\n  text\n')
     assert source.inner_span(("a",), 4, 7) == Span("job.yaml", 1, 9, 1, 12)
     assert source.inner_span(("b", 0), 2, 3) == Span("job.yaml", 2, 7, 2, 8)
@@ -74,18 +74,18 @@ def test_a_place_inside_a_text_is_exact_where_the_text_is_written_as_it_is() -> 
         ("x: " + "[" * (MAX_DEPTH + 5), [("yaml-depth", f"1:{MAX_DEPTH + 4}")], None),
     ],
 )
-def test_what_a_reader_could_misread_is_pointed_at(
+def test_load_source_ambiguous_yaml_is_located_finding(
     text: str, expected: list[tuple[str, str]], value: object
 ) -> None:
     source = read(text)
-    assert said(source) == expected
+    assert rules_and_locations(source) == expected
     if value is not None:
         assert source.value == value
 
 
-def test_several_mistakes_are_found_in_one_pass() -> None:
+def test_load_source_several_mistakes_reports_all() -> None:
     text = "topics:\n  - !/a\n  - */b\nname: {stem}_1\nx: 1\nx: no\n"
-    assert [rule for rule, _ in said(read(text))] == [
+    assert [rule for rule, _ in rules_and_locations(read(text))] == [
         "yaml-tag",
         "yaml-alias",
         "yaml-brace",
@@ -94,18 +94,18 @@ def test_several_mistakes_are_found_in_one_pass() -> None:
     ]
 
 
-def test_an_alias_bomb_is_refused_quickly() -> None:
+def test_load_source_alias_bomb_exceeds_size_limit() -> None:
     lines = ["a: &a [x, x, x, x, x, x, x, x, x]"]
     pairs = zip("abcdefgh", "bcdefghi", strict=True)
     lines += [f"{new}: &{new} [{', '.join([f'*{old}'] * 9)}]" for old, new in pairs]
-    assert [rule for rule, _ in said(read("\n".join(lines)))] == ["yaml-size"]
+    assert [rule for rule, _ in rules_and_locations(read("\n".join(lines)))] == ["yaml-size"]
 
 
-def test_a_document_that_is_too_long_is_refused() -> None:
-    assert [rule for rule, _ in said(read("#" * (MAX_CHARACTERS + 1)))] == ["yaml-size"]
+def test_load_source_too_long_document_exceeds_size_limit() -> None:
+    assert [rule for rule, _ in rules_and_locations(read("#" * (MAX_CHARACTERS + 1)))] == ["yaml-size"]
 
 
-def test_an_anchor_serves_its_aliases_and_merges() -> None:
+def test_load_source_anchor_resolves_aliases_and_merge_keys() -> None:
     source = read("base: &base {a: 1, b: 2}\njob:\n  <<: *base\n  b: 3\n")
     assert source.value == {"base": {"a": 1, "b": 2}, "job": {"a": 1, "b": 3}}
     assert source.findings == ()
@@ -113,18 +113,18 @@ def test_an_anchor_serves_its_aliases_and_merges() -> None:
     assert source.span(("job", "b")).line == 4
 
 
-def test_a_quoted_text_is_a_text_whatever_it_looks_like() -> None:
+def test_load_source_quoted_scalar_is_text() -> None:
     assert read('a: "no"\nb: "010"\nc: !!str 5\n').value == {"a": "no", "b": "010", "c": "5"}
 
 
-def test_an_empty_document_is_null() -> None:
+def test_load_source_empty_document_is_null() -> None:
     assert read("").value is None
     assert read("# nothing\n").findings == ()
 
 
 @settings(max_examples=300)
 @given(st.text(alphabet=st.sampled_from("ab:-[]{}!*&#|>'\"%@`,?\t\n 01.~$_<é"), max_size=60))
-def test_any_text_gives_a_source_whose_places_lie_in_the_text(text: str) -> None:
+def test_load_source_any_text_has_spans_inside_text(text: str) -> None:
     source = read(text)
     lines = len(text.splitlines()) + 1
     assert all(1 <= span.line <= lines for span in source.spans.values())
@@ -132,7 +132,7 @@ def test_any_text_gives_a_source_whose_places_lie_in_the_text(text: str) -> None
 
 
 def is_text_to_all(text: str) -> bool:
-    """Say whether a text is one to this reader too where PyYAML, which knows no 1e3, writes it without quotes."""
+    """Return whether this reader reads the text that PyYAML writes as text; PyYAML does not quote 1e3."""
     return isinstance(resolve_plain(text)[0], str) or yaml.safe_dump(text).startswith(("'", '"'))
 
 
@@ -147,9 +147,9 @@ PLAIN = st.recursive(
 @settings(max_examples=50)
 @given(PLAIN)
 @example({"08": None})
-def test_what_a_yaml_writer_writes_is_read_back(value: object) -> None:
+def test_load_source_pyyaml_output_round_trips(value: object) -> None:
     text = yaml.safe_dump(value)
     source = read(text)
-    # PyYAML quotes no text that is a number to other readers only, as 08
+    # PyYAML does not quote texts such as 08, which are numbers only for other readers.
     assert {finding.rule for finding in source.findings} <= {"yaml-number"}
     assert source.value == value

@@ -1,4 +1,4 @@
-"""Sizes, offsets and instants are read exactly or refused."""
+"""Parsing of sizes, offsets and instants."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from mosaico_ingest.job.units import parse_instant, parse_offset, parse_size
         ("1TiB", 2**40),
     ],
 )
-def test_a_size_is_bytes(text: str, expected: int) -> None:
+def test_parse_size_valid_text_returns_bytes(text: str, expected: int) -> None:
     assert parse_size(text) == expected
 
 
 @pytest.mark.parametrize("text", ["", "12", "MiB", "1 cow", "-1B", "1mB", "1e3B"])
-def test_what_is_no_size_is_refused(text: str) -> None:
+def test_parse_size_invalid_text_raises(text: str) -> None:
     with pytest.raises(ValueError, match="size"):
         parse_size(text)
 
@@ -43,12 +43,12 @@ def test_what_is_no_size_is_refused(text: str) -> None:
         ("-2h", -7200 * 10**9),
     ],
 )
-def test_an_offset_is_nanoseconds(text: str, expected: int) -> None:
+def test_parse_offset_valid_text_returns_nanoseconds(text: str, expected: int) -> None:
     assert parse_offset(text) == expected
 
 
 @pytest.mark.parametrize("text", ["10s", "+10", "+s", "+10m", "+-1s"])
-def test_what_is_no_offset_is_refused(text: str) -> None:
+def test_parse_offset_invalid_text_raises(text: str) -> None:
     with pytest.raises(ValueError, match="offset"):
         parse_offset(text)
 
@@ -63,18 +63,18 @@ def test_what_is_no_offset_is_refused(text: str) -> None:
         ("2026-03-01T12:00:00.123456789Z", 1772366400123456789),
     ],
 )
-def test_an_instant_is_nanoseconds_since_the_epoch(text: str, expected: int) -> None:
+def test_parse_instant_valid_text_returns_nanoseconds_since_epoch(text: str, expected: int) -> None:
     assert parse_instant(text) == expected
 
 
 @pytest.mark.parametrize("text", ["now", "2026-13-01", "2026-03-01T25:00", "12:00", ""])
-def test_what_is_no_instant_is_refused(text: str) -> None:
+def test_parse_instant_invalid_text_raises(text: str) -> None:
     with pytest.raises(ValueError, match=r"instant|month|hour"):
         parse_instant(text)
 
 
 @pytest.mark.parametrize("parse", [parse_size, parse_offset, parse_instant])
 @given(text=st.text(max_size=30))
-def test_any_text_is_read_or_refused(parse: Callable[[str], int], text: str) -> None:
+def test_parse_any_text_returns_integer_or_raises(parse: Callable[[str], int], text: str) -> None:
     with suppress(ValueError):
         assert isinstance(parse(text), int)

@@ -1,4 +1,4 @@
-"""A report shows the manifest with what it extends; whatever it says, no secret gets into it."""
+"""The composed manifest of a report, without secrets."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ SECRETS = (
 
 
 @pytest.mark.parametrize("text", SECRETS)
-def test_no_secret_gets_into_the_text(text: str, tmp_path: Path) -> None:
+def test_manifest_text_with_secret_masks_it(text: str, tmp_path: Path) -> None:
     (tmp_path / "job.yaml").write_text(text)
     shown = manifest_text(tmp_path / "job.yaml")
     assert "hunter2" not in shown
     assert MASK in shown or "${K}" in shown
 
 
-def test_what_another_file_says_is_there_with_its_place(tmp_path: Path) -> None:
+def test_manifest_text_extended_file_is_merged_with_location(tmp_path: Path) -> None:
     (tmp_path / "base.yaml").write_text("run: {jobs: 2}\n")
     (tmp_path / "job.yaml").write_text('extends: base.yaml\nbag: {path: "${DIR}/*.mcap"}\n')
     shown = manifest_text(tmp_path / "job.yaml")
