@@ -1,4 +1,4 @@
-"""What the adapter tests share: definitions of standard types, and a bound adapter over dicts."""
+"""Helpers of the adapter tests: definitions of standard types, and an adapter bound to dicts."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _NOT_IN_THE_DISTROS = {
 
 @pytest.fixture(scope="session")
 def define() -> Callable[..., Definition]:
-    """The definition of a type as a distro has it."""
+    """Return the definition of a type in a distro."""
     resolvers: dict[Stores, TypeResolver] = {}
 
     def definition(msgtype: str, distro: Stores = Stores.LATEST) -> Definition:
@@ -54,7 +54,7 @@ def define() -> Callable[..., Definition]:
 
 @pytest.fixture(scope="session")
 def adapt() -> Callable[..., Adapted]:
-    """Put messages, as dicts, through an adapter."""
+    """Convert messages, given as dicts, with an adapter."""
 
     def run(spec: AdapterSpec, definition: Definition, messages: Sequence[dict[str, Any]]) -> Adapted:
         shape = ros_shape(definition)
@@ -66,7 +66,7 @@ def adapt() -> Callable[..., Adapted]:
 
 @pytest.fixture(scope="session")
 def fuzzed() -> Callable[[Definition, int], list[dict[str, Any]]]:
-    """Make messages of a type; the same seed makes the same ones."""
+    """Return random messages of a type; equal seeds return equal messages."""
     message = runpy.run_path(str(Path(__file__).with_name("fuzz.py")))["message"]
 
     def messages(definition: Definition, count: int, seed: int = 1) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""This file makes messages of any definition: plain dicts, with the values that adapters treat specially among them."""
+"""Random messages of any definition as plain dicts, including values that adapters treat specially."""
 
 from __future__ import annotations
 

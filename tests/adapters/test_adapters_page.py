@@ -1,4 +1,4 @@
-"""docs/adapters.md says what the catalog says, and its examples work."""
+"""docs/adapters.md agrees with the catalog, and its examples work."""
 
 from __future__ import annotations
 

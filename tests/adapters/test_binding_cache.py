@@ -1,4 +1,4 @@
-"""An adapter is compiled once for each definition: a batch has the same few types in each of its recordings."""
+"""An adapter is compiled once per definition, because recordings of a batch share their types."""
 
 from __future__ import annotations
 

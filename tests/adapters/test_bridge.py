@@ -1,4 +1,4 @@
-"""Which adapter a topic gets, in order of precedence, and what is said about it."""
+"""The precedence of adapters for a topic, and the stated reason of each choice."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ tests:
 
 
 class BridgeRow(Serializable):
-    """A row of the tests."""
+    """The ontology class of the tests."""
 
     x: float
 

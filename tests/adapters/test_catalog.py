@@ -1,4 +1,4 @@
-"""One contract for every adapter of the catalog, over every type it takes."""
+"""The contract of every adapter of the catalog, for every type that it accepts."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_catalog_adapter_pickles(builtin: Builtin) -> None:
 
 
 def _definitions(define: Define, msgtype: str) -> list[Definition]:
-    """Return the type as ROS 1 and ROS 2 have it, those there are."""
+    """Return the definitions of the type in ROS 1 and ROS 2, as far as they exist."""
     found: list[Definition] = []
     for distro in (Stores.LATEST, Stores.ROS2_FOXY, Stores.ROS1_NOETIC):
         with suppress(BagError):
@@ -178,7 +178,7 @@ def _envelope(definition: Definition, count: int) -> Envelope:
 
 
 def _assert_required(rows: Any, where: str) -> None:
-    """Fail where a field that is never null is null in a struct that is there."""
+    """Fail if a non-nullable field is null in a struct that is not null."""
     if not pa.types.is_struct(rows.type):
         if pa.types.is_list(rows.type) or pa.types.is_fixed_size_list(rows.type):
             _assert_required(rows.flatten(), f"{where}[]")

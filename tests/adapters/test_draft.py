@@ -1,4 +1,4 @@
-"""A first draft of an adapter is an adapter: it loads, binds, and passes its test, whatever the type."""
+"""Drafted adapters load, bind and pass their tests for any type."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The PNG form of raw images loses nothing and is made only where it can be."""
+"""PNG compression of raw images is lossless and applies only to supported images."""
 
 from __future__ import annotations
 

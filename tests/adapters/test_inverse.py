@@ -1,4 +1,4 @@
-"""What a mapping computes is undone, form by form."""
+"""Inversion of mapping expressions, for each kind of expression."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ MESSAGE: dict[str, Any] = {
 
 
 def restore(type_: str, value: str, message: dict[str, Any]) -> Restored:
-    """Put one message through a mapping of one column and take it back."""
+    """Convert one message with a mapping of one column, and invert the result."""
     text = (
         f"version: 1\nadapter: TAdapter\nros_type: acme_msgs/msg/T\n"
         f"ontology: {{tag: T, fields: {{x: {type_}}}}}\nfields:\n  x: {value}\n"

@@ -1,4 +1,4 @@
-"""Whole adapters: what moves without a copy, what rejects a row, how adapters compose."""
+"""Mapping adapters: zero-copy fields, rejected rows and composition."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def definition(msgtype: str = "acme_msgs/msg/Pack") -> Definition:
 
 
 def spec_of(types: str, fields: str, **more: Any) -> MappingSpec:
-    """Return an adapter of a type of its own; `types` and `fields` are lines of a mapping."""
+    """Return an adapter with an inline ontology type; `types` and `fields` are lines of a mapping."""
     text = (
         "version: 1\nadapter: PackAdapter\nros_type: acme_msgs/msg/Pack\n"
         f"ontology:\n  tag: Pack\n  fields:\n{lines(types)}fields:\n{lines(fields)}"

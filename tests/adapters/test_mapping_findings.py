@@ -59,7 +59,7 @@ def definition() -> Definition:
 
 
 def findings_of(text: str) -> list[tuple[Finding, str]]:
-    """Return every finding with the text it points at."""
+    """Return each finding with the text at its location."""
     try:
         spec = load_adapter(text, file="pack.yaml", adapters=find_builtin)
         pack = definition()

@@ -1,4 +1,4 @@
-"""Every function of the language, by what it gives for a few values."""
+"""Every function of the mapping language, with expected results for a few values."""
 
 from __future__ import annotations
 

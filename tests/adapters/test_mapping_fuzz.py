@@ -1,4 +1,4 @@
-"""Random programs and damaged files: what comes out is a column, a finding, or a rejected row; never anything else."""
+"""Random expressions and damaged files result in columns, findings or rejected rows, never in other errors."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ TYPES = ["bool", "int8", "uint64", "float32", "int64", "float64"]
 
 
 class Writer:
-    """Writes programs and messages."""
+    """A generator of random expressions and messages."""
 
     def __init__(self, seed: int) -> None:
         self.random = random.Random(seed)  # noqa: S311 - no secret
@@ -100,7 +100,7 @@ class Writer:
 
 
 def run(typed: TypedExpression, rows: Any) -> None:
-    """Evaluate and convert to whatever it surely fits; every round leaves out the rows that were refused."""
+    """Evaluate, and convert to a type that fits; each round excludes the rows rejected before."""
     while True:
         evaluation = Evaluation(rows, Envelope("", "", np.zeros(len(rows), np.int64)))
         try:
@@ -130,7 +130,7 @@ def check_fit(typed: TypedExpression, result: Any, target: Any, evaluation: Eval
 
 
 def attempts(seed: int, count: int) -> int:
-    """Return how many of the programs had a meaning."""
+    """Return the number of valid expressions."""
     writer = Writer(seed)
     rows: Any = pa.array([writer.value(MESSAGE) or {} for _ in range(12)], MESSAGE)
     meant = 0

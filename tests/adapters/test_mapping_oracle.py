@@ -1,4 +1,4 @@
-"""Expressions over columns against the same expressions over one message at a time, in plain Python."""
+"""Evaluation by columns compared with a plain Python interpreter of single messages."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ MESSAGE = every_kind()
 
 
 class RefusedError(Exception):
-    """The row does not fit."""
+    """Raised if a row is rejected."""
 
 
 # --- the slow twin -------------------------------------------------------------------------------------------------
 
 
 def interpret(typed: TypedExpression, row: dict[str, Any]) -> Any:  # noqa: PLR0911 - a return for each kind of node
-    """Return the value for one message; open lists are Python lists."""
+    """Return the value for one message; variable-size lists are Python lists."""
     match typed:
         case MessageRef():
             return row
@@ -241,7 +241,7 @@ COMPUTED: dict[str, Callable[..., Any]] = {
     "min": extreme(min),
     "max": extreme(max),
 }
-"""What differs for integers and floats."""
+"""The operations that differ for integers and floats."""
 PLAIN: dict[str, Callable[..., Any]] = {
     "/": strict(lambda a, b: ieee(operator.truediv, float(a), float(b))),
     "==": compared(operator.eq),
@@ -268,7 +268,7 @@ PLAIN: dict[str, Callable[..., Any]] = {
 }
 
 
-# --- what is generated ---------------------------------------------------------------------------------------------
+# --- generators ---------------------------------------------------------------------------------------------
 
 FLOATS = st.floats(width=32) | st.sampled_from([0.0, -1.0, 1.0, 0.5, math.inf, math.nan])
 DOUBLES = st.floats(-1e6, 1e6) | st.sampled_from([0.0, math.inf, -math.inf, math.nan])
@@ -381,7 +381,7 @@ def typed_of(text: str) -> TypedExpression | None:
 
 
 def over_columns(typed: TypedExpression, rows: list[dict[str, Any]]) -> dict[int, Any]:
-    """Return the value of every row that is not refused."""
+    """Return the value of every row that is not rejected."""
     array, index = pa.array(rows, MESSAGE), np.arange(len(rows))
     while True:
         envelope = Envelope("", "", np.zeros(len(array), np.int64))

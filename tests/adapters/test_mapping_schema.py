@@ -1,4 +1,4 @@
-"""The published schema of adapter files: it takes what the model takes."""
+"""The published schema of adapter files accepts the same files as the model."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ VALIDATOR = jsonschema.Draft202012Validator(adapter_schema())
 
 
 def plain(value: Any) -> Any:
-    """Return what JSON has of a YAML value: keys are text."""
+    """Return a YAML value as JSON, with text keys."""
     return json.loads(json.dumps(value))
 
 
@@ -50,5 +50,5 @@ def test_adapter_schema_describes_every_key() -> None:
         "{version: 1, adapter: A, ros_type: a/b, ontology: T, fields: {x: {valu: 1}}}",
     ],
 )
-def test_adapter_schema_rejects_what_the_model_rejects(text: str) -> None:
+def test_adapter_schema_rejects_files_that_model_rejects(text: str) -> None:
     assert not VALIDATOR.is_valid(plain(load_source(text, file="a.yaml").value))

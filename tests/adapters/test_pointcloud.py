@@ -1,4 +1,4 @@
-"""Unpacking clouds: whole batches against one value at a time read with `struct`."""
+"""Unpacking of point clouds in batches, compared with single values read by `struct`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def unpack(define: Callable[..., Definition], adapt: Callable[..., Adapted]) -> 
 
 @st.composite
 def clouds(draw: st.DrawFn, *, fields: list[dict[str, Any]] | None = None, step: int = 0) -> dict[str, Any]:
-    """A cloud with x, y, z and some more, anywhere in the point, lines padded or not, bytes at random."""
+    """Return a cloud of random bytes with x, y, z and other fields at any offsets, with or without row padding."""
     if fields is None:
         fields, step = draw(layouts())
     height, width, padding = (
@@ -59,7 +59,7 @@ def layouts(draw: st.DrawFn) -> tuple[list[dict[str, Any]], int]:
 
 
 def _one_by_one(cloud: dict[str, Any], name: str) -> list[float] | None:
-    """Read a field point by point, as float32."""
+    """Return a field as float32, read point by point."""
     entry = next((field for field in cloud["fields"] if field["name"] == name), None)
     if entry is None:
         return None

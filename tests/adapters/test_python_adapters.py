@@ -30,7 +30,7 @@ from mosaico_ingest.rosbag.definitions.model import Definition
 
 
 class Speed(Serializable):
-    """A row of the tests."""
+    """The ontology class of the tests."""
 
     value: float
     name: str | None = None

@@ -1,4 +1,4 @@
-"""What the decoders' tests share: batches out of payloads, and the comparison of the two decoders."""
+"""Helpers of the decoder tests: message blocks from payloads, and a comparison of both decoders."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mosaico_ingest.rosbag.definitions.model import Definition
 
 
 def make_batch(payloads: Sequence[bytes]) -> MessageBlock:
-    """Lay the payloads into one buffer, with other bytes before, between and after them."""
+    """Return a message block of the payloads, with other bytes before, between and after them."""
     lengths = np.array([len(payload) for payload in payloads], np.int64)
     gaps = 3 + np.arange(len(payloads)) % 5
     starts = np.cumsum(lengths + gaps) - lengths
@@ -26,7 +26,7 @@ def make_batch(payloads: Sequence[bytes]) -> MessageBlock:
 
 
 def bits(array: pa.Array) -> Any:
-    """Return the array as values that can be compared, NaN with NaN and 0.0 not with -0.0."""
+    """Return comparable values of the array: NaN equals NaN, and 0.0 differs from -0.0."""
     kind = array.type
     if pa.types.is_struct(kind):
         return len(array), [bits(array.field(number)) for number in range(kind.num_fields)]
@@ -52,7 +52,7 @@ def check_same(fast: Decoded, slow: Decoded) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def small_batches_by_columns() -> Iterator[None]:
-    """Small batches are decoded by columns too, or most random cases would compare rows with rows."""
+    """Decode small batches by columns too; otherwise most random cases would compare rows with rows."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(columnar, "_FEW", -1)
         yield
@@ -70,7 +70,7 @@ def assert_same() -> Callable[[Decoded, Decoded], None]:
 
 @pytest.fixture(scope="session")
 def assert_agree() -> Callable[[Sequence[bytes], Definition, Encoding], Decoded]:
-    """Decode the payloads both ways, compare, and return what the row-wise decoder says."""
+    """Decode the payloads with both decoders, compare them, and return the row-wise result."""
 
     def check(payloads: Sequence[bytes], definition: Definition, encoding: Encoding) -> Decoded:
         batch = make_batch(payloads)

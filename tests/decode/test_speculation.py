@@ -1,4 +1,4 @@
-"""Elements that look alike are walked by guesses, which are right or are not taken."""
+"""Speculation on element sizes: correct guesses save steps, wrong guesses do not change results."""
 
 from __future__ import annotations
 

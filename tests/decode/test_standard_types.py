@@ -26,7 +26,7 @@ LARGEST_ROWWISE = 40_000_000
 
 
 class Values:
-    """Random values of any type, short where lengths are free."""
+    """A source of random values of any type, with short sequences and texts."""
 
     def __init__(self, definition: Definition, seed: int) -> None:
         self.types = definition.types
@@ -74,7 +74,7 @@ def test_standard_types_decode_equally_columnar_and_rowwise(
 
 
 def batches_of(corpus: Path) -> Iterator[tuple[Connection, MessageBlock]]:
-    """Yield the batches of every recording that opens, those of one-message rows as large as row-wise can bear."""
+    """Yield the message blocks of every readable recording, with their connections."""
     for line in (corpus / "INDEX.tsv").read_text().splitlines()[1:]:
         path = corpus / line.split("\t")[0]
         try:

@@ -1,4 +1,4 @@
-"""Between two recordings of a batch the catalog stays open; afterwards nothing of it is left."""
+"""The catalog stays open between the recordings of a batch and is closed afterwards."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_in_process_executor_keeps_catalog_open_between_recordings(tmp_path: Pat
 
 
 def test_keep_open_store_removed_between_runs_is_created_again(tmp_path: Path) -> None:
-    """Letting go of the old catalog must not take the files of the new one."""
+    """Closing the old catalog must not delete the files of the new one."""
     with keep_destinations_open() as keep_open:
         for name in "ab":
             list(InProcess().map([task(tmp_path, name)], lambda *_: None))

@@ -1,4 +1,4 @@
-"""A cluster of two nodes does what one machine does, with nodes that go, an interrupt, and files it must be sent."""
+"""A cluster of two nodes: same results as one machine, lost nodes, interrupts and shipped files."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def cluster() -> Iterator[Any]:
 
 
 def make_job(folder: Path, names: str, *, wait_for: str = "") -> Path:
-    """A job whose adapter is a file beside it, which needs another one; it waits for a file to be there."""
+    """A job with an adapter file that imports another file and waits until a marker file exists."""
     (folder / "adapters").mkdir(parents=True)
     for name in names:
         shutil.copy(DRIVE, folder / f"{name}.mcap")
@@ -98,7 +98,7 @@ def ended(process: subprocess.Popen[str]) -> tuple[int, str]:
 
 
 def outcome(folder: Path) -> list[dict[str, Any]]:
-    """What a run's report says, without what time it took."""
+    """Return a run's report without its durations."""
     report = RunReport.model_validate_json((folder / "run.json").read_text())
     timed = {"started_at", "duration_s", "steps"}
     return [recording.model_dump(mode="json", exclude=timed) for recording in report.recordings]
@@ -143,7 +143,7 @@ def test_run_interrupted_follows_session_policy_and_exits_130(cluster: Any, tmp_
 
 
 def test_ray_lost_node_restarts_its_recording(cluster: Any, tmp_path: Path) -> None:
-    """It takes the node, so it comes last of those who use the cluster."""
+    """This test removes a node, so it must run after the other tests of the cluster."""
     jobs = compile_job(make_job(tmp_path, "ab", wait_for="go"))
     begun: list[int] = []
 

@@ -1,4 +1,4 @@
-"""What a job needs travels with it: adapters with what lies beside them, definitions, certificates; nothing else."""
+"""Packed jobs contain their adapters, neighboring modules, definitions and certificates, and nothing else."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ target: {store: ../store}
 
 @pytest.fixture
 def job(tmp_path: Path) -> Path:
-    """A manifest whose adapters lie beside and above it."""
+    """A manifest with adapters in its own and its parent folder."""
     for folder in ("adapters", "acme_msgs"):
         shutil.copytree(QUICKSTART / folder, tmp_path / "here" / folder)
     jobs = tmp_path / "here" / "jobs"

@@ -1,4 +1,4 @@
-"""`ingest status` says what a run that skips what is there would find; shards together are the whole."""
+"""`ingest status` reports the state of each recording, and shards partition the recordings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recording is ingested once it has come to rest, and once only, whatever happens to the watcher."""
+"""The watcher ingests each recording exactly once, after its file stops changing."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def test_run_of_recording_that_has_grown_replaces_sequence(tmp_path: Path) -> No
 
 
 STRICT = os.environ | {"PYTHONIOENCODING": "utf-8:strict"}
-"""Standard output as it is in most languages: what is not UTF-8 cannot be written to it."""
+"""An environment with strict UTF-8 standard output, as in most locales: it rejects file names that are not UTF-8."""
 
 
 def watch_once(folder: Path, code: int = 0) -> list[str]:

@@ -1,4 +1,4 @@
-"""The watcher as a process: slow copies, a request to stop, and a sudden end in the middle of an ingest."""
+"""The watcher as a process: slow copies, stop signals and kills during an ingest."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PATIENCE_S = 60.0
 
 @dataclass
 class Watch:
-    """A watcher started in a folder; what it says goes to a file, for a full pipe would stop it."""
+    """A watcher process in a folder; its output goes to a file, since a full pipe would block it."""
 
     folder: Path
     started: list[subprocess.Popen[bytes]] = field(default_factory=list[subprocess.Popen[bytes]])
@@ -82,7 +82,7 @@ def children(pid: int) -> list[int]:
     return []
 
 
-def test_watch_ingests_renamed_file_at_once_and_slow_copy_after_rest(watch: Watch) -> None:
+def test_watch_ingests_renamed_file_immediately_and_slow_copy_after_rest(watch: Watch) -> None:
     whole = DRIVE.read_bytes()
     watch.start()
     (watch.folder / "in" / ".a.mcap.part").write_bytes(whole)
@@ -133,7 +133,7 @@ def test_watch_restarted_after_kill_ingests_interrupted_recording_exactly_once(w
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not here")
-def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
+def test_systemd_unit_is_valid(tmp_path: Path) -> None:
     text = UNIT.read_text().replace("/srv/ingest/.venv/bin/ingest", sys.executable)
     (tmp_path / UNIT.name).write_text(text)
     done = subprocess.run(  # noqa: S603 - the unit is ours

@@ -76,7 +76,7 @@ SPECIAL = {"Unmodeled", "Range", "Image", "CompressedImage", "PointCloud2", "Poi
 
 
 def within_a_second(value: Any) -> Any:
-    """Bring every `nanoseconds` into a second."""
+    """Reduce every `nanoseconds` to less than one second."""
     if isinstance(value, dict):
         return {k: v % 10**9 if k == "nanoseconds" else within_a_second(v) for k, v in value.items()}
     return [within_a_second(item) for item in value] if isinstance(value, list) else value

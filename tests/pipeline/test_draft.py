@@ -1,4 +1,4 @@
-"""A drafted manifest says of a recording only what is true."""
+"""Drafted manifests describe a recording correctly."""
 
 from __future__ import annotations
 

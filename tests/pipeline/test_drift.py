@@ -1,4 +1,4 @@
-"""Two plans differ in what is said, and in nothing else."""
+"""The differences of two plans are complete and correct."""
 
 from __future__ import annotations
 

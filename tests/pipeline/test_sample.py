@@ -1,4 +1,4 @@
-"""A plan tries the first messages of each topic in memory: what would be lost shows, however rare the topic."""
+"""A plan's sample converts the first messages of each topic in memory and reports rejections."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ START_NS = 1_700_000_000 * 10**9
 
 
 def recording(folder: Path, payloads: dict[str, list[bytes]]) -> Path:
-    """Write `std_msgs/msg/Float64` payloads as they stand, one a second on each topic."""
+    """Write raw payloads of `std_msgs/msg/Float64`, one per second on each topic."""
     store = get_typestore(Stores.LATEST)
     with Ros2Writer(folder / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         for topic, items in payloads.items():

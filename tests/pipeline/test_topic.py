@@ -30,7 +30,7 @@ CONNECTION = Connection(0, "/speed", "std_msgs/msg/Float64", Encoding.CDR, None,
 SPEED = OntologyType("Speed", pa.struct([pa.field("data", pa.float64(), nullable=False)]))
 SERIALIZER = Serializer(DEFINITION, Encoding.CDR)
 CUT = b"\x00\x01\x00\x00\x01"
-"""A payload that ends within its number."""
+"""A payload that ends inside its number."""
 
 
 class Positive:
@@ -197,7 +197,7 @@ def test_topic_every_keeps_the_first_message_of_each_group(every: int) -> None:
     assert counts(collector)[2] == 10 - len(values[::every])
 
 
-def test_topic_topic_refused_by_destination_follows_the_topic_policy() -> None:
+def test_topic_refused_by_destination_follows_topic_policy() -> None:
     session, collector, error = run([1.0, 2.0, 3.0], size=2, refuse=True)
     assert error is None
     assert session.values == []

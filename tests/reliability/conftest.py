@@ -1,4 +1,4 @@
-"""Recordings and jobs that go wrong in known ways."""
+"""Fixtures of recordings and jobs with known faults."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mosaico_ingest.report.model import Report
 
 START_NS = 1_700_000_000_000_000_000
 CUT = b"\x00\x01\x00\x00\x01"
-"""A payload that ends in the middle of its number."""
+"""A payload that ends inside its number."""
 WriteBag = Callable[..., Path]
 RunJob = Callable[..., Report]
 
@@ -30,9 +30,9 @@ def number(value: float) -> bytes:
 
 @pytest.fixture
 def write_bag(tmp_path: Path) -> WriteBag:
-    """Write payloads by topic, one each 10 ms, into `name.db3`; it defines no type.
+    """Write payloads by topic, one every 10 ms, into `name.db3`, without definitions.
 
-    Topics below /std are of a standard type, the others of one nobody knows.
+    Topics below /std have a standard type, the others an unknown type.
     """
 
     def write(topics: dict[str, Sequence[bytes]], *, name: str = "drive") -> Path:
@@ -57,7 +57,7 @@ def write_bag(tmp_path: Path) -> WriteBag:
 
 @pytest.fixture
 def write_job(tmp_path: Path) -> Callable[..., Path]:
-    """Write a manifest for `drive.db3`; `definition` is what the job says a Number is."""
+    """Write a manifest for `drive.db3` that defines the type Number by `definition`."""
 
     def write(*, definition: str = "float64 data", file: str = "job.yaml", **sections: object) -> Path:
         messages = tmp_path / "definitions"

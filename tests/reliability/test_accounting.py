@@ -1,4 +1,4 @@
-"""Every message that an index promises was read, or is known to be unreadable; what is stored is what was written."""
+"""Every message of an index is read or reported as unreadable, and stored rows equal written rows."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_run_of_truncated_recording_reports_unreadable_messages_in_status_counts
 
 @pytest.fixture
 def undefined(tmp_path: Path) -> Path:
-    """A recording without definitions; no distro knows the type of one of its two topics."""
+    """A recording without definitions, where the type of one of two topics is in no distro."""
     number = define("std_msgs/msg/Int32", "int32 data\n")
     own = define("own_msgs/msg/Thing", "int32 a\n")
     bag = record(

@@ -1,4 +1,4 @@
-"""No room, or no leave to write: one line that says so, the old state, and the next run completes it."""
+"""Full and read-only disks: one error line, an unchanged store, and a next run that completes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ REPLACE = {"name": "drive", "if_exists": "replace"}
 
 
 def ran(*arguments: object, **environment: str) -> tuple[int, str]:
-    """Run the command; return its exit code and its errors."""
+    """Run the command; return its exit code and standard error."""
     done = subprocess.run(  # noqa: S603 - our own command
         [sys.executable, "-m", "mosaico_ingest", *map(str, arguments)],
         capture_output=True,
@@ -39,7 +39,7 @@ def ran(*arguments: object, **environment: str) -> tuple[int, str]:
 
 
 def the_error(said: str) -> str:
-    """Return the one line that says what went wrong."""
+    """Return the only error line."""
     (line,) = [line for line in said.splitlines() if line.startswith("error: ")]
     return line
 
@@ -57,7 +57,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.fixture
 def noise() -> list[bytes]:
-    """Numbers that take 640 kB in a recording, and no less in a store."""
+    """Incompressible numbers: 640 kB in a recording and at least as much in a store."""
     source = random.Random(1)  # noqa: S311 - they only must not compress
     return [number(struct.unpack("<d", struct.pack("<Q", source.getrandbits(62)))[0]) for _ in range(80_000)]
 

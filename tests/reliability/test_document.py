@@ -1,4 +1,4 @@
-"""What docs/reliability.md promises names tests that are there."""
+"""docs/reliability.md names existing tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Jobs that are killed, stopped, starved of space or deprived of their files: the old state or the new, and an answer."""
+"""Jobs that are killed or stopped, or whose files are removed: the store keeps the old or the new sequence."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def speeds(store: Store) -> list[float]:
 
 
 def kill_and_look(write_bag: WriteBag, job: Path, store: Path, rounds: int) -> int:
-    """Replace the sequence again and again, killing each run; return how many got through in time."""
+    """Replace the sequence repeatedly and kill each run; return the number of runs that replaced it before."""
     moments = random.Random()  # noqa: S311 - any moment will do
     survivor = 0.0
     through = 0
@@ -109,7 +109,7 @@ def test_run_with_other_file_at_store_path_fails(
 
 
 def interrupted_by(job: Path, act: Callable[[], object]) -> tuple[RunStatus, int, str]:
-    """Run a job and do something to its files once the first rows are written."""
+    """Run a job and change its files after the first rows are written."""
     done: list[bool] = []
 
     def tell(_position: int, event: Event) -> None:

@@ -1,4 +1,4 @@
-"""Whatever stands in the place of a recording or a manifest: an answer in one line, and no file outside the store."""
+"""Hostile recordings, manifests and names: one error line, and no file outside the store."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def ingest(data: bytes) -> RunReport:
 
 
 def told(report: RunReport) -> None:
-    """Look at how a run ended: well, or with one line that is no mistake of the program."""
+    """Check that a run succeeded or failed with one error line that is not an internal error."""
     (recording,) = report.recordings
     error = recording.error or ""
     assert report.exit_code in {0, 1, 3, 4}, error

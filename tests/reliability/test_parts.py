@@ -1,4 +1,4 @@
-"""A recording in parts of which some, or all, are empty, damaged or gone: inspected and ingested by the command."""
+"""Split recordings whose splits are empty, damaged or missing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Ingest = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture
 def ingest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Ingest:
-    """Run the command; return exit code, output and errors on one line each."""
+    """Run the command; return its exit code, and standard output and error as one line each."""
     monkeypatch.chdir(tmp_path)
 
     def run(*arguments: str) -> tuple[int, str, str]:
@@ -32,7 +32,7 @@ def ingest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
 
 @pytest.fixture
 def parts(write_bag: WriteBag, tmp_path: Path) -> Path:
-    """Three parts of two messages each, without metadata."""
+    """Three splits of two messages each, without metadata."""
     folder = tmp_path / "parts"
     folder.mkdir()
     for part in range(3):

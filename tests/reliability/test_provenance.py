@@ -1,4 +1,4 @@
-"""The same job again does nothing; other content under the same name is refused; half of it is completed."""
+"""Repeated jobs: same content is skipped, other content is refused, an incomplete sequence is completed."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_skip_treats_sequence_with_rejected_rows_as_complete(
 
 
 def rewritten(bag: Path, value: float, other: float) -> None:
-    """Put one number of a recording in the place of another; what the file system says of it is as before."""
+    """Replace one number of a recording by another, and keep the file's size and modification time."""
     was = bag.stat()
     data = bag.read_bytes()
     assert data.count(number(value)) == 1

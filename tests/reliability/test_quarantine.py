@@ -1,4 +1,4 @@
-"""What is rejected is kept, within limits, and comes in once the reason is mended."""
+"""Rejected messages are kept in quarantine, within limits, and are replayed after the cause is fixed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WriteJob = Callable[..., Path]
 
 
 def kept(folder: Path) -> list[dict[str, object]]:
-    """Return the index's entries, after a look at whether the messages beside it are theirs."""
+    """Check that the index matches its messages, and return the entries of the index."""
     entries: list[dict[str, object]] = []
     for index in sorted(folder.glob("*.jsonl")):
         lines = [json.loads(line) for line in index.read_text().splitlines()]

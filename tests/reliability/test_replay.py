@@ -1,4 +1,4 @@
-"""A replay brings each kept message in once, wherever it is stopped, and leaves what still does not fit."""
+"""A replay appends each quarantined message exactly once, wherever it is stopped, and keeps messages that fail again."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def command(*arguments: object) -> int:
 
 
 def killed(moment: str, *arguments: object) -> int:
-    """Run the command in a process that is killed at a moment; return its exit code."""
+    """Run the command in a process that is killed at the given step; return its exit code."""
     ran = subprocess.run(  # noqa: S603 - this interpreter, our own code
         [sys.executable, "-c", _KILLED, *MOMENTS[moment], *map(str, arguments)],
         check=False,
@@ -73,7 +73,7 @@ def values(store: Store, topic: str = "/speed") -> list[float]:
 
 
 def waiting(folder: Path, job: Path) -> int:
-    """Return how many messages a replay would bring in, or try to."""
+    """Return the number of messages that a replay processes."""
     found = find_replays(folder, api.compile_job(job))
     files = [one.file.messages for one in found if one.state is ReplayState.WAITING]
     return sum(len(path.with_suffix(".jsonl").read_text().splitlines()) for path in files)
@@ -81,7 +81,7 @@ def waiting(folder: Path, job: Path) -> int:
 
 @pytest.fixture
 def spoilt(write_bag: WriteBag, write_job: WriteJob, run_job: RunJob) -> Path:
-    """A sequence of one good message, five in quarantine and one there that will never fit; the mended job."""
+    """A fixed job, and its sequence of one stored and six quarantined messages, one of which always fails."""
     write_bag({"/speed": [*map(number, range(5)), CUT], "/std/speed": [number(1)]})
     report = run_job(write_job(definition=WRONG, quarantine={}))
     assert (report.status, report.totals.written, report.totals.rejected) == (RunStatus.WITH_ERRORS, 1, 6)
@@ -126,7 +126,7 @@ def test_replay_stopped_before_marking_file_is_not_repeated(
     with monkeypatch.context() as patched:
         patched.setattr(QuarantineFile, "mark_replayed", str)
         assert command("replay", "-q", folder, "-m", spoilt) == 4
-    assert len(list(folder.glob("*.mcap"))) == 2, "what was replayed, and what failed again"
+    assert len(list(folder.glob("*.mcap"))) == 2, "the replayed messages, and the messages that failed again"
     assert command("replay", folder, "-m", spoilt) == 1
     assert "already in the sequence" in capsys.readouterr().err
     assert (values(store), waiting(folder, spoilt)) == (list(range(5)), 1)

@@ -1,4 +1,4 @@
-"""A definition that is not what it was in the last sequences of the family is refused, noted or stored apart."""
+"""A definition that differs from earlier sequences of the family fails, warns or creates a new topic."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DOUBLE = b"\x00\x01\x00\x00" + struct.pack("<d", 2.5)
 
 @pytest.fixture
 def session(write_bag: WriteBag, write_job: WriteJob, run_job: RunJob) -> Session:
-    """Ingest one more session of a family: a recording `name.db3` whose topic /speed is of the type `kind`."""
+    """Ingest a recording `name.db3` of the family, whose topic /speed has the type `kind`."""
 
     def ingest(name: str, kind: str, policy: str | None = None, **sections: object) -> Report:
         write_bag({"/speed": [DOUBLE if kind == "float64" else FLOAT]}, name=name)

@@ -1,4 +1,4 @@
-"""The same job again, against a server: done once, completed where it was cut short, never twice."""
+"""Repeated jobs with a server as destination: rows are stored exactly once, also after interruptions."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def command(*arguments: object) -> list[str]:
 
 
 def ran(*arguments: object) -> tuple[int, str]:
-    """Run the command; return its exit code and what it said."""
+    """Run the command; return its exit code and output."""
     done = subprocess.run(  # noqa: S603 - our own command
         command(*arguments), capture_output=True, text=True, check=False, timeout=120
     )
@@ -44,7 +44,7 @@ def ran(*arguments: object) -> tuple[int, str]:
 
 @contextmanager
 def serving(folder: Path, port: int = 0) -> Generator[tuple[int, subprocess.Popen[str]], None, None]:
-    """Serve `served`, in a process of its own; give its port and the process."""
+    """Serve `served` in a separate process; yield its port and the process."""
     arguments = command("serve", "--port", port, "--store", folder / "served")
     server = subprocess.Popen(  # noqa: S603 - our own command
         arguments, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=folder
@@ -65,7 +65,7 @@ def serving(folder: Path, port: int = 0) -> Generator[tuple[int, subprocess.Pope
 
 @pytest.fixture
 def port(tmp_path: Path) -> Generator[int, None, None]:
-    """The port of a server over `served`."""
+    """The port of a server of the store `served`."""
     with serving(tmp_path) as (found, _):
         yield found
 
@@ -128,7 +128,7 @@ def test_server_append_adds_new_topics_once(
 
 
 def kill_and_look(job: Path, folder: Path, rounds: int) -> tuple[int, int]:
-    """Kill the first run of a job at any moment and run it again; return how often what was there, and was not."""
+    """Kill the first run of a job at random moments and repeat it; return how many kills left a complete sequence, and how many none."""
     moments = random.Random()  # noqa: S311 - any moment will do
     began = time.monotonic()
     assert ran("run", job)[0] == 0
@@ -189,7 +189,7 @@ def test_run_with_killed_server_fails_and_next_run_completes(
 
 
 class Forgetful(Proxy):
-    """A line on which the answer to one question is lost, then everything, then nothing more."""
+    """A proxy that drops all data after one request, disconnects, and then recovers if `mended`."""
 
     def __init__(self, port: int, word: bytes, *, mended: bool = True) -> None:
         self.word: bytes | None = word

@@ -26,7 +26,7 @@ DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.
 
 @dataclass
 class Collector:
-    """What has arrived; counters are cumulative, so the last export of each counts."""
+    """The received exports; counters are cumulative, so the last export of each applies."""
 
     url: str = ""
     resources: list[dict[str, str]] = field(default_factory=list[dict[str, str]])

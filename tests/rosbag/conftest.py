@@ -1,4 +1,4 @@
-"""Recordings of every container, written for a test: by rosbags, and by a small MCAP writer that can leave things out."""
+"""Recordings in every container, written by rosbags and by a small MCAP writer that can omit records."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ class Sent(NamedTuple):
 
 
 class BlindResolver:
-    """Knows no type; the containers do not need one."""
+    """A type store without types, since containers do not need them."""
 
     def resolve(self, msgtype: str, embedded: Embedded | None, *, ros_version: int) -> Definition:
         raise BagError(f"{msgtype} of ROS {ros_version} is not known, nor from {embedded}")
 
 
 class EasyResolver:
-    """Believes that every type exists and is empty."""
+    """A type store in which every type exists and is empty."""
 
     def resolve(self, msgtype: str, embedded: Embedded | None, *, ros_version: int) -> Definition:
         types = {msgtype: MessageType(msgtype, ())}
@@ -53,7 +53,7 @@ class EasyResolver:
 
 
 def sent(count: int = 300, *, seed: int = 0, big: bool = False, cdr: bool = True) -> list[Sent]:
-    """Return messages of a few topics, of fixed and of random lengths, in time order, some at the same time."""
+    """Return messages of a few topics in time order, of fixed and random lengths, some with equal times."""
     rng = random.Random(seed)  # noqa: S311 - test data
     head = b"\x00\x01\x00\x00" if cdr else b""
     found: list[Sent] = []
@@ -164,7 +164,7 @@ class _McapWriter:
         self.out += _record(op, body)
 
     def described(self, message: Sent) -> bytes:
-        """Return the schema and channel records, the first time a topic is seen."""
+        """Return the schema and channel records for the first message of a topic, else nothing."""
         if message.topic in self.descriptions:
             return b""
         key = len(self.descriptions) + 1
@@ -222,7 +222,7 @@ class _McapWriter:
 
 
 def received(recording: Recording, **selection: object) -> list[Sent]:
-    """Return all messages by time, and check on the way what every batch promises."""
+    """Return all messages by time, and check the invariants of each block."""
     found: list[Sent] = []
     last: dict[int, int] = {}
     for batch in recording.message_blocks(**selection):  # type: ignore[arg-type]  # the tests name what batches() takes
@@ -241,7 +241,7 @@ def received(recording: Recording, **selection: object) -> list[Sent]:
 
 
 class Recordings:
-    """The functions above, for tests that cannot import them."""
+    """The functions above, as attributes for tests that cannot import this module."""
 
     Sent = Sent
     START_NS = START_NS
@@ -256,5 +256,5 @@ class Recordings:
 
 @pytest.fixture(scope="session")
 def recordings() -> Recordings:
-    """What writes recordings for a test, and reads them back."""
+    """Functions that write recordings and read them back."""
     return Recordings()

@@ -1,4 +1,4 @@
-"""Inflating believes the bytes and not what is announced about them."""
+"""Decompression checks the announced sizes of chunks and reports damaged data."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_decompress_file_several_frames_concatenates_them(tmp_path: Path) -> Non
 
 
 def _packed(chunks: Sequence[tuple[str, bytes, int]]) -> tuple[NDArray[np.uint8], list[CompressedChunk]]:
-    """Return bytes that hold the chunks, each after something else, and where they lie in them."""
+    """Return a buffer with the chunks, each after other bytes, and their offsets in it."""
     data, packed = b"", list[CompressedChunk]()
     for name, held, size in chunks:
         begin = len(data) + len(_BETWEEN)

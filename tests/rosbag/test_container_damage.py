@@ -1,4 +1,4 @@
-"""Damage costs what it destroys: the rest is read, what is lost is told, and nothing but BagError is ever raised."""
+"""Damaged containers: intact messages are read, unreadable ranges are reported, and only BagError is raised."""
 
 from __future__ import annotations
 

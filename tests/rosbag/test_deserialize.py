@@ -1,4 +1,4 @@
-"""One message at a time: what comes out, and what is refused."""
+"""Deserialization of single messages: decoded values and refused payloads."""
 
 from __future__ import annotations
 
@@ -218,7 +218,7 @@ def messages_of(known: Definition, name: str) -> st.SearchStrategy[dict[str, Any
 
 
 def plain(value: Any, field: Field, known: Definition) -> Any:
-    """Turn rosbags' objects and arrays into the values we give."""
+    """Convert objects and arrays of rosbags to the values of our deserializer."""
     if field.container is not Container.SCALAR:
         if field.type in {"byte", "char", "uint8"} and field.container is Container.SEQUENCE:
             return bytes(value)
@@ -259,7 +259,7 @@ def test_serializer_output_is_decoded_equally_by_rosbags(encoding: Encoding, dat
 
 @st.composite
 def own_definitions(draw: st.DrawFn) -> str:
-    """The text of a type with every kind of field, and of the type it holds."""
+    """The definition of a type with every kind of field, and of its nested type."""
     kinds = st.sampled_from([*PLAIN, "time", "string<=20", "Inner", "Empty"])
     brackets = st.sampled_from(["", "", "", "[]", "[3]", "[<=4]"])
 

@@ -1,4 +1,4 @@
-"""A path stands for the files it should: by content, by directory, by metadata.yaml, and never silently for less."""
+"""Discovery of a recording's files by content, directory and metadata.yaml; missing files are reported."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BOMB = "\n".join(
 
 @pytest.fixture
 def split(tmp_path: Path, recordings: Any) -> Path:
-    """A recording in three parts, with its metadata."""
+    """A recording with three splits and its metadata."""
     folder = tmp_path / "split"
     folder.mkdir()
     messages = recordings.sent(90)

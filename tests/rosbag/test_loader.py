@@ -1,4 +1,4 @@
-"""A recording message by message."""
+"""Iteration over the messages of a recording with `ROSLoader`."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def point(second: int) -> bytes:
 
 @pytest.fixture(params=[StoragePlugin.MCAP, StoragePlugin.SQLITE3])
 def bag(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
-    """Twenty seconds: a point every second, a text every two, one text broken, one type of our own."""
+    """Twenty seconds: a point every second, a text every two seconds, one invalid text, and one custom type."""
     path = tmp_path / "bag"
     store = get_typestore(RosbagsStores.ROS2_HUMBLE)
     own = "uint8[] blob\nint32 from\n"

@@ -1,4 +1,4 @@
-"""Recordings that define nothing, of types no distro's core has."""
+"""Recordings without definitions, whose types belong to bundled packages and not to a distro's core."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ NAMES = sorted(
 )
 HELLO = b"\x00\x01\x00\x00\x03\x00\x00\x00hi\x00"
 STRINGS = "RIHS01_eee55533636293ac7c94c62432eedb5777eb849847d2a17b4dcead8c4a20ab32"
-"""The hash of test_msgs/msg/Strings, as ROS itself computes it."""
+"""The hash of test_msgs/msg/Strings as computed by ROS."""
 
 
 def recorded(
     path: Path, msgtype: str, digest: str = "", definitions: tuple[tuple[str, str], ...] = ()
 ) -> Path:
-    """Write a recording with one message of bytes that fit a text."""
+    """Write a recording with one message whose payload is a string."""
     with sqlite3.connect(path) as file:
         file.executescript(
             "CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format, offered_qos_profiles,"
@@ -66,7 +66,7 @@ def test_package_types_have_the_hashes_of_ros2() -> None:
 
 
 def in_ros_1(name: str) -> Definition:
-    """Return a type of a package as ROS 1 would have it, which is the same but for the header."""
+    """Return the definition of a type for ROS 1, which differs only in the header."""
     package = name.partition("/")[0]
     text = Path(packages.__file__).with_name("packages").joinpath(f"{package}.txt").read_text()
     parts = dict(part.split("\n", 1) for part in text.split(f"{'=' * 80}\n"))
@@ -87,7 +87,7 @@ def in_ros_1(name: str) -> Definition:
     ],
 )
 def test_package_types_have_the_hashes_of_ros1(name: str, digest: str) -> None:
-    """The hashes are those that ROS 1 bags and generated code carry."""
+    """Compare with the MD5 sums in ROS 1 bags and generated code."""
     assert md5sum(in_ros_1(name)) == digest
 
 

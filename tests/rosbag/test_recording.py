@@ -1,4 +1,4 @@
-"""A recording gives back what was recorded, whatever the container, the compression and the selection."""
+"""Recordings return the recorded messages for every container, compression and selection."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Types a program announces for all its recordings."""
+"""Types that a program registers for all recordings."""
 
 from __future__ import annotations
 

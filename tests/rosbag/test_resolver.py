@@ -1,4 +1,4 @@
-"""Where a definition comes from."""
+"""The sources of definitions and their precedence."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bags of version 1.2: one record after the other, each with its own topic and type."""
+"""Bags of version 1.2, in which each record states its topic and type."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def message(
 
 
 def bag(messages: Sequence[Any], *, indexed: bool = True, line: bytes = b"#ROSRECORD V1.2\n") -> bytes:
-    """Return a bag: each topic's definition before its first message, and an index of them behind."""
+    """Return a bag with each topic's definition before its first message, and an index at the end."""
     out = line
     if indexed:
         out += record(b" " * 4000, index_pos=b"INDEXPOS", op=b"\3")
@@ -78,7 +78,7 @@ def bag(messages: Sequence[Any], *, indexed: bool = True, line: bytes = b"#ROSRE
 
 @pytest.fixture
 def texts(recordings: Any) -> list[Any]:
-    """Thirty messages of three topics, each unlike any other."""
+    """Thirty distinct messages of three topics."""
     return [
         recordings.Sent(f"/t{n % 3}", "std_msgs/msg/String", 10**18 + n * 10**8, b"<%d>" % n + b"x" * n)
         for n in range(30)

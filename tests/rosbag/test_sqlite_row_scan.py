@@ -6,7 +6,7 @@ from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.recording import open_recording
 
 DAMAGED = Path(__file__).parent / "data" / "damaged_rowids.db3"
-"""Found by fuzzing: a page that gives other rows than the index says, so that reading seems to go on but does not."""
+"""A database found by fuzzing: the rows of a page differ from the index, so that a naive scan never advances."""
 
 
 def test_row_scan_rows_out_of_order_terminates() -> None:

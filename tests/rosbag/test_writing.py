@@ -1,4 +1,4 @@
-"""Files that are written are whole, and read as what was written."""
+"""Written recordings are complete and readable."""
 
 from __future__ import annotations
 
