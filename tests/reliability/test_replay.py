@@ -24,7 +24,7 @@ WriteJob = Callable[..., Path]
 WRONG = "float64 data\nfloat64 more"
 MOMENTS = {
     "before the commit": ("mosaico_ingest.destinations.store.session.StoreSession", "commit", "before"),
-    "segments moved, not entered": ("mosaico_ingest.destinations.store.files.Layout", "publish", "after"),
+    "segments moved, not entered": ("mosaico_ingest.destinations.store.files.LocalFiles", "publish", "after"),
     "committed": ("mosaico_ingest.destinations.store.session.StoreSession", "commit", "after"),
     "committed and checked": ("mosaico_ingest.destinations.store.session.StoreSession", "stored", "after"),
     "before it is marked": ("mosaico_ingest.pipeline.quarantine.QuarantineFile", "mark_replayed", "before"),

@@ -87,7 +87,7 @@ def test_skip_of_same_job_reports_skipped(
     before = Store.open(tmp_path / "served").sequence("drive")
     code, said = ran("run", job)
     assert code == 0
-    assert "the same content is there already" in said
+    assert "it already has the same content" in said
     assert Store.open(tmp_path / "served").sequence("drive") == before
 
 
@@ -150,7 +150,7 @@ def kill_and_look(job: Path, folder: Path, rounds: int) -> tuple[int, int]:
         whole, nothing = whole + (rows == ROWS), nothing + (rows == 0)
         code, said = ran("run", job)
         assert code == 0, said
-        assert ("the same content is there already" in said) == (rows == ROWS)
+        assert ("it already has the same content" in said) == (rows == ROWS)
         assert speeds(folder) == [1.0] * ROWS
         assert ran("run", job)[0] == 0
         assert ran("store", "rm", "drive", "--yes", "--store", folder / "served")[0] == 0
@@ -185,7 +185,7 @@ def test_run_with_killed_server_fails_and_next_run_completes(
         code, said = ran("run", job)
         assert code == 0, said
         assert speeds(tmp_path) == [1.0] * ROWS
-        assert "the same content is there already" in ran("run", job)[1]
+        assert "it already has the same content" in ran("run", job)[1]
 
 
 class Forgetful(Proxy):
