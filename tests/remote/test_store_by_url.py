@@ -136,7 +136,7 @@ def test_every_store_command_accepts_a_url(recording: Path, url: str, tmp_path: 
     assert "s3://bucket" in run("store", "show", "drive/b/c", "--store", store)
     run("export", "drive", "--store", store, "--to", "again.mcap")
     assert (tmp_path / "again.mcap").is_file()
-    assert "0 files removed" in run("store", "gc", "--store", store)
+    assert "0 files, 0 B" in run("store", "gc", "--store", store)
     run("store", "rm", "drive", "--yes", "--store", store)
     assert json.loads(run("store", "ls", "--store", store, "--json")) == []
     assert "on a disk" in run("serve", "--store", store, exits=1)
