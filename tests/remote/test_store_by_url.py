@@ -139,7 +139,7 @@ def test_every_store_command_accepts_a_url(recording: Path, url: str, tmp_path: 
     assert "0 files, 0 B" in run("store", "gc", "--store", store)
     run("store", "rm", "drive", "--yes", "--store", store)
     assert json.loads(run("store", "ls", "--store", store, "--json")) == []
-    assert "on a disk" in run("serve", "--store", store, exits=1)
+    assert "in a local folder" in run("serve", "--store", store, exits=1)
     assert sorted(path.name for path in tmp_path.iterdir() if path.is_dir()) == []
 
 

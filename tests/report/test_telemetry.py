@@ -164,7 +164,7 @@ def test_telemetry_unreachable_collector_prints_one_line(tmp_path: Path) -> None
     assert time.monotonic() - began < 60
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
-    assert "127.0.0.1" in done.stderr
+    assert "127.0.0.1" in done.stderr or "Failed to export" in done.stderr
     assert len(read_report(tmp_path / "run.json").recordings) == 3
 
 

@@ -160,7 +160,7 @@ def test_rosrecord_truncated_yields_remaining_messages_and_unreadable_range(
         with open_recording(path, resolve=recordings.blind) as recording:
             assert recordings.received(recording) == sorted(texts[: sum(end <= size for end in ends)])
             if indexed:
-                assert any("cut off" in loss.reason for loss in recording.unreadable)
+                assert any("truncated" in loss.reason for loss in recording.unreadable)
 
 
 def test_rosrecord_not_closed_is_read_completely(tmp_path: Path, recordings: Any, texts: list[Any]) -> None:
