@@ -10,11 +10,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from mosaico_ingest.api import compile_job
 from mosaico_ingest.destinations.store import Store
@@ -29,6 +29,7 @@ from ray_cluster import two_nodes
 from mosaico_ingest.executors.processes import Registrations
 from mosaico_ingest.executors.ray import Ray
 from mosaico_ingest.executors.ray_worker import Setting, machine, out_of_reach
+from mosaico_ingest.pipeline.task import Task
 
 pytestmark = pytest.mark.slow
 
@@ -154,7 +155,7 @@ def test_ray_lost_node_restarts_its_recording(cluster: Any, tmp_path: Path) -> N
                 cluster.remove_node(cluster.worker_nodes.copy().pop(), allow_graceful=False)
                 (tmp_path / "go").touch()
 
-    reports = list(Ray(cluster.address).map(jobs, end_a_node_once_both_are_at_work))
+    reports = list(Ray(cluster.address).map([Task(job) for job in jobs], end_a_node_once_both_are_at_work))
     assert [(report.exit_code, report.totals.written) for report in reports] == [(0, 1000)] * 2
     assert len(begun) == 3
     assert [one.rows for one in Store.open(tmp_path / "store").sequences()] == [1000, 1000]
@@ -185,4 +186,4 @@ def test_ray_node_without_access_to_files_fails(tmp_path: Path) -> None:
     on_server = job.replace(target=DestinationSettings(host="localhost"))
     assert out_of_reach(on_server, replace(here, machine="another")) is None
     (tmp_path / "a.mcap").unlink()
-    assert "does not see the recording" in str(out_of_reach(job, here))
+    assert "the recording does not exist" in str(out_of_reach(job, here))

@@ -34,8 +34,15 @@ def speeds(store: Store) -> list[float]:
 
 
 def kill_and_look(write_bag: WriteBag, job: Path, store: Path, rounds: int) -> int:
-    """Replace the sequence repeatedly and kill each run; return the number of runs that replaced it before."""
+    """Replace the sequence repeatedly and kill each run; return the number of runs that replaced it before.
+
+    Runs are killed between a third of the duration of an undisturbed run and a little after it.
+    """
     moments = random.Random()  # noqa: S311 - any moment will do
+    write_bag({"/speed": [number(0)] * 3000})
+    started = time.monotonic()
+    assert start(job).wait() == 0
+    duration = time.monotonic() - started
     survivor = 0.0
     through = 0
     for source in range(1, rounds + 1):
@@ -43,7 +50,7 @@ def kill_and_look(write_bag: WriteBag, job: Path, store: Path, rounds: int) -> i
         write_bag({"/speed": [number(source)] * 3000})
         process = start(job)
         try:
-            process.wait(0.3 + moments.random() * 0.9)
+            process.wait(duration * moments.uniform(0.3, 1.3))
         except subprocess.TimeoutExpired:
             process.kill()
         process.communicate()
