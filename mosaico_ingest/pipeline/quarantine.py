@@ -21,7 +21,7 @@ from mosaico_ingest.job.model import QuarantineSettings
 from mosaico_ingest.job.values import Limit
 from mosaico_ingest.rosbag.blocks import Connection, MessageBlock
 from mosaico_ingest.rosbag.definitions.model import Source
-from mosaico_ingest.rosbag.writers import McapWriter
+from mosaico_ingest.rosbag.mcap.writer import McapWriter
 
 __all__ = [
     "INDEX",

@@ -1,4 +1,4 @@
-"""The reader of MCAP files: a file in, connections, index and message blocks out.
+"""MCAP files: the reader turns a file into connections, index and message blocks; the writer does the opposite.
 
-It reads through the index where the file has one, and recovers what is readable otherwise. It must not depend on the other containers.
+The reader uses the index if the file has one, and recovers readable messages otherwise. The package must not depend on the other containers.
 """

@@ -1,0 +1,189 @@
+"""The writer of MCAP files: Zstandard chunks with indexes, statistics and checksums."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import zstandard
+
+from mosaico_ingest.errors import BagError
+from mosaico_ingest.rosbag.definitions.model import Definition, short_msgtype
+from mosaico_ingest.rosbag.formats import MCAP
+from mosaico_ingest.rosbag.mcap.records import (
+    RECORD,
+    Op,
+    record_bytes,
+    text_bytes,
+    texts_bytes,
+)
+from mosaico_ingest.version import __version__
+
+__all__ = ["McapWriter"]
+
+_CHUNK_BYTES = 4 << 20
+_MESSAGE = struct.Struct("<HIQQ")
+_MAX_CHANNELS = 65535
+
+
+@dataclass(slots=True)
+class _Chunk:
+    """The content of the chunk being written."""
+
+    data: bytearray = field(default_factory=bytearray)
+    index: dict[int, bytearray] = field(default_factory=dict[int, bytearray])
+    """Log time and offset of each message, by channel."""
+    start_ns: int = 0
+    end_ns: int = 0
+
+
+class McapWriter:
+    """Writes one MCAP file; satisfies `RecordingWriter`."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("xb")
+        self._schemas: dict[tuple[str, int, str], int] = {}
+        self._records: list[bytes] = []
+        """Schema and channel records, which precede the first chunk that refers to them and are repeated in the summary."""
+        self._versions: list[int] = []
+        self._counts: dict[int, int] = {}
+        self._pending: list[bytes] = []
+        self._chunk = _Chunk()
+        self._chunk_indexes: list[bytes] = []
+        self._start_ns: int | None = None
+        self._end_ns = 0
+        self._file.write(MCAP)
+        self._has_header = False
+
+    def add_connection(
+        self,
+        topic: str,
+        definition: Definition,
+        *,
+        embed: bool = True,
+        metadata: Mapping[str, str] | None = None,
+    ) -> int:
+        """Add a connection; two definitions of one type are two schemas. Without `embed` the schema has no text."""
+        if len(self._versions) == _MAX_CHANNELS:
+            raise BagError(f"an MCAP file can have at most {_MAX_CHANNELS} channels", where=topic)
+        number, version = len(self._versions) + 1, definition.ros_version
+        self._versions.append(version)
+        encoding = "ros1" if version == 1 else "cdr"
+        schema = self._schema(definition, definition.text if embed else "")
+        content = struct.pack("<HH", number, schema) + text_bytes(topic) + text_bytes(encoding)
+        self._add(Op.CHANNEL, content + texts_bytes(dict(metadata or {})))
+        self._counts[number] = 0
+        return number
+
+    def write(self, channel: int, log_ns: int, payload: bytes) -> None:
+        """Append a message; its publish time is unknown, so the log time is used."""
+        self._write_pending()
+        chunk = self._chunk
+        if not chunk.data:
+            chunk.start_ns = chunk.end_ns = log_ns
+        chunk.start_ns, chunk.end_ns = min(chunk.start_ns, log_ns), max(chunk.end_ns, log_ns)
+        chunk.index.setdefault(channel, bytearray()).extend(struct.pack("<QQ", log_ns, len(chunk.data)))
+        chunk.data += RECORD.pack(Op.MESSAGE, _MESSAGE.size + len(payload))
+        chunk.data += _MESSAGE.pack(channel, self._counts[channel] & 0xFFFFFFFF, log_ns, log_ns)
+        chunk.data += payload
+        self._counts[channel] += 1
+        self._start_ns = log_ns if self._start_ns is None else min(self._start_ns, log_ns)
+        self._end_ns = max(self._end_ns, log_ns)
+        if len(chunk.data) >= _CHUNK_BYTES:
+            self._flush()
+
+    def finish(self) -> None:
+        """Write the last chunk and the summary."""
+        self._write_pending()
+        self._flush()
+        self._put(Op.DATA_END, struct.pack("<I", 0))
+        start = self._file.tell()
+        groups = [
+            (Op.SCHEMA, [record for record in self._records if record[0] == Op.SCHEMA]),
+            (Op.CHANNEL, [record for record in self._records if record[0] == Op.CHANNEL]),
+            (Op.STATISTICS, [record_bytes(Op.STATISTICS, self._statistics())]),
+            (Op.CHUNK_INDEX, self._chunk_indexes),
+        ]
+        summary, offsets = b"", b""
+        for op, records in groups:
+            group = b"".join(records)
+            if group:
+                entry = struct.pack("<BQQ", op, start + len(summary), len(group))
+                offsets += record_bytes(Op.SUMMARY_OFFSET, entry)
+                summary += group
+        footer = RECORD.pack(Op.FOOTER, 20) + struct.pack("<QQ", start, start + len(summary))
+        checked = summary + offsets + footer
+        self._file.write(checked + struct.pack("<I", zlib.crc32(checked)) + MCAP)
+        self._file.close()
+
+    def abandon(self) -> None:
+        """Close the unfinished file."""
+        self._file.close()
+
+    def _write_pending(self) -> None:
+        """Write the header, which depends on the ROS versions of the channels, and the channels added since."""
+        if not self._has_header:
+            versions = set(self._versions)
+            profile = f"ros{versions.pop()}" if len(versions) == 1 else ""
+            self._put(Op.HEADER, text_bytes(profile) + text_bytes(f"mosaico-ingest {__version__}"))
+            self._has_header = True
+        for record in self._pending:
+            self._file.write(record)
+        self._pending.clear()
+
+    def _schema(self, definition: Definition, text: str) -> int:
+        version = definition.ros_version
+        key = (definition.root, version, text)
+        if key not in self._schemas:
+            number = self._schemas[key] = len(self._schemas) + 1
+            name = short_msgtype(definition.root) if version == 1 else definition.root
+            data = text.encode()
+            content = struct.pack("<H", number) + text_bytes(name) + text_bytes(f"ros{version}msg")
+            self._add(Op.SCHEMA, content + struct.pack("<I", len(data)) + data)
+        return self._schemas[key]
+
+    def _add(self, op: int, content: bytes) -> None:
+        record = record_bytes(op, content)
+        self._records.append(record)
+        self._pending.append(record)
+
+    def _put(self, op: int, content: bytes) -> int:
+        """Write a record and return its offset."""
+        at = self._file.tell()
+        self._file.write(record_bytes(op, content))
+        return at
+
+    def _flush(self) -> None:
+        chunk, self._chunk = self._chunk, _Chunk()
+        if not chunk.data:
+            return
+        data = bytes(chunk.data)
+        packed = zstandard.compress(data, 3)
+        span = struct.pack("<QQ", chunk.start_ns, chunk.end_ns)
+        head = span + struct.pack("<QI", len(data), zlib.crc32(data)) + text_bytes("zstd")
+        at = self._put(Op.CHUNK, head + struct.pack("<Q", len(packed)) + packed)
+        length = self._file.tell() - at
+        index_offsets = b""
+        for channel, entries in chunk.index.items():
+            offset = self._put(Op.MESSAGE_INDEX, struct.pack("<HI", channel, len(entries)) + entries)
+            index_offsets += struct.pack("<HQ", channel, offset)
+        content = (
+            span + struct.pack("<QQ", at, length) + struct.pack("<I", len(index_offsets)) + index_offsets
+        )
+        content += struct.pack("<Q", self._file.tell() - at - length) + text_bytes("zstd")
+        content += struct.pack("<QQ", len(packed), len(data))
+        self._chunk_indexes.append(record_bytes(Op.CHUNK_INDEX, content))
+
+    def _statistics(self) -> bytes:
+        counts = b"".join(struct.pack("<HQ", channel, count) for channel, count in self._counts.items())
+        return (
+            struct.pack("<QHI", sum(self._counts.values()), len(self._schemas), len(self._versions))
+            + struct.pack("<II", 0, 0)
+            + struct.pack("<I", len(self._chunk_indexes))
+            + struct.pack("<QQ", self._start_ns or 0, self._end_ns)
+            + struct.pack("<I", len(counts))
+            + counts
+        )
