@@ -1,6 +1,6 @@
 """The base of JSON documents (reports, plans, inspections), and JSON Schemas of models.
 
-Pydantic's `use_attribute_docstrings` gives the same, but reads the source of every class whenever it is imported.
+Pydantic's `use_attribute_docstrings` would read the source of every class at each import; here only the schema reads it.
 """
 
 from __future__ import annotations
@@ -96,9 +96,9 @@ def _validator(model: type[BaseModel]) -> Validator:
 
 class _WithDocstrings(GenerateJsonSchema):
     def model_schema(self, schema: ModelSchema) -> JsonSchemaValue:
-        """Add to the members of one model what stands under its fields."""
+        """Add the docstrings of a model's fields as descriptions."""
         written, model = super().model_schema(schema), schema["cls"]
-        model.model_rebuild()  # one that names a later class knows its aliases only then
+        model.model_rebuild()  # resolves aliases of classes that are defined later
         members = written.get("properties", {})
         for owner in reversed(model.__mro__):
             if not issubclass(owner, BaseModel) or owner is BaseModel:
@@ -125,7 +125,7 @@ def _docstrings(owner: type) -> dict[str, str]:
 
 
 def tidy(node: dict[str, Any]) -> dict[str, Any]:
-    """Leave out titles, which repeat the keys, nulls for keys left out, and the defaults of whole sections."""
+    """Remove titles, which repeat the keys, null as the default of optional keys, and the defaults of sections."""
     branches = [branch for branch in node.get("anyOf", ()) if branch != {"type": "null"}]
     if len(branches) == 1:
         node = {**{key: value for key, value in node.items() if key != "anyOf"}, **branches[0]}

@@ -222,7 +222,7 @@ def plan_document(jobs: Sequence[Job], *, manifest: Path, folder: Path, connect:
     """Return the plan document of a manifest's jobs, with paths relative to `folder`.
 
     Raises:
-        IngestError: One of them cannot be done; of several that cannot, `findings` says why of each.
+        IngestError: A job cannot be done; `findings` states the reason for each of them.
     """
     tried = [_tried(job, connect=connect) for job in jobs]
     planned = tuple(one for one in tried if isinstance(one, RecordingPlan))
@@ -260,7 +260,7 @@ def preview(job: Job, *, connect: bool) -> RecordingPlan:
     """Plan a recording, convert a sample of its messages, and inspect the destination (a server only with `connect`).
 
     Raises:
-        IngestError: The job cannot be done; the message says why.
+        IngestError: The job cannot be done; the message states the reason.
     """
     bridge = ROSBridge.for_job(job)
     with open_job(job) as (recording, resolver):
@@ -284,7 +284,7 @@ def decide(job: Job, *, folder: Path) -> dict[str, Any]:
     """Open the recording and return its plan as a document; paths are relative to `folder`.
 
     Raises:
-        IngestError: The job cannot be done; the message says why.
+        IngestError: The job cannot be done; the message states the reason.
     """
     bridge = ROSBridge.for_job(job)
     with open_job(job) as (recording, resolver):

@@ -274,7 +274,7 @@ def explain_topics(
     """Return the adapter of each topic of a job's recordings or of one recording, with the reason.
 
     Raises:
-        IngestError: The job cannot be done; the message says why.
+        IngestError: The job cannot be done; the message states the reason.
     """
     if job is not None:
         jobs = compile_manifest(load_manifest(job))

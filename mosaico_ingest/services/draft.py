@@ -29,7 +29,7 @@ _HEAD = (
 
 
 def draft_manifest(
-    found: Inspection, recording: AnyPath, *, folder: Path, ros_distro: Stores | str | None = None
+    inspection: Inspection, recording: AnyPath, *, folder: Path, ros_distro: Stores | str | None = None
 ) -> str:
     """Return a manifest of `recording` for a file in `folder`; it has no lint findings and can be run unchanged."""
     return "\n".join(
@@ -37,21 +37,21 @@ def draft_manifest(
             *_HEAD,
             "version: 1",
             "",
-            *_bag(found, _seen_from(folder, recording), ros_distro),
+            *_bag(inspection, _path_from(folder, recording), ros_distro),
             "",
             "sequence:",
             f"  name: {plain(default_name(recording))}",
             "  # metadata: {vehicle: demo-01}",
             "  # if_exists: replace                # fail, skip, append or replace",
             "",
-            *_topics(found),
+            *_topics(inspection),
             "",
-            *_adapters(found),
+            *_adapters(inspection),
             "",
             "on_error:",
-            "  message: log_warn                   # bytes that do not fit their type: ignore, log_warn, raise",
-            "  topic: raise                        # rows that do not fit theirs: raise, ignore, finalize",
-            "  session: report                     # what an early end leaves behind: report, delete",
+            "  message: log_warn                   # messages that cannot be decoded: ignore, log_warn, raise",
+            "  topic: raise                        # rejected rows: raise, ignore, finalize",
+            "  session: report                     # after an error that ends the run: report, delete",
             "",
             "target: {store: mosaico}",
             '# target: {host: mosaico.example.org, api_key: "${MOSAICO_API_KEY}", tls: true}',
@@ -68,12 +68,12 @@ def default_name(recording: AnyPath) -> str:
     return name if name[:1].isalnum() else f"drive_{name}".rstrip("_")
 
 
-def _bag(found: Inspection, path: str, ros_distro: Stores | str | None) -> Iterator[str]:
-    span = "" if found.duration_s is None else f", {seconds_text(found.duration_s)}"
-    messages = "" if found.messages is None else f", {counted(found.messages, 'message')}"
-    ours = [topic for topic in found.topics if topic.encoding != Encoding.OTHER.value]
+def _bag(inspection: Inspection, path: str, ros_distro: Stores | str | None) -> Iterator[str]:
+    span = "" if inspection.duration_s is None else f", {seconds_text(inspection.duration_s)}"
+    messages = "" if inspection.messages is None else f", {counted(inspection.messages, 'message')}"
+    ours = [topic for topic in inspection.topics if topic.encoding != Encoding.OTHER.value]
     undefined = sorted({topic.msgtype for topic in ours if topic.definition == "none"})
-    yield f"# {found.container}, {bytes_text(found.size_bytes)}{messages}{span}"
+    yield f"# {inspection.container}, {bytes_text(inspection.size_bytes)}{messages}{span}"
     yield "bag:"
     silenced = path.lower().endswith(".db3") and ros_distro is None and not undefined
     mark = f"  # ingest: ignore[distro-missing] ({_known_from(ours)})" if silenced else ""
@@ -87,11 +87,11 @@ def _definitions(undefined: Sequence[str], ros_distro: Stores | str | None) -> I
     """Yield comments on types without a definition, and on types that differ between distros."""
     standard = [name for name in undefined if any(distro_type(distro, name) for distro in ROS2)]
     if standard and ros_distro is None:
-        yield f"  # {', '.join(standard)} changed between distros, and the recording does not carry it; say which:"
+        yield f"  # {', '.join(standard)} differs between distros, and the recording does not define it; set the distro:"
         yield "  # ros_distro: ros2_humble"
     own = [name for name in undefined if ros_distro is not None or name not in standard]
     if own:
-        yield f"  # no definition is known of {', '.join(own)}; say where they are:"
+        yield f"  # no definition found for {', '.join(own)}; name the folder of the .msg files:"
         for package in dict.fromkeys(msgtype.partition("/")[0] for msgtype in own):
             yield f"  # custom_msgs: [{{package: {package}, path: definitions/{package}}}]"
 
@@ -100,18 +100,18 @@ def _known_from(topics: Sequence[InspectedTopic]) -> str:
     assumed = sorted({topic.definition for topic in topics} - {Source.BAG.value})
     phrases = {Source.DISTRO.value: "as in all distros", Source.PACKAGE.value: "as in public packages"}
     how = " or ".join(phrases[source] for source in assumed)
-    return f"it carries no definitions; they are read {how}" if assumed else "it carries its definitions"
+    return f"it contains no definitions; they are read {how}" if assumed else "it contains its definitions"
 
 
-def _topics(found: Inspection) -> Iterator[str]:
+def _topics(inspection: Inspection) -> Iterator[str]:
     """Yield the topics as a list in which a # excludes a topic; topics that cannot be ingested are excluded."""
-    topics = _merged(found.topics)
+    topics = _merged(inspection.topics)
     good = [topic for topic in topics if topic.problem is None]
     width = min(44, max((len(_quoted(topic.topic)) for topic in topics), default=0))
-    yield "# Put a # before what is not wanted. Globs work too, the last that matches decides, ! leaves out;"
-    yield '# what begins with * or ! must be quoted: ["/cam*", "!/cam/debug*"].'
+    yield "# Put a # before a topic to exclude it. Globs work too: the last match decides, a leading ! excludes."
+    yield '# Quote names that start with * or !: ["/cam*", "!/cam/debug*"].'
     if any(not topic.topic.startswith("/") for topic in good):
-        yield "# ingest: ignore-file[relative-topic] (these names are as the recording has them)"
+        yield "# ingest: ignore-file[relative-topic] (the recording uses these names)"
     yield "topics:" if good else "# topics:"
     for topic in good:
         yield f"  - {_quoted(topic.topic):{width}}  # {_about(topic)}"
@@ -120,24 +120,26 @@ def _topics(found: Inspection) -> Iterator[str]:
             yield f"  # - {_quoted(topic.topic):{width}}  # {topic.msgtype}: {_one_line(topic.problem)}"
 
 
-def _adapters(found: Inspection) -> Iterator[str]:
-    kept = [topic for topic in _merged(found.topics) if topic.adapter == UnmodeledSpec().name]
-    if kept:
-        yield f"# No adapter takes {', '.join(sorted({topic.msgtype for topic in kept}))}: the ROS shape is kept."
+def _adapters(inspection: Inspection) -> Iterator[str]:
+    unmodeled = [topic for topic in _merged(inspection.topics) if topic.adapter == UnmodeledSpec().name]
+    if unmodeled:
+        yield f"# No adapter accepts {', '.join(sorted({topic.msgtype for topic in unmodeled}))}: the ROS shape is kept."
     yield "adapters:"
     yield "  unmodeled: keep                     # a type without an adapter: keep, skip, fail"
-    yield "  # load: [adapters/mine.yaml]        # adapters of your own, for every topic of their types"
-    some = kept[0].topic if kept else found.topics[0].topic if found.topics else "/topic"
-    offers = [(topic, known) for topic in kept for known in BUILTIN if topic.msgtype in known.ros_types]
+    yield "  # load: [adapters/mine.yaml]        # your adapters, for every topic of their types"
+    example = (
+        unmodeled[0].topic if unmodeled else inspection.topics[0].topic if inspection.topics else "/topic"
+    )
+    offers = [(topic, known) for topic in unmodeled for known in BUILTIN if topic.msgtype in known.ros_types]
     for topic, adapter in offers:
-        yield f"  # {adapter.name} takes {topic.msgtype} only where an override selects it, and stores {adapter.tag}:"
+        yield f"  # {adapter.name} accepts {topic.msgtype} only if an override selects it, and stores {adapter.tag}:"
         yield f"  # override: {{{plain(topic.topic)}: {adapter.name}}}"
     if not offers:
-        yield f"  # override: {{{plain(some)}: MyAdapter}}"
+        yield f"  # override: {{{plain(example)}: MyAdapter}}"
 
 
 def _merged(topics: Sequence[InspectedTopic]) -> list[InspectedTopic]:
-    """Return one entry for each topic, of several connections one that can be ingested."""
+    """Return one entry per topic; of several connections, prefer one that can be ingested."""
     best: dict[str, InspectedTopic] = {}
     for topic in topics:
         known = best.get(topic.topic)
@@ -160,5 +162,5 @@ def _one_line(text: str) -> str:
     return " ".join(text.split())
 
 
-def _seen_from(folder: Path, path: AnyPath) -> str:
+def _path_from(folder: Path, path: AnyPath) -> str:
     return path.url if isinstance(path, RemotePath) else Path(relpath(path, folder)).as_posix()

@@ -113,7 +113,7 @@ def estimate_rate_hz(count: int, duration_ns: int) -> float:
     """Return the roundest rate with which `count` messages, at least two, fit the duration of the recording.
 
     An index has no times per topic. A regular topic with n messages in d seconds has a rate between (n - 1) / d and
-    n / d, so that the digits that both have in common are what is known.
+    n / d, so only the digits that both bounds share are known.
     """
     low, high = (count - 1) * 1e9 / duration_ns, count * 1e9 / duration_ns
     middle = (low + high) / 2

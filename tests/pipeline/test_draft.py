@@ -40,9 +40,9 @@ def draft(
 @pytest.mark.parametrize(
     ("definition", "said"),
     [
-        ("bag", "(it carries its definitions)"),
-        ("distro", "(it carries no definitions; they are read as in all distros)"),
-        ("package", "(it carries no definitions; they are read as in public packages)"),
+        ("bag", "(it contains its definitions)"),
+        ("distro", "(it contains no definitions; they are read as in all distros)"),
+        ("package", "(it contains no definitions; they are read as in public packages)"),
     ],
 )
 def test_draft_manifest_states_source_of_definitions(definition: str, said: str) -> None:
@@ -57,7 +57,7 @@ def test_draft_manifest_asks_for_definitions_of_ros_messages_only() -> None:
 def test_draft_manifest_asks_for_distro_if_distros_differ() -> None:
     marker = "visualization_msgs/msg/Marker"
     said = draft("none", msgtype=marker)
-    assert f"# {marker} changed between distros" in said
+    assert f"# {marker} differs between distros" in said
     assert "# ros_distro: ros2_humble" in said
     assert "custom_msgs" not in said
     assert "custom_msgs" in draft("none", msgtype=marker, ros_distro="ros2_dashing")

@@ -187,7 +187,7 @@ def _with_fixed_size(elements: Array, axis: Axis, size: int) -> tuple[Array, Axi
 def _rejecting_rows_of(axis: Axis, refuse: RejectRows) -> RejectRows:
     """Return a callback that rejects rows by the elements of their lists."""
 
-    def reject_elements(bad: Mask, rule: str, says: Callable[[int], str]) -> None:
+    def reject_elements(bad: Mask, rule: str, reason: Callable[[int], str]) -> None:
         rows, first = np.unique(axis.parents[bad], return_index=True)
         positions = dict(zip(rows.tolist(), np.flatnonzero(bad)[first].tolist(), strict=True))
         mask = np.zeros(len(axis.lengths), bool)
@@ -195,7 +195,7 @@ def _rejecting_rows_of(axis: Axis, refuse: RejectRows) -> RejectRows:
         refuse(
             mask,
             rule,
-            lambda row: f"element {positions[row] - int(axis.offsets[row])}: {says(positions[row])}",
+            lambda row: f"element {positions[row] - int(axis.offsets[row])}: {reason(positions[row])}",
         )
 
     return reject_elements
@@ -218,8 +218,8 @@ def _convert_struct(array: Array, target: DataType, refuse: RejectRows) -> Array
 
 
 def _naming_field(name: str, refuse: RejectRows) -> RejectRows:
-    def reject_named(bad: Mask, rule: str, says: Callable[[int], str]) -> None:
-        refuse(bad, rule, lambda i: f"{name}: {says(i)}")
+    def reject_named(bad: Mask, rule: str, reason: Callable[[int], str]) -> None:
+        refuse(bad, rule, lambda i: f"{name}: {reason(i)}")
 
     return reject_named
 

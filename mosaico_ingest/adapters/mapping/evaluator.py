@@ -112,7 +112,7 @@ class Evaluation:
         """
         target = self.target
 
-        def refuse(bad: Mask, rule: str, says: Callable[[int], str]) -> None:
+        def refuse(bad: Mask, rule: str, reason: Callable[[int], str]) -> None:
             count = self.count(axes)
             is_literal = len(bad) != count
             rejected = self._in_selected_branches(np.broadcast_to(bad, count), axes)
@@ -126,7 +126,7 @@ class Evaluation:
                 rows = axis.parents[rows]
             for row, position in zip(rows.tolist(), positions.tolist(), strict=True):
                 if row not in rejections:
-                    rejections[row] = (rule, prefix + says(0 if is_literal else position))
+                    rejections[row] = (rule, prefix + reason(0 if is_literal else position))
             raise RowsRejected(rejections)
 
         return refuse
@@ -241,7 +241,7 @@ class Evaluation:
 
 
 def _scalar(typed: Constant) -> Array:
-    """Return a literal as an Arrow scalar; floats are computed in 64 bits, whatever their type says."""
+    """Return a literal as an Arrow scalar; floats are computed in 64 bits, regardless of their type."""
     if pt.is_floating(typed.type.arrow):
         return arrays.scalar(typed.value, arrays.float64())
     return arrays.scalar(typed.value, typed.type.arrow)

@@ -51,8 +51,8 @@ __all__ = [
 class RejectRows(Protocol):
     """Rejects the rows of invalid elements; returns if none of them is needed, because its branch is not taken."""
 
-    def __call__(self, bad: Mask, rule: str, says: Callable[[int], str]) -> None:
-        """Reject the rows where `bad` is true; `says` returns the reason for the element at a position."""
+    def __call__(self, bad: Mask, rule: str, reason: Callable[[int], str]) -> None:
+        """Reject the rows where `bad` is true; `reason` returns the reason for the element at a position."""
         ...
 
 
