@@ -89,7 +89,7 @@ class _Chunk:
 def traffic(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Traffic, Traffic]]:
     """What our injector said, and what the official one said, about the same recording."""
     store = Store.open(tmp_path_factory.mktemp("heard"))
-    server = Recorder(store, "grpc://127.0.0.1:0", keyring=None, certificates=None)
+    server = Recorder(store, "grpc://127.0.0.1:0", keyring=None, certificates=None, request_s=60.0)
     ours = server.heard = Traffic()
     topics = "!/camera/image_raw"  # the SDK makes PNGs of these
     config = ROSInjectionConfig(RECORDING, "ours", host="127.0.0.1", port=server.port, topics=(topics,))
