@@ -53,7 +53,7 @@ _UNICODE_END = 0x110000
 
 
 def utf8_texts(kind: pa.DataType, sizes: Int64s, data: NDArray[np.uint8]) -> tuple[Array, Int64s]:
-    """Return strings of the given sizes in bytes, and the indices of those that are not UTF-8."""
+    """Return strings of the given sizes in bytes, and the indices of strings that are not UTF-8."""
     texts = array_of(kind, len(sizes), list_offsets(sizes), data)
     if data.max(initial=0) < _ASCII_END:
         return texts, np.zeros(0, np.int64)

@@ -195,7 +195,7 @@ def _run_job(pipe: Connection, pickled: bytes, stop: StopHandler, keep_open: Kee
         stop.disable()  # an interrupt in the middle of a message would leave half of it in the pipe
         try:
             pipe.send(event)
-        except OSError as error:  # the parent is gone: nobody will see the result
+        except OSError as error:  # the parent is gone, so the result has no reader
             raise Abandoned from error
         stop.enable()
 

@@ -36,7 +36,7 @@ class RejectionLog:
     _pending: dict[tuple[str, str], _Pending] = field(default_factory=dict[tuple[str, str], _Pending])
 
     def __call__(self, event: Event) -> None:
-        """Log or collect an event; the end of the run logs what is still pending."""
+        """Log or collect an event; the end of the run logs all pending events."""
         if isinstance(event, RunFinished):
             for pending in self._pending.values():
                 self._flush(pending)

@@ -92,7 +92,7 @@ class Compiler:
         return None
 
     def metadata(self, values: Mapping[str, Value], scope: Scope | None) -> dict[str, TypedExpression]:
-        """Compile the expressions of `schema_metadata`, without those that have a finding."""
+        """Compile the expressions of `schema_metadata` that have no finding."""
         compiled: dict[str, TypedExpression] = {}
         for key, value in values.items():
             path = ("schema_metadata", key)
