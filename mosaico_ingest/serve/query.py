@@ -61,7 +61,7 @@ class Test(Protocol):
 
 _FLOAT_LIMIT = 2**1023
 """Integers whose absolute value is smaller can be converted to a finite float."""
-_GLOB_PARTS = re.compile(r"\[!?\]?[^]]*\]|.", re.DOTALL)
+_GLOB_PARTS = re.compile(r"\[(?:!?\][^]]*|![^]]+|[^]!][^]]*)\]|.", re.DOTALL)
 """A part of a glob: a character class in brackets, or one character."""
 _COMPARISONS: Mapping[str, Callable[[Any, Any], Any]] = {
     "$eq": operator.eq,
@@ -187,10 +187,16 @@ def _like_regex(pattern: str) -> re.Pattern[str]:
 @lru_cache(maxsize=256)
 def _glob_regex(pattern: str) -> re.Pattern[str]:
     """Return the glob as translated by `fnmatch`, whose expressions never backtrack across a `*`."""
-    parts = _GLOB_PARTS.findall(pattern)
-    return re.compile(
-        translate("".join("[0-9]" if part == "#" else part.replace("#", "0-9") for part in parts))
-    )
+    return re.compile(translate("".join(map(_glob_part, _GLOB_PARTS.findall(pattern)))))
+
+
+def _glob_part(part: str) -> str:
+    """Return one part of a glob in the syntax of `fnmatch`."""
+    if part == "#":
+        return "[0-9]"
+    if part == "[":  # without its "]", and not the start of a class that a later "#" would close
+        return "[[]"
+    return part.replace("#", "0-9")
 
 
 class Presence(Struct, frozen=True):
@@ -216,7 +222,7 @@ def _glob_part_regex(part: str) -> str:
     """Return one part of a glob as a regular expression."""
     if part == "*":
         return ".*"
-    expression = translate("[0-9]" if part == "#" else part.replace("#", "0-9"))
+    expression = translate(_glob_part(part))
     # `(?!)` is how `translate` writes an empty class such as [z-a]
     return expression[len("(?s:") : -len(r")\Z")].replace("(?!)", r"[^\s\S]")
 

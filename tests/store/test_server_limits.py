@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.flight as fl
 import pytest
 from flight_calls import Client, descriptor_of, refused
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from mosaico_ingest.destinations.store import Store
@@ -60,6 +60,9 @@ def test_topic_glob_with_many_stars_returns_quickly() -> None:
 
 
 @settings(deadline=None, max_examples=200)
+@example(pattern="1[#", value="11")
+@example(pattern="[]1[", value="1")
+@example(pattern="[!]", value="[!]")
 @given(pattern=st.text("ab*?[]!-#1", max_size=8), value=st.text("ab1]-#", max_size=6))
 def test_match_of_values_equals_match_of_columns(pattern: str, value: str) -> None:
     glob = Glob(pattern)
