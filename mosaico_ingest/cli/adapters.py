@@ -18,7 +18,7 @@ from mosaico_ingest.cli.console import (
     read_sources,
     render_findings,
 )
-from mosaico_ingest.cli.output import STANDARD_OUTPUT, write_output
+from mosaico_ingest.cli.options import STANDARD_OUTPUT, JsonOption, write_output
 from mosaico_ingest.report.units import counted
 
 if TYPE_CHECKING:
@@ -36,8 +36,7 @@ __all__ = [
 
 adapters_app = typer.Typer(no_args_is_help=True, help="List, show, explain, test and draft adapters.")
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-DistroOption = Annotated[
+TypeDistroOption = Annotated[
     str | None,
     typer.Option(
         "--ros-distro",
@@ -110,7 +109,7 @@ def explain(
     bag: Annotated[
         Path | None, typer.Option("--bag", metavar="BAG", help="Explain every topic of a recording.")
     ] = None,
-    distro: DistroOption = None,
+    distro: TypeDistroOption = None,
     msg_dirs: MsgDirOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -182,7 +181,7 @@ def run_tests(
         list[str] | None, typer.Argument(metavar="NAME|FILE", help="Adapters to test.")
     ] = None,
     test_all: Annotated[bool, typer.Option("--all", help="Test all built-in adapters.")] = False,
-    distro: DistroOption = None,
+    distro: TypeDistroOption = None,
     msg_dirs: MsgDirOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -258,7 +257,7 @@ def init(
         Path | None,
         typer.Option("--out", "-o", metavar="FILE", help="Write to this new file.", show_default="stdout"),
     ] = None,
-    distro: DistroOption = None,
+    distro: TypeDistroOption = None,
     msg_dirs: MsgDirOption = None,
 ) -> None:
     """Draft an adapter with every field of the type; columns with the same name are filled in."""

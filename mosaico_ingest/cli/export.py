@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mosaico_ingest.cli.options import DEFAULT_STORE, ForceOption, JsonOption, StoreOption, TopicsOption
+
 if TYPE_CHECKING:
     from mosaico_ingest.export import ExportReport, TopicExport
 
@@ -25,18 +27,8 @@ def export(
             "--to", help="The recording to write: .mcap, .db3 (ROS 2) or .bag (ROS 1).", metavar="FILE"
         ),
     ],
-    store: Annotated[
-        str, typer.Option("--store", help="Folder or URL of the store.", metavar="DIR|URL")
-    ] = "mosaico",
-    topics: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--topics",
-            "-t",
-            help="Topic name or glob, such as /cam/*; !GLOB excludes. Repeatable.",
-            metavar="GLOB",
-        ),
-    ] = None,
+    store: StoreOption = DEFAULT_STORE,
+    topics: TopicsOption = None,
     start: Annotated[
         str | None,
         typer.Option("--start", help="First instant, or +10s after the first message.", metavar="TIME"),
@@ -51,8 +43,8 @@ def export(
         list[str] | None,
         typer.Option("--adapter", help="Custom adapter that created the rows. Repeatable.", metavar="REF"),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", "-f", help="Replace an existing file.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Export a sequence as a recording with the original message definitions.
 

@@ -7,9 +7,7 @@ import logging
 import sys
 from datetime import datetime, timezone
 from enum import Enum
-from typing import Annotated, Any, TypeAlias
-
-import typer
+from typing import Any
 
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import one_line
@@ -17,23 +15,11 @@ from mosaico_ingest.findings import one_line
 __all__ = [
     "LEVELS",
     "LogFormat",
-    "LogOption",
     "json_line",
     "set_up_logging",
 ]
 
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
-
-LogOption: TypeAlias = Annotated[
-    str | None,
-    typer.Option(
-        "--log",
-        "-l",
-        help="Log level: DEBUG, INFO, WARNING, ERROR or CRITICAL. Overrides run.log_level.",
-        metavar="LEVEL",
-    ),
-]
-"""The `--log` option of commands that read a manifest."""
 
 
 class LogFormat(str, Enum):

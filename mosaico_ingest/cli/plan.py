@@ -16,7 +16,15 @@ from mosaico_ingest.cli.console import (
     print_json,
     print_line,
 )
-from mosaico_ingest.cli.output import STANDARD_OUTPUT, write_output
+from mosaico_ingest.cli.options import (
+    STANDARD_OUTPUT,
+    DistroOption,
+    ForceOption,
+    JsonOption,
+    ManifestArgument,
+    RecordingArgument,
+    write_output,
+)
 from mosaico_ingest.findings import Severity
 from mosaico_ingest.remote import is_url
 from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text, time_text
@@ -43,11 +51,9 @@ __all__ = [
 
 NOTE_STYLES = {Severity.ERROR: "red", Severity.WARNING: "yellow", Severity.INFO: "dim"}
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-
 
 def plan(
-    manifest: Annotated[Path, typer.Argument(metavar="JOB.yaml", help="A job manifest.")],
+    manifest: ManifestArgument,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -226,8 +232,8 @@ def print_differences(differences: Sequence[Difference]) -> None:
 
 
 def expand(
-    manifest: Annotated[Path, typer.Argument(metavar="JOB.yaml", help="A job manifest.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list of the jobs.")] = False,
+    manifest: ManifestArgument,
+    as_json: JsonOption = False,
 ) -> None:
     """Print every job of a manifest as a separate manifest, without `extends`, `matrix` and secrets.
 
@@ -249,24 +255,15 @@ def _cell_comment(manifest: Path, job: Expanded) -> str:
 
 
 def init(
-    path: Annotated[
-        str, typer.Argument(metavar="BAG", help="A .bag, .db3 or .mcap file, a rosbag2 directory, or a URL.")
-    ],
+    path: RecordingArgument,
     out: Annotated[
         Path | None,
         typer.Option(
             "--out", "-o", help="Write the manifest to this file.", metavar="JOB.yaml", show_default="stdout"
         ),
     ] = None,
-    ros_distro: Annotated[
-        str | None,
-        typer.Option(
-            "--ros-distro",
-            help="Distro of recordings without definitions, such as ros2_humble.",
-            metavar="DISTRO",
-        ),
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", "-f", help="Replace an existing file.")] = False,
+    ros_distro: DistroOption = None,
+    force: ForceOption = False,
 ) -> None:
     """Draft a manifest for a recording: every topic with its type, count and adapter, and common options."""
     from shlex import quote

@@ -10,7 +10,7 @@ import typer
 from rich.text import Text
 
 from mosaico_ingest.cli.console import PlainTable, Terminal, print_line
-from mosaico_ingest.cli.output import write_output
+from mosaico_ingest.cli.options import DistroOption, JsonOption, RecordingArgument, write_output
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.units import (
     bytes_text,
@@ -50,18 +50,9 @@ STATUS_STYLES = {
 
 
 def inspect(
-    path: Annotated[
-        str, typer.Argument(metavar="BAG", help="A .bag, .db3 or .mcap file, a rosbag2 directory, or a URL.")
-    ],
-    ros_distro: Annotated[
-        str | None,
-        typer.Option(
-            "--ros-distro",
-            help="Distro of recordings without definitions, such as ros2_humble.",
-            metavar="DISTRO",
-        ),
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    path: RecordingArgument,
+    ros_distro: DistroOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """List a recording's topics with type, count, rate, definition and adapter, without reading messages."""
     from mosaico_ingest import api

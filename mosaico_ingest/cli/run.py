@@ -12,7 +12,19 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from mosaico_ingest.cli.logs import LogFormat, LogOption, set_up_logging
+from mosaico_ingest.cli.logs import LogFormat, set_up_logging
+from mosaico_ingest.cli.options import (
+    STANDARD_OUTPUT,
+    STORE,
+    DistroOption,
+    LogOption,
+    QuietOption,
+    RecordingArgument,
+    ReportOption,
+    TopicsOption,
+    log_level,
+    write_output,
+)
 from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas, interrupt_on_sigterm
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.job.values import IfExists
@@ -42,12 +54,6 @@ REPLAY_NOTES = {
     "ORPHANED": "the sequence does not contain the run that quarantined it; ingest the recording again",
 }
 """Why a file of quarantined messages is not replayed."""
-
-ReportOption = Annotated[
-    Path | None,
-    typer.Option("--report", metavar="FILE", help="Write the report as JSON; - writes it to stdout."),
-]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 
 
 class ExecutorName(str, Enum):
@@ -117,7 +123,6 @@ def run(
 ) -> None:
     """Ingest the recordings of job manifests, or exactly the decisions of a plan."""
     from mosaico_ingest import api
-    from mosaico_ingest.cli.output import STANDARD_OUTPUT, write_output
     from mosaico_ingest.executors.base import choose_executor
     from mosaico_ingest.pipeline.task import Task
     from mosaico_ingest.report.metrics import prometheus_text
@@ -167,9 +172,7 @@ def run(
 
 
 def bag(
-    path: Annotated[
-        str, typer.Argument(metavar="BAG", help="A .bag, .db3 or .mcap file, a rosbag2 directory, or a URL.")
-    ],
+    path: RecordingArgument,
     *,
     name: Annotated[
         str | None,
@@ -177,15 +180,7 @@ def bag(
             "--name", "-n", metavar="NAME", help="Name of the sequence.", show_default="the file's stem"
         ),
     ] = None,
-    topics: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--topics",
-            "-t",
-            help="Topic name or glob, such as /cam/*; !GLOB excludes. Repeatable.",
-            metavar="GLOB",
-        ),
-    ] = None,
+    topics: TopicsOption = None,
     more_topics: Annotated[
         list[str] | None, typer.Argument(metavar="TOPIC", help="More topics, after those of --topics.")
     ] = None,
@@ -203,14 +198,7 @@ def bag(
             metavar="JSON|FILE",
         ),
     ] = None,
-    ros_distro: Annotated[
-        str | None,
-        typer.Option(
-            "--ros-distro",
-            help="Distro of recordings without definitions, such as ros2_humble.",
-            metavar="DISTRO",
-        ),
-    ] = None,
+    ros_distro: DistroOption = None,
     host: Annotated[
         str | None,
         typer.Option(
@@ -232,12 +220,7 @@ def bag(
         Path | None,
         typer.Option("--tls-cert", metavar="FILE", help="CA certificate of the server, in PEM format."),
     ] = None,
-    store: Annotated[
-        str | None,
-        typer.Option(
-            "--store", help="Folder or URL of the store.", metavar="DIR|URL", show_default="mosaico"
-        ),
-    ] = None,
+    store: Annotated[str | None, STORE] = None,
     if_exists: Annotated[
         IfExists,
         typer.Option("--if-exists", help="Action if the sequence exists; skip needs the same content."),
@@ -253,16 +236,7 @@ def bag(
     ] = False,
     report: ReportOption = None,
     quiet: QuietOption = False,
-    log: Annotated[
-        str | None,
-        typer.Option(
-            "--log",
-            "-l",
-            help="Log level: DEBUG, INFO, WARNING, ERROR or CRITICAL.",
-            metavar="LEVEL",
-            show_default="INFO",
-        ),
-    ] = None,
+    log: Annotated[str | None, log_level("INFO")] = None,
 ) -> None:
     """Ingest one recording without a manifest."""
     from mosaico_ingest import api
@@ -362,7 +336,6 @@ def run_tasks(
         typer.Exit: The exit code is not 0.
     """
     from mosaico_ingest import api
-    from mosaico_ingest.cli.output import STANDARD_OUTPUT
     from mosaico_ingest.executors.base import choose_executor
     from mosaico_ingest.textfile import check_output_file
 
@@ -422,8 +395,6 @@ def _write_results(
     result: RunReport, report_files: set[Path], on_finish: Callable[[RunReport], None]
 ) -> Iterator[SinkError]:
     """Call `on_finish` and write the report files; yield the errors."""
-    from mosaico_ingest.cli.output import write_output
-
     text = result.model_dump_json(indent=2) + "\n"
     for write in (partial(on_finish, result), *(partial(write_output, file, text) for file in report_files)):
         try:

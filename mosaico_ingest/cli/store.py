@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mosaico_ingest.cli.console import PlainTable, Terminal, print_json, print_line
+from mosaico_ingest.cli.options import DEFAULT_STORE, JsonOption, StoreOption
 from mosaico_ingest.job.values import PROVENANCE_KEY
 from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text, time_text
 
@@ -25,16 +26,12 @@ __all__ = [
     "verify",
 ]
 
-DEFAULT_STORE = "mosaico"
 CELL_WIDTH = 28
 """Characters of a value in a table of rows."""
 METADATA_WIDTH = 100
 """Characters of a metadata value."""
 
 store_app = typer.Typer(no_args_is_help=True, help="List, show and remove the sequences of a store.")
-
-StoreOption = Annotated[str, typer.Option("--store", help="Folder or URL of the store.", metavar="DIR|URL")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 def verify(

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mosaico_ingest.cli.options import JsonOption, log_level
+
 if TYPE_CHECKING:
     from mosaico_ingest.job.model import Job
     from mosaico_ingest.report.model import Report
@@ -32,7 +34,7 @@ def status(
     check: Annotated[
         bool, typer.Option("--check", help="Exit with 1 unless every recording is done.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Show the status of each recording: done, new, changed, failed or unreadable. Read-only."""
     from msgspec import to_builtins
@@ -103,15 +105,7 @@ def watch(
             "--once", help="Ingest the current recordings once they are complete, then exit like a run."
         ),
     ] = False,
-    log: Annotated[
-        str,
-        typer.Option(
-            "--log",
-            "-l",
-            metavar="LEVEL",
-            help="Log level: DEBUG, INFO, WARNING, ERROR or CRITICAL.",
-        ),
-    ] = "WARNING",
+    log: Annotated[str, log_level()] = "WARNING",
 ) -> None:
     """Ingest recordings that arrive in a folder, until interrupted.
 

@@ -13,7 +13,7 @@ from mosaico_ingest.cli.console import (
     read_sources,
     render_findings,
 )
-from mosaico_ingest.cli.output import write_output
+from mosaico_ingest.cli.options import write_output
 from mosaico_ingest.findings import Finding, Severity, Span
 
 

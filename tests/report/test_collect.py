@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mosaico_ingest.cli.output import write_output
+from mosaico_ingest.cli.options import write_output
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.findings import Finding, Severity, Stage
 from mosaico_ingest.report.collect import Collector

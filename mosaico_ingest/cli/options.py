@@ -1,0 +1,100 @@
+"""Options and arguments that several commands share, and the output files that options name."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from typer.models import OptionInfo
+
+from mosaico_ingest.job import values
+
+__all__ = [
+    "DEFAULT_STORE",
+    "STANDARD_OUTPUT",
+    "STORE",
+    "DistroOption",
+    "ForceOption",
+    "JsonOption",
+    "LogOption",
+    "ManifestArgument",
+    "QuietOption",
+    "RecordingArgument",
+    "ReportOption",
+    "StoreOption",
+    "TopicsOption",
+    "log_level",
+    "write_output",
+]
+
+DEFAULT_STORE = str(values.DEFAULT_STORE)
+STANDARD_OUTPUT = Path("-")
+"""The path that output options accept for standard output."""
+STORE = typer.Option(
+    "--store", help="Folder or URL of the store.", metavar="DIR|URL", show_default=DEFAULT_STORE
+)
+
+
+def log_level(default: str | None = None) -> OptionInfo:
+    """Return the option `--log`. `default` names its default in the help if the parameter's default is None."""
+    return typer.Option(
+        "--log",
+        "-l",
+        help="Log level: DEBUG, INFO, WARNING, ERROR or CRITICAL.",
+        metavar="LEVEL",
+        show_default=default or True,
+    )
+
+
+ManifestArgument = Annotated[Path, typer.Argument(metavar="JOB.yaml", help="A job manifest.")]
+RecordingArgument = Annotated[
+    str, typer.Argument(metavar="BAG", help="A .bag, .db3 or .mcap file, a rosbag2 directory, or a URL.")
+]
+DistroOption = Annotated[
+    str | None,
+    typer.Option(
+        "--ros-distro",
+        help="Distro of recordings without definitions, such as ros2_humble.",
+        metavar="DISTRO",
+    ),
+]
+TopicsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--topics",
+        "-t",
+        help="Topic name or glob, such as /cam/*; !GLOB excludes. Repeatable.",
+        metavar="GLOB",
+    ),
+]
+StoreOption = Annotated[str, STORE]
+ForceOption = Annotated[bool, typer.Option("--force", "-f", help="Replace an existing file.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+LogOption = Annotated[str | None, log_level("run.log_level")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
+ReportOption = Annotated[
+    Path | None,
+    typer.Option("--report", metavar="FILE", help="Write the report as JSON; - writes it to stdout."),
+]
+
+
+def write_output(path: Path, text: str, *, announce: bool = False) -> None:
+    """Write the text of an output option: to a file, or to standard output if the path is `-`.
+
+    With `announce`, print the name of the file to standard error.
+
+    Raises:
+        SinkError: The file cannot be written.
+    """
+    from mosaico_ingest.textfile import write_atomically
+
+    if path == STANDARD_OUTPUT:
+        sys.stdout.write(text)
+        return
+    write_atomically(path, text)
+    if announce:
+        from mosaico_ingest.cli.console import print_line
+
+        print_line(f"wrote {path}", stderr=True)
