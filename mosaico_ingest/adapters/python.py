@@ -21,7 +21,7 @@ from mosaico_ingest.rosbag.blocks import ROSMessage
 from mosaico_ingest.rosbag.definitions.model import Definition, normalize_msgtype
 
 if TYPE_CHECKING:
-    from mosaico_ingest.ontology.header import Message
+    from mosaico_ingest.ontology.header import Header, Message
     from mosaico_ingest.ontology.model import Serializable
 
 __all__ = [
@@ -75,6 +75,40 @@ class ROSAdapterBase(ABC, Generic[T]):
     ) -> dict[str, Any] | None:
         """Return topic metadata read from the topic's first message; None by default."""
         return None
+
+    @classmethod
+    def to_ros(
+        cls,
+        mosaico_data: Message | T,  # noqa: ARG003 - for overrides
+        typestore: Any,  # noqa: ANN401, ARG003 - rosbags' class, which only `rosbag` imports
+        ros_msg_type: str | None = None,  # noqa: ARG003 - for overrides
+    ) -> Any:  # noqa: ANN401 - a generated class
+        """Return the message object of a rosbags typestore for an ontology object. Override it to support this.
+
+        Raises:
+            AdapterError: The adapter does not convert to ROS messages, or not to this type.
+        """
+        raise AdapterError(
+            f"{cls.__name__} does not convert to ROS messages", hint="override to_ros in the adapter"
+        )
+
+    @classmethod
+    def to_native(cls, mosaico_data: Message | T, **kwargs: Any) -> Any:  # noqa: ANN401 - as `to_ros`
+        """Return `to_ros` with keyword arguments, as generic code of the official SDK calls it."""
+        return cls.to_ros(mosaico_data, **kwargs)
+
+    @classmethod
+    def unpack_mosaico_msg(cls, mosaico_msg: Message | T) -> tuple[T, Header]:
+        """Return the ontology object of a message and its header, which is empty if the object has none."""
+        from mosaico_ingest.ontology.header import (  # noqa: PLC0415 - the models are slow to import
+            Header,
+            Message,
+            Time,
+        )
+
+        data = cast("T", mosaico_msg.data if isinstance(mosaico_msg, Message) else mosaico_msg)
+        header: Header | None = getattr(data, "header", None)
+        return data, header or Header(timestamp=Time(seconds=0, nanoseconds=0), frame_id="")
 
     @classmethod
     def ros_msg_type(cls) -> str | tuple[str, ...]:

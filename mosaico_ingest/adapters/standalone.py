@@ -12,8 +12,9 @@ import pyarrow as pa
 
 from mosaico_ingest.adapters.adapter import Adapter, AdapterSpec, Envelope
 from mosaico_ingest.adapters.builtin import BY_NAME, Builtin
+from mosaico_ingest.adapters.inverse import invert
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
-from mosaico_ingest.adapters.python import PythonAdapterSpec, ROSAdapterBase
+from mosaico_ingest.adapters.python import PythonAdapterSpec, ROSAdapterBase, ros_types_of
 from mosaico_ingest.errors import AdapterError, BagError
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.ontology.header import Message
@@ -23,6 +24,7 @@ from mosaico_ingest.rosbag.blocks import ROSMessage
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, normalize_msgtype
 from mosaico_ingest.rosbag.definitions.registry import CustomMessages, TypeResolver, store_of
+from mosaico_ingest.rosbag.typestore import definition_in, native_message
 
 __all__ = [
     "CatalogAdapter",
@@ -206,6 +208,33 @@ class CatalogAdapter(ROSAdapterBase[Serializable]):
     ) -> dict[str, Any] | None:
         """Return the topic metadata of a first message."""
         return metadata_of(cls.__adapter_spec__, ros_data) or None
+
+    @classmethod
+    def to_ros(
+        cls,
+        mosaico_data: Message | Serializable,
+        typestore: Any,  # noqa: ANN401 - rosbags' class, which only `rosbag` imports
+        ros_msg_type: str | None = None,
+    ) -> Any:  # noqa: ANN401 - a generated class
+        """Return the message object of a rosbags typestore for an ontology object; restores as the export does.
+
+        Raises:
+            AdapterError: The adapter does not take the type, or the object is of another ontology type.
+            BagError: The typestore does not have the type.
+        """
+        msgtype = normalize_msgtype(ros_msg_type or cls.get_default_ros_msg())
+        data, _ = cls.unpack_mosaico_msg(mosaico_data)
+        if not cls.is_rosmsg_type_valid(msgtype) or not isinstance(data, cls.__mosaico_ontology_type__):
+            raise AdapterError(
+                f"{cls.__name__} does not convert {type(data).__name__} to {msgtype}",
+                hint=f"it converts {cls.__mosaico_ontology_type__.__name__} to {', '.join(ros_types_of(cls))}",
+            )
+        definition = definition_in(typestore, msgtype)
+        shape = ros_shape(definition)
+        adapter = cls.__adapter_spec__.bind(definition, shape)
+        row = cast("pa.StructArray", pa.array([data.to_row()], adapter.ontology.struct))
+        restored = invert(adapter, shape, {}).restore(row, Envelope("", msgtype, np.zeros(1, np.int64)))
+        return native_message(typestore, msgtype, cast("dict[str, Any]", restored.rows[0].as_py()))
 
 
 @cache

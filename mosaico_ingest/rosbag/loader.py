@@ -6,9 +6,10 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from difflib import get_close_matches
+from enum import Enum
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 from typing_extensions import Self
@@ -28,6 +29,9 @@ from mosaico_ingest.rosbag.recording import (
     time_slices,
 )
 from mosaico_ingest.rosbag.serialization import Deserializer
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 __all__ = ["ROSLoader"]
 
@@ -55,26 +59,29 @@ class ROSLoader:
     def __init__(
         self,
         file_path: Path | str | Sequence[Path | str],
+        typestore_or_distro: Typestore | Stores | str | None = None,
         topics: str | Sequence[str] | None = None,
-        typestore_name: Stores | str | None = None,
+        serialization_formats: Mapping[str, Any] | None = None,  # noqa: ARG002 - a parameter of the official SDK
+        *,
         error_policy: LoaderErrorPolicy | str = LoaderErrorPolicy.LOG_WARN,
         custom_types: Mapping[str, Path | str] | None = None,
-        *,
-        ros_distro: Stores | str | None = None,
         custom_msgs: Sequence[CustomMessages] = (),
         reader: Literal["native", "rosbags"] = "native",
     ) -> None:
         """Open a file, a directory, or the splits of one recording.
 
-        `custom_types` maps message types to their definition: the text, or a path. `reader` selects this package's
-        reader, which also reads damaged and remote recordings, or that of the rosbags library.
+        The positional parameters are those of the official SDK. `typestore_or_distro` has the definitions for recordings
+        that contain none: a distro, or a typestore of rosbags. `serialization_formats` has no effect, because a layout
+        belongs to stored rows. `custom_types` maps message types to their definition: the text, or a path. `reader`
+        selects this package's reader, which also reads damaged and remote recordings, or that of the rosbags library.
 
         Raises:
             BagError: The recording cannot be opened, is damaged so that no topic is left, or a definition cannot be read.
             NothingMatched: The patterns select no topic.
         """
         self._policy = LoaderErrorPolicy(error_policy)
-        self._resolver = TypeResolver(ros_distro or typestore_name, custom_msgs, types=custom_types)
+        distro, types = _definitions(typestore_or_distro)
+        self._resolver = TypeResolver(distro, custom_msgs, types={**types, **(custom_types or {})})
         paths = [as_path(path) for path in ([file_path] if isinstance(file_path, (str, Path)) else file_path)]
         self._recording: Recording | None = None
         if reader == "rosbags":
@@ -110,6 +117,16 @@ class ROSLoader:
     def topics(self) -> list[str]:
         """The selected topics, sorted."""
         return sorted({connection.topic for connection in self._connections.values()})
+
+    @property
+    def filtered_topics(self) -> list[str]:
+        """The topics that the patterns do not select, sorted."""
+        return sorted({connection.topic for connection in self._source.connections} - set(self.topics))
+
+    @property
+    def resolved_topics(self) -> list[str]:
+        """The topics of the recording whose messages can be decoded, sorted; they may be filtered."""
+        return sorted({one.topic for one in self._source.connections if self._source.deserializer(one)})
 
     @property
     def msg_types(self) -> list[str]:
@@ -221,6 +238,17 @@ def _by_log_time(blocks: list[MessageBlock]) -> Iterator[tuple[int, int, bytes]]
     for position in np.argsort(times, kind="stable"):
         block, row = blocks[owners[position]], int(rows[position])
         yield int(times[position]), block.connection, block.payload(row)
+
+
+def _definitions(
+    source: Typestore | Stores | str | None,
+) -> tuple[Stores | str | None, Mapping[str, str]]:
+    """Return a distro, or the texts of the types in a typestore of rosbags."""
+    if source is None or isinstance(source, (str, Enum)):
+        return source, {}
+    from mosaico_ingest.rosbag.typestore import definition_texts  # noqa: PLC0415 - imports rosbags
+
+    return Stores.EMPTY, definition_texts(source)
 
 
 def _open_with_rosbags(paths: Sequence[Path | RemotePath], resolver: TypeResolver) -> _Source:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import sqlite3
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 
@@ -10,7 +12,7 @@ import pytest
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores as RosbagsStores
-from rosbags.typesys import get_typestore
+from rosbags.typesys import get_types_from_msg, get_typestore
 
 from mosaico_ingest.errors import BagError, DecodeError, NothingMatched
 from mosaico_ingest.job.values import LoaderErrorPolicy, Stores
@@ -171,7 +173,7 @@ class TestDefinitions:
 
     def test_custom_types_define_the_type(self, old_bag: Path) -> None:
         with ROSLoader(
-            old_bag, ["/mine"], Stores.ROS2_HUMBLE, custom_types={"mine/msg/Own": "int8 x"}
+            old_bag, Stores.ROS2_HUMBLE, ["/mine"], custom_types={"mine/msg/Own": "int8 x"}
         ) as loader:
             assert [message.data for message in loader] == [{"x": 5}]
 
@@ -191,3 +193,30 @@ def test_loader_reads_ros1_bag(tmp_path: Path) -> None:
 def test_loader_missing_file_raises(tmp_path: Path) -> None:
     with pytest.raises(BagError):
         ROSLoader(tmp_path / "missing.mcap")
+
+
+def test_loader_positional_parameters_are_those_of_the_sdk(bag: Path) -> None:
+    with ROSLoader(bag, Stores.ROS2_HUMBLE, ["/po*"], {"mine/msg/Own": "ragged"}) as loader:
+        assert loader.topics == ["/point"]
+        assert loader.filtered_topics == ["/mine", "/text"]
+        assert loader.resolved_topics == ["/mine", "/point", "/text"]
+
+
+def test_loader_with_typestore_uses_its_definitions(tmp_path: Path) -> None:
+    typestore = get_typestore(RosbagsStores.ROS2_HUMBLE)
+    typestore.register(get_types_from_msg("std_msgs/Header header\nuint8[] blob\n", "mine/msg/Own"))
+    path = tmp_path / "bag"
+    with Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connection = writer.add_connection("/mine", "mine/msg/Own", typestore=typestore)
+        header = {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "f"}
+        text = "std_msgs/Header header\nuint8[] blob\n"
+        writer.write(connection, 5, payload("mine/msg/Own", {"header": header, "blob": b"abc"}, text))
+    with closing(sqlite3.connect(next(path.glob("*.db3")))) as database:
+        database.execute("DROP TABLE message_definitions")
+        database.commit()
+    with ROSLoader(path, "ros2_humble", error_policy="ignore") as loader:
+        assert (loader.resolved_topics, list(loader)) == ([], [])
+    with ROSLoader(path, typestore) as loader:
+        (message,) = loader
+        assert loader.resolved_topics == ["/mine"]
+    assert message.data == {"header": header, "blob": b"abc"}

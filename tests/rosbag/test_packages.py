@@ -94,7 +94,7 @@ def test_package_types_have_the_hashes_of_ros1(name: str, digest: str) -> None:
 @pytest.mark.parametrize("distro", [None, Stores.ROS2_HUMBLE])
 def test_package_type_is_used_with_finding(tmp_path: Path, distro: Stores | None) -> None:
     path = recorded(tmp_path / "a.db3", "example_interfaces/msg/String")
-    with ROSLoader(path, ros_distro=distro) as loader:
+    with ROSLoader(path, typestore_or_distro=distro) as loader:
         assert [message.data for message in loader] == [{"data": "hi"}]
         (finding,) = [found for found in loader.findings if found.rule == "assumed-definition"]
     assert "the public package example_interfaces are used: example_interfaces/msg/String" in finding.message

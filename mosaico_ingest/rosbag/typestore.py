@@ -1,0 +1,69 @@
+"""The typestores of the rosbags library: their definitions as text, and their message objects."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+
+from mosaico_ingest.errors import BagError
+from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, normalize_msgtype
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+__all__ = ["definition_in", "definition_texts", "native_message"]
+
+_HEADER = "std_msgs/msg/Header"
+
+
+def definition_texts(typestore: Typestore) -> dict[str, str]:
+    """Return the definition of each type of a typestore, with its dependencies."""
+    version = _ros_version(typestore)
+    return {name: typestore.generate_msgdef(name, ros_version=version)[0] for name in typestore.fielddefs}
+
+
+def definition_in(typestore: Typestore, msgtype: str) -> Definition:
+    """Return the parsed definition of a type of a typestore.
+
+    Raises:
+        BagError: The typestore does not have the type.
+    """
+    name, version = normalize_msgtype(msgtype), _ros_version(typestore)
+    if name not in typestore.fielddefs:
+        raise BagError(f"the typestore does not define {name}", hint="register the type in the typestore")
+    text, _ = typestore.generate_msgdef(name, ros_version=version)
+    return TypeResolver("empty").resolve(name, Embedded(f"ros{version}msg", text), ros_version=version)
+
+
+def native_message(typestore: Typestore, msgtype: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401 - a generated class
+    """Return the message object of a typestore with the field values of a dictionary."""
+    fields: dict[str, Any] = {}
+    for name, (kind, detail) in typestore.fielddefs[msgtype][1]:
+        value: Any = values[name]
+        if kind is Nodetype.NAME:
+            value = native_message(typestore, str(detail), value)
+        elif kind in {Nodetype.ARRAY, Nodetype.SEQUENCE}:
+            value = _native_list(typestore, detail[0], value)
+        fields[name] = value
+    return typestore.types[msgtype](**fields)
+
+
+def _native_list(typestore: Typestore, element: Any, values: Any) -> Any:  # noqa: ANN401 - rosbags' nested tuples
+    """Return numbers as an array, other elements as a list."""
+    kind, detail = element
+    if kind is Nodetype.NAME:
+        return [native_message(typestore, str(detail), value) for value in values]
+    if detail[0] in {"string", "wstring"}:
+        return list(values)
+    dtype = {"octet": "uint8", "byte": "uint8", "char": "uint8"}.get(detail[0], detail[0])
+    return np.frombuffer(values, dtype) if isinstance(values, bytes) else np.array(values, dtype)
+
+
+def _ros_version(typestore: Typestore) -> int:
+    """Return 1 if the header of a typestore has a sequence number, else 2."""
+    fields = typestore.fielddefs[_HEADER][1] if _HEADER in typestore.fielddefs else ()
+    return 1 if any(name == "seq" for name, _ in fields) else 2
