@@ -11,6 +11,7 @@ IngestError
 │   ├── SequenceExists   the sequence already exists
 │   └── SinkUnavailable  the destination does not respond; a retry may help
 ├── Unreachable          a URL does not respond or its content changed; a retry may help  exit code 1
+├── ViewError            stored data cannot be shown                           exit code 1
 ├── VerificationError    the stored data differ from the recording             exit code 5
 └── Interrupted          a signal stopped the run                              exit code 130
 """
@@ -35,6 +36,7 @@ __all__ = [
     "SinkUnavailable",
     "Unreachable",
     "VerificationError",
+    "ViewError",
 ]
 
 
@@ -140,6 +142,10 @@ class Unreachable(IngestError):  # noqa: N818 - named after the condition
     """A URL does not respond, or its content changed while it was read."""
 
     retryable = True
+
+
+class ViewError(IngestError):
+    """Stored data cannot be shown, such as an image in an unknown encoding."""
 
 
 class VerificationError(IngestError):

@@ -1,0 +1,236 @@
+"""Raw pixel encodings of ROS images, converted to RGB."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Struct
+
+from mosaico_ingest.errors import ViewError
+from mosaico_ingest.view.depth import colour_map
+
+__all__ = ["ENCODINGS", "Pixels", "RawImage", "demosaic", "is_bayer", "raw_pixels"]
+
+Pixels: TypeAlias = npt.NDArray[np.uint8]
+"""An RGB picture, of shape (height, width, 3)."""
+_Array: TypeAlias = npt.NDArray[Any]
+
+_OPENCV = re.compile(r"(8U|8S|16U|16S|32S|32F|64F)C(\d*)")
+_OPENCV_TYPES = {"8U": "u1", "8S": "i1", "16U": "u2", "16S": "i2", "32S": "i4", "32F": "f4", "64F": "f8"}
+_BAYER = re.compile(r"bayer_(rggb|bggr|gbrg|grbg)(8|16)")
+_COLOURS = {
+    f"{order}{bits}": (order, f"u{bits // 8}") for order in ("rgb", "bgr", "rgba", "bgra") for bits in (8, 16)
+}
+_EIGHT_BITS = 8
+
+
+class RawImage(Struct, frozen=True):
+    """The buffer of an image and its layout."""
+
+    data: bytes | memoryview
+    width: int
+    height: int
+    stride: int
+    """Bytes per row; 0 if the rows have no padding."""
+    encoding: str
+    is_bigendian: bool = False
+
+
+def raw_pixels(image: RawImage) -> Pixels:
+    """Return the pixels of a raw image as RGB; depth and other measurements are colour-mapped.
+
+    Raises:
+        ViewError: The encoding is unknown, or the buffer is too short.
+    """
+    encoding = image.encoding.strip()
+    if image.width <= 0 or image.height <= 0:
+        raise ViewError(f"the image has {image.width} x {image.height} pixels")
+    if encoding in _COLOURS:
+        order, kind = _COLOURS[encoding]
+        return _ordered(_eight_bits(_samples(image, kind, len(order))), order)
+    if encoding in {"mono8", "mono16", "8UC1", "8UC", "8UC01"}:
+        kind = "u2" if encoding == "mono16" else "u1"
+        return grey(_eight_bits(_samples(image, kind, 1)[..., 0]))
+    bayer = _BAYER.fullmatch(encoding)
+    if bayer is not None:
+        return demosaic(_eight_bits(_samples(image, f"u{int(bayer[2]) // 8}", 1)[..., 0]), bayer[1])
+    if encoding in _YUV:
+        return _YUV[encoding](image)
+    opencv = _OPENCV.fullmatch(encoding)
+    if opencv is not None:
+        return _opencv_pixels(image, opencv[1], int(opencv[2] or 1))
+    raise ViewError(
+        f"the encoding {image.encoding!r} is not supported", hint=f"use one of {', '.join(ENCODINGS)}"
+    )
+
+
+def is_bayer(encoding: str) -> str | None:
+    """Return the pattern of a Bayer encoding, such as `rggb`, or None."""
+    match = _BAYER.fullmatch(encoding)
+    return match[1] if match else None
+
+
+def grey(values: Pixels) -> Pixels:
+    """Return grey values of shape (height, width) as RGB."""
+    return np.repeat(values[..., np.newaxis], 3, axis=2)
+
+
+def demosaic(mosaic: Pixels, pattern: str) -> Pixels:
+    """Return the colours of a Bayer mosaic of shape (height, width), interpolated from neighbouring pixels.
+
+    `pattern` has the colours of the first two rows, such as `rggb`.
+    """
+    height, width = mosaic.shape
+    pixels = np.empty((height, width, 3), np.uint8)
+    for channel, colour in enumerate("rgb"):
+        mask = np.zeros((height, width), np.float32)
+        for at, letter in enumerate(pattern):
+            if letter == colour:
+                mask[at // 2 :: 2, at % 2 :: 2] = 1
+        values = _blur(mask * mosaic) / np.maximum(_blur(mask), 1e-6)
+        pixels[..., channel] = np.where(mask > 0, mosaic, np.rint(values))
+    return pixels
+
+
+def _blur(values: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.floating[Any]]:
+    """Return the sums of 3 x 3 neighbours with the weights 1, 2, 1 along each axis."""
+    padded = np.pad(values, 1)
+    rows = padded[:-2] + 2 * padded[1:-1] + padded[2:]
+    return rows[:, :-2] + 2 * rows[:, 1:-1] + rows[:, 2:]
+
+
+def _samples(image: RawImage, kind: str, channels: int) -> _Array:
+    """Return the samples of shape (height, width, channels)."""
+    item = np.dtype(kind).newbyteorder(">" if image.is_bigendian else "<")
+    rows = _rows(image, image.width * channels * item.itemsize, image.height)
+    return np.ascontiguousarray(rows).view(item).reshape(image.height, image.width, channels)
+
+
+def _rows(image: RawImage, used: int, height: int) -> npt.NDArray[np.uint8]:
+    """Return the first `used` bytes of each row, of shape (height, used)."""
+    stride = max(image.stride, used) if image.stride else used
+    if image.stride and image.stride < used:
+        raise ViewError(
+            f"a row of {image.width} pixels in {image.encoding} has {used} bytes, but the stride is {image.stride}"
+        )
+    data = np.frombuffer(image.data, np.uint8)
+    needed = stride * (height - 1) + used
+    if data.size < needed:
+        size = f"{image.width} x {image.height}"
+        raise ViewError(
+            f"an image of {size} pixels in {image.encoding} has {needed} bytes, found {data.size}"
+        )
+    if data.size < stride * height:  # the last row need not be padded
+        data = np.pad(data, (0, stride * height - data.size))
+    return data[: stride * height].reshape(height, stride)[:, :used]
+
+
+def _eight_bits(samples: _Array) -> Pixels:
+    return samples if samples.dtype.itemsize == 1 else (samples >> _EIGHT_BITS).astype(np.uint8)
+
+
+def _ordered(samples: Pixels, order: str) -> Pixels:
+    return np.ascontiguousarray(samples[..., [order.index(colour) for colour in "rgb"]])
+
+
+def _opencv_pixels(image: RawImage, depth: str, channels: int) -> Pixels:
+    """Return the pixels of an OpenCV matrix: bytes in three or four channels are colours in OpenCV's order."""
+    samples = _samples(image, _OPENCV_TYPES[depth], channels)
+    if channels in {3, 4}:
+        return _ordered(_eight_bits(samples) if depth in {"8U", "16U"} else _stretched(samples), "bgra")
+    values = samples[..., 0] if channels == 1 else np.hypot(samples[..., 0], samples[..., 1])
+    return colour_map(values)
+
+
+def _stretched(samples: _Array) -> Pixels:
+    """Return samples scaled so that the smallest finite one is 0 and the largest is 255."""
+    finite = np.isfinite(samples)
+    if not finite.any():
+        return np.zeros(samples.shape, np.uint8)
+    low, high = float(samples[finite].min()), float(samples[finite].max())
+    scaled = (samples.astype(np.float64) - low) * (255 / (high - low if high > low else 1))
+    return np.where(finite, scaled, 0).astype(np.uint8)
+
+
+def _from_yuv(luma: _Array, blue: _Array, red: _Array) -> Pixels:
+    """Return RGB for luma and chroma in the ranges of ITU-R BT.601, as OpenCV and ROS convert them."""
+    y = 1.164 * (luma.astype(np.float32) - 16)
+    u, v = blue.astype(np.float32) - 128, red.astype(np.float32) - 128
+    pixels = np.stack([y + 1.596 * v, y - 0.813 * v - 0.391 * u, y + 2.018 * u], axis=-1)
+    return np.clip(np.rint(pixels), 0, 255).astype(np.uint8)
+
+
+def _packed_422(luma: int, blue: int, red: int) -> Callable[[RawImage], Pixels]:
+    """Return the converter of pairs of pixels in 4 bytes; the arguments are the offsets of the first samples."""
+
+    def convert(image: RawImage) -> Pixels:
+        pairs = (image.width + 1) // 2
+        quads = _rows(image, pairs * 4, image.height).reshape(image.height, pairs, 4)
+        lumas = quads[..., [luma, luma + 2]].reshape(image.height, pairs * 2)
+        chroma = [np.repeat(quads[..., at], 2, axis=1) for at in (blue, red)]
+        return _from_yuv(lumas, *chroma)[:, : image.width]
+
+    return convert
+
+
+def _planar(blue: int, *, divisor: int = 2, interleaved: bool = True) -> Callable[[RawImage], Pixels]:
+    """Return the converter of a luma plane that is followed by chroma at 1 / `divisor` of its resolution.
+
+    `blue` is the position of the blue chroma: 0 if it precedes the red chroma, otherwise 1.
+    """
+
+    def convert(image: RawImage) -> Pixels:
+        width, height = -(-image.width // divisor), -(-image.height // divisor)
+        stride = image.stride or image.width
+        lumas = _rows(image, image.width, image.height)
+        chroma_bytes = np.frombuffer(image.data, np.uint8)[stride * image.height :]
+        chroma_stride = -(-stride // divisor)
+        row_bytes = chroma_stride * 2 if interleaved else chroma_stride
+        plane_rows = height if interleaved else height * 2
+        if chroma_bytes.size < row_bytes * plane_rows:
+            raise ViewError(
+                f"the chroma of {image.encoding} has {row_bytes * plane_rows} bytes, found {chroma_bytes.size}"
+            )
+        rows = chroma_bytes[: row_bytes * plane_rows].reshape(plane_rows, row_bytes)
+        planes = (
+            [rows[:, at : 2 * width : 2] for at in (0, 1)] if interleaved else [rows[:height], rows[height:]]
+        )
+        full = [
+            plane[:, :width].repeat(divisor, axis=0).repeat(divisor, axis=1)[: image.height, : image.width]
+            for plane in planes
+        ]
+        return _from_yuv(lumas, full[blue], full[1 - blue])
+
+    return convert
+
+
+def _packed_444(image: RawImage) -> Pixels:
+    samples = _samples(image, "u1", 3)
+    return _from_yuv(samples[..., 0], samples[..., 1], samples[..., 2])
+
+
+_UYVY, _YUYV = _packed_422(1, 0, 2), _packed_422(0, 1, 3)
+_YUV: dict[str, Callable[[RawImage], Pixels]] = {
+    "uyvy": _UYVY,
+    "yuv422": _UYVY,
+    "yuyv": _YUYV,
+    "yuv422_yuy2": _YUYV,
+    "nv12": _planar(0),
+    "nv21": _planar(1),
+    "nv24": _planar(0, divisor=1),
+    "i420": _planar(0, interleaved=False),
+    "yv12": _planar(1, interleaved=False),
+    "yuv444": _packed_444,
+}
+ENCODINGS = (
+    *_COLOURS,
+    *("mono8", "mono16"),
+    *(f"bayer_{pattern}{bits}" for pattern in ("rggb", "bggr", "gbrg", "grbg") for bits in (8, 16)),
+    *_YUV,
+    *(f"{depth}C1..4" for depth in _OPENCV_TYPES),
+)
+"""The supported encodings; OpenCV's have 1 to 4 channels."""

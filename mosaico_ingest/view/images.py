@@ -1,0 +1,231 @@
+"""Images of all supported encodings as RGB pixels, PNG files, thumbnails and contact sheets."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from mosaico_ingest.errors import ViewError
+from mosaico_ingest.view.depth import (
+    colour_map,
+    depth_from_inverse,
+    depth_parameters,
+    depth_payload,
+    run_length_depth,
+)
+from mosaico_ingest.view.encodings import Pixels, RawImage, demosaic, grey, is_bayer, raw_pixels
+from mosaico_ingest.view.extras import missing_library
+
+if TYPE_CHECKING:
+    from PIL.Image import Image as Picture
+
+__all__ = [
+    "Pixels",
+    "contact_sheet",
+    "decode_image",
+    "fit_pixels",
+    "has_images",
+    "image_file_type",
+    "png_bytes",
+]
+
+VIDEO = ("h264", "hevc", "h265", "vp9", "av1", "theora")
+"""Formats whose frames depend on earlier frames."""
+_GAP = 4
+"""Pixels between the pictures of a contact sheet."""
+_BACKGROUND = 32
+"""Grey value between the pictures of a contact sheet."""
+_SIGNATURES = {
+    b"\x89PNG": "png",
+    b"\xff\xd8\xff": "jpeg",
+    b"RIFF": "webp",
+    b"II*\0": "tiff",
+    b"MM\0*": "tiff",
+    b"BM": "bmp",
+}
+
+
+def has_images(schema: pa.Schema) -> bool:
+    """Return whether a topic with these columns contains images: bytes with a pixel encoding or a format."""
+    if "data" not in schema.names or not _is_bytes(schema.field("data").type):
+        return False
+    if "encoding" in schema.names:
+        return {"width", "height"} <= set(schema.names)
+    return "format" in schema.names
+
+
+def image_file_type(data: bytes | memoryview) -> str | None:
+    """Return the type of an image file, such as `png`, or None if the bytes are no image file."""
+    start = bytes(data[:4])
+    return next((name for signature, name in _SIGNATURES.items() if start.startswith(signature)), None)
+
+
+def decode_image(row: Mapping[str, Any], *, ros_format: str = "") -> Pixels:
+    """Return the image of a row as RGB pixels of shape (height, width, 3).
+
+    `row` has the columns of `Image` or `CompressedImage`, or the fields of the ROS messages. `ros_format` is the format
+    text of a compressed image in the topic's metadata, such as `16UC1; compressedDepth png`. Depth is colour-mapped.
+
+    Raises:
+        ViewError: The encoding is not supported, or the bytes do not fit it.
+        IngestError: Pillow is required and not installed.
+    """
+    data = row["data"]
+    if not isinstance(data, bytes) or not len(data):
+        raise ViewError("the row contains no image")
+    encoding = row.get("encoding")
+    if encoding is None:
+        return _compressed_pixels(bytes(data), str(row.get("format") or ""), ros_format)
+    if row.get("format") in {None, "", "raw"}:
+        return raw_pixels(_raw_image(row, data))
+    samples = _file_samples(bytes(data))
+    if samples.ndim == 2 and samples.dtype == np.uint8:  # noqa: PLR2004 - the buffer, stored as a greyscale picture
+        return raw_pixels(_raw_image(row, samples.tobytes()))
+    return _sample_pixels(samples, str(encoding))
+
+
+def fit_pixels(pixels: Pixels, *, width: int, height: int) -> Pixels:
+    """Return the picture scaled to fit into `width` x `height`, with its proportions; never enlarged.
+
+    Raises:
+        IngestError: Pillow is not installed.
+    """
+    picture = _picture(pixels)
+    picture.thumbnail((max(1, width), max(1, height)))
+    return np.asarray(picture)
+
+
+def png_bytes(pixels: Pixels) -> bytes:
+    """Return the picture as a PNG file.
+
+    Raises:
+        IngestError: Pillow is not installed.
+    """
+    buffer = io.BytesIO()
+    _picture(pixels).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def contact_sheet(pictures: Sequence[tuple[str, Pixels]], *, columns: int = 4, width: int = 320) -> Pixels:
+    """Return one picture with small versions of all pictures in rows, each above its label.
+
+    Raises:
+        IngestError: Pillow is not installed.
+    """
+    image, draw = _pillow("Image"), _pillow("ImageDraw")
+    font = _pillow("ImageFont").load_default(size=14)
+    thumbnails = [fit_pixels(pixels, width=width, height=width) for _, pixels in pictures]
+    label_height = 20
+    cell_height = max((each.shape[0] for each in thumbnails), default=0) + label_height + _GAP
+    cell_width = max((each.shape[1] for each in thumbnails), default=0) + _GAP
+    columns = max(1, min(columns, len(pictures)))
+    rows = -(-len(pictures) // columns)
+    size = (columns * cell_width + _GAP, rows * cell_height + _GAP)
+    sheet = image.new("RGB", size, (_BACKGROUND,) * 3)
+    pen = draw.Draw(sheet)
+    for at, ((label, _), thumbnail) in enumerate(zip(pictures, thumbnails, strict=True)):
+        row, column = divmod(at, columns)
+        x, y = _GAP + column * cell_width, _GAP + row * cell_height
+        sheet.paste(image.fromarray(thumbnail), (x, y))
+        pen.text((x, y + cell_height - label_height - _GAP + 2), label, fill=(230,) * 3, font=font)
+    return np.asarray(sheet)
+
+
+def _is_bytes(kind: pa.DataType) -> bool:
+    return pa.types.is_binary(kind) or pa.types.is_large_binary(kind) or pa.types.is_binary_view(kind)
+
+
+def _raw_image(row: Mapping[str, Any], data: bytes | memoryview) -> RawImage:
+    stride = row.get("stride", row.get("step"))
+    return RawImage(
+        data,
+        width=int(row["width"]),
+        height=int(row["height"]),
+        stride=int(stride or 0),
+        encoding=str(row["encoding"]),
+        is_bigendian=bool(row.get("is_bigendian")),
+    )
+
+
+def _compressed_pixels(data: bytes, codec: str, ros_format: str) -> Pixels:
+    """Return the pixels of an image file or of a compressed depth image."""
+    encoding = ros_format.partition(";")[0].strip()
+    if "compressedDepth" in ros_format or depth_payload(data) is not None:
+        return colour_map(_compressed_depth(data, encoding, ros_format))
+    words = {codec.lower(), *ros_format.lower().replace(";", " ").split()}
+    video = next((name for name in VIDEO if name in words), None)
+    if video is not None:
+        raise ViewError(
+            f"{video} is a video stream, whose frames depend on earlier frames", hint="use `ingest view`"
+        )
+    return _sample_pixels(_file_samples(data), encoding)
+
+
+def _compressed_depth(data: bytes, encoding: str, ros_format: str) -> npt.NDArray[Any]:
+    payload = depth_payload(data)
+    if payload is not None:
+        values = _file_samples(payload)
+    elif image_file_type(data) is not None:
+        return _file_samples(data)
+    elif "rvl" in ros_format.lower():
+        values = run_length_depth(data)
+    else:
+        raise ViewError("the compressed depth image contains neither PNG nor RVL data")
+    return depth_from_inverse(values, depth_parameters(data)) if encoding == "32FC1" else values
+
+
+def _sample_pixels(samples: npt.NDArray[Any], encoding: str) -> Pixels:
+    """Return the samples of an image file as RGB; `encoding` is that of the image before its compression, if known."""
+    if samples.ndim == 3:  # noqa: PLR2004 - height, width and channels
+        return np.ascontiguousarray(samples[..., :3])
+    pattern = is_bayer(encoding)
+    if pattern is not None:
+        return demosaic(_eight_bits(samples), pattern)
+    if samples.dtype == np.uint8:
+        return grey(samples)
+    return grey(_eight_bits(samples)) if encoding == "mono16" else colour_map(samples)
+
+
+def _eight_bits(samples: npt.NDArray[Any]) -> Pixels:
+    return samples if samples.dtype == np.uint8 else (samples >> 8).astype(np.uint8)
+
+
+def _file_samples(data: bytes) -> npt.NDArray[Any]:
+    """Return the samples of an image file: 8-bit RGB, or one channel with the depth of the file."""
+    picture = _opened(data)
+    try:
+        if picture.mode in {"L", "F", "I"} or picture.mode.startswith("I;16"):
+            samples = np.asarray(picture)
+            return samples.astype(np.uint16) if picture.mode.startswith("I;16") else samples
+        return np.asarray(picture.convert("RGB"))
+    except (OSError, ValueError, SyntaxError) as error:
+        raise ViewError(f"the image file is damaged: {error}") from error
+
+
+def _opened(data: bytes) -> Picture:
+    image = _pillow("Image")
+    try:
+        return image.open(io.BytesIO(data))
+    except (OSError, ValueError, SyntaxError, image.DecompressionBombError) as error:
+        start = data[:8].hex(" ")
+        raise ViewError(
+            f"the bytes are no image file that Pillow can read; they start with {start}"
+        ) from error
+
+
+def _picture(pixels: Pixels) -> Picture:
+    return _pillow("Image").fromarray(pixels)
+
+
+def _pillow(module: str) -> Any:  # noqa: ANN401 - a module
+    """Return a module of Pillow, which only images need."""
+    try:
+        return import_module(f"PIL.{module}")
+    except ImportError as error:
+        raise missing_library("Pillow", "images") from error
