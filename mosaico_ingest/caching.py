@@ -10,8 +10,6 @@ from collections.abc import Callable
 from threading import Lock
 from typing import TypeVar
 
-__all__ = ["cache_by_identity"]
-
 _Argument = TypeVar("_Argument")
 _Result = TypeVar("_Result")
 _MAX_ENTRIES = 256

@@ -24,16 +24,6 @@ from mosaico_ingest.findings import escape_undecodable
 if TYPE_CHECKING:
     from jsonschema.protocols import Validator
 
-__all__ = [
-    "DIALECT",
-    "Part",
-    "Unchecked",
-    "document_schema",
-    "read_document",
-    "schema_of",
-    "tidy",
-]
-
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _MAX_MESSAGE = 200
 """Maximum length of a schema violation in an error message, as it repeats the value."""

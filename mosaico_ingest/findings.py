@@ -10,21 +10,6 @@ from enum import Enum
 
 from msgspec import Struct
 
-__all__ = [
-    "Edit",
-    "Finding",
-    "RowFailure",
-    "Severity",
-    "Span",
-    "Stage",
-    "escape_undecodable",
-    "has_credentials",
-    "join_names",
-    "mask_credentials",
-    "one_line",
-    "suggest_names",
-]
-
 
 class Severity(str, Enum):
     """The severity of a finding."""

@@ -11,8 +11,6 @@ from typing import Any
 
 from typing_extensions import Self
 
-__all__ = ["Abandoned", "DeferredInterrupt", "StopHandler", "count_interrupts"]
-
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 

@@ -28,21 +28,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from pyarrow.fs import FileInfo, FileSystem
 
-__all__ = [
-    "SCHEMES",
-    "AnyPath",
-    "RemotePath",
-    "RemoteStat",
-    "as_path",
-    "explained",
-    "filesystem",
-    "is_transient",
-    "is_url",
-    "parse_url",
-    "reaching",
-    "without_options",
-]
-
 _REFUSED = re.compile(
     r"ACCESS_DENIED|INVALID_ACCESS_KEY|INVALID_SIGNATURE|INVALID_CLIENT_TOKEN|SIGNATURE_DOES_NOT_MATCH"
     r"|MISSING_AUTHENTICATION|EXPIRED_TOKEN|HTTP status 40[13]|PERMISSION_DENIED|UNAUTHENTICATED|PermissionDenied"

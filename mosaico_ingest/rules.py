@@ -9,8 +9,6 @@ from msgspec import Struct
 
 from mosaico_ingest.findings import Severity
 
-__all__ = ["LINT_RULES", "RULES", "Rule", "find_rule"]
-
 _ERROR, _WARNING, _INFO = Severity.ERROR, Severity.WARNING, Severity.INFO
 
 

@@ -11,8 +11,6 @@ from stat import S_ISDIR, S_ISREG
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.remote import AnyPath
 
-__all__ = ["MAX_FILE_BYTES", "check_output_file", "read_limited", "write_atomically"]
-
 MAX_FILE_BYTES = 64 * 1024 * 1024
 """Maximum size of a manifest, definition, plan or report that is read, in bytes."""
 

@@ -26,14 +26,6 @@ if TYPE_CHECKING:
     from mosaico_ingest.adapters.standalone import DefinitionFinder
     from mosaico_ingest.services.adapters import Explained, Known, TestResult, TopicChoice
 
-__all__ = [
-    "adapters_app",
-    "print_adapters",
-    "print_explanation",
-    "print_test_results",
-    "print_topics",
-]
-
 adapters_app = typer.Typer(no_args_is_help=True, help="List, show, explain, test and draft adapters.")
 
 TypeDistroOption = Annotated[

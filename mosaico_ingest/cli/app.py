@@ -20,8 +20,6 @@ from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.findings import one_line
 from mosaico_ingest.version import __version__
 
-__all__ = ["command_line", "main"]
-
 COMMANDS = {
     "run": "run", "bag": "run", "inspect": "report", "plan": "plan", "diff": "plan", "init": "plan", "expand": "plan",
     "verify": "store", "replay": "run", "export": "export", "lint": "lint", "serve": "serve", "watch": "watch",

@@ -20,16 +20,6 @@ from rich.text import Text
 
 from mosaico_ingest.findings import Finding, Severity, Span, mask_credentials, one_line
 
-__all__ = [
-    "PlainTable",
-    "Terminal",
-    "print_error",
-    "print_json",
-    "print_line",
-    "read_sources",
-    "render_findings",
-]
-
 FILE_WIDTH = 240
 """Columns of output that goes to a file or a pipe, where long lines do no harm."""
 EXCERPT_WIDTH = 160

@@ -12,8 +12,6 @@ from mosaico_ingest.cli.options import DEFAULT_STORE, ForceOption, JsonOption, S
 if TYPE_CHECKING:
     from mosaico_ingest.export import ExportReport, TopicExport
 
-__all__ = ["export"]
-
 INCOMPLETE = 4
 """Exit code if a topic was excluded, or if ingesting the file would not give the same rows."""
 

@@ -15,11 +15,6 @@ import typer
 if TYPE_CHECKING:
     from mosaico_ingest.lint.engine import LintReport
 
-__all__ = [
-    "lint",
-    "schema",
-]
-
 
 class Document(str, Enum):
     """Files that have a JSON Schema."""

@@ -12,13 +12,6 @@ from typing import Any
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import one_line
 
-__all__ = [
-    "LEVELS",
-    "LogFormat",
-    "json_line",
-    "set_up_logging",
-]
-
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
 
 

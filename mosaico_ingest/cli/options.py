@@ -11,24 +11,6 @@ from typer.models import OptionInfo
 
 from mosaico_ingest.job import values
 
-__all__ = [
-    "DEFAULT_STORE",
-    "STANDARD_OUTPUT",
-    "STORE",
-    "DistroOption",
-    "ForceOption",
-    "JsonOption",
-    "LogOption",
-    "ManifestArgument",
-    "QuietOption",
-    "RecordingArgument",
-    "ReportOption",
-    "StoreOption",
-    "TopicsOption",
-    "log_level",
-    "write_output",
-]
-
 DEFAULT_STORE = str(values.DEFAULT_STORE)
 STANDARD_OUTPUT = Path("-")
 """The path that output options accept for standard output."""

@@ -40,15 +40,6 @@ if TYPE_CHECKING:
         Sample,
     )
 
-__all__ = [
-    "diff",
-    "expand",
-    "init",
-    "plan",
-    "print_differences",
-    "print_plan",
-]
-
 NOTE_STYLES = {Severity.ERROR: "red", Severity.WARNING: "yellow", Severity.INFO: "dim"}
 
 

@@ -16,15 +16,6 @@ from mosaico_ingest.errors import AdapterError
 if TYPE_CHECKING:
     from mosaico_ingest.job.model import Job
 
-__all__ = [
-    "collect_garbage_as_usual",
-    "defer_garbage_collection",
-    "exit_on_signals",
-    "hide_pandas",
-    "interrupt_on_sigterm",
-    "limit_heaps",
-]
-
 DEFAULT_THRESHOLD = gc.get_threshold()
 IMPORT_THRESHOLD = 500_000
 """Allocations between two collections during start-up: more than all imports make."""

@@ -37,16 +37,6 @@ if TYPE_CHECKING:
     from mosaico_ingest.job.model import Job
     from mosaico_ingest.remote import AnyPath
 
-__all__ = [
-    "JsonLines",
-    "LiveTable",
-    "Tally",
-    "TextLines",
-    "headline",
-    "live_display",
-    "recording_sizes",
-]
-
 LINE_INTERVAL_S = 5.0
 """Seconds between two lines about the progress of the run."""
 MAX_ROWS = 30

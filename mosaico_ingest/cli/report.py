@@ -27,13 +27,6 @@ if TYPE_CHECKING:
     from mosaico_ingest.report.model import Report, RunReport, TopicReport
     from mosaico_ingest.services.inspection import Inspection
 
-__all__ = [
-    "inspect",
-    "print_inspection",
-    "print_report",
-    "report",
-]
-
 WIDE = 100
 """Terminal columns from which all columns of a report's table fit."""
 MAX_TABLES = 3

@@ -36,15 +36,6 @@ if TYPE_CHECKING:
     from mosaico_ingest.pipeline.task import Task
     from mosaico_ingest.report.model import RunReport, UsedManifest
 
-__all__ = [
-    "bag",
-    "replay",
-    "run",
-    "run_tasks",
-    "send_telemetry",
-    "take_shard",
-]
-
 T = TypeVar("T")
 
 SUCCESSFUL = {0, 4}

@@ -13,12 +13,6 @@ import typer
 
 from mosaico_ingest.errors import ManifestError
 
-__all__ = [
-    "check_key_file",
-    "keys_app",
-    "serve",
-]
-
 DEFAULT_KEY_FILE = Path("api_keys.json")
 LOOPBACK = {"127.0.0.1", "::1", "[::1]", "localhost"}
 GRACE_S = 0.5

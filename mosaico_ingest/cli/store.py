@@ -17,15 +17,6 @@ if TYPE_CHECKING:
 
     from mosaico_ingest.destinations.store import SequenceInfo, TopicInfo
 
-__all__ = [
-    "print_sequence",
-    "print_sequences",
-    "print_topic",
-    "store_app",
-    "value_text",
-    "verify",
-]
-
 CELL_WIDTH = 28
 """Characters of a value in a table of rows."""
 METADATA_WIDTH = 100

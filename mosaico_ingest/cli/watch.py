@@ -18,11 +18,6 @@ if TYPE_CHECKING:
     from mosaico_ingest.services.status import RecordingStatus
     from mosaico_ingest.services.watch import Arrivals
 
-__all__ = [
-    "status",
-    "watch",
-]
-
 EXIT_UNFINISHED = 4
 """Exit code of `watch --once` if a recording was not ingested because its end is missing."""
 STATUS_STYLES = {"done": "green", "new": "cyan", "changed": "yellow", "failed": "red", "unreadable": "red"}

@@ -16,24 +16,6 @@ from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.values import IfExists, SessionLevelErrorPolicy
 from mosaico_ingest.ontology.types import OntologyType
 
-__all__ = [
-    "ENVELOPE",
-    "Destination",
-    "DestinationStatus",
-    "ExistingSequence",
-    "ExistingSession",
-    "ExistingTopic",
-    "Session",
-    "Sink",
-    "StoredTopic",
-    "TopicWriter",
-    "check_batch",
-    "check_same_type",
-    "replacement_is_incomplete",
-    "sequence_exists",
-    "topic_schema",
-]
-
 ENVELOPE = pa.field("timestamp_ns", pa.int64(), nullable=False)
 """The first column of every batch: the log time of the message, ns since the epoch."""
 

@@ -25,8 +25,6 @@ from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.protocol.batches import with_offsets
 
-__all__ = ["MemorySequence", "MemorySink", "MemoryTopic"]
-
 
 @dataclass(slots=True)
 class MemoryTopic:

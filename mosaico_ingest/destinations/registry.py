@@ -22,8 +22,6 @@ from mosaico_ingest.errors import IngestError, ManifestError, SinkError
 from mosaico_ingest.findings import suggest_names
 from mosaico_ingest.job.values import PluginTarget, ServerTarget, StoreTarget, Target
 
-__all__ = ["ENTRY_POINTS", "DestinationFactory", "KeepOpen", "destination_of", "keep_destinations_open"]
-
 ENTRY_POINTS = "mosaico_ingest.destinations"
 
 DestinationFactory: TypeAlias = Callable[[Mapping[str, Any], Path], Destination]

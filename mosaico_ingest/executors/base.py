@@ -10,8 +10,6 @@ if TYPE_CHECKING:
     from mosaico_ingest.report.events import BatchObserver
     from mosaico_ingest.report.model import Report
 
-__all__ = ["Executor", "choose_executor", "do_nothing"]
-
 
 class Executor(Protocol):
     """Runs the recordings of a batch."""

@@ -14,8 +14,6 @@ from mosaico_ingest.pipeline.task import Attempt, Task
 from mosaico_ingest.report.events import BatchObserver, Event
 from mosaico_ingest.report.model import Report
 
-__all__ = ["Batch"]
-
 
 @dataclass(slots=True)
 class Batch:

@@ -11,8 +11,6 @@ from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.report.events import BatchObserver, RunStatus
 from mosaico_ingest.report.model import Report
 
-__all__ = ["InProcess"]
-
 
 class InProcess:
     """Runs recordings one after the other in this process."""

@@ -30,8 +30,6 @@ from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.report.events import BatchObserver, Event
 from mosaico_ingest.report.model import Report
 
-__all__ = ["ATTEMPTS", "Processes", "work"]
-
 ATTEMPTS = 2
 """Number of times a recording is started if its worker process dies."""
 _SHUTDOWN_S = 10.0

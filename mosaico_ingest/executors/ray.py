@@ -43,8 +43,6 @@ from mosaico_ingest.executors.ray_worker import (
     machine,
 )
 
-__all__ = ["Ray"]
-
 _log = logging.getLogger(__name__)
 
 MAX_NODE_FAILURES = 3

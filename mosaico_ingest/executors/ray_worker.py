@@ -31,8 +31,6 @@ from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.report.events import Event, RunFinished, RunStarted
 from mosaico_ingest.report.model import Report
 
-__all__ = ["Mailbox", "Notice", "Setting", "ingest", "machine", "out_of_reach"]
-
 Notice: TypeAlias = tuple[int, int, Event | logging.LogRecord]
 """The position of the recording, the number of the attempt, and an event or a log record."""
 

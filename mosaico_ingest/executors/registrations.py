@@ -11,8 +11,6 @@ from mosaico_ingest.adapters.python import register_default_adapter, registered_
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.registry import Registered, ROSTypeRegistry
 
-__all__ = ["Registrations"]
-
 
 class Registrations(Struct, frozen=True):
     """The message types and adapters that were registered in a process; a new process starts without them."""

@@ -26,8 +26,6 @@ from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.remote import is_url
 from mosaico_ingest.rosbag.definitions.registry import definition_files
 
-__all__ = ["absolute", "pack"]
-
 _FILES = "files"
 """The folder of the shipment that mirrors the paths of this machine."""
 _HERE = ".here"

@@ -32,18 +32,6 @@ from mosaico_ingest.rosbag.formats import ROS_VERSIONS
 from mosaico_ingest.rosbag.serialization import Serializer
 from mosaico_ingest.rosbag.writers import RecordingWriter, open_writer
 
-__all__ = [
-    "ExportReport",
-    "Message",
-    "Origin",
-    "Restorer",
-    "TopicExport",
-    "export_sequence",
-    "origin_of",
-    "restorer_for",
-    "version_of",
-]
-
 
 class _Record(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)

@@ -25,22 +25,6 @@ from mosaico_ingest.job.yaml_source import (
 from mosaico_ingest.remote import is_url
 from mosaico_ingest.textfile import read_limited
 
-__all__ = [
-    "EXTENDS_KEY",
-    "MATRIX_KEY",
-    "MAX_FILES",
-    "PLACEHOLDERS",
-    "Filled",
-    "Placeholder",
-    "bases_of",
-    "combinations",
-    "extended",
-    "fill_in",
-    "fill_in_cell",
-    "placeholders_in",
-    "variables",
-]
-
 PLACEHOLDERS = ("stem", "name", "parent", "date", "index")
 
 _WIDTH = re.compile(r"0?[0-9]")

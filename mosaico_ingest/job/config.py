@@ -33,8 +33,6 @@ from mosaico_ingest.job.values import (
 )
 from mosaico_ingest.remote import AnyPath, RemotePath, as_path
 
-__all__ = ["ROSInjectionConfig"]
-
 _KEY = "key"
 _TOPIC = "*"
 

@@ -22,16 +22,6 @@ from mosaico_ingest.job.manifest import (
 from mosaico_ingest.job.model import Manifest
 from mosaico_ingest.job.yaml_source import KeyPath, Scalar, Source, Value, resolve_plain
 
-__all__ = [
-    "MASK",
-    "Expanded",
-    "Remark",
-    "expand_manifest",
-    "manifest_text",
-    "plain",
-    "to_yaml",
-]
-
 Remark: TypeAlias = Callable[[KeyPath], "str | None"]
 """A function that returns the comment for the value at a key path, or None."""
 

@@ -16,23 +16,6 @@ from pydantic import BaseModel, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
-__all__ = [
-    "ANY",
-    "AdapterRef",
-    "FilePath",
-    "Literally",
-    "MarkedField",
-    "Parsed",
-    "PathPattern",
-    "PathRole",
-    "Secret",
-    "TopicGlob",
-    "marked_fields",
-    "matches",
-    "replace_values",
-    "values_at",
-]
-
 PathPattern: TypeAlias = tuple["str | None", ...]
 """A key path in which `ANY` stands for every key of a mapping or position in a list."""
 ANY = None

@@ -30,17 +30,6 @@ from mosaico_ingest.job.yaml_source import (
 from mosaico_ingest.remote import AnyPath, is_url, parse_url
 from mosaico_ingest.textfile import read_limited
 
-__all__ = [
-    "LoadedManifest",
-    "check_manifest",
-    "load_manifest",
-    "load_manifests",
-    "read_manifest",
-    "read_text",
-    "refusal",
-    "stand_alone",
-]
-
 
 class LoadedManifest(Struct, frozen=True):
     """A valid manifest, with the span of each of its values."""

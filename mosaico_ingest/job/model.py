@@ -62,26 +62,6 @@ from mosaico_ingest.job.values import (
 from mosaico_ingest.protocol import check_metadata, check_sequence_name, check_topic_name
 from mosaico_ingest.remote import RemotePath, as_path
 
-__all__ = [
-    "MAX_JOBS",
-    "VERSION",
-    "AdapterReference",
-    "AdapterSettings",
-    "BagSource",
-    "CustomMessages",
-    "DestinationSettings",
-    "ErrorPolicy",
-    "Job",
-    "JobSettings",
-    "Manifest",
-    "Origin",
-    "QuarantineSettings",
-    "RunOptions",
-    "SequenceSettings",
-    "TimeRange",
-    "TopicSettings",
-]
-
 VERSION = 1
 """The newest manifest version that this tool reads."""
 MAX_JOBS = 1000

@@ -7,8 +7,6 @@ from fnmatch import fnmatchcase
 
 from msgspec import Struct
 
-__all__ = ["Selection", "first_match", "is_glob", "select"]
-
 
 class Selection(Struct, frozen=True):
     """The selected topics, and for each topic the position of the deciding pattern (None: the default)."""

@@ -12,11 +12,6 @@ from mosaico_ingest.documents import DIALECT, schema_of, tidy
 from mosaico_ingest.job.compose import EXTENDS_KEY as EXTENDS
 from mosaico_ingest.job.model import Manifest
 
-__all__ = [
-    "job_schema",
-    "manifest_reference",
-]
-
 _VARIABLE = {"type": "string", "pattern": r"\$\{[^{}]+\}", "description": "An environment variable."}
 
 

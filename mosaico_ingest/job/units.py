@@ -8,8 +8,6 @@ from typing import Final
 
 from mosaico_ingest.job.values import Limit, TimeBound
 
-__all__ = ["format_time", "parse_instant", "parse_limit", "parse_offset", "parse_size", "parse_time"]
-
 _SIZE = re.compile(r"([0-9]{1,18}(?:\.[0-9]{1,18})?) ?([kKMGT]?i?B)")
 _BYTES: Final = {
     "B": 1,

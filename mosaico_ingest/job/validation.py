@@ -26,8 +26,6 @@ from mosaico_ingest.job.yaml_source import (
     member,
 )
 
-__all__ = ["explain", "key_path_of", "keys_at", "nearest"]
-
 _EXPECTED = {
     "string_type": "text",
     "int_type": "a whole number",

@@ -12,28 +12,6 @@ from msgspec import Struct
 
 from mosaico_ingest.remote import AnyPath
 
-__all__ = [
-    "DEFAULT_MESSAGE_BYTES",
-    "DEFAULT_PORT",
-    "DEFAULT_STORE",
-    "DEFAULT_TOPIC",
-    "PROVENANCE_KEY",
-    "IfExists",
-    "Limit",
-    "LoaderErrorPolicy",
-    "OnSchemaChange",
-    "PluginTarget",
-    "ServerTarget",
-    "SessionLevelErrorPolicy",
-    "StoreTarget",
-    "Stores",
-    "Target",
-    "TimeBound",
-    "TopicLevelErrorPolicy",
-    "Unmodeled",
-]
-
-
 DEFAULT_STORE = Path("mosaico")
 DEFAULT_PORT = 6726
 DEFAULT_MESSAGE_BYTES = 10_000_000

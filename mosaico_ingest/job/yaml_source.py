@@ -22,22 +22,6 @@ from mosaico_ingest.findings import (
     Span,
 )
 
-__all__ = [
-    "MAX_CHARACTERS",
-    "MAX_DEPTH",
-    "MAX_NODES",
-    "Composer",
-    "KeyPath",
-    "LimitExceeded",
-    "Scalar",
-    "Source",
-    "Trap",
-    "Value",
-    "load_source",
-    "member",
-    "resolve_plain",
-]
-
 Scalar = str | int | float | bool | None
 
 _CONSTANTS: dict[str, Scalar] = {

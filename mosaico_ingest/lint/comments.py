@@ -10,8 +10,6 @@ from difflib import get_close_matches
 from mosaico_ingest.findings import Finding, Severity, Span
 from mosaico_ingest.rules import LINT_RULES, find_rule
 
-__all__ = ["Ignore", "apply_ignores", "ignores_in"]
-
 _COMMENT = re.compile(r"#\s*ingest:\s*(?P<action>[\w-]+)(?:\s*\[(?P<rules>[^\]\n]*)\]?)?")
 _ACTIONS = ("ignore", "ignore-file")
 _WORD = re.compile(r"[^\s,]+")

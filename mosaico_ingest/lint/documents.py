@@ -13,8 +13,6 @@ from msgspec import Struct
 
 from mosaico_ingest.job.model import Manifest
 
-__all__ = ["Document", "Kind", "documents_in", "files_below", "kind_of", "looks_like_ours"]
-
 _YAML_SUFFIXES = (".yaml", ".yml", ".json")
 _MARKDOWN_SUFFIXES = (".md", ".markdown")
 _SUFFIXES = (*_YAML_SUFFIXES, *_MARKDOWN_SUFFIXES, ".msg")

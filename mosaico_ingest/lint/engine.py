@@ -29,16 +29,6 @@ from mosaico_ingest.rosbag.definitions.model import Definition
 from mosaico_ingest.rosbag.definitions.registry import definition_files
 from mosaico_ingest.textfile import read_limited
 
-__all__ = [
-    "STDIN",
-    "LintReport",
-    "LintedFile",
-    "SkippedFile",
-    "adapter_findings",
-    "lint_document",
-    "lint_paths",
-]
-
 STDIN = "-"
 """The path that stands for the text of `stdin`."""
 

@@ -21,8 +21,6 @@ from mosaico_ingest.lint.pages import page_of
 from mosaico_ingest.rules import RULES, Rule
 from mosaico_ingest.version import __version__
 
-__all__ = ["FORMATS"]
-
 
 def _render_json(report: LintReport) -> str:
     """Return `{version, files, skipped, findings}`. Lines and columns start at 1; end columns are exclusive."""

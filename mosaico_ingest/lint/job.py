@@ -26,27 +26,6 @@ from mosaico_ingest.job.yaml_source import KeyPath, Source, Value, load_source, 
 from mosaico_ingest.remote import without_options
 from mosaico_ingest.textfile import read_limited
 
-__all__ = [
-    "Job",
-    "PythonReference",
-    "adapter_references",
-    "covers",
-    "find_module",
-    "is_mapping_file",
-    "key_paths_below",
-    "keyed_patterns",
-    "load_mapping_source",
-    "loaded_names",
-    "manifest_paths",
-    "metadata_sections",
-    "python_reference",
-    "read_classes",
-    "read_job",
-    "recording_paths",
-    "topic_patterns",
-    "value_paths_below",
-]
-
 _PLACEHOLDER = "missing"
 """Stands for a missing required string, so that the rest of the manifest can be checked."""
 _MAX_REPAIRS = 50

@@ -14,8 +14,6 @@ from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.distros import distro_type
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
 
-__all__ = ["Declaration", "MessageFile", "is_defined", "read_message"]
-
 _SUFFIXES = (".msg", ".idl")
 _DECLARATION = re.compile(
     r"\s*(?P<type>[A-Za-z]\w*(?:/\w+)*)(?P<bound><=\d+)?(?P<array>\[(?:<=)?\d*\])?\s+(?P<name>\w+)\s*(?P<rest>.*)"

@@ -8,8 +8,6 @@ from pathlib import Path
 
 from mosaico_ingest.rules import RULES, Rule
 
-__all__ = ["page_of", "rule_index"]
-
 _PACKAGE = Path(__file__).parents[1]
 _FOLDERS = (_PACKAGE / "rule_pages", _PACKAGE.parent / "docs" / "rules")
 """The folder of the pages in an installed wheel, and in a checkout."""

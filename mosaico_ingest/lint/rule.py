@@ -11,8 +11,6 @@ from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.message import MessageFile
 from mosaico_ingest.rules import RULES
 
-__all__ = ["Check", "Problem"]
-
 
 class Problem(Struct, frozen=True):
     """A violation of a rule, without the rule's id and severity."""

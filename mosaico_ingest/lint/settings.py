@@ -25,8 +25,6 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-__all__ = ["Settings", "settings_for"]
-
 _RULE_IDS = {name: rule.id for rule in LINT_RULES.values() for name in (rule.id, rule.code)}
 """The id of each lint rule, by id and by code."""
 

@@ -7,8 +7,6 @@ import json
 from mosaico_ingest.ontology.registry import COLUMNS_FILE, MODULES, encode_fields, model
 from mosaico_ingest.ontology.types import OntologyType
 
-__all__ = ["columns_file"]
-
 
 def columns_file() -> str:
     """Return the content of the file: one entry per tag, one line per column."""

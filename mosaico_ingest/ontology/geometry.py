@@ -11,27 +11,6 @@ from typing_extensions import Self
 from mosaico_ingest.ontology.header import Stamped
 from mosaico_ingest.ontology.model import FixedSize, Float64, Int16, Nullable, Serializable
 
-__all__ = [
-    "Acceleration",
-    "ForceTorque",
-    "FrameTransform",
-    "Inertia",
-    "MotionState",
-    "Point2d",
-    "Point3d",
-    "Polygon",
-    "Pose",
-    "Quaternion",
-    "RobotPath",
-    "Transform",
-    "Uncertain",
-    "Varying",
-    "Vector2d",
-    "Vector3d",
-    "Vector4d",
-    "Velocity",
-]
-
 
 class Uncertain(Stamped):
     """A value of several components, with a header and a covariance."""

@@ -10,14 +10,6 @@ from typing_extensions import Self
 
 from mosaico_ingest.ontology.model import Int32, Serializable, UInt32, UInt64
 
-__all__ = [
-    "Duration",
-    "Header",
-    "Message",
-    "Stamped",
-    "Time",
-]
-
 _SECOND = 1_000_000_000
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 

@@ -10,14 +10,6 @@ from mosaico_ingest.ontology.header import Stamped
 from mosaico_ingest.ontology.model import FixedSize, Float64, Int32, Serializable, UInt32
 from mosaico_ingest.ontology.types import SerializationFormat
 
-__all__ = [
-    "ROI",
-    "CameraInfo",
-    "CompressedImage",
-    "Image",
-    "ImageFormat",
-]
-
 
 class ImageFormat(str, Enum):
     """The encoding of an image's bytes."""

@@ -27,24 +27,6 @@ from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.ontology.registry import DEFINED, MODULES
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 
-__all__ = [
-    "FixedSize",
-    "Float16",
-    "Float32",
-    "Float64",
-    "Int8",
-    "Int16",
-    "Int32",
-    "Int64",
-    "Nullable",
-    "Serializable",
-    "UInt8",
-    "UInt16",
-    "UInt32",
-    "UInt64",
-    "struct_of",
-]
-
 Int8 = Annotated[int, Field(ge=-(2**7), lt=2**7), pa.int8()]
 Int16 = Annotated[int, Field(ge=-(2**15), lt=2**15), pa.int16()]
 Int32 = Annotated[int, Field(ge=-(2**31), lt=2**31), pa.int32()]

@@ -19,24 +19,6 @@ from mosaico_ingest.ontology.model import (
     UInt32,
 )
 
-__all__ = [
-    "Cloud",
-    "GridCells",
-    "LaserScan",
-    "Lidar",
-    "MapMetadata",
-    "MultiEchoLaserScan",
-    "OccupancyGrid",
-    "PointCloud2",
-    "PointField",
-    "PointFieldDataType",
-    "RGBDCamera",
-    "Radar",
-    "Range",
-    "StereoCamera",
-    "ToFCamera",
-]
-
 
 class Cloud(Stamped):
     """Points as lists of coordinates; all lists have the same length."""

@@ -24,19 +24,6 @@ from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 if TYPE_CHECKING:
     from mosaico_ingest.ontology.model import Serializable
 
-__all__ = [
-    "COLUMNS_FILE",
-    "DEFINED",
-    "MODULES",
-    "EncodedType",
-    "UnknownTag",
-    "builtin_type",
-    "encode_fields",
-    "model",
-    "ontology_type",
-    "tags",
-]
-
 DEFINED: dict[str, type[Serializable]] = {}
 """Model classes by tag; a later class with the same tag replaces an earlier one."""
 

@@ -23,23 +23,6 @@ from mosaico_ingest.ontology.model import (
     UInt64,
 )
 
-__all__ = [
-    "Boolean",
-    "Floating16",
-    "Floating32",
-    "Floating64",
-    "Integer8",
-    "Integer16",
-    "Integer32",
-    "Integer64",
-    "String",
-    "Unmodeled",
-    "Unsigned8",
-    "Unsigned16",
-    "Unsigned32",
-    "Unsigned64",
-]
-
 
 class Boolean(Serializable):
     """A boolean."""

@@ -8,19 +8,6 @@ from mosaico_ingest.ontology.geometry import Point3d, Quaternion, Varying, Vecto
 from mosaico_ingest.ontology.header import Stamped
 from mosaico_ingest.ontology.model import Float32, Float64, Int8, Int32, Serializable, UInt8, UInt16
 
-__all__ = [
-    "GPS",
-    "IMU",
-    "BatteryState",
-    "GPSStatus",
-    "Joy",
-    "Magnetometer",
-    "NMEASentence",
-    "Pressure",
-    "RobotJoint",
-    "Temperature",
-]
-
 
 class IMU(Stamped, Serializable):
     """Acceleration and angular velocity of a body, each with a 3 x 3 covariance."""

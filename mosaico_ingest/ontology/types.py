@@ -15,14 +15,6 @@ from msgspec import Struct
 
 from mosaico_ingest.caching import cache_by_identity
 
-__all__ = [
-    "NullRows",
-    "OntologyType",
-    "RequiredFields",
-    "SerializationFormat",
-    "fingerprint",
-]
-
 _PLAIN: dict[pa.DataType, pa.DataType] = {
     pa.large_string(): pa.string(),
     pa.string_view(): pa.string(),

@@ -10,8 +10,6 @@ from typing import Any
 
 import pyarrow as pa
 
-__all__ = ["has_nested_lists", "validated", "with_offsets"]
-
 
 def validated(batch: pa.RecordBatch) -> pa.RecordBatch:
     """Return a received batch that is safe to process.

@@ -10,8 +10,6 @@ from enum import Enum
 import pyarrow as pa
 import pyarrow.flight as fl
 
-__all__ = ["Condition", "as_flight_error", "condition_of", "text_of"]
-
 
 class Condition(str, Enum):
     """The statuses of the protocol."""

@@ -12,15 +12,6 @@ from typing import Any
 
 from mosaico_ingest.errors import SinkError
 
-__all__ = [
-    "check_metadata",
-    "check_sequence_name",
-    "check_topic_name",
-    "key_fingerprint",
-    "key_problem",
-    "new_key",
-]
-
 _MAX_SEQUENCE_NAME, _MAX_TOPIC_NAME = 255, 4096
 _FORBIDDEN = re.compile(r"[^\x21-\x7e]|[!\"'*£$%&.:]")
 _MAX_DEPTH = 64

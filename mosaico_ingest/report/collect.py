@@ -31,15 +31,6 @@ from mosaico_ingest.report.model import (
 )
 from mosaico_ingest.report.timing import Stopwatch
 
-__all__ = [
-    "STEP_WORDS",
-    "Collector",
-    "longest_step",
-    "slowest",
-    "step_seconds",
-    "total_seconds",
-]
-
 STEP_WORDS = {
     "prepare": "opening and planning",
     "read": "reading",

@@ -13,26 +13,6 @@ from mosaico_ingest.findings import Finding, Stage
 if TYPE_CHECKING:  # pydantic and NumPy are slow to import
     from mosaico_ingest.report.timing import Step, TimelineReport
 
-__all__ = [
-    "BatchObserver",
-    "Event",
-    "Expected",
-    "Noted",
-    "Observer",
-    "Quarantined",
-    "Rejected",
-    "RunFinished",
-    "RunStarted",
-    "RunStatus",
-    "Timed",
-    "TopicClosed",
-    "TopicProgress",
-    "TopicStatus",
-    "Unreadable",
-    "ignore_batch",
-    "ignore_events",
-]
-
 
 class RunStatus(str, Enum):
     """How the ingestion of one recording ended."""

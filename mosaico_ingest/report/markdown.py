@@ -14,8 +14,6 @@ from mosaico_ingest.report.collect import (
 from mosaico_ingest.report.model import Report, RunReport, replay_command
 from mosaico_ingest.report.units import bytes_text, count_text, percent_text, seconds_text
 
-__all__ = ["markdown_summary"]
-
 MAX_SLOWEST = 3
 MAX_ROWS = 100
 """Rows of a table or list, because CI services limit the size of a job's page."""

@@ -9,8 +9,6 @@ from mosaico_ingest.report.events import RunStatus
 from mosaico_ingest.report.model import RunReport
 from mosaico_ingest.report.timing import Step
 
-__all__ = ["prometheus_text"]
-
 _PREFIX = "mosaico_ingest"
 
 

@@ -19,22 +19,6 @@ from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.timing import TimelineReport
 from mosaico_ingest.report.units import count_text, counted
 
-__all__ = [
-    "Rejection",
-    "Report",
-    "RunReport",
-    "Steps",
-    "TopicReport",
-    "Totals",
-    "UnreadableRange",
-    "UsedManifest",
-    "folder_link",
-    "gravest",
-    "read_report",
-    "replay_command",
-    "report_schema",
-]
-
 _GRAVEST_FIRST = (130, 5, 1, 2, 3, 4)
 
 

@@ -33,8 +33,6 @@ except ImportError as missing:
         "OpenTelemetry is not installed", hint="pip install 'mosaico-ingest[otel]'"
     ) from missing
 
-__all__ = ["Telemetry"]
-
 _NAME = "mosaico_ingest"
 _SERVICE = "mosaico-ingest"
 

@@ -13,16 +13,6 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.documents import Part
 
-__all__ = [
-    "MAX_BINS",
-    "MAX_GAPS",
-    "Gap",
-    "Step",
-    "Stopwatch",
-    "Timeline",
-    "TimelineReport",
-]
-
 MAX_BINS = 120
 """Maximum number of bins of a timeline."""
 MAX_GAPS = 50

@@ -9,19 +9,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:  # pydantic is slow to import
     from mosaico_ingest.report.model import Report
 
-__all__ = [
-    "bytes_text",
-    "count_text",
-    "counted",
-    "percent_text",
-    "rate_text",
-    "seconds_text",
-    "stored_text",
-    "time_text",
-    "unreadable_text",
-    "written_text",
-]
-
 _STEP = 1000.0
 
 

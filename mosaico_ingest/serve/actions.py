@@ -23,8 +23,6 @@ from mosaico_ingest.serve.keys import Keyring, StoredKey
 from mosaico_ingest.serve.uploads import Uploads
 from mosaico_ingest.version import __version__
 
-__all__ = ["HANDLERS", "Backend"]
-
 _PROTOCOL_VERSION = messages.SemVer(major=0, minor=7, patch=0)
 _EMPTY = messages.Empty()
 

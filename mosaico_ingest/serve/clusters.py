@@ -8,8 +8,6 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Range", "clusterize", "intersect"]
-
 Range: TypeAlias = tuple[int, int]
 """The first and the last timestamp in nanoseconds, both inclusive."""
 

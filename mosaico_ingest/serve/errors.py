@@ -15,8 +15,6 @@ from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
 from mosaico_ingest.protocol.errors import Condition, as_flight_error
 from mosaico_ingest.protocol.messages import Malformed
 
-__all__ = ["Deadline", "Refusal", "refuse_invalid", "translate_errors"]
-
 _LOG = logging.getLogger(__name__)
 
 

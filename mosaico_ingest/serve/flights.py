@@ -19,15 +19,6 @@ from mosaico_ingest.protocol.messages import JSON, Body, Interval
 from mosaico_ingest.serve.errors import Refusal, refuse_invalid
 from mosaico_ingest.serve.uploads import OpenSession, OpenTopic, Uploads
 
-__all__ = [
-    "Extent",
-    "Flights",
-    "OlderTopicInfo",
-    "sequence_schema",
-    "split_locator",
-    "topic_schema",
-]
-
 
 class Extent(Body):
     """The size of a topic, with the field names of clients before 0.7."""

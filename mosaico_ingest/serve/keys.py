@@ -22,14 +22,6 @@ from mosaico_ingest.protocol.messages import API_KEY_HEADER, Permission
 from mosaico_ingest.protocol.names import key_fingerprint, key_problem, new_key
 from mosaico_ingest.serve.errors import Refusal
 
-__all__ = [
-    "MIDDLEWARE",
-    "KeyCheck",
-    "Keyring",
-    "StoredKey",
-    "require",
-]
-
 MIDDLEWARE = "api-key"
 """The name under which Flight stores the result of the key check."""
 

@@ -30,15 +30,6 @@ from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.serve.errors import Deadline, Refusal
 
-__all__ = [
-    "MISSING",
-    "Comparison",
-    "Test",
-    "matching_times",
-    "run",
-    "tests_of",
-]
-
 MISSING: Final = object()
 """The value of a field that does not exist."""
 

@@ -24,16 +24,6 @@ from mosaico_ingest.serve.flights import Flights
 from mosaico_ingest.serve.keys import MIDDLEWARE, KeyCheck, Keyring, require
 from mosaico_ingest.serve.uploads import Uploads
 
-__all__ = [
-    "IDLE_S",
-    "PORT",
-    "REQUEST_S",
-    "Server",
-    "Service",
-    "Tls",
-    "serve",
-]
-
 
 class Service(fl.FlightServerBase):
     """The Flight service of one store; Flight runs each call on its own thread."""

@@ -24,8 +24,6 @@ from mosaico_ingest.protocol.batches import validated
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.serve.errors import Refusal, refuse_invalid
 
-__all__ = ["OpenSession", "OpenTopic", "Uploads"]
-
 _BUFFER_BYTES = 96 << 20
 """Maximum size of the buffered rows per session, in bytes."""
 _MAX_SESSIONS = 128

@@ -42,22 +42,6 @@ from mosaico_ingest.rosbag.definitions.model import (
 from mosaico_ingest.rosbag.definitions.registry import CustomMessages
 from mosaico_ingest.rosbag.recording import Recording, open_recording
 
-__all__ = [
-    "Explained",
-    "Known",
-    "TestResult",
-    "TopicChoice",
-    "definition_in",
-    "draft_adapter",
-    "explain_adapter",
-    "explain_topics",
-    "find_adapter",
-    "known_adapters",
-    "message_in",
-    "run_adapter_tests",
-    "source_text",
-]
-
 _ROWS = 64
 
 

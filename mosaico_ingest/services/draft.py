@@ -19,8 +19,6 @@ from mosaico_ingest.rosbag.definitions.distros import ROS2, distro_type
 from mosaico_ingest.rosbag.definitions.model import Source
 from mosaico_ingest.services.inspection import InspectedTopic, Inspection
 
-__all__ = ["default_name", "draft_manifest"]
-
 _REFUSED = re.compile(r"[^A-Za-z0-9_-]+")
 _HEAD = (
     "# yaml-language-server: $schema=job.schema.json",

@@ -12,13 +12,6 @@ from mosaico_ingest.pipeline.planning import plan_connection
 from mosaico_ingest.pipeline.run import open_job
 from mosaico_ingest.rosbag.blocks import Connection
 
-__all__ = [
-    "InspectedTopic",
-    "Inspection",
-    "estimate_rate_hz",
-    "inspect",
-]
-
 
 class InspectedTopic(Part):
     """One topic of the recording, with the adapter it would get."""

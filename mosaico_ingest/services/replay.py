@@ -19,8 +19,6 @@ from mosaico_ingest.job.values import IfExists, SessionLevelErrorPolicy, TopicLe
 from mosaico_ingest.pipeline.provenance import content_digest, stored_provenance
 from mosaico_ingest.pipeline.quarantine import QuarantineFile, find_quarantine_files
 
-__all__ = ["Replay", "ReplayState", "find_replays", "lock_quarantine"]
-
 _LOCK = ".replay.lock"
 
 

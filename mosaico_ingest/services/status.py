@@ -19,8 +19,6 @@ from mosaico_ingest.pipeline.provenance import (
 from mosaico_ingest.pipeline.run import make_plan
 from mosaico_ingest.pipeline.task import Task
 
-__all__ = ["RecordingStatus", "Status", "recording_statuses"]
-
 
 class Status(str, Enum):
     """What a run with `if_exists: skip` would do with a recording."""

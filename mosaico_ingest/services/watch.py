@@ -14,8 +14,6 @@ from typing import BinaryIO, TypeAlias
 
 from mosaico_ingest.rosbag.formats import MCAP, RECORDING_NAME
 
-__all__ = ["UNFINISHED_REST_S", "Arrivals", "is_unfinished"]
-
 UNFINISHED_REST_S = 600.0
 """Seconds without a change after which a recording is ingested although its end is missing."""
 _METADATA = "metadata.yaml"

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import pyarrow as pa
 
-__all__ = ["every_kind"]
-
 
 def every_kind(
     *inner: tuple[str, pa.DataType], more: tuple[tuple[str, pa.DataType], ...] = ()

@@ -12,8 +12,6 @@ from mosaico_ingest.protocol.errors import Condition, condition_of, text_of
 from mosaico_ingest.protocol.messages import API_KEY_HEADER
 from mosaico_ingest.serve import Server
 
-__all__ = ["Client", "descriptor_of", "refused"]
-
 
 class Client:
     """A client of a server, with or without an API key."""

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-__all__ = ["hollow_array", "hollow_batch", "malformed_batch"]
-
 EMPTY = pa.py_buffer(b"")
 
 

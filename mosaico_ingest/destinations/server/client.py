@@ -42,15 +42,6 @@ from mosaico_ingest.protocol.messages import (
     Permission,
 )
 
-__all__ = [
-    "DeadlinePassed",
-    "ServerClient",
-    "Uploaded",
-    "connect",
-    "in_thread",
-    "within",
-]
-
 _Returned = TypeVar("_Returned")
 
 DeadlinePassed = FutureTimeout

@@ -19,8 +19,6 @@ from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.values import ServerTarget, SessionLevelErrorPolicy
 from mosaico_ingest.protocol import messages
 
-__all__ = ["ServerDestination"]
-
 
 class ServerDestination(Destination):
     """A Mosaico server; every method but `describe` and `open_sink` connects to it."""

@@ -12,8 +12,6 @@ from mosaico_ingest.protocol.errors import Condition, condition_of, text_of
 from mosaico_ingest.protocol.messages import Permission
 from mosaico_ingest.protocol.names import key_problem
 
-__all__ = ["Address", "Refused", "add_hint", "check_tls", "late", "reraise"]
-
 _PATIENCE_S = 3.0
 _WRONG_NAME = frozenset({62, 64})
 """OpenSSL's verification codes for a certificate of another host name or IP address."""

@@ -32,8 +32,6 @@ from mosaico_ingest.protocol.batches import with_offsets
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.protocol.messages import Action, topic_locator
 
-__all__ = ["ServerSession"]
-
 _OLD_IS_DELETED = "the stored sequence is deleted"
 _UNCHECKED = (
     "the session is finalized, so the sequence is stored, but its rows were not counted;"

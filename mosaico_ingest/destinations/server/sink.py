@@ -19,12 +19,6 @@ from mosaico_ingest.job.values import IfExists, ServerTarget
 from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.errors import Condition
 
-__all__ = [
-    "ServerSink",
-    "delete_finding",
-    "version_finding",
-]
-
 _OLD_VERSIONS = ("0.1.", "0.2.", "0.3.", "0.4.", "0.5.")
 _NO_SESSION = "0" * 26
 """The id of no session, in the format of session ids."""

@@ -20,15 +20,6 @@ from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.protocol.batches import with_offsets
 from mosaico_ingest.protocol.messages import Permission
 
-__all__ = [
-    "MessageSizes",
-    "SharedBuffer",
-    "Upload",
-    "encoded_bits",
-    "framing_bytes",
-    "row_spans",
-]
-
 _LARGEST_ROW_SHARE = 0.8
 """Share of the server's limit that one row may take: a stored chunk grows when the server sends it back."""
 _UPLOAD_S = 600.0

@@ -38,8 +38,6 @@ from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 from mosaico_ingest.remote import AnyPath
 
-__all__ = ["FORMAT", "Catalog"]
-
 FORMAT = 1
 """The version of the tables; it increases if earlier releases cannot read them."""
 

@@ -11,8 +11,6 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from xxhash import xxh3_128, xxh3_128_digest
 
-__all__ = ["ColumnMaker", "ContentHash", "column_makers", "combined"]
-
 
 def column_makers(schema: pa.Schema) -> tuple[ColumnMaker, ...]:
     """Return a factory of the hash state of each column."""

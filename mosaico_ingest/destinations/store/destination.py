@@ -24,8 +24,6 @@ from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import SinkError, Unreachable
 from mosaico_ingest.remote import AnyPath, RemotePath
 
-__all__ = ["StoreDestination"]
-
 
 class StoreDestination(Destination):
     """The store in a folder or behind a URL; a run creates it if it does not exist."""

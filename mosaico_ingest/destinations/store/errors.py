@@ -14,8 +14,6 @@ from mosaico_ingest.errors import SinkError, SinkUnavailable, Unreachable
 from mosaico_ingest.remote import AnyPath, is_transient
 from mosaico_ingest.remote import explained as unreachable
 
-__all__ = ["NotInStore", "explained", "sequence_changed"]
-
 _HINTS = {
     errno.ENOSPC: "free some space, or choose another target.store",
     errno.EDQUOT: "free some quota, or choose another target.store",

@@ -46,23 +46,6 @@ from mosaico_ingest.destinations.store.errors import explained
 from mosaico_ingest.errors import IngestError, SinkUnavailable
 from mosaico_ingest.remote import AnyPath, RemotePath
 
-__all__ = [
-    "MARKER",
-    "Heartbeat",
-    "Lease",
-    "LocalFiles",
-    "ObjectFiles",
-    "create",
-    "encoded",
-    "footer",
-    "fsync",
-    "is_live",
-    "new_session_id",
-    "opened",
-    "send_ahead",
-    "sync",
-]
-
 
 class Lease:
     """An exclusive lock on the file at `path`, held until `release` or the end of the process.

@@ -14,19 +14,6 @@ from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote import AnyPath
 
-__all__ = [
-    "Claim",
-    "Collected",
-    "NewNote",
-    "NewSession",
-    "NewTopic",
-    "Note",
-    "SegmentInfo",
-    "SequenceInfo",
-    "SessionInfo",
-    "TopicInfo",
-]
-
 
 class SegmentInfo(Struct, frozen=True):
     """One Parquet file: rows of one topic and session, sorted by `timestamp_ns`."""

@@ -41,13 +41,6 @@ from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 from mosaico_ingest.remote import AnyPath, RemotePath
 
-__all__ = [
-    "FORMAT",
-    "ObjectCatalog",
-    "SequenceDocument",
-    "check_unchanged",
-]
-
 FORMAT = 1
 """The version of the documents; it increases if earlier releases cannot read them."""
 

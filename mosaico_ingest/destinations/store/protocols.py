@@ -9,8 +9,6 @@ from mosaico_ingest.destinations.store.model import Claim, NewNote, NewSession, 
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.remote import AnyPath
 
-__all__ = ["Closable", "Files", "Lease", "StoreCatalog"]
-
 
 class Lease(Protocol):
     """Shows other processes that a writer is alive."""

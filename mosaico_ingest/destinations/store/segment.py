@@ -19,17 +19,6 @@ from mosaico_ingest.destinations.store.checksum import ContentHash, column_maker
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote import AnyPath
 
-__all__ = [
-    "Bounds",
-    "Columns",
-    "Leaf",
-    "Segment",
-    "SegmentWriter",
-    "columns_of",
-    "sorted_rows",
-    "time_span",
-]
-
 _LEVEL = 1
 _SAMPLE_BYTES = 1 << 18
 _SAMPLES = 16

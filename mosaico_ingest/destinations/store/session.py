@@ -43,13 +43,6 @@ from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.protocol.batches import has_nested_lists, with_offsets
 from mosaico_ingest.remote import AnyPath, RemotePath
 
-__all__ = [
-    "Staging",
-    "StoreSession",
-    "StoreSink",
-    "StoreTopic",
-]
-
 _FIRST_GROUP_BYTES, _GROUP_BYTES = 4 << 20, 32 << 20
 """Size of the first and the largest row group. Sizes double in between, so that writing starts early."""
 _GROUP_ROWS = 1 << 20

@@ -23,15 +23,6 @@ from mosaico_ingest.errors import SinkError
 from mosaico_ingest.findings import suggest_names
 from mosaico_ingest.remote import AnyPath, RemotePath, as_path
 
-__all__ = [
-    "Checked",
-    "Store",
-    "Window",
-    "count",
-    "scan",
-    "verify",
-]
-
 
 class Checked(Struct, frozen=True):
     """A segment that was read completely, and its problem, if any."""
