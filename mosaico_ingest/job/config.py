@@ -125,6 +125,8 @@ class ROSInjectionConfig:
     """Maximum number of recordings to ingest at the same time."""
     quarantine: QuarantineSettings | None = field(default=None, metadata=_key("quarantine"))
     """The quarantine of rejected messages; without a quarantine, they are only counted."""
+    expect: Mapping[str, Any] | None = field(default=None, metadata=_key("expect"))
+    """The data contract, in the structure of the section `expect` of manifests."""
     family: str | None = field(default=None, metadata=_key("sequence.family"))
     """The name that sequences with the same message definitions share; defaults to `sequence_name`."""
     on_schema_change: OnSchemaChange | str | None = field(default=None, metadata=_key("on_schema_change"))

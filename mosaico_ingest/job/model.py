@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal, TypeAlias
 from msgspec import Struct
 from pydantic import (
     AfterValidator,
-    BaseModel,
     ConfigDict,
     Discriminator,
     Field,
@@ -28,6 +27,7 @@ from typing_extensions import Self
 
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.findings import Span
+from mosaico_ingest.job.expect import Expectations
 from mosaico_ingest.job.fields import (
     AdapterRef,
     FilePath,
@@ -38,7 +38,8 @@ from mosaico_ingest.job.fields import (
     TopicGlob,
 )
 from mosaico_ingest.job.patterns import first_match, is_glob
-from mosaico_ingest.job.units import format_time, parse_limit, parse_size, parse_time
+from mosaico_ingest.job.section import Count, MessageLimit, Section, Text, Time, Topic, shape_of
+from mosaico_ingest.job.units import parse_size
 from mosaico_ingest.job.values import (
     DEFAULT_MESSAGE_BYTES,
     DEFAULT_PORT,
@@ -46,7 +47,6 @@ from mosaico_ingest.job.values import (
     DEFAULT_TOPIC,
     PROVENANCE_KEY,
     IfExists,
-    Limit,
     LoaderErrorPolicy,
     OnSchemaChange,
     PluginTarget,
@@ -55,7 +55,6 @@ from mosaico_ingest.job.values import (
     Stores,
     StoreTarget,
     Target,
-    TimeBound,
     TopicLevelErrorPolicy,
     Unmodeled,
 )
@@ -68,7 +67,6 @@ MAX_JOBS = 1000
 """Maximum number of jobs that a matrix may expand to."""
 KeyPath: TypeAlias = "tuple[str | int | float | bool | None, ...]"
 _SIZES = range(1 << 20, (1 << 50) + 1)
-_MAX_COUNT = 1_000_000_000
 
 
 def _bytes(text: str) -> int:
@@ -76,10 +74,6 @@ def _bytes(text: str) -> int:
     if size not in _SIZES:
         raise ValueError(f"{text!r} is out of range; write a size from 1MiB to 1024TiB")
     return size
-
-
-def _shape(value: Any) -> str:  # noqa: ANN401 - any YAML value
-    return "several" if isinstance(value, list | tuple | dict) else "one"
 
 
 def _check_variable(value: Any) -> str | int:  # noqa: ANN401 - any YAML value
@@ -98,12 +92,6 @@ def _matrix_form(value: Any) -> str:  # noqa: ANN401 - any YAML value
     return "combinations" if isinstance(value, list | tuple) else "axes"
 
 
-def _limit_to_json(limit: Limit) -> int | float | None:
-    return limit.count if limit.share is None else limit.share
-
-
-Text = Annotated[str, StringConstraints(min_length=1)]
-Count = Annotated[int, Field(ge=1, le=_MAX_COUNT)]
 VariableName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 VariableValue = Annotated[
     Any,
@@ -120,23 +108,7 @@ Matrix = Annotated[
     Discriminator(_matrix_form),
     AfterValidator(_check_matrix),
 ]
-Time = Annotated[
-    TimeBound,
-    Parsed(
-        parse_time, r"^([+-][0-9.]+ ?(ns|us|ms|s|min|h)|[0-9]{4}-[0-9]{2}-[0-9]{2}.*)$", to_json=format_time
-    ),
-]
 Bytes = Annotated[int, Parsed(_bytes, r"^[0-9.]+ ?[kKMGT]?i?B$", to_json=int)]
-MessageLimit = Annotated[
-    Limit,
-    Parsed(
-        parse_limit,
-        r"^[0-9]+$|^0*(100(\.0*)?|[0-9]{1,2}(\.[0-9]+)?) ?%$",
-        whole_numbers=True,
-        to_json=_limit_to_json,
-    ),
-]
-Topic = Annotated[Text, TopicGlob()]
 AdapterReference = Annotated[Any, AdapterRef()]
 """An adapter: in manifests a text, in Python also a class or an `AdapterSpec`."""
 RecordingPath = Annotated[Text, FilePath(PathRole.RECORDING)]
@@ -147,15 +119,7 @@ WorkerPath = Annotated[Text, FilePath(PathRole.WORKER_FILE)]
 OutputPath = Annotated[Text, FilePath(PathRole.OUTPUT_FILE)]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
-
-    def replace(self, **changes: Any) -> Self:  # noqa: ANN401 - the types of the fields
-        """Return a copy with other values, which are not validated."""
-        return self.model_copy(update=changes)
-
-
-class CustomMessages(_Section):
+class CustomMessages(Section):
     """Message definitions of one package, for recordings that do not contain them."""
 
     package: Text = Field(examples=["my_custom_pkg"])
@@ -166,7 +130,7 @@ class CustomMessages(_Section):
     """The distro that the definitions belong to; defaults to every distro."""
 
 
-class TimeRange(_Section):
+class TimeRange(Section):
     """Part of a recording, as offsets (`+10s` from the first message, `-5s` from the last) or instants."""
 
     start: Time | None = Field(default=None, examples=["+10s", "2026-03-01T12:00:00Z"])
@@ -175,13 +139,13 @@ class TimeRange(_Section):
     """The end, exclusive."""
 
 
-class BagSource(_Section):
+class BagSource(Section):
     """The recording, and the options for reading it."""
 
     path: Annotated[
         Annotated[RecordingPath, Tag("one")]
         | Annotated[tuple[RecordingPath, ...], Field(min_length=1), Tag("several")],
-        Discriminator(_shape),
+        Discriminator(shape_of),
     ] = Field(examples=["data/session_01.db3", ["part_0.mcap", "part_1.mcap"], "data/*.mcap"])
     """A file, a rosbag2 directory or a URL. A list names the splits of one recording. A glob makes one sequence for each
     match that is not hidden."""
@@ -195,7 +159,7 @@ class BagSource(_Section):
     """Maximum decompressed size of a chunk; larger chunks are unreadable. Defaults to 256MiB."""
 
 
-class SequenceSettings(_Section):
+class SequenceSettings(Section):
     """The sequence that a recording becomes."""
 
     name: Text = Field(default="{stem}", examples=["Test_Run_01", "{parent}_{stem}"])
@@ -213,7 +177,7 @@ class SequenceSettings(_Section):
     """Action if the sequence exists: fail, skip (if its content is the same), append, replace."""
 
 
-class TopicSettings(_Section):
+class TopicSettings(Section):
     """Settings of the topics that a name or glob matches."""
 
     rename: Text | None = Field(default=None, examples=["/sensors/imu"])
@@ -226,7 +190,7 @@ class TopicSettings(_Section):
     """The encoding of raw images: as recorded, or PNG."""
 
 
-class AdapterSettings(_Section):
+class AdapterSettings(Section):
     """The adapters that turn messages into ontology records in place of the built-in ones."""
 
     load: tuple[AdapterReference, ...] = Field(
@@ -244,7 +208,7 @@ class AdapterSettings(_Section):
     """The platform's serialization format for types without an adapter, by message type."""
 
 
-class ErrorPolicy(_Section):
+class ErrorPolicy(Section):
     """Whether an error affects one message, one topic, or the entire run."""
 
     session: SessionLevelErrorPolicy = SessionLevelErrorPolicy.Report
@@ -254,7 +218,7 @@ class ErrorPolicy(_Section):
         | Annotated[
             dict[Annotated[Text, TopicGlob(default=DEFAULT_TOPIC)], TopicLevelErrorPolicy], Tag("several")
         ],
-        Discriminator(_shape),
+        Discriminator(shape_of),
     ] = Field(
         default=TopicLevelErrorPolicy.Raise, examples=["raise", {"default": "raise", "/gps/*": "ignore"}]
     )
@@ -273,7 +237,7 @@ class ErrorPolicy(_Section):
         return self.topic.get(match or DEFAULT_TOPIC, TopicLevelErrorPolicy.Raise)
 
 
-class QuarantineSettings(_Section):
+class QuarantineSettings(Section):
     """The quarantine, which keeps rejected messages for `ingest replay`; `on_error` applies only beyond its limits."""
 
     path: Annotated[Text, FilePath(PathRole.OUTPUT_FOLDER)] = Field(
@@ -290,7 +254,7 @@ class QuarantineSettings(_Section):
     wrong."""
 
 
-class DestinationSettings(_Section):
+class DestinationSettings(Section):
     """Where sequences are written: a store of files or a Mosaico server; defaults to the store `./mosaico`."""
 
     store: Annotated[Text, FilePath(PathRole.STORE)] | None = Field(default=None, examples=["./mosaico"])
@@ -343,7 +307,7 @@ def _conflict(message: str, key: str) -> PydanticCustomError:
     return PydanticCustomError("conflicting-keys", "{message}", {"key": key, "message": message})
 
 
-class RunOptions(_Section):
+class RunOptions(Section):
     """Options of a run; none of them changes the stored content."""
 
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"] = "INFO"
@@ -356,7 +320,7 @@ class RunOptions(_Section):
     """Maximum number of recordings to ingest at the same time."""
 
 
-class _Composition(_Section):
+class _Composition(Section):
     """The keys that are resolved before the job is built."""
 
     version: Annotated[int, Field(ge=1, le=VERSION)] = VERSION
@@ -365,7 +329,7 @@ class _Composition(_Section):
         Annotated[
             Annotated[BasePath, Tag("one")]
             | Annotated[tuple[BasePath, ...], Field(min_length=1), Tag("several")],
-            Discriminator(_shape),
+            Discriminator(shape_of),
         ]
         | None
     ) = Field(default=None, examples=["base.yaml", ["fleet.yaml", "night.yaml"]])
@@ -382,7 +346,7 @@ class _Composition(_Section):
     """Values of `${NAME}`, with one job for each combination; or a list of the combinations."""
 
 
-class JobSettings(_Section):
+class JobSettings(Section):
     """The sections of a job."""
 
     bag: BagSource
@@ -403,6 +367,8 @@ class JobSettings(_Section):
     on_schema_change: OnSchemaChange | None = None
     """Action if a topic's message definition differs from that of earlier sequences of the family: fail, evolve (warn and
     store the new columns), new_topic (store it under another name). If omitted, definitions are not compared."""
+    expect: Expectations | None = None
+    """The data contract: expectations of the recording, its topics and their values, and the action if one fails."""
     quarantine: QuarantineSettings | None = None
     """Where rejected messages are kept; without this section, they are only counted."""
     target: DestinationSettings = DestinationSettings()

@@ -77,7 +77,7 @@ def _models(
 ) -> Iterator[tuple[tuple[str, ...], dict[str, Any]]]:
     """Yield the path and schema of every mapping with defined keys below these properties, in order."""
     for key, node in properties.items():
-        name, inner = key, _resolved(node, schema)
+        name, inner = key, _mapping_form(_resolved(node, schema), schema)
         if "items" in inner:
             name, inner = f"{key}[]", _resolved(inner["items"], schema)
         elif isinstance(inner.get("additionalProperties"), dict):
@@ -85,6 +85,12 @@ def _models(
         if "properties" in inner:
             yield (*path, name), inner
             yield from _models(inner["properties"], (*path, name), schema)
+
+
+def _mapping_form(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
+    """Return the alternative with defined keys of a value that has short forms, and any other value unchanged."""
+    branches = (_resolved(branch, schema) for branch in (*node.get("anyOf", ()), *node.get("oneOf", ())))
+    return next((branch for branch in branches if "properties" in branch), node)
 
 
 def _section(title: str, model: dict[str, Any], schema: dict[str, Any]) -> str:

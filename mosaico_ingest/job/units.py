@@ -6,7 +6,7 @@ import re
 from datetime import datetime, timezone
 from typing import Final
 
-from mosaico_ingest.job.values import Limit, TimeBound
+from mosaico_ingest.job.values import Interval, Limit, TimeBound
 
 _SIZE = re.compile(r"([0-9]{1,18}(?:\.[0-9]{1,18})?) ?([kKMGT]?i?B)")
 _BYTES: Final = {
@@ -25,6 +25,13 @@ _NANOSECONDS: Final = {
     "min": 60_000_000_000,
     "h": 3_600_000_000_000,
 }
+_DURATION = re.compile(r"([+-]?)([0-9]{1,18}(?:\.[0-9]{1,18})?) ?(ns|us|ms|s|min|h|d)")
+_LONG_UNITS: Final = {**_NANOSECONDS, "d": 86_400_000_000_000}
+_NUMBER = r"([0-9]{1,18}(?:\.[0-9]{1,18})?)"
+_RATE = re.compile(_NUMBER + r" ?(mHz|Hz|kHz|/s|/min|/h)")
+_HERTZ: Final = {"mHz": 1e-3, "Hz": 1.0, "kHz": 1e3, "/s": 1.0, "/min": 1 / 60, "/h": 1 / 3600}
+_SHARE = re.compile(_NUMBER + r" ?%")
+_PERIODS = re.compile(_NUMBER + r" ?periods?")
 _INSTANT = re.compile(
     r"(\d{4}-\d\d-\d\d)(?:[Tt ](\d\d:\d\d(?::\d\d)?)(?:\.(\d{1,9}))?)? ?(Z|z|[+-]\d\d:\d\d)?"
 )
@@ -105,6 +112,69 @@ def parse_offset(text: str) -> int:
     if magnitude not in _INT64:
         raise ValueError(f"{text!r} is out of range; write an offset of at most 292 years (2562047h)")
     return -magnitude if match[1] == "-" else magnitude
+
+
+def parse_duration(text: str, *, signed: bool = False) -> int:
+    """Parse a duration such as `50 ms`, `1.5h` or `2 d`, with `signed` also `-5 ms`; return nanoseconds.
+
+    Raises:
+        ValueError: The text is not a duration, or the duration exceeds 292 years.
+    """
+    match = _DURATION.fullmatch(text)
+    if match is None or (match[1] and not signed):
+        raise ValueError(f"{text!r} is not a duration; write a number and a unit, such as 50 ms, 30s or 2h")
+    whole, _, fraction = match[2].partition(".")
+    unit = _LONG_UNITS[match[3]]
+    length = int(whole) * unit + (int(fraction) * unit // 10 ** len(fraction) if fraction else 0)
+    if length not in _INT64:
+        raise ValueError(f"{text!r} is out of range; write a duration of at most 292 years (2562047h)")
+    return -length if match[1] == "-" else length
+
+
+def format_duration(ns: int) -> str:
+    """Format a duration in the largest unit that represents it exactly, such as `50 ms`."""
+    unit = next((unit for unit in ("h", "min", "s", "ms", "us") if ns and ns % _NANOSECONDS[unit] == 0), "ns")
+    return f"{ns // _NANOSECONDS[unit]} {unit}"
+
+
+def parse_rate(text: str) -> float:
+    """Parse a rate such as `95 Hz`, `2 kHz` or `10/min`; return hertz.
+
+    Raises:
+        ValueError: The text is not a rate.
+    """
+    match = _RATE.fullmatch(text)
+    if match is None:
+        raise ValueError(f"{text!r} is not a rate; write a number and a unit, such as 95 Hz or 10/min")
+    return float(match[1]) * _HERTZ[match[2]]
+
+
+def parse_share(text: str) -> float:
+    """Parse a share such as `5%`; return a number from 0 to 1.
+
+    Raises:
+        ValueError: The text is not a share, or is more than 100%.
+    """
+    match = _SHARE.fullmatch(text)
+    if match is None or float(match[1]) > 100:  # noqa: PLR2004 - percent
+        raise ValueError(f"{text!r} is not a share; write a number from 0% to 100%, such as 5%")
+    return float(match[1]) / 100
+
+
+def parse_interval(text: str) -> Interval:
+    """Parse a duration (`100 ms`) or a multiple of a topic's period (`2 periods`).
+
+    Raises:
+        ValueError: The text is neither of the two.
+    """
+    match = _PERIODS.fullmatch(text)
+    if match is not None:
+        return Interval(periods=float(match[1]))
+    try:
+        return Interval(ns=parse_duration(text))
+    except ValueError:
+        message = f"{text!r} is neither a duration nor a number of periods; write 100 ms or 2 periods"
+        raise ValueError(message) from None
 
 
 def parse_instant(text: str) -> int:

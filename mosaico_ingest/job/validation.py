@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 from difflib import get_close_matches
 from math import isfinite
@@ -119,13 +119,14 @@ def nearest(word: str, known: Iterable[str]) -> str | None:
 
 def keys_at(schema: dict[str, Any], path: KeyPath) -> list[str]:
     """Return the keys that a JSON Schema allows in the mapping at `path`; empty if every key is allowed."""
-    return list(_resolved(_node_at(schema, path), schema).get("properties", {}))
+    return list(_resolved(_node_at(schema, path), schema, {"object"}).get("properties", {}))
 
 
 def _node_at(schema: dict[str, Any], path: KeyPath) -> dict[str, Any]:
     node = schema
     for part in path:
-        node = _descend(_resolved(node, schema), part)
+        kind = "array" if isinstance(part, int) else "object"
+        node = _descend(_resolved(node, schema, {kind}), part)
     return node
 
 
@@ -151,13 +152,15 @@ def _descend(node: dict[str, Any], part: object) -> dict[str, Any]:
     return inner or (extra if isinstance(extra, dict) else {})
 
 
-def _resolved(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
-    """Follow references, and select the alternative that is a mapping or a list."""
+def _resolved(
+    node: dict[str, Any], schema: dict[str, Any], kinds: Collection[str] = ("object", "array")
+) -> dict[str, Any]:
+    """Follow references, and select the alternative of one of these JSON types."""
     while "$ref" in node:
         node = schema["$defs"][node["$ref"].rsplit("/", 1)[-1]]
     for branch in node.get("anyOf", node.get("oneOf", ())):
-        resolved = _resolved(branch, schema)
-        if resolved.get("type") in {"object", "array"}:
+        resolved = _resolved(branch, schema, kinds)
+        if resolved.get("type") in kinds:
             return resolved
     return node
 

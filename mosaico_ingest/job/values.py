@@ -22,6 +22,10 @@ PROVENANCE_KEY = "mosaico_ingest"
 """The metadata key of a sequence, and of each of its sessions, for its provenance."""
 
 
+RECORDING = "recording"
+"""The word for the whole recording where a contract may also name a topic."""
+
+
 class SessionLevelErrorPolicy(str, Enum):
     """The action after an error that ends the run."""
 
@@ -72,6 +76,17 @@ class OnSchemaChange(str, Enum):
     """Store the topic under another name."""
 
 
+class OnFailure(str, Enum):
+    """The action if an expectation of a contract fails."""
+
+    FAIL = "fail"
+    """Commit nothing."""
+    WARN = "warn"
+    """Commit, and report the failure."""
+    DIVERT = "divert"
+    """Commit under the name `<name>__failed`."""
+
+
 class Unmodeled(str, Enum):
     """The action for a topic whose type has no adapter."""
 
@@ -116,6 +131,17 @@ class Limit(Struct, frozen=True):
 
     count: int | None = None
     share: float | None = None
+
+
+class Interval(Struct, frozen=True):
+    """A length of time: nanoseconds, or a multiple of a topic's period; the other attribute is None."""
+
+    ns: int | None = None
+    periods: float | None = None
+
+    def __str__(self) -> str:
+        """Return the length in the notation of manifests."""
+        return f"{self.periods:g} periods" if self.ns is None else f"{self.ns} ns"
 
 
 class StoreTarget(Struct, frozen=True):

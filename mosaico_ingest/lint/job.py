@@ -108,6 +108,8 @@ def topic_patterns(job: Job) -> Iterator[tuple[str, str, Span]]:
     for i, pattern in enumerate(job.manifest.topics):
         yield "topics", pattern, job.span("topics", i)
     yield from keyed_patterns(job)
+    for path, pattern in expected_patterns(job):
+        yield ".".join(part for part in path if isinstance(part, str)), pattern, job.source.span(path)
 
 
 def keyed_patterns(job: Job) -> Iterator[tuple[str, str, Span]]:
@@ -117,6 +119,15 @@ def keyed_patterns(job: Job) -> Iterator[tuple[str, str, Span]]:
             for key in mapping if isinstance(mapping, dict) else ():
                 if isinstance(key, str) and key != field.marker.default:
                     yield ".".join(path), key, job.key_span(*path, key)
+
+
+def expected_patterns(job: Job) -> Iterator[tuple[KeyPath, str]]:
+    """Yield the key path and the text of each topic name and glob in the lists and values of `expect`."""
+    for field in marked_fields(JobSettings, TopicGlob):
+        if field.path[0] == "expect" and not field.is_key:
+            for path, text in values_at(job.manifest, field.path):
+                if isinstance(text, str) and text != field.marker.default:
+                    yield path, text
 
 
 def covers(general: str, special: str) -> bool:
