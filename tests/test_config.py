@@ -41,6 +41,7 @@ def job(**fields: Any) -> Job:
     return config(**fields).job
 
 
+@pytest.mark.promise("config-arguments")
 def test_config_reference_example_builds_job() -> None:
     made = ROSInjectionConfig(
         file_path=Path("data/session_01.db3"),

@@ -83,6 +83,7 @@ def test_resolve_without_other_source_uses_builtin(tmp_path: Path) -> None:
     assert (found.spec.name, found.reason, found.unmodeled) == ("IMUAdapter", "built-in", False)
 
 
+@pytest.mark.promise("no-adapter")
 def test_resolve_unknown_type_is_unmodeled() -> None:
     bridge = ROSBridge(formats={"visualization_msgs/Marker": "ragged"})
     found = bridge.resolve("/m", "visualization_msgs/msg/Marker")
@@ -262,6 +263,7 @@ def test_from_ros_message_translates_one_message() -> None:
         ROSBridge.from_ros_message(ROSMessage(0, "/m", "visualization_msgs/msg/Marker", {}))
 
 
+@pytest.mark.promise("adapter-register")
 def test_register_default_adapter_with_parentheses_registers_class() -> None:
     adapter = base.register_default_adapter()(MyImuAdapter)
     assert adapter is MyImuAdapter
@@ -273,6 +275,7 @@ def test_register_default_adapter_with_is_default_registers_class() -> None:
     assert ROSBridge.get_default_adapter("sensor_msgs/Imu") is MyImuAdapter
 
 
+@pytest.mark.promise("bridge-registry")
 def test_get_default_adapter_builtin_returns_its_class() -> None:
     adapter = ROSBridge.get_default_adapter(IMU)
     assert adapter is not None
@@ -294,6 +297,7 @@ def test_adapter_base_has_members_of_the_sdk() -> None:
     assert MyImuAdapter.ontology_data_type() is BridgeRow
 
 
+@pytest.mark.promise("adapter-abstract")
 def test_adapter_base_is_abstract() -> None:
     with pytest.raises(TypeError):
         ROSAdapterBase()  # type: ignore[abstract]

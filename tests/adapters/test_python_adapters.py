@@ -87,6 +87,7 @@ def test_python_adapter_exception_rejects_only_its_row(floats: Callable[..., Ada
     assert failure.reason == "SpeedAdapter: ValueError: speed is -2.0"
 
 
+@pytest.mark.promise("adapter-translate")
 def test_python_adapter_overridden_translate_receives_envelope(floats: Callable[..., Adapted]) -> None:
     class Shifted(SpeedAdapter):
         @classmethod

@@ -143,6 +143,7 @@ def test_text_lines_name_with_line_break_prints_one_line() -> None:
     assert not any(line.startswith("error") for line in lines)
 
 
+@pytest.mark.promise("progress")
 def test_live_table_single_recording_lists_its_topics(tally: Tally) -> None:
     tally = Tally([1], started=0.0)
     table = LiveTable(tally)

@@ -81,6 +81,7 @@ def test_bag_to_server_is_in_its_store(served: tuple[Path, str, str]) -> None:
     assert sum(topic.rows for topic in topics) == 2130
 
 
+@pytest.mark.promise("write-permission")
 def test_bag_with_read_key_is_refused(served: tuple[Path, str, str]) -> None:
     folder, port, _ = served
     key = ingest("keys", "new", "--permission", "read", "--api-keys", "other.json", cwd=folder).stdout.strip()

@@ -88,6 +88,7 @@ def test_columnar_invalid_message_has_rule(
     assert [(failure.row, failure.rule) for failure in decoded.failures] == [(others, rule)]
 
 
+@pytest.mark.promise("trailing-bytes")
 def test_columnar_trailing_padding_is_accepted(assert_agree: AssertAgree) -> None:
     payloads = [text(b"a" * (number % 4)) + bytes(number % 8) for number in range(64)]
     decoded = assert_agree(payloads, STRING, Encoding.CDR)

@@ -135,6 +135,7 @@ def containers(case: Path) -> list[str]:
         for container in containers(case)
     ],
 )
+@pytest.mark.promise("validated-containers")
 def test_job_case_gives_the_expected_result(case: Path, container: str, tmp_path: Path) -> None:
     expected = yaml.safe_load((case / "expected.yaml").read_text())
     messages = yaml.safe_load((case / "messages.yaml").read_text())

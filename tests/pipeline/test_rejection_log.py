@@ -40,6 +40,7 @@ def run(recording: Path, tmp_path: Path, **options: object) -> None:
     assert (report.totals.written, report.totals.rejected) == (1, 2)
 
 
+@pytest.mark.promise("corrupt-messages", "loader-log-warn")
 def test_injector_log_warn_logs_undecodable_messages(
     recording: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -52,6 +53,7 @@ def test_injector_log_warn_logs_undecodable_messages(
     assert "topic /speed, first log time 1970-01-01 00:00:00.000, offset " in text
 
 
+@pytest.mark.promise("loader-ignore")
 def test_injector_ignore_logs_nothing(
     recording: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -59,6 +61,7 @@ def test_injector_ignore_logs_nothing(
     assert caplog.records == []
 
 
+@pytest.mark.promise("log-level")
 def test_injector_log_level_error_suppresses_warnings_during_run_only(
     recording: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -36,6 +36,7 @@ def threads() -> list[str]:
     return [thread.name for thread in threading.enumerate() if thread.name.startswith("mosaico-ingest")]
 
 
+@pytest.mark.promise("write-buffer")
 def test_buffer_writes_all_batches_in_order() -> None:
     writer = Writer()
     with WriteBuffer(max_bytes=100) as buffer:
@@ -72,6 +73,7 @@ def test_buffer_writes_accepted_batches_after_an_error_of_the_caller() -> None:
     assert not threads()
 
 
+@pytest.mark.promise("write-buffer")
 def test_put_waits_while_the_buffer_is_full() -> None:
     writer = Writer(delay_s=0.02)
     with WriteBuffer(max_bytes=batch(0).nbytes * 2) as buffer:

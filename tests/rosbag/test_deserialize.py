@@ -96,6 +96,7 @@ class TestTails:
     def test_cdr_three_trailing_bytes_are_accepted(self, tail: bytes) -> None:
         assert cdr("int8 a", b"\5" + tail) == {"a": 5}
 
+    @pytest.mark.promise("trailing-bytes")
     def test_cdr_four_to_seven_trailing_zeros_are_counted(self) -> None:
         reader = Deserializer(definition("int32 a"), Encoding.CDR)
         assert reader.to_dict(LITTLE + struct.pack("<i", 5) + bytes(7)) == {"a": 5}

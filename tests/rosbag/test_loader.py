@@ -116,6 +116,7 @@ def test_loader_unmatched_pattern_raises_with_nearest_topics(bag: Path) -> None:
 
 
 class TestPolicies:
+    @pytest.mark.promise("loader-raise")
     def test_policy_raise_stops_at_first_invalid_message(self, bag: Path) -> None:
         with ROSLoader(bag, error_policy=LoaderErrorPolicy.RAISE) as loader:
             with pytest.raises(DecodeError, match=r"^/text at 8000000000 ns: data: ") as caught:
@@ -128,11 +129,13 @@ class TestPolicies:
         with loader, pytest.raises(DecodeError, match="use the definition of ros2_iron"):
             list(loader)
 
+    @pytest.mark.promise("loader-log-warn")
     def test_policy_log_warn_logs_and_continues(self, bag: Path, caplog: pytest.LogCaptureFixture) -> None:
         with caplog.at_level(logging.WARNING, "mosaico_ingest.rosbag"), ROSLoader(bag) as loader:
             list(loader)
         assert "/text: 1 messages could not be read" in caplog.messages
 
+    @pytest.mark.promise("loader-ignore")
     def test_policy_ignore_counts_silently(self, bag: Path, caplog: pytest.LogCaptureFixture) -> None:
         with ROSLoader(bag, error_policy="ignore") as loader:
             list(loader)

@@ -20,6 +20,7 @@ def _forget() -> Iterator[None]:
     ROSTypeRegistry.reset()
 
 
+@pytest.mark.promise("registry-register")
 def test_register_accepts_text_and_path(tmp_path: Path) -> None:
     file = tmp_path / "my messages" / "Heartbeat.msg"
     file.parent.mkdir()
@@ -34,6 +35,7 @@ def test_register_accepts_text_and_path(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.promise("registry-cascade")
 def test_registry_distro_overlays_types_of_all_distros() -> None:
     ROSTypeRegistry.register("a/msg/B", "int8 for_all")
     ROSTypeRegistry.register("a/msg/B", "int8 for_humble", store="ros2_humble")
@@ -50,6 +52,7 @@ def test_registered_types_yield_to_types_of_job() -> None:
     assert own.message.fields[0].name == "own"
 
 
+@pytest.mark.promise("registry-directory")
 def test_register_directory_registers_every_file(tmp_path: Path) -> None:
     (tmp_path / "One.msg").write_text("Two two\n")
     (tmp_path / "Two.msg").write_text("int8 x\n")

@@ -129,6 +129,7 @@ class TestWithoutADistro:
         with pytest.raises(BagError, match="not known"):
             resolve(resolver, "sensor_msgs/msg/Range", "")
 
+    @pytest.mark.promise("db3-needs-distro")
     def test_resolve_without_distro_ambiguous_type_raises(self) -> None:
         with pytest.raises(BagError, match=r"not known.*searched.*set ros_distro"):
             resolve(TypeResolver(), "rcl_interfaces/msg/ParameterDescriptor")
@@ -203,6 +204,7 @@ class TestCustomMessages:
         with pytest.raises(BagError):
             resolve(TypeResolver(), "mine/msg/Part")
 
+    @pytest.mark.promise("custom-msgs-scope")
     def test_custom_msgs_of_another_distro_are_mentioned_only(self, folder: Path) -> None:
         resolver = TypeResolver("ros2_jazzy", [("mine", folder, "ros2_humble")])
         with pytest.raises(BagError, match="custom_msgs has it for ros2_humble only"):

@@ -20,6 +20,7 @@ from mosaico_ingest.serve import Keyring, Tls, serve
 Rows = Callable[..., pa.RecordBatch]
 
 
+@pytest.mark.promise("write-permission")
 def test_key_permits_only_actions_of_its_permission(tmp_path: Path, rows: Rows) -> None:
     ring = Keyring(tmp_path / "keys.json")
     keys = {permission: ring.add(permission) for permission in Permission}
