@@ -247,7 +247,11 @@ def _report_reading(
     for item in recording.unreadable:
         if item.count != 0:
             target = None if item.connection is None else targets.get(item.connection)
-            observe(Unreadable(target, item.count, item.offset, item.reason))
+            observe(
+                Unreadable(
+                    target, item.count, item.offset, item.reason, item.start_ns or None, item.end_ns or None
+                )
+            )
         elif item not in reported:
             message = f"{item.file} at {item.offset}: {item.reason}"
             observe(Noted(Finding("recovered-range", Severity.INFO, message)))
@@ -351,5 +355,14 @@ def _subtract(topic: TopicPipeline, rows: int, reason: str, observe: Observer) -
     if rows > 0:
         observe(TopicProgress(topic.plan.target, written=-rows))
         observe(
-            Rejected(topic.plan.target, Stage.WRITE, "not-written", rows, reason, topic.start_ns or 0, -1)
+            Rejected(
+                topic.plan.target,
+                Stage.WRITE,
+                "not-written",
+                rows,
+                reason,
+                topic.start_ns or 0,
+                -1,
+                last_log_time_ns=topic.end_ns,
+            )
         )

@@ -242,6 +242,7 @@ class TopicPipeline:
                 f"the topic was closed: {self.error}",
                 int(block.log_times[start]),
                 int(block.offsets[start]),
+                last_log_time_ns=int(block.log_times[-1]),
             )
         )
 
@@ -284,6 +285,7 @@ class TopicPipeline:
                 self.error,
                 int(block.log_times[first]),
                 int(block.offsets[first]),
+                last_log_time_ns=int(block.log_times[int(index[-1])]),
             )
         )
         if self.plan.on_error is TopicLevelErrorPolicy.Raise:
@@ -318,6 +320,7 @@ class TopicPipeline:
                     int(block.log_times[first.row]),
                     int(block.offsets[first.row]),
                     sum(failure.row in quarantined for failure in failures),
+                    int(block.log_times[failures[-1].row]),
                 )
             )
 

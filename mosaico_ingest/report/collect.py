@@ -26,6 +26,7 @@ from mosaico_ingest.report.model import (
     Rejection,
     Report,
     Steps,
+    Stretch,
     TopicReport,
     UnreadableRange,
 )
@@ -40,6 +41,8 @@ STEP_WORDS = {
     "commit": "committing",
 }
 """The steps of a run in the order of the pipeline; `write` is missing because it runs in parallel to them."""
+MAX_STRETCHES = 50
+"""Maximum number of stretches that a rejection lists."""
 
 
 def step_seconds(steps: Steps) -> dict[str, float]:
@@ -80,6 +83,7 @@ class _Sum:
     start_ns: int | None = None
     end_ns: int | None = None
     rejections: dict[tuple[Stage, str], Rejection] = field(default_factory=dict[tuple[Stage, str], Rejection])
+    stretches: dict[tuple[Stage, str], list[tuple[int, int]]] = field(default_factory=dict)
     closed: TopicClosed | None = None
 
     def take(self, event: TopicProgress | Rejected | TopicClosed) -> None:
@@ -104,6 +108,11 @@ class _Sum:
     def _reject(self, event: Rejected) -> None:
         self.quarantined += event.quarantined
         key = (event.stage, event.rule)
+        if event.last_log_time_ns is not None:
+            stretches = self.stretches.setdefault(key, [])
+            stretches.append((event.first_log_time_ns, event.last_log_time_ns))
+            if len(stretches) > 2 * MAX_STRETCHES:
+                self.stretches[key] = _merged(stretches)
         known = self.rejections.get(key)
         if known is None:
             self.rejections[key] = Rejection(
@@ -143,7 +152,12 @@ class Collector:
                     self._sums[event.target].unreadable += event.count or 0
                 self._unreadable.append(
                     UnreadableRange(
-                        topic=event.target, count=event.count, offset=event.offset, reason=event.reason
+                        topic=event.target,
+                        count=event.count,
+                        offset=event.offset,
+                        reason=event.reason,
+                        start_ns=event.start_ns,
+                        end_ns=event.end_ns,
                     )
                 )
             case Noted():
@@ -190,7 +204,10 @@ class Collector:
 
     def _topic(self, expected: Expected) -> TopicReport:
         total = self._sums[expected.target] if not expected.excluded else self._unread(expected)
-        rejections = tuple(total.rejections.values())
+        rejections = tuple(
+            rejection.replace(stretches=_stretches(total.stretches.get(key, ())))
+            for key, rejection in total.rejections.items()
+        )
         return TopicReport(
             topic=expected.topic,
             target=expected.target,
@@ -216,6 +233,19 @@ class Collector:
             error=total.closed.error if total.closed else None,
             timeline=total.closed.timeline if total.closed and total.written else None,
         )
+
+
+def _merged(stretches: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return pairs of neighbors as one stretch each, in half as many stretches."""
+    ordered = sorted(stretches)
+    pairs = [ordered[at : at + 2] for at in range(0, len(ordered), 2)]
+    return [(pair[0][0], max(end for _, end in pair)) for pair in pairs]
+
+
+def _stretches(stretches: Sequence[tuple[int, int]]) -> tuple[Stretch, ...]:
+    while len(stretches) > MAX_STRETCHES:
+        stretches = _merged(stretches)
+    return tuple(Stretch(start_ns=start, end_ns=end) for start, end in sorted(stretches))
 
 
 def _status(expected: Expected, total: _Sum) -> TopicStatus:

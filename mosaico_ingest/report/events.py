@@ -89,6 +89,8 @@ class Rejected(Struct, frozen=True):
     first_offset: int
     quarantined: int = 0
     """Number of these messages in the quarantine."""
+    last_log_time_ns: int | None = None
+    """Log time of the last of them; None if it is unknown."""
 
 
 class Unreadable(Struct, frozen=True):
@@ -101,6 +103,10 @@ class Unreadable(Struct, frozen=True):
     offset: int | None
     """File offset or row id of the range."""
     reason: str
+    start_ns: int | None = None
+    """First log time of the range according to its index; None if unknown."""
+    end_ns: int | None = None
+    """Last log time of the range according to its index, inclusive; None if unknown."""
 
 
 class Noted(Struct, frozen=True):

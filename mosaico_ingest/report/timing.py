@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -51,6 +52,8 @@ class TimelineReport(Part):
     """Rows in each bin."""
     interval_ns: int | None = None
     """Median interval between two rows, in ns; null with fewer than two different times."""
+    jitter_ns: int | None = None
+    """Standard deviation of the intervals that are not gaps, in ns; null with fewer than two of them."""
     gap_count: int = 0
     """Number of gaps."""
     gaps: tuple[Gap, ...] = ()
@@ -68,6 +71,8 @@ class Timeline:
     _last_ns: int | None = None
     _intervals: NDArray[np.int64] = field(default_factory=lambda: np.zeros(_BUCKETS, np.int64))
     """A histogram of the intervals with logarithmic buckets; see `_bucket_start_ns`."""
+    _sums: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, _BUCKETS)))
+    """The sum of the intervals of each bucket and the sum of their squares, in ns and ns²."""
     _longest: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
     """Start and end of the longest intervals, in any order."""
 
@@ -99,7 +104,10 @@ class Timeline:
         if last_ns is not None and last_ns <= times_ns[0]:
             times_ns = np.concatenate(([last_ns], times_ns))
         intervals = np.diff(times_ns)
-        self._intervals += np.bincount(_buckets(intervals), minlength=_BUCKETS)
+        buckets = _buckets(intervals)
+        self._intervals += np.bincount(buckets, minlength=_BUCKETS)
+        self._sums[0] += np.bincount(buckets, intervals, minlength=_BUCKETS)
+        self._sums[1] += np.bincount(buckets, intervals.astype(np.float64) ** 2, minlength=_BUCKETS)
         is_full = len(self._longest) == MAX_GAPS
         minimum = int((self._longest[:, 1] - self._longest[:, 0]).min()) if is_full else 0
         starts = np.flatnonzero(intervals > minimum)
@@ -122,9 +130,18 @@ class Timeline:
             step_ns=self.step_ns,
             counts=tuple(self.counts.tolist()),
             interval_ns=interval_ns,
+            jitter_ns=self._jitter_ns(gap_bucket),
             gap_count=int(self._intervals[gap_bucket:].sum()),
             gaps=tuple(Gap(start_ns=start, end_ns=end) for start, end in sorted(gaps)),
         )
+
+    def _jitter_ns(self, gap_bucket: int) -> int | None:
+        """Return the standard deviation of the intervals below a bucket, in ns; None with fewer than two."""
+        count = int(self._intervals[:gap_bucket].sum())
+        if count < 2:  # noqa: PLR2004 - one interval does not vary
+            return None
+        mean, mean_square = self._sums[:, :gap_bucket].sum(axis=1) / count
+        return round(math.sqrt(max(mean_square - mean * mean, 0.0)))
 
     def _median_and_gap_bucket(self) -> tuple[int | None, int]:
         """Return the median interval in ns, within 13 %, and the first bucket of intervals that are gaps."""

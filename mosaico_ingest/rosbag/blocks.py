@@ -173,6 +173,10 @@ class UnreadableRange(Struct, frozen=True):
     """Number of unreadable messages; None if unknown, 0 if all messages could be read in an alternative way."""
     file: str = ""
     """Path of the file; `Recording` fills it in."""
+    start_ns: int | None = None
+    """First log time of the range according to its index; None if unknown."""
+    end_ns: int | None = None
+    """Last log time of the range according to its index, inclusive; None if unknown."""
 
 
 class ReadRequest(Struct, frozen=True):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from mosaico_ingest.cli.options import write_output
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.findings import Finding, Severity, Stage
-from mosaico_ingest.report.collect import Collector
+from mosaico_ingest.report.collect import MAX_STRETCHES, Collector
 from mosaico_ingest.report.events import (
     Expected,
     Noted,
@@ -54,6 +54,30 @@ def test_collector_sums_every_increment(steps: list[tuple[int, int, str]]) -> No
     assert topic.rejected == sum(lost for _, lost, _ in steps) == collector.rejected
     assert topic.read == topic.written + topic.rejected
     assert len(topic.rejections) <= 2
+
+
+@given(st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 100)), min_size=1, max_size=400))
+def test_collector_stretches_cover_all_rejected_times_and_are_limited(spans: list[tuple[int, int]]) -> None:
+    collector = started()
+    for start, length in spans:
+        event = Rejected(IMU.target, Stage.ADAPT, "nan", 1, "nan", start, 7, last_log_time_ns=start + length)
+        collector(event)
+    (rejection,) = collector.report().topics[0].rejections
+    covered = [(each.start_ns, each.end_ns) for each in rejection.stretches]
+    assert len(covered) <= MAX_STRETCHES
+    assert covered == sorted(covered)
+    assert min(start for start, _ in spans) == covered[0][0]
+    assert max(start + length for start, length in spans) == max(end for _, end in covered)
+    if len(spans) <= MAX_STRETCHES:
+        assert covered == sorted((start, start + length) for start, length in spans)
+    for start, length in spans:
+        assert any(low <= start and start + length <= high for low, high in covered)
+
+
+def test_collector_rejection_without_last_time_has_no_stretch() -> None:
+    collector = started()
+    collector(rejected("nan", 1))
+    assert collector.report().topics[0].rejections[0].stretches == ()
 
 
 def test_collector_rejection_keeps_first_reason() -> None:

@@ -80,3 +80,16 @@ def test_timeline_many_gaps_lists_the_longest() -> None:
     assert len(report.gaps) == MAX_GAPS
     assert min(gap.end_ns - gap.start_ns for gap in report.gaps) >= 1.49e9
     assert gap_seconds(report) == sorted(gap_seconds(report))
+
+
+@pytest.mark.parametrize("batch_rows", [7, 10_000])
+def test_timeline_jitter_is_the_standard_deviation_of_intervals_without_gaps(batch_rows: int) -> None:
+    intervals = np.random.default_rng(7).normal(0.1, 0.005, 5000)
+    seconds = np.cumsum(np.insert(intervals, 2500, 60.0))
+    report = report_of(seconds, batch_rows)
+    assert report.gap_count == 1
+    assert report.jitter_ns == pytest.approx(np.std(intervals) * 1e9, rel=0.01)
+
+
+def test_timeline_of_one_interval_has_no_jitter() -> None:
+    assert report_of([0, 1]).jitter_ns is None

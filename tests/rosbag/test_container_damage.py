@@ -8,6 +8,7 @@ import struct
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import zstandard
 from hypothesis import HealthCheck, given, settings
@@ -261,3 +262,26 @@ def test_walk_zeroed_range_resumes_at_next_chunk(tmp_path: Path, recordings: Any
         assert len(set(found) - set(messages)) <= altered
         assert len(messages) - 120 <= len(found) < len(messages)
         assert recording.unreadable
+
+
+@pytest.mark.parametrize("kind", ["mcap", "ros1 lz4"])
+def test_unreadable_chunk_has_the_time_range_of_its_messages(
+    tmp_path: Path, recordings: Any, kind: str
+) -> None:
+    file = tmp_path / "damaged"
+    if kind == "mcap":
+        recordings.mcap(file, recordings.sent(60), chunk_messages=20)
+    else:
+        recordings.ros1(file, recordings.sent(60, cdr=False), compression="lz4")
+    content = bytearray(file.read_bytes())
+    start = len(content) // 3 if kind == "mcap" else content.find(b"op=\x05") + 200
+    content[start : start + 16] = bytes(byte ^ 0xFF for byte in content[start : start + 16])
+    with open_recording(file, resolve=recordings.blind) as recording:
+        log_times = np.concatenate([block.log_times for block in recording.message_blocks()])
+    file.write_bytes(content)
+    with open_recording(file, resolve=recordings.blind) as recording:
+        readable = [block.log_times for block in recording.message_blocks()]
+        unreadable = [item for item in recording.unreadable if item.count != 0]
+    missing = np.setdiff1d(log_times, np.concatenate(readable) if readable else [])
+    assert unreadable
+    assert {(item.start_ns, item.end_ns) for item in unreadable} == {(missing.min(), missing.max())}

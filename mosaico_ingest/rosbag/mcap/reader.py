@@ -15,6 +15,7 @@ from operator import itemgetter
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from mosaico_ingest.errors import BagError
@@ -259,15 +260,16 @@ def _unreadable_chunk(
 ) -> Iterator[UnreadableRange]:
     """Yield the unreadable range of a chunk, per channel and with counts if its indexes are readable."""
     reason = f"broken chunk: {err.what}"
+    unreadable = UnreadableRange(extent.offset, reason, start_ns=extent.start_ns, end_ns=extent.end_ns)
     if not extent.indexes:
-        yield UnreadableRange(extent.offset, reason)
+        yield unreadable
     for key, offset in extent.index_offsets():
         if key in request.connections:
             try:
                 count: int | None = len(_index_entries(raw, extent, key, offset)) // _INDEX_ENTRY.itemsize
             except BagError:
                 count = None
-            yield UnreadableRange(extent.offset, reason, connection=key, count=count)
+            yield replace(unreadable, connection=key, count=count)
 
 
 def _index_entries(raw: memoryview, extent: Extent, key: int, offset: int) -> memoryview:

@@ -225,7 +225,14 @@ def _unreadable_chunk(extent: Extent, request: ReadRequest, err: BagError) -> It
     """Yield the unreadable range of a chunk for each requested connection, with its count."""
     reason = f"broken chunk: {err.what}"
     for key in extent.counts.keys() & request.connections:
-        yield UnreadableRange(extent.offset, reason, connection=key, count=extent.counts[key])
+        yield UnreadableRange(
+            extent.offset,
+            reason,
+            connection=key,
+            count=extent.counts[key],
+            start_ns=extent.start_ns,
+            end_ns=extent.end_ns,
+        )
 
 
 def _add_indexed(chunks: Sequence[_Chunk], request: ReadRequest, result: ReadResult) -> None:
