@@ -101,7 +101,7 @@ def check(column: ColumnStatistics, rows: list[dict[str, Any]]) -> None:
     if column.is_time or not finite:
         assert column.mean is None, column
     else:
-        assert column.mean == pytest.approx(statistics.fmean(finite), abs=1e-9), column
+        assert column.mean == pytest.approx(statistics.fmean(finite), rel=1e-9, abs=1e-9), column
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40)
