@@ -248,3 +248,20 @@ def test_ros_specific_models_have_their_fields() -> None:
     )
     assert {"height", "width", "fields", "is_bigendian", "data"} <= PointCloud2.model_fields.keys()
     assert {"name", "offset", "datatype", "count"} == PointField.model_fields.keys()
+
+
+def test_custom_msgs_of_a_run_take_precedence_and_affect_no_other_run(project: Path) -> None:
+    path = write_recording(project / "drive.db3", StoragePlugin.SQLITE3)
+    other = project / "other" / "SystemHeartbeat.msg"
+    other.parent.mkdir()
+    other.write_text("uint16 low\nuint16 high\n")
+    ROSTypeRegistry.register("common_msgs/msg/SystemHeartbeat", project / "definitions/Heartbeat.msg")
+    columns: dict[str, list[str]] = {}
+    for name, custom in (("own", [("common_msgs", other.parent, None)]), ("shared", None)):
+        config = ROSInjectionConfig(
+            path, name, topics="/heartbeat", ros_distro="ros2_humble", custom_msgs=custom
+        )
+        RosbagInjector(config).run()
+        rows = Store.open(Path("mosaico")).scan(name, "/heartbeat").read_all()
+        columns[name] = rows.column_names[1:]
+    assert columns == {"own": ["low", "high"], "shared": ["beat"]}
