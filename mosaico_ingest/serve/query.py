@@ -150,15 +150,13 @@ class Glob(Struct, frozen=True):
 
 
 class Like(Struct, frozen=True):
-    """`LIKE '%pattern%'` of SQL, ignoring case: `%` matches any text, and `_` matches one character."""
+    """`LIKE '%pattern%'` of SQL: `%` matches any text, and `_` matches one character."""
 
     pattern: str
 
     def holds(self, value: Any) -> bool:  # noqa: ANN401 - see Test
-        """Return whether the value is a string that contains the pattern, ignoring case."""
-        return (
-            isinstance(value, str) and _like_regex(self.pattern.lower()).fullmatch(value.lower()) is not None
-        )
+        """Return whether the value is a string that contains the pattern."""
+        return isinstance(value, str) and _like_regex(self.pattern).fullmatch(value) is not None
 
     def may_hold(self, low: Any, high: Any) -> bool:  # noqa: ANN401, ARG002 - see Test
         """Return True, because the bounds of a range do not exclude a match."""
@@ -166,7 +164,7 @@ class Like(Struct, frozen=True):
 
     def column(self, column: pc.Expression, kind: pa.DataType) -> pc.Expression:  # noqa: ARG002 - text only
         """Return the match as an expression."""
-        return pc.match_like(column, f"%{self.pattern}%", ignore_case=True)
+        return pc.match_like(column, f"%{self.pattern}%")
 
 
 @lru_cache(maxsize=256)
@@ -375,11 +373,12 @@ def _sequence_values(sequence: SequenceInfo) -> dict[str, tuple[object, ...]]:
 
 
 def _topic_values(topic: TopicInfo) -> dict[str, tuple[object, ...]]:
-    """Return the values of a topic's fields; its name has three accepted spellings."""
+    """Return the values of a topic's fields; clients write its name and its locator in three spellings."""
     bare = topic.name.removeprefix("/")
+    spellings = (topic.name, bare, messages.topic_locator(topic.sequence, bare))
     return {
-        "name": (topic.name, bare, messages.topic_locator(topic.sequence, bare)),
-        "locator": (messages.topic_locator(topic.sequence, bare),),
+        "name": spellings,
+        "locator": spellings,
         "created_at_ns": (topic.created_ns,),
         "ontology_tag": (topic.ontology.tag,),
         "serialization_format": (topic.ontology.serialization_format.value,),

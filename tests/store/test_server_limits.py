@@ -161,7 +161,8 @@ def test_query_by_locator_matches_as_sql_like(client: Client, rows: Rows) -> Non
         return [item["sequence"] for item in client.call("query", **question)["items"]]
 
     assert names(sequence={"locator": {"$eq": "drive_1"}}) == ["drive_1"]
-    assert names(sequence={"locator": {"$match": "DRIVE"}}) == ["drive_1", "drive_2"]
+    assert names(sequence={"locator": {"$match": "riv"}}) == ["drive_1", "drive_2"]
+    assert names(sequence={"locator": {"$match": "DRIVE"}}) == []
     assert names(sequence={"locator": {"$match": "dr%_2"}}) == ["drive_2"]
     assert names(sequence={"locator": {"$match": "*"}}) == []
     assert names(topic={"locator": {"$eq": "drive_2/front/imu"}}) == ["drive_2"]
