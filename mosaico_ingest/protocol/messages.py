@@ -204,7 +204,7 @@ class QueryResult(Body):
 
 
 class TimeBounds(Body):
-    """The first and the last timestamp of a time range, both inclusive."""
+    """A time range. The end of a cluster is its last timestamp; the end of a condition is excluded."""
 
     start_ns: int
     end_ns: int
@@ -215,15 +215,17 @@ class Clusterize(Body):
 
     locator: str
     clustering_dt_ns: int = Field(default=0, ge=0)
-    """Gaps of at least this length separate clusters; 0 returns one cluster."""
+    """Gaps longer than this separate clusters; 0 returns one cluster."""
     ontology: dict[str, Any] = Field(default_factory=dict[str, Any])
+    """Conditions, at least one."""
     timestamp_range: TimeBounds | None = None
 
 
 class Intersect(Body):
     """The times at which every topic has a cluster."""
 
-    topics: list[Clusterize] = Field(min_length=1)
+    topics: list[Clusterize] = Field(min_length=2)
+    """Topics of one sequence."""
     intersect_dt_ns: int = Field(default=0, ge=0)
     """Clusters at most this far apart count as overlapping."""
 

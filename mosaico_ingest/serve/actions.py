@@ -136,12 +136,19 @@ def _clusterize(backend: Backend, question: messages.Clusterize) -> Iterator[mes
 
 def _intersect(backend: Backend, question: messages.Intersect) -> Iterator[messages.Cluster]:
     deadline = Deadline(backend.request_s)
+    if len({_topic(topic.locator)[0] for topic in question.topics}) > 1:
+        raise Refusal(
+            Condition.INVALID, "the topics belong to several sequences; choose topics of one sequence"
+        )
     clusters = [_clusters(backend, topic, deadline) for topic in question.topics]
     return _numbered(intersect(clusters, question.intersect_dt_ns))
 
 
 def _clusters(backend: Backend, question: messages.Clusterize, deadline: Deadline) -> list[Range]:
     topic = backend.store.topic(*_topic(question.locator))
+    if not question.ontology:
+        text = f"{question.locator}: the filter has no condition; add one, such as {topic.ontology.tag}.timestamp_ns"
+        raise Refusal(Condition.INVALID, text)
     times = query.matching_times(backend.store, topic, question.ontology, question.timestamp_range, deadline)
     return clusterize(times, question.clustering_dt_ns)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -13,35 +13,32 @@ Range: TypeAlias = tuple[int, int]
 
 
 def clusterize(times: NDArray[np.int64], gap_ns: int) -> list[Range]:
-    """Return the ranges of sorted timestamps that gaps of at least `gap_ns` separate; 0 returns one range."""
+    """Return the ranges of sorted timestamps that gaps longer than `gap_ns` separate; 0 returns one range."""
     if not len(times):
         return []
-    ends = np.flatnonzero(np.diff(times) >= gap_ns) if gap_ns else np.array([], np.int64)
+    ends = np.flatnonzero(np.diff(times) > gap_ns) if gap_ns else np.array([], np.int64)
     starts = times[np.append(0, ends + 1)]
     return list(zip(starts.tolist(), times[np.append(ends, len(times) - 1)].tolist(), strict=True))
 
 
-def intersect(clusters: Sequence[Sequence[Range]], tolerance_ns: int) -> list[Range]:
-    """Return the ranges in which every topic has a cluster.
+def intersect(clusters: Sequence[Sequence[Range]], tolerance_ns: int) -> Iterator[Range]:
+    """Yield the ranges in which every topic has a cluster, as the platform's server computes them.
 
-    Clusters that do not overlap but are at most `tolerance_ns` apart yield the range between them.
+    The walk compares one cluster per topic and then advances the topic whose cluster ends first. Clusters that do not
+    overlap but are at most `tolerance_ns` apart yield their distance, widened by half the tolerance on each side.
     """
-    common = list(clusters[0])
-    for others in clusters[1:]:
-        common = _intersect(common, others, tolerance_ns)
-    return common
-
-
-def _intersect(first: Sequence[Range], second: Sequence[Range], tolerance_ns: int) -> list[Range]:
-    """Return the sorted intersections of two sorted lists of ranges."""
-    ranges: set[Range] = set()
-    start = 0
-    for low, high in first:
-        while start < len(second) and second[start][1] + tolerance_ns < low:
-            start += 1
-        for other_low, other_high in second[start:]:
-            if other_low - tolerance_ns > high:
-                break
-            bounds = (max(low, other_low), min(high, other_high))
-            ranges.add((min(bounds), max(bounds)))
-    return sorted(ranges)
+    if not all(clusters):
+        return
+    positions = [0] * len(clusters)
+    before_ns, after_ns = tolerance_ns // 2, tolerance_ns - tolerance_ns // 2
+    while True:
+        current = [ranges[position] for ranges, position in zip(clusters, positions, strict=True)]
+        first_end, topic = min((end, topic) for topic, (_, end) in enumerate(current))
+        last_start = max(start for start, _ in current)
+        if last_start <= first_end:
+            yield last_start, first_end
+        elif last_start <= first_end + tolerance_ns:
+            yield last_start - before_ns, first_end + after_ns
+        positions[topic] += 1
+        if positions[topic] == len(clusters[topic]):
+            return

@@ -8,6 +8,8 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
+import time
+from collections import defaultdict, deque
 from collections.abc import Mapping
 from datetime import datetime, timezone
 from pathlib import Path
@@ -167,38 +169,70 @@ def _hash(key: str) -> str:
 
 
 class _Granted(fl.ServerMiddleware):
-    """The permission of the caller."""
+    """The permission of the caller, and the times at which GetSchema calls of its key were refused."""
 
-    def __init__(self, permission: Permission) -> None:
+    def __init__(self, permission: Permission, refused_schemas: deque[float]) -> None:
         super().__init__()
         self.permission = permission
+        self.refused_schemas = refused_schemas
+
+
+MAX_REFUSED_SCHEMAS = 500
+"""Number of refused GetSchema calls per key and hour. Flight leaks about 1.7 kB for each of them."""
+_HOUR_S = 3600.0
 
 
 class KeyCheck(fl.ServerMiddlewareFactory):
-    """The check that accepts calls with a key of the key ring; without a key ring, every call has every permission."""
+    """The check that accepts calls with a key of the key ring; without a key ring, every call has every permission.
+
+    It also refuses the GetSchema calls of a key that has had too many refused: only an error of this check costs no
+    memory.
+    """
 
     def __init__(self, keyring: Keyring | None) -> None:
         super().__init__()
         self._keyring = keyring
+        self._refused_schemas: defaultdict[str, deque[float]] = defaultdict(
+            lambda: deque[float](maxlen=MAX_REFUSED_SCHEMAS)
+        )
 
     def start_call(  # pyright: ignore[reportIncompatibleMethodOverride] - a list may contain text and bytes
-        self,
-        info: fl.CallInfo,  # noqa: ARG002 - Flight's signature
-        headers: Mapping[str, list[str | bytes]],
+        self, info: fl.CallInfo, headers: Mapping[str, list[str | bytes]]
     ) -> _Granted:
         """Return the permission of the key in the headers, or refuse the call."""
+        key = self._key_of(headers)
+        permission = Permission.MANAGE if self._keyring is None else self._permission_of(self._keyring, key)
+        refused = self._refused_schemas[key]
+        is_full = len(refused) == refused.maxlen and time.monotonic() - refused[0] < _HOUR_S
+        if is_full and info.method is fl.FlightMethod.GET_SCHEMA:
+            raise as_flight_error(
+                Condition.UNAVAILABLE, f"{len(refused)} calls of GetSchema were refused within an hour"
+            )
+        return _Granted(permission, refused)
+
+    def _key_of(self, headers: Mapping[str, list[str | bytes]]) -> str:
+        """Return the key in the headers, or an empty text if the server has no keys."""
         if self._keyring is None:
-            return _Granted(Permission.MANAGE)
+            return ""
         values = headers.get(API_KEY_HEADER)
         if not values:
             raise as_flight_error(Condition.UNAUTHENTICATED, "this server requires an API key")
-        key = values[0].decode("ascii", "replace") if isinstance(values[0], bytes) else values[0]
+        return values[0].decode("ascii", "replace") if isinstance(values[0], bytes) else values[0]
+
+    def _permission_of(self, keyring: Keyring, key: str) -> Permission:
         try:
-            return _Granted(self._keyring.permission_of(key))
+            return keyring.permission_of(key)
         except PermissionError as err:
             raise as_flight_error(Condition.UNAUTHENTICATED, str(err)) from None
         except SinkError as err:
             raise as_flight_error(Condition.UNAVAILABLE, err.what) from None
+
+
+def count_refused_schema(context: fl.ServerCallContext) -> None:
+    """Count a refused GetSchema call of the caller's key."""
+    granted = context.get_middleware(MIDDLEWARE)
+    if isinstance(granted, _Granted):
+        granted.refused_schemas.append(time.monotonic())
 
 
 def require(context: fl.ServerCallContext, needed: Permission) -> None:

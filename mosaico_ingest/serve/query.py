@@ -466,7 +466,7 @@ def matching_times(
     tests: list[tuple[str, Test]] = list(groups.get(topic.ontology.tag, ()))
     if bounds is not None:
         time = topic.schema.names[0]
-        tests += [(time, Comparison("$geq", bounds.start_ns)), (time, Comparison("$leq", bounds.end_ns))]
+        tests += [(time, Comparison("$geq", bounds.start_ns)), (time, Comparison("$lt", bounds.end_ns))]
     batches = list(_matching_batches(store, topic, tests, deadline))
     return np.sort(np.concatenate(batches)) if batches else np.array([], np.int64)
 

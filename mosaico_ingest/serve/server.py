@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
 
@@ -15,13 +15,13 @@ from typing_extensions import Self
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.protocol import messages
-from mosaico_ingest.protocol.errors import Condition
+from mosaico_ingest.protocol.errors import Condition, as_flight_error
 from mosaico_ingest.protocol.messages import ACTIONS, JSON, Body, Permission
 from mosaico_ingest.remote import RemotePath, as_path
 from mosaico_ingest.serve.actions import HANDLERS, Backend
 from mosaico_ingest.serve.errors import Refusal, translate_errors
 from mosaico_ingest.serve.flights import Flights
-from mosaico_ingest.serve.keys import MIDDLEWARE, KeyCheck, Keyring, require
+from mosaico_ingest.serve.keys import MIDDLEWARE, KeyCheck, Keyring, count_refused_schema, require
 from mosaico_ingest.serve.uploads import Uploads
 
 
@@ -75,10 +75,18 @@ class Service(fl.FlightServerBase):
     def get_schema(  # pyright: ignore[reportIncompatibleMethodOverride] - Flight requires a SchemaResult
         self, context: fl.ServerCallContext, descriptor: fl.FlightDescriptor
     ) -> fl.SchemaResult:
-        """Return the schema of a topic."""
-        with translate_errors():
-            require(context, Permission.READ)
-            return fl.SchemaResult(self._flights.schema(descriptor))
+        """Return the schema of a topic.
+
+        Flight has no statuses for this call: it sends the exception with its traceback, and never frees it.
+        """
+        try:
+            with translate_errors():
+                require(context, Permission.READ)
+                return fl.SchemaResult(self._flights.schema(descriptor))
+        except fl.FlightError as error:
+            count_refused_schema(context)
+            refusal = error.with_traceback(None)
+        raise refusal
 
     def do_get(self, context: fl.ServerCallContext, ticket: fl.Ticket) -> fl.FlightDataStream:
         """Stream the rows of a topic."""
@@ -114,6 +122,24 @@ class Service(fl.FlightServerBase):
             if isinstance(response, Body):
                 return iter([JSON.encode_answer(definition, response)])
             return iter([JSON.encode_answer(definition, body) + b"\n" for body in response])
+
+    def list_actions(self, context: fl.ServerCallContext) -> Iterable[fl.ActionType]:  # noqa: ARG002 - Flight's signature
+        """Refuse the call, as the platform's server does; Flight's own refusal sends a traceback and leaks."""
+        raise as_flight_error(Condition.UNIMPLEMENTED, "ListActions is not implemented")
+
+    def do_exchange(
+        self,
+        context: fl.ServerCallContext,  # noqa: ARG002 - Flight's signature
+        descriptor: fl.FlightDescriptor,  # noqa: ARG002 - Flight's signature
+        reader: fl.MetadataRecordBatchReader,  # noqa: ARG002 - Flight's signature
+        writer: fl.MetadataRecordBatchWriter,  # noqa: ARG002 - Flight's signature
+    ) -> None:
+        """Refuse the call; see `list_actions`."""
+        raise as_flight_error(Condition.UNIMPLEMENTED, "DoExchange is not implemented")
+
+
+# the traceback that Flight sends names no path of this machine
+Service.get_schema.__code__ = Service.get_schema.__code__.replace(co_filename="mosaico_ingest")
 
 
 def _with_translated_errors(batches: Iterator[pa.RecordBatch]) -> Generator[pa.RecordBatch, None, None]:

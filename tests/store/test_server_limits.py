@@ -26,6 +26,7 @@ from mosaico_ingest.protocol.messages import Permission
 from mosaico_ingest.serve import Keyring, Server, query, serve
 from mosaico_ingest.serve.clusters import clusterize, intersect
 from mosaico_ingest.serve.errors import Deadline, Refusal
+from mosaico_ingest.serve.keys import MAX_REFUSED_SCHEMAS
 from mosaico_ingest.serve.query import Glob, run
 from mosaico_ingest.serve.uploads import Uploads
 
@@ -91,26 +92,67 @@ def _query() -> Any:
     return Query()
 
 
-def test_refused_requests_leak_no_memory_and_no_paths(client: Client) -> None:
-    def refuse(count: int) -> str:
-        text = ""
-        for _ in range(count):
-            try:
-                client.info("nowhere")
-            except fl.FlightError as error:  # noqa: PERF203 - every request is refused
-                text = str(error)
-        return text
+def list_actions(client: Client) -> None:
+    client.flight.list_actions(client.options)
 
+
+def exchange(client: Client) -> None:
+    _, reader = client.flight.do_exchange(fl.FlightDescriptor.for_command(b"{}"), client.options)
+    reader.read_all()
+
+
+def describe_missing(client: Client) -> None:
+    client.info("nowhere")
+
+
+def schema_of_missing(client: Client) -> None:
+    client.flight.get_schema(fl.FlightDescriptor.for_command(b'{"resource_locator": "nowhere/x"}'))
+
+
+def refusal(client: Client, call: Callable[[Client], None], count: int) -> str:
+    """Repeat a call that is refused, and return the last message."""
+    text = ""
+    for _ in range(count):
+        try:
+            call(client)
+        except (pa.ArrowException, OSError) as error:  # noqa: PERF203 - every request is refused
+            text = str(error)
+    return text
+
+
+@pytest.mark.parametrize("call", [describe_missing, schema_of_missing, list_actions, exchange])
+def test_refused_requests_leak_no_memory_and_no_paths(
+    call: Callable[[Client], None], client: Client, capfd: pytest.CaptureFixture[str]
+) -> None:
     def resident_bytes() -> int:
         gc.collect()
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
-    text = refuse(300)
+    text = refusal(client, call, MAX_REFUSED_SCHEMAS + 100)
     before = resident_bytes()
-    refuse(2000)
-    assert (resident_bytes() - before) / 2000 < 500
+    text += refusal(client, call, 2000)
+    assert (resident_bytes() - before) / 2000 < 300
     assert "Traceback" not in text
     assert "/" not in text.partition("gRPC")[0]
+    capfd.readouterr()  # Arrow prints a warning for each exchange
+
+
+def test_refused_schema_names_no_path_and_is_limited_per_key(tmp_path: Path) -> None:
+    keyring = Keyring(tmp_path / "keys.json")
+    keys = [keyring.add(Permission.READ) for _ in range(2)]
+    with serve(tmp_path / "served", port=0, keys=keyring) as running:
+        texts: list[str] = []
+        for key, count in zip(keys, (MAX_REFUSED_SCHEMAS + 1, 1), strict=True):
+            with Client(running, key) as client:
+
+                def call(client: Client = client) -> None:
+                    command = fl.FlightDescriptor.for_command(b'{"resource_locator": "nowhere/x"}')
+                    client.flight.get_schema(command, client.options)
+
+                texts.append(refusal(client, lambda _: call(), count))
+    assert "GetSchema" in texts[0]
+    assert texts[1].startswith("Unknown error: NOT_FOUND")
+    assert str(Path(__file__).parents[2]) not in texts[1]
 
 
 @pytest.mark.parametrize("condition", list(Condition))
@@ -178,38 +220,81 @@ def test_topics_of_open_sessions_are_listed(client: Client) -> None:
     assert [(each["resource_locator"], each["locked"]) for each in endpoints] == [("drive/imu", False)]
 
 
+ANY: dict[str, Any] = {"Sample.timestamp_ns": {"$geq": 0}}
+
+
 def test_clusterize_groups_matching_rows_by_gaps(client: Client, rows: Rows) -> None:
     client.call("sequence_create", locator="drive", user_metadata={})
     client.upload("drive", "/imu", rows([1, 2, 3, 10, 11, 30]))
-    question = {"locator": "drive/imu", "ontology": {}}
+    question = {"locator": "drive/imu", "ontology": ANY}
     assert spans(stream(client, "topic_filter_clusterize", **question)) == [(1, 30)]
-    grouped = stream(client, "topic_filter_clusterize", **question, clustering_dt_ns=7)
+    assert spans(stream(client, "topic_filter_clusterize", **question, clustering_dt_ns=7)) == [
+        (1, 11),
+        (30, 30),
+    ]
+    grouped = stream(client, "topic_filter_clusterize", **question, clustering_dt_ns=6)
     assert spans(grouped) == [(1, 3), (10, 11), (30, 30)]
     assert [each["id"] for each in grouped] == [0, 1, 2]
-    bounds = {"start_ns": 2, "end_ns": 10}
-    within = stream(client, "topic_filter_clusterize", **question, clustering_dt_ns=7, timestamp_range=bounds)
+    bounds = {"start_ns": 2, "end_ns": 11}
+    within = stream(client, "topic_filter_clusterize", **question, clustering_dt_ns=6, timestamp_range=bounds)
     assert spans(within) == [(2, 3), (10, 10)]
     matching = {"locator": "drive/imu", "ontology": {"Sample.timestamp_ns": {"$gt": 100}}}
     assert stream(client, "topic_filter_clusterize", **matching) == []
+
+
+@pytest.mark.parametrize("ontology", [{"Other.x": {"$gt": 1}}, {}])
+def test_clusterize_without_condition_on_its_topic_is_refused(
+    ontology: dict[str, Any], client: Client, rows: Rows
+) -> None:
+    client.call("sequence_create", locator="drive", user_metadata={})
+    client.upload("drive", "/imu", rows([1]))
     with refused(Condition.INVALID):
-        stream(client, "topic_filter_clusterize", locator="drive/imu", ontology={"Other.x": {"$gt": 1}})
+        stream(client, "topic_filter_clusterize", locator="drive/imu", ontology=ontology)
 
 
 def test_intersect_returns_common_times_of_topics(client: Client, rows: Rows) -> None:
     client.call("sequence_create", locator="drive", user_metadata={})
     client.upload("drive", "/a", rows([1, 2, 3, 20, 21]))
-    client.upload("drive", "/b", rows([2, 4, 23]))
-    topics = [{"locator": f"drive/{name}", "clustering_dt_ns": 5} for name in "ab"]
+    client.upload("drive", "/b", rows([2, 4, 24]))
+    topics = [{"locator": f"drive/{name}", "clustering_dt_ns": 5, "ontology": ANY} for name in "ab"]
     assert spans(stream(client, "topic_filter_intersect", topics=topics)) == [(2, 3)]
-    assert spans(stream(client, "topic_filter_intersect", topics=topics, intersect_dt_ns=2)) == [
+    assert spans(stream(client, "topic_filter_intersect", topics=topics, intersect_dt_ns=3)) == [
         (2, 3),
-        (21, 23),
+        (23, 23),
     ]
+
+
+@pytest.mark.parametrize("locators", [["drive/a"], ["drive/a", "other/a"]])
+def test_intersect_of_one_topic_or_of_two_sequences_is_refused(
+    locators: list[str], client: Client, rows: Rows
+) -> None:
+    for sequence in ("drive", "other"):
+        client.call("sequence_create", locator=sequence, user_metadata={})
+        client.upload(sequence, "/a", rows([1]))
+    topics = [{"locator": locator, "ontology": ANY} for locator in locators]
+    with refused(Condition.INVALID):
+        stream(client, "topic_filter_intersect", topics=topics)
 
 
 def test_clusterize_and_intersect_of_nothing_are_empty() -> None:
     assert clusterize(np.array([], np.int64), 5) == []
-    assert intersect([[(1, 2)], []], 10) == []
+    assert list(intersect([[(1, 2)], []], 10)) == []
+
+
+@pytest.mark.parametrize(
+    ("clusters", "tolerance_ns", "ranges"),
+    [
+        ([[(100, 110), (500, 510)], [(105, 115), (495, 505)]], 0, [(105, 110), (500, 505)]),
+        ([[(100, 200)], [(120, 180)], [(130, 170)]], 0, [(130, 170)]),
+        ([[(100, 140)], [(155, 200)]], 20, [(145, 150)]),
+        ([[(100, 140)], [(155, 200)]], 15, [(148, 148)]),
+        ([[(100, 140)], [(155, 200)]], 14, []),
+    ],
+)
+def test_intersect_of_clusters_returns_ranges_of_the_platform(
+    clusters: list[list[tuple[int, int]]], tolerance_ns: int, ranges: list[tuple[int, int]]
+) -> None:
+    assert list(intersect(clusters, tolerance_ns)) == ranges
 
 
 def test_key_added_while_serving_is_accepted_and_revoked_key_refused(tmp_path: Path) -> None:
