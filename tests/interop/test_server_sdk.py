@@ -206,6 +206,29 @@ def test_sdk_query_builder_selects_by_name_tag_and_metadata(client: Any) -> None
     assert [item.sequence.name for item in by_key] == ["theirs"]
 
 
+def test_sdk_clusters_and_intersects_topics_of_a_query(served: Server, client: Any) -> None:
+    store = Store.open(served.store_path)
+    rows = {
+        name: store.scan("ours", name).read_all()["timestamp_ns"].to_pylist() for name in ("/imu", "/gps/fix")
+    }
+    high = rows["/imu"][-1] - rows["/imu"][0]
+    found = client.query(
+        QuerySequence().with_name("ours"),
+        QueryOntologyCatalog(IMU.Q.timestamp_ns.geq(0), GPS.Q.timestamp_ns.geq(0)),
+    )
+    topics = {topic.name: topic for item in found for topic in item.topics}
+
+    def spans(clusters: Any) -> list[tuple[int, int]]:
+        return [(cluster.timerange.start, cluster.timerange.end) for cluster in clusters]
+
+    for name in rows:
+        assert spans(topics[name].clusterize()) == [(rows[name][0], rows[name][-1])]
+        assert len(topics[name].clusterize(1)) == len(set(rows[name]))
+        assert spans(topics[name].clusterize(high)) == [(rows[name][0], rows[name][-1])]
+    common = (max(times[0] for times in rows.values()), min(times[-1] for times in rows.values()))
+    assert spans(topics["/imu"].intersect(topics["/gps/fix"])) == [common]
+
+
 def test_sdk_writes_notifications_and_deletes(client: Any) -> None:
     stamp = sdk.Time(seconds=1, nanoseconds=0)
     with client.sequence_create(
