@@ -123,7 +123,7 @@ class Service(fl.FlightServerBase):
                 return iter([JSON.encode_answer(definition, response)])
             return iter([JSON.encode_answer(definition, body) + b"\n" for body in response])
 
-    def list_actions(self, context: fl.ServerCallContext) -> Iterable[fl.ActionType]:  # noqa: ARG002 - Flight's signature
+    def list_actions(self, context: fl.ServerCallContext) -> Iterable[fl.Action]:  # noqa: ARG002 - Flight's signature
         """Refuse the call, as the platform's server does; Flight's own refusal sends a traceback and leaks."""
         raise as_flight_error(Condition.UNIMPLEMENTED, "ListActions is not implemented")
 

@@ -221,10 +221,10 @@ def test_sdk_clusters_and_intersects_topics_of_a_query(served: Server, client: A
     def spans(clusters: Any) -> list[tuple[int, int]]:
         return [(cluster.timerange.start, cluster.timerange.end) for cluster in clusters]
 
-    for name in rows:
-        assert spans(topics[name].clusterize()) == [(rows[name][0], rows[name][-1])]
-        assert len(topics[name].clusterize(1)) == len(set(rows[name]))
-        assert spans(topics[name].clusterize(high)) == [(rows[name][0], rows[name][-1])]
+    for name, times in rows.items():
+        assert spans(topics[name].clusterize()) == [(times[0], times[-1])]
+        assert len(topics[name].clusterize(1)) == len(set(times))
+        assert spans(topics[name].clusterize(high)) == [(times[0], times[-1])]
     common = (max(times[0] for times in rows.values()), min(times[-1] for times in rows.values()))
     assert spans(topics["/imu"].intersect(topics["/gps/fix"])) == [common]
 
