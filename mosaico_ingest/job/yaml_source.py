@@ -1,7 +1,7 @@
 """YAML documents with the span of every value.
 
-PyYAML's events are composed here instead of by `yaml.compose`, because its nodes lose the spans of aliases and merge
-keys, resolve YAML 1.1 scalars such as `no`, and stop at the first error; lint must report every mistake of a file.
+PyYAML's events are composed here instead of by `yaml.compose`, whose nodes lose the spans of aliases and whose errors end
+the reading; lint must report every mistake of a file. CONTRIBUTING.md compares both, and ruamel.yaml.
 """
 
 from __future__ import annotations
@@ -15,12 +15,7 @@ import msgspec
 import yaml
 from msgspec import Struct
 
-from mosaico_ingest.findings import (
-    Edit,
-    Finding,
-    Severity,
-    Span,
-)
+from mosaico_ingest.findings import Edit, Finding, Severity, Span
 
 Scalar = str | int | float | bool | None
 
@@ -186,7 +181,7 @@ class Composer:
     def _node(self, event: yaml.Event, *, depth: int) -> _Node:
         if depth > MAX_DEPTH:
             raise LimitExceeded(
-                self._finding(
+                _finding(
                     "yaml-depth",
                     f"values nest deeper than {MAX_DEPTH} levels",
                     self._span(event),
@@ -211,7 +206,7 @@ class Composer:
         self._nodes += node.size if size is None else size
         if self._nodes > MAX_NODES:
             message = f"more than {MAX_NODES} values, including the values of aliases"
-            raise LimitExceeded(self._finding("yaml-size", message, self._span(event), "use fewer aliases"))
+            raise LimitExceeded(_finding("yaml-size", message, self._span(event), "use fewer aliases"))
         return node
 
     def _anchor(self, name: str, node: _Node, event: yaml.Event) -> None:
@@ -245,7 +240,7 @@ class Composer:
             return _Node(event.value, span)
         value, trap = resolve_plain(event.value)
         if trap is not None:
-            self.findings.append(self._finding(trap.rule, trap.message, span, trap.help))
+            self.findings.append(_finding(trap.rule, trap.message, span, trap.help))
         return _Node(value, span)
 
     def _indicator(self, written: str, span: Span) -> _Node:
@@ -254,7 +249,7 @@ class Composer:
         if "{" in written and written[0] not in _INDICATORS:
             rule, message = "yaml-brace", "an unquoted { starts a YAML mapping here"
         fix = Edit(span, f'"{written}"') if _QUOTABLE.fullmatch(written) else None
-        self.findings.append(self._finding(rule, message, span, f'quote it: "{written}"', fix))
+        self.findings.append(_finding(rule, message, span, f'quote it: "{written}"', fix))
         return _Node(written, span)
 
     def _tag(self, event: yaml.ScalarEvent | yaml.CollectionStartEvent) -> str | None:
@@ -306,13 +301,13 @@ class Composer:
 
     def _is_new_key(self, key: _Node, values: dict[Key, Value], node: _Node) -> bool:
         if isinstance(key.value, list | dict):
-            finding = self._finding("yaml-key", "a key must be one word or number", key.span, "quote it")
+            finding = _finding("yaml-key", "a key must be one word or number", key.span, "quote it")
             self.findings.append(finding)
             return False
         if key.value in values:
             first = node.keys[(key.value,)]
             message = f"duplicate key {key.value!r}, first set in line {first.line}"
-            self.findings.append(self._finding("duplicate-key", message, key.span, "remove one of the two"))
+            self.findings.append(_finding("duplicate-key", message, key.span, "remove one of the two"))
             return False
         return True
 
@@ -325,9 +320,7 @@ class Composer:
         for part in parts:
             if not isinstance(part.value, dict):
                 message = "<< takes a mapping, or a list of them"
-                self.findings.append(
-                    self._finding("yaml-merge", message, part.span, "name an anchor: <<: *base")
-                )
+                self.findings.append(_finding("yaml-merge", message, part.span, "name an anchor: <<: *base"))
                 continue
             for key, value in part.value.items():
                 if key not in values:
@@ -336,12 +329,7 @@ class Composer:
                     values[key] = value
 
     def _report(self, rule: str, message: str, event: yaml.Event, remedy: str) -> None:
-        self.findings.append(self._finding(rule, message, self._span(event), remedy))
-
-    def _finding(
-        self, rule: str, message: str, span: Span, remedy: str | None = None, fix: Edit | None = None
-    ) -> Finding:
-        return Finding(rule, Severity.ERROR, message, span, remedy, fix)
+        self.findings.append(_finding(rule, message, self._span(event), remedy))
 
     def _span(self, event: yaml.Event) -> Span:
         return self._between(event, event)
@@ -556,8 +544,10 @@ class _Reader:
         return [_finding("yaml-syntax", message, _span_at(self._original, index, self._file), remedy)]
 
 
-def _finding(rule: str, message: str, span: Span, remedy: str | None = None) -> Finding:
-    return Finding(rule, Severity.ERROR, message, span, remedy)
+def _finding(
+    rule: str, message: str, span: Span, remedy: str | None = None, fix: Edit | None = None
+) -> Finding:
+    return Finding(rule, Severity.ERROR, message, span, remedy, fix)
 
 
 def _span_at(text: str, index: int, file: str) -> Span:

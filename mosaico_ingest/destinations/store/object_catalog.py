@@ -2,7 +2,8 @@
 
 Object stores have no transactions, but writes of objects are atomic, and listings show all earlier writes. A writer first
 writes its claim on a sequence, then lists the claims: of two writers, at least one sees the other and gives up. The
-holder of the claim reads, changes and writes the document.
+holder of the claim reads, changes and writes the document. Conditional writes would replace the claims, but pyarrow's
+file systems have none; CONTRIBUTING.md compares them with obstore.
 """
 
 from __future__ import annotations
