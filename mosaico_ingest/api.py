@@ -26,12 +26,7 @@ from mosaico_ingest.pipeline.plan import digest_of
 from mosaico_ingest.pipeline.run import make_plan, run_recording
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.remote import AnyPath, as_path
-from mosaico_ingest.report.events import (
-    BatchObserver,
-    Observer,
-    ignore_batch,
-    ignore_events,
-)
+from mosaico_ingest.report.events import BatchObserver, Observer, ignore_batch, ignore_events
 from mosaico_ingest.report.model import Report, RunReport, UsedManifest
 from mosaico_ingest.textfile import read_limited
 from mosaico_ingest.version import __version__
@@ -174,11 +169,7 @@ def inspect_recording(path: AnyPath | str, *, ros_distro: str | None = None) -> 
 
 
 def plan_job(
-    manifest: Path,
-    *,
-    jobs: Sequence[Job] | None = None,
-    folder: Path | None = None,
-    connect: bool = False,
+    manifest: Path, *, jobs: Sequence[Job] | None = None, folder: Path | None = None, connect: bool = False
 ) -> PlanDocument:
     """Return the plan of a manifest with the result of a sample of each topic; write nothing.
 

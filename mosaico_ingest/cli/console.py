@@ -24,11 +24,7 @@ FILE_WIDTH = 240
 """Columns of output that goes to a file or a pipe, where long lines do no harm."""
 EXCERPT_WIDTH = 160
 """Columns of a source line below a finding."""
-SEVERITY_STYLES = {
-    Severity.ERROR: "bold red",
-    Severity.WARNING: "bold yellow",
-    Severity.INFO: "bold cyan",
-}
+SEVERITY_STYLES = {Severity.ERROR: "bold red", Severity.WARNING: "bold yellow", Severity.INFO: "bold cyan"}
 
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
@@ -84,10 +80,7 @@ class PlainTable(Table):
             )
 
     def add_row(
-        self,
-        *renderables: RenderableType | None,
-        style: StyleType | None = None,
-        end_section: bool = False,
+        self, *renderables: RenderableType | None, style: StyleType | None = None, end_section: bool = False
     ) -> None:
         """Add a row; a line break inside a name must not look like a line of our own."""
         cells = (Text(one_line(cell)) if isinstance(cell, str) else cell for cell in renderables)

@@ -136,8 +136,7 @@ def schema(
         typer.Option("--write", metavar="DIR", help="Write NAME.schema.json into DIR, for editors."),
     ] = None,
     check: Annotated[
-        Path | None,
-        typer.Option("--check", metavar="DIR", help="Fail if a schema in DIR is not up to date."),
+        Path | None, typer.Option("--check", metavar="DIR", help="Fail if a schema in DIR is not up to date.")
     ] = None,
 ) -> None:
     """Print, write or check the JSON Schemas (draft 2020-12). --write and --check default to all of them."""

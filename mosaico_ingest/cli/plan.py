@@ -10,12 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
-from mosaico_ingest.cli.console import (
-    PlainTable,
-    Terminal,
-    print_json,
-    print_line,
-)
+from mosaico_ingest.cli.console import PlainTable, Terminal, print_json, print_line
 from mosaico_ingest.cli.options import (
     STANDARD_OUTPUT,
     DistroOption,
@@ -222,10 +217,7 @@ def print_differences(differences: Sequence[Difference]) -> None:
         print_line("the plans are equal", style="green")
 
 
-def expand(
-    manifest: ManifestArgument,
-    as_json: JsonOption = False,
-) -> None:
+def expand(manifest: ManifestArgument, as_json: JsonOption = False) -> None:
     """Print every job of a manifest as a separate manifest, without `extends`, `matrix` and secrets.
 
     Environment variables are not replaced. A comment shows the location of a value from another file.

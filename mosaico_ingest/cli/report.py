@@ -42,11 +42,7 @@ STATUS_STYLES = {
 }
 
 
-def inspect(
-    path: RecordingArgument,
-    ros_distro: DistroOption = None,
-    as_json: JsonOption = False,
-) -> None:
+def inspect(path: RecordingArgument, ros_distro: DistroOption = None, as_json: JsonOption = False) -> None:
     """List a recording's topics with type, count, rate, definition and adapter, without reading messages."""
     from mosaico_ingest import api
     from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas

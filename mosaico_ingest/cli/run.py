@@ -103,8 +103,7 @@ def run(
         ),
     ] = None,
     otel: Annotated[
-        bool,
-        typer.Option("--otel", help="Send metrics and traces, as configured by the OTEL_... variables."),
+        bool, typer.Option("--otel", help="Send metrics and traces, as configured by the OTEL_... variables.")
     ] = False,
     quiet: QuietOption = False,
     log: LogOption = None,

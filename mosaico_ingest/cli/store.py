@@ -47,12 +47,7 @@ def verify(
     infos = [opened.sequence(name) for name in sequences] if sequences else opened.sequences()
     results = {info.name: list(verify_sequence(info)) for info in infos}
     problems = [
-        {
-            "sequence": name,
-            "topic": result.topic,
-            "file": str(result.segment.path),
-            "problem": result.problem,
-        }
+        {"sequence": name, "topic": result.topic, "file": str(result.segment.path), "problem": result.problem}
         for name, checked in results.items()
         for result in checked
         if result.problem is not None
@@ -73,9 +68,7 @@ def verify(
         counts = [f"damaged: {counted(len(problems), 'file')}"] if problems else []
         counts += [f"incomplete: {counted(len(incomplete), 'sequence')}"] if incomplete else []
         raise VerificationError(
-            ", ".join(counts),
-            where=store,
-            hint="ingest their recordings again with if_exists: replace",
+            ", ".join(counts), where=store, hint="ingest their recordings again with if_exists: replace"
         )
     if not as_json:
         total = f"{counted(len(results), 'sequence')}, {counted(rows, 'row')} in {bytes_text(size)}"

@@ -36,12 +36,7 @@ try:
 except ModuleNotFoundError as missing:
     raise IngestError("Ray is not installed", hint="pip install 'mosaico-ingest[ray]'") from missing
 
-from mosaico_ingest.executors.ray_worker import (
-    Mailbox,
-    Setting,
-    ingest,
-    machine,
-)
+from mosaico_ingest.executors.ray_worker import Mailbox, Setting, ingest, machine
 
 _log = logging.getLogger(__name__)
 

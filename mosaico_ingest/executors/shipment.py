@@ -13,14 +13,7 @@ from msgspec import Struct, structs
 
 from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.destinations.registry import destination_of
-from mosaico_ingest.job.fields import (
-    AdapterRef,
-    FilePath,
-    PathRole,
-    marked_fields,
-    replace_values,
-    values_at,
-)
+from mosaico_ingest.job.fields import AdapterRef, FilePath, PathRole, marked_fields, replace_values, values_at
 from mosaico_ingest.job.model import JobSettings
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.remote import is_url

@@ -15,13 +15,7 @@ from msgspec.structs import replace
 from mosaico_ingest.findings import Finding, Severity, Span
 from mosaico_ingest.job.fields import AdapterRef, FilePath, Literally, marked_fields, replace_values
 from mosaico_ingest.job.model import MAX_JOBS, Manifest
-from mosaico_ingest.job.yaml_source import (
-    KeyPath,
-    Scalar,
-    Source,
-    Value,
-    load_source,
-)
+from mosaico_ingest.job.yaml_source import KeyPath, Scalar, Source, Value, load_source
 from mosaico_ingest.remote import is_url
 from mosaico_ingest.textfile import read_limited
 

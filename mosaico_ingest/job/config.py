@@ -12,13 +12,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from mosaico_ingest.errors import ManifestError
-from mosaico_ingest.job.model import (
-    AdapterReference,
-    Job,
-    Origin,
-    QuarantineSettings,
-    TimeRange,
-)
+from mosaico_ingest.job.model import AdapterReference, Job, Origin, QuarantineSettings, TimeRange
 from mosaico_ingest.job.values import (
     DEFAULT_MESSAGE_BYTES,
     DEFAULT_PORT,

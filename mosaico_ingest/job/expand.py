@@ -13,12 +13,7 @@ from msgspec import Struct
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.compose import EXTENDS_KEY, combinations
 from mosaico_ingest.job.fields import Secret, marked_fields
-from mosaico_ingest.job.manifest import (
-    check_manifest,
-    read_manifest,
-    refusal,
-    stand_alone,
-)
+from mosaico_ingest.job.manifest import check_manifest, read_manifest, refusal, stand_alone
 from mosaico_ingest.job.model import Manifest
 from mosaico_ingest.job.yaml_source import KeyPath, Scalar, Source, Value, resolve_plain
 

@@ -19,14 +19,7 @@ from mosaico_ingest.job.compose import Filled, combinations, extended, fill_in, 
 from mosaico_ingest.job.model import Manifest, Origin
 from mosaico_ingest.job.reference import job_schema
 from mosaico_ingest.job.validation import explain
-from mosaico_ingest.job.yaml_source import (
-    KeyPath,
-    Source,
-    Value,
-    load_source,
-    member,
-    resolve_plain,
-)
+from mosaico_ingest.job.yaml_source import KeyPath, Source, Value, load_source, member, resolve_plain
 from mosaico_ingest.remote import AnyPath, is_url, parse_url
 from mosaico_ingest.textfile import read_limited
 

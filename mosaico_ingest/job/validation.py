@@ -13,18 +13,8 @@ from msgspec import Struct
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from mosaico_ingest.findings import (
-    Edit,
-    Finding,
-    Severity,
-    Span,
-)
-from mosaico_ingest.job.yaml_source import (
-    KeyPath,
-    Source,
-    Value,
-    member,
-)
+from mosaico_ingest.findings import Edit, Finding, Severity, Span
+from mosaico_ingest.job.yaml_source import KeyPath, Source, Value, member
 
 _EXPECTED = {
     "string_type": "text",

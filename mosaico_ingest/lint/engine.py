@@ -78,11 +78,7 @@ class LintReport(Struct, frozen=True):
 
 
 def lint_paths(
-    paths: Iterable[Path | str],
-    *,
-    env: Mapping[str, str] | None,
-    fix: bool = False,
-    stdin: str | None = None,
+    paths: Iterable[Path | str], *, env: Mapping[str, str] | None, fix: bool = False, stdin: str | None = None
 ) -> LintReport:
     """Check files and the manifests, adapters and message definitions in folders.
 

@@ -9,13 +9,7 @@ from typing import Any
 from urllib.parse import quote
 from xml.sax.saxutils import escape, quoteattr
 
-from mosaico_ingest.findings import (
-    Edit,
-    Finding,
-    Severity,
-    Span,
-    mask_credentials,
-)
+from mosaico_ingest.findings import Edit, Finding, Severity, Span, mask_credentials
 from mosaico_ingest.lint.engine import LintedFile, LintReport
 from mosaico_ingest.lint.pages import page_of
 from mosaico_ingest.rules import RULES, Rule

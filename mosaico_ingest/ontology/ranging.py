@@ -9,15 +9,7 @@ from typing_extensions import Self
 
 from mosaico_ingest.ontology.geometry import Point3d, Pose, Varying
 from mosaico_ingest.ontology.header import Stamped, Time
-from mosaico_ingest.ontology.model import (
-    Float32,
-    Float64,
-    Int8,
-    Serializable,
-    UInt8,
-    UInt16,
-    UInt32,
-)
+from mosaico_ingest.ontology.model import Float32, Float64, Int8, Serializable, UInt8, UInt16, UInt32
 
 
 class Cloud(Stamped):

@@ -51,10 +51,7 @@ def _check_length(name: str, limit: int, *, kind: str) -> None:
 def _check_characters(name: str, forbidden: re.Match[str] | None, *, kind: str, allowed: str) -> None:
     if forbidden is not None:
         hint = "set sequence.name" if kind == "sequence" else "rename it in topic_settings"
-        raise SinkError(
-            f"{kind} name {name!r} contains {forbidden.group()!r}; allowed: {allowed}",
-            hint=hint,
-        )
+        raise SinkError(f"{kind} name {name!r} contains {forbidden.group()!r}; allowed: {allowed}", hint=hint)
 
 
 def check_metadata(metadata: Mapping[str, Any], *, where: str) -> str:

@@ -5,12 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from mosaico_ingest.findings import one_line
-from mosaico_ingest.report.collect import (
-    STEP_WORDS,
-    longest_step,
-    slowest,
-    total_seconds,
-)
+from mosaico_ingest.report.collect import STEP_WORDS, longest_step, slowest, total_seconds
 from mosaico_ingest.report.model import Report, RunReport, replay_command
 from mosaico_ingest.report.units import bytes_text, count_text, percent_text, seconds_text
 

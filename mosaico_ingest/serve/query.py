@@ -365,11 +365,7 @@ def _by_tag(ontology: Mapping[str, Any]) -> dict[str, Tests]:
 
 
 def _sequence_values(sequence: SequenceInfo) -> dict[str, tuple[object, ...]]:
-    return {
-        "name": (sequence.name,),
-        "locator": (sequence.name,),
-        "created_at_ns": (sequence.created_ns,),
-    }
+    return {"name": (sequence.name,), "locator": (sequence.name,), "created_at_ns": (sequence.created_ns,)}
 
 
 def _topic_values(topic: TopicInfo) -> dict[str, tuple[object, ...]]:

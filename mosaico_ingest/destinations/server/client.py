@@ -19,13 +19,7 @@ import pyarrow.compute as pc
 import pyarrow.flight as fl
 from msgspec import Struct
 
-from mosaico_ingest.destinations.server.errors import (
-    Address,
-    Refused,
-    check_tls,
-    late,
-    reraise,
-)
+from mosaico_ingest.destinations.server.errors import Address, Refused, check_tls, late, reraise
 from mosaico_ingest.errors import SinkError, SinkUnavailable
 from mosaico_ingest.job.values import ServerTarget
 from mosaico_ingest.protocol import messages

@@ -150,10 +150,7 @@ class SequenceDocument(_Part):
     def with_session(self, new: NewSession, *, completed_ns: int) -> SequenceDocument:
         """Return the sequence with the content of a new session."""
         entry = SessionEntry(
-            id=new.id,
-            metadata=json.loads(new.metadata),
-            created_ns=new.created_ns,
-            completed_ns=completed_ns,
+            id=new.id, metadata=json.loads(new.metadata), created_ns=new.created_ns, completed_ns=completed_ns
         )
         topics = {topic.name: topic for topic in self.topics}
         for topic in new.topics:

@@ -4,13 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.lint.job import (
-    Job,
-    adapter_references,
-    find_module,
-    is_mapping_file,
-    python_reference,
-)
+from mosaico_ingest.lint.job import Job, adapter_references, find_module, is_mapping_file, python_reference
 from mosaico_ingest.lint.rule import Check, Problem
 
 
