@@ -28,15 +28,7 @@ from typing_extensions import Self
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.findings import Span
 from mosaico_ingest.job.expect import Expectations
-from mosaico_ingest.job.fields import (
-    AdapterRef,
-    FilePath,
-    Literally,
-    Parsed,
-    PathRole,
-    Secret,
-    TopicGlob,
-)
+from mosaico_ingest.job.fields import AdapterRef, FilePath, Literally, Parsed, PathRole, Secret, TopicGlob
 from mosaico_ingest.job.patterns import first_match, is_glob
 from mosaico_ingest.job.section import Count, MessageLimit, Section, Text, Time, Topic, shape_of
 from mosaico_ingest.job.units import parse_size
@@ -94,9 +86,7 @@ def _matrix_form(value: Any) -> str:  # noqa: ANN401 - any YAML value
 
 VariableName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 VariableValue = Annotated[
-    Any,
-    AfterValidator(_check_variable),
-    WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "integer"}]}),
+    Any, AfterValidator(_check_variable), WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "integer"}]})
 ]
 Matrix = Annotated[
     Annotated[dict[VariableName, Annotated[tuple[VariableValue, ...], Field(min_length=1)]], Tag("axes")]

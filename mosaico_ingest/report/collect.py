@@ -22,14 +22,7 @@ from mosaico_ingest.report.events import (
     TopicStatus,
     Unreadable,
 )
-from mosaico_ingest.report.model import (
-    Rejection,
-    Report,
-    Steps,
-    Stretch,
-    TopicReport,
-    UnreadableRange,
-)
+from mosaico_ingest.report.model import Rejection, Report, Steps, Stretch, TopicReport, UnreadableRange
 from mosaico_ingest.report.timing import Stopwatch
 
 STEP_WORDS = {
