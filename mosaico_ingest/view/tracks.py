@@ -1,0 +1,147 @@
+"""Positions over time: GPS tracks and trajectories of bodies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+from msgspec import Struct
+
+from mosaico_ingest.destinations.store.model import TopicInfo
+from mosaico_ingest.destinations.store.store import Window, scan
+from mosaico_ingest.view.columns import Column, is_number, topic_columns
+
+__all__ = ["Track", "has_track", "local_metres", "read_track"]
+
+_EARTH_M = 6_371_008.8
+"""Mean radius of the Earth in m."""
+_NO_FIX = -1
+_BODIES = (
+    "pose.pose.position.",
+    "pose.position.",
+    "position.",
+    "translation.",
+    "transform.translation.",
+    "point.",
+)
+"""Prefixes of the coordinates of a body."""
+
+
+class Track(Struct, frozen=True):
+    """Positions of one topic in order of time, without rows that have no position."""
+
+    topic: str
+    is_gps: bool
+    times_ns: npt.NDArray[np.int64]
+    positions: npt.NDArray[np.float64]
+    """Of shape (n, 3): x, y, z in m; of a GPS track latitude and longitude in degrees and altitude in m."""
+    frame_id: str
+    """The coordinate frame of the first position, or an empty text."""
+    rows: int
+    """Number of rows with a position, of which `positions` contains some."""
+
+
+class _Source(Struct, frozen=True):
+    axes: tuple[Column, ...]
+    """Two or three coordinates."""
+    status: Column | None
+    frame: Column | None
+    is_gps: bool
+
+
+def has_track(topic: TopicInfo) -> bool:
+    """Return whether the rows of a topic have positions."""
+    return _source(topic) is not None
+
+
+def read_track(topic: TopicInfo, *, max_points: int = 5_000) -> Track | None:
+    """Return at most `max_points` positions at equal distances in the rows, or None if the topic has none.
+
+    Only the columns of the positions are read.
+    """
+    source = _source(topic)
+    if source is None:
+        return None
+    every = max(1, -(-topic.rows // max_points))
+    times: list[npt.NDArray[np.int64]] = []
+    positions: list[npt.NDArray[np.float64]] = []
+    rows, frame_id = 0, ""
+    for batch in _batches(topic, source):
+        coordinates = _coordinates(batch, source)
+        valid = np.isfinite(coordinates[:, :2]).all(axis=1) & _has_fix(batch, source)
+        selected = np.flatnonzero(valid)
+        if len(selected) and not rows and source.frame is not None:
+            frame_id = str(source.frame.values(batch)[int(selected[0])].as_py() or "")
+        chosen = selected[(-rows) % every :: every]
+        rows += len(selected)
+        times.append(batch.column(0).to_numpy()[chosen])
+        positions.append(coordinates[chosen])
+    empty_times, empty_positions = np.empty(0, np.int64), np.empty((0, 3))
+    return Track(
+        topic.name,
+        source.is_gps,
+        np.concatenate([empty_times, *times]),
+        np.concatenate([empty_positions, *positions]),
+        frame_id,
+        rows,
+    )
+
+
+def local_metres(track: Track) -> npt.NDArray[np.float64]:
+    """Return the positions as east and north in m, of shape (n, 2), relative to the first one of a GPS track."""
+    if not track.is_gps or not len(track.positions):
+        return track.positions[:, :2]
+    latitude, longitude = np.radians(track.positions[:, 0]), np.radians(track.positions[:, 1])
+    turn = (longitude - longitude[0] + math.pi) % (2 * math.pi) - math.pi
+    east = turn * math.cos(float(latitude[0])) * _EARTH_M
+    return np.stack([east, (latitude - latitude[0]) * _EARTH_M], axis=1)
+
+
+def _source(topic: TopicInfo) -> _Source | None:
+    columns = {column.path: column for column in topic_columns(topic.schema) if "[]" not in column.path}
+    frame = columns.get("header.frame_id")
+    if topic.ontology.tag == "GPS":
+        names = ("position.x", "position.y", "position.z")
+        return _Source(
+            tuple(columns[name] for name in names), columns.get("status.status"), frame, is_gps=True
+        )
+    for names in (("latitude", "longitude", "altitude"), ("lat", "lon", "alt")):
+        if all(name in columns and is_number(columns[name].type) for name in names[:2]):
+            axes = tuple(columns[name] for name in names if name in columns)
+            return _Source(axes, columns.get("status.status"), frame, is_gps=True)
+    prefixes = (
+        (*_BODIES, "") if {"theta", "yaw"} & set(columns) or topic.ontology.tag == "Point3d" else _BODIES
+    )
+    for prefix in prefixes:
+        axes = tuple(columns[f"{prefix}{axis}"] for axis in "xyz" if f"{prefix}{axis}" in columns)
+        if len(axes) >= 2 and all(is_number(axis.type) for axis in axes):  # noqa: PLR2004 - x and y
+            return _Source(axes, None, frame, is_gps=False)
+    return None
+
+
+def _batches(topic: TopicInfo, source: _Source) -> Iterator[pa.RecordBatch]:
+    used = [
+        *source.axes,
+        *([source.status] if source.status else []),
+        *([source.frame] if source.frame else []),
+    ]
+    names = dict.fromkeys([topic.schema.names[0], *(column.name for column in used)])
+    return scan(topic.segments, pa.schema([topic.schema.field(name) for name in names]), Window())
+
+
+def _coordinates(batch: pa.RecordBatch, source: _Source) -> npt.NDArray[np.float64]:
+    coordinates = np.zeros((batch.num_rows, 3))
+    for at, column in enumerate(source.axes):
+        values = column.values(batch).cast(pa.float64(), safe=False)
+        coordinates[:, at] = values.to_numpy(zero_copy_only=False)
+    return coordinates
+
+
+def _has_fix(batch: pa.RecordBatch, source: _Source) -> npt.NDArray[np.bool_]:
+    if source.status is None or not is_number(source.status.type):
+        return np.ones(batch.num_rows, bool)
+    status = source.status.values(batch).cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
+    return ~(status <= _NO_FIX)
