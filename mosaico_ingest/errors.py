@@ -12,6 +12,7 @@ IngestError
 │   └── SinkUnavailable  the destination does not respond; a retry may help
 ├── Unreachable          a URL does not respond or its content changed; a retry may help  exit code 1
 ├── ViewError            stored data cannot be shown                           exit code 1
+├── ContractError        the recording or its metadata violates a contract    exit code 6
 ├── VerificationError    the stored data differ from the recording             exit code 5
 └── Interrupted          a signal stopped the run                              exit code 130
 """
@@ -25,6 +26,7 @@ from mosaico_ingest.findings import Finding, one_line
 __all__ = [
     "AdapterError",
     "BagError",
+    "ContractError",
     "DecodeError",
     "DefinitionError",
     "IngestError",
@@ -146,6 +148,12 @@ class Unreachable(IngestError):  # noqa: N818 - named after the condition
 
 class ViewError(IngestError):
     """Stored data cannot be shown, such as an image in an unknown encoding."""
+
+
+class ContractError(IngestError):
+    """The recording or its metadata violates a contract of the job. `findings` has one entry per violation."""
+
+    exit_code = 6
 
 
 class VerificationError(IngestError):

@@ -128,6 +128,8 @@ _TABLE = (
     Rule("ING241", "adapter-clash", _ERROR, "two loaded adapters for the same message type"),
     Rule("ING242", "image-setting", _WARNING, "an `image` setting for topics that are not images"),
     Rule("ING243", "expectation-bounds", _ERROR, "an expectation whose bounds are missing or contradictory"),
+    Rule("ING244", "metadata-schema", _ERROR, "metadata that violates its schema"),
+    Rule("ING245", "invalid-schema", _ERROR, "a metadata schema that cannot be used"),
     Rule("ING301", "msg-syntax", _ERROR, "a line of a `.msg` file that is not a declaration"),
     Rule("ING302", "msg-unknown-type", _ERROR, "a field whose type is not defined"),
     Rule("ING303", "msg-repeated-name", _ERROR, "two declarations with the same name"),
@@ -174,6 +176,11 @@ _TABLE = (
     Rule("ING614", "expectation-failed", _ERROR, "a recording that violates its data contract"),
     Rule("ING615", "expectation-skipped", _INFO, "an expectation that cannot be evaluated"),
     Rule("ING616", "expectation-explained", _INFO, "a gap that events of the recorder explain"),
+    Rule(
+        "ING617", "metadata-source", _WARNING, "a source of `metadata_from` that does not match the recording"
+    ),
+    Rule("ING618", "metadata-conflict", _WARNING, "two sources of `metadata_from` that differ"),
+    Rule("ING619", "invalid-sidecar", _ERROR, "a side-car file of `metadata_from` that is not a JSON object"),
     Rule("ING701", "decode", _WARNING, "bytes that do not fit their message type"),
     Rule("ING702", "definition", _WARNING, "a message type without a usable definition"),
     Rule("ING703", "encoding", _WARNING, "a message that is not in a ROS encoding"),

@@ -15,6 +15,7 @@ from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.job.fields import AdapterRef, FilePath, PathRole, marked_fields, replace_values, values_at
 from mosaico_ingest.job.model import JobSettings
+from mosaico_ingest.metadata.schema import schema_files
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.remote import is_url
 from mosaico_ingest.rosbag.definitions.registry import definition_files
@@ -24,7 +25,7 @@ _FILES = "files"
 _HERE = ".here"
 _YAML = frozenset({".yaml", ".yml"})
 _CODE = _YAML | {".py"}
-_SHIPPED = {PathRole.WORKER_FILE, PathRole.DEFINITIONS}
+_SHIPPED = {PathRole.WORKER_FILE, PathRole.DEFINITIONS, PathRole.SCHEMA}
 
 
 def absolute(task: Task) -> Task:
@@ -67,13 +68,19 @@ class _Box(Struct, frozen=True):
                 self._add_adapter(reference, job.folder)
         for field in marked_fields(JobSettings, FilePath):
             if field.marker.role in _SHIPPED:
-                job = replace_values(job, field.path, self._add_input)
+                add = self._add_schema if field.marker.role is PathRole.SCHEMA else self._add_input
+                job = replace_values(job, field.path, add)
         self._add_all([], folder=job.folder)
         return structs.replace(task, job=job, code_dir=_shipped(job.folder))
 
     def _add_input(self, _: object, path: str) -> str:
         """Add a file, or the message definitions of a folder; return its path in the shipment."""
         self._add_all(definition_files(Path(path)) if Path(path).is_dir() else [Path(path)])
+        return str(_shipped(path))
+
+    def _add_schema(self, _: object, path: str) -> str:
+        """Add a JSON Schema with the files that it refers to; return its path in the shipment."""
+        self._add_all(schema_files(Path(path)))
         return str(_shipped(path))
 
     def _add_adapter(self, reference: object, base_dir: Path) -> None:

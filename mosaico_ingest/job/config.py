@@ -127,6 +127,10 @@ class ROSInjectionConfig:
     """Action if a topic's definition differs from that of the family; if omitted, definitions are not compared."""
     message_bytes: int = field(default=DEFAULT_MESSAGE_BYTES, metadata=_key("target.message_size"))
     """Maximum size, in bytes, up to which rows are combined into one upload message to a server."""
+    metadata_from: Mapping[str, Any] | None = field(default=None, metadata=_key("sequence.metadata_from"))
+    """Sources of metadata that the recording fills, with the keys of `sequence.metadata_from`."""
+    metadata_schema: Path | str | None = field(default=None, metadata=_key("sequence.metadata_schema"))
+    """The JSON Schema of the metadata."""
     plugin: PluginTarget | None = None
     """A destination that an installed package provides, instead of `store` and `host`."""
     job: Job = field(init=False, compare=False, repr=False)

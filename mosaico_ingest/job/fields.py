@@ -33,6 +33,8 @@ class PathRole(Enum):
     """A file that is read by the machine that ingests the recording."""
     DEFINITIONS = "definitions"
     """A `.msg` file or a folder of them, read by the machine that ingests the recording."""
+    SCHEMA = "schema"
+    """A JSON Schema, read with the files that it refers to by the machine that ingests the recording."""
     STORE = "store"
     OUTPUT_FILE = "output file"
     OUTPUT_FOLDER = "output folder"

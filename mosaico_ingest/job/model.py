@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from math import prod
@@ -29,6 +30,7 @@ from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.findings import Span
 from mosaico_ingest.job.expect import Expectations
 from mosaico_ingest.job.fields import AdapterRef, FilePath, Literally, Parsed, PathRole, Secret, TopicGlob
+from mosaico_ingest.job.file_names import FileNamePattern
 from mosaico_ingest.job.patterns import first_match, is_glob
 from mosaico_ingest.job.section import Count, MessageLimit, Section, Text, Time, Topic, shape_of
 from mosaico_ingest.job.units import parse_size
@@ -57,6 +59,8 @@ VERSION = 1
 """The newest manifest version that this tool reads."""
 MAX_JOBS = 1000
 """Maximum number of jobs that a matrix may expand to."""
+SIDECAR_PLACEHOLDERS = ("stem", "name", "parent")
+"""The placeholders of `sequence.metadata_from.sidecar`."""
 KeyPath: TypeAlias = "tuple[str | int | float | bool | None, ...]"
 _SIZES = range(1 << 20, (1 << 50) + 1)
 
@@ -84,6 +88,14 @@ def _matrix_form(value: Any) -> str:  # noqa: ANN401 - any YAML value
     return "combinations" if isinstance(value, list | tuple) else "axes"
 
 
+def _check_sidecar(text: str) -> str:
+    unknown = [word for word in re.findall(r"\{([^{}]*)\}", text) if word not in SIDECAR_PLACEHOLDERS]
+    if unknown:
+        names = ", ".join(f"{{{name}}}" for name in SIDECAR_PLACEHOLDERS)
+        raise ValueError(f"unknown placeholder {{{unknown[0]}}}; the placeholders are {names}")
+    return text
+
+
 VariableName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 VariableValue = Annotated[
     Any, AfterValidator(_check_variable), WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "integer"}]})
@@ -105,6 +117,7 @@ RecordingPath = Annotated[Text, FilePath(PathRole.RECORDING)]
 BasePath = Annotated[Text, FilePath(PathRole.BASE)]
 InputPath = Annotated[Text, FilePath(PathRole.INPUT)]
 DefinitionsPath = Annotated[Text, FilePath(PathRole.DEFINITIONS)]
+SchemaPath = Annotated[Text, FilePath(PathRole.SCHEMA)]
 WorkerPath = Annotated[Text, FilePath(PathRole.WORKER_FILE)]
 OutputPath = Annotated[Text, FilePath(PathRole.OUTPUT_FILE)]
 
@@ -149,6 +162,28 @@ class BagSource(Section):
     """Maximum decompressed size of a chunk; larger chunks are unreadable. Defaults to 256MiB."""
 
 
+class MetadataSources(Section):
+    """Sources of metadata that each recording fills on its own, in ascending order of precedence.
+
+    `metadata` and `metadata_file` take precedence over all of them.
+    """
+
+    records: tuple[Text, ...] = Field(default=(), examples=[["vehicle", "drive_*"]])
+    """Names or globs of MCAP metadata records; each entry of a record becomes a key, whose value is text."""
+    custom_data: bool = False
+    """Whether to add the `custom_data` of rosbag2's `metadata.yaml`, whose values are text."""
+    file_name: (
+        Annotated[FileNamePattern, Parsed(FileNamePattern, r"\{[A-Za-z_][A-Za-z0-9_]*(:[^{}]+)?\}")] | None
+    ) = Field(default=None, examples=["{vehicle}_{date:%Y%m%d}_{run:int}.mcap"])
+    """A pattern of the recording's name: `{key}` is text, `{key:int}` and `{key:float}` are numbers, `{key:%Y%m%d}` is a date,
+    `{_}` matches text that is ignored. A pattern with `/` also matches the folders."""
+    sidecar: Annotated[Text, AfterValidator(_check_sidecar)] | None = Field(
+        default=None, examples=["{stem}.json"]
+    )
+    """A JSON file for each recording, relative to the recording's folder; `{stem}` and `{name}` are the recording's name without
+    and with the suffix, `{parent}` is the name of its folder."""
+
+
 class SequenceSettings(Section):
     """The sequence that a recording becomes."""
 
@@ -163,6 +198,10 @@ class SequenceSettings(Section):
     """Metadata of the sequence; any JSON."""
     metadata_file: InputPath | None = Field(default=None, examples=["metadata.json"])
     """A JSON file with more metadata; `metadata` takes precedence."""
+    metadata_from: MetadataSources | None = None
+    """Sources of metadata that each recording fills on its own: its name, its metadata records, a file next to it."""
+    metadata_schema: SchemaPath | None = Field(default=None, examples=["fleet/vehicle.schema.json"])
+    """A JSON Schema (draft 2020-12) for the final metadata. It may refer to other files (`$ref`), but not to URLs."""
     if_exists: IfExists = IfExists.FAIL
     """Action if the sequence exists: fail, skip (if its content is the same), append, replace."""
 
@@ -174,10 +213,24 @@ class TopicSettings(Section):
     """The topic's name in the sequence; only for a topic name, not for a glob."""
     metadata: dict[Text, JsonValue] = Field(default={}, examples=[{"mount": "roof"}])
     """Metadata of the topic."""
+    metadata_schema: SchemaPath | None = Field(default=None, examples=["fleet/sensor.schema.json"])
+    """A JSON Schema for the metadata of the topic, see `sequence.metadata_schema`."""
     every: Count = Field(default=1, examples=[3])
     """Keep the first of each `every` messages."""
     image: Literal["raw", "png"] = "raw"
     """The encoding of raw images: as recorded, or PNG."""
+
+
+def combined_settings(settings: Mapping[str, TopicSettings], topic: str) -> TopicSettings:
+    """Return the settings of a topic, each from the topic's name or else from the first glob that defines the setting."""
+    values: dict[str, Any] = {}
+    for name in TopicSettings.model_fields:
+        match = first_match(
+            (glob for glob, entry in settings.items() if name in entry.model_fields_set), topic
+        )
+        if match is not None:
+            values[name] = getattr(settings[match], name)
+    return TopicSettings.model_construct(**values)
 
 
 class AdapterSettings(Section):
@@ -428,13 +481,7 @@ class Job(JobSettings):
 
     def settings_of(self, topic: str) -> TopicSettings:
         """Return the settings of a topic, each from the topic's name or else from the first glob that defines the setting."""
-        values: dict[str, Any] = {}
-        for name in TopicSettings.model_fields:
-            globs = (glob for glob, entry in self.topic_settings.items() if name in entry.model_fields_set)
-            match = first_match(globs, topic)
-            if match is not None:
-                values[name] = getattr(self.topic_settings[match], name)
-        return TopicSettings.model_construct(**values)
+        return combined_settings(self.topic_settings, topic)
 
     def check(self) -> Self:
         """Return the job if the platform accepts its names and metadata.

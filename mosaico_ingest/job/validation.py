@@ -42,7 +42,7 @@ class _Problem(Struct, frozen=True):
     @property
     def name(self) -> str:
         """The value's key path as text."""
-        return _name(self.path) or "the document"
+        return key_path_text(self.path) or "the document"
 
     @property
     def span(self) -> Span:
@@ -120,7 +120,7 @@ def _node_at(schema: dict[str, Any], path: KeyPath) -> dict[str, Any]:
     return node
 
 
-def _name(path: KeyPath) -> str:
+def key_path_text(path: KeyPath) -> str:
     """Return a key path as text, such as `bag.custom_msgs[0].path`."""
     return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path).lstrip(".")
 
@@ -177,7 +177,7 @@ def _unknown_key(problem: _Problem) -> Finding:
     parent, word = problem.path[:-1], str(problem.path[-1])
     allowed = keys_at(problem.schema, parent)
     span = problem.source.key_span(problem.path)
-    section = f"in {_name(parent)}" if parent else "at the top level"
+    section = f"in {key_path_text(parent)}" if parent else "at the top level"
     close = _suggestion(problem)
     if close:
         remedy = f"did you mean {close!r}? "

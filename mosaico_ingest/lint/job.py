@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from mosaico_ingest.findings import Finding, Span
-from mosaico_ingest.job.compose import fill_in
+from mosaico_ingest.job.compose import combinations, fill_in
 from mosaico_ingest.job.fields import AdapterRef, FilePath, PathRole, TopicGlob, marked_fields, values_at
 from mosaico_ingest.job.manifest import check_manifest
 from mosaico_ingest.job.model import JobSettings, Manifest
@@ -40,6 +40,8 @@ class Job(Struct, frozen=True):
     """The folder that relative paths start in."""
     file: Path | None = None
     """The manifest's file, or None for standard input and examples."""
+    env: Mapping[str, str] | None = None
+    """The environment variables; None leaves unset variables in the texts."""
 
     def span(self, *path: str | int) -> Span:
         """Return the span of a value."""
@@ -69,7 +71,16 @@ def read_job(
     manifest, findings = check_manifest(source, env=env)
     if manifest is None and isinstance(source.value, dict):
         manifest = _valid_part(fill_in(source, env).value)
-    return (None if manifest is None else Job(manifest, source, folder, file)), findings
+    return (None if manifest is None else Job(manifest, source, folder, file, env)), findings
+
+
+def manifests_of_matrix(job: Job) -> Iterator[Manifest]:
+    """Yield the manifest of each combination of the matrix that is valid; the manifest itself without a matrix."""
+    yield job.manifest
+    for cell in combinations(job.source.value)[1:]:
+        manifest, _ = check_manifest(job.source, env=job.env, cell=cell)
+        if manifest is not None:
+            yield manifest
 
 
 def _valid_part(value: Value) -> Manifest | None:

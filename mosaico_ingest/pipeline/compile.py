@@ -23,6 +23,9 @@ from mosaico_ingest.job.compose import PLACEHOLDERS, Placeholder, placeholders_i
 from mosaico_ingest.job.fields import FilePath, PathRole, marked_fields, replace_values
 from mosaico_ingest.job.manifest import LoadedManifest, refusal
 from mosaico_ingest.job.model import Job, JobSettings, Manifest, Origin, SequenceSettings
+from mosaico_ingest.job.yaml_source import Source
+from mosaico_ingest.metadata.schema import read_json
+from mosaico_ingest.metadata.sources import source_spans, with_spans
 from mosaico_ingest.remote import AnyPath, RemotePath, without_options
 from mosaico_ingest.rosbag.formats import RECORDING_NAME
 from mosaico_ingest.textfile import read_limited
@@ -36,7 +39,7 @@ __all__ = [
     "sequence_name",
 ]
 
-_READ_LATER = {PathRole.WORKER_FILE, PathRole.DEFINITIONS}
+_READ_LATER = {PathRole.WORKER_FILE, PathRole.DEFINITIONS, PathRole.SCHEMA}
 _REFUSED = re.compile(r"[^A-Za-z0-9_-]+")
 
 
@@ -190,13 +193,11 @@ def compile_manifest(loaded: LoadedManifest) -> tuple[Job, ...]:
     names = [sequence_name(loaded, recording) for recording in recordings]
     _refuse_duplicates(loaded, names)
     shared = _resolve_paths(loaded)
+    metadata, origin = _metadata(loaded, shared.sequence)
     sequence = shared.sequence.replace(
-        family=shared.sequence.family or shared.sequence.name,
-        metadata=_metadata(loaded, shared.sequence),
-        metadata_file=None,
+        family=shared.sequence.family or shared.sequence.name, metadata=metadata, metadata_file=None
     )
     sections: dict[str, Any] = {key: getattr(shared, key) for key in JobSettings.model_fields}
-    origin = loaded.origin
     return tuple(
         _job({**sections, "sequence": sequence.replace(name=name)}, recording.paths, origin)
         for recording, name in zip(recordings, names, strict=True)
@@ -241,10 +242,11 @@ def _resolve_paths(loaded: LoadedManifest) -> Manifest:
     return manifest
 
 
-def _metadata(loaded: LoadedManifest, sequence: SequenceSettings) -> dict[str, Any]:
-    """Return the metadata of the manifest and of its metadata file."""
+def _metadata(loaded: LoadedManifest, sequence: SequenceSettings) -> tuple[dict[str, Any], Origin]:
+    """Return the metadata of the manifest and of its metadata file, and the origin with the spans of both."""
+    origin = loaded.origin
     if sequence.metadata_file is None:
-        return sequence.metadata
+        return sequence.metadata, origin
     where = loaded.where("sequence", "metadata_file")
     path = sequence.metadata_file
     try:
@@ -256,7 +258,12 @@ def _metadata(loaded: LoadedManifest, sequence: SequenceSettings) -> dict[str, A
         raise ManifestError(f"{path} is not JSON: {error}", where=where) from error
     if not isinstance(metadata, dict):
         raise ManifestError(f"{path} has no JSON object", where=where, hint='write {"key": "value"}')
-    return {**metadata, **sequence.metadata}
+    if sequence.metadata_schema is not None:
+        source = read_json(Path(path))
+        for key in metadata:
+            if isinstance(source, Source) and key not in sequence.metadata:
+                origin = with_spans(origin, *source_spans(source, key))
+    return {**metadata, **sequence.metadata}, origin
 
 
 def check_adapters(job: Job) -> None:

@@ -22,6 +22,8 @@ from mosaico_ingest.job.model import Job, JobSettings
 from mosaico_ingest.job.patterns import Selection, first_match, select
 from mosaico_ingest.job.units import format_time
 from mosaico_ingest.job.values import LoaderErrorPolicy, TimeBound, Unmodeled
+from mosaico_ingest.metadata.contract import check_metadata_contracts
+from mosaico_ingest.metadata.sources import fill_in_metadata
 from mosaico_ingest.pipeline.memory import MemoryBudget
 from mosaico_ingest.pipeline.plan import ExcludedTopic, Plan, TopicPlan, digest_of
 from mosaico_ingest.pipeline.schema_changes import follow_schema_changes
@@ -43,12 +45,14 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
         BagError: The definition of a selected topic is unknown and `on_error.message` is `raise`.
         AdapterError: An adapter does not fit its topic, or a type has no adapter and `adapters.unmodeled` is `fail`;
             `findings` has every such topic.
+        ContractError: The metadata violates its schema.
         IngestError: The task is for another plan, or a definition has changed and `on_schema_change` is `fail`.
     """
-    job = task.job
+    job, metadata_findings = fill_in_metadata(task.job, recording)
     names = tuple(dict.fromkeys(connection.topic for connection in recording.connections))
     selection = select(job.topics, names)
     findings = [*_recording_findings(recording, resolver, selection), *_unmatched(job, selection, names)]
+    findings += metadata_findings
     topics: list[TopicPlan] = []
     excluded: list[ExcludedTopic] = []
     misfits: list[tuple[str, AdapterError]] = []
@@ -68,11 +72,12 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
         raise _misfit(job, misfits)
     if not topics:
         raise _nothing_selected(job, recording, excluded)
+    check_metadata_contracts(job, dict.fromkeys(topic.topic for topic in topics))
     read_from_ns, read_until_ns = _time_range(job, recording)
     findings += _image_settings(job, topics)
     findings += _static_before(job, topics, recording.start_ns, read_from_ns)
     plan = Plan(
-        sequence=job.sequence.replace(family=job.family),
+        sequence=job.sequence.replace(family=job.family, metadata_from=None, metadata_schema=None),
         files=recording.files,
         container=recording.container,
         source_bytes=recording.size_bytes,

@@ -21,7 +21,7 @@ from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.timing import TimelineReport
 from mosaico_ingest.report.units import count_text, counted
 
-_GRAVEST_FIRST = (130, 5, 1, 2, 3, 4)
+_GRAVEST_FIRST = (130, 5, 1, 2, 6, 3, 4)
 
 
 class _Part(Part):
@@ -242,7 +242,7 @@ class RunReport(_Part):
     @computed_field
     @property
     def exit_code(self) -> int:
-        """The first of 130, 5, 1, 2, 3, 4, 0 that any recording produced."""
+        """The first of 130, 5, 1, 2, 6, 3, 4, 0 that any recording produced."""
         return gravest([report.exit_code for report in self.recordings])
 
 

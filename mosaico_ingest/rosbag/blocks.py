@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from msgspec import Struct, field
@@ -27,6 +27,7 @@ __all__ = [
     "Bytes",
     "Connection",
     "Encoding",
+    "HasMetadataRecords",
     "Int64s",
     "MessageBlock",
     "ROSHeader",
@@ -235,6 +236,15 @@ class SplitReader(Protocol):
 
     def close(self) -> None:
         """Close the file."""
+        ...
+
+
+@runtime_checkable
+class HasMetadataRecords(Protocol):
+    """A reader of a container that can contain metadata records."""
+
+    def metadata_records(self) -> dict[str, dict[str, str]]:
+        """Return the entries of the metadata records by name."""
         ...
 
 

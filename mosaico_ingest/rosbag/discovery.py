@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +22,12 @@ __all__ = [
     "MetadataTopic",
     "RecordingFiles",
     "discover",
+    "parse_metadata",
     "read_metadata",
 ]
 
 FILE_NAME = "metadata.yaml"
+_TOP_KEY = "rosbag2_bagfile_information"
 _MAX_BYTES = 16 << 20
 _SPLIT_NAME = re.compile(
     rf"(?P<stem>.*)_\d+(?P<suffix>(?:{'|'.join(map(re.escape, SUFFIXES))})(?:{re.escape(ZSTD_SUFFIX)})?)"
@@ -52,6 +54,8 @@ class Metadata(Struct, frozen=True):
     message_count: int
     topics: tuple[MetadataTopic, ...]
     distro: str
+    custom_data: Mapping[str, str] = {}
+    """Texts that the user of the recorder added."""
 
 
 def read_metadata(path: AnyPath) -> Metadata:
@@ -60,22 +64,33 @@ def read_metadata(path: AnyPath) -> Metadata:
     Raises:
         BagError: The file is not YAML, or does not have the structure of rosbag2's metadata.
     """
-    import yaml  # noqa: PLC0415 - slow to import, and few recordings come with metadata
-
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise BagError(f"larger than {_MAX_BYTES} bytes", where=str(path))
-        content = yaml.load(read_limited(path), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))  # noqa: S506 - both are safe loaders, one is fast
-        info = content["rosbag2_bagfile_information"]
+        return parse_metadata(read_limited(path), path)
+    except OSError as err:
+        raise BagError(f"cannot be read: {err.strerror}", where=str(path)) from err
+
+
+def parse_metadata(content: bytes | str, path: AnyPath, *, is_embedded: bool = False) -> Metadata:
+    """Parse the text of a `metadata.yaml` of any version; the copy embedded in MCAP files may lack the top-level key.
+
+    Raises:
+        BagError: The text is not YAML, or does not have the structure of rosbag2's metadata.
+    """
+    import yaml  # noqa: PLC0415 - slow to import, and few recordings come with metadata
+
+    try:
+        document = yaml.load(content, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))  # noqa: S506 - both are safe loaders, one is fast
+        info = document if is_embedded and _TOP_KEY not in document else document[_TOP_KEY]
         return Metadata(
             path,
             tuple(_text(name) for name in info.get("relative_file_paths") or ()),
             int(info.get("message_count") or 0),
             tuple(_topic(entry) for entry in info.get("topics_with_message_count") or ()),
             _text(info.get("ros_distro")),
+            _texts(info.get("custom_data")),
         )
-    except OSError as err:
-        raise BagError(f"cannot be read: {err.strerror}", where=str(path)) from err
     except yaml.YAMLError as err:
         raise BagError(f"not valid YAML: {' '.join(str(err).split())}", where=str(path)) from err
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as err:
@@ -92,6 +107,13 @@ def _topic(entry: dict[str, Any]) -> MetadataTopic:
         _text(topic.get("serialization_format")),
         qos if isinstance(qos, str) else "",
     )
+
+
+def _texts(value: object) -> dict[str, str]:
+    """Return the scalars of a mapping as texts; empty for other values."""
+    scalars = (str, int, float)
+    items = value.items() if isinstance(value, dict) else ()
+    return {str(key): _text(item) for key, item in items if item is None or isinstance(item, scalars)}
 
 
 def _text(value: object) -> str:

@@ -6,7 +6,7 @@ import re
 import weakref
 from collections import defaultdict
 from collections.abc import Collection, Generator, Iterator, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -31,6 +31,7 @@ from mosaico_ingest.rosbag.blocks import (
     LATEST_NS,
     Connection,
     Encoding,
+    HasMetadataRecords,
     MessageBlock,
     ReadRequest,
     ReadResult,
@@ -48,7 +49,7 @@ from mosaico_ingest.rosbag.definitions.model import (
     Source,
     normalize_msgtype,
 )
-from mosaico_ingest.rosbag.discovery import Metadata, MetadataTopic, RecordingFiles, discover
+from mosaico_ingest.rosbag.discovery import Metadata, MetadataTopic, RecordingFiles, discover, parse_metadata
 from mosaico_ingest.rosbag.opening import open_split
 
 __all__ = [
@@ -68,6 +69,8 @@ _PREFETCH_CPUS = 3
 """Minimum number of CPUs for a prefetch thread: decoding and writing already use one thread each."""
 _BLOCKS_IN_MEMORY = 4
 """The memory limit divided by the size of one read, without prefetching; prefetching doubles it."""
+_ROSBAG2_RECORD, _ROSBAG2_ENTRY = "rosbag2", "serialized_metadata"
+"""The metadata record and its entry in which rosbag2 stores the text of `metadata.yaml`."""
 _MAX_ROWS = 1 << 16
 _MEMORY_BYTES = 64 << 20
 _SLICE_BYTES, _MAX_SLICE_BYTES, _MAX_SLICES = 32 << 20, 256 << 20, 10_000
@@ -140,6 +143,8 @@ class Recording:
         self._iterators: weakref.WeakSet[Generator[MessageBlock, None, None]] = weakref.WeakSet()
         self._unreadable: dict[UnreadableRange, None] = dict.fromkeys(unreadable)
         self.files: tuple[AnyPath, ...] = files.files
+        self.metadata: Metadata | None = files.metadata
+        """The content of the recording's `metadata.yaml`."""
         self.missing_files: tuple[AnyPath, ...] = files.missing
         """Splits that the metadata lists and that do not exist; each is an unreadable range as well."""
         self.container: str = splits[0].container
@@ -180,6 +185,35 @@ class Recording:
     def unreadable(self) -> tuple[UnreadableRange, ...]:
         """The ranges that could not be read: found while opening the files, and by every iteration so far."""
         return tuple(self._unreadable)
+
+    def metadata_records(self) -> dict[str, dict[str, str]]:
+        """Return the entries of the MCAP metadata records by name; later splits take precedence.
+
+        Raises:
+            BagError: The file cannot be read.
+        """
+        records: dict[str, dict[str, str]] = {}
+        for split in self._splits:
+            for name, entries in (
+                split.metadata_records().items() if isinstance(split, HasMetadataRecords) else ()
+            ):
+                records.setdefault(name, {}).update(entries)
+        return records
+
+    def custom_data(self) -> dict[str, str]:
+        """Return the `custom_data` of rosbag2, from `metadata.yaml` or else from the copy that rosbag2 adds to MCAP files.
+
+        Raises:
+            BagError: The file cannot be read.
+        """
+        if self.metadata is not None:
+            return dict(self.metadata.custom_data)
+        text = self.metadata_records().get(_ROSBAG2_RECORD, {}).get(_ROSBAG2_ENTRY)
+        if text is None:
+            return {}
+        with suppress(BagError):
+            return dict(parse_metadata(text, self.files[0], is_embedded=True).custom_data)
+        return {}
 
     def message_blocks(
         self,

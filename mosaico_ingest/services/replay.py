@@ -118,7 +118,7 @@ def _replay_job(file: QuarantineFile, job: Job) -> Job:
     return job.replace(
         bag=job.bag.replace(path=str(file.messages), time=TimeRange()),
         paths=(file.messages,),
-        sequence=job.sequence.replace(if_exists=IfExists.APPEND),
+        sequence=job.sequence.replace(if_exists=IfExists.APPEND, metadata_from=None, metadata_schema=None),
         on_error=ErrorPolicy(
             session=SessionLevelErrorPolicy.Delete,
             topic=TopicLevelErrorPolicy.Raise,

@@ -16,6 +16,10 @@ fields:
   value: temperature
 """
 
+SCHEMA = """\
+{"required": ["vehicle"], "properties": {"vehicle": {"type": "string"}}, "additionalProperties": false}
+"""
+
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
@@ -25,6 +29,8 @@ def project(tmp_path: Path) -> Path:
     (tmp_path / "msgs" / "Cell.msg").write_text("float64 voltage\n")
     (tmp_path / "base.yaml").write_text("on_error: {topic: ignore}\n")
     (tmp_path / "metadata.json").write_text("{}")
+    (tmp_path / "vehicle.schema.json").write_text(SCHEMA)
+    (tmp_path / "broken.schema.json").write_text('{"type": "strin"}')
     (tmp_path / "adapters" / "pack.yaml").write_text(ADAPTER)
     (tmp_path / "adapters" / "pack_v2.yaml").write_text(ADAPTER.replace("PackAdapter", "PackV2Adapter"))
     (tmp_path / "adapters" / "wheel.py").write_text("class WheelAdapter(Base):\n    pass\n")

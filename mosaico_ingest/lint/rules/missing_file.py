@@ -10,8 +10,8 @@ from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Report a metadata file or TLS certificate that does not exist."""
-    for path, text in manifest_paths(job, PathRole.INPUT, PathRole.WORKER_FILE):
+    """Report a metadata file, metadata schema or TLS certificate that does not exist."""
+    for path, text in manifest_paths(job, PathRole.INPUT, PathRole.WORKER_FILE, PathRole.SCHEMA):
         if not job.resolve(text).is_file():
             message = f"the file {job.resolve(text)} does not exist"
             hint = "correct the path; it starts at the manifest's folder"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Collection
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 from msgspec import Struct
@@ -17,17 +18,19 @@ from mosaico_ingest.rosbag.formats import MCAP
 from mosaico_ingest.rosbag.mcap.records import (
     RECORD,
     ChannelRecord,
+    MetadataRecord,
     Op,
     SchemaRecord,
     channel_of,
     chunk_head,
+    metadata_of,
     records_in,
     schema_of,
 )
 from mosaico_ingest.rosbag.recovery import find_mcap_chunk
 from mosaico_ingest.rosbag.source import Fields, Source, Window
 
-__all__ = ["Extent", "McapIndex", "read_extents", "read_index"]
+__all__ = ["Extent", "McapIndex", "read_extents", "read_index", "read_metadata"]
 
 _FOOTER_BYTES = RECORD.size + 20
 _INDEX_ENTRY_BYTES = 16
@@ -76,6 +79,10 @@ class McapIndex:
     data_end: int = 0
     """Offset of the summary, or of the first byte that cannot be read."""
     unreadable: list[UnreadableRange] = field(default_factory=list[UnreadableRange])
+    metadata: list[tuple[int, int]] = field(default_factory=list[tuple[int, int]])
+    """Start and end of the content of each metadata record."""
+    lists_metadata: bool = True
+    """Whether `metadata` is complete; the summary may omit the index of metadata records."""
     is_walked: bool = False
     """Whether the index comes from a walk over all records rather than from the summary."""
 
@@ -117,6 +124,22 @@ def read_extents(
     return sorted(listed + unlisted.extents, key=lambda extent: extent.start_ns), unlisted.unreadable
 
 
+def read_metadata(
+    source: Source, index: McapIndex, max_chunk_bytes: int = MAX_CHUNK_BYTES
+) -> list[MetadataRecord]:
+    """Return the metadata records; damaged ones are skipped. Walks over the records if the summary does not list them."""
+    ranges = index.metadata
+    if not index.lists_metadata:
+        walked = McapIndex()
+        _Walk(source, walked, max_chunk_bytes).over(len(MCAP), index.data_end)
+        ranges = walked.metadata
+    records: list[MetadataRecord] = []
+    for start, end in ranges:
+        with suppress(BagError):
+            records.append(metadata_of(Fields(source.read(start, end - start))))
+    return records
+
+
 def _read_summary(source: Source) -> McapIndex | None:
     tail_at = source.size - _FOOTER_BYTES - len(MCAP)
     if tail_at < len(MCAP):
@@ -139,17 +162,22 @@ def _parse_summary(data: bytes, data_end: int) -> McapIndex | None:
     """Return the content of the summary, or None if records that the reader needs are missing."""
     index = McapIndex(data_end=data_end)
     chunk_count: int | None = None
+    metadata_count = 0
     for op, start, end in records_in(data):
         fields = Fields(data, start, end)
         if op == Op.CHUNK_INDEX:
             index.extents.append(_indexed_chunk(fields, data_end))
+        elif op == Op.METADATA_INDEX:
+            offset, length = fields.u64(), fields.u64()
+            index.metadata.append((offset + RECORD.size, offset + length))
         elif op == Op.STATISTICS:
-            chunk_count = _add_statistics(fields, index)
+            chunk_count, metadata_count = _add_statistics(fields, index)
         else:
             _add_description(op, fields, index)
     counts = index.counts
     if counts is None or chunk_count != len(index.extents) or not index.channels.keys() >= counts.keys():
         return None
+    index.lists_metadata = metadata_count == len(index.metadata)
     return index
 
 
@@ -173,11 +201,11 @@ def _indexed_chunk(fields: Fields, data_end: int) -> Extent:
     return Extent(offset, stop, start_ns, end_ns, indexes, fields.u64())
 
 
-def _add_statistics(fields: Fields, index: McapIndex) -> int:
-    """Add counts and times to the index; return the number of chunks."""
+def _add_statistics(fields: Fields, index: McapIndex) -> tuple[int, int]:
+    """Add counts and times to the index; return the number of chunks and of metadata records."""
     total = fields.u64()
-    fields.take(2 + 4 + 4 + 4)
-    chunks = fields.u32()
+    fields.take(2 + 4 + 4)
+    metadata, chunks = fields.u32(), fields.u32()
     start_ns, end_ns = fields.u64(), fields.u64()
     index.counts = {channel: count for channel, count in fields.pairs("<HQ") if count}
     if max(start_ns, end_ns) > LATEST_NS:
@@ -186,7 +214,7 @@ def _add_statistics(fields: Fields, index: McapIndex) -> int:
         raise BagError(f"{total} messages in total, {sum(index.counts.values())} by channel")
     if total:
         index.start_ns, index.end_ns = start_ns, end_ns
-    return chunks
+    return chunks, metadata
 
 
 class _Walk:
@@ -237,6 +265,8 @@ class _Walk:
             self._add_chunk(start, end)
         elif op == Op.MESSAGE_INDEX:
             self._add_message_index(start, end)
+        elif op == Op.METADATA:
+            self._index.metadata.append((start + RECORD.size, end))
         elif op in (Op.SCHEMA, Op.CHANNEL):
             content = start + RECORD.size
             try:

@@ -45,7 +45,7 @@ from mosaico_ingest.rosbag.compression import (
     decompression_groups,
 )
 from mosaico_ingest.rosbag.definitions.model import Embedded
-from mosaico_ingest.rosbag.mcap.index import Extent, McapIndex, read_extents, read_index
+from mosaico_ingest.rosbag.mcap.index import Extent, McapIndex, read_extents, read_index, read_metadata
 from mosaico_ingest.rosbag.mcap.records import (
     RECORD,
     ChannelRecord,
@@ -134,6 +134,13 @@ class McapReader:
         self._source.prefetch((extent.offset, extent.stop) for extent in requested)
         for group in group_by_bytes(requested, _decompressed_bytes, request.block_bytes):
             yield ReadTask(min(group[0].start_ns, LATEST_NS), partial(self._load, group, request))
+
+    def metadata_records(self) -> dict[str, dict[str, str]]:
+        """Return the entries of the metadata records by name; of two entries with one key, the later one."""
+        records: dict[str, dict[str, str]] = {}
+        for record in read_metadata(self._source, self._index, self._max_chunk_bytes):
+            records.setdefault(record.name, {}).update(record.entries)
+        return records
 
     def check_unchanged(self) -> None:
         """See `Source.check_unchanged`."""

@@ -14,10 +14,12 @@ __all__ = [
     "RECORD",
     "ChannelRecord",
     "ChunkHead",
+    "MetadataRecord",
     "Op",
     "SchemaRecord",
     "channel_of",
     "chunk_head",
+    "metadata_of",
     "record_bytes",
     "records_in",
     "schema_of",
@@ -34,6 +36,7 @@ class Op:
 
     HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
     STATISTICS = 0x0B
+    METADATA, METADATA_INDEX = 0x0C, 0x0D
     SUMMARY_OFFSET = 0x0E
     DATA_END = 0x0F
 
@@ -53,6 +56,13 @@ class ChannelRecord(Struct, frozen=True):
     topic: str
     encoding: str
     metadata: dict[str, str]
+
+
+class MetadataRecord(Struct, frozen=True):
+    """A metadata record: its name and its entries."""
+
+    name: str
+    entries: dict[str, str]
 
 
 class ChunkHead(Struct, frozen=True):
@@ -76,6 +86,11 @@ def schema_of(fields: Fields) -> tuple[int, SchemaRecord]:
 def channel_of(fields: Fields) -> tuple[int, ChannelRecord]:
     """Return the id and content of a channel record."""
     return fields.u16(), ChannelRecord(fields.u16(), fields.text(), fields.text(), fields.texts())
+
+
+def metadata_of(fields: Fields) -> MetadataRecord:
+    """Return the content of a metadata record."""
+    return MetadataRecord(fields.text(), fields.texts())
 
 
 def chunk_head(data: bytes | memoryview, start: int = RECORD.size) -> ChunkHead:
