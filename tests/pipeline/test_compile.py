@@ -70,6 +70,7 @@ adapters:
   serialization_formats: {p/msg/Scan: ragged}
 on_error: {session: delete, topic: {default: finalize, /gps: ignore}, message: raise}
 on_schema_change: new_topic
+expect: {required: [/imu]}
 quarantine: {path: q, max: 0.1%, max_run: 100, systematic: 7}
 target: {host: h, port: 1, api_key: "${KEY}", tls_cert: ca.pem, tls: true, message_size: 4MB}
 run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
@@ -104,6 +105,7 @@ run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
         messages_on_error=LoaderErrorPolicy.RAISE,
         family="f",
         on_schema_change=OnSchemaChange.NEW_TOPIC,
+        expect={"required": ["/imu"]},
         quarantine=QuarantineSettings(
             path=str(folder / "q"), max=Limit(share=0.001), max_run=Limit(100), systematic=7
         ),
@@ -116,7 +118,7 @@ run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
     assert job == expected.replace(bag=bag, origin=job.origin)
     assert job.bag.custom_msgs[0].path == str(folder / "msgs")
     assert job.origin.file == str(folder / "job.yaml")
-    assert job.where("run", "jobs") == f"{folder / 'job.yaml'}:19:61"
+    assert job.where("run", "jobs") == f"{folder / 'job.yaml'}:20:61"
     assert [key for key in JobSettings.model_fields if getattr(job, key) == getattr(DEFAULT, key)] == []
 
 
