@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,8 +16,10 @@ from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from mosaico_ingest.destinations.store import SequenceInfo, TopicInfo
+    from mosaico_ingest.destinations.store import Listing, SequenceInfo, SequenceSummary, TopicInfo
 
+DEFAULT_ROWS = 100
+"""Number of sequences that `ingest store ls` prints by default."""
 CELL_WIDTH = 28
 """Characters of a value in a table of rows."""
 METADATA_WIDTH = 100
@@ -76,15 +79,55 @@ def verify(
 
 
 @store_app.command("ls")
-def list_sequences(store: StoreOption = DEFAULT_STORE, as_json: JsonOption = False) -> None:
-    """List the sequences with their topics, rows, size and time span."""
+def list_sequences(
+    match: Annotated[
+        str | None,
+        typer.Argument(metavar="GLOB", help="List only sequences whose names match, such as 'yard_*'."),
+    ] = None,
+    *,
+    metadata: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--metadata",
+            "-m",
+            metavar="KEY=VALUE",
+            help="List only sequences with this metadata; vehicle.id is the key id inside vehicle. Repeatable.",
+        ),
+    ] = None,
+    incomplete: Annotated[bool, typer.Option("--incomplete", help="List only incomplete sequences.")] = False,
+    limit: Annotated[
+        int | None,
+        typer.Option(
+            "--limit",
+            "-n",
+            min=0,
+            metavar="N",
+            help="Maximum number of sequences; 0 lists all.",
+            show_default=f"{DEFAULT_ROWS}; all with --json",
+        ),
+    ] = None,
+    after: Annotated[
+        str | None, typer.Option("--after", metavar="NAME", help="Start after the sequence of this name.")
+    ] = None,
+    store: StoreOption = DEFAULT_STORE,
+    as_json: JsonOption = False,
+) -> None:
+    """List the sequences with their topics, rows, size and time span, sorted by name."""
     from mosaico_ingest.destinations.store import Store
 
-    sequences = Store.open(store, create=False).sequences()
+    if limit is None and not as_json:
+        limit = DEFAULT_ROWS
+    listing = Store.open(store, create=False).listing(
+        match=match,
+        metadata=_metadata_filter(metadata or ()),
+        incomplete=incomplete,
+        after=after,
+        limit=limit or None,
+    )
     if as_json:
-        print_json([_sequence_json(info) for info in sequences])
+        print_json([_summary_json(summary) for summary in listing.sequences])
     else:
-        print_sequences(sequences)
+        print_sequences(listing)
 
 
 @store_app.command()
@@ -99,14 +142,19 @@ def show(
     as_json: JsonOption = False,
 ) -> None:
     """Show a sequence's topics, or a topic's schema, counts, time span, metadata and first rows."""
-    from mosaico_ingest.destinations.store import Store
+    from mosaico_ingest.destinations.store import SequenceSummary, Store
 
     opened = Store.open(store, create=False)
     sequence, _, topic = path.lstrip("/").partition("/")
     if not topic:
         info = opened.sequence(sequence)
         if as_json:
-            print_json({**_sequence_json(info), "topics": [_topic_json(topic) for topic in info.topics]})
+            print_json(
+                {
+                    **_summary_json(SequenceSummary.of(info)),
+                    "topics": [_topic_json(topic) for topic in info.topics],
+                }
+            )
         else:
             print_sequence(info)
         return
@@ -146,28 +194,46 @@ def remove(
     print_line(f"removed {sequence} ({size})")
 
 
-def print_sequences(sequences: Sequence[SequenceInfo]) -> None:
-    """Print a row for each sequence, and the latest note of each sequence that has notes."""
-    if not sequences:
+def print_sequences(listing: Listing) -> None:
+    """Print a row for each sequence, the latest note of each sequence that has notes, and how to continue."""
+    if not listing.sequences:
         print_line("no sequences")
         return
     names = ("sequence", "topics", "rows", "size", "start", "duration")
     table = PlainTable(*names, numbers={"topics", "rows", "size", "duration"})
-    for info in sequences:
+    for summary in listing.sequences:
         table.add_row(
-            info.name,
-            count_text(len(info.topics)),
-            count_text(info.rows),
-            bytes_text(info.stored_bytes),
-            time_text(info.start_ns),
-            _duration_text(info),
+            summary.name,
+            count_text(summary.topics),
+            count_text(summary.rows),
+            bytes_text(summary.stored_bytes),
+            time_text(summary.start_ns),
+            _duration_text(summary),
         )
     Terminal().print(table)
-    for info in sequences:
-        if info.incomplete is not None:
-            print_line(f"{info.name}: incomplete: {info.incomplete}", style="red")
-        elif info.notes:  # `store show` prints all of them
-            print_line(f"{info.name}: {info.notes[-1].message}", style="yellow")
+    for summary in listing.sequences:
+        if summary.incomplete is not None:
+            print_line(f"{summary.name}: incomplete: {summary.incomplete}", style="red")
+        elif summary.notes:  # `store show` prints all of them
+            print_line(f"{summary.name}: {summary.notes[-1].message}", style="yellow")
+    if listing.next_after is not None:
+        shown = f"{count_text(len(listing.sequences))} of {counted(listing.total, 'sequence')}"
+        print_line(
+            f"{shown}; continue with --after {shlex.quote(listing.next_after)}, or list all with --limit 0"
+        )
+
+
+def _metadata_filter(conditions: Iterable[str]) -> dict[str, str]:
+    """Return the conditions `KEY=VALUE` as a mapping.
+
+    Raises:
+        typer.BadParameter: A condition has no `=`.
+    """
+    pairs = [condition.partition("=") for condition in conditions]
+    for key, separator, _ in pairs:
+        if not separator or not key:
+            raise typer.BadParameter(f"{key!r} is not KEY=VALUE", param_hint="--metadata")
+    return {key: value for key, _, value in pairs}
 
 
 def print_sequence(info: SequenceInfo) -> None:
@@ -281,23 +347,23 @@ def _first_rows(reader: pa.RecordBatchReader, count: int) -> list[dict[str, Any]
     return rows
 
 
-def _duration_text(info: SequenceInfo | TopicInfo) -> str:
+def _duration_text(info: SequenceSummary | TopicInfo) -> str:
     if info.start_ns is None or info.end_ns is None:
         return "-"
     return seconds_text((info.end_ns - info.start_ns) / 1e9)
 
 
-def _sequence_json(info: SequenceInfo) -> dict[str, Any]:
+def _summary_json(summary: SequenceSummary) -> dict[str, Any]:
     return {
-        "name": info.name,
-        "metadata": dict(info.metadata),
-        "topics": len(info.topics),
-        "rows": info.rows,
-        "stored_bytes": info.stored_bytes,
-        "start_ns": info.start_ns,
-        "end_ns": info.end_ns,
-        "incomplete": info.incomplete,
-        "notes": [{"topic": note.topic, "message": note.message} for note in info.notes],
+        "name": summary.name,
+        "metadata": dict(summary.metadata),
+        "topics": summary.topics,
+        "rows": summary.rows,
+        "stored_bytes": summary.stored_bytes,
+        "start_ns": summary.start_ns,
+        "end_ns": summary.end_ns,
+        "incomplete": summary.incomplete,
+        "notes": [{"topic": note.topic, "message": note.message} for note in summary.notes],
     }
 
 

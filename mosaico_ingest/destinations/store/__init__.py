@@ -6,6 +6,7 @@ and no sequence or topic name can refer to a path outside the store. The package
 
 from __future__ import annotations
 
+from mosaico_ingest.destinations.store.listing import Listing, SequenceSummary
 from mosaico_ingest.destinations.store.model import (
     Collected,
     Note,
@@ -19,9 +20,11 @@ from mosaico_ingest.destinations.store.store import Store
 
 __all__ = [
     "Collected",
+    "Listing",
     "Note",
     "SegmentInfo",
     "SequenceInfo",
+    "SequenceSummary",
     "SessionInfo",
     "Store",
     "StoreSink",

@@ -21,6 +21,7 @@ import pyarrow as pa
 
 from mosaico_ingest.destinations.base import check_same_type, sequence_exists
 from mosaico_ingest.destinations.store.errors import NotInStore, explained, sequence_changed
+from mosaico_ingest.destinations.store.listing import Listing, SequenceFilter, listing
 from mosaico_ingest.destinations.store.model import (
     Claim,
     NewNote,
@@ -182,6 +183,11 @@ class Catalog:
         with self.read() as db:
             found = (_find_sequence(db, name, self.root) for name in _names(db))
             return tuple(info for info in found if info is not None)
+
+    def listing(self, selection: SequenceFilter, *, after: str | None, limit: int | None) -> Listing:
+        """See `StoreCatalog.listing`."""
+        with self.read() as db:
+            return listing(db, selection, after=after, limit=limit)
 
     def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
         """See `StoreCatalog.bounds`."""

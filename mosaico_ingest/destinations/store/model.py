@@ -103,10 +103,7 @@ class SequenceInfo(Struct, frozen=True):
     @property
     def incomplete(self) -> str | None:
         """The reason why rows may be missing: the error that ended a run early, or a missing session."""
-        errors = [note.message for note in self.notes if note.topic is None]
-        if errors:
-            return errors[-1]
-        return None if self.sessions else "no session was finished"
+        return reason_incomplete(self.notes, has_session=bool(self.sessions))
 
     @property
     def rows(self) -> int:
@@ -176,6 +173,14 @@ class NewSession(Struct, frozen=True):
     created_ns: int
     topics: tuple[NewTopic, ...]
     notes: tuple[NewNote, ...]
+
+
+def reason_incomplete(notes: Iterable[Note], *, has_session: bool) -> str | None:
+    """Return the latest error of the sequence itself, or that it has no session; None for a complete sequence."""
+    errors = [note.message for note in notes if note.topic is None]
+    if errors:
+        return errors[-1]
+    return None if has_session else "no session was finished"
 
 
 def _not_none(times: Iterable[int | None]) -> list[int]:

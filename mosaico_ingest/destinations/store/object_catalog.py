@@ -12,9 +12,10 @@ import json
 import random
 import time
 from base64 import b64decode, b64encode
-from collections.abc import Callable, Collection, Generator, Iterator
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from fnmatch import fnmatchcase
 from io import BytesIO
 from typing import Any
 from urllib.parse import unquote
@@ -25,6 +26,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from mosaico_ingest.destinations.base import check_same_type, sequence_exists
 from mosaico_ingest.destinations.store.errors import NotInStore, explained, sequence_changed
 from mosaico_ingest.destinations.store.files import MARKER, ObjectFiles, encoded, new_session_id
+from mosaico_ingest.destinations.store.listing import Listing, SequenceFilter, SequenceSummary
 from mosaico_ingest.destinations.store.model import (
     Claim,
     NewNote,
@@ -365,6 +367,18 @@ class ObjectCatalog:
         """See `StoreCatalog.sequences`; the sequences are not read at the same moment."""
         return tuple(one.info(self._root) for one in self._all())
 
+    def listing(self, selection: SequenceFilter, *, after: str | None, limit: int | None) -> Listing:
+        """See `StoreCatalog.listing`; filters of the content read every document whose name matches."""
+        names = [
+            name for name in self.names() if selection.match is None or fnmatchcase(name, selection.match)
+        ]
+        if selection.metadata or selection.incomplete:
+            names = [info.name for info in self._infos(names) if selection.selects(info)]
+        rest = [name for name in names if after is None or name > after]
+        page = rest[:limit]
+        summaries = tuple(map(SequenceSummary.of, self._infos(page)))
+        return Listing(summaries, len(names), page[-1] if page and len(page) < len(rest) else None)
+
     def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
         """See `StoreCatalog.bounds`."""
         found = self._load(topic.sequence)
@@ -496,6 +510,11 @@ class ObjectCatalog:
     def _all(self) -> list[SequenceDocument]:
         with ThreadPoolExecutor(_THREADS, thread_name_prefix="catalog") as pool:
             return sorted(pool.map(self._read, self._paths()), key=lambda one: one.name)
+
+    def _infos(self, names: Iterable[str]) -> list[SequenceInfo]:
+        """Return the sequences of these names that still exist, in the order of the names."""
+        with ThreadPoolExecutor(_THREADS, thread_name_prefix="catalog") as pool:
+            return [info for info in pool.map(self.sequence, names) if info is not None]
 
     def _load(self, sequence: str) -> SequenceDocument | None:
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any, Protocol
 
+from mosaico_ingest.destinations.store.listing import Listing, SequenceFilter
 from mosaico_ingest.destinations.store.model import Claim, NewNote, NewSession, SequenceInfo, TopicInfo
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.remote import AnyPath
@@ -129,6 +130,10 @@ class StoreCatalog(Protocol):
 
     def sequences(self) -> tuple[SequenceInfo, ...]:
         """Return every sequence by name, in one consistent state if the catalog supports it."""
+        ...
+
+    def listing(self, selection: SequenceFilter, *, after: str | None, limit: int | None) -> Listing:
+        """Return the selected sequences after the name `after`, at most `limit`, sorted by name."""
         ...
 
     def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:

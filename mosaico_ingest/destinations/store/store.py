@@ -16,6 +16,7 @@ from mosaico_ingest.destinations.store.catalog import Catalog
 from mosaico_ingest.destinations.store.checksum import ContentHash, column_makers
 from mosaico_ingest.destinations.store.errors import NotInStore, explained
 from mosaico_ingest.destinations.store.files import LocalFiles, opened
+from mosaico_ingest.destinations.store.listing import Listing, SequenceFilter
 from mosaico_ingest.destinations.store.model import Collected, NewNote, SegmentInfo, SequenceInfo, TopicInfo
 from mosaico_ingest.destinations.store.protocols import Files, StoreCatalog
 from mosaico_ingest.destinations.store.segment import sorted_rows, time_span
@@ -208,6 +209,27 @@ class Store(Struct, frozen=True):
     def sequences(self) -> tuple[SequenceInfo, ...]:
         """Return every sequence, sorted by name."""
         return self.catalog.sequences()
+
+    def listing(
+        self,
+        *,
+        match: str | None = None,
+        metadata: Mapping[str, str] | None = None,
+        incomplete: bool = False,
+        after: str | None = None,
+        limit: int | None = None,
+    ) -> Listing:
+        """Return a page of summaries, sorted by name; its cost does not depend on the number of sequences.
+
+        Args:
+            match: A glob for the names.
+            metadata: Required values by dotted key, as text.
+            incomplete: Select only incomplete sequences.
+            after: Return sequences after this name; see `Listing.next_after`.
+            limit: Maximum number of sequences, or None for all.
+        """
+        selection = SequenceFilter(match, metadata or {}, incomplete)
+        return self.catalog.listing(selection, after=after, limit=limit)
 
     def names(self) -> tuple[str, ...]:
         """Return the names of all sequences, sorted."""
