@@ -24,6 +24,7 @@ from mosaico_ingest.report.units import (
 )
 
 if TYPE_CHECKING:
+    from mosaico_ingest.report.compare import Comparison
     from mosaico_ingest.report.model import Report, RunReport, TopicReport
     from mosaico_ingest.services.inspection import Inspection
 
@@ -104,9 +105,18 @@ def report(
             "--markdown", metavar="FILE", help="Write a summary for a CI job; - writes it to stdout."
         ),
     ] = None,
+    compare: Annotated[
+        Path | None,
+        typer.Option(
+            "--compare",
+            metavar="LAST.json",
+            help="Report of an earlier run; the changes since then are listed.",
+        ),
+    ] = None,
 ) -> None:
     """Show report files as tables, as an HTML page, or as a Markdown summary."""
-    from mosaico_ingest.report.html import html_page
+    from mosaico_ingest.pages.run import run_page
+    from mosaico_ingest.report.compare import compare_reports
     from mosaico_ingest.report.markdown import markdown_summary
     from mosaico_ingest.report.model import read_report
 
@@ -117,15 +127,30 @@ def report(
             "recordings": tuple(recording for one in reports for recording in one.recordings),
         }
     )
+    comparison = compare_reports(combined, read_report(compare)) if compare is not None else None
     if html is not None:
-        write_output(html, html_page(combined, html.parent), announce=True)
+        write_output(html, run_page(combined, html.parent, comparison), announce=True)
     if markdown is not None:
-        write_output(markdown, markdown_summary(combined), announce=True)
+        write_output(markdown, markdown_summary(combined, comparison), announce=True)
     if html is None and markdown is None:
         print_report(combined)
         for recording in combined.recordings:
             if recording.error is not None:
                 print_line(f"error: {recording.error}")
+        if comparison is not None:
+            print_comparison(comparison)
+
+
+def print_comparison(comparison: Comparison) -> None:
+    """Print a row for each change since an earlier run."""
+    names = ("recording", "topic", "property", "before", "now", "change")
+    table = PlainTable(*names, numbers={"before", "now", "change"})
+    for change in comparison.changes:
+        percent = "" if change.ratio is None else f"{(change.ratio - 1) * 100:+.0f} %"
+        table.add_row(change.recording, change.topic, change.aspect, change.before, change.after, percent)
+    if comparison.changes:
+        Terminal().print(table)
+    print_line(comparison.headline)
 
 
 def print_report(report: RunReport, *, stderr: bool = False) -> None:

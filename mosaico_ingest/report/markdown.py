@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from mosaico_ingest.findings import one_line
 from mosaico_ingest.report.collect import STEP_WORDS, longest_step, slowest, total_seconds
+from mosaico_ingest.report.compare import Comparison
 from mosaico_ingest.report.model import Report, RunReport, replay_command
 from mosaico_ingest.report.units import bytes_text, count_text, percent_text, seconds_text
 
@@ -14,8 +15,8 @@ MAX_ROWS = 100
 """Rows of a table or list, because CI services limit the size of a job's page."""
 
 
-def markdown_summary(report: RunReport) -> str:
-    """Return headline, a row for each recording, and all errors and rejections; problems come first."""
+def markdown_summary(report: RunReport, comparison: Comparison | None = None) -> str:
+    """Return headline, a row for each recording, errors and rejections, and changes; problems come first."""
     recordings = sorted(report.recordings, key=lambda recording: recording.exit_code == 0)
     lines = [f"## Ingestion: {report.headline}", ""]
     if recordings:
@@ -31,7 +32,18 @@ def markdown_summary(report: RunReport) -> str:
     if commands:
         lines += ["", "Rejected messages are in the quarantine. Fix the manifest, then run:", ""]
         lines += sorted(commands)
+    if comparison is not None:
+        lines += ["", "### Changes since the earlier run", "", *_change_lines(comparison)]
     return "\n".join(lines) + "\n"
+
+
+def _change_lines(comparison: Comparison) -> Iterator[str]:
+    yield f"{comparison.headline}."
+    if comparison.changes:
+        yield from ("", "| recording | topic | property | before | now |", "|---|---|---|---:|---:|")
+    for change in comparison.changes[:MAX_ROWS]:
+        cells = (change.recording, change.topic, change.aspect, change.before, change.after)
+        yield f"| {' | '.join(map(_escape, cells))} |"
 
 
 def _row(recording: Report) -> str:

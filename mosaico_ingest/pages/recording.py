@@ -1,0 +1,320 @@
+"""The values of one recording on the page of a run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from msgspec import Struct
+
+from mosaico_ingest.pages.timeline import Axis, Span, Track, draw_track, interval_text, time_axis
+from mosaico_ingest.report.collect import STEP_WORDS, longest_step, step_seconds
+from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Outcome
+from mosaico_ingest.report.events import RunStatus, TopicStatus
+from mosaico_ingest.report.model import Report, RunReport, TopicReport, folder_link, replay_command
+from mosaico_ingest.report.units import (
+    bytes_text,
+    count_text,
+    counted,
+    stored_text,
+    time_text,
+    unreadable_text,
+    written_text,
+)
+
+FAILED = {RunStatus.FAILED, RunStatus.INTERRUPTED}
+STATUS_WORDS = {
+    RunStatus.COMPLETED: "completed",
+    RunStatus.WITH_ERRORS: "some messages are missing",
+    RunStatus.SKIPPED: "already stored",
+    RunStatus.FAILED: "failed",
+    RunStatus.INTERRUPTED: "interrupted",
+}
+STATUS_COLORS = {
+    RunStatus.COMPLETED: "good",
+    RunStatus.WITH_ERRORS: "warn",
+    RunStatus.SKIPPED: "dim",
+    RunStatus.FAILED: "bad",
+    RunStatus.INTERRUPTED: "bad",
+}
+MAX_EXAMPLES = 3
+"""Quarantined messages that the page shows for each topic and rule."""
+MAX_INDEX_BYTES = 1 << 20
+"""Bytes of a quarantine's index that are searched for examples."""
+MAX_SEARCH_TOPICS = 200
+"""Topics by whose names a recording can be found."""
+
+
+def contract_of(report: Report) -> ContractResult | None:
+    """Return the contract results of a recording, if its job has a contract."""
+    return getattr(report, "contract", None)
+
+
+class ContractRow(Struct, frozen=True):
+    """The result of one expectation, and the recording."""
+
+    recording_id: str
+    sequence: str
+    result: ExpectationResult
+
+    @property
+    def color(self) -> str:
+        """The class of the outcome's color."""
+        if self.result.outcome is Outcome.FAILED:
+            return "bad" if self.result.severity.value == "error" else "warn"
+        return "good" if self.result.outcome is Outcome.PASSED else "dim"
+
+    @property
+    def word(self) -> str:
+        """The outcome in words."""
+        if self.result.outcome is Outcome.FAILED:
+            return "failed" if self.result.severity.value == "error" else "warning"
+        return self.result.outcome.value
+
+    @property
+    def occurrence(self) -> str:
+        """The time of the first violation."""
+        first = self.result.first
+        return time_text(first.log_time_ns) if first and first.log_time_ns is not None else ""
+
+
+def contract_rows(recordings: Sequence[Report]) -> list[ContractRow]:
+    """Return the results of all recordings: errors first, then warnings, skipped and passed expectations."""
+    rows = [
+        ContractRow(f"r{at}", report.sequence, result)
+        for at, report in enumerate(recordings)
+        if (contract := contract_of(report)) is not None
+        for result in contract.results
+    ]
+    order = {"failed": 0, "warning": 1, "skipped": 2, "passed": 3}
+    return sorted(rows, key=lambda row: order[row.word])
+
+
+class StepShare(Struct, frozen=True):
+    """One step of a run, and its part of a bar from 0 to 1."""
+
+    name: str
+    label: str
+    seconds: float
+    share: float
+    start: float
+
+
+def step_shares(seconds: Mapping[str, float], *, stacked: bool = True) -> list[StepShare]:
+    """Return the steps; `stacked` steps start where the previous one ends. Without any time, there are none."""
+    total = sum(seconds.values())
+    steps: list[StepShare] = []
+    start = 0.0
+    for name, spent in seconds.items() if total else ():
+        steps.append(StepShare(name, STEP_WORDS[name], spent, spent / total, start if stacked else 0.0))
+        start += spent / total
+    return steps
+
+
+class RecordingView:
+    """The values of one recording on the page; those of its content are computed when they are rendered."""
+
+    def __init__(self, at: int, run: RunReport, folder: Path) -> None:
+        report = run.recordings[at]
+        self.report = report
+        self.id = f"r{at}"
+        self.status = STATUS_WORDS[report.status]
+        self.color = STATUS_COLORS[report.status]
+        contract = contract_of(report)
+        self.violations = len(contract.errors) if contract else 0
+        self.warnings = len(contract.warnings) if contract else 0
+        self.totals = report.totals
+        is_incomplete = bool(
+            report.status is RunStatus.WITH_ERRORS or self.totals.rejected or report.unreadable_ranges
+        )
+        self.rank = (
+            2 if report.status in FAILED or self.violations else int(is_incomplete or self.warnings > 0)
+        )
+        """0 without problems, 1 with missing messages or warnings, 2 if failed or with a violated contract."""
+        self.written = written_text(report)
+        self.unreadable = unreadable_text([report])
+        self._run, self._folder = run, folder
+
+    @property
+    def search_words(self) -> str:
+        """The words by which the list can be filtered."""
+        topics = [topic.target for topic in self.report.topics[:MAX_SEARCH_TOPICS]]
+        return " ".join((self.report.sequence, self.status, *self.report.files, *topics))
+
+    @property
+    def size(self) -> str:
+        """The size of the files, and the stored size."""
+        source, stored = self.report.source_bytes, self.totals.stored_bytes
+        return f"{bytes_text(source)}{f', {stored_text(source, stored)}' if stored else ''}"
+
+    @property
+    def messages_per_s(self) -> int:
+        """Messages read per second."""
+        return round(self.totals.read / self.report.duration_s) if self.report.duration_s else 0
+
+    @property
+    def steps(self) -> list[StepShare]:
+        """The steps of the run."""
+        return step_shares(step_seconds(self.report.steps))
+
+    @property
+    def longest_step(self) -> str:
+        """The longest step and its share."""
+        return longest_step(self.report.steps)
+
+    @property
+    def quarantined(self) -> int:
+        """Number of messages in the quarantine."""
+        return sum(topic.quarantined for topic in self.report.topics)
+
+    @property
+    def quarantine_link(self) -> str | None:
+        """The link to the folder of the quarantine."""
+        return folder_link(self.report, self._folder)
+
+    @property
+    def replay_command(self) -> str | None:
+        """The command that adds the quarantined messages."""
+        return replay_command(self._run, self.report)
+
+    @cached_property
+    def axis(self) -> Axis | None:
+        """The time axis of all topics."""
+        return time_axis(_times(self.report))
+
+    @cached_property
+    def topics(self) -> list[TopicView]:
+        """The selected topics by name."""
+        selected = [topic for topic in self.report.topics if topic.status is not TopicStatus.EXCLUDED]
+        unknown = _spans(self.report, None)
+        return [
+            TopicView(topic, self.axis, (*_spans(self.report, topic.target), *unknown))
+            for topic in sorted(selected, key=lambda topic: topic.target)
+        ]
+
+    @property
+    def has_marks(self) -> bool:
+        """Whether a track shows rejected or unreadable messages."""
+        return any(topic.track and (topic.track.rejected or topic.track.unreadable) for topic in self.topics)
+
+    @property
+    def excluded(self) -> dict[str, list[str]]:
+        """The excluded topics by reason."""
+        reasons: dict[str, list[str]] = {}
+        for topic in self.report.topics:
+            if topic.status is TopicStatus.EXCLUDED:
+                reasons.setdefault(topic.why, []).append(f"{topic.topic} ({topic.msgtype})")
+        return dict(sorted(reasons.items()))
+
+    @property
+    def rejections(self) -> list[str]:
+        """The reasons of rejections."""
+        return [
+            f"{topic.target}: {counted(rejection.count, 'message')} at {rejection.stage.value} "
+            f"[{rejection.rule}]: {rejection.reason} (first log time "
+            f"{time_text(rejection.first_log_time_ns)}, offset {count_text(rejection.first_offset)})"
+            for topic in self.report.topics
+            for rejection in topic.rejections
+        ]
+
+    @property
+    def unreadable_ranges(self) -> list[str]:
+        """The unreadable ranges."""
+        return [
+            f"{item.topic or 'the recording'}: "
+            f"{'unknown number of messages' if item.count is None else counted(item.count, 'message')}"
+            f"{'' if item.offset is None else f' at offset {count_text(item.offset)}'}: {item.reason}"
+            for item in self.report.unreadable_ranges
+        ]
+
+    @property
+    def contract_rows(self) -> list[ContractRow]:
+        """The results of the contract."""
+        return contract_rows([self.report])
+
+    @cached_property
+    def examples(self) -> list[QuarantinedMessage]:
+        """The first quarantined messages of each topic and rule, if the quarantine can be read."""
+        return list(_examples(self.report)) if self.quarantined else []
+
+
+class TopicView:
+    """The values of one topic on the page."""
+
+    def __init__(self, report: TopicReport, axis: Axis | None, unreadable: Sequence[Span]) -> None:
+        self.report = report
+        timeline = report.timeline
+        self.rate = "" if report.rate_hz is None else f"{report.rate_hz:.4g} Hz"
+        self.jitter = interval_text(timeline.jitter_ns) if timeline else ""
+        self.gap_count = timeline.gap_count if timeline else 0
+        self.track: Track | None = None
+        if axis is not None:
+            rejected = [
+                (stretch.start_ns, stretch.end_ns)
+                for rejection in report.rejections
+                for stretch in rejection.stretches
+            ]
+            self.track = draw_track(axis, report.target, timeline, rejected=rejected, unreadable=unreadable)
+
+
+class QuarantinedMessage(Struct, frozen=True):
+    """A message in the quarantine."""
+
+    topic: str
+    rule: str
+    log_time_ns: int
+    offset: int
+    size: int
+    reason: str
+
+
+def _examples(report: Report) -> Iterator[QuarantinedMessage]:
+    """Yield the first messages of each topic and rule in the start of the quarantine's index."""
+    if report.quarantine is None:
+        return
+    counts: dict[tuple[str, str], int] = {}
+    try:
+        with Path(report.quarantine).with_suffix(".jsonl").open("rb") as file:
+            lines = file.read(MAX_INDEX_BYTES).splitlines()
+    except (OSError, ValueError):
+        return
+    for line in lines:
+        try:
+            entry: dict[str, Any] = json.loads(line)
+            message = QuarantinedMessage(
+                str(entry["target"]),
+                str(entry["rule"]),
+                int(entry["log_time_ns"]),
+                int(entry["offset"]),
+                int(entry["bytes"]),
+                str(entry["reason"]),
+            )
+        except (ValueError, KeyError, TypeError):
+            continue  # the last line can be incomplete
+        key = (message.topic, message.rule)
+        counts[key] = counts.get(key, 0) + 1
+        if counts[key] <= MAX_EXAMPLES:
+            yield message
+
+
+def _times(report: Report) -> Iterator[int]:
+    """Yield the times between which a recording's axis extends."""
+    for topic in report.topics:
+        if topic.status is not TopicStatus.EXCLUDED:
+            yield from (time for time in (topic.start_ns, topic.end_ns) if time is not None)
+            for rejection in topic.rejections:
+                yield from (time for each in rejection.stretches for time in (each.start_ns, each.end_ns))
+    for item in report.unreadable_ranges:
+        yield from (time for time in (item.start_ns, item.end_ns) if time is not None)
+
+
+def _spans(report: Report, topic: str | None) -> list[Span]:
+    """Return the times of the unreadable ranges of a topic, or of those that affect unknown topics."""
+    return [
+        (item.start_ns, item.end_ns)
+        for item in report.unreadable_ranges
+        if item.topic == topic and item.start_ns is not None and item.end_ns is not None
+    ]
