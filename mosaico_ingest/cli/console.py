@@ -68,8 +68,10 @@ class PlainTable(Table):
     ellipsis if `ellipsis` is set.
     """
 
-    def __init__(self, *names: str, numbers: Collection[str] = (), ellipsis: bool = False) -> None:
-        super().__init__(box=None, pad_edge=False, header_style="dim")
+    def __init__(
+        self, *names: str, numbers: Collection[str] = (), ellipsis: bool = False, header: bool = True
+    ) -> None:
+        super().__init__(box=None, pad_edge=False, header_style="dim", show_header=header)
         for name in names:
             number = name in numbers
             self.add_column(

@@ -10,6 +10,7 @@ import typer
 
 from mosaico_ingest.cli.console import PlainTable, Terminal, print_json, print_line
 from mosaico_ingest.cli.options import DEFAULT_STORE, JsonOption, StoreOption
+from mosaico_ingest.cli.store_rows import describe, head, sample, tail
 from mosaico_ingest.job.values import PROVENANCE_KEY
 from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text, time_text
 
@@ -25,7 +26,7 @@ CELL_WIDTH = 28
 METADATA_WIDTH = 100
 """Characters of a metadata value."""
 
-store_app = typer.Typer(no_args_is_help=True, help="List, show and remove the sequences of a store.")
+store_app = typer.Typer(no_args_is_help=True, help="List, show, query and remove the sequences of a store.")
 
 
 def verify(
@@ -143,6 +144,8 @@ def show(
 ) -> None:
     """Show a sequence's topics, or a topic's schema, counts, time span, metadata and first rows."""
     from mosaico_ingest.destinations.store import SequenceSummary, Store
+    from mosaico_ingest.view.rows import first_rows as first
+    from mosaico_ingest.view.values import json_value
 
     opened = Store.open(store, create=False)
     sequence, _, topic = path.lstrip("/").partition("/")
@@ -159,11 +162,15 @@ def show(
             print_sequence(info)
         return
     topic_info = opened.topic(sequence, topic)
-    first_rows = _first_rows(opened.scan(sequence, topic), rows)
+    first_rows = first(topic_info, rows).to_pylist()
     if as_json:
-        print_json({**_topic_json(topic_info), "first_rows": first_rows}, default=_json_value)
+        print_json({**_topic_json(topic_info), "first_rows": json_value(first_rows)})
     else:
         print_topic(topic_info, first_rows)
+
+
+for command in (head, tail, sample, describe):
+    store_app.command()(command)
 
 
 @store_app.command()
@@ -259,6 +266,8 @@ def print_sequence(info: SequenceInfo) -> None:
 
 def print_topic(info: TopicInfo, first_rows: Sequence[Mapping[str, Any]]) -> None:
     """Print a topic's counts, time span, files, metadata, columns and first rows."""
+    from mosaico_ingest.view.values import value_text
+
     print_line(f"{info.sequence}{info.name}", style="bold")
     facts = f"{info.ontology.tag}, {counted(info.rows, 'row')}, {bytes_text(info.stored_bytes)}"
     print_line(f"{facts}, {time_text(info.start_ns)} .. {time_text(info.end_ns)} UTC")
@@ -292,6 +301,8 @@ def _leaf_columns(
 
 
 def _print_metadata(metadata: Mapping[str, Any]) -> None:
+    from mosaico_ingest.view.values import value_text
+
     for name, value in _metadata_lines(metadata):
         print_line(f"  {name}: {value_text(value, METADATA_WIDTH)}")
 
@@ -306,45 +317,6 @@ def _metadata_lines(metadata: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
             yield key, f"{value.get('tool')} from {', '.join(names)}"
         else:
             yield from ((f"{key}.{name}", member) for name, member in value.items())
-
-
-def value_text(value: object, width: int) -> str:
-    """Return a value as text of about `width` characters; the text states how much is omitted."""
-    if value is None:
-        return "-"
-    if isinstance(value, bytes):
-        return f"<{counted(len(value), 'byte')}>"
-    if isinstance(value, str):
-        return value if len(value) <= width else f"{value[:width]}… ({len(value)} characters)"
-    if isinstance(value, list | tuple):
-        return _members_text([value_text(item, width) for item in value], "[]", "values", width)
-    if isinstance(value, dict):
-        members = [f"{key}: {value_text(item, width)}" for key, item in value.items()]
-        return _members_text(members, "{}", "members", width)
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def _members_text(members: Sequence[str], brackets: str, noun: str, width: int) -> str:
-    text = ", ".join(members)
-    if len(text) <= width:
-        return f"{brackets[0]}{text}{brackets[1]}"
-    first, length = list[str](), 0
-    for member in members:
-        length += len(member) + len(", ")
-        if length > width:
-            break
-        first.append(member)
-    return f"{brackets[0]}{', '.join((*first, '…'))}{brackets[1]} ({len(members)} {noun})"
-
-
-def _first_rows(reader: pa.RecordBatchReader, count: int) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = []
-    with reader:
-        for batch in reader:
-            if len(rows) >= count:
-                break
-            rows += batch.slice(0, count - len(rows)).to_pylist()
-    return rows
 
 
 def _duration_text(info: SequenceSummary | TopicInfo) -> str:
@@ -381,8 +353,3 @@ def _topic_json(info: TopicInfo) -> dict[str, Any]:
         "files": [str(segment.path) for segment in info.segments],
         "schema": {field.name: str(field.type) for field in info.schema},
     }
-
-
-def _json_value(value: object) -> object:
-    """Return the size of binary values and the text of other values that JSON cannot represent."""
-    return f"<{counted(len(value), 'byte')}>" if isinstance(value, bytes) else str(value)

@@ -10,7 +10,17 @@ import pyarrow.compute as pc
 import pyarrow.types as pt
 from msgspec import Struct
 
-__all__ = ["Column", "is_binary", "is_list", "is_number", "topic_columns"]
+__all__ = [
+    "Column",
+    "flat_columns",
+    "is_binary",
+    "is_list",
+    "is_number",
+    "path_values",
+    "struct_paths",
+    "time_values",
+    "topic_columns",
+]
 
 _compute: Any = pc
 """`pyarrow.compute`, whose stubs do not accept arrays of any type."""
@@ -54,6 +64,34 @@ def topic_columns(schema: pa.Schema) -> tuple[Column, ...]:
     return tuple(column for field in schema for column in _walk(field, (), "", nullable=False))
 
 
+def struct_paths(schema: pa.Schema) -> list[str]:
+    """Return the paths of all columns and of the structs that contain them, such as `pose` and `pose.position.x`."""
+    return [path for field in schema for path in _struct_paths(field, "")]
+
+
+def path_values(table: pa.Table, path: str) -> pa.Array[Any]:
+    """Return the values of a path such as `pose.position`, one per row."""
+    name, *members = path.split(".")
+    column = table.column(name)
+    values: Any = _compute.struct_field(column, members) if members else column
+    return values.combine_chunks() if isinstance(values, pa.ChunkedArray) else values
+
+
+def flat_columns(path: str, values: pa.Array[Any]) -> Iterator[tuple[str, pa.Array[Any]]]:
+    """Yield the path and the values of each column in a struct; times and lists remain as they are."""
+    kind = values.type
+    if not pt.is_struct(kind) or _is_time(kind):
+        yield path, values
+        return
+    for member in kind:
+        yield from flat_columns(f"{path}.{member.name}", _compute.struct_field(values, member.name))
+
+
+def time_values(values: pa.Array[Any]) -> pa.Array[Any]:
+    """Return times in two parts in ns, and other values unchanged."""
+    return _nanoseconds(values) if _is_time(values.type) else values
+
+
 def is_number(kind: pa.DataType) -> bool:
     """Return whether values of this type are numbers."""
     return pt.is_integer(kind) or pt.is_floating(kind) or pt.is_decimal(kind)
@@ -89,6 +127,14 @@ def _walk(field: pa.Field[Any], steps: tuple[str, ...], prefix: str, *, nullable
     else:
         is_timestamp = path == _TIMESTAMP or pt.is_timestamp(kind)
         yield Column(path, steps, kind, is_time=is_timestamp, nullable=nullable)
+
+
+def _struct_paths(field: pa.Field[Any], prefix: str) -> Iterator[str]:
+    path = f"{prefix}{field.name}"
+    yield path
+    if pt.is_struct(field.type):
+        for member in field.type:
+            yield from _struct_paths(member, f"{path}.")
 
 
 def _item_type(kind: pa.DataType) -> pa.DataType:

@@ -18,6 +18,7 @@ from mosaico_ingest.report.model import Rejection, RunReport
 from mosaico_ingest.report.units import rate_text, written_text
 from mosaico_ingest.services.draft import draft_manifest
 from mosaico_ingest.services.inspection import estimate_rate_hz
+from mosaico_ingest.view.values import value_text
 
 JOB = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
 DRIVE = JOB.parent / "quickstart" / "drive.mcap"
@@ -103,7 +104,7 @@ def test_print_sequences_incomplete_sequence_prints_its_note(
             session.topic("/t", ontology_type("String"), {})
             if name == "torn":
                 session.note_error("the disk is full")
-    store_command.print_sequences(Store.open(tmp_path).sequences())
+    store_command.print_sequences(Store.open(tmp_path).listing())
     assert capsys.readouterr().out.splitlines()[-1:] == ["torn: incomplete: the disk is full"]
 
 
@@ -115,14 +116,14 @@ def test_print_sequences_incomplete_sequence_prints_its_note(
         (0.5, "0.5"),
         (b"abc", "<3 bytes>"),
         ([1.0, 2.0], "[1.0, 2.0]"),
-        (list(range(1000)), "[0, 1, 2, 3, 4, 5, …] (1000 values)"),
+        (list(range(1000)), "[0, 1, 2, 3, 4, 5, …] (1,000 values)"),
         ({"x": 1, "y": None}, "{x: 1, y: -}"),
         ([{"name": "a", "size": 4}] * 9, "[{name: a, size: 4}, …] (9 values)"),
         ("a" * 30, "aaaaaaaaaaaaaaaaaaaa… (30 characters)"),
     ],
 )
 def test_value_text_long_value_states_omitted_count(value: object, text: str) -> None:
-    assert store_command.value_text(value, 20) == text
+    assert value_text(value, 20) == text
 
 
 def test_written_text_interrupted_run_states_messages_of_recording(tmp_path: Path) -> None:

@@ -1,0 +1,383 @@
+"""`ingest store head`, `tail`, `sample` and `describe`: rows and statistics of stored topics."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.text import Text
+
+from mosaico_ingest.cli.console import PlainTable, Terminal, print_json, print_line
+from mosaico_ingest.cli.options import DEFAULT_STORE, JsonOption, StoreOption
+from mosaico_ingest.report.units import bytes_text, count_text, counted, rate_text, seconds_text, time_text
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from mosaico_ingest.destinations.store import SequenceInfo, Store, TopicInfo
+    from mosaico_ingest.view.statistics import ColumnStatistics, TopicStatistics, TopicTiming
+
+CELL_WIDTH = 40
+"""Characters of a value in a table of rows."""
+RECORD_WIDTH = 90
+"""Characters of a value where each column of a row has its own line."""
+MAX_GAPS = 5
+"""Gaps of a topic that are listed."""
+
+TopicArgument = Annotated[str, typer.Argument(metavar="SEQUENCE/TOPIC", help="A topic of a sequence.")]
+CountOption = Annotated[int, typer.Option("--count", "-n", min=0, metavar="N", help="Number of rows.")]
+ColumnsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--columns",
+        "-c",
+        metavar="NAMES",
+        help="Columns to print, separated by commas, such as acceleration.z,header.",
+    ),
+]
+FlattenOption = Annotated[
+    bool, typer.Option("--flatten", help="Print each member of a struct as a column of its own.")
+]
+CsvOption = Annotated[bool, typer.Option("--csv", help="Print CSV with flattened structs.")]
+
+
+def head(
+    path: TopicArgument,
+    *,
+    store: StoreOption = DEFAULT_STORE,
+    count: CountOption = 10,
+    columns: ColumnsOption = None,
+    at: Annotated[
+        str | None,
+        typer.Option("--at", metavar="TIME", help="Start here: a time, or an offset such as +10s or -5s."),
+    ] = None,
+    flatten: FlattenOption = False,
+    as_json: JsonOption = False,
+    as_csv: CsvOption = False,
+) -> None:
+    """Print the first rows of a topic, or the first rows from a time on."""
+    from mosaico_ingest.view.rows import first_rows
+
+    topic = open_topic(store, path)
+    start_ns = None if at is None else time_option(topic, at)
+    table = first_rows(topic, count, columns=_top_level(topic, columns), start_ns=start_ns)
+    _print_rows(topic, table, columns, flatten=flatten, as_json=as_json, as_csv=as_csv)
+
+
+def tail(
+    path: TopicArgument,
+    *,
+    store: StoreOption = DEFAULT_STORE,
+    count: CountOption = 10,
+    columns: ColumnsOption = None,
+    at: Annotated[
+        str | None,
+        typer.Option("--at", metavar="TIME", help="End here: a time, or an offset such as +10s or -5s."),
+    ] = None,
+    flatten: FlattenOption = False,
+    as_json: JsonOption = False,
+    as_csv: CsvOption = False,
+) -> None:
+    """Print the last rows of a topic, or the last rows until a time."""
+    from mosaico_ingest.view.rows import last_rows
+
+    topic = open_topic(store, path)
+    end_ns = None if at is None else time_option(topic, at)
+    table = last_rows(topic, count, columns=_top_level(topic, columns), end_ns=end_ns)
+    _print_rows(topic, table, columns, flatten=flatten, as_json=as_json, as_csv=as_csv)
+
+
+def sample(
+    path: TopicArgument,
+    *,
+    store: StoreOption = DEFAULT_STORE,
+    count: CountOption = 10,
+    columns: ColumnsOption = None,
+    at: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--at", metavar="TIME", help="Print the row nearest to this time or offset. Repeatable."
+        ),
+    ] = None,
+    flatten: FlattenOption = False,
+    as_json: JsonOption = False,
+    as_csv: CsvOption = False,
+) -> None:
+    """Print rows at equal distances, or the rows nearest to some times."""
+    from mosaico_ingest.view.rows import rows_near, sampled_rows
+
+    topic = open_topic(store, path)
+    names = _top_level(topic, columns)
+    if at:
+        table = rows_near(topic, [time_option(topic, text) for text in at], columns=names)
+    else:
+        table = sampled_rows(topic, count, columns=names)
+    _print_rows(topic, table, columns, flatten=flatten, as_json=as_json, as_csv=as_csv)
+
+
+def describe(
+    path: Annotated[
+        str, typer.Argument(metavar="SEQUENCE[/TOPIC]", help="A sequence, or one of its topics.")
+    ],
+    store: StoreOption = DEFAULT_STORE,
+    every: Annotated[
+        bool, typer.Option("--all", help="Also print columns that are null in every row.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Print rate, jitter and gaps of each topic of a sequence, and the statistics of a topic's columns."""
+    from msgspec import to_builtins
+
+    from mosaico_ingest.view.statistics import describe_topic, topic_timing
+    from mosaico_ingest.view.values import json_value
+
+    opened = _opened(store)
+    sequence, _, topic = path.lstrip("/").partition("/")
+    if topic:
+        described = describe_topic(opened.topic(sequence, topic))
+        if as_json:
+            print_json(json_value(to_builtins(described, enc_hook=_builtin)))
+        else:
+            _print_topic_statistics(described, every=every)
+        return
+    info = opened.sequence(sequence)
+    timings = [(topic, topic_timing(topic)) for topic in info.topics]
+    if as_json:
+        topics = [
+            {"topic": topic.name, "ontology": topic.ontology.tag, **to_builtins(timing, enc_hook=_builtin)}
+            for topic, timing in timings
+        ]
+        print_json({"sequence": info.name, "topics": topics})
+    else:
+        _print_timings(info, timings)
+
+
+def open_topic(store: str, path: str) -> TopicInfo:
+    """Return the topic of an argument `SEQUENCE/TOPIC`; raises a usage error if it names no topic."""
+    sequence, _, topic = path.lstrip("/").partition("/")
+    opened = _opened(store)
+    if not topic:
+        names = ", ".join(f"{sequence}{info.name}" for info in opened.sequence(sequence).topics)
+        raise typer.BadParameter(f"{path} names no topic; choose one of {names}", param_hint="SEQUENCE/TOPIC")
+    return opened.topic(sequence, topic)
+
+
+def time_option(info: TopicInfo | SequenceInfo, text: str) -> int:
+    """Return the ns of `--at`: nanoseconds, an instant, or an offset from the start (`+`) or the end (`-`)."""
+    from mosaico_ingest.job.units import parse_time
+
+    if text.isdecimal() and len(text) < 20:  # noqa: PLR2004 - the digits of 64 bits
+        return int(text)
+    try:
+        bound = parse_time(text)
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--at") from error
+    if not bound.relative:
+        return bound.ns
+    origin = info.start_ns if bound.ns >= 0 and not text.startswith("-") else info.end_ns
+    return (origin or 0) + bound.ns
+
+
+def _opened(store: str) -> Store:
+    from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas
+    from mosaico_ingest.destinations.store import Store
+
+    collect_garbage_as_usual()
+    hide_pandas()
+    return Store.open(store, create=False)
+
+
+def _top_level(topic: TopicInfo, columns: str | None) -> list[str] | None:
+    """Return the top-level columns that contain the selected ones; raises a usage error for an unknown one."""
+    if columns is None:
+        return None
+    return list(dict.fromkeys(column.partition(".")[0] for column in _selected(topic, columns)))
+
+
+def _selected(topic: TopicInfo, columns: str) -> list[str]:
+    from mosaico_ingest.findings import suggest_names
+    from mosaico_ingest.view.columns import struct_paths
+
+    names = [name.strip() for name in columns.split(",") if name.strip()]
+    paths = struct_paths(topic.schema)
+    for name in names:
+        if name not in paths:
+            hint = suggest_names(paths, [name])
+            raise typer.BadParameter(f"there is no column {name!r}; {hint}", param_hint="--columns")
+    return names
+
+
+def _print_rows(
+    topic: TopicInfo,
+    table: pa.Table,
+    columns: str | None,
+    *,
+    flatten: bool,
+    as_json: bool,
+    as_csv: bool,
+) -> None:
+    from mosaico_ingest.view.columns import flat_columns, path_values, time_values
+    from mosaico_ingest.view.values import flat_text, json_value
+
+    names = [table.schema.names[0], *(_selected(topic, columns) if columns else table.schema.names[1:])]
+    cells = {name: path_values(table, name) for name in dict.fromkeys(names)}
+    if flatten or as_csv:
+        cells = {path: values for name, array in cells.items() for path, values in flat_columns(name, array)}
+        cells = {path: time_values(values) for path, values in cells.items()} if as_csv else cells
+    if as_json:
+        lists = {name: values.to_pylist() for name, values in cells.items()}
+        print_json([json_value({name: lists[name][row] for name in lists}) for row in range(table.num_rows)])
+    elif as_csv:
+        writer = csv.writer(sys.stdout)
+        writer.writerow(cells)
+        writer.writerows(
+            zip(*([flat_text(each) for each in values.to_pylist()] for values in cells.values()), strict=True)
+        )
+    elif not table.num_rows:
+        print_line(f"{topic.sequence}{topic.name}: no rows here")
+    else:
+        empty = [name for name, values in cells.items() if values.null_count == len(values)]
+        texts = {
+            name: _cell_texts(values, is_time=at == 0)
+            for at, (name, values) in enumerate(cells.items())
+            if name not in empty
+        }
+        _print_texts(texts)
+        if empty:
+            noun = "column is" if len(empty) == 1 else "columns are"
+            print_line(f"{count_text(len(empty))} more {noun} null in these rows", style="dim")
+
+
+def _cell_texts(values: pa.Array[Any], *, is_time: bool) -> list[str]:
+    from mosaico_ingest.view.values import instant_text, scalar_text
+
+    if is_time:
+        return [instant_text(value) for value in values.to_pylist() if value is not None]
+    return [scalar_text(value, RECORD_WIDTH) for value in values]
+
+
+def _print_texts(texts: dict[str, list[str]]) -> None:
+    """Print a line for each row if that fits the terminal, otherwise a line for each column of each row."""
+    console = Terminal()
+    widths = [max(len(name), *map(len, column)) for name, column in texts.items()]
+    if sum(widths) + 2 * len(widths) <= console.width:
+        table = PlainTable(*texts, numbers=texts.keys())
+        for column in table.columns:
+            column.justify = "left"
+        for cells in zip(*texts.values(), strict=True):
+            table.add_row(*cells)
+        console.print(table)
+        return
+    (time_name, times), *others = texts.items()
+    for row, time in enumerate(times):
+        print_line(f"{time_name} {time}", style="bold")
+        table = PlainTable("column", "value", header=False)
+        for name, column in others:
+            table.add_row(Text(f"  {name}", style="cyan"), column[row])
+        console.print(table)
+
+
+def _print_timings(info: SequenceInfo, timings: Sequence[tuple[TopicInfo, TopicTiming]]) -> None:
+    print_line(info.name, style="bold")
+    names = ("topic", "ontology", "rows", "size", "rate", "jitter", "gaps", "longest gap")
+    table = PlainTable(*names, numbers=set(names[2:]))
+    for topic, timing in timings:
+        gaps = timing.timeline.gaps if timing.timeline else ()
+        longest = max((gap.end_ns - gap.start_ns for gap in gaps), default=None)
+        table.add_row(
+            topic.name,
+            topic.ontology.tag,
+            count_text(timing.rows),
+            bytes_text(topic.stored_bytes),
+            _rate(timing.rate_hz),
+            _short_time(timing.jitter_s),
+            count_text(timing.timeline.gap_count if timing.timeline else 0),
+            "" if longest is None else seconds_text(longest / 1e9),
+        )
+    Terminal().print(table)
+
+
+def _print_topic_statistics(described: TopicStatistics, *, every: bool) -> None:
+    timing = described.timing
+    print_line(f"{described.sequence}{described.topic}", style="bold")
+    span = f"{time_text(timing.start_ns)} .. {time_text(timing.end_ns)} UTC"
+    facts = [described.ontology, counted(timing.rows, "row"), span]
+    if timing.rate_hz is not None:
+        facts += [_rate(timing.rate_hz), f"jitter {_short_time(timing.jitter_s)}"]
+    print_line(", ".join(facts))
+    if timing.timeline is not None and timing.timeline.gap_count:
+        _print_gaps(timing)
+    columns = [column for column in described.columns if every or column.rows != 0]
+    names = ("column", "type", "unit", "nulls", "min", "max", "mean", "distinct")
+    table = PlainTable(*names, numbers={"nulls", "min", "max", "mean", "distinct"})
+    for column in columns:
+        table.add_row(*_statistics_cells(column))
+    Terminal().print(table)
+    hidden = len(described.columns) - len(columns)
+    if hidden:
+        noun = "column is" if hidden == 1 else "columns are"
+        print_line(f"{count_text(hidden)} more {noun} null in every row; --all prints them", style="dim")
+
+
+def _print_gaps(timing: TopicTiming) -> None:
+    if timing.timeline is None:
+        return
+    gaps = sorted(timing.timeline.gaps, key=lambda gap: gap.start_ns - gap.end_ns)[:MAX_GAPS]
+    shown = "" if timing.timeline.gap_count <= MAX_GAPS else f", the {MAX_GAPS} longest"
+    print_line(f"{counted(timing.timeline.gap_count, 'gap')}{shown}:", style="yellow")
+    for gap in sorted(gaps, key=lambda gap: gap.start_ns):
+        length = seconds_text((gap.end_ns - gap.start_ns) / 1e9)
+        print_line(f"  {length} from {time_text(gap.start_ns)} to {time_text(gap.end_ns)}", style="yellow")
+
+
+def _statistics_cells(column: ColumnStatistics) -> tuple[str | Text, ...]:
+    from mosaico_ingest.view.values import instant_text, value_text
+
+    is_size = "binary" in column.type
+    low, high = (
+        "-" if bound is None
+        else instant_text(bound) if column.is_time
+        else bytes_text(bound) if is_size
+        else value_text(bound, CELL_WIDTH // 2)
+        for bound in (column.minimum, column.maximum)
+    )  # fmt: skip
+    mean = "-" if column.mean is None else bytes_text(column.mean) if is_size else f"{column.mean:.6g}"
+    kind = "time" if column.is_time else _type_text(column)
+    nulls = "?" if column.nulls is None else count_text(column.nulls)
+    nulls += f" +{count_text(column.nan)} NaN" if column.nan else ""
+    if column.distinct is not None:
+        distinct = count_text(column.distinct)
+    else:
+        distinct = "?" if column.rows is None else "> 10,000" if column.rows else "-"
+    return Text(column.path, style="cyan"), kind, column.unit, nulls, low, high, mean, distinct
+
+
+def _type_text(column: ColumnStatistics) -> str:
+    """Return the type; of lists with the lengths, as in `double[9]` or `float[0..64]`."""
+    if column.lengths is None:
+        return column.type
+    shortest, longest = column.lengths
+    item = column.type.partition("item: ")[2].partition(">")[0].removesuffix(" not null") or column.type
+    return f"{item}[{shortest if shortest == longest else f'{shortest}..{longest}'}]"
+
+
+def _rate(rate_hz: float | None) -> str:
+    if rate_hz is None or rate_hz >= 1:
+        return rate_text(rate_hz)
+    return f"{rate_hz:.3g} Hz"
+
+
+def _short_time(seconds: float | None) -> str:
+    if seconds is None:
+        return ""
+    for factor, unit in ((1, "s"), (1e3, "ms")):
+        if seconds * factor >= 1:
+            return f"{seconds * factor:.3g} {unit}"
+    return f"{seconds * 1e6:.0f} µs"
+
+
+def _builtin(value: Any) -> Any:  # noqa: ANN401 - msgspec's hook
+    return value.model_dump() if hasattr(value, "model_dump") else str(value)

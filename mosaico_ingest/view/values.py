@@ -1,0 +1,153 @@
+"""Values of rows as text for people: times as times, bytes as size and kind, long values shortened."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from datetime import datetime, timezone
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from mosaico_ingest.report.units import counted, time_text
+from mosaico_ingest.view.images import image_file_type
+
+__all__ = ["flat_text", "instant_text", "json_value", "scalar_text", "time_parts_ns", "value_text"]
+
+_SECOND = 1_000_000_000
+_FIRST_INSTANT_NS = 10**17
+"""Times before March 1973 are durations, or times of a simulation, which starts at 0."""
+_PARTS = (("seconds", "nanoseconds"), ("sec", "nanosec"), ("secs", "nsecs"))
+_VIDEO_START = b"\0\0\0\1"
+
+
+def value_text(value: object, width: int) -> str:
+    """Return a value as text of about `width` characters; the text states how much is omitted."""
+    if isinstance(value, list | tuple):
+        texts = [value_text(item, width) for item in value[:width]]
+        return _members_text(texts, "[]", "value", width, len(value))
+    if isinstance(value, dict):
+        instant_ns = time_parts_ns(value)
+        if instant_ns is not None:
+            return instant_text(instant_ns)
+        members = [f"{key}: {value_text(item, width)}" for key, item in value.items()]
+        return _members_text(members, "{}", "member", width, len(members))
+    if isinstance(value, str):
+        return value if len(value) <= width else f"{value[:width]}… ({len(value)} characters)"
+    return _plain_text(value)
+
+
+def _plain_text(value: object) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, bytes):
+        return _bytes_text(value)
+    if isinstance(value, float):
+        return _float_text(value)
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def scalar_text(scalar: pa.Scalar[Any], width: int) -> str:
+    """Return `value_text` of an Arrow scalar, without converting the items of a long list that are not shown."""
+    if isinstance(scalar, pa.ListScalar | pa.LargeListScalar | pa.FixedSizeListScalar):
+        items: pa.Array[Any] | None = scalar.values
+        if items is None:
+            return "-"
+        values = [
+            _without_nulls(item) if isinstance(item, dict) else item for item in items[:width].to_pylist()
+        ]
+        texts = [value_text(item, width) for item in values]
+        return _members_text(texts, "[]", "value", width, len(items))
+    value: Any = scalar.as_py()
+    return value_text(_without_nulls(value) if isinstance(value, dict) else value, width)
+
+
+def _without_nulls(struct: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return a struct without null members and with lists after other members, or None if all are null."""
+    members = {
+        key: _without_nulls(member) if isinstance(member, dict) else member for key, member in struct.items()
+    }
+    present = {key: member for key, member in members.items() if member is not None}
+    return dict(sorted(present.items(), key=lambda item: isinstance(item[1], list))) or None
+
+
+def instant_text(time_ns: int) -> str:
+    """Return an instant in UTC with as many decimals as it needs, or a duration such as `12.5 s`."""
+    if abs(time_ns) < _FIRST_INSTANT_NS:
+        seconds, rest = divmod(abs(time_ns), _SECOND)
+        fraction = f".{rest:09}".rstrip("0") if rest else ""
+        return f"{'-' if time_ns < 0 else ''}{seconds}{fraction} s"
+    try:
+        instant = datetime.fromtimestamp(time_ns // _SECOND, tz=timezone.utc)
+    except (OverflowError, ValueError, OSError):
+        return time_text(time_ns)
+    digits = f"{time_ns % _SECOND:09}"
+    while len(digits) > 3 and digits.endswith("000"):  # noqa: PLR2004 - at least milliseconds
+        digits = digits[:-3]
+    return f"{instant:%Y-%m-%d %H:%M:%S}.{digits}"
+
+
+def time_parts_ns(value: Mapping[str, Any]) -> int | None:
+    """Return the ns of a time in seconds and nanoseconds, or None for any other struct and for null parts."""
+    for seconds, rest in _PARTS:
+        if set(value) == {seconds, rest} and isinstance(value[seconds], int) and isinstance(value[rest], int):
+            return value[seconds] * _SECOND + value[rest]
+    return None
+
+
+def json_value(value: object) -> Any:  # noqa: ANN401 - any JSON value
+    """Return a value that JSON can represent: bytes as `<12 bytes>`, NaN and infinities as text."""
+    if isinstance(value, bytes):
+        return _bytes_text(value)
+    if isinstance(value, float) and not math.isfinite(value):
+        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    if isinstance(value, Mapping):
+        return {str(key): json_value(member) for key, member in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [json_value(member) for member in value]
+    return value if isinstance(value, str | int | float | bool | None) else str(value)
+
+
+def flat_text(value: object) -> str:
+    """Return a value for a cell of a CSV file: empty for null, lists and structs as JSON."""
+    if value is None:
+        return ""
+    if isinstance(value, Mapping) or (isinstance(value, Sequence) and not isinstance(value, str | bytes)):
+        return json.dumps(json_value(value), ensure_ascii=False)
+    if isinstance(value, bool):
+        return str(value).lower()
+    return _bytes_text(value) if isinstance(value, bytes) else str(value)
+
+
+def _bytes_text(value: bytes) -> str:
+    kind = image_file_type(value) or ("video" if value.startswith(_VIDEO_START) else "")
+    return f"<{counted(len(value), 'byte')}{f', {kind}' if kind else ''}>"
+
+
+def _float_text(value: float) -> str:
+    """Return nine digits, or fewer if they determine a float32, as most sensors measure."""
+    if not math.isfinite(value):
+        return "NaN" if math.isnan(value) else str(value)
+    with np.errstate(over="ignore"):
+        single = np.float32(value)
+    if float(single) == value:
+        return str(single)
+    text = f"{value:.9g}"
+    return text if any(mark in text for mark in ".e") else f"{text}.0"
+
+
+def _members_text(members: Sequence[str], brackets: str, noun: str, width: int, count: int) -> str:
+    """Return the members that fit, in brackets, and their total `count`."""
+    text = ", ".join(members)
+    if len(text) <= width and len(members) == count:
+        return f"{brackets[0]}{text}{brackets[1]}"
+    first, length = list[str](), 0
+    for member in members:
+        length += len(member) + len(", ")
+        if length > width:
+            break
+        first.append(member)
+    shown = ", ".join((*first, "…")) if first or not members else f"{members[0][:width]}…"
+    return f"{brackets[0]}{shown}{brackets[1]} ({counted(count, noun)})"
