@@ -1,9 +1,12 @@
-"""The interface of an executor, and the choice of one."""
+"""The interface of an executor, the executor that runs in this process, and the choice of an executor."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Protocol
+
+from mosaico_ingest.report.events import RunStatus
 
 if TYPE_CHECKING:
     from mosaico_ingest.pipeline.task import Task
@@ -21,6 +24,24 @@ class Executor(Protocol):
         no report.
         """
         ...
+
+
+class InProcess:
+    """The executor that runs recordings one after the other in this process."""
+
+    def map(self, tasks: Sequence[Task], observe: BatchObserver) -> Iterator[Report]:
+        """Yield the report of each task; see `Executor.map`."""
+        from mosaico_ingest.destinations.registry import keep_destinations_open  # noqa: PLC0415 - as the next line
+        from mosaico_ingest.pipeline.run import run_recording  # noqa: PLC0415 - it loads the pipeline
+
+        with keep_destinations_open() as keep_open:
+            for position, task in enumerate(tasks):
+                report = run_recording(task, partial(observe, position)).report
+                yield report
+                if report.status is RunStatus.INTERRUPTED:
+                    return
+                if position + 1 < len(tasks):
+                    keep_open(task.job.destination)
 
 
 def do_nothing() -> None:
@@ -50,8 +71,6 @@ def choose_executor(
         return Ray(address, simultaneous)
     processes = min(simultaneous or tasks[0].job.run.jobs, len(tasks)) if tasks else 1
     if processes == 1:
-        from mosaico_ingest.executors.in_process import InProcess  # noqa: PLC0415 - it loads the pipeline
-
         return InProcess()
     from mosaico_ingest.executors.processes import Processes  # noqa: PLC0415 - multiprocessing is slow to import
 

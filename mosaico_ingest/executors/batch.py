@@ -1,18 +1,24 @@
-"""The bookkeeping of a batch whose recordings run in other processes: waiting, attempts and finished reports."""
+"""What executors with other processes share: the bookkeeping of a batch, and the types and adapters that workers need."""
 
 from __future__ import annotations
 
 import uuid
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
+from msgspec import Struct
+
+from mosaico_ingest.adapters.python import register_default_adapter, registered_adapters
 from mosaico_ingest.errors import IngestError
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.pipeline.run import failed_report
 from mosaico_ingest.pipeline.task import Attempt, Task
 from mosaico_ingest.report.events import BatchObserver, Event
 from mosaico_ingest.report.model import Report
+from mosaico_ingest.rosbag.definitions.registry import Registered, ROSTypeRegistry
 
 
 @dataclass(slots=True)
@@ -63,3 +69,21 @@ class Batch:
         """Yield the reports behind recordings that will never finish."""
         for position in sorted(self._reports):
             yield self._reports.pop(position)
+
+
+class Registrations(Struct, frozen=True):
+    """The message types and adapters that were registered in a process; a new process starts without them."""
+
+    types: Mapping[Stores | None, Mapping[str, Registered]]
+    adapters: tuple[type[Any], ...]
+
+    @classmethod
+    def current(cls) -> Registrations:
+        """Return the registrations of this process."""
+        return cls(ROSTypeRegistry.snapshot(), tuple(dict.fromkeys(registered_adapters().values())))
+
+    def register(self) -> None:
+        """Register the types and adapters in this process."""
+        ROSTypeRegistry.restore(self.types)
+        for adapter in self.adapters:
+            register_default_adapter(adapter)

@@ -18,9 +18,8 @@ from msgspec import Struct, structs
 from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.destinations.store.errors import explained
 from mosaico_ingest.errors import IngestError, Interrupted
-from mosaico_ingest.executors.batch import Batch
+from mosaico_ingest.executors.batch import Batch, Registrations
 from mosaico_ingest.executors.processes import ATTEMPTS
-from mosaico_ingest.executors.registrations import Registrations
 from mosaico_ingest.executors.shipment import absolute, pack
 from mosaico_ingest.interrupts import count_interrupts
 from mosaico_ingest.pipeline.memory import DEFAULT_BYTES

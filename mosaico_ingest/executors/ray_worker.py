@@ -18,7 +18,7 @@ from msgspec import Struct
 
 from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import BagError, IngestError, Interrupted, SinkError
-from mosaico_ingest.executors.registrations import Registrations
+from mosaico_ingest.executors.batch import Registrations
 from mosaico_ingest.interrupts import StopHandler
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.pipeline.run import failed_report, run_recording

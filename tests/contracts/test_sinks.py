@@ -14,7 +14,7 @@ from object_store import ObjectStore
 
 from mosaico_ingest.destinations.base import Sink, topic_schema
 from mosaico_ingest.destinations.memory import MemorySink
-from mosaico_ingest.destinations.server.sink import ServerSink
+from mosaico_ingest.destinations.server.destination import ServerSink
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.errors import SequenceExists, SinkError
 from mosaico_ingest.job.values import IfExists, ServerTarget

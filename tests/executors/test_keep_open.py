@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mosaico_ingest.destinations.registry import keep_destinations_open
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.executors.in_process import InProcess
+from mosaico_ingest.executors.base import InProcess
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.pipeline.task import Task
 

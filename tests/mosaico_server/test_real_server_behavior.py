@@ -18,7 +18,7 @@ from mosaicod import Mosaicod, Topic, running
 from mosaico_ingest.destinations.base import topic_schema
 from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.destinations.server.client import connect
-from mosaico_ingest.destinations.server.sink import ServerSink
+from mosaico_ingest.destinations.server.destination import ServerSink
 from mosaico_ingest.errors import SinkError, SinkUnavailable
 from mosaico_ingest.job.values import IfExists, ServerTarget, SessionLevelErrorPolicy
 from mosaico_ingest.ontology.registry import MODULES, ontology_type

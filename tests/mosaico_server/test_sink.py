@@ -18,9 +18,8 @@ from mosaicod import Mosaicod, Proxy, exists, make_key, precondition, running
 
 from mosaico_ingest.destinations.base import topic_schema
 from mosaico_ingest.destinations.server.client import connect
-from mosaico_ingest.destinations.server.destination import ServerDestination
+from mosaico_ingest.destinations.server.destination import ServerDestination, ServerSink
 from mosaico_ingest.destinations.server.errors import Address
-from mosaico_ingest.destinations.server.sink import ServerSink
 from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
 from mosaico_ingest.job.values import IfExists, ServerTarget, SessionLevelErrorPolicy
 from mosaico_ingest.ontology import Integer64

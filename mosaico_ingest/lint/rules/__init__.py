@@ -1,113 +1,19 @@
 """The checks of the lint rules, one module per rule.
 
-Rules without a module here are checked while the file is parsed, validated or compiled.
+Each module defines its check as `CHECK`. Rules without a module here are checked while the file is parsed, validated or
+compiled.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
+from pkgutil import iter_modules
+
 from mosaico_ingest.lint.rule import Check
-from mosaico_ingest.lint.rules import (
-    adapter_clash,
-    broken_adapter,
-    changed_number,
-    contradictory_policies,
-    delete_permission,
-    distro_mismatch,
-    distro_missing,
-    early_exclusion,
-    empty_time_range,
-    excluded_topic,
-    expectation_bounds,
-    idle_jobs,
-    image_setting,
-    invalid_schema,
-    machine_path,
-    metadata_key,
-    metadata_number,
-    metadata_schema,
-    missing_adapter,
-    missing_definitions,
-    missing_file,
-    missing_folder,
-    mixed_formats,
-    msg_constant_name,
-    msg_field_name,
-    msg_repeated_name,
-    msg_syntax,
-    msg_unknown_type,
-    name_clash,
-    name_without_placeholder,
-    overridden_pattern,
-    overwritten_input,
-    path_outside,
-    plaintext_secret,
-    readable_secret,
-    relative_topic,
-    renamed_glob,
-    repeated_definition,
-    repeated_pattern,
-    repeated_split,
-    sequence_name,
-    topic_name,
-    topic_pattern,
-    unencrypted_key,
-    unknown_adapter,
-    unknown_format,
-    unknown_placeholder,
-    unreachable_key,
-    wrong_url,
-)
 
 __all__ = ["CHECKS"]
 
-CHECKS: tuple[Check, ...] = (
-    adapter_clash.CHECK,
-    broken_adapter.CHECK,
-    changed_number.CHECK,
-    contradictory_policies.CHECK,
-    delete_permission.CHECK,
-    distro_mismatch.CHECK,
-    distro_missing.CHECK,
-    early_exclusion.CHECK,
-    empty_time_range.CHECK,
-    excluded_topic.CHECK,
-    expectation_bounds.CHECK,
-    idle_jobs.CHECK,
-    image_setting.CHECK,
-    invalid_schema.CHECK,
-    machine_path.CHECK,
-    metadata_key.CHECK,
-    metadata_number.CHECK,
-    metadata_schema.CHECK,
-    missing_adapter.CHECK,
-    missing_definitions.CHECK,
-    missing_file.CHECK,
-    missing_folder.CHECK,
-    mixed_formats.CHECK,
-    msg_constant_name.CHECK,
-    msg_field_name.CHECK,
-    msg_repeated_name.CHECK,
-    msg_syntax.CHECK,
-    msg_unknown_type.CHECK,
-    name_clash.CHECK,
-    name_without_placeholder.CHECK,
-    overridden_pattern.CHECK,
-    overwritten_input.CHECK,
-    path_outside.CHECK,
-    plaintext_secret.CHECK,
-    readable_secret.CHECK,
-    relative_topic.CHECK,
-    renamed_glob.CHECK,
-    repeated_definition.CHECK,
-    repeated_pattern.CHECK,
-    repeated_split.CHECK,
-    sequence_name.CHECK,
-    topic_name.CHECK,
-    topic_pattern.CHECK,
-    unencrypted_key.CHECK,
-    unknown_adapter.CHECK,
-    unknown_format.CHECK,
-    unknown_placeholder.CHECK,
-    unreachable_key.CHECK,
-    wrong_url.CHECK,
+CHECKS: tuple[Check, ...] = tuple(
+    import_module(f"{__name__}.{module.name}").CHECK for module in iter_modules(__path__)
 )
+"""The checks of all modules in this package, sorted by name."""

@@ -1,4 +1,8 @@
-"""Export of a sequence: restores the messages of each topic and writes them to a recording in time order."""
+"""Export of a sequence of the store to a recording, with a report of its fidelity.
+
+The messages of each topic are restored and written in time order. Every restored batch is adapted again and compared
+with the stored rows; the report lists each difference and each excluded topic. The module must not depend on the pipeline.
+"""
 
 from __future__ import annotations
 
