@@ -86,8 +86,8 @@ class RosbagInjector:
         return outcome.report
 
 
-def compile_job(manifest: Path) -> tuple[Job, ...]:
-    """Return the jobs of a manifest, one for each recording.
+def compile_job(manifest: Path, *, locked: bool = True) -> tuple[Job, ...]:
+    """Return the jobs of a manifest, one for each recording; `locked=False` does not read the lock file.
 
     Raises:
         ManifestError: The manifest has mistakes; `findings` has their locations.
@@ -97,7 +97,7 @@ def compile_job(manifest: Path) -> tuple[Job, ...]:
     from mosaico_ingest.job.manifest import load_manifests
     from mosaico_ingest.pipeline.compile import check_adapters, compile_manifests
 
-    jobs = compile_manifests(load_manifests(manifest))
+    jobs = compile_manifests(load_manifests(manifest), locked=locked)
     for _, group in groupby(jobs, key=lambda job: job.adapters):
         check_adapters(next(group))
     return jobs

@@ -23,10 +23,10 @@ from mosaico_ingest.version import __version__
 COMMANDS = {
     "run": "run", "bag": "run", "inspect": "report", "plan": "plan", "diff": "plan", "init": "plan", "expand": "plan",
     "verify": "store", "replay": "run", "export": "export", "lint": "lint", "serve": "serve", "watch": "watch",
-    "status": "watch", "report": "report", "schema": "lint",
+    "status": "watch", "report": "report",
 }  # fmt: skip
 """The module in `cli` that defines each command, in the order of `--help`."""
-GROUPS = {"adapters": "adapters", "store": "store", "keys": "serve"}
+GROUPS = {"adapters": "adapters", "store": "store", "keys": "serve", "schema": "schema"}
 """The module in `cli` that defines each command group, as the Typer application `<name>_app`."""
 NAMES = (*COMMANDS, *GROUPS)
 MANIFEST_SUFFIXES = (".yaml", ".yml")

@@ -1,28 +1,17 @@
-"""`ingest lint` and `schema`."""
+"""`ingest lint`."""
 
 from __future__ import annotations
 
-import json
 import os
 import sys
-from collections.abc import Callable
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
     from mosaico_ingest.lint.engine import LintReport
-
-
-class Document(str, Enum):
-    """Files that have a JSON Schema."""
-
-    JOB = "job"
-    ADAPTER = "adapter"
-    PLAN = "plan"
-    REPORT = "report"
 
 
 class OutputFormat(str, Enum):
@@ -127,59 +116,3 @@ def _explanation(name: str) -> str:
         hint = f"; did you mean {close!r}?" if close else "; list the rules with `--explain all`"
         raise typer.BadParameter(f"there is no rule {name!r}{hint}", param_hint="--explain")
     return page_of(rule)
-
-
-def schema(
-    document: Annotated[Document | None, typer.Argument(help="File whose schema to print.")] = None,
-    write: Annotated[
-        Path | None,
-        typer.Option("--write", metavar="DIR", help="Write NAME.schema.json into DIR, for editors."),
-    ] = None,
-    check: Annotated[
-        Path | None, typer.Option("--check", metavar="DIR", help="Fail if a schema in DIR is not up to date.")
-    ] = None,
-) -> None:
-    """Print, write or check the JSON Schemas (draft 2020-12). --write and --check default to all of them."""
-    from mosaico_ingest.textfile import write_atomically
-
-    documents = [document] if document else list(Document)
-    if write is None and check is None and document is None:
-        choices = ", ".join(choice.value for choice in Document)
-        raise typer.BadParameter(f"give one of {choices}", param_hint="DOCUMENT")
-    stale = 0
-    for each in documents:
-        text = _schema_text(each)
-        if write is not None:
-            write_atomically(_schema_file(write, each), text)
-        elif check is not None:
-            stale += _is_stale(_schema_file(check, each), text)
-        else:
-            typer.echo(text, nl=False)
-    if stale:
-        raise typer.Exit(1)
-
-
-def _schema_text(document: Document) -> str:
-    from mosaico_ingest.adapters.mapping.model import adapter_schema
-    from mosaico_ingest.job.reference import job_schema
-    from mosaico_ingest.pipeline.plan_document import plan_schema
-    from mosaico_ingest.report.model import report_schema
-
-    schemas: dict[Document, Callable[[], dict[str, Any]]] = {
-        Document.JOB: job_schema,
-        Document.ADAPTER: adapter_schema,
-        Document.PLAN: plan_schema,
-        Document.REPORT: report_schema,
-    }
-    return json.dumps(schemas[document](), indent=2, ensure_ascii=False) + "\n"
-
-
-def _schema_file(folder: Path, document: Document) -> Path:
-    return folder / f"{document.value}.schema.json"
-
-
-def _is_stale(path: Path, text: str) -> bool:
-    if path.exists() and path.read_text(encoding="utf-8") == text:
-        return False
-    typer.echo(f"{path} is not up to date — run `ingest schema --write {path.parent}`", err=True)
-    return True

@@ -42,6 +42,7 @@ from mosaico_ingest.job.values import (
     PROVENANCE_KEY,
     IfExists,
     LoaderErrorPolicy,
+    LockFile,
     OnSchemaChange,
     PluginTarget,
     ServerTarget,
@@ -412,6 +413,9 @@ class JobSettings(Section):
     store the new columns), new_topic (store it under another name). If omitted, definitions are not compared."""
     expect: Expectations | None = None
     """The data contract: expectations of the recording, its topics and their values, and the action if one fails."""
+    definitions: Literal["locked"] | None = None
+    """`locked` refuses recordings whose topics, message definitions or output columns differ from the lock file, which
+    `ingest schema lock` writes next to the manifest (`job.lock.json` for `job.yaml`). If omitted, they are not compared."""
     quarantine: QuarantineSettings | None = None
     """Where rejected messages are kept; without this section, they are only counted."""
     target: DestinationSettings = DestinationSettings()
@@ -445,6 +449,8 @@ class Job(JobSettings):
     paths: SkipValidation[tuple[Path | RemotePath, ...]]
     """The recording's splits."""
     origin: SkipValidation[Origin] = Field(default=Origin(), repr=False)
+    lock: SkipValidation[LockFile | None] = Field(default=None, repr=False)
+    """The lock file, if `definitions` is `locked`."""
     registry: SkipValidation[Any] = Field(default=None, repr=False)
     """The `ROSTypeRegistry` for definitions; None selects the process-wide registry."""
 

@@ -26,6 +26,13 @@ RECORDING = "recording"
 """The word for the whole recording where a contract may also name a topic."""
 
 
+class LockFile(Struct, frozen=True):
+    """The lock file of a manifest: its path, and the text that was read when the job was compiled."""
+
+    path: str
+    text: str
+
+
 class SessionLevelErrorPolicy(str, Enum):
     """The action after an error that ends the run."""
 

@@ -23,6 +23,7 @@ from mosaico_ingest.job.compose import PLACEHOLDERS, Placeholder, placeholders_i
 from mosaico_ingest.job.fields import FilePath, PathRole, marked_fields, replace_values
 from mosaico_ingest.job.manifest import LoadedManifest, refusal
 from mosaico_ingest.job.model import Job, JobSettings, Manifest, Origin, SequenceSettings
+from mosaico_ingest.job.values import LockFile
 from mosaico_ingest.job.yaml_source import Source
 from mosaico_ingest.metadata.schema import read_json
 from mosaico_ingest.metadata.sources import source_spans, with_spans
@@ -174,15 +175,17 @@ def _nearby(path: AnyPath) -> str:
     return f"{folder} has {', '.join(recordings[:5]) or 'no recording'}"
 
 
-def compile_manifests(jobs: Sequence[LoadedManifest]) -> tuple[Job, ...]:
+def compile_manifests(jobs: Sequence[LoadedManifest], *, locked: bool = True) -> tuple[Job, ...]:
     """Return the jobs of the recordings of every combination of a manifest's matrix; see `compile_manifest`."""
-    compiled = tuple(job for loaded in jobs for job in compile_manifest(loaded))
+    compiled = tuple(job for loaded in jobs for job in compile_manifest(loaded, locked=locked))
     _refuse_duplicates(jobs[0], [job.sequence.name for job in compiled])
     return compiled
 
 
-def compile_manifest(loaded: LoadedManifest) -> tuple[Job, ...]:
+def compile_manifest(loaded: LoadedManifest, *, locked: bool = True) -> tuple[Job, ...]:
     """Return a job for each recording that `bag.path` names, in the order of their paths.
+
+    With `locked=False`, the lock file of `definitions: locked` is not read.
 
     Raises:
         NothingMatched: A file does not exist, or a glob matches no recording.
@@ -198,8 +201,9 @@ def compile_manifest(loaded: LoadedManifest) -> tuple[Job, ...]:
         family=shared.sequence.family or shared.sequence.name, metadata=metadata, metadata_file=None
     )
     sections: dict[str, Any] = {key: getattr(shared, key) for key in JobSettings.model_fields}
+    lock = None if shared.definitions is None or not locked else read_lock_file(loaded.path, loaded.origin)
     return tuple(
-        _job({**sections, "sequence": sequence.replace(name=name)}, recording.paths, origin)
+        _job({**sections, "sequence": sequence.replace(name=name), "lock": lock}, recording.paths, origin)
         for recording, name in zip(recordings, names, strict=True)
     )
 
@@ -264,6 +268,31 @@ def _metadata(loaded: LoadedManifest, sequence: SequenceSettings) -> tuple[dict[
             if isinstance(source, Source) and key not in sequence.metadata:
                 origin = with_spans(origin, *source_spans(source, key))
     return {**metadata, **sequence.metadata}, origin
+
+
+def lock_path(manifest: Path) -> Path:
+    """Return the path of a manifest's lock file, such as `job.lock.json` for `job.yaml`."""
+    return manifest.with_suffix(".lock.json")
+
+
+def read_lock_file(manifest: Path, origin: Origin = Origin()) -> LockFile:  # noqa: B008 - origins are immutable
+    """Return the text of a manifest's lock file.
+
+    Raises:
+        ManifestError: The file cannot be read; the error has the location of `definitions`.
+    """
+    path = lock_path(manifest)
+    try:
+        return LockFile(str(path), read_limited(path).decode())
+    except (OSError, UnicodeDecodeError) as error:
+        missing = isinstance(error, FileNotFoundError)
+        reason = "does not exist" if missing else "cannot be read"
+        message = f"the lock file {path} {reason}"
+        hint = f"run `ingest schema lock {manifest}`" if missing else "restore it from version control"
+        span = origin.spans.get(("definitions",))
+        finding = Finding("lock-file", Severity.ERROR, message, span, hint)
+        where = str(span) if span else str(manifest)
+        raise ManifestError(message, where=where, hint=hint, findings=(finding,)) from error
 
 
 def check_adapters(job: Job) -> None:

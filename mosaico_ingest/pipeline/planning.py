@@ -24,6 +24,7 @@ from mosaico_ingest.job.units import format_time
 from mosaico_ingest.job.values import LoaderErrorPolicy, TimeBound, Unmodeled
 from mosaico_ingest.metadata.contract import check_metadata_contracts
 from mosaico_ingest.metadata.sources import fill_in_metadata
+from mosaico_ingest.pipeline.definition_lock import check_lock, lock_of
 from mosaico_ingest.pipeline.memory import MemoryBudget
 from mosaico_ingest.pipeline.plan import ExcludedTopic, Plan, TopicPlan, digest_of
 from mosaico_ingest.pipeline.schema_changes import follow_schema_changes
@@ -45,7 +46,7 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
         BagError: The definition of a selected topic is unknown and `on_error.message` is `raise`.
         AdapterError: An adapter does not fit its topic, or a type has no adapter and `adapters.unmodeled` is `fail`;
             `findings` has every such topic.
-        ContractError: The metadata violates its schema.
+        ContractError: The metadata violates its schema, or the definitions differ from the lock file.
         IngestError: The task is for another plan, or a definition has changed and `on_schema_change` is `fail`.
     """
     job, metadata_findings = fill_in_metadata(task.job, recording)
@@ -96,6 +97,8 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
         missing=recording.missing_files,
         attempt=task.attempt,
     )
+    if job.lock is not None:
+        check_lock(job.lock, lock_of(plan, recording.connections), recording=str(recording.files[0]))
     if job.on_schema_change is not None:
         plan = follow_schema_changes(plan, job.on_schema_change)
     _check_digest(plan, task)

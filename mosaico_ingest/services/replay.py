@@ -131,5 +131,7 @@ def _replay_job(file: QuarantineFile, job: Job) -> Job:
             )
             for topic, settings in job.topic_settings.items()
         },
+        definitions=None,
+        lock=None,
         quarantine=QuarantineSettings(path=folder).replace(systematic=sys.maxsize),
     )

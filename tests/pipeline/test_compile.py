@@ -15,6 +15,7 @@ from mosaico_ingest.job.values import (
     IfExists,
     Limit,
     LoaderErrorPolicy,
+    LockFile,
     OnSchemaChange,
     ServerTarget,
     SessionLevelErrorPolicy,
@@ -52,6 +53,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_compile_manifest_with_every_key_sets_every_field(folder: Path) -> None:
+    (folder / "job.lock.json").write_text("{}")
     (job,) = compiled(
         folder,
         """
@@ -71,6 +73,7 @@ adapters:
 on_error: {session: delete, topic: {default: finalize, /gps: ignore}, message: raise}
 on_schema_change: new_topic
 expect: {required: [/imu]}
+definitions: locked
 quarantine: {path: q, max: 0.1%, max_run: 100, systematic: 7}
 target: {host: h, port: 1, api_key: "${KEY}", tls_cert: ca.pem, tls: true, message_size: 4MB}
 run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
@@ -115,10 +118,11 @@ run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
         jobs=2,
     ).job
     bag = expected.bag.replace(path=("data/run_a.bag", "data/run 1.2.mcap"))
-    assert job == expected.replace(bag=bag, origin=job.origin)
+    lock = LockFile(str(folder / "job.lock.json"), "{}")
+    assert job == expected.replace(bag=bag, origin=job.origin, definitions="locked", lock=lock)
     assert job.bag.custom_msgs[0].path == str(folder / "msgs")
     assert job.origin.file == str(folder / "job.yaml")
-    assert job.where("run", "jobs") == f"{folder / 'job.yaml'}:20:61"
+    assert job.where("run", "jobs") == f"{folder / 'job.yaml'}:21:61"
     assert [key for key in JobSettings.model_fields if getattr(job, key) == getattr(DEFAULT, key)] == []
 
 

@@ -1,0 +1,160 @@
+"""`ingest schema`: JSON Schemas of files, and the lock file of a manifest."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from enum import Enum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+schema_app = typer.Typer()
+
+
+class Document(str, Enum):
+    """Files that have a JSON Schema."""
+
+    JOB = "job"
+    ADAPTER = "adapter"
+    PLAN = "plan"
+    REPORT = "report"
+    LOCK = "lock"
+
+
+WriteOption = Annotated[
+    Path | None,
+    typer.Option("--write", metavar="DIR", help="Write NAME.schema.json into DIR, for editors."),
+]
+CheckOption = Annotated[
+    Path | None,
+    typer.Option("--check", metavar="DIR", help="Fail if a schema in DIR is not up to date."),
+]
+
+
+@schema_app.callback(invoke_without_command=True)
+def schema(context: typer.Context, write: WriteOption = None, check: CheckOption = None) -> None:
+    """Print, write or check the JSON Schemas (draft 2020-12) of files, or lock message definitions.
+
+    Without a command, --write and --check apply to all schemas.
+    """
+    if context.invoked_subcommand is None:
+        if write is None and check is None:
+            choices = ", ".join(choice.value for choice in Document)
+            raise typer.BadParameter(f"give one of {choices}", param_hint="COMMAND")
+        write_schemas(list(Document), write, check)
+
+
+@schema_app.command()
+def job(write: WriteOption = None, check: CheckOption = None) -> None:
+    """Print the JSON Schema of job manifests."""
+    write_schemas([Document.JOB], write, check)
+
+
+@schema_app.command()
+def adapter(write: WriteOption = None, check: CheckOption = None) -> None:
+    """Print the JSON Schema of adapter files."""
+    write_schemas([Document.ADAPTER], write, check)
+
+
+@schema_app.command()
+def plan(write: WriteOption = None, check: CheckOption = None) -> None:
+    """Print the JSON Schema of plan files."""
+    write_schemas([Document.PLAN], write, check)
+
+
+@schema_app.command()
+def report(write: WriteOption = None, check: CheckOption = None) -> None:
+    """Print the JSON Schema of report files."""
+    write_schemas([Document.REPORT], write, check)
+
+
+@schema_app.command()
+def lock(
+    manifest: Annotated[
+        Path | None, typer.Argument(metavar="JOB.yaml", help="A job manifest.", show_default=False)
+    ] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Compare the recordings with the lock file; write nothing.")
+    ] = False,
+) -> None:
+    """Write the types, fields and output columns of every selected topic to JOB.lock.json.
+
+    With `definitions: locked` in the manifest, plans and runs refuse recordings that differ from this file. Without a
+    manifest, print the JSON Schema of lock files. Exit codes of --check: 0 equal, 6 different.
+    """
+    from mosaico_ingest import api
+    from mosaico_ingest.cli.console import print_line
+    from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas
+    from mosaico_ingest.report.units import counted
+
+    if manifest is None:
+        if check:
+            raise typer.BadParameter("give a manifest", param_hint="JOB.yaml")
+        write_schemas([Document.LOCK], None, None)
+        return
+    from mosaico_ingest.services.lock import check_locked, write_lock
+
+    collect_garbage_as_usual()
+    jobs = api.compile_job(manifest, locked=False)
+    hide_pandas(jobs)
+    if check:
+        count = check_locked(manifest, jobs)
+        print_line(f"{counted(count, 'recording')}: no differences", style="green")
+        return
+    written = write_lock(manifest, jobs)
+    for difference in written.differences:
+        print_line(str(difference))
+    topics = counted(len(written.lock.topics), "topic")
+    state = "" if written.is_new else f", {counted(len(written.differences), 'difference')}"
+    print_line(f"{written.path}: {topics}{state}", style="bold")
+
+
+def write_schemas(documents: Sequence[Document], write: Path | None, check: Path | None) -> None:
+    """Print the schemas, write them into the folder `write`, or compare them with those in the folder `check`.
+
+    Raises:
+        typer.Exit: A schema is not up to date.
+    """
+    from mosaico_ingest.textfile import write_atomically
+
+    stale = 0
+    for each in documents:
+        text = _schema_text(each)
+        if write is not None:
+            write_atomically(_schema_file(write, each), text)
+        elif check is not None:
+            stale += _is_stale(_schema_file(check, each), text)
+        else:
+            typer.echo(text, nl=False)
+    if stale:
+        raise typer.Exit(1)
+
+
+def _schema_text(document: Document) -> str:
+    from mosaico_ingest.adapters.mapping.model import adapter_schema
+    from mosaico_ingest.job.reference import job_schema
+    from mosaico_ingest.pipeline.definition_lock import lock_schema
+    from mosaico_ingest.pipeline.plan_document import plan_schema
+    from mosaico_ingest.report.model import report_schema
+
+    schemas: dict[Document, Callable[[], dict[str, Any]]] = {
+        Document.JOB: job_schema,
+        Document.ADAPTER: adapter_schema,
+        Document.PLAN: plan_schema,
+        Document.REPORT: report_schema,
+        Document.LOCK: lock_schema,
+    }
+    return json.dumps(schemas[document](), indent=2, ensure_ascii=False) + "\n"
+
+
+def _schema_file(folder: Path, document: Document) -> Path:
+    return folder / f"{document.value}.schema.json"
+
+
+def _is_stale(path: Path, text: str) -> bool:
+    if path.exists() and path.read_text(encoding="utf-8") == text:
+        return False
+    typer.echo(f"{path} is not up to date — run `ingest schema --write {path.parent}`", err=True)
+    return True
