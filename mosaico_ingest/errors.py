@@ -166,3 +166,8 @@ class Interrupted(IngestError):  # noqa: N818 - named after the condition
     """A signal stopped the run, after the session policy was applied."""
 
     exit_code = 130
+
+
+def missing_library(library: str, extra: str) -> IngestError:
+    """Return the error for a library that the extra `extra` of this package installs."""
+    return IngestError(f"{library} is not installed", hint=f"pip install 'mosaico-ingest[{extra}]'")

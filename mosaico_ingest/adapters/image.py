@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from mosaico_ingest.adapters.adapter import (
     AdapterSpec,
     Envelope,
 )
-from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.errors import AdapterError, missing_library
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.rosbag.definitions.model import Definition
 
@@ -40,10 +41,11 @@ def greyscale_png(data: bytes | memoryview, *, width: int, height: int) -> bytes
 
 
 def greyscale_pixels(png: bytes) -> bytes:
-    """Return the bytes that `greyscale_png` encoded.
+    """Return the bytes of an 8-bit greyscale PNG; one with filtered lines, as the official SDK writes, needs Pillow.
 
     Raises:
         AdapterError: The picture is not such a PNG.
+        IngestError: Pillow is not installed.
     """
     at, packed = len(_SIGNATURE), b""
     width = height = 0
@@ -54,13 +56,22 @@ def greyscale_pixels(png: bytes) -> bytes:
             at += size + 12
             if kind == b"IHDR":
                 width, height = struct.unpack(">II", body[:8])
+                if body[8:] != _GREYSCALE_8_BIT:
+                    raise AdapterError("the picture is no 8-bit greyscale PNG")
             packed += body if kind == b"IDAT" else b""
         scanlines = np.frombuffer(zlib.decompress(packed), np.uint8).reshape(height, width + 1)
     except (struct.error, zlib.error, ValueError) as error:
-        raise AdapterError(f"this is no PNG of ours: {error}") from error
-    if scanlines[:, 0].any():
-        raise AdapterError("this is no PNG of ours: its lines are filtered")
-    return scanlines[:, 1:].tobytes()
+        raise AdapterError(f"the picture is no PNG: {error}") from error
+    return _unfiltered(png) if scanlines[:, 0].any() else scanlines[:, 1:].tobytes()
+
+
+def _unfiltered(png: bytes) -> bytes:
+    try:
+        from PIL import Image  # noqa: PLC0415 - the extra `images`
+    except ImportError as error:
+        raise missing_library("Pillow", "images") from error
+    with Image.open(BytesIO(png), formats=["PNG"]) as picture:
+        return picture.tobytes()
 
 
 def without_png(rows: pa.StructArray) -> pa.StructArray:

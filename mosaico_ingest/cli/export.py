@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mosaico_ingest.cli.options import DEFAULT_STORE, ForceOption, JsonOption, StoreOption, TopicsOption
+from mosaico_ingest.cli.options import (
+    DEFAULT_STORE,
+    STORE,
+    ApiKeyOption,
+    ForceOption,
+    JsonOption,
+    TlsCertOption,
+    TopicsOption,
+)
 
 if TYPE_CHECKING:
     from mosaico_ingest.export import ExportReport, TopicExport
+    from mosaico_ingest.export.sources import SourceSequence
 
 INCOMPLETE = 4
 """Exit code if a topic was excluded, or if ingesting the file would not give the same rows."""
@@ -25,7 +36,18 @@ def export(
             "--to", help="The recording to write: .mcap, .db3 (ROS 2) or .bag (ROS 1).", metavar="FILE"
         ),
     ],
-    store: StoreOption = DEFAULT_STORE,
+    server: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="ADDRESS",
+            help="Mosaico server to read from, instead of the store: HOST:PORT, mosaico://HOST:PORT or, with TLS, "
+            "mosaico+tls://HOST:PORT.",
+        ),
+    ] = None,
+    api_key: ApiKeyOption = None,
+    tls_cert: TlsCertOption = None,
+    store: Annotated[str | None, STORE] = None,
     topics: TopicsOption = None,
     start: Annotated[
         str | None,
@@ -41,6 +63,14 @@ def export(
         list[str] | None,
         typer.Option("--adapter", help="Custom adapter that created the rows. Repeatable.", metavar="REF"),
     ] = None,
+    ros_distro: Annotated[
+        str | None,
+        typer.Option(
+            "--ros-distro",
+            metavar="DISTRO",
+            help="Distro of the definitions for topics that were stored without one, such as ros2_humble.",
+        ),
+    ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -48,21 +78,22 @@ def export(
 
     Exit codes: 0 complete, 4 a topic was excluded or would not give the same rows if the file were ingested.
     """
-    from mosaico_ingest.destinations.store import Store
     from mosaico_ingest.export import export_sequence
 
-    opened = Store.open(store, create=False)
-    info = opened.sequence(sequence)
-    report = export_sequence(
-        opened,
-        sequence,
-        to,
-        topics=topics or (),
-        start_ns=_instant_ns("--start", start, info.start_ns, info.end_ns),
-        end_ns=_instant_ns("--end", end, info.start_ns, info.end_ns),
-        adapters=adapter or (),
-        replace=force,
-    )
+    if server is not None and store is not None:
+        raise typer.BadParameter("excludes --from", param_hint="--store")
+    with _opened(sequence, server, api_key, tls_cert, store) as source:
+        report = export_sequence(
+            source,
+            sequence,
+            to,
+            topics=topics or (),
+            start_ns=_instant_ns("--start", start, source),
+            end_ns=_instant_ns("--end", end, source),
+            adapters=adapter or (),
+            ros_distro=ros_distro,
+            replace=force,
+        )
     if as_json:
         typer.echo(report.model_dump_json(indent=2))
     else:
@@ -71,7 +102,26 @@ def export(
         raise typer.Exit(INCOMPLETE)
 
 
-def _instant_ns(option: str, text: str | None, first_ns: int | None, last_ns: int | None) -> int | None:
+@contextmanager
+def _opened(
+    sequence: str, server: str | None, api_key: str | None, tls_cert: Path | None, store: str | None
+) -> Generator[SourceSequence, None, None]:
+    """Open a sequence of a server or of a store."""
+    from mosaico_ingest.export.sources import ServerSequence, StoreSequence
+
+    if server is None:
+        from mosaico_ingest.destinations.store import Store
+
+        yield StoreSequence(Store.open(store or DEFAULT_STORE, create=False), sequence)
+        return
+    from mosaico_ingest.destinations.server.address import server_at
+    from mosaico_ingest.destinations.server.client import connect
+
+    with connect(server_at(server, api_key=api_key, tls_cert=tls_cert)) as client:
+        yield ServerSequence(client, sequence)
+
+
+def _instant_ns(option: str, text: str | None, source: SourceSequence) -> int | None:
     """Return ns since the epoch; `+` counts from the first message, `-` back from the last."""
     from mosaico_ingest.job.units import parse_instant, parse_offset
 
@@ -83,7 +133,7 @@ def _instant_ns(option: str, text: str | None, first_ns: int | None, last_ns: in
         offset_ns = parse_offset(text)
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint=option) from None
-    return ((last_ns if offset_ns < 0 else first_ns) or 0) + offset_ns
+    return source.bounds[offset_ns < 0] + offset_ns
 
 
 def _print_export(report: ExportReport) -> None:
@@ -106,6 +156,8 @@ def _print_export(report: ExportReport) -> None:
 def _differences(topic: TopicExport) -> list[str]:
     """Return how the exported messages differ from the original ones."""
     lines = [f"excluded: {topic.excluded}"] if topic.excluded else []
+    if topic.assumed:
+        lines.append(f"stored without a definition; {topic.assumed} is assumed")
     lines += [f"{column} cannot be inverted ({reason})" for column, reason in topic.not_invertible.items()]
     if topic.defaulted:
         lines.append(f"not in the store, written as zero or empty: {', '.join(topic.defaulted)}")

@@ -52,6 +52,20 @@ TopicsOption = Annotated[
     ),
 ]
 StoreOption = Annotated[str, STORE]
+ApiKeyOption = Annotated[
+    str | None,
+    typer.Option(
+        "--api-key",
+        envvar="MOSAICO_API_KEY",
+        metavar="KEY",
+        help="API key for the server.",
+        show_envvar=True,
+    ),
+]
+TlsCertOption = Annotated[
+    Path | None,
+    typer.Option("--tls-cert", metavar="FILE", help="CA certificate of the server, in PEM format."),
+]
 ForceOption = Annotated[bool, typer.Option("--force", "-f", help="Replace an existing file.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 LogOption = Annotated[str | None, log_level("run.log_level")]

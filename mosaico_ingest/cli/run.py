@@ -16,11 +16,13 @@ from mosaico_ingest.cli.logs import LogFormat, set_up_logging
 from mosaico_ingest.cli.options import (
     STANDARD_OUTPUT,
     STORE,
+    ApiKeyOption,
     DistroOption,
     LogOption,
     QuietOption,
     RecordingArgument,
     ReportOption,
+    TlsCertOption,
     TopicsOption,
     log_level,
     write_output,
@@ -196,20 +198,8 @@ def bag(
         ),
     ] = None,
     port: Annotated[int, typer.Option("--port", metavar="PORT", help="Port of the server.")] = 6726,
-    api_key: Annotated[
-        str | None,
-        typer.Option(
-            "--api-key",
-            envvar="MOSAICO_API_KEY",
-            metavar="KEY",
-            help="API key for the server.",
-            show_envvar=True,
-        ),
-    ] = None,
-    tls_cert: Annotated[
-        Path | None,
-        typer.Option("--tls-cert", metavar="FILE", help="CA certificate of the server, in PEM format."),
-    ] = None,
+    api_key: ApiKeyOption = None,
+    tls_cert: TlsCertOption = None,
     store: Annotated[str | None, STORE] = None,
     if_exists: Annotated[
         IfExists,

@@ -343,7 +343,8 @@ class TopicInfo(Body):
     created_at_ns: int
     completed_at_ns: int | None = None
     locked: bool
-    data_info: DataInfo
+    data_info: DataInfo | None
+    """None from servers before 0.7."""
     time_window_info: TimeWindow | None = None
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from mosaico_ingest.errors import ViewError
+from mosaico_ingest.errors import ViewError, missing_library
 from mosaico_ingest.view.depth import (
     colour_map,
     depth_from_inverse,
@@ -20,7 +20,6 @@ from mosaico_ingest.view.depth import (
     run_length_depth,
 )
 from mosaico_ingest.view.encodings import Pixels, RawImage, demosaic, grey, is_bayer, raw_pixels
-from mosaico_ingest.view.extras import missing_library
 
 if TYPE_CHECKING:
     from PIL.Image import Image as Picture

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,10 @@ from pathlib import Path
 import pytest
 
 from mosaico_ingest.cli.app import main
+from mosaico_ingest.destinations.server.address import server_at
+from mosaico_ingest.errors import SinkError
+from mosaico_ingest.protocol.messages import Permission
+from mosaico_ingest.serve import Keyring, serve
 
 DRIVE = Path(__file__).parents[2] / "configs" / "quickstart" / "drive.mcap"
 
@@ -89,3 +94,72 @@ def test_export_invalid_arguments_leave_no_file(
     assert done.returncode == code
     assert says in done.stderr
     assert not list(folder.glob("x.*"))
+
+
+@pytest.fixture
+def secured(tmp_path: Path) -> Iterator[tuple[str, Keyring]]:
+    """The address of a server that requires a key, and its keys; it has the sequence `drive`."""
+    ring = Keyring(tmp_path / "keys.json")
+    with serve(tmp_path / "served", port=0, keys=ring) as server:
+        address = f"127.0.0.1:{server.port}"
+        key = ring.add(Permission.WRITE)
+        host, port = address.split(":")
+        upload = ("bag", str(DRIVE), "--name", "drive", "--host", host, "--port", port, "--api-key", key)
+        assert ingest(tmp_path, *upload).returncode == 0
+        yield address, ring
+
+
+def test_export_from_server_writes_the_selected_part(secured: tuple[str, Keyring], tmp_path: Path) -> None:
+    address, ring = secured
+    options = (
+        "--topics",
+        "/imu",
+        "--start",
+        "+2s",
+        "--end=-5s",
+        "--api-key",
+        ring.add(Permission.READ),
+        "--json",
+    )
+    done = ingest(tmp_path, "export", "drive", "--from", f"mosaico://{address}", "--to", "imu.mcap", *options)
+    assert done.returncode == 0, done.stderr
+    (topic,) = json.loads(done.stdout)["topics"]
+    assert (topic["topic"], topic["messages"]) == ("/imu", 299)
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "words"),
+    [
+        ((), 1, "requires an API key"),
+        (("--api-key", "msco_wrong"), 1, "API key is refused"),
+        (("--store", "mosaico"), 2, "excludes --from"),
+    ],
+)
+def test_export_from_server_refused_option_leaves_no_file(
+    secured: tuple[str, Keyring], tmp_path: Path, options: tuple[str, ...], code: int, words: str
+) -> None:
+    done = ingest(tmp_path, "export", "drive", "--from", secured[0], "--to", "out.mcap", *options)
+    assert done.returncode == code
+    assert words in done.stderr
+    assert not (tmp_path / "out.mcap").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "target"),
+    [
+        ("robot", ("robot", 6726, False)),
+        ("robot:7", ("robot", 7, False)),
+        ("mosaico://robot:7/", ("robot", 7, False)),
+        ("mosaico+tls://robot", ("robot", 6726, True)),
+        ("grpc+tls://[::1]:7", ("::1", 7, True)),
+    ],
+)
+def test_server_at_address_is_parsed(text: str, target: tuple[str, int, bool]) -> None:
+    server = server_at(text)
+    assert (server.host, server.port, server.tls) == target
+
+
+@pytest.mark.parametrize("text", ["", "http://robot", "robot:70000", "robot:port", "robot/s", "::1"])
+def test_server_at_other_text_raises(text: str) -> None:
+    with pytest.raises(SinkError, match="not the address of a server"):
+        server_at(text)

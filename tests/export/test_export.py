@@ -18,6 +18,7 @@ from mosaico_ingest.errors import BagError, IngestError, NothingMatched
 from mosaico_ingest.export import export_sequence
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.values import LoaderErrorPolicy, TopicLevelErrorPolicy
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 
 DRIVE = Path(__file__).parents[2] / "configs" / "quickstart" / "drive.mcap"
 ODD = """
@@ -203,13 +204,44 @@ def test_export_names_columns_that_cannot_be_inverted(ingested: Ingest, tmp_path
     assert not topic.faithful
 
 
-def test_export_topic_without_message_type_is_skipped(ingested: Ingest, tmp_path: Path) -> None:
+def test_export_topic_without_definition_uses_that_of_the_distro(ingested: Ingest, tmp_path: Path) -> None:
     store = ingested(DRIVE)
     with store.catalog.write() as db:
-        db.execute("UPDATE topics SET metadata = '{}' WHERE name = '/imu'")
-    report = export_sequence(store, "s", tmp_path / "out.mcap", topics=["/imu", "/joint_states"])
-    assert "does not describe" in report.topics[0].excluded
-    assert report.topics[1].messages == 500
+        db.execute("UPDATE topics SET metadata = '{}' WHERE name IN ('/imu', '/odom', '/battery')")
+    out = tmp_path / "out.mcap"
+    topics = ["/imu", "/odom", "/battery"]
+    report = export_sequence(store, "s", out, topics=topics, ros_distro="ros2_humble")
+    battery, imu, odom = report.topics
+    assert "no adapter produces BatteryPack" in battery.excluded
+    assert (imu.assumed, odom.assumed) == (
+        "sensor_msgs/msg/Imu of ros2_humble",
+        "nav_msgs/msg/Odometry of ros2_humble",
+    )
+    assert differences(DRIVE, out, topics=["/imu", "/odom"]) == {}
+
+
+def test_export_assumed_type_is_the_one_that_keeps_the_rows(ingested: Ingest, tmp_path: Path) -> None:
+    resolver = TypeResolver("ros2_humble")
+    messages: list[tuple[str, Any, int, dict[str, Any]]] = []
+    point = {"x": 1.0, "y": 2.0, "z": 3.0}
+    header = {"stamp": {"sec": 5, "nanosec": 6}, "frame_id": "f"}
+    for topic, name, values in (
+        ("/plain", "Point", point),
+        ("/stamped", "PointStamped", {"header": header, "point": point}),
+    ):
+        definition = resolver.resolve(f"geometry_msgs/msg/{name}", None, ros_version=2)
+        messages.append((topic, definition, 10, values))
+    source = record(tmp_path / "in.mcap", messages)
+    store = ingested(source)
+    with store.catalog.write() as db:
+        db.execute("UPDATE topics SET metadata = '{}'")
+    out = tmp_path / "out.mcap"
+    report = export_sequence(store, "s", out, ros_distro="ros2_humble")
+    assert [topic.msgtype for topic in report.topics] == [
+        "geometry_msgs/msg/Point",
+        "geometry_msgs/msg/PointStamped",
+    ]
+    assert differences(source, out) == {}
 
 
 LISTED = {

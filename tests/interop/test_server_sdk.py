@@ -12,10 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from message_differences import differences as message_differences
 
 from mosaico_ingest.api import RosbagInjector
+from mosaico_ingest.destinations.server.client import connect
 from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.export import export_sequence
+from mosaico_ingest.export.sources import ServerSequence
 from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.values import ServerTarget
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.protocol.messages import Permission
 from mosaico_ingest.serve import Keyring, Server, serve
@@ -276,3 +281,14 @@ def test_sdk_is_accepted_with_a_key_and_refused_without(tmp_path: Path) -> None:
             assert client.list_sequences() == []
         with pytest.raises(Exception, match=r"API key|onnect"):
             sdk.MosaicoClient.connect("127.0.0.1", server.port, timeout=1)
+
+
+def test_export_of_sequence_uploaded_by_the_sdk_equals_the_recording(served: Server, tmp_path: Path) -> None:
+    with connect(ServerTarget("127.0.0.1", served.port)) as connected:
+        source = ServerSequence(connected, "theirs")
+        report = export_sequence(source, "theirs", tmp_path / "out.mcap")
+    assert [topic.topic for topic in report.topics if topic.excluded or topic.assumed] == []
+    assert {topic.topic: topic.changed for topic in report.topics if topic.changed} == {}
+    # The SDK stores the codec only, and not the text of the message.
+    listed = {"/camera/image_raw/compressed": {"format"}}
+    assert message_differences(RECORDING, tmp_path / "out.mcap") == listed

@@ -95,6 +95,8 @@ class Faults:
     """The stored size of each topic."""
     rows_sent: Callable[[Topic], fl.FlightDataStream] | None = None
     """Replaces the rows that `do_get` sends."""
+    columns_sent: Callable[[Topic], pa.Schema] | None = None
+    """Replaces the columns that `get_schema` sends."""
     refuse_open_sequences: bool = False
     """A sequence with an open session cannot be deleted."""
 
@@ -290,13 +292,24 @@ class Mosaicod(fl.FlightServerBase):
             "sessions": sessions,
         }
         schema = pa.schema([])
-        if self.faults.metadata_in_schema:
+        if locator in self.topics and self.faults.version < "0.7":
+            topic = self.topics[locator]
+            properties = {"ontology_tag": topic.tag, "serialization_format": topic.format}
+            metadata = {"mosaico:properties": properties, "mosaico:user_metadata": topic.metadata}
+            schema = schema.with_metadata({key: json.dumps(value) for key, value in metadata.items()})
+        elif self.faults.metadata_in_schema:
             metadata = json.dumps(description.pop("user_metadata"))
             schema = schema.with_metadata({"mosaico:user_metadata": metadata})
         total_bytes = self.faults.total_bytes if locator in self.topics else -1
         return fl.FlightInfo(
             schema, descriptor, endpoints, -1, total_bytes, app_metadata=json.dumps(description).encode()
         )
+
+    def get_schema(self, context: fl.ServerCallContext, descriptor: fl.FlightDescriptor) -> fl.SchemaResult:
+        self._check_permission(context, "get_flight_info")
+        topic = self.topics[json.loads(descriptor.command)["resource_locator"]]
+        stream = self.faults.columns_sent
+        return fl.SchemaResult(topic.schema if stream is None else stream(topic))
 
     def do_get(self, context: fl.ServerCallContext, ticket: fl.Ticket) -> fl.RecordBatchStream:
         self._check_permission(context, "do_get")

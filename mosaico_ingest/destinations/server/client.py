@@ -11,6 +11,7 @@ from collections.abc import Callable, Generator
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeout
 from contextlib import contextmanager, suppress
+from functools import partial
 from ipaddress import ip_address
 from typing import Any, TypeVar, cast
 
@@ -22,7 +23,9 @@ from msgspec import Struct
 from mosaico_ingest.destinations.server.errors import Address, Refused, check_tls, late, reraise
 from mosaico_ingest.errors import SinkError, SinkUnavailable
 from mosaico_ingest.job.values import ServerTarget
+from mosaico_ingest.ontology.types import SerializationFormat
 from mosaico_ingest.protocol import messages
+from mosaico_ingest.protocol.batches import validated
 from mosaico_ingest.protocol.errors import Condition, condition_of
 from mosaico_ingest.protocol.messages import (
     API_KEY_HEADER,
@@ -77,6 +80,7 @@ _CHANNEL: list[tuple[str, Any]] = [
 _HOST = re.compile(r"[A-Za-z0-9._-]+|[0-9A-Fa-f:.]+%\w+")
 """A host name, or an IPv6 address with its interface."""
 _USER_METADATA = b"mosaico:user_metadata"
+_PROPERTIES = b"mosaico:properties"
 _UNKNOWN = frozenset({Condition.UNIMPLEMENTED, Condition.INVALID, Condition.NOT_FOUND})
 
 _Question = TypeVar("_Question", bound=Body)
@@ -166,18 +170,15 @@ class ServerClient:
         """Return the content of each topic of a sequence by locator; topics without reported counts are missing."""
         endpoints = map(self._topic_info, self._info(sequence).endpoints)
         return {
-            about.resource_locator: _uploaded(about.data_info) for about in endpoints if about is not None
+            about.resource_locator: _uploaded(about.data_info)
+            for about in endpoints
+            if about is not None and about.data_info is not None
         }
 
     def count_rows(self, locator: str) -> Uploaded:
         """Return the content of a topic by reading its rows, for servers that do not report counts."""
         info = self._info(locator)
-        reader = self._call(
-            lambda: self._flight.do_get(info.endpoints[0].ticket, self._stream_options).to_reader(),
-            "do_get",
-            Permission.READ,
-            repeatable=True,
-        )
+        reader = self._open_rows(info.endpoints[0].ticket).to_reader()
         rows = 0
         bounds: list[int] = []
         while (batch := self._once(lambda: next(reader, None), "do_get", Permission.READ)) is not None:
@@ -187,6 +188,67 @@ class ServerClient:
             bounds += [at for at in (times["min"].as_py(), times["max"].as_py()) if at is not None]
         stored_bytes = max(0, info.total_bytes)
         return Uploaded(rows, min(bounds, default=None), max(bounds, default=None), stored_bytes)
+
+    def sequence_names(self) -> list[str]:
+        """Return the names of all sequences."""
+
+        def call() -> list[str]:
+            flights = self._flight.list_flights(options=self._options)
+            return [b"/".join(info.descriptor.path or ()).decode() for info in flights]
+
+        return self._call(call, "list_flights", Permission.READ, repeatable=True)
+
+    def topic_infos(self, sequence: str) -> tuple[messages.TopicInfo, ...]:
+        """Return the topics of a sequence, with their metadata.
+
+        Servers before 0.7 list the topics in the sessions of the sequence, and describe each in its schema only.
+
+        Raises:
+            SinkError: The server refuses the request, or its response cannot be decoded.
+        """
+        info = self._info(sequence)
+        described = {
+            about.resource_locator: about
+            for about in map(self._topic_info, info.endpoints)
+            if about is not None
+        }
+        with self._decoding("get_flight_info"):
+            sessions = self._codec.decode(messages.SequenceInfo, _bytes(info.app_metadata) or b"{}").sessions
+            listed = (locator for session in sessions for locator in session.topics)
+            return tuple(
+                about
+                if (about := described.get(locator)) and (about.user_metadata or not about.locked)
+                else self._topic_of_schema(locator, about)
+                for locator in dict.fromkeys((*described, *listed))
+            )
+
+    def topic_schema(self, locator: str) -> pa.Schema:
+        """Return the columns of a topic, including the timestamp."""
+        question = messages.GetInfo(resource_locator=locator)
+        descriptor = fl.FlightDescriptor.for_command(self._codec.encode(question))
+
+        def call() -> pa.Schema:
+            result: Any = self._flight.get_schema(descriptor, self._options)  # the stubs return a Schema
+            return result.schema
+
+        return self._call(call, "get_schema", Permission.READ, repeatable=True)
+
+    def rows(
+        self, locator: str, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Generator[pa.RecordBatch, None, None]:
+        """Yield the rows of a topic as the server sends them, one message at a time; `end_ns` is exclusive.
+
+        Raises:
+            SinkError: The server refuses the request, the connection breaks, or a batch is invalid.
+        """
+        stream = self._open_rows(self._info(locator, start_ns, end_ns).endpoints[0].ticket)
+        reader = stream.to_reader()
+        try:
+            while (batch := self._once(lambda: next(reader, None), "do_get", Permission.READ)) is not None:
+                yield self._once(partial(validated, batch), "do_get", Permission.READ)
+        finally:
+            with suppress(DeadlinePassed, pa.ArrowException, OSError):
+                within(_CLOSE_S, stream.cancel)
 
     def put(self, put: messages.Put, schema: pa.Schema) -> fl.FlightStreamWriter:
         """Start an upload."""
@@ -208,8 +270,18 @@ class ServerClient:
                 hint="check that this is a Mosaico server of version 0.5 to 0.7",
             ) from error
 
-    def _info(self, locator: str) -> fl.FlightInfo:
-        question = messages.GetInfo(resource_locator=locator)
+    def _open_rows(self, ticket: fl.Ticket) -> fl.FlightStreamReader:
+        return self._call(
+            lambda: self._flight.do_get(ticket, self._stream_options),
+            "do_get",
+            Permission.READ,
+            repeatable=True,
+        )
+
+    def _info(self, locator: str, start_ns: int | None = None, end_ns: int | None = None) -> fl.FlightInfo:
+        question = messages.GetInfo(
+            resource_locator=locator, timestamp_ns_start=start_ns, timestamp_ns_end=end_ns
+        )
         descriptor = fl.FlightDescriptor.for_command(self._codec.encode(question))
         return self._call(
             lambda: self._flight.get_flight_info(descriptor, self._options),
@@ -223,6 +295,23 @@ class ServerClient:
             return self._codec.decode(messages.TopicInfo, _bytes(endpoint.app_metadata))
         except Malformed:
             return None
+
+    def _topic_of_schema(self, locator: str, about: messages.TopicInfo | None) -> messages.TopicInfo:
+        """Return the description of a topic, completed with the metadata of its schema."""
+        schema = self._info(locator).schema
+        metadata = _schema_metadata(schema)
+        if about is not None:
+            return about.model_copy(update={"user_metadata": metadata})
+        properties = _schema_metadata(schema, _PROPERTIES)
+        return messages.TopicInfo(
+            resource_locator=locator,
+            ontology_tag=str(properties.get("ontology_tag", "")),
+            serialization_format=_layout(properties.get("serialization_format")),
+            user_metadata=metadata,
+            created_at_ns=0,
+            locked=True,
+            data_info=None,
+        )
 
     def _version_before_0_7(self) -> str:
         try:
@@ -330,14 +419,19 @@ def _uploaded(info: messages.DataInfo) -> Uploaded:
     return Uploaded(info.total_row_count, times and times.start_ns, times and times.end_ns, info.total_bytes)
 
 
-def _schema_metadata(schema: pa.Schema) -> dict[str, Any]:
-    """Return the user metadata of a sequence as servers before 0.7 send it."""
-    text = (schema.metadata or {}).get(_USER_METADATA, b"{}")
+def _schema_metadata(schema: pa.Schema, key: bytes = _USER_METADATA) -> dict[str, Any]:
+    """Return the user metadata of a sequence or topic as servers before 0.7 send it, or another key."""
+    text = (schema.metadata or {}).get(key, b"{}")
     try:
         metadata = json.loads(text)
     except ValueError as error:
-        raise Malformed(f"{_USER_METADATA.decode()}: {error}") from error
+        raise Malformed(f"{key.decode()}: {error}") from error
     return metadata if isinstance(metadata, dict) else {}
+
+
+def _layout(name: object) -> SerializationFormat:
+    known = (layout for layout in SerializationFormat if layout.value == name)
+    return next(known, SerializationFormat.DEFAULT)
 
 
 def _bytes(metadata: bytes | str) -> bytes:

@@ -1,8 +1,4 @@
-"""Export of a sequence of the store to a recording, with a report of its fidelity.
-
-The messages of each topic are restored and written in time order. Every restored batch is adapted again and compared
-with the stored rows; the report lists each difference and each excluded topic. The module must not depend on the pipeline.
-"""
+"""Export of a sequence: restores the messages of each topic and writes them to a recording in time order."""
 
 from __future__ import annotations
 
@@ -10,6 +6,7 @@ import heapq
 import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Any, cast
@@ -23,15 +20,19 @@ from mosaico_ingest.adapters.bridge import ROSBridge, adapter_spec
 from mosaico_ingest.adapters.builtin import BUILTIN
 from mosaico_ingest.adapters.inverse import Inverse, Restored, invert
 from mosaico_ingest.adapters.mapping.columns import struct_of
-from mosaico_ingest.destinations.store import SequenceInfo, Store, TopicInfo
-from mosaico_ingest.errors import AdapterError, BagError, NothingMatched
+from mosaico_ingest.adapters.standalone import DefinitionFinder
+from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.errors import AdapterError, BagError, IngestError, NothingMatched
+from mosaico_ingest.export.columns import as_type, comparable
+from mosaico_ingest.export.sources import SourceSequence, SourceTopic, StoreSequence
 from mosaico_ingest.findings import suggest_names
 from mosaico_ingest.job.patterns import select
 from mosaico_ingest.job.values import Stores
+from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.rosbag.blocks import Encoding
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
-from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver, store_of
 from mosaico_ingest.rosbag.formats import ROS_VERSIONS
 from mosaico_ingest.rosbag.serialization import Serializer
 from mosaico_ingest.rosbag.writers import RecordingWriter, open_writer
@@ -51,6 +52,8 @@ class TopicExport(_Record):
     adapter: str = ""
     """The adapter that was inverted; `Unmodeled` if the rows are stored in the ROS shape."""
     messages: int = 0
+    assumed: str = ""
+    """The type and the distro of the definition, if the topic's metadata does not contain one."""
     defaulted: tuple[str, ...] = ()
     """Message fields that the store does not contain; they are zero, empty or false in every message."""
     not_invertible: dict[str, str] = {}
@@ -112,7 +115,7 @@ class Origin(Struct, frozen=True):
         return TypeResolver(Stores.EMPTY).resolve(self.msgtype, embedded, ros_version=version)
 
 
-def origin_of(topic: TopicInfo) -> Origin | None:
+def origin_of(topic: SourceTopic) -> Origin | None:
     """Return the original messages of a topic, or None if its metadata does not describe them."""
     metadata = topic.metadata.get(ROS_METADATA_KEY)
     if not isinstance(metadata, dict):
@@ -144,10 +147,14 @@ Message = tuple[int, bytes]
 class Restorer:
     """The restorer of the messages of one topic; it counts missing fields and differing rows."""
 
-    info: TopicInfo
+    info: SourceTopic
     definition: Definition
     adapter: str
+    ontology: OntologyType
+    """The type of the rows that the adapter produces."""
     inverse: Inverse
+    assumed: str = ""
+    """The type and the distro of the definition, if the topic's metadata does not contain one."""
     messages: int = 0
     _defaulted: dict[str, None] = field(default_factory=dict[str, None])
     _not_invertible: dict[str, str] = field(default_factory=dict[str, str])
@@ -162,12 +169,11 @@ class Restorer:
         encoding = Encoding.ROS1 if self.definition.ros_version == 1 else Encoding.CDR
         serializer = Serializer(self.definition, encoding)
         for batch in batches:
+            all_times: Any = batch.column("timestamp_ns").to_numpy()
+            all_rows = self._rows(batch)
             for start in range(0, batch.num_rows, _ROWS):
-                rows_batch = batch.slice(start, _ROWS)
-                times: Any = rows_batch.column(0).to_numpy()
-                rows = struct_of(rows_batch.columns[1:], self.info.ontology.struct, None, rows_batch.num_rows)
-                envelope = Envelope(self.info.name, self.definition.root, times)
-                restored = self.inverse.restore(rows, envelope)
+                times = all_times[start : start + _ROWS]
+                restored = self._restore(all_rows.slice(start, _ROWS), times)
                 self._count(restored)
                 array: Any = restored.rows  # the stubs lack to_pylist of struct arrays
                 values = array.to_pylist()
@@ -180,11 +186,28 @@ class Restorer:
             msgtype=self.definition.root,
             ontology=self.info.ontology.tag,
             adapter=self.adapter,
+            assumed=self.assumed,
             messages=self.messages,
             defaulted=tuple(self._defaulted),
             not_invertible=dict(self._not_invertible),
             changed=dict(self._changed),
         )
+
+    def trial(self, batch: pa.RecordBatch) -> tuple[int, int]:
+        """Return how many values of a first batch would differ, and how many fields it does not define."""
+        times: Any = batch.column("timestamp_ns").to_numpy()
+        restored = self._restore(self._rows(batch).slice(0, _ROWS), times[:_ROWS])
+        differing = sum((restored.changed or {}).values()) + len(restored.not_invertible or {})
+        return differing, len(restored.defaulted)
+
+    def _rows(self, batch: pa.RecordBatch) -> pa.StructArray:
+        columns = [
+            as_type(batch.column(field.name), field.type, field.name) for field in self.ontology.struct
+        ]
+        return struct_of(columns, self.ontology.struct, None, batch.num_rows)
+
+    def _restore(self, rows: pa.StructArray, times: Any) -> Restored:  # noqa: ANN401 - an array of numpy
+        return self.inverse.restore(rows, Envelope(self.info.name, self.definition.root, times))
 
     def _count(self, restored: Restored) -> None:
         self.messages += len(restored.rows)
@@ -193,7 +216,7 @@ class Restorer:
         self._changed.update(restored.changed or {})
 
 
-def restorer_for(info: TopicInfo, definition: Definition, specs: Sequence[AdapterSpec]) -> Restorer:
+def restorer_for(info: SourceTopic, definition: Definition, specs: Sequence[AdapterSpec]) -> Restorer:
     """Return the restorer of a topic, which inverts the first adapter that produces the topic's columns.
 
     Raises:
@@ -209,7 +232,7 @@ def restorer_for(info: TopicInfo, definition: Definition, specs: Sequence[Adapte
             continue
         if _produces(adapter, info):
             inverse = invert(adapter, shape, info.metadata)
-            return Restorer(info, definition, spec.name, inverse)
+            return Restorer(info, definition, spec.name, adapter.ontology, inverse)
     raise AdapterError(
         f"no known adapter converts {definition.root} to {info.ontology.tag}",
         hint=mismatches[0] if mismatches else "select the adapter of the topic with --adapter",
@@ -217,7 +240,7 @@ def restorer_for(info: TopicInfo, definition: Definition, specs: Sequence[Adapte
 
 
 def _candidates(
-    info: TopicInfo, definition: Definition, specs: Sequence[AdapterSpec]
+    info: SourceTopic, definition: Definition, specs: Sequence[AdapterSpec]
 ) -> Iterator[AdapterSpec]:
     """Yield the adapters that can have produced a topic: the named ones, the default one, other built-in ones."""
     yield from (spec for spec in specs if not spec.ros_types or definition.root in spec.ros_types)
@@ -226,13 +249,44 @@ def _candidates(
     yield UnmodeledSpec(serialization_format=info.ontology.serialization_format)
 
 
-def _produces(adapter: Adapter, info: TopicInfo) -> bool:
+def _produces(adapter: Adapter, info: SourceTopic) -> bool:
     ontology = adapter.ontology
-    return (ontology.tag, ontology.struct) == (info.ontology.tag, info.ontology.struct)
+    return (ontology.tag, comparable(ontology.struct)) == (
+        info.ontology.tag,
+        comparable(info.ontology.struct),
+    )
+
+
+def _assumed_restorer(
+    source: SourceSequence, info: SourceTopic, specs: Sequence[AdapterSpec], distro: Stores
+) -> Restorer | None:
+    """Return the restorer of a topic whose metadata has no definition, or None if no adapter produces its columns.
+
+    The message type is the one of an adapter's types, as defined by the distro, that changes the fewest values of the first rows.
+    """
+    finder = DefinitionFinder(distro)
+    version = 1 if distro.value.startswith("ros1") else 2
+    restorers: list[Restorer] = []
+    for spec in (*specs, *(spec for spec in BUILTIN if spec.tag == info.ontology.tag)):
+        for msgtype in spec.ros_types:
+            with suppress(AdapterError, BagError):
+                definition = finder.find(msgtype, spec)
+                adapter = spec.bind(definition, ros_shape(definition))
+                if definition.ros_version == version and _produces(adapter, info):
+                    inverse = invert(adapter, ros_shape(definition), info.metadata)
+                    assumed = f"{definition.root} of {distro.value}"
+                    restorers.append(
+                        Restorer(info, definition, spec.name, adapter.ontology, inverse, assumed)
+                    )
+    if len(restorers) < 2:  # noqa: PLR2004 - nothing to choose
+        return restorers[0] if restorers else None
+    with closing(source.rows(info)) as batches:
+        first = next(batches, None)
+    return restorers[0] if first is None else min(restorers, key=lambda restorer: restorer.trial(first))
 
 
 def export_sequence(
-    store: Store,
+    source: Store | SourceSequence,
     sequence: str,
     path: Path | str,
     *,
@@ -240,12 +294,14 @@ def export_sequence(
     start_ns: int | None = None,
     end_ns: int | None = None,
     adapters: Sequence[str] = (),
+    ros_distro: Stores | str | None = None,
     replace: bool = False,
 ) -> ExportReport:
     """Write a sequence, or the selected topics and time range of it, to a recording.
 
-    The suffix of the file selects the container: `.mcap`, `.db3` (ROS 2) or `.bag` (ROS 1). `start_ns` is inclusive, `end_ns`
-    exclusive.
+    `source` is a store, or a sequence of another source, such as `sources.ServerSequence`. The suffix of the file selects the
+    container: `.mcap`, `.db3` (ROS 2) or `.bag` (ROS 1). `start_ns` is inclusive, `end_ns` exclusive. `ros_distro` defines the
+    message types of topics whose metadata has no definition; it defaults to the newest distro that the container can store.
 
     Raises:
         NothingMatched: No topic or message is selected, or no topic can be exported.
@@ -254,13 +310,17 @@ def export_sequence(
         AdapterError: One of `adapters` cannot be loaded.
     """
     path = Path(path)
-    selected = _selected(store.sequence(sequence), topics)
+    opened = StoreSequence(source, sequence) if isinstance(source, Store) else source
+    default = Stores.LATEST if 2 in ROS_VERSIONS.get(path.suffix, (2,)) else Stores.ROS1_NOETIC  # noqa: PLR2004 - ROS 2
+    distro = store_of(ros_distro) or default
+    selected = _selected(opened, topics)
     specs = [adapter_spec(reference, Path()) for reference in adapters]
     with open_writer(path, replace=replace) as writer:
         restorers: list[tuple[int, Restorer]] = []
         excluded: list[TopicExport] = []
         for info in selected:
-            outcome = _prepare(info, selected, specs, path.suffix, writer)
+            restorer = _restorer(opened, info, selected, specs, suffix=path.suffix, distro=distro)
+            outcome = _connected(restorer, writer) if isinstance(restorer, Restorer) else restorer
             if isinstance(outcome, TopicExport):
                 excluded.append(outcome)
             else:
@@ -272,7 +332,7 @@ def export_sequence(
                 hint=_first_reason(excluded),
             )
         messages = [
-            _messages(store, connection, restorer, start_ns, end_ns) for connection, restorer in restorers
+            _messages(opened, connection, restorer, start_ns, end_ns) for connection, restorer in restorers
         ]
         for log_ns, connection, payload in heapq.merge(*messages, key=lambda message: message[0]):
             writer.write(connection, log_ns, payload)
@@ -285,7 +345,7 @@ def export_sequence(
     return ExportReport(sequence=sequence, path=str(path), bytes=path.stat().st_size, topics=tuple(results))
 
 
-def _selected(sequence: SequenceInfo, patterns: Sequence[str]) -> tuple[TopicInfo, ...]:
+def _selected(sequence: SourceSequence, patterns: Sequence[str]) -> tuple[SourceTopic, ...]:
     names = [topic.name for topic in sequence.topics]
     selection = select(patterns, names)
     if not selection.selected:
@@ -298,27 +358,44 @@ def _selected(sequence: SequenceInfo, patterns: Sequence[str]) -> tuple[TopicInf
     return tuple(topic for topic in sequence.topics if topic.name in selection.selected)
 
 
-def _prepare(
-    info: TopicInfo,
-    selected: Sequence[TopicInfo],
+def _restorer(
+    source: SourceSequence,
+    info: SourceTopic,
+    selected: Sequence[SourceTopic],
     specs: Sequence[AdapterSpec],
+    *,
     suffix: str,
-    writer: RecordingWriter,
-) -> tuple[int, Restorer] | TopicExport:
-    """Add the connection of a topic, or return the reason why the topic cannot be exported."""
+    distro: Stores,
+) -> Restorer | TopicExport:
+    """Return the restorer of a topic, or the reason why the topic cannot be exported."""
+    if info.problem:
+        return _excluded(info, "", info.problem)
     origin = origin_of(info)
     if origin is None:
-        return _excluded(info, "", "its metadata does not describe the original messages")
+        restorer = _assumed_restorer(source, info, specs, distro)
+        reason = "its metadata does not describe the original messages"
+        return restorer or _excluded(info, "", f"{reason}, and no adapter produces {info.ontology.tag}")
     others = [other for topic in selected if (other := origin_of(topic)) is not None]
     version = version_of(origin, others, ROS_VERSIONS[suffix])
     try:
-        restorer = restorer_for(info, origin.definition(version), specs)
-        return writer.add_connection(info.name, restorer.definition), restorer
+        return restorer_for(info, origin.definition(version), specs)
     except (AdapterError, BagError) as error:
-        return _excluded(info, origin.msgtype, f"{error.what} — {error.hint}" if error.hint else error.what)
+        return _excluded(info, origin.msgtype, _reason(error))
 
 
-def _excluded(info: TopicInfo, msgtype: str, reason: str) -> TopicExport:
+def _connected(restorer: Restorer, writer: RecordingWriter) -> tuple[int, Restorer] | TopicExport:
+    """Add the connection of a topic, or return the reason why the container does not accept it."""
+    try:
+        return writer.add_connection(restorer.info.name, restorer.definition), restorer
+    except (AdapterError, BagError) as error:
+        return _excluded(restorer.info, restorer.definition.root, _reason(error))
+
+
+def _reason(error: IngestError) -> str:
+    return f"{error.what} — {error.hint}" if error.hint else error.what
+
+
+def _excluded(info: SourceTopic, msgtype: str, reason: str) -> TopicExport:
     return TopicExport(topic=info.name, msgtype=msgtype, ontology=info.ontology.tag, excluded=reason)
 
 
@@ -327,9 +404,8 @@ def _first_reason(excluded: Sequence[TopicExport]) -> str:
 
 
 def _messages(
-    store: Store, connection: int, restorer: Restorer, start_ns: int | None, end_ns: int | None
+    source: SourceSequence, connection: int, restorer: Restorer, start_ns: int | None, end_ns: int | None
 ) -> Iterator[tuple[int, int, bytes]]:
-    info = restorer.info
-    with store.scan(info.sequence, info.name, start_ns=start_ns, end_ns=end_ns) as reader:
-        for log_ns, payload in restorer.read(iter(reader)):
+    with closing(source.rows(restorer.info, start_ns, end_ns)) as batches:
+        for log_ns, payload in restorer.read(batches):
             yield log_ns, connection, payload

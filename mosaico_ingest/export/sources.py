@@ -1,0 +1,127 @@
+"""Where sequences are exported from: the embedded store, or a Mosaico server."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import pyarrow as pa
+from msgspec import Struct
+
+from mosaico_ingest.errors import SinkError
+from mosaico_ingest.export.columns import comparable
+from mosaico_ingest.findings import suggest_names
+from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.protocol.messages import TopicInfo as ServerTopic
+from mosaico_ingest.protocol.messages import topic_name
+
+if TYPE_CHECKING:
+    from mosaico_ingest.destinations.server.client import ServerClient
+    from mosaico_ingest.destinations.store import Store
+
+__all__ = ["ServerSequence", "SourceSequence", "SourceTopic", "StoreSequence"]
+
+_TIME = "timestamp_ns"
+
+
+class SourceTopic(Struct, frozen=True):
+    """A topic to export."""
+
+    name: str
+    """With its leading slash."""
+    ontology: OntologyType
+    """The type of its rows; from a server, up to `columns.comparable`."""
+    metadata: Mapping[str, Any]
+    problem: str = ""
+    """The reason why its rows cannot be read; empty if they can."""
+
+
+class SourceSequence(Protocol):
+    """A sequence to export."""
+
+    @property
+    def name(self) -> str:
+        """The name of the sequence."""
+        ...
+
+    @property
+    def topics(self) -> Sequence[SourceTopic]:
+        """Its topics, sorted by name."""
+        ...
+
+    @property
+    def bounds(self) -> tuple[int, int]:
+        """The first and the last timestamp, nanoseconds; zeros without rows."""
+        ...
+
+    def rows(
+        self, topic: SourceTopic, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Generator[pa.RecordBatch, None, None]:
+        """Yield the rows of a topic: `timestamp_ns`, then the columns of its type; the end is exclusive."""
+        ...
+
+
+class StoreSequence:
+    """A sequence of the embedded store."""
+
+    def __init__(self, store: Store, name: str) -> None:
+        """Look the sequence up.
+
+        Raises:
+            SinkError: The sequence does not exist.
+        """
+        info = store.sequence(name)
+        self._store = store
+        self.name = info.name
+        self.topics = tuple(SourceTopic(one.name, one.ontology, one.metadata) for one in info.topics)
+        self.bounds = info.start_ns or 0, info.end_ns or 0
+
+    def rows(
+        self, topic: SourceTopic, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Generator[pa.RecordBatch, None, None]:
+        """Yield the rows of a topic in the order of their timestamps."""
+        with self._store.scan(self.name, topic.name, start_ns=start_ns, end_ns=end_ns) as reader:
+            yield from reader
+
+
+class ServerSequence:
+    """A sequence of a Mosaico server. Its rows are streamed; each topic holds one message of the server at a time."""
+
+    def __init__(self, client: ServerClient, name: str) -> None:
+        """Look the sequence and its topics up.
+
+        Raises:
+            SinkError: The sequence does not exist, or the server refuses the request.
+        """
+        self._client = client
+        self.name = name
+        if client.find(name) is None:
+            hint = suggest_names(client.sequence_names(), [name])
+            raise SinkError(f"there is no sequence {name!r}", where=str(client.address), hint=hint)
+        self._infos = {topic_name(info.resource_locator): info for info in client.topic_infos(name)}
+        self.topics = tuple(self._topic(name, info) for name, info in sorted(self._infos.items()))
+
+    @property
+    def bounds(self) -> tuple[int, int]:
+        """The first and the last timestamp of all topics; zeros if the server does not report them."""
+        intervals = [info.data_info.interval for info in self._infos.values() if info.data_info]
+        reported = [interval for interval in intervals if interval is not None]
+        start_ns = min((interval.start_ns for interval in reported), default=0)
+        return start_ns, max((interval.end_ns for interval in reported), default=0)
+
+    def rows(
+        self, topic: SourceTopic, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Generator[pa.RecordBatch, None, None]:
+        """Yield the rows of a topic in the order in which they were uploaded."""
+        info = self._infos[topic.name]
+        if info.data_info is None or info.data_info.total_row_count:
+            yield from self._client.rows(info.resource_locator, start_ns, end_ns)
+
+    def _topic(self, name: str, info: ServerTopic) -> SourceTopic:
+        if not info.locked:
+            empty = OntologyType(info.ontology_tag, pa.struct([]), info.serialization_format)
+            return SourceTopic(name, empty, info.user_metadata, "its upload is not finished")
+        schema = self._client.topic_schema(info.resource_locator)
+        struct = comparable(pa.struct([field for field in schema if field.name != _TIME]))
+        ontology = OntologyType(info.ontology_tag, struct, info.serialization_format)
+        return SourceTopic(name, ontology, info.user_metadata)
