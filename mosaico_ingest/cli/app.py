@@ -146,7 +146,7 @@ def _add_command(words: list[str]) -> list[str]:
     is_option_value = first != words[0] and any(word.endswith(MANIFEST_SUFFIXES) for word in words)
     if first.endswith(MANIFEST_SUFFIXES) or is_option_value:
         return ["run", *words]
-    from mosaico_ingest.rosbag.formats import RECORDING_NAME
+    from mosaico_ingest.containers import RECORDING_NAME
 
     if RECORDING_NAME.search(first) or Path(first).is_dir():
         bag = shlex.quote(first)

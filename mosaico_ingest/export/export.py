@@ -21,6 +21,7 @@ from mosaico_ingest.adapters.builtin import BUILTIN
 from mosaico_ingest.adapters.inverse import Inverse, Restored, invert
 from mosaico_ingest.adapters.mapping.columns import struct_of
 from mosaico_ingest.adapters.standalone import DefinitionFinder
+from mosaico_ingest.containers import ROS_VERSIONS
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import AdapterError, BagError, IngestError, NothingMatched
 from mosaico_ingest.export.columns import as_type, comparable
@@ -33,7 +34,6 @@ from mosaico_ingest.rosbag.blocks import Encoding
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver, store_of
-from mosaico_ingest.rosbag.formats import ROS_VERSIONS
 from mosaico_ingest.rosbag.serialization import Serializer
 from mosaico_ingest.rosbag.writers import RecordingWriter, open_writer
 

@@ -39,6 +39,11 @@ class PathRole(Enum):
     OUTPUT_FILE = "output file"
     OUTPUT_FOLDER = "output folder"
 
+    @property
+    def accepts_urls(self) -> bool:
+        """Whether the path can be a URL."""
+        return self in {PathRole.RECORDING, PathRole.STORE}
+
 
 class FilePath(Struct, frozen=True):
     """The text is a path; relative paths start at the manifest's folder."""

@@ -13,6 +13,7 @@ from msgspec import Struct, field
 from msgspec.structs import replace
 from pydantic import ValidationError
 
+from mosaico_ingest.containers import RECORDING_NAME
 from mosaico_ingest.errors import IngestError, ManifestError
 from mosaico_ingest.findings import Finding, Severity, Span
 from mosaico_ingest.job.compose import Filled, combinations, extended, fill_in, fill_in_cell
@@ -149,7 +150,6 @@ def stand_alone(source: Source, cell: Mapping[str, str]) -> Value:
     return job
 
 
-_RECORDINGS = frozenset({".bag", ".db3", ".mcap"})
 _WITHOUT_MANIFEST = "run `ingest bag RECORDING --name NAME`, or draft a manifest with `ingest init RECORDING`"
 
 
@@ -159,7 +159,7 @@ def read_text(path: Path) -> str:
     Raises:
         ManifestError: The file does not exist, is not readable, or is not UTF-8.
     """
-    if path.is_dir() or path.suffix in _RECORDINGS:
+    if path.is_dir() or RECORDING_NAME.search(path.name):
         kind = "a folder" if path.is_dir() else "a recording"
         finding = Finding(
             "unreadable-file", Severity.ERROR, f"{path} is {kind}, not a manifest", help=_WITHOUT_MANIFEST

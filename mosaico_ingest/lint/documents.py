@@ -11,6 +11,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
+from mosaico_ingest.containers import SUFFIXES
 from mosaico_ingest.job.model import Manifest
 
 _YAML_SUFFIXES = (".yaml", ".yml", ".json")
@@ -25,7 +26,7 @@ _KEY_LINE = re.compile(
     r"^(?P<indent> *)(?P<quote>[\"']?)(?P<key>[A-Za-z_][\w-]*)(?P=quote)[ \t]*:(?=\s|$)", re.MULTILINE
 )
 _FLOW_KEY = re.compile(r"[{,\s](?P<quote>[\"']?)(?P<key>[A-Za-z_][\w-]*)(?P=quote)\s*:(?=\s|$|[\[{\"'])")
-_RECORDING = re.compile(r"\.(mcap|bag|db3)\b", re.IGNORECASE)
+_RECORDING = re.compile(rf"({'|'.join(map(re.escape, SUFFIXES))})\b", re.IGNORECASE)
 _VERSION = re.compile(r"[\"']?\bversion[\"']?[ \t]*:[ \t]*[\"']?\d+[\"']?[ \t]*(?=[\n,}#]|$)")
 
 _ADAPTER_KEYS = frozenset({"adapter", "ros_type", "variants"})

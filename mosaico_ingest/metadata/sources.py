@@ -12,6 +12,7 @@ from typing import Any
 from msgspec import Struct, field
 from msgspec.structs import replace
 
+from mosaico_ingest.containers import RECORDING_NAME
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import Finding, Severity, Span, join_names
 from mosaico_ingest.job.file_names import FileNamePattern
@@ -20,7 +21,6 @@ from mosaico_ingest.job.validation import nearest
 from mosaico_ingest.job.yaml_source import KeyPath, Source
 from mosaico_ingest.metadata.schema import read_json
 from mosaico_ingest.remote import AnyPath
-from mosaico_ingest.rosbag.formats import RECORDING_NAME
 from mosaico_ingest.rosbag.recording import Recording
 
 _SECTION = ("sequence", "metadata")

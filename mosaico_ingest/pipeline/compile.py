@@ -17,6 +17,7 @@ from msgspec import Struct
 from mosaico_ingest.adapters.adapter import AdapterSpec
 from mosaico_ingest.adapters.bridge import adapter_spec, installed_adapters, suggest_reference
 from mosaico_ingest.adapters.builtin import BY_NAME
+from mosaico_ingest.containers import RECORDING_NAME
 from mosaico_ingest.errors import AdapterError, ManifestError, NothingMatched
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.compose import PLACEHOLDERS, Placeholder, placeholders_in
@@ -28,7 +29,6 @@ from mosaico_ingest.job.yaml_source import Source
 from mosaico_ingest.metadata.schema import read_json
 from mosaico_ingest.metadata.sources import source_spans, with_spans
 from mosaico_ingest.remote import AnyPath, RemotePath, without_options
-from mosaico_ingest.rosbag.formats import RECORDING_NAME
 from mosaico_ingest.textfile import read_limited
 
 __all__ = [

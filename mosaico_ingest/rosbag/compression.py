@@ -18,9 +18,9 @@ import pyarrow as pa
 import zstandard
 from msgspec import Struct
 
+from mosaico_ingest.containers import ZSTD
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.blocks import Bytes, MessageBlock, UnreadableRange, fixed_slices
-from mosaico_ingest.rosbag.formats import ZSTD
 
 __all__ = [
     "MAX_CHUNK_BYTES",

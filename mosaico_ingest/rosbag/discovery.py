@@ -9,10 +9,10 @@ from typing import Any
 
 from msgspec import Struct
 
+from mosaico_ingest.containers import SUFFIX_LIST, SUFFIXES, ZSTD_SUFFIX
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.remote import AnyPath
-from mosaico_ingest.rosbag.formats import SUFFIX_LIST, SUFFIXES, ZSTD_SUFFIX
 from mosaico_ingest.rosbag.opening import is_recording
 from mosaico_ingest.textfile import read_limited
 

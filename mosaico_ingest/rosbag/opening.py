@@ -5,15 +5,15 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
+from pkgutil import resolve_name
 from stat import S_ISREG
 
+from mosaico_ingest.containers import SUFFIX_LIST, ZSTD, ZSTD_SUFFIX, Container, container_of
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.remote import AnyPath, RemotePath
 from mosaico_ingest.rosbag.blocks import SplitReader, UnreadableRange
 from mosaico_ingest.rosbag.compression import MAX_CHUNK_BYTES, decompress_file
-from mosaico_ingest.rosbag.formats import SUFFIX_LIST, ZSTD, ZSTD_SUFFIX, container_of
 from mosaico_ingest.rosbag.source import FileSource, RemoteSource, download
 
 __all__ = ["is_recording", "open_split"]
@@ -49,8 +49,8 @@ def _open_remote(path: RemotePath, stack: ExitStack, max_chunk_bytes: int) -> Sp
     source = RemoteSource(path)
     head = source.read_some(0, _HEAD_BYTES)
     container = container_of(head)
-    if container is not None and container.open_source is not None:
-        return _opened(partial(container.open_source, source, max_chunk_bytes), path, stack)
+    if container is not None and container.by_offset:
+        return _opened(container, path, stack, source, max_chunk_bytes)
     source.close()
     if container is None and not head.startswith(ZSTD):
         raise _not_a_recording(head, path)
@@ -96,17 +96,18 @@ def _open_local(
     path: Path, name: AnyPath, head: bytes, stack: ExitStack, max_chunk_bytes: int
 ) -> SplitReader:
     container = container_of(head)
-    if container is not None and container.open_source is not None:
-        source = FileSource(path, name)
-        return _opened(partial(container.open_source, source, max_chunk_bytes), name, stack)
-    if container is not None and container.open_path is not None:
-        return _opened(partial(container.open_path, path, name), name, stack)
-    raise _not_a_recording(head, name)
+    if container is None:
+        raise _not_a_recording(head, name)
+    if container.by_offset:
+        return _opened(container, name, stack, FileSource(path, name), max_chunk_bytes)
+    return _opened(container, name, stack, path, name)
 
 
-def _opened(opener: Callable[[], SplitReader], name: AnyPath, stack: ExitStack) -> SplitReader:
+def _opened(container: Container, name: AnyPath, stack: ExitStack, *arguments: object) -> SplitReader:
+    """Create the reader of a container; see `Container.by_offset` for its arguments."""
+    reader: Callable[..., SplitReader] = resolve_name(container.reader)
     try:
-        split = opener()
+        split = reader(*arguments)
     except BagError as err:
         raise err if err.where else BagError(err.what, where=str(name), hint=err.hint) from err
     stack.callback(split.close)

@@ -15,10 +15,10 @@ from rosbags.rosbag1 import Writer as Rosbag1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2
 
+from mosaico_ingest.containers import SUFFIX_LIST
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.definitions.hashes import md5sum, rihs01
 from mosaico_ingest.rosbag.definitions.model import Definition
-from mosaico_ingest.rosbag.formats import SUFFIX_LIST
 from mosaico_ingest.rosbag.mcap.writer import McapWriter
 
 __all__ = [

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, TypeAlias
 
-from mosaico_ingest.rosbag.formats import MCAP, RECORDING_NAME
+from mosaico_ingest.containers import MCAP, RECORDING_NAME
 
 UNFINISHED_REST_S = 600.0
 """Seconds without a change after which a recording is ingested although its end is missing."""

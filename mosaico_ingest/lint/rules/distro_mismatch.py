@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from mosaico_ingest.containers import ROS_VERSIONS
 from mosaico_ingest.lint.job import Job, recording_paths
 from mosaico_ingest.lint.rule import Check, Problem
-from mosaico_ingest.rosbag.formats import ROS_VERSIONS
 
 _VERSIONS = {suffix: f"ros{versions[0]}" for suffix, versions in ROS_VERSIONS.items() if len(versions) == 1}
 """The ROS version of containers that store only one."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from mosaico_ingest.containers import SUFFIXES
 from mosaico_ingest.lint.job import Job, recording_paths
 from mosaico_ingest.lint.rule import Check, Problem
-from mosaico_ingest.rosbag.formats import SUFFIXES
 
 
 def check(job: Job) -> Iterator[Problem]:

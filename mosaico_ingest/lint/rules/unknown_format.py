@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from mosaico_ingest.containers import RECORDING_NAME, SUFFIX_LIST
 from mosaico_ingest.job.patterns import is_glob
 from mosaico_ingest.lint.job import Job, recording_paths
 from mosaico_ingest.lint.rule import Check, Problem
-from mosaico_ingest.rosbag.formats import RECORDING_NAME, SUFFIX_LIST
 
 
 def check(job: Job) -> Iterator[Problem]:

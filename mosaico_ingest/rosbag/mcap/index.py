@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from msgspec import Struct
 from msgspec.structs import replace
 
+from mosaico_ingest.containers import MCAP
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.blocks import LATEST_NS, UnreadableRange
 from mosaico_ingest.rosbag.compression import MAX_CHUNK_BYTES, decompress_partially
-from mosaico_ingest.rosbag.formats import MCAP
 from mosaico_ingest.rosbag.mcap.records import (
     RECORD,
     ChannelRecord,

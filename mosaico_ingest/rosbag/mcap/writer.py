@@ -10,9 +10,9 @@ from pathlib import Path
 
 import zstandard
 
+from mosaico_ingest.containers import MCAP
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.definitions.model import Definition, short_msgtype
-from mosaico_ingest.rosbag.formats import MCAP
 from mosaico_ingest.rosbag.mcap.records import (
     RECORD,
     Op,

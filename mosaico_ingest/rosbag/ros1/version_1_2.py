@@ -13,6 +13,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from mosaico_ingest.containers import ROSRECORD
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.blocks import (
     Encoding,
@@ -27,7 +28,6 @@ from mosaico_ingest.rosbag.blocks import (
     rows_by_connection,
 )
 from mosaico_ingest.rosbag.definitions.model import Embedded
-from mosaico_ingest.rosbag.formats import ROSRECORD
 from mosaico_ingest.rosbag.recovery import find_ros1_message
 from mosaico_ingest.rosbag.ros1.records import Header, Record, number, record_at
 from mosaico_ingest.rosbag.source import Source, Window
@@ -64,7 +64,7 @@ class RosrecordReader:
 
     container = "ros1"
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: Source, _max_chunk_bytes: int = 0) -> None:  # the format has no chunks
         self.path = source.path
         self._source = source
         self.notes: list[str] = source.notes
