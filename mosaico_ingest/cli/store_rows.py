@@ -165,8 +165,8 @@ def open_topic(store: str, path: str) -> TopicInfo:
     return opened.topic(sequence, topic)
 
 
-def time_option(info: TopicInfo | SequenceInfo, text: str) -> int:
-    """Return the ns of `--at`: nanoseconds, an instant, or an offset from the start (`+`) or the end (`-`)."""
+def time_option(info: TopicInfo | SequenceInfo, text: str, *, option: str = "--at") -> int:
+    """Return the ns of an option: nanoseconds, an instant, or an offset from the start (`+`) or the end (`-`)."""
     from mosaico_ingest.job.units import parse_time
 
     if text.isdecimal() and len(text) < 20:  # noqa: PLR2004 - the digits of 64 bits
@@ -174,7 +174,7 @@ def time_option(info: TopicInfo | SequenceInfo, text: str) -> int:
     try:
         bound = parse_time(text)
     except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint="--at") from error
+        raise typer.BadParameter(str(error), param_hint=option) from error
     if not bound.relative:
         return bound.ns
     origin = info.start_ns if bound.ns >= 0 and not text.startswith("-") else info.end_ns

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,6 +33,7 @@ __all__ = [
     "has_images",
     "image_file_type",
     "png_bytes",
+    "write_picture",
 ]
 
 VIDEO = ("h264", "hevc", "h265", "vp9", "av1", "theora")
@@ -40,6 +42,7 @@ _GAP = 4
 """Pixels between the pictures of a contact sheet."""
 _BACKGROUND = 32
 """Grey value between the pictures of a contact sheet."""
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 _SIGNATURES = {
     b"\x89PNG": "png",
     b"\xff\xd8\xff": "jpeg",
@@ -109,6 +112,22 @@ def png_bytes(pixels: Pixels) -> bytes:
     buffer = io.BytesIO()
     _picture(pixels).save(buffer, "PNG")
     return buffer.getvalue()
+
+
+def write_picture(pixels: Pixels, path: Path) -> None:
+    """Write the picture as PNG, JPEG or WebP, by the suffix of the file.
+
+    Raises:
+        ViewError: The suffix is unknown.
+        IngestError: Pillow is not installed.
+    """
+    if path.suffix.lower() not in _SUFFIXES:
+        raise ViewError(
+            f"{path.suffix or 'no suffix'} is no supported suffix",
+            where=str(path),
+            hint=f"use one of {', '.join(_SUFFIXES)}",
+        )
+    _picture(pixels).save(path)
 
 
 def contact_sheet(pictures: Sequence[tuple[str, Pixels]], *, columns: int = 4, width: int = 320) -> Pixels:
