@@ -10,9 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from mosaico_ingest.errors import ViewError
+from mosaico_ingest.errors import ViewError, missing_library
 from mosaico_ingest.report.units import seconds_text, time_text
-from mosaico_ingest.view.extras import missing_library
 from mosaico_ingest.view.series import Series
 
 __all__ = ["ChartLine", "chart_lines", "write_chart"]
