@@ -2,60 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any, Protocol, cast
 
 import numpy as np
 import pyarrow as pa
 from msgspec import Struct
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
+from mosaico_ingest.decode.base import Decoded, Decoder, DictDecoder, merge_parts
 from mosaico_ingest.decode.columns import build_columns
 from mosaico_ingest.decode.layout import PADDING, compile_layout
 from mosaico_ingest.decode.lockstep import locate
-from mosaico_ingest.decode.spans import Int64s, Payloads, array_of, bytes_at
+from mosaico_ingest.decode.spans import Int64s, Payloads, bytes_at
 from mosaico_ingest.errors import DecodeError
 from mosaico_ingest.findings import RowFailure
 from mosaico_ingest.rosbag.blocks import Connection, Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
-from mosaico_ingest.rosbag.definitions.model import Definition
+from mosaico_ingest.rosbag.definitions.model import Definition, Language
 from mosaico_ingest.rosbag.serialization import Deserializer
 
 __all__ = [
+    "DECODERS",
     "ColumnarDecoder",
     "Decoded",
     "Decoder",
     "RowwiseDecoder",
     "decoder_for",
 ]
-
-
-class Decoded(Struct, frozen=True):
-    """The result of decoding a message block: rows, their positions in the block, and failures."""
-
-    rows: pa.StructArray
-    """One row per decoded message, in the ROS shape, without nulls."""
-    index: NDArray[np.int64]
-    """Position of each row in the block, ascending, shape (len(rows),)."""
-    failures: tuple[RowFailure, ...]
-    """`row` is the position in the block; len(index) + len(failures) = len(block)."""
-    padded: int = 0
-    """Number of rows that end in 4 to 7 zero bytes that the definition does not explain."""
-
-
-class Decoder(Protocol):
-    """Decodes message blocks of one connection. Invalid bytes become failures, never exceptions."""
-
-    @property
-    def shape(self) -> pa.StructType:
-        """The ROS shape: the type of `Decoded.rows`."""
-        ...
-
-    def decode(self, block: MessageBlock) -> Decoded:
-        """Decode all messages of the block."""
-        ...
 
 
 class RowwiseDecoder:
@@ -66,30 +41,19 @@ class RowwiseDecoder:
     """
 
     def __init__(self, definition: Definition, encoding: Encoding) -> None:
-        self._shape = ros_shape(definition)
         self._deserializer = Deserializer(definition, encoding)
+        self._decoder = DictDecoder(ros_shape(definition), self._deserializer)
 
     @property
     def shape(self) -> pa.StructType:
         """The ROS shape."""
-        return self._shape
+        return self._decoder.shape
 
     def decode(self, block: MessageBlock) -> Decoded:
         """Decode all messages of the block."""
-        values: list[dict[str, Any]] = []
-        index: list[int] = []
-        failures: list[RowFailure] = []
         padded = self._deserializer.padded
-        for row in range(len(block)):
-            try:
-                values.append(self._deserializer.to_dict(block.payload(row)))
-                index.append(row)
-            except DecodeError as error:  # noqa: PERF203 - each message may fail
-                failures.append(RowFailure(row, error.rule, str(error)))
-        # The stubs cannot express that an array of a struct type is a StructArray.
-        rows = cast("pa.StructArray", pa.array(values, type=self._shape))
-        padded = self._deserializer.padded - padded
-        return Decoded(rows, np.array(index, np.int64), tuple(failures), padded)
+        decoded = self._decoder.decode(block)
+        return replace(decoded, padded=self._deserializer.padded - padded)
 
 
 _HEADER = 4
@@ -134,7 +98,7 @@ class ColumnarDecoder:
             is_remaining[part.index] = False
         if is_remaining.any() or not parts:
             parts.append(self._by_rows(block, np.flatnonzero(is_remaining)))
-        return _merge(parts)
+        return merge_parts(parts)
 
     def _in_two(self, block: MessageBlock, total: int) -> Decoded:
         """Decode a block too large for the 32-bit offsets of a column in two halves."""
@@ -181,34 +145,43 @@ class ColumnarDecoder:
 
     def _by_rows(self, block: MessageBlock, rows: Int64s) -> Decoded:
         """Decode some messages one by one."""
-        decoded = self._rowwise.decode(block.rows(rows))
-        failures = tuple(replace(failure, row=int(rows[failure.row])) for failure in decoded.failures)
-        return replace(decoded, index=rows[decoded.index], failures=failures)
+        return self._rowwise.decode(block.rows(rows)).relocated(rows)
 
 
-def _merge(parts: list[Decoded]) -> Decoded:
-    """Merge the parts of one block in order; only the last part may have failures."""
-    failures, padded = parts[-1].failures, sum(part.padded for part in parts)
-    filled = [part for part in parts if len(part.index)] or parts[:1]
-    if len(filled) == 1:
-        return Decoded(filled[0].rows, filled[0].index, failures, padded)
-    index = np.concatenate([part.index for part in filled])
-    order = np.argsort(index)
-    rows = pa.concat_arrays([part.rows for part in filled]).take(array_of(pa.int64(), len(order), order))
-    return Decoded(rows, index[order], failures, padded)
+def _decode_ros(definition: Definition, encoding: Encoding) -> Decoder:
+    return ColumnarDecoder(definition, encoding)
+
+
+def _decode_protobuf(definition: Definition, encoding: Encoding) -> Decoder:  # noqa: ARG001 - the table's signature
+    from mosaico_ingest.decode.protobuf import ProtobufDecoder  # noqa: PLC0415 - ROS recordings do not need it
+
+    return ProtobufDecoder(definition)
+
+
+def _decode_json(definition: Definition, encoding: Encoding) -> Decoder:  # noqa: ARG001 - the table's signature
+    from mosaico_ingest.decode.json import JsonDecoder  # noqa: PLC0415 - ROS recordings do not need it
+
+    return JsonDecoder(definition)
+
+
+DECODERS: Mapping[Encoding, Callable[[Definition, Encoding], Decoder]] = {
+    Encoding.CDR: _decode_ros,
+    Encoding.ROS1: _decode_ros,
+    Encoding.PROTOBUF: _decode_protobuf,
+    Encoding.JSON: _decode_json,
+}
+"""The decoder of each encoding that can be decoded."""
 
 
 def decoder_for(connection: Connection) -> Decoder:
     """Return the decoder of a connection.
 
     Raises:
-        DecodeError: The encoding is not a ROS encoding, or the connection has no definition with an Arrow shape.
+        DecodeError: There is no decoder for the encoding, or the connection has no definition with an Arrow shape.
     """
-    if connection.encoding is Encoding.OTHER:
+    if connection.encoding not in DECODERS:
         raise DecodeError(
-            f"the messages are not in a ROS encoding ({connection.attributes.get('encoding', 'unknown')})",
-            rule="encoding",
-            where=connection.topic,
+            connection.problem or "there is no decoder", rule="encoding", where=connection.topic
         )
     if connection.definition is None:
         raise DecodeError(
@@ -220,7 +193,10 @@ def decoder_for(connection: Connection) -> Decoder:
 
 
 class _DefinitionKey(Struct, frozen=True):
-    """A definition as a cache key: equal if the root, ROS version and fields are equal."""
+    """A definition as a cache key: equal if the root, ROS version and fields are equal.
+
+    Schemas in other languages must be equal as text, because a JSON Schema has more than fields.
+    """
 
     definition: Definition
 
@@ -231,10 +207,17 @@ class _DefinitionKey(Struct, frozen=True):
         if not isinstance(other, _DefinitionKey):
             return NotImplemented
         own, others = self.definition, other.definition
-        return (own.root, own.ros_version, own.types) == (others.root, others.ros_version, others.types)
+        if (own.root, own.ros_version, own.types, own.shape) != (
+            others.root,
+            others.ros_version,
+            others.types,
+            others.shape,
+        ):
+            return False
+        return own.language is Language.ROS or own.text == others.text
 
 
 @lru_cache(maxsize=128)
 def _decoder(key: _DefinitionKey, encoding: Encoding) -> Decoder:
     """Return a cached decoder; decoders have no state, so that several recordings can share one."""
-    return ColumnarDecoder(key.definition, encoding)
+    return DECODERS[encoding](key.definition, encoding)

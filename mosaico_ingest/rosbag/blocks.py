@@ -71,8 +71,10 @@ class Encoding(str, Enum):
     """ROS 2: a 4-byte encapsulation header, then aligned little- or big-endian fields."""
     ROS1 = "ros1"
     """ROS 1: packed little-endian fields."""
+    PROTOBUF = "protobuf"
+    JSON = "json"
     OTHER = "other"
-    """Any other encoding (protobuf, JSON, …): listed, never decoded."""
+    """Any other encoding (CBOR, FlatBuffers, …): listed, never decoded."""
 
 
 class Connection(Struct, frozen=True):

@@ -45,11 +45,13 @@ from mosaico_ingest.rosbag.definitions.hashes import definition_difference
 from mosaico_ingest.rosbag.definitions.model import (
     Definition,
     Embedded,
+    Language,
     Resolver,
     Source,
     normalize_msgtype,
 )
 from mosaico_ingest.rosbag.discovery import Metadata, MetadataTopic, RecordingFiles, discover, parse_metadata
+from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS, MessageEncoding, refusal
 from mosaico_ingest.rosbag.opening import open_split
 
 __all__ = [
@@ -375,19 +377,17 @@ class _DefinitionCache:
 
     def __init__(self, resolver: Resolver) -> None:
         self._resolver = resolver
-        self._cache: dict[tuple[str, Embedded | None, int], Definition | str] = {}
+        self._cache: dict[tuple[Encoding, str, Embedded | None, int], Definition | str] = {}
 
     def resolve(self, connection: SplitConnection) -> Definition | str:
         """Return the connection's definition, or the reason why there is none."""
-        if connection.encoding is Encoding.OTHER:
-            encoding = connection.attributes.get("encoding", "")
-            return f"its encoding is {encoding!r}, which is not a ROS serialization"
-        key = (connection.msgtype, connection.embedded, connection.ros_version)
+        entry = MESSAGE_ENCODINGS.get(connection.encoding)
+        if entry is None:
+            return refusal(connection.attributes.get("encoding", ""))
+        key = (connection.encoding, connection.msgtype, connection.embedded, connection.ros_version)
         if key not in self._cache:
             try:
-                self._cache[key] = self._resolver.resolve(
-                    connection.msgtype, connection.embedded, ros_version=connection.ros_version
-                )
+                self._cache[key] = self._read(connection, entry)
             except BagError as err:
                 self._cache[key] = str(err)
         definition = self._cache[key]
@@ -398,6 +398,13 @@ class _DefinitionCache:
             return definition
         remedy = "provide the definition with custom_msgs"
         return f"the known definition of {definition.root} differs from the recorded one: {difference} — {remedy}"
+
+    def _read(self, connection: SplitConnection, entry: MessageEncoding) -> Definition:
+        if entry.read_schema is not None:
+            return entry.read_schema(connection.msgtype, connection.embedded)
+        return self._resolver.resolve(
+            connection.msgtype, connection.embedded, ros_version=connection.ros_version
+        )
 
 
 def _resolved(connection: SplitConnection, definition: Definition | str) -> Connection:
@@ -433,6 +440,8 @@ def _are_equal(first: Connection, second: Connection) -> bool:
     a, b = first.definition, second.definition
     if a is None or b is None:
         return a is b
+    if a.language is not Language.ROS and a.text != b.text:
+        return False
     return a is b or (a.ros_version == b.ros_version and a.types == b.types)
 
 

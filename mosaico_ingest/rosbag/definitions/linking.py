@@ -124,10 +124,12 @@ TEXTS = frozenset({"string", "wstring"})
 def ros_shape(definition: Definition) -> pa.StructType:
     """Return the Arrow type of a message's rows. All fields are nullable; constants are not columns.
 
+    Definitions in languages other than ROS have their own shape.
+
     Raises:
         DecodeError: A type is recursive, or a primitive is unknown.
     """
-    return _struct(definition, definition.message, ())
+    return _struct(definition, definition.message, ()) if definition.shape is None else definition.shape
 
 
 def _struct(definition: Definition, message: MessageType, within: tuple[str, ...]) -> pa.StructType:

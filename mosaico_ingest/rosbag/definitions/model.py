@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping
 from enum import Enum
 from typing import Protocol
 
+import pyarrow as pa
 from msgspec import Struct
 
 __all__ = [
@@ -17,6 +19,7 @@ __all__ = [
     "Definition",
     "Embedded",
     "Field",
+    "Language",
     "MessageType",
     "Resolver",
     "Source",
@@ -28,6 +31,7 @@ TIME = "builtin_interfaces/msg/Time"
 DURATION = "builtin_interfaces/msg/Duration"
 HEADER = "std_msgs/msg/Header"
 
+_BINARY_SCHEMAS = frozenset({"protobuf", "flatbuffer"})
 _KINDS = frozenset({"msg", "srv", "action"})
 _RENAMED = {
     "roslib/msg/Header": HEADER,
@@ -76,8 +80,22 @@ class Source(str, Enum):
     """A public package that no distro's core has."""
 
 
+class Language(str, Enum):
+    """The language of a definition."""
+
+    ROS = "ros"
+    """`.msg` or IDL."""
+    PROTOBUF = "protobuf"
+    """A serialized FileDescriptorSet; its text is base64."""
+    JSON_SCHEMA = "jsonschema"
+    """A JSON Schema; without text, the type was inferred from the messages."""
+
+
 class Field(Struct, frozen=True):
-    """One field: `type` is a primitive (`float64`, `string`, `wstring`, …) or a full message type name."""
+    """One field: `type` is a primitive (`float64`, `string`, `wstring`, …) or a full message type name.
+
+    Definitions in languages other than ROS also have the types `binary` and `json` (any value, as JSON text).
+    """
 
     name: str
     type: str
@@ -112,9 +130,14 @@ class Definition(Struct, frozen=True):
     types: Mapping[str, MessageType]
     source: Source
     text: str
-    """The flattened `.msg` text: each nested type follows 80 `=` and a line `MSG: pkg/Name`."""
+    """ROS: the flattened `.msg` text, in which each nested type follows 80 `=` and a line `MSG: pkg/Name`.
+
+    Other languages: the text of the embedded schema, see `Embedded`."""
     ros_version: int
-    """1 or 2; determines the form of `time` and of the header."""
+    """1 or 2; determines the form of `time` and of the header. 0 for other languages than ROS."""
+    language: Language = Language.ROS
+    shape: pa.StructType | None = None
+    """The type of the rows, if `types` cannot express it; None for ROS."""
 
     @property
     def message(self) -> MessageType:
@@ -126,8 +149,20 @@ class Embedded(Struct, frozen=True):
     """The definition of a type as embedded in a recording."""
 
     encoding: str
-    """`ros1msg`, `ros2msg`, `ros2idl`, or another name that the recording uses."""
+    """`ros1msg`, `ros2msg`, `ros2idl`, `protobuf`, `jsonschema`, or another name that the recording uses."""
     text: str
+    """The schema; base64 for binary schemas (`protobuf`, `flatbuffer`)."""
+
+    @classmethod
+    def from_bytes(cls, encoding: str, data: bytes) -> Embedded:
+        """Return the definition for the bytes that a recording stores."""
+        if encoding in _BINARY_SCHEMAS:
+            return cls(encoding, base64.b64encode(data).decode())
+        return cls(encoding, data.decode("utf-8", "replace"))
+
+    def to_bytes(self) -> bytes:
+        """Return the bytes that a recording stores."""
+        return base64.b64decode(self.text) if self.encoding in _BINARY_SCHEMAS else self.text.encode()
 
 
 class Resolver(Protocol):

@@ -58,7 +58,12 @@ from mosaico_ingest.rosbag.source import ReadBuffer, Source
 
 __all__ = ["McapReader"]
 
-_ENCODINGS = {"cdr": Encoding.CDR, "ros1": Encoding.ROS1}
+_ENCODINGS = {
+    "cdr": Encoding.CDR,
+    "ros1": Encoding.ROS1,
+    "protobuf": Encoding.PROTOBUF,
+    "json": Encoding.JSON,
+}
 _INDEX_ENTRY = np.dtype([("time", "<i8"), ("offset", "<u8")])
 _MESSAGE_HEAD = np.dtype(
     [
@@ -232,7 +237,7 @@ class McapReader:
 
 
 def _connection(key: int, channel: ChannelRecord, index: McapIndex) -> SplitConnection:
-    schema = index.schemas.get(channel.schema, SchemaRecord("", "", ""))
+    schema = index.schemas.get(channel.schema, SchemaRecord("", "", b""))
     ros_version = 1 if channel.encoding == "ros1" or schema.encoding == "ros1msg" else 2
     counts = index.counts
     return SplitConnection(
@@ -241,7 +246,7 @@ def _connection(key: int, channel: ChannelRecord, index: McapIndex) -> SplitConn
         schema.name,
         _ENCODINGS.get(channel.encoding, Encoding.OTHER),
         ros_version,
-        Embedded(schema.encoding, schema.text) if schema.encoding else None,
+        Embedded.from_bytes(schema.encoding, schema.data) if schema.encoding else None,
         counts.get(key, 0) if counts is not None else None,
         latched=channel.metadata.get("latching") == "1",
         attributes={"encoding": channel.encoding, "schema_encoding": schema.encoding, **channel.metadata},

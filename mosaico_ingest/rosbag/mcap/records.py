@@ -46,7 +46,7 @@ class SchemaRecord(Struct, frozen=True):
 
     name: str
     encoding: str
-    text: str
+    data: bytes
 
 
 class ChannelRecord(Struct, frozen=True):
@@ -80,7 +80,7 @@ class ChunkHead(Struct, frozen=True):
 
 def schema_of(fields: Fields) -> tuple[int, SchemaRecord]:
     """Return the id and content of a schema record."""
-    return fields.u16(), SchemaRecord(fields.text(), fields.text(), fields.text())
+    return fields.u16(), SchemaRecord(fields.text(), fields.text(), fields.take(fields.u32()))
 
 
 def channel_of(fields: Fields) -> tuple[int, ChannelRecord]:
