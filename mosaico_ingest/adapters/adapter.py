@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Mapping
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -12,20 +14,78 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.findings import RowFailure
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
-from mosaico_ingest.rosbag.definitions.model import Definition
+from mosaico_ingest.rosbag.definitions.model import Definition, Language
+from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS, encoding_of
 
 __all__ = [
+    "RESERVED_KEYS",
     "ROS_METADATA_KEY",
     "Adapted",
     "Adapter",
     "AdapterSpec",
     "Envelope",
+    "RecordedSchema",
     "UnmodeledSpec",
+    "recorded_schema",
     "ros_metadata",
+    "source_metadata",
 ]
 
 ROS_METADATA_KEY = "_ros_"
 """Reserved key: it takes precedence over the same key in the user's topic metadata."""
+MCAP_METADATA_KEY = "_mcap_"
+"""Reserved key of topics in other encodings than those of ROS, with the same members as in the official SDK."""
+RESERVED_KEYS = frozenset({ROS_METADATA_KEY, MCAP_METADATA_KEY})
+
+
+def source_metadata(definition: Definition, source_file: str, *, topic: str) -> dict[str, Any]:
+    """Return the metadata that describes the original messages of a topic."""
+    if definition.language is Language.ROS:
+        return ros_metadata(definition, source_file)
+    encoding = encoding_of(definition)
+    return {
+        MCAP_METADATA_KEY: {
+            "channel_name": topic,
+            "channel_encoding": encoding.value,
+            "schema_name": definition.root,
+            "schema_encoding": MESSAGE_ENCODINGS[encoding].schema_encoding if definition.text else "",
+            "schema_def": definition.text,
+            "enums": _enums(definition),
+            "source_file": source_file,
+        }
+    }
+
+
+class RecordedSchema(Struct, frozen=True):
+    """The schema of a topic's original messages, from its metadata."""
+
+    msgtype: str
+    text: str
+    """As in `Definition.text`."""
+    source_file: str
+    language: Language = Language.ROS
+
+
+_MEMBERS = {
+    ROS_METADATA_KEY: ("msgtype", "msgdef", "source_file"),
+    MCAP_METADATA_KEY: ("schema_name", "schema_def", "source_file", "channel_encoding"),
+}
+
+
+def recorded_schema(metadata: Mapping[str, Any]) -> RecordedSchema | None:
+    """Return the schema of a topic's original messages; None if the metadata does not describe it."""
+    for key, members in _MEMBERS.items():
+        block = metadata.get(key)
+        if not isinstance(block, Mapping):
+            continue
+        values = cast("Mapping[str, Any]", block)
+        texts = [values.get(member, "") for member in members]
+        if not all(isinstance(text, str) for text in texts) or not texts[0]:
+            return None
+        languages = {encoding.value: entry.language for encoding, entry in MESSAGE_ENCODINGS.items()}
+        language = languages.get(texts[3]) if key == MCAP_METADATA_KEY else Language.ROS
+        return None if language is None else RecordedSchema(texts[0], texts[1], texts[2], language)
+    return None
 
 
 def ros_metadata(definition: Definition, source_file: str) -> dict[str, Any]:
@@ -36,13 +96,15 @@ def ros_metadata(definition: Definition, source_file: str) -> dict[str, Any]:
     return {
         ROS_METADATA_KEY: {
             "msgtype": definition.root,
-            "enums": {
-                constant.name: _json_value(constant.value) for constant in definition.message.constants
-            },
+            "enums": _enums(definition),
             "msgdef": definition.text,
             "source_file": source_file,
         }
     }
+
+
+def _enums(definition: Definition) -> dict[str, object]:
+    return {constant.name: _json_value(constant.value) for constant in definition.message.constants}
 
 
 def _json_value(value: object) -> object:
@@ -120,6 +182,11 @@ class AdapterSpec(Protocol):
         ...
 
 
+def short_name(msgtype: str) -> str:
+    """Return the last part of a type's name, without its package; characters that no tag can have become `_`."""
+    return re.sub(r"\W", "_", re.split(r"[/.]", msgtype)[-1]) or "Message"
+
+
 _ENVELOPE_COLUMN = "timestamp_ns"
 _ONE_MEMBER = pa.struct([("structure_needs_at_least_one_member", pa.uint8())])
 """Type of a nested message without fields, named as in ROS 2: Parquet has no structs without fields."""
@@ -135,7 +202,7 @@ class UnmodeledSpec(Struct, frozen=True):
 
     def bind(self, definition: Definition, shape: pa.StructType) -> UnmodeledAdapter:
         """Use the ROS shape as ontology columns; types with the same short name differ by fingerprint."""
-        tag = definition.root.rsplit("/", 1)[-1]
+        tag = short_name(definition.root)
         names = _free_of_the_envelope(shape)
         struct = pa.struct([pa.field(names[field.name], _storable(field.type)) for field in shape])
         renamed = {new: old for old, new in names.items() if new != old}

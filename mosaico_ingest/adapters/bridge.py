@@ -340,7 +340,7 @@ class ROSBridge:
         if msgtype in BY_TYPE:
             return Resolution(BY_TYPE[msgtype], "built-in", f"built-in for {msgtype}")
         layout = self._formats.get(msgtype, SerializationFormat.DEFAULT)
-        why = f"no adapter takes {msgtype}; it keeps its ROS shape"
+        why = f"no adapter takes {msgtype}; its messages keep their shape"
         return Resolution(UnmodeledSpec(serialization_format=layout), "unmodeled", why)
 
     def _override(self, pattern: str, topic: str, msgtype: str) -> Resolution:

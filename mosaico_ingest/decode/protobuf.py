@@ -41,6 +41,7 @@ from mosaico_ingest.rosbag.encodings.protobuf import (
     form_of,
     json_text,
     message_class,
+    message_type,
     requires_fields,
 )
 
@@ -131,7 +132,7 @@ def _fields(descriptor: Descriptor, visited: set[str]) -> Iterator[FieldDescript
     for field in descriptor.fields:
         yield field
         if form_of(field) is Form.MESSAGE:
-            yield from _fields(field.message_type, visited)
+            yield from _fields(message_type(field), visited)
 
 
 class _Columns:
@@ -211,7 +212,7 @@ def _equivalent(
         copy.type = kind
     else:
         copy.type = FieldDescriptorProto.TYPE_MESSAGE
-        copy.type_name = f".{_add_message(file, field.message_type, names)}"
+        copy.type_name = f".{_add_message(file, message_type(field), names)}"
     return copy
 
 
@@ -230,12 +231,9 @@ class _FieldPlan(Struct, frozen=True):
     @classmethod
     def of(cls, field: FieldDescriptor) -> _FieldPlan:
         form = form_of(field)
-        message = field.message_type
-        parse = None
-        if form is Form.JSON:
-            parse = message_factory.GetMessageClass(message).FromString
-        is_map = form is Form.MESSAGE and message.GetOptions().map_entry
-        struct = _StructPlan.of(message) if form is Form.MESSAGE else None
+        parse = message_factory.GetMessageClass(message_type(field)).FromString if form is Form.JSON else None
+        is_map = form is Form.MESSAGE and message_type(field).GetOptions().map_entry
+        struct = _StructPlan.of(message_type(field)) if form is Form.MESSAGE else None
         enum = field.enum_type
         numbers = None
         if enum is not None and enum.is_closed:
@@ -311,7 +309,8 @@ def _refuse_irregular_entries(column: Any, entries: Any) -> None:  # noqa: ANN40
         return
     if entries.field(1).null_count:
         raise _NeedsCodec
-    owners = np.repeat(np.arange(len(column)), np.diff(np.asarray(column.offsets)))
+    counts = np.diff(np.asarray(column.offsets)).astype(np.int64)
+    owners = np.repeat(np.arange(len(column)), counts)
     keys = pa.table({"owner": pa.array(owners), "key": entries.field(0)})
     if keys.group_by(["owner", "key"]).aggregate([]).num_rows < len(entries):
         raise _NeedsCodec

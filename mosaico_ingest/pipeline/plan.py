@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from pydantic import Field, JsonValue, PlainSerializer, SerializationInfo
 from typing_extensions import TypedDict
 
-from mosaico_ingest.adapters.adapter import ROS_METADATA_KEY, AdapterSpec
+from mosaico_ingest.adapters.adapter import RESERVED_KEYS, AdapterSpec
 from mosaico_ingest.adapters.image import PngImageSpec
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.destinations.registry import destination_of
@@ -87,7 +87,7 @@ def _describe_ontology(ontology: OntologyType) -> OntologyDocument:
 
 
 def _own_metadata(metadata: Mapping[str, Any]) -> dict[str, JsonValue]:
-    return {key: value for key, value in metadata.items() if key != ROS_METADATA_KEY}
+    return {key: value for key, value in metadata.items() if key not in RESERVED_KEYS}
 
 
 def _describe_files(files: tuple[Path | RemotePath, ...], info: SerializationInfo) -> list[FileDocument]:

@@ -6,8 +6,8 @@ import hashlib
 from collections.abc import Iterable, Iterator
 from difflib import get_close_matches
 
-from mosaico_ingest.adapters.adapter import ros_metadata
-from mosaico_ingest.adapters.bridge import ROSBridge
+from mosaico_ingest.adapters.adapter import UnmodeledSpec, source_metadata
+from mosaico_ingest.adapters.bridge import Resolution, ROSBridge
 from mosaico_ingest.adapters.image import IMAGE_TAG
 from mosaico_ingest.errors import AdapterError, BagError, IngestError, NothingMatched
 from mosaico_ingest.findings import (
@@ -31,8 +31,9 @@ from mosaico_ingest.pipeline.schema_changes import follow_schema_changes
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.rosbag.blocks import Connection, Encoding
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
-from mosaico_ingest.rosbag.definitions.model import Definition
+from mosaico_ingest.rosbag.definitions.model import Definition, Language
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.encodings.table import refusal
 from mosaico_ingest.rosbag.recording import Recording, no_topics_error
 
 __all__ = ["merge", "plan_connection", "plan_recording"]
@@ -117,13 +118,12 @@ def plan_connection(
     if connection.topic not in selection.selected:
         return _not_selected(job, connection, selection)
     if connection.encoding is Encoding.OTHER:
-        encoding = connection.attributes.get("encoding", "unknown")
-        return _excluded(connection, connection.problem or f"not a ROS encoding: {encoding}")
+        return _excluded(connection, connection.problem or refusal(connection.attributes.get("encoding", "")))
     if connection.definition is None:
         return _undefined(
             job, connection, connection.problem or f"no definition of {connection.msgtype} is known"
         )
-    resolution = bridge.resolve(connection.topic, connection.msgtype)
+    resolution = _fitting(bridge.resolve(connection.topic, connection.msgtype), connection.definition)
     if resolution.unmodeled and job.adapters.unmodeled is not Unmodeled.KEEP:
         if job.adapters.unmodeled is Unmodeled.FAIL:
             raise AdapterError(
@@ -144,11 +144,29 @@ def plan_connection(
         why=resolution.why,
         ontology=bound.ontology,
         count=connection.count,
-        metadata={**settings.metadata, **ros_metadata(connection.definition, source_file)},
+        metadata={
+            **settings.metadata,
+            **source_metadata(connection.definition, source_file, topic=connection.topic),
+        },
         on_error=job.on_error.for_topic(connection.topic),
         every=settings.every,
         definitions=(_describe_definition(connection.definition),),
     )
+
+
+def _fitting(resolution: Resolution, definition: Definition) -> Resolution:
+    """Return the resolution, or the unmodeled one if a built-in adapter does not fit a schema that is not from ROS.
+
+    Only ROS definitions have unique names: any JSON Schema may be called `sensor_msgs/Imu`.
+    """
+    if resolution.reason != "built-in" or definition.language is Language.ROS:
+        return resolution
+    try:
+        resolution.spec.bind(definition, ros_shape(definition))
+    except AdapterError as error:
+        why = f"{resolution.spec.name} does not fit: {error.what}; the messages keep their shape"
+        return Resolution(UnmodeledSpec(), "unmodeled", why)
+    return resolution
 
 
 def _describe_definition(definition: Definition) -> str:

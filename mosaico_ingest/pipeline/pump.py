@@ -32,6 +32,9 @@ from mosaico_ingest.rosbag.recording import Recording, damage_error
 
 __all__ = ["Written", "check_counts", "verify", "write_sequence"]
 
+_SHOWN_FIELDS = 8
+"""Number of undeclared fields that a finding names."""
+
 
 class Written(Struct, frozen=True):
     """The result of a committed session."""
@@ -243,6 +246,8 @@ def _report_reading(
     for topic in topics:
         if topic.padded:
             observe(Noted(_padded(topic)))
+        if topic.undeclared:
+            observe(Noted(_undeclared(topic)))
     targets = {connection: topic.plan.target for topic in topics for connection in topic.plan.connections}
     for item in recording.unreadable:
         if item.count != 0:
@@ -264,6 +269,18 @@ def _padded(topic: TopicPipeline) -> Finding:
         f"{topic.plan.topic}: {topic.padded} messages end in 4 to 7 zero bytes that {topic.plan.msgtype} does not"
         " explain",
         help="check that the definition is the one the messages were written with",
+    )
+
+
+def _undeclared(topic: TopicPipeline) -> Finding:
+    names = sorted(topic.undeclared)
+    more = f" and {len(names) - _SHOWN_FIELDS} more" if len(names) > _SHOWN_FIELDS else ""
+    return Finding(
+        "undeclared-fields",
+        Severity.WARNING,
+        f"{topic.plan.topic}: {topic.plan.msgtype} does not declare {', '.join(names[:_SHOWN_FIELDS])}{more};"
+        " they are not stored",
+        help="add them to the JSON Schema of the channel",
     )
 
 

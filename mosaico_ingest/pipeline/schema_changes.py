@@ -9,7 +9,7 @@ from typing import Any, cast
 
 from msgspec import Struct
 
-from mosaico_ingest.adapters.adapter import ROS_METADATA_KEY
+from mosaico_ingest.adapters.adapter import recorded_schema
 from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.findings import Finding, Severity
@@ -88,8 +88,8 @@ def _family(metadata: Mapping[str, Any]) -> object:
 
 
 def _definition(metadata: Mapping[str, Any]) -> str | None:
-    text = _member(metadata.get(ROS_METADATA_KEY), "msgdef")
-    return text if isinstance(text, str) else None
+    schema = recorded_schema(metadata)
+    return None if schema is None else schema.text
 
 
 def _member(value: object, key: str) -> object:

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.adapters.adapter import Adapted, Adapter, Envelope
 from mosaico_ingest.caching import cache_by_identity
-from mosaico_ingest.decode.decoder import Decoder, decoder_for
+from mosaico_ingest.decode.base import Decoder
+from mosaico_ingest.decode.decoder import decoder_for
 from mosaico_ingest.destinations.base import ENVELOPE, Session, TopicWriter
 from mosaico_ingest.errors import (
     AdapterError,
@@ -80,6 +81,8 @@ class TopicPipeline:
     """Number of rows handed to the destination so far."""
     padded: int = 0
     """Number of messages that end in zero bytes their definition does not explain."""
+    undeclared: set[str] = field(default_factory=set[str])
+    """Fields of messages that their schema does not declare, and that are not stored."""
     start_ns: int | None = None
     end_ns: int | None = None
     status: TopicStatus = TopicStatus.EMPTY
@@ -148,6 +151,7 @@ class TopicPipeline:
         decoded = self._decoders[block.connection].decode(block if selected.all() else block.rows(sample))
         self.stopwatch.lap(Step.DECODE)
         self.padded += decoded.padded
+        self.undeclared |= decoded.undeclared
         rejections = [
             _Rejection(Stage.DECODE, replace(failure, row=int(sample[failure.row])))
             for failure in decoded.failures

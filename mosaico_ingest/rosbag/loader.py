@@ -19,8 +19,9 @@ from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.patterns import select
 from mosaico_ingest.job.values import LoaderErrorPolicy, Stores
 from mosaico_ingest.remote import RemotePath, as_path
-from mosaico_ingest.rosbag.blocks import Connection, Encoding, MessageBlock, ROSMessage, UnreadableRange
+from mosaico_ingest.rosbag.blocks import Connection, MessageBlock, ROSMessage, UnreadableRange
 from mosaico_ingest.rosbag.definitions.registry import CustomMessages, TypeResolver
+from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS
 from mosaico_ingest.rosbag.recording import (
     Recording,
     no_topics_error,
@@ -28,7 +29,6 @@ from mosaico_ingest.rosbag.recording import (
     time_bounds,
     time_slices,
 )
-from mosaico_ingest.rosbag.serialization import Deserializer
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -189,7 +189,7 @@ class ROSLoader:
     def _deserializer(self, connection: Connection) -> Callable[[bytes], dict[str, Any]] | None:
         deserialize = self._source.deserializer(connection)
         if deserialize is None:
-            problem = connection.problem or "its encoding is not a ROS serialization"
+            problem = connection.problem or "it cannot be decoded"
             if self._policy is LoaderErrorPolicy.RAISE:
                 raise BagError(problem, where=connection.topic)
             if self._policy is LoaderErrorPolicy.LOG_WARN:
@@ -224,9 +224,10 @@ class _NativeSource:
             yield from _by_log_time(blocks)
 
     def deserializer(self, connection: Connection) -> Callable[[bytes], dict[str, Any]] | None:
-        if connection.definition is None or connection.encoding is Encoding.OTHER:
+        entry = MESSAGE_ENCODINGS.get(connection.encoding)
+        if connection.definition is None or entry is None:
             return None
-        return Deserializer(connection.definition, connection.encoding).to_dict
+        return entry.reader(connection.definition).to_dict
 
 
 def _by_log_time(blocks: list[MessageBlock]) -> Iterator[tuple[int, int, bytes]]:

@@ -160,12 +160,32 @@ class Recording:
         self.message_count: int | None = None if None in counts else sum(count or 0 for count in counts)
         for number, split in enumerate(splits):
             self._report(number, split.unreadable)
+        self._infer_definitions()
         findings = recording_findings(splits, self.connections, self.unreadable, files.metadata)
         self._unreadable |= dict.fromkeys(
             UnreadableRange(0, "this split does not exist", file=str(file)) for file in files.missing
         )
         self.findings: tuple[Finding, ...] = (*files.findings, *findings)
         """Findings from opening the recording; damage found while reading is in `unreadable` only."""
+
+    def _infer_definitions(self) -> None:
+        """Complete the definitions of JSON connections whose schemas declare no properties, by reading all messages."""
+        connections = list(self.connections)
+        for connection in connections:
+            definition = connection.definition
+            if (
+                definition is None
+                or definition.language is not Language.JSON_SCHEMA
+                or definition.shape is not None
+            ):
+                continue
+            from mosaico_ingest.rosbag.encodings.json_inference import (  # noqa: PLC0415 - rarely needed
+                infer_definition,
+            )
+
+            inferred = infer_definition(definition, self.message_blocks([connection.id]))
+            connections[connection.id] = replace(connection, definition=inferred)
+        self.connections = tuple(connections)
 
     def __enter__(self) -> Self:
         """Return the recording."""

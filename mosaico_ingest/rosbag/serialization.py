@@ -100,7 +100,7 @@ class Deserializer:
     """Decodes messages of one definition. Arrays and sequences become lists, sequences of `uint8`, `byte` and `char` `bytes`."""
 
     def __init__(self, definition: Definition, encoding: Encoding) -> None:
-        if encoding is Encoding.OTHER:
+        if encoding not in {Encoding.CDR, Encoding.ROS1}:
             raise BagError(f"{definition.root}: only CDR and ROS 1 payloads can be decoded")
         self._definition = definition
         self._encoding = encoding
@@ -334,7 +334,7 @@ class Serializer:
     """Encodes messages of one definition, little-endian by default."""
 
     def __init__(self, definition: Definition, encoding: Encoding, *, big_endian: bool = False) -> None:
-        if encoding is Encoding.OTHER or (encoding is Encoding.ROS1 and big_endian):
+        if encoding not in {Encoding.CDR, Encoding.ROS1} or (encoding is Encoding.ROS1 and big_endian):
             raise BagError(f"{definition.root}: only CDR and little-endian ROS 1 payloads can be encoded")
         self._definition = definition
         self._cdr = encoding is Encoding.CDR

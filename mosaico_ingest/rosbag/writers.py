@@ -18,7 +18,7 @@ from rosbags.rosbag2 import Writer as Rosbag2
 from mosaico_ingest.containers import SUFFIX_LIST
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.definitions.hashes import md5sum, rihs01
-from mosaico_ingest.rosbag.definitions.model import Definition
+from mosaico_ingest.rosbag.definitions.model import Definition, Language
 from mosaico_ingest.rosbag.mcap.writer import McapWriter
 
 __all__ = [
@@ -67,6 +67,8 @@ class SqliteWriter:
 
     def add_connection(self, topic: str, definition: Definition) -> int:
         """Add a connection; a `.db3` file stores one definition per type, and only ROS 2 types."""
+        if definition.language is not Language.ROS:
+            raise _not_ros(topic, definition)
         if definition.ros_version == 1:
             raise BagError(f"{definition.root} is a ROS 1 type", where=topic, hint="write .mcap or .bag")
         if self._texts.setdefault(definition.root, definition.text) != definition.text:
@@ -105,6 +107,8 @@ class Ros1Writer:
 
     def add_connection(self, topic: str, definition: Definition) -> int:
         """Add a connection; a bag stores only ROS 1 types."""
+        if definition.language is not Language.ROS:
+            raise _not_ros(topic, definition)
         if definition.ros_version != 1:
             raise BagError(f"{definition.root} is a ROS 2 type", where=topic, hint="write .mcap or .db3")
         try:
@@ -167,3 +171,8 @@ def open_writer(path: Path, *, replace: bool = False) -> Generator[RecordingWrit
         raise BagError(f"cannot be written: {error}", where=str(path)) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _not_ros(topic: str, definition: Definition) -> BagError:
+    message = f"{definition.root} is a {definition.language.value} type, not a ROS type"
+    return BagError(message, where=topic, hint="write .mcap")

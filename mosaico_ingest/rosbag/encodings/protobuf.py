@@ -45,6 +45,7 @@ __all__ = [
     "form_of",
     "json_text",
     "message_class",
+    "message_type",
     "read_schema",
     "requires_fields",
 ]
@@ -147,6 +148,13 @@ def _well_known(path: str) -> Any:  # noqa: ANN401 - a FileDescriptorProto
     raise KeyError(f"it lacks the imported file {path}")
 
 
+def message_type(field: FieldDescriptor) -> Descriptor:
+    """Return the type of a field's messages."""
+    if field.message_type is None:
+        raise TypeError(f"{field.full_name} is not a message")
+    return field.message_type
+
+
 def form_of(field: FieldDescriptor) -> Form:
     """Return how a field becomes a column."""
     message = field.message_type
@@ -156,9 +164,15 @@ def form_of(field: FieldDescriptor) -> Form:
         return Form.MESSAGE
     if message.full_name in _WRAPPERS:
         return Form.WRAPPER
-    if message.full_name in _DYNAMIC or _reaches(message, field.containing_type):
+    if message.full_name in _DYNAMIC or _reaches(message, _owner(field)):
         return Form.JSON
     return Form.MESSAGE
+
+
+def _owner(field: FieldDescriptor) -> Descriptor:
+    if field.containing_type is None:
+        raise TypeError(f"{field.full_name} is an extension")
+    return field.containing_type
 
 
 def _reaches(start: Descriptor, goal: Descriptor) -> bool:
@@ -193,7 +207,7 @@ def _struct(message: Descriptor, budget: _Budget) -> pa.StructType:
 
 
 def _column(field: FieldDescriptor, budget: _Budget) -> pa.DataType:
-    item = _struct(field.message_type, budget) if form_of(field) is Form.MESSAGE else arrow_type(field)
+    item = _struct(message_type(field), budget) if form_of(field) is Form.MESSAGE else arrow_type(field)
     if not field.is_repeated:
         return item
     return pa.list_(pa.field(field.name if pa.types.is_struct(item) else "item", item))
@@ -209,7 +223,7 @@ def _type_of(field: FieldDescriptor) -> tuple[str, pa.DataType]:
     if form is Form.JSON:
         return "json", pa.string()
     if form is Form.WRAPPER:
-        return _type_of(field.message_type.fields_by_name["value"])
+        return _type_of(message_type(field).fields_by_name["value"])
     if field.type == FieldDescriptor.TYPE_BYTES:
         return "binary", pa.binary()
     return _TYPES[field.cpp_type]
@@ -224,13 +238,13 @@ def _add_types(message: Descriptor, types: dict[str, MessageType]) -> None:
     )
     for field in message.fields:
         if form_of(field) is Form.MESSAGE:
-            _add_types(field.message_type, types)
+            _add_types(message_type(field), types)
 
 
 def _field(field: FieldDescriptor) -> Field:
     container = Container.SEQUENCE if field.is_repeated else Container.SCALAR
     if form_of(field) is Form.MESSAGE:
-        return Field(field.name, field.message_type.full_name, is_message=True, container=container)
+        return Field(field.name, message_type(field).full_name, is_message=True, container=container)
     return Field(field.name, _type_of(field)[0], container=container)
 
 
@@ -284,7 +298,8 @@ class ProtobufCodec:
                 f"the bytes are not valid protobuf: {_reason(error)}", rule="protobuf"
             ) from None
         if self._is_checked and not message.IsInitialized():
-            missing = ", ".join(message.FindInitializationErrors())
+            unset: Any = message  # the stubs lack the method
+            missing = ", ".join(unset.FindInitializationErrors())
             raise DecodeError(f"required fields are missing: {missing}", rule="protobuf")
         try:
             return self._read(message)
@@ -335,7 +350,7 @@ def _converter(field: FieldDescriptor) -> _Converter:
         case Form.JSON:
             return _Converter(json_text, _fill_json)
         case Form.MESSAGE:
-            return _Converter(_reader(field.message_type), _writer(field.message_type))
+            return _Converter(_reader(message_type(field)), _writer(message_type(field)))
 
 
 def _fill_wrapper(message: Any, value: object) -> None:  # noqa: ANN401 - a protobuf message
@@ -348,7 +363,7 @@ def _fill_json(message: Any, text: str) -> None:  # noqa: ANN401 - a protobuf me
     message.SetInParent()
 
 
-def json_text(message: Message) -> str:
+def json_text(message: Any) -> str:  # noqa: ANN401 - a protobuf message
     """Return a message as JSON text with the field names of its declaration."""
     return json_format.MessageToJson(
         message, preserving_proto_field_name=True, indent=None, descriptor_pool=message.DESCRIPTOR.file.pool
@@ -367,7 +382,7 @@ def _reader(descriptor: Descriptor) -> _Read:
 def _field_reader(field: FieldDescriptor) -> Callable[[Any], Any]:
     name = field.name
     if _is_map(field):
-        return _map_reader(name, field.message_type.fields_by_name["value"])
+        return _map_reader(name, message_type(field).fields_by_name["value"])
     read = _converter(field).read
     if field.is_repeated:
         return lambda message: [read(value) for value in getattr(message, name)]
@@ -405,7 +420,7 @@ def _writer(descriptor: Descriptor) -> _Write:
 def _field_writer(field: FieldDescriptor) -> Callable[[Any, Any], None]:
     name = field.name
     if _is_map(field):
-        return _map_writer(name, _converter(field.message_type.fields_by_name["value"]).write)
+        return _map_writer(name, _converter(message_type(field).fields_by_name["value"]).write)
     fill = _converter(field).write
     if fill is None:
         if field.is_repeated:

@@ -12,7 +12,8 @@ import zstandard
 
 from mosaico_ingest.containers import MCAP
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.rosbag.definitions.model import Definition, short_msgtype
+from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, short_msgtype
+from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS, encoding_of
 from mosaico_ingest.rosbag.mcap.records import (
     RECORD,
     Op,
@@ -27,6 +28,8 @@ __all__ = ["McapWriter"]
 _CHUNK_BYTES = 4 << 20
 _MESSAGE = struct.Struct("<HIQQ")
 _MAX_CHANNELS = 65535
+_NO_SCHEMA = 0
+"""The schema id of channels without a schema, such as JSON without a JSON Schema."""
 
 
 @dataclass(slots=True)
@@ -69,10 +72,10 @@ class McapWriter:
         """Add a connection; two definitions of one type are two schemas. Without `embed` the schema has no text."""
         if len(self._versions) == _MAX_CHANNELS:
             raise BagError(f"an MCAP file can have at most {_MAX_CHANNELS} channels", where=topic)
-        number, version = len(self._versions) + 1, definition.ros_version
-        self._versions.append(version)
-        encoding = "ros1" if version == 1 else "cdr"
+        number = len(self._versions) + 1
+        self._versions.append(definition.ros_version)
         schema = self._schema(definition, definition.text if embed else "")
+        encoding = encoding_of(definition).value
         content = struct.pack("<HH", number, schema) + text_bytes(topic) + text_bytes(encoding)
         self._add(Op.CHANNEL, content + texts_bytes(dict(metadata or {})))
         self._counts[number] = 0
@@ -127,7 +130,8 @@ class McapWriter:
         """Write the header, which depends on the ROS versions of the channels, and the channels added since."""
         if not self._has_header:
             versions = set(self._versions)
-            profile = f"ros{versions.pop()}" if len(versions) == 1 else ""
+            version = versions.pop() if len(versions) == 1 else 0
+            profile = f"ros{version}" if version else ""
             self._put(Op.HEADER, text_bytes(profile) + text_bytes(f"mosaico-ingest {__version__}"))
             self._has_header = True
         for record in self._pending:
@@ -136,12 +140,16 @@ class McapWriter:
 
     def _schema(self, definition: Definition, text: str) -> int:
         version = definition.ros_version
+        language = MESSAGE_ENCODINGS[encoding_of(definition)].schema_encoding
+        if language and not definition.text:
+            return _NO_SCHEMA
         key = (definition.root, version, text)
         if key not in self._schemas:
             number = self._schemas[key] = len(self._schemas) + 1
             name = short_msgtype(definition.root) if version == 1 else definition.root
-            data = text.encode()
-            content = struct.pack("<H", number) + text_bytes(name) + text_bytes(f"ros{version}msg")
+            embedded = Embedded(language or f"ros{version}msg", text)
+            data = embedded.to_bytes()
+            content = struct.pack("<H", number) + text_bytes(name) + text_bytes(embedded.encoding)
             self._add(Op.SCHEMA, content + struct.pack("<I", len(data)) + data)
         return self._schemas[key]
 

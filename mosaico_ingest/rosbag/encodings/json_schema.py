@@ -1,0 +1,377 @@
+"""JSON Schemas as definitions, and as msgspec types that confirm valid messages.
+
+The columns of a schema:
+
+* An object with `properties` is a struct; an array with `items` is a list. `integer` is int64, `number` is float64, and
+  a string with `contentEncoding: base64` is binary. `null` beside another type makes no difference: every column is
+  nullable, and an absent property is null.
+* Everything else, such as a property of several types or an object without `properties`, is JSON text.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from typing import Annotated, Any, Literal, cast
+
+import msgspec
+from jsonschema import validators
+from jsonschema.exceptions import SchemaError
+from jsonschema.protocols import Validator
+from msgspec import UNSET, Meta, UnsetType
+from referencing import Registry
+
+from mosaico_ingest.errors import BagError
+from mosaico_ingest.rosbag.definitions.model import (
+    Constant,
+    Definition,
+    Embedded,
+    Language,
+    MessageType,
+    Source,
+)
+from mosaico_ingest.rosbag.encodings.json_types import (
+    ANY,
+    BINARY,
+    JsonType,
+    list_of,
+    message_types,
+    struct_of,
+)
+
+__all__ = ["confirming_type", "json_type", "read_schema", "validator_of"]
+
+_UNNAMED = "json"
+"""The type name of channels without a schema."""
+_MAX_COLUMNS = 20_000
+_KINDS = {"boolean": "bool", "integer": "int64", "number": "float64", "string": "string"}
+_ANNOTATIONS = frozenset({
+    "$schema", "$id", "id", "$comment", "title", "description", "default", "examples", "definitions", "$defs", "format",
+    "contentEncoding", "contentMediaType", "readOnly", "writeOnly", "deprecated",
+})  # fmt: skip
+"""Keywords that reject no value; `format` is not checked."""
+_LIMITS = {"minimum": "ge", "maximum": "le", "exclusiveMinimum": "gt", "exclusiveMaximum": "lt"}
+_SIZES = {
+    "string": {"minLength": "min_length", "maxLength": "max_length"},
+    "array": {"minItems": "min_length", "maxItems": "max_length"},
+}
+
+
+def read_schema(name: str, embedded: Embedded | None) -> Definition:
+    """Return the definition of a JSON channel. Without properties, its shape is None, and must be inferred.
+
+    Raises:
+        BagError: The schema is not a JSON Schema, or it refers to other documents.
+    """
+    name = name or _UNNAMED
+    text = "" if embedded is None else embedded.text
+    if embedded is not None and embedded.encoding != "jsonschema":
+        raise BagError(
+            f"the JSON channel has a schema in {embedded.encoding!r}; it needs a JSON Schema", where=name
+        )
+    kind = json_type(text, name) if text.strip() else ANY
+    if kind.kind != "struct":
+        return Definition(name, {name: MessageType(name, ())}, Source.BAG, text, 0, Language.JSON_SCHEMA)
+    types = message_types(kind, name)
+    return Definition(name, types, Source.BAG, text, 0, Language.JSON_SCHEMA, kind.struct)
+
+
+def json_type(text: str, name: str) -> JsonType:
+    """Return the type of the columns of a JSON Schema.
+
+    Raises:
+        BagError: The text is not a JSON Schema, or it refers to other documents.
+    """
+    return _Columns(_parse(text, name)).root()
+
+
+def validator_of(text: str, name: str) -> Validator:
+    """Return the validator of a JSON Schema, in the draft that it names; the default is 2020-12."""
+    schema = _parse(text, name)
+    kind = validators.validator_for(schema, default=validators.validator_for({"$schema": _LATEST}))
+    return kind(schema, registry=Registry())  # this registry never downloads schemas
+
+
+_LATEST = "https://json-schema.org/draft/2020-12/schema"
+
+
+@lru_cache(maxsize=64)
+def _parse(text: str, name: str) -> Any:  # noqa: ANN401 - an object or a boolean
+    try:
+        schema = json.loads(text)
+        validators.validator_for(schema, default=validators.validator_for({"$schema": _LATEST})).check_schema(
+            schema
+        )
+    except (ValueError, RecursionError) as error:
+        raise BagError(f"the schema is not JSON: {error}", where=name) from error
+    except SchemaError as error:
+        raise BagError(
+            f"the schema is not a JSON Schema: {error.json_path}: {error.message}", where=name
+        ) from error
+    for target in _references(schema):
+        if not target.startswith("#"):
+            raise BagError(f"the JSON Schema refers to another document: {target}", where=name)
+        if _lookup(schema, target) is None:
+            raise BagError(f"the JSON Schema refers to {target}, which it does not contain", where=name)
+    return schema
+
+
+def _references(schema: Any) -> Iterator[str]:  # noqa: ANN401 - any JSON value
+    if isinstance(schema, list):
+        for item in cast("list[Any]", schema):
+            yield from _references(item)
+    elif isinstance(schema, dict):
+        for key, value in cast("dict[str, Any]", schema).items():
+            if key in {"$ref", "$dynamicRef", "$recursiveRef"} and isinstance(value, str):
+                yield value
+            else:
+                yield from _references(value)
+
+
+def _lookup(schema: Any, target: str) -> Any:  # noqa: ANN401 - any JSON value
+    """Return the schema that a JSON pointer refers to; None if there is none."""
+    for part in target.removeprefix("#").split("/")[1:]:
+        key = part.replace("~1", "/").replace("~0", "~")
+        if not isinstance(schema, dict) or key not in schema:
+            return None
+        schema = cast("dict[str, Any]", schema)[key]
+    return schema
+
+
+class _Columns:
+    """Derives the columns of one schema."""
+
+    def __init__(self, schema: Any) -> None:  # noqa: ANN401 - an object or a boolean
+        self._schema = schema
+        self._count = 0
+
+    def root(self) -> JsonType:
+        return self._type(self._schema, ())
+
+    def _type(self, schema: Any, above: tuple[str, ...]) -> JsonType:  # noqa: ANN401 - an object or a boolean
+        if not isinstance(schema, dict):
+            return ANY
+        node = cast("dict[str, Any]", schema)
+        reference = node.get("$ref")
+        if reference is not None:
+            return (
+                ANY
+                if reference in above
+                else self._type(_lookup(self._schema, reference), (*above, reference))
+            )
+        if (only := _without_null(node)) is not node:
+            return self._type(only, above)
+        return self._typed(node, above)
+
+    def _typed(self, node: dict[str, Any], above: tuple[str, ...]) -> JsonType:
+        kinds = _kinds_of(node)
+        if kinds == {"object"}:
+            return self._struct(node, above)
+        if kinds == {"array"}:
+            items = node.get("items")
+            return list_of(self._type(items, above)) if isinstance(items, dict) else ANY
+        if kinds == {"string"} and node.get("contentEncoding") == "base64":
+            return BINARY
+        if kinds == {"integer", "number"}:
+            return JsonType("float64")
+        return JsonType(_KINDS[next(iter(kinds))]) if len(kinds) == 1 else ANY
+
+    def _struct(self, node: dict[str, Any], above: tuple[str, ...]) -> JsonType:
+        properties: dict[str, Any] = node.get("properties") or {}
+        self._count += len(properties)
+        if self._count > _MAX_COLUMNS:
+            raise BagError(f"the JSON Schema has more than {_MAX_COLUMNS} properties")
+        fields = {name: self._type(schema, above) for name, schema in properties.items()}
+        return struct_of(
+            fields,
+            name=str(node.get("title") or ""),
+            required=frozenset(node.get("required") or ()),
+            constants=tuple(_constants(properties)),
+        )
+
+
+def _without_null(node: dict[str, Any]) -> dict[str, Any]:
+    """Return the other schema of `anyOf: [schema, {type: null}]`, or the same schema if it has another form."""
+    for keyword in ("anyOf", "oneOf"):
+        options = node.get(keyword)
+        if isinstance(options, list) and not node.keys() - {keyword} - _ANNOTATIONS:
+            others = [one for one in cast("list[Any]", options) if one != {"type": "null"}]
+            if len(others) == 1 and isinstance(others[0], dict):
+                return cast("dict[str, Any]", others[0])
+    return node
+
+
+def _kinds_of(node: Mapping[str, Any]) -> set[str]:
+    """Return the types of JSON values that a schema allows, except null; empty if it does not name them."""
+    named = node.get("type")
+    if isinstance(named, str):
+        return {named} - {"null"}
+    if isinstance(named, list):
+        return {str(one) for one in cast("list[Any]", named)} - {"null"}
+    if "properties" in node:
+        return {"object"}
+    values = _allowed_values(node)
+    if values and all(isinstance(value, str) for value in values):
+        return {"string"}
+    if values and all(isinstance(value, int) and not isinstance(value, bool) for value in values):
+        return {"integer"}
+    return set()
+
+
+def _allowed_values(node: Mapping[str, Any]) -> list[Any]:
+    """Return the values that `enum`, `const` or a `oneOf` of constants lists."""
+    if isinstance(node.get("enum"), list):
+        return list(node["enum"])
+    if "const" in node:
+        return [node["const"]]
+    options = node.get("oneOf")
+    if isinstance(options, list) and options and all(_is_constant(one) for one in cast("list[Any]", options)):
+        return [one["const"] for one in cast("list[Any]", options)]
+    return []
+
+
+def _is_constant(node: object) -> bool:
+    return isinstance(node, dict) and "const" in node and not node.keys() - {"const"} - _ANNOTATIONS
+
+
+def _constants(properties: Mapping[str, Any]) -> Iterator[Constant]:
+    """Yield the titled integers of the properties; a title with two values is preceded by its property's name."""
+    values: dict[str, int] = {}
+    for field, schema in properties.items():
+        options = schema.get("oneOf") if isinstance(schema, dict) else None
+        for one in cast("list[Any]", options or []):
+            if (
+                not _is_constant(one)
+                or not isinstance(one.get("title"), str)
+                or type(one["const"]) is not int
+            ):
+                continue
+            name, number = one["title"], one["const"]
+            if values.get(name, number) != number:
+                name = f"{field}_{name}"
+            if name not in values:
+                values[name] = number
+                yield Constant(name, "int64", number)
+
+
+class _Unconfirmable(Exception):  # noqa: N818 - control flow inside this module
+    """A schema has a keyword without an equivalent in msgspec."""
+
+
+def confirming_type(text: str, name: str) -> Any:  # noqa: ANN401 - a type
+    """Return a type that msgspec decodes only from valid messages; None if the schema has no such type.
+
+    A message that msgspec rejects may still be valid; `validator_of` decides about it.
+    """
+    schema = _parse(text, name)
+    try:
+        kind = _Confirming(schema).type_of(schema, ())
+        msgspec.json.Decoder(kind)
+    except (_Unconfirmable, TypeError, ValueError):
+        return None
+    return kind
+
+
+class _Confirming:
+    """Builds msgspec types for one schema."""
+
+    def __init__(self, schema: Any) -> None:  # noqa: ANN401 - an object or a boolean
+        self._schema = schema
+        self._count = 0
+
+    def type_of(self, schema: Any, above: tuple[str, ...]) -> Any:  # noqa: ANN401 - a schema and a type
+        """Return the type of a schema; its values are a subset of the valid ones."""
+        if schema is True or schema == {}:
+            return Any
+        if not isinstance(schema, dict):
+            raise _Unconfirmable
+        node = {
+            key: value for key, value in cast("dict[str, Any]", schema).items() if key not in _ANNOTATIONS
+        }
+        if "$ref" in node:
+            if len(node) > 1 or node["$ref"] in above:
+                raise _Unconfirmable
+            return self.type_of(_lookup(self._schema, node["$ref"]), (*above, node["$ref"]))
+        if not node:
+            return Any
+        if (only := _without_null(node)) is not node:
+            return self.type_of(only, above) | None
+        values = _allowed_values(node)
+        if values:
+            return self._literal(node, values)
+        named = node.pop("type", "object" if "properties" in node else None)
+        kinds = cast("list[str]", named if isinstance(named, list) else [named])
+        others = [kind for kind in kinds if kind != "null"]
+        if len(others) > 1 and node:
+            raise _Unconfirmable
+        union = None if len(others) < len(kinds) else self._kind(others.pop(), node, above)
+        for kind in others:
+            union = union | self._kind(kind, node, above)
+        return union
+
+    def _literal(self, node: dict[str, Any], values: list[Any]) -> Any:  # noqa: ANN401 - a type
+        if node.keys() - {"type", "enum", "const", "oneOf"} or len(node.keys() - {"type"}) > 1:
+            raise _Unconfirmable
+        kinds = _kinds_of({"type": node["type"]}) if "type" in node else {"string", "integer"}
+        names = {str: {"string"}, int: {"integer", "number"}}
+        if not all(names.get(type(value), set()) & kinds for value in values) or len(set(values)) < len(
+            values
+        ):
+            raise _Unconfirmable
+        return Literal[tuple(values)]  # type: ignore[valid-type]  # the values are known when the recording is opened
+
+    def _kind(self, kind: str, node: dict[str, Any], above: tuple[str, ...]) -> Any:  # noqa: ANN401 - a type
+        match kind:
+            case "object":
+                return self._object(node, above)
+            case "array":
+                items = node.get("items", True)
+                _allow_only(node, {"items", *_SIZES["array"]})
+                return _limited(list[self.type_of(items, above)], node, _SIZES["array"])  # type: ignore[misc]
+            case "string":
+                _allow_only(node, {"pattern", *_SIZES["string"]})
+                pattern = {"pattern": "pattern"} if "pattern" in node else {}
+                return _limited(str, node, {**_SIZES["string"], **pattern})
+            case "integer" | "number":
+                _allow_only(node, set(_LIMITS))
+                return _limited(int if kind == "integer" else float, node, _LIMITS)
+            case "boolean":
+                _allow_only(node, set())
+                return bool
+            case _:
+                raise _Unconfirmable
+
+    def _object(self, node: dict[str, Any], above: tuple[str, ...]) -> Any:  # noqa: ANN401 - a type
+        _allow_only(node, {"properties", "required", "additionalProperties"})
+        extra = node.get("additionalProperties", True)
+        properties: dict[str, Any] = node.get("properties") or {}
+        required = set(node.get("required") or ())
+        if not isinstance(extra, bool) or required - properties.keys():
+            raise _Unconfirmable
+        if not properties and extra:
+            return dict
+        self._count += len(properties)
+        if self._count > _MAX_COLUMNS:
+            raise _Unconfirmable
+        fields: list[Any] = []
+        for number, (name, schema) in enumerate(properties.items()):
+            kind = self.type_of(schema, above)
+            if name in required:
+                fields.append((f"f{number}", kind, msgspec.field(name=name)))
+            else:
+                fields.append((f"f{number}", kind | UnsetType, msgspec.field(default=UNSET, name=name)))
+        return msgspec.defstruct("Message", fields, kw_only=True, forbid_unknown_fields=not extra, gc=False)
+
+
+def _allow_only(node: dict[str, Any], keywords: set[str]) -> None:
+    if node.keys() - keywords:
+        raise _Unconfirmable
+
+
+def _limited(kind: Any, node: dict[str, Any], limits: Mapping[str, str]) -> Any:  # noqa: ANN401 - types
+    """Return a type with the limits of a schema."""
+    values = {limits[keyword]: node[keyword] for keyword in limits if keyword in node}
+    if any(isinstance(value, bool) for value in values.values()):  # `exclusiveMinimum` of draft 4
+        raise _Unconfirmable
+    return Annotated[kind, Meta(**values)] if values else kind
