@@ -109,8 +109,7 @@ class JsonDecoder:
         if table.num_rows != len(payloads):
             return None
         undeclared: set[str] = set()
-        rows = table.combine_chunks().to_struct_array()
-        rows = rows.chunk(0) if isinstance(rows, pa.ChunkedArray) else rows
+        rows = table.combine_chunks().to_struct_array().combine_chunks()
         try:
             shaped = _shaped(rows, self._columns, self._shape, "$", undeclared)
         except ValueError:

@@ -91,7 +91,7 @@ def test_resolve_unknown_type_is_unmodeled() -> None:
     assert found.spec.serialization_format is SerializationFormat.RAGGED
     with pytest.raises(AdapterError, match="no serialization format 'raged'"):
         ROSBridge(formats={"visualization_msgs/Marker": "raged"})
-    assert found.why == "no adapter takes visualization_msgs/msg/Marker; it keeps its ROS shape"
+    assert found.why == "no adapter takes visualization_msgs/msg/Marker; its messages keep their shape"
 
 
 def test_resolve_sources_follow_precedence(tmp_path: Path, installed: Callable[[str], None]) -> None:

@@ -165,7 +165,7 @@ def test_connection_without_definition_has_a_problem(tmp_path: Path, recordings:
 
 
 def test_other_encodings_are_listed_and_readable(tmp_path: Path, recordings: Any) -> None:
-    path = recordings.mcap(tmp_path / "i.mcap", recordings.sent(10), encoding="protobuf")
+    path = recordings.mcap(tmp_path / "i.mcap", recordings.sent(10), encoding="cbor")
     with open_recording(path, resolve=recordings.easy) as recording:
         assert {channel.encoding for channel in recording.connections} == {Encoding.OTHER}
         assert {finding.rule for finding in recording.findings} == {"skipped-encoding"}

@@ -70,7 +70,7 @@ class JsonCodec:
         except (TypeError, ValueError, AttributeError) as error:
             raise BagError(f"the values do not match their columns: {error}") from error
 
-    def _validate(self, value: object) -> None:
+    def _validate(self, value: Any) -> None:  # noqa: ANN401 - any JSON value
         if self._validator is None:
             return
         error: Any = best_match(self._validator.iter_errors(value))

@@ -319,7 +319,7 @@ class _Confirming:
             values
         ):
             raise _Unconfirmable
-        return Literal[tuple(values)]  # type: ignore[valid-type]  # the values are known when the recording is opened
+        return Literal[tuple(values)]
 
     def _kind(self, kind: str, node: dict[str, Any], above: tuple[str, ...]) -> Any:  # noqa: ANN401 - a type
         match kind:
@@ -328,7 +328,7 @@ class _Confirming:
             case "array":
                 items = node.get("items", True)
                 _allow_only(node, {"items", *_SIZES["array"]})
-                return _limited(list[self.type_of(items, above)], node, _SIZES["array"])  # type: ignore[misc]
+                return _limited(list[self.type_of(items, above)], node, _SIZES["array"])
             case "string":
                 _allow_only(node, {"pattern", *_SIZES["string"]})
                 pattern = {"pattern": "pattern"} if "pattern" in node else {}
@@ -346,7 +346,7 @@ class _Confirming:
         _allow_only(node, {"properties", "required", "additionalProperties"})
         extra = node.get("additionalProperties", True)
         properties: dict[str, Any] = node.get("properties") or {}
-        required = set(node.get("required") or ())
+        required: set[str] = set(node.get("required") or ())
         if not isinstance(extra, bool) or required - properties.keys():
             raise _Unconfirmable
         if not properties and extra:
@@ -374,4 +374,5 @@ def _limited(kind: Any, node: dict[str, Any], limits: Mapping[str, str]) -> Any:
     values = {limits[keyword]: node[keyword] for keyword in limits if keyword in node}
     if any(isinstance(value, bool) for value in values.values()):  # `exclusiveMinimum` of draft 4
         raise _Unconfirmable
-    return Annotated[kind, Meta(**values)] if values else kind
+    limited: Any = Annotated  # the arguments are known when the recording is opened
+    return limited[kind, Meta(**values)] if values else kind
