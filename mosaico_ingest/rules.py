@@ -186,6 +186,7 @@ _TABLE = (
     Rule("ING618", "metadata-conflict", _WARNING, "two sources of `metadata_from` that differ"),
     Rule("ING619", "invalid-sidecar", _ERROR, "a side-car file of `metadata_from` that is not a JSON object"),
     Rule("ING620", "definition-difference", _ERROR, "a definition or column that differs from the lock file"),
+    Rule("ING621", "run-failed", _ERROR, "a recording whose run ended with an error"),
     Rule("ING701", "decode", _WARNING, "bytes that do not fit their message type"),
     Rule("ING702", "definition", _WARNING, "a message type without a usable definition"),
     Rule("ING703", "encoding", _WARNING, "a message in an encoding that cannot be decoded"),

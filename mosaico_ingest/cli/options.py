@@ -75,6 +75,21 @@ ReportOption = Annotated[
     typer.Option("--report", metavar="FILE", help="Write the report as JSON; - writes it to stdout."),
 ]
 
+JunitOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--junit",
+        metavar="FILE",
+        help="Write a test case per expectation and finding as JUnit XML; - writes to stdout.",
+    ),
+]
+SarifOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--sarif", metavar="FILE", help="Write failed expectations and findings as SARIF; - writes to stdout."
+    ),
+]
+
 
 def write_output(path: Path, text: str, *, announce: bool = False) -> None:
     """Write the text of an output option: to a file, or to standard output if the path is `-`.

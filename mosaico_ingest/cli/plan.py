@@ -16,10 +16,13 @@ from mosaico_ingest.cli.options import (
     DistroOption,
     ForceOption,
     JsonOption,
+    JunitOption,
     ManifestArgument,
     RecordingArgument,
+    SarifOption,
     write_output,
 )
+from mosaico_ingest.errors import IngestError
 from mosaico_ingest.findings import Severity
 from mosaico_ingest.remote import is_url
 from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text, time_text
@@ -40,6 +43,7 @@ NOTE_STYLES = {Severity.ERROR: "red", Severity.WARNING: "yellow", Severity.INFO:
 
 def plan(
     manifest: ManifestArgument,
+    *,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -53,20 +57,27 @@ def plan(
     connect: Annotated[
         bool, typer.Option("--connect", help="Connect to the server, if the destination is one.")
     ] = False,
+    junit: JunitOption = None,
+    sarif: SarifOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Make every decision about the real recordings and try a few messages of each topic. Read-only.
 
     Exit codes: 0 the job can run, 1 it cannot run or differs from --check, 3 no message is selected,
-    4 messages would be rejected.
+    4 messages would be rejected, 6 a contract is violated.
     """
     from mosaico_ingest import api
     from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas
 
     collect_garbage_as_usual()
-    jobs = api.compile_job(manifest)
-    hide_pandas(jobs)
-    document = api.plan_job(manifest, jobs=jobs, folder=out.parent if out else None, connect=connect)
+    try:
+        jobs = api.compile_job(manifest)
+        hide_pandas(jobs)
+        document = api.plan_job(manifest, jobs=jobs, folder=out.parent if out else None, connect=connect)
+    except IngestError as error:
+        _write_ci_files([], junit=junit, sarif=sarif, manifest=manifest, error=error)
+        raise
+    _write_ci_files(document.recordings, junit=junit, sarif=sarif, manifest=manifest)
     if out is not None:
         write_output(out, document.model_dump_json(indent=2) + "\n")
     if out == STANDARD_OUTPUT:
@@ -83,6 +94,24 @@ def plan(
         code = 1 if differences else 0
     if code:
         raise typer.Exit(code)
+
+
+def _write_ci_files(
+    recordings: Sequence[RecordingPlan],
+    *,
+    junit: Path | None,
+    sarif: Path | None,
+    manifest: Path,
+    error: IngestError | None = None,
+) -> None:
+    """Write the files of `--junit` and `--sarif`: an outcome for each planned recording, or the error of the plan."""
+    if junit is not None or sarif is not None:
+        from mosaico_ingest.cli.ci import CheckedRecording, plan_outcomes, write_ci_files
+
+        outcomes = plan_outcomes(recordings)
+        if error is not None:
+            outcomes.append(CheckedRecording(str(manifest), None, str(error), error.findings))
+        write_ci_files(outcomes, junit=junit, sarif=sarif)
 
 
 def print_plan(document: PlanDocument, *, folder: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, field
 from enum import Enum
 from functools import partial
 from pathlib import Path
@@ -18,10 +19,12 @@ from mosaico_ingest.cli.options import (
     STORE,
     ApiKeyOption,
     DistroOption,
+    JunitOption,
     LogOption,
     QuietOption,
     RecordingArgument,
     ReportOption,
+    SarifOption,
     TlsCertOption,
     TopicsOption,
     log_level,
@@ -54,6 +57,46 @@ class ExecutorName(str, Enum):
 
     LOCAL = "local"
     RAY = "ray"
+
+
+@dataclass(slots=True)
+class _ResultFiles:
+    """The files of `--metrics`, `--junit` and `--sarif`."""
+
+    metrics: Path | None
+    junit: Path | None
+    sarif: Path | None
+    _ends: dict[int, RunFinished] = field(default_factory=dict[int, RunFinished])
+    """The last event of each recording, by position."""
+
+    def check(self) -> None:
+        """Raise ManifestError if one of the paths is a folder."""
+        from mosaico_ingest.textfile import check_output_file
+
+        for file in (self.metrics, self.junit, self.sarif):
+            if file is not None and file != STANDARD_OUTPUT:
+                check_output_file(file)
+
+    def observing(self, observe: BatchObserver) -> BatchObserver:
+        """Return an observer that also keeps what the files need."""
+
+        def observe_end(position: int, event: Event) -> None:
+            if isinstance(event, RunFinished):
+                self._ends[position] = event
+            observe(position, event)
+
+        return observe_end
+
+    def write(self, report: RunReport) -> None:
+        """Write the files."""
+        from mosaico_ingest.report.metrics import prometheus_text
+
+        if self.metrics is not None:
+            write_output(self.metrics, prometheus_text(report))
+        if self.junit is not None or self.sarif is not None:
+            from mosaico_ingest.cli.ci import run_outcomes, write_ci_files
+
+            write_ci_files(run_outcomes(report, self._ends), junit=self.junit, sarif=self.sarif)
 
 
 def run(
@@ -104,6 +147,8 @@ def run(
             metavar="FILE",
         ),
     ] = None,
+    junit: JunitOption = None,
+    sarif: SarifOption = None,
     otel: Annotated[
         bool, typer.Option("--otel", help="Send metrics and traces, as configured by the OTEL_... variables.")
     ] = False,
@@ -117,9 +162,7 @@ def run(
     from mosaico_ingest import api
     from mosaico_ingest.executors.base import choose_executor
     from mosaico_ingest.pipeline.task import Task
-    from mosaico_ingest.report.metrics import prometheus_text
     from mosaico_ingest.report.units import counted
-    from mosaico_ingest.textfile import check_output_file
 
     if bool(manifests) == (plan is not None):
         raise typer.BadParameter("give manifests, or a plan with --plan", param_hint="JOB.yaml")
@@ -137,12 +180,8 @@ def run(
             from mosaico_ingest.cli.console import print_line
 
             print_line(f"shard {shard} is empty: the job has {counted(total, 'recording')}", stderr=True)
-    if metrics is not None and metrics != STANDARD_OUTPUT:
-        check_output_file(metrics)
-
-    def write_metrics(result: RunReport) -> None:
-        if metrics is not None:
-            write_output(metrics, prometheus_text(result))
+    files = _ResultFiles(metrics, junit, sarif)
+    files.check()
 
     on_ray = None
     if executor is ExecutorName.RAY:
@@ -158,8 +197,8 @@ def run(
             executor=on_ray,
             log_format=log_format,
             manifests=used_manifests,
-            observe=telemetry,
-            on_finish=write_metrics,
+            observe=files.observing(telemetry),
+            on_finish=files.write,
         )
 
 

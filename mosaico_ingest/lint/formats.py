@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 from urllib.parse import quote
 from xml.sax.saxutils import escape, quoteattr
+
+from msgspec import Struct
 
 from mosaico_ingest.findings import Edit, Finding, Severity, Span, mask_credentials
 from mosaico_ingest.lint.engine import LintedFile, LintReport
@@ -81,25 +83,68 @@ def _property(text: str) -> str:
 _NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
+class Case(Struct, frozen=True):
+    """One test case of a JUnit file; it passed if it has neither a finding nor a reason why it was skipped."""
+
+    name: str
+    class_name: str
+    failure: Finding | None = None
+    skipped: str | None = None
+    span: Span | None = None
+    """The location of the test, such as a key of a manifest."""
+
+
+class Suite(Struct, frozen=True):
+    """The test cases of one file or recording."""
+
+    name: str
+    cases: tuple[Case, ...]
+
+
+def junit_text(suites: Iterable[Suite]) -> str:
+    """Return test suites as JUnit XML."""
+    texts = "".join(map(_suite, suites))
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n<testsuites>\n{texts}</testsuites>\n'
+
+
 def _render_junit(report: LintReport) -> str:
     """Return one test suite per file. A file without findings is one passed test case."""
-    suites = "".join(_suite(linted) for linted in report.files)
-    return f'<?xml version="1.0" encoding="UTF-8"?>\n<testsuites>\n{suites}</testsuites>\n'
+    return junit_text(map(_file_suite, report.files))
 
 
-def _suite(linted: LintedFile) -> str:
-    cases = "".join(_case(finding, linted.file) for finding in linted.findings)
-    count = len(linted.findings)
-    cases = cases or f"    <testcase name={_attribute(linted.file)}/>\n"
-    name = _attribute(linted.file)
-    return f'  <testsuite name={name} tests="{max(count, 1)}" failures="{count}">\n{cases}  </testsuite>\n'
+def _file_suite(linted: LintedFile) -> Suite:
+    file = linted.file
+    cases = tuple(
+        Case(_case_name(finding, file), file, failure=finding, span=finding.span)
+        for finding in linted.findings
+    )
+    return Suite(file, cases or (Case(file, file),))
 
 
-def _case(finding: Finding, file: str) -> str:
+def _case_name(finding: Finding, file: str) -> str:
     location = file if finding.span is None else f"{finding.span.line}:{finding.span.column}"
-    message = _attribute(finding.message)
-    failure = f"<failure type={_attribute(finding.severity.value)} message={message}>{_text(str(finding))}</failure>"
-    return f"    <testcase name={_attribute(f'{location} {finding.rule}')} classname={_attribute(file)}>{failure}</testcase>\n"
+    return f"{location} {finding.rule}"
+
+
+def _suite(suite: Suite) -> str:
+    failures = sum(case.failure is not None for case in suite.cases)
+    skipped = sum(case.skipped is not None for case in suite.cases)
+    counts = f'tests="{len(suite.cases)}" failures="{failures}" skipped="{skipped}"'
+    cases = "".join(map(_case, suite.cases))
+    return f"  <testsuite name={_attribute(suite.name)} {counts}>\n{cases}  </testsuite>\n"
+
+
+def _case(case: Case) -> str:
+    head = f"    <testcase name={_attribute(case.name)} classname={_attribute(case.class_name)}"
+    if case.span is not None:
+        head += f' file={_attribute(case.span.file)} line="{case.span.line}"'
+    if case.failure is not None:
+        kind, message = _attribute(case.failure.severity.value), _attribute(case.failure.message)
+        failure = f"<failure type={kind} message={message}>{_text(str(case.failure))}</failure>"
+        return f"{head}>{failure}</testcase>\n"
+    if case.skipped is not None:
+        return f"{head}><skipped message={_attribute(case.skipped)}/></testcase>\n"
+    return f"{head}/>\n"
 
 
 def _attribute(text: str) -> str:
@@ -115,8 +160,12 @@ _LEVELS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.INFO: 
 
 
 def _render_sarif(report: LintReport) -> str:
-    """Return one run with the findings, their rules and their fixes."""
-    reported = {finding.rule for finding in report.findings}
+    return sarif_text(report.findings)
+
+
+def sarif_text(findings: Sequence[Finding]) -> str:
+    """Return one SARIF run with the findings, their rules and their fixes."""
+    reported = {finding.rule for finding in findings}
     driver = {
         "name": "mosaico-ingest",
         "semanticVersion": __version__,
@@ -125,7 +174,7 @@ def _render_sarif(report: LintReport) -> str:
     run = {
         "tool": {"driver": driver},
         "columnKind": "unicodeCodePoints",
-        "results": [_result(finding) for finding in report.findings],
+        "results": [_result(finding) for finding in findings],
     }
     return json.dumps({"$schema": _SCHEMA, "version": "2.1.0", "runs": [run]}, indent=2) + "\n"
 

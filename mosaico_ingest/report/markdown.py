@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from mosaico_ingest.findings import one_line
+from mosaico_ingest.findings import Severity, one_line
 from mosaico_ingest.report.collect import STEP_WORDS, longest_step, slowest, total_seconds
 from mosaico_ingest.report.compare import Comparison
+from mosaico_ingest.report.contract import ExpectationResult, Outcome
 from mosaico_ingest.report.model import Report, RunReport, replay_command
-from mosaico_ingest.report.units import bytes_text, count_text, percent_text, seconds_text
+from mosaico_ingest.report.units import bytes_text, count_text, counted, percent_text, seconds_text
 
 MAX_SLOWEST = 3
 MAX_ROWS = 100
@@ -25,6 +26,7 @@ def markdown_summary(report: RunReport, comparison: Comparison | None = None) ->
     if len(recordings) > MAX_ROWS:
         lines += ["", f"… and {len(recordings) - MAX_ROWS} more, see the report file."]
     lines += _time_lines(report)
+    lines += _contract_lines(recordings)
     problems = list(_problems(recordings))
     if problems:
         lines += ["", "### Problems", "", *problems[:MAX_ROWS]]
@@ -75,6 +77,36 @@ def _time_lines(report: RunReport) -> list[str]:
         )
         lines += ["", f"Slowest: {'; '.join(recordings)}."]
     return lines
+
+
+def _contract_lines(recordings: Sequence[Report]) -> list[str]:
+    """Return the number of expectations that passed, and a row for each failed one; errors come first."""
+    checked = [(one.sequence, one.contract) for one in recordings if one.contract is not None]
+    results = [(sequence, result) for sequence, contract in checked for result in contract.results]
+    if not results:
+        return []
+    failed = [pair for pair in results if not pair[1].passed]
+    failed.sort(key=lambda pair: pair[1].severity is not Severity.ERROR)
+    passed = sum(result.outcome is Outcome.PASSED for _, result in results)
+    lines = [
+        "",
+        "### Contract",
+        "",
+        f"{count_text(passed)} of {counted(len(results), 'expectation')} passed.",
+    ]
+    if failed:
+        lines += ["", "| sequence | severity | expectation | result | location |", "|---|---|---|---|---|"]
+        lines += [_expectation_row(sequence, result) for sequence, result in failed[:MAX_ROWS]]
+    if len(failed) > MAX_ROWS:
+        lines += ["", f"… and {len(failed) - MAX_ROWS} more, see the report file."]
+    return lines
+
+
+def _expectation_row(sequence: str, result: ExpectationResult) -> str:
+    text = f"{result.topic}: {result.text}" if result.topic else result.text
+    location = "" if result.location is None else str(result.location.span)
+    cells = (sequence, result.severity.value, result.expectation, text, location)
+    return f"| {' | '.join(map(_escape, cells))} |"
 
 
 def _problems(recordings: Sequence[Report]) -> Iterator[str]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.report.contract import Outcome
 from mosaico_ingest.report.events import RunStatus
 from mosaico_ingest.report.model import RunReport
 from mosaico_ingest.report.timing import Step
@@ -28,6 +30,14 @@ def _lines(report: RunReport) -> Iterator[str]:
         yield f'{_PREFIX}_messages{{fate="{fate}"}} {sum(getattr(one, fate) for one in totals)}'
     unread = sum(item.count or 0 for one in report.recordings for item in one.unreadable_ranges)
     yield f'{_PREFIX}_messages{{fate="unreadable"}} {unread}'
+    results = [result for one in report.recordings if one.contract for result in one.contract.results]
+    if results:
+        counts = Counter((result.outcome, result.severity) for result in results)
+        yield from _gauge("expectations", "Expectations of the last run by outcome and severity.")
+        for outcome in Outcome:
+            for severity in (Severity.ERROR, Severity.WARNING):
+                labels = f'outcome="{outcome.value}",severity="{severity.value}"'
+                yield f"{_PREFIX}_expectations{{{labels}}} {counts[outcome, severity]}"
     yield from _gauge(
         "step_seconds", "Time of the last run by step; the write step runs in parallel to the others."
     )

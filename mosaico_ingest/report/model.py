@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, computed_field
 from mosaico_ingest.documents import Part, document_schema, read_document
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import Stage
+from mosaico_ingest.report.contract import ContractResult
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.timing import TimelineReport
 from mosaico_ingest.report.units import count_text, counted
@@ -181,6 +182,8 @@ class Report(_Part):
     steps: Steps = Steps()
     quarantine: str | None = None
     """The file with the rejected messages."""
+    contract: ContractResult | None = None
+    """The results of the data contract; None if the job has no expectations."""
     topics: tuple[TopicReport, ...] = ()
     unreadable_ranges: tuple[UnreadableRange, ...] = ()
     findings: tuple[str, ...] = ()
