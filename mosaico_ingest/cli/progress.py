@@ -125,7 +125,7 @@ class Tally:
 
     def _finish(self, position: int, event: RunFinished) -> None:
         self.finished += 1
-        self.failed += event.status in {RunStatus.FAILED, RunStatus.INTERRUPTED}
+        self.failed += event.status in {RunStatus.DIVERTED, RunStatus.FAILED, RunStatus.INTERRUPTED}
         self._finished_bytes += self.sizes[position]
         recording = self.active.pop(position, None)
         if recording is None or not recording.read:

@@ -37,6 +37,7 @@ MAX_REASONS = 20
 STATUS_STYLES = {
     RunStatus.COMPLETED: "green",
     RunStatus.WITH_ERRORS: "yellow",
+    RunStatus.DIVERTED: "red",
     RunStatus.SKIPPED: "dim",
     RunStatus.FAILED: "red",
     RunStatus.INTERRUPTED: "red",

@@ -72,6 +72,8 @@ class Destination(ABC):
 
     kind: ClassVar[str]
     """The name of this type of destination in plans."""
+    can_amend: ClassVar[bool] = False
+    """True if its sinks accept `amendable=True` and then open an `AmendableSession`."""
     replaces_atomically: ClassVar[bool] = True
     """True if `replace` keeps the old sequence until the new one is committed."""
 
@@ -160,6 +162,35 @@ class Session(Protocol):
 
     def stored(self) -> tuple[StoredTopic, ...]:
         """Return the stored content, read from the destination again; only after a commit."""
+        ...
+
+
+class AmendableSession(Session, Protocol):
+    """A session whose metadata and name may change until the commit."""
+
+    def amend(self, metadata: Mapping[str, Any], *, sequence: str | None = None) -> None:
+        """Replace the metadata and, with `sequence`, store the content under this name.
+
+        A stored sequence of the new name is replaced at the commit.
+
+        Raises:
+            SinkError: The destination refuses the name or the metadata.
+        """
+        ...
+
+
+class AmendableSink(Protocol):
+    """A sink whose sessions can be amendable."""
+
+    def open(
+        self,
+        sequence: str,
+        metadata: Mapping[str, Any],
+        *,
+        if_exists: IfExists = IfExists.FAIL,
+        amendable: bool = False,
+    ) -> AbstractContextManager[Session]:
+        """Open a session; see `Sink.open`. With `amendable`, it is an `AmendableSession`."""
         ...
 
 

@@ -63,7 +63,12 @@ class MemorySink:
 
     @contextmanager
     def open(
-        self, sequence: str, metadata: Mapping[str, Any], *, if_exists: IfExists = IfExists.FAIL
+        self,
+        sequence: str,
+        metadata: Mapping[str, Any],
+        *,
+        if_exists: IfExists = IfExists.FAIL,
+        amendable: bool = False,  # noqa: ARG002 - every session is
     ) -> Generator[Session, None, None]:
         """Open a session; see `Sink.open`."""
         protocol.check_sequence_name(sequence)
@@ -72,6 +77,9 @@ class MemorySink:
         existing = self.sequences.get(sequence) if if_exists is IfExists.APPEND else None
         session = _MemorySession(MemorySequence(dict(metadata)), existing.topics if existing else {})
         yield session
+        if session.name is not None:
+            self.sequences[session.name] = session.sequence
+            return
         self._check_name(sequence, if_exists)
         ended_early = any(topic is None for topic, _ in session.sequence.errors)
         if if_exists is IfExists.REPLACE and sequence in self.sequences and ended_early:
@@ -93,6 +101,13 @@ class _MemorySession:
     """The topics that earlier sessions wrote."""
     topics: dict[str, MemoryTopic] = field(default_factory=dict[str, MemoryTopic])
     """The topics of this session, by the name that was passed to `topic`."""
+    name: str | None = None
+    """The name of the sequence, if `amend` changed it."""
+
+    def amend(self, metadata: Mapping[str, Any], *, sequence: str | None = None) -> None:
+        protocol.check_metadata(metadata, where=sequence or "")
+        self.sequence.metadata = dict(metadata)
+        self.name = sequence and protocol.check_sequence_name(sequence)
 
     def topic(self, name: str, ontology: OntologyType, metadata: Mapping[str, Any]) -> MemoryTopic:
         path = protocol.check_topic_name(name)

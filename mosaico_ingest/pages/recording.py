@@ -25,10 +25,11 @@ from mosaico_ingest.report.units import (
     written_text,
 )
 
-FAILED = {RunStatus.FAILED, RunStatus.INTERRUPTED}
+FAILED = {RunStatus.DIVERTED, RunStatus.FAILED, RunStatus.INTERRUPTED}
 STATUS_WORDS = {
     RunStatus.COMPLETED: "completed",
     RunStatus.WITH_ERRORS: "some messages are missing",
+    RunStatus.DIVERTED: "data contract violated",
     RunStatus.SKIPPED: "already stored",
     RunStatus.FAILED: "failed",
     RunStatus.INTERRUPTED: "interrupted",
@@ -36,6 +37,7 @@ STATUS_WORDS = {
 STATUS_COLORS = {
     RunStatus.COMPLETED: "good",
     RunStatus.WITH_ERRORS: "warn",
+    RunStatus.DIVERTED: "bad",
     RunStatus.SKIPPED: "dim",
     RunStatus.FAILED: "bad",
     RunStatus.INTERRUPTED: "bad",

@@ -15,6 +15,8 @@ from typing_extensions import TypedDict
 from mosaico_ingest.adapters.adapter import RESERVED_KEYS, AdapterSpec
 from mosaico_ingest.adapters.image import PngImageSpec
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
+from mosaico_ingest.contracts.clauses import Contract
+from mosaico_ingest.contracts.recording_monitor import ReadTopic
 from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.documents import Part, Unchecked
 from mosaico_ingest.findings import Finding, Span, escape_undecodable
@@ -139,6 +141,11 @@ class TopicPlan(Part):
     on_error: TopicLevelErrorPolicy
     metadata: Annotated[Mapping[str, Any], Unchecked(), PlainSerializer(_own_metadata)]
 
+    @property
+    def as_read(self) -> ReadTopic:
+        """The topic as a data contract observes it."""
+        return ReadTopic(self.topic, self.connections, self.ontology)
+
 
 class ExcludedTopic(Part):
     """A topic that is not read."""
@@ -184,6 +191,8 @@ class Plan(Part):
     findings: Annotated[tuple[Finding, ...], Unchecked()] = Field(default=(), exclude=True)
     missing: Annotated[tuple[Path | RemotePath, ...], Unchecked()] = Field(default=(), exclude=True)
     """Splits that the recording's metadata lists and that do not exist."""
+    contract: Annotated[Contract | None, Unchecked()] = Field(default=None, exclude=True)
+    """The data contract. It is not part of the document, because it does not change the stored rows."""
     attempt: Annotated[Attempt | None, Unchecked()] = Field(default=None, exclude=True)
     """The attempt of an executor that may start a recording more than once."""
 

@@ -9,6 +9,8 @@ from difflib import get_close_matches
 from mosaico_ingest.adapters.adapter import UnmodeledSpec, source_metadata
 from mosaico_ingest.adapters.bridge import Resolution, ROSBridge
 from mosaico_ingest.adapters.image import IMAGE_TAG
+from mosaico_ingest.contracts.clauses import Contract
+from mosaico_ingest.contracts.recording_monitor import check_expressions
 from mosaico_ingest.errors import AdapterError, BagError, IngestError, NothingMatched
 from mosaico_ingest.findings import (
     Finding,
@@ -48,6 +50,7 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
         AdapterError: An adapter does not fit its topic, or a type has no adapter and `adapters.unmodeled` is `fail`;
             `findings` has every such topic.
         ContractError: The metadata violates its schema, or the definitions differ from the lock file.
+        ManifestError: An expression of the data contract does not fit the messages of its topic.
         IngestError: The task is for another plan, or a definition has changed and `on_schema_change` is `fail`.
     """
     job, metadata_findings = fill_in_metadata(task.job, recording)
@@ -75,6 +78,9 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
     if not topics:
         raise _nothing_selected(job, recording, excluded)
     check_metadata_contracts(job, dict.fromkeys(topic.topic for topic in topics))
+    contract = Contract.of(job)
+    if contract is not None:
+        check_expressions(contract, recording.connections, [topic.as_read for topic in topics])
     read_from_ns, read_until_ns = _time_range(job, recording)
     findings += _image_settings(job, topics)
     findings += _static_before(job, topics, recording.start_ns, read_from_ns)
@@ -97,6 +103,7 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
         read_until_ns=read_until_ns,
         missing=recording.missing_files,
         attempt=task.attempt,
+        contract=contract,
     )
     if job.lock is not None:
         check_lock(job.lock, lock_of(plan, recording.connections), recording=str(recording.files[0]))

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
+from typing import cast
 
 from msgspec import Struct
 
-from mosaico_ingest.destinations.base import Session, Sink, StoredTopic
+from mosaico_ingest.destinations.base import AmendableSink, Session, Sink, StoredTopic
+from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import IngestError, Interrupted, NothingMatched, VerificationError
 from mosaico_ingest.findings import Finding, Severity, Stage
 from mosaico_ingest.interrupts import Abandoned, DeferredInterrupt
-from mosaico_ingest.job.values import IfExists, SessionLevelErrorPolicy
+from mosaico_ingest.job.values import IfExists, OnFailure, SessionLevelErrorPolicy
+from mosaico_ingest.pipeline.contract import ContractRun
 from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.provenance import SequenceRequest
 from mosaico_ingest.pipeline.quarantine import Quarantine
@@ -72,16 +76,19 @@ def write_sequence(
     try:
         with (
             DeferredInterrupt() as interrupt,
-            sink.open(request.name, request.metadata, if_exists=request.if_exists) as session,
+            _open_session(plan, request, sink) as session,
         ):
             topics = _open_topics(
                 plan, recording, session, observe, quarantine=quarantine, stopwatch=stopwatch
             )
+            contract = ContractRun.start(plan, recording, topics)
             reported = frozenset(recording.unreadable)
             try:
-                _pump(plan, recording, topics, stopwatch)
+                _pump(plan, recording, topics, stopwatch, contract)
                 _report_reading(recording, topics, observe, reported=reported)
                 missing = check_counts(plan, recording, topics, observe)
+                if contract is not None:
+                    contract.conclude(request, session, observe)
                 _check_not_empty(plan, recording, topics)
             except BaseException as error:
                 failure = _as_interrupt(error)
@@ -170,6 +177,13 @@ def check_counts(
     return missing
 
 
+def _open_session(plan: Plan, request: SequenceRequest, sink: Sink) -> AbstractContextManager[Session]:
+    if plan.contract is not None and destination_of(plan.destination).can_amend:
+        amendable = cast("AmendableSink", sink)
+        return amendable.open(request.name, request.metadata, if_exists=request.if_exists, amendable=True)
+    return sink.open(request.name, request.metadata, if_exists=request.if_exists)
+
+
 def _open_quarantine(plan: Plan, request: SequenceRequest) -> Quarantine | None:
     if plan.quarantine is None:
         return None
@@ -199,12 +213,18 @@ def _open_topics(
     return tuple(topics)
 
 
-def _pump(plan: Plan, recording: Recording, topics: tuple[TopicPipeline, ...], stopwatch: Stopwatch) -> None:
+def _pump(
+    plan: Plan,
+    recording: Recording,
+    topics: tuple[TopicPipeline, ...],
+    stopwatch: Stopwatch,
+    contract: ContractRun | None,
+) -> None:
     """Move every message block of the recording through its topic; a thread of the buffer writes the rows."""
     by_connection = {connection: topic for topic in topics for connection in topic.plan.connections}
     buffer = WriteBuffer(max_bytes=plan.memory.queue_bytes)
     try:
-        _process(plan, recording, by_connection, buffer, stopwatch)
+        _process(plan, recording, by_connection, buffer, stopwatch, contract=contract)
     finally:
         stopwatch.lap(Step.WAIT)
         stopwatch.add(Step.WRITE, buffer.busy_s)
@@ -216,6 +236,8 @@ def _process(
     topics: Mapping[int, TopicPipeline],
     buffer: WriteBuffer,
     stopwatch: Stopwatch,
+    *,
+    contract: ContractRun | None,
 ) -> None:
     with buffer:
         blocks = recording.message_blocks(
@@ -223,6 +245,7 @@ def _process(
             start_ns=plan.read_from_ns,
             end_ns=plan.read_until_ns,
             memory_bytes=plan.memory.read_bytes,
+            observe=None if contract is None else contract.observe_order,
         )
         stopwatch.lap(Step.PREPARE)
         for block in blocks:
@@ -311,6 +334,8 @@ def _keeps_partial(
     """
     if isinstance(failure, Abandoned) or request.replaces_stored:
         return False
+    if plan.contract is not None and plan.contract.expect.on_failure is not OnFailure.WARN:
+        return False  # an incomplete recording cannot fulfill its contract
     if isinstance(failure, Interrupted) and request.if_exists is IfExists.APPEND:
         return False
     return plan.on_error.session is SessionLevelErrorPolicy.Report and any(topic.rows for topic in topics)

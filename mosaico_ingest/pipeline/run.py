@@ -12,10 +12,11 @@ from msgspec import Struct
 from mosaico_ingest.adapters.bridge import ROSBridge
 from mosaico_ingest.destinations.base import Sink
 from mosaico_ingest.destinations.registry import destination_of
-from mosaico_ingest.errors import IngestError, Interrupted
+from mosaico_ingest.errors import ContractError, IngestError, Interrupted
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import LoaderErrorPolicy
+from mosaico_ingest.pipeline.contract import contract_error
 from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.planning import plan_recording
 from mosaico_ingest.pipeline.provenance import check_provenance
@@ -23,6 +24,7 @@ from mosaico_ingest.pipeline.pump import verify, write_sequence
 from mosaico_ingest.pipeline.rejection_log import RejectionLog
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.report.collect import Collector
+from mosaico_ingest.report.contract import ContractResult
 from mosaico_ingest.report.events import (
     Event,
     Expected,
@@ -151,6 +153,11 @@ def _open_sink(plan: Plan, events: _RunEvents) -> Sink:
     return destination_of(plan.destination).open_sink(buffer_bytes=plan.memory.sink_bytes)
 
 
+def _diverted(contract: ContractResult) -> str:
+    error = contract_error(contract)
+    return f"stored as {contract.stored_as}: {error.where}: {error.what}" if error.where else error.what
+
+
 def _unexpected(job: Job, cause: Exception) -> IngestError:
     first_line = str(cause).strip().partition("\n")[0]
     name = type(cause).__name__
@@ -200,7 +207,10 @@ class _RunEvents:
     def complete(self) -> Outcome:
         """End a run that was committed and verified."""
         self._report_times()
-        if self._collector.rejected or self._collector.unreadable:
+        contract = self._collector.contract
+        if contract is not None and contract.stored_as is not None:
+            self(RunFinished(RunStatus.DIVERTED, ContractError.exit_code, _diverted(contract)))
+        elif self._collector.rejected or self._collector.unreadable:
             self(RunFinished(RunStatus.WITH_ERRORS, EXIT_WITH_ERRORS))
         else:
             self(RunFinished(RunStatus.COMPLETED, 0))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.adapters.adapter import Adapted, Adapter, Envelope
 from mosaico_ingest.caching import cache_by_identity
+from mosaico_ingest.contracts.monitor import BlockObserver
 from mosaico_ingest.decode.base import Decoder
 from mosaico_ingest.decode.decoder import decoder_for
 from mosaico_ingest.destinations.base import ENVELOPE, Session, TopicWriter
@@ -87,6 +88,10 @@ class TopicPipeline:
     end_ns: int | None = None
     status: TopicStatus = TopicStatus.EMPTY
     error: str | None = None
+    downsampled: int = 0
+    """Number of messages that `every` dropped."""
+    observers: dict[int, BlockObserver] = field(default_factory=dict[int, BlockObserver])
+    """The observers of the data contract by connection."""
     quarantine: Quarantine | None = None
     """Keeps rejected messages; the error policies apply to messages beyond its limits."""
     timeline: Timeline = field(default_factory=Timeline)
@@ -121,12 +126,15 @@ class TopicPipeline:
         Raises:
             IngestError: An error policy ends the run.
         """
+        observer = self.observers.get(block.connection)
+        if observer is not None:
+            observer.block(block.log_times)
         if self.status in {TopicStatus.FINALIZED, TopicStatus.FAILED}:
             self.read += len(block)
             self._count(block, len(block))
             self._reject_from(block, 0)
             return
-        converted = self._convert(block)
+        converted = self._convert(block, observer)
         fatal, quarantined = self._apply_policies(block, converted)
         end = len(block) if fatal is None else fatal.failure.row + 1
         self._count(block, end, downsampled=int((converted.downsampled < end).sum()))
@@ -142,7 +150,7 @@ class TopicPipeline:
         if fatal is not None:
             self._stop(fatal, block, end)
 
-    def _convert(self, block: MessageBlock) -> _Converted:
+    def _convert(self, block: MessageBlock, observer: BlockObserver | None) -> _Converted:
         """Downsample, decode and adapt a message block."""
         positions = np.arange(len(block), dtype=np.int64)
         selected = (positions + self.read) % self.plan.every == 0
@@ -157,6 +165,8 @@ class TopicPipeline:
             for failure in decoded.failures
         ]
         index = sample[decoded.index]
+        if observer is not None:
+            observer.messages(decoded.rows, index)
         envelope = Envelope(self.plan.topic, self.plan.msgtype, block.log_times[index])
         adapter = self._adapters[block.connection]
         try:
@@ -170,6 +180,8 @@ class TopicPipeline:
             _Rejection(Stage.ADAPT, replace(failure, row=int(index[failure.row])))
             for failure in adapted.failures
         ]
+        if observer is not None:
+            observer.ontology(adapted.rows, index[adapted.index])
         rejections.sort(key=lambda rejection: rejection.failure.row)
         times = envelope.log_times[adapted.index] if adapted.log_times is None else adapted.log_times
         return _Converted(adapted.rows, times, index[adapted.index], tuple(rejections), positions[~selected])
@@ -296,6 +308,7 @@ class TopicPipeline:
             raise error
 
     def _count(self, block: MessageBlock, end: int, *, downsampled: int = 0) -> None:
+        self.downsampled += downsampled
         self.observe(
             TopicProgress(
                 self.plan.target,

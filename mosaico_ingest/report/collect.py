@@ -7,7 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from mosaico_ingest.findings import Stage
+from mosaico_ingest.report.contract import ContractResult
 from mosaico_ingest.report.events import (
+    ContractEvaluated,
     Event,
     Expected,
     Noted,
@@ -131,6 +133,7 @@ class Collector:
         self._findings: list[str] = []
         self._steps = Steps()
         self._quarantine: str | None = None
+        self._contract: ContractResult | None = None
         self._finish = RunFinished(status=RunStatus.FAILED, exit_code=1)
 
     def __call__(self, event: Event) -> None:
@@ -155,6 +158,8 @@ class Collector:
                 )
             case Noted():
                 self._findings.append(str(event.finding))
+            case ContractEvaluated():
+                self._contract = event.result
             case Quarantined():
                 self._quarantine = event.messages
             case Timed():
@@ -166,6 +171,11 @@ class Collector:
     def rejected(self) -> int:
         """Number of messages rejected so far."""
         return sum(r.count for s in self._sums.values() for r in s.rejections.values())
+
+    @property
+    def contract(self) -> ContractResult | None:
+        """The results of the data contract, if it was evaluated."""
+        return self._contract
 
     @property
     def unreadable(self) -> bool:
@@ -186,6 +196,7 @@ class Collector:
             source_bytes=self._start.source_bytes,
             steps=self._steps,
             quarantine=self._quarantine,
+            contract=self._contract,
             topics=tuple(self._topic(topic) for topic in self._start.topics),
             unreadable_ranges=tuple(self._unreadable),
             findings=tuple(self._findings),

@@ -61,6 +61,8 @@ class ExpectationResult(_Part):
     outcome: Outcome
     text: str
     """The result in one line, such as `the longest gap is 2.1 s, at most 50 ms expected`."""
+    key: str = ""
+    """The part of the key path below the recording or topic, such as `rate` or `fields.linear_acceleration.z.between`."""
     topic: str | None = None
     """The topic in the recording; None for an expectation of the recording or of a group."""
     location: Location | None = None
@@ -86,9 +88,14 @@ class ExpectationResult(_Part):
         return self.outcome is not Outcome.FAILED
 
     @property
+    def line(self) -> str:
+        """The result in one line, with its topic."""
+        return f"{self.topic}: {self.text}" if self.topic else self.text
+
+    @property
     def finding(self) -> Finding | None:
         """The result as a finding; None for an expectation that passed without explained violations."""
-        text = f"{self.topic}: {self.text}" if self.topic else self.text
+        text = self.line
         span = None if self.location is None else self.location.span
         if self.outcome is Outcome.FAILED:
             severity = self.severity
@@ -104,6 +111,8 @@ class ContractResult(_Part):
     on_failure: Literal["fail", "warn", "divert"]
     """The action if an expectation with the severity `error` fails."""
     results: tuple[ExpectationResult, ...] = ()
+    stored_as: str | None = None
+    """The name of the sequence that a recording was diverted to."""
 
     @computed_field
     @property

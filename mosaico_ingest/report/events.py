@@ -11,6 +11,7 @@ from msgspec import Struct
 from mosaico_ingest.findings import Finding, Stage
 
 if TYPE_CHECKING:  # pydantic and NumPy are slow to import
+    from mosaico_ingest.report.contract import ContractResult
     from mosaico_ingest.report.timing import Step, TimelineReport
 
 
@@ -20,6 +21,8 @@ class RunStatus(str, Enum):
     COMPLETED = "completed"
     WITH_ERRORS = "completed_with_errors"
     """Some rows were rejected or ranges unreadable; everything else was ingested."""
+    DIVERTED = "diverted"
+    """The recording violates its data contract and was stored under another name."""
     SKIPPED = "skipped"
     """The same content is already stored, or the run was a dry run."""
     FAILED = "failed"
@@ -133,6 +136,12 @@ class TopicClosed(Struct, frozen=True):
     checksum: str | None = None
 
 
+class ContractEvaluated(Struct, frozen=True):
+    """The expectations of the recording were evaluated."""
+
+    result: ContractResult
+
+
 class Timed(Struct, frozen=True):
     """The seconds that each step of the run took."""
 
@@ -157,6 +166,7 @@ Event: TypeAlias = (
     | Noted
     | Quarantined
     | TopicClosed
+    | ContractEvaluated
     | Timed
     | RunFinished
 )

@@ -183,7 +183,7 @@ class Report(_Part):
     quarantine: str | None = None
     """The file with the rejected messages."""
     contract: ContractResult | None = None
-    """The results of the data contract; None if the job has no expectations."""
+    """The results of the data contract; None without a contract, or if the recording was not read completely."""
     topics: tuple[TopicReport, ...] = ()
     unreadable_ranges: tuple[UnreadableRange, ...] = ()
     findings: tuple[str, ...] = ()

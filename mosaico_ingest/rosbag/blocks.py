@@ -25,6 +25,7 @@ __all__ = [
     "FIRST_GROUP_BYTES",
     "LATEST_NS",
     "Bytes",
+    "ChunkChecksum",
     "Connection",
     "Encoding",
     "HasMetadataRecords",
@@ -75,6 +76,14 @@ class Encoding(str, Enum):
     JSON = "json"
     OTHER = "other"
     """Any other encoding (CBOR, FlatBuffers, …): listed, never decoded."""
+
+
+class ChunkChecksum(str, Enum):
+    """The checksum of a chunk of an MCAP file."""
+
+    ABSENT = "absent"
+    VALID = "valid"
+    WRONG = "wrong"
 
 
 class Connection(Struct, frozen=True):

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import re
 import weakref
-from collections import defaultdict
-from collections.abc import Collection, Generator, Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, suppress
 from functools import partial
 from pathlib import Path
 from types import TracebackType
+from typing import TypeAlias
 
+import numpy as np
 import pyarrow as pa
 from msgspec import Struct
 from msgspec.structs import replace
@@ -29,9 +31,11 @@ from mosaico_ingest.rosbag.batching import (
 from mosaico_ingest.rosbag.blocks import (
     EARLIEST_NS,
     LATEST_NS,
+    ChunkChecksum,
     Connection,
     Encoding,
     HasMetadataRecords,
+    Int64s,
     MessageBlock,
     ReadRequest,
     ReadResult,
@@ -65,6 +69,8 @@ __all__ = [
     "time_slices",
 ]
 
+BlockObserver: TypeAlias = Callable[[int, int, MessageBlock], None]
+"""Receives the number of a split, the id of a connection, and messages over the buffer that was read."""
 _SMALL_RECORDING_BYTES = 1 << 20
 """Up to this size, reading the recording takes less time than starting a prefetch thread."""
 _PREFETCH_CPUS = 3
@@ -204,6 +210,14 @@ class Recording:
         self._stack.close()
 
     @property
+    def chunk_checksums(self) -> Counter[ChunkChecksum] | None:
+        """The number of chunks that were read, by their checksum; None if the format has no checksums of chunks."""
+        by_split = [getattr(split, "chunk_checksums", None) for split in self._splits]
+        if None in by_split:
+            return None
+        return Counter(checksum for chunks in by_split if chunks for checksum in chunks.values())
+
+    @property
     def unreadable(self) -> tuple[UnreadableRange, ...]:
         """The ranges that could not be read: found while opening the files, and by every iteration so far."""
         return tuple(self._unreadable)
@@ -245,12 +259,13 @@ class Recording:
         end_ns: int | None = None,
         max_rows: int = _MAX_ROWS,
         memory_bytes: int = _MEMORY_BYTES,
+        observe: BlockObserver | None = None,
     ) -> Iterator[MessageBlock]:
         """Yield the messages of some connections (default: all) with start_ns <= log time < end_ns.
 
         The blocks of a connection are in log-time order, unless sorting its messages would take more than about
         `memory_bytes`. A block has at most `max_rows` messages. Unreadable ranges are skipped and added to
-        `unreadable`.
+        `unreadable`. `observe` receives the messages before they are sorted, possibly in another thread.
         """
         ids = frozenset(range(len(self.connections))) if connection_ids is None else frozenset(connection_ids)
         first = EARLIEST_NS if start_ns is None else start_ns
@@ -263,14 +278,39 @@ class Recording:
             if (keys := self._table.split_connections(number, ids))
         }
         coalescer = BlockCoalescer(max_rows=max_rows, memory_bytes=memory_bytes)
-        iterator = self._coalesced(requests, coalescer, prefetch=prefetch)
+        iterator = self._coalesced(requests, coalescer, observe, prefetch=prefetch)
         self._iterators.add(iterator)
         return iterator
 
+    def index_times(
+        self, connection_ids: Collection[int], *, start_ns: int | None = None, end_ns: int | None = None
+    ) -> dict[int, Int64s] | None:
+        """Return the log times of some connections with start_ns <= log time < end_ns, sorted, without their messages.
+
+        The times are those of the index, so messages that cannot be read count, too. None if a file has no index.
+        """
+        parts: dict[int, list[Int64s]] = {key: [] for key in connection_ids}
+        for number, split in enumerate(self._splits):
+            keys = self._table.split_connections(number, connection_ids)
+            read = getattr(split, "index_times", None)
+            times = read(keys) if read is not None else None
+            if times is None:
+                return None
+            for key, arrays in times.items():
+                parts[self._table.connection_id(number, key)] += arrays
+        first = 0 if start_ns is None else max(start_ns, 0)
+        end = LATEST_NS if end_ns is None else end_ns - 1
+        return {key: _sorted_times(arrays, first, end) for key, arrays in parts.items()}
+
     def _coalesced(
-        self, requests: dict[int, ReadRequest], coalescer: BlockCoalescer, *, prefetch: bool
+        self,
+        requests: dict[int, ReadRequest],
+        coalescer: BlockCoalescer,
+        observe: BlockObserver | None,
+        *,
+        prefetch: bool,
     ) -> Generator[MessageBlock, None, None]:
-        source = self._loaded(requests)
+        source = self._loaded(requests, observe)
         with Prefetcher(source) if prefetch else closing(source) as loaded_tasks:
             for loaded in loaded_tasks:
                 self._report(loaded.split, loaded.unreadable)
@@ -279,7 +319,9 @@ class Recording:
                 yield from coalescer.flush_ready(loaded.next_ns)
             yield from coalescer.flush_all()
 
-    def _loaded(self, requests: dict[int, ReadRequest]) -> Generator[_LoadedTask, None, None]:
+    def _loaded(
+        self, requests: dict[int, ReadRequest], observe: BlockObserver | None
+    ) -> Generator[_LoadedTask, None, None]:
         """Load task after task; runs in the prefetch thread if there is one."""
         numbers = list(requests)
         tasks = [
@@ -287,11 +329,11 @@ class Recording:
             for number, request in requests.items()
         ]
         for merged in merge_by_time(tasks):
-            yield self._load(numbers[merged.split], merged)
+            yield self._load(numbers[merged.split], merged, observe)
         for number in numbers:
             self._splits[number].check_unchanged()
 
-    def _load(self, split: int, merged: MergedTask) -> _LoadedTask:
+    def _load(self, split: int, merged: MergedTask, observe: BlockObserver | None) -> _LoadedTask:
         try:
             result = merged.task.load()
         except BagError as err:
@@ -299,6 +341,8 @@ class Recording:
         blocks: list[MessageBlock] = []
         for block in result.blocks:
             connection = self.connections[self._table.connection_id(split, block.connection)]
+            if observe is not None:
+                observe(split, connection.id, block)
             messages = (
                 decompress_messages(block, result.unreadable)
                 if connection.encoding is Encoding.CDR
@@ -314,6 +358,16 @@ class Recording:
         for gap in unreadable:
             connection = None if gap.connection is None else self._table.connection_id(split, gap.connection)
             self._unreadable[replace(gap, file=file, connection=connection)] = None
+
+
+def _sorted_times(parts: Sequence[Int64s], first_ns: int, last_ns: int) -> Int64s:
+    """Return the times from `first_ns` to `last_ns`, both inclusive; negative times are beyond the year 2262."""
+    if not parts:
+        return np.zeros(0, np.int64)
+    times = np.concatenate(parts)
+    if bool((times[1:] < times[:-1]).any()):
+        times.sort()
+    return times[np.searchsorted(times, first_ns, "left") : np.searchsorted(times, last_ns, "right")]
 
 
 def no_topics_error(recording: Recording) -> NothingMatched | BagError:

@@ -16,7 +16,7 @@ import shutil
 import sqlite3
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,7 @@ from mosaico_ingest.rosbag.blocks import (
     EARLIEST_NS,
     LATEST_NS,
     Encoding,
+    Int64s,
     MessageBlock,
     ReadRequest,
     ReadResult,
@@ -107,6 +108,19 @@ class SqliteReader:
                     return
                 damage = "the index on the timestamp is damaged"
         yield from self._remaining_tasks(request, rows_read, damage, last_ns)
+
+    def index_times(self, connections: Collection[int]) -> dict[int, list[Int64s]] | None:
+        """Return the log times of some connections; None if the file is damaged."""
+        if self._totals.damage is not None:
+            return None
+        times: dict[int, list[Int64s]] = {}
+        try:
+            for key in connections:
+                rows = self._database.execute("SELECT timestamp FROM messages WHERE topic_id = ?", (key,))
+                times[key] = [np.fromiter((time for (time,) in rows), np.int64)]
+        except (*DAMAGE, TypeError, ValueError):
+            return None
+        return times
 
     def check_unchanged(self) -> None:
         """Do nothing; see `FileSource.check_unchanged`."""

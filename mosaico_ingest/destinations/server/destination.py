@@ -38,6 +38,7 @@ class ServerDestination(Destination):
     """A Mosaico server; every method but `describe` and `open_sink` connects to it."""
 
     kind: ClassVar[str] = "server"
+    can_amend: ClassVar[bool] = True
     replaces_atomically: ClassVar[bool] = False
 
     def __init__(self, target: ServerTarget) -> None:
@@ -98,14 +99,25 @@ class ServerSink(Struct, frozen=True):
 
     @contextmanager
     def open(
-        self, sequence: str, metadata: Mapping[str, Any], *, if_exists: IfExists = IfExists.FAIL
+        self,
+        sequence: str,
+        metadata: Mapping[str, Any],
+        *,
+        if_exists: IfExists = IfExists.FAIL,
+        amendable: bool = False,
     ) -> Generator[Session, None, None]:
-        """Open a session; see `Sink.open`."""
+        """Open a session; see `Sink.open`. An amendable one keeps its rows in temporary files until the commit."""
         protocol.check_sequence_name(sequence)
         described = protocol.check_metadata(metadata, where=sequence)
         with connect_to(self.target) as client:
             session = ServerSession(
-                self.target, client, sequence, described, if_exists=if_exists, buffer_bytes=self.buffer_bytes
+                self.target,
+                client,
+                sequence,
+                described,
+                if_exists=if_exists,
+                buffer_bytes=self.buffer_bytes,
+                amendable=amendable,
             )
             try:
                 yield session

@@ -55,6 +55,7 @@ class ServerSession:
         *,
         if_exists: IfExists,
         buffer_bytes: int,
+        amendable: bool = False,
     ) -> None:
         self._target = target
         self._client = client
@@ -73,10 +74,19 @@ class ServerSession:
         if stored is not None and if_exists in {IfExists.FAIL, IfExists.SKIP}:
             raise sequence_exists(sequence)
         self._replaced = stored if if_exists is IfExists.REPLACE else None
-        self._spool = _Spool(self._sizes) if self._replaced else None
+        self._spool = _Spool(self._sizes) if self._replaced or amendable else None
         self._existing_topics = _topics_of(stored) if stored and not self._replaced else frozenset[str]()
-        if stored is None:
+        self._is_new = stored is None
+        if stored is None and not amendable:
             self._create()
+
+    def amend(self, metadata: Mapping[str, Any], *, sequence: str | None = None) -> None:
+        """Replace the metadata, and optionally the sequence; see `AmendableSession.amend`."""
+        self._metadata = protocol.check_metadata(metadata, where=sequence or self._sequence)
+        if sequence is not None:
+            self._sequence = protocol.check_sequence_name(sequence)
+            self._replaced = self._client.find(self._sequence)
+            self._is_new, self._existing_topics = self._replaced is None, frozenset()
 
     def topic(self, name: str, ontology: OntologyType, metadata: Mapping[str, Any]) -> TopicWriter:
         """Open a topic; see `Session.topic`."""
@@ -161,12 +171,14 @@ class ServerSession:
         return upload
 
     def _send_spool(self, spool: _Spool) -> None:
-        """Replace the stored sequence by the rows in the temporary files."""
-        if any(path is None for path, _ in self._notes):
+        """Upload the rows in the temporary files, after the stored sequence that they replace is deleted."""
+        if self._replaced is not None and any(path is None for path, _ in self._notes):
             raise replacement_is_incomplete(self._sequence)
         spool.finish()
-        self._delete_stored()
-        self._create()
+        if self._replaced is not None:
+            self._delete_stored()
+        if self._is_new or self._replaced is not None:
+            self._create()
         for topic in spool.topics:
             upload = self._start_upload(topic.name, topic.path, topic.ontology, topic.metadata)
             for batch in topic.batches():

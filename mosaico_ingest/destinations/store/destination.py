@@ -29,6 +29,7 @@ class StoreDestination(Destination):
     """The store in a folder or behind a URL; a run creates it if it does not exist."""
 
     kind: ClassVar[str] = "store"
+    can_amend: ClassVar[bool] = True
 
     def __init__(self, path: AnyPath) -> None:
         self.path = path

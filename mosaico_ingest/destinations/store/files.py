@@ -36,7 +36,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -261,6 +261,7 @@ _SILENT_S = 180.0
 _LAST_BEAT_S = 5.0
 """Time limit for a heartbeat that is in progress at the end of a session."""
 _THREADS = 8
+_COPY_BYTES = 8 << 20
 
 
 class ObjectFiles:
@@ -311,11 +312,22 @@ class ObjectFiles:
         return self.is_live(session)
 
     def publish(self, moves: Mapping[AnyPath, AnyPath]) -> None:
-        """Mark finished files, which have their final paths already, as published."""
+        """Mark finished files as published; copy those whose final path has changed since they were written."""
+        for path, final in moves.items():
+            if path != final:
+                self._copy(path, final)
         for session, unpublished in list(self._unpublished.items()):
             if any(path in moves for path in unpublished):
                 self._beats[session].check()
-                unpublished[:] = [path for path in unpublished if path not in moves]
+                final = set(moves.values())
+                unpublished[:] = [path for path in unpublished if path not in final]
+
+    def _copy(self, path: AnyPath, final: AnyPath) -> None:
+        """Copy a segment; the original stays unpublished, so that the end of its session removes it."""
+        session = next(key for key, unpublished in self._unpublished.items() if path in unpublished)
+        self._unpublished[session].append(cast("RemotePath", final))
+        with path.open("rb") as source, final.open("wb") as target:
+            shutil.copyfileobj(source, target, _COPY_BYTES)
 
     def remove(self, paths: Iterable[AnyPath]) -> None:
         """Remove segments; garbage collection removes those that cannot be removed now."""

@@ -248,6 +248,19 @@ class StoreSession:
         path = None if topic is None else protocol.check_topic_name(topic)
         self._notes.append(NewNote(path, message, time.time_ns()))
 
+    def amend(self, metadata: Mapping[str, Any], *, sequence: str | None = None) -> None:
+        """Replace the metadata, and optionally the sequence; see `AmendableSession.amend`."""
+        where = sequence or self._claim.sequence
+        self._metadata = protocol.check_metadata(metadata, where=where)
+        if sequence is None:
+            return
+        name = protocol.check_sequence_name(sequence)
+        self._catalog.release(self.id, self._claim.sequence)
+        self._claim = self._catalog.claim(self.id, name, IfExists.REPLACE, is_live=self._layout.is_live)
+        with explained(name):
+            for topic in self._staging.topics.values():
+                topic.folder = self._layout.topic(name, topic.name)
+
     def stored(self) -> tuple[StoredTopic, ...]:
         """Return the content according to the footers of the committed files; see `Session.stored`."""
         return tuple(self._stored(name, topic) for name, topic in self._topics.items())
@@ -366,7 +379,12 @@ class StoreSink(Struct, frozen=True):
 
     @contextmanager
     def open(
-        self, sequence: str, metadata: Mapping[str, Any], *, if_exists: IfExists = IfExists.FAIL
+        self,
+        sequence: str,
+        metadata: Mapping[str, Any],
+        *,
+        if_exists: IfExists = IfExists.FAIL,
+        amendable: bool = False,  # noqa: ARG002 - every session is
     ) -> Generator[Session, None, None]:
         """Open a session; see `Sink.open`."""
         session = StoreSession(

@@ -23,6 +23,7 @@ from mosaico_ingest.rosbag.blocks import (
     EARLIEST_NS,
     LATEST_NS,
     Bytes,
+    ChunkChecksum,
     Encoding,
     Int64s,
     MessageBlock,
@@ -122,13 +123,13 @@ class McapReader:
             *undescribed_connections(index.counts, index.channels),
         ]
         self.notes: list[str] = source.notes
+        self.chunk_checksums: dict[int, ChunkChecksum] = {}
+        """The checksum of each chunk that was read, by the offset of the chunk."""
         self._extents: tuple[list[Extent], list[UnreadableRange]] | None = None
 
     def read_tasks(self, request: ReadRequest) -> Iterator[ReadTask]:
         """Yield tasks for the chunks, and the messages between chunks, that may contain requested messages."""
-        if self._extents is None:
-            self._extents = read_extents(self._source, self._index, self._max_chunk_bytes)
-        extents, unreadable = self._extents
+        extents, unreadable = self._all_extents()
         if unreadable:
             yield ReadTask(EARLIEST_NS, lambda: ReadResult([], list(unreadable)))
         requested = [
@@ -147,6 +148,27 @@ class McapReader:
             records.setdefault(record.name, {}).update(record.entries)
         return records
 
+    def index_times(self, connections: Collection[int]) -> dict[int, list[Int64s]] | None:
+        """Return the log times of some connections according to the message indexes; None if a chunk has none."""
+        extents, unreadable = self._all_extents()
+        requested = [extent for extent in extents if extent.has_any(connections)]
+        if unreadable or any(not extent.indexes for extent in requested):
+            return None
+        times: dict[int, list[Int64s]] = {key: [] for key in connections}
+        for extent in requested:
+            offsets = extent.index_offsets()
+            start = min(offset for _, offset in offsets)
+            try:
+                raw = memoryview(self._source.read(start, extent.stop - start))
+                indexes = replace(extent, offset=start)
+                for key, offset in offsets:
+                    if key in times:
+                        entries = np.frombuffer(_index_entries(raw, indexes, key, offset), _INDEX_ENTRY)
+                        times[key].append(entries["time"])
+            except BagError:
+                return None
+        return times
+
     def check_unchanged(self) -> None:
         """See `Source.check_unchanged`."""
         self._source.check_unchanged()
@@ -154,6 +176,11 @@ class McapReader:
     def close(self) -> None:
         """Close the file."""
         self._source.close()
+
+    def _all_extents(self) -> tuple[list[Extent], list[UnreadableRange]]:
+        if self._extents is None:
+            self._extents = read_extents(self._source, self._index, self._max_chunk_bytes)
+        return self._extents
 
     def _load(self, extents: Sequence[Extent], request: ReadRequest) -> ReadResult:
         result = ReadResult([], [])
@@ -197,6 +224,7 @@ class McapReader:
             for number, (extent, raw, head, _) in enumerate(group):
                 chunk = _Chunk(extent, raw, decompressed.data, *decompressed.bounds[number])
                 error = decompressed.errors.get(number) or _checksum_error(chunk.records, head)
+                self.chunk_checksums[extent.offset] = _checksum(head, error)
                 if error:
                     result.unreadable.extend(_unreadable_chunk(extent, raw, request, error))
                 else:
@@ -265,6 +293,12 @@ def _checksum_error(records: Bytes, head: ChunkHead) -> BagError | None:
     if not head.crc or (checksum := zlib.crc32(records.data)) == head.crc:
         return None
     return BagError(f"its checksum is {checksum:08x}, {head.crc:08x} expected")
+
+
+def _checksum(head: ChunkHead, error: BagError | None) -> ChunkChecksum:
+    if not head.crc:
+        return ChunkChecksum.ABSENT
+    return ChunkChecksum.VALID if error is None else ChunkChecksum.WRONG
 
 
 def _unreadable_chunk(

@@ -57,6 +57,8 @@ __all__ = ["Ros1Reader"]
 
 _MAX_LAYOUTS = 4
 """Maximum number of header layouts per connection; with more, chunks are scanned record by record."""
+_HEAD_BYTES = 1 << 12
+"""Bytes to read for the header of a chunk record; more than it can take."""
 _MAX_CHUNKS = 16
 """Maximum number of chunks per read: their decompressed size is unknown until they are read."""
 
@@ -127,6 +129,25 @@ class Ros1Reader:
             requested, _compressed_bytes, request.block_bytes, max_length=_MAX_CHUNKS
         ):
             yield ReadTask(group[0].start_ns, partial(self._load, group, request))
+
+    def index_times(self, connections: Collection[int]) -> dict[int, list[Int64s]] | None:
+        """Return the log times of some connections according to the index records; None if a chunk has none."""
+        times: dict[int, list[Int64s]] = {key: [] for key in connections}
+        for extent in self._extents:
+            if extent.is_truncated or (extent.counts.keys() & times.keys() and not extent.is_chunk):
+                return None
+            if not extent.counts.keys() & times.keys():
+                continue
+            try:
+                head = _chunk_head_at(self._source, extent)
+                start = extent.offset + head.end
+                index = memoryview(self._source.read(start, extent.stop - start))
+                chunk = _Chunk(extent, index, np.zeros(0, np.uint8), 0, 0)
+                for key, entries in _chunk_indexes(chunk, times).items():
+                    times[key].append(times_of(entries))
+            except BagError:
+                return None
+        return times
 
     def check_unchanged(self) -> None:
         """See `Source.check_unchanged`."""
@@ -219,6 +240,10 @@ def _chunk_head(raw: memoryview, extent: Extent) -> ChunkHead:
     if head.end > len(raw) and not extent.is_truncated:
         raise BagError(f"{head.end - head.start} bytes announced, {len(raw) - head.start} left")
     return head
+
+
+def _chunk_head_at(source: Source, extent: Extent) -> ChunkHead:
+    return chunk_head(source.read(extent.offset, min(extent.stop - extent.offset, _HEAD_BYTES)))
 
 
 def _unreadable_chunk(extent: Extent, request: ReadRequest, err: BagError) -> Iterator[UnreadableRange]:

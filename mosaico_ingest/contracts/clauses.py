@@ -1,0 +1,186 @@
+"""The clauses of a contract: each expectation of a job with its key path, severity and location."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from msgspec import Struct
+
+from mosaico_ingest.findings import Severity, Span, one_line
+from mosaico_ingest.job.expect import (
+    AllowedNames,
+    Expectation,
+    Expectations,
+    ExpectedTopic,
+    FieldExpectations,
+    Limit,
+    StampOrder,
+    TopicExpectations,
+)
+from mosaico_ingest.job.model import Job
+from mosaico_ingest.report.contract import ExpectationResult, Location, Occurrence, Outcome
+
+KeyPath = tuple[str | int, ...]
+
+_LISTS = {"type": AllowedNames, "frame_id": AllowedNames}
+_LIMITS = frozenset({"rejected", "out_of_order", "unreadable"})
+
+
+class Clause(Struct, frozen=True):
+    """One expectation of the recording, of one of its topics, or of an expression."""
+
+    path: KeyPath
+    expected: Any
+    """The expectation; short forms are replaced by the mapping that they stand for."""
+    severity: Severity
+    topic: str | None = None
+    span: Span | None = None
+    own: int = 1
+    """Position in `path` of the first key below the recording, the topic or the group."""
+
+    @property
+    def key(self) -> str:
+        """The last key of the path."""
+        return str(self.path[-1])
+
+    def passed(self, text: str, **details: Any) -> ExpectationResult:  # noqa: ANN401 - fields of the result
+        """Return the result of an expectation that holds."""
+        return self._result(Outcome.PASSED, text, details)
+
+    def failed(self, text: str, **details: Any) -> ExpectationResult:  # noqa: ANN401 - fields of the result
+        """Return the result of an expectation that does not hold."""
+        details.setdefault("violations", 1)
+        return self._result(Outcome.FAILED, text, details)
+
+    def skipped(self, reason: str) -> ExpectationResult:
+        """Return the result of an expectation that cannot be evaluated."""
+        return self._result(Outcome.SKIPPED, f"{self.key} not evaluated: {reason}", {})
+
+    def _result(self, outcome: Outcome, text: str, details: dict[str, Any]) -> ExpectationResult:
+        span = self.span
+        return ExpectationResult(
+            expectation=".".join(map(str, self.path)),
+            key=".".join(map(str, self.path[self.own :])),
+            severity=self.severity,
+            outcome=outcome,
+            text=one_line(text),
+            topic=self.topic,
+            location=None
+            if span is None
+            else Location(
+                file=span.file,
+                line=span.line,
+                column=span.column,
+                end_line=span.end_line,
+                end_column=span.end_column,
+            ),
+            **details,
+        )
+
+
+class Contract(Struct, frozen=True):
+    """The section `expect` of a job."""
+
+    job: Job
+    expect: Expectations
+
+    @classmethod
+    def of(cls, job: Job) -> Contract | None:
+        """Return the contract of a job, or None."""
+        return None if job.expect is None else cls(job, job.expect)
+
+    def recording_clauses(self) -> Iterator[Clause]:
+        """Yield the expectations of the recording."""
+        section = self.expect.recording
+        for name in type(section).model_fields:
+            value = getattr(section, name)
+            if name != "severity" and value is not None:
+                yield self._clause(("expect", "recording", name), value, section.severity)
+
+    def pattern_clauses(self, key: str) -> Iterator[tuple[str, Clause]]:
+        """Yield the patterns of `required` or `forbidden`, each with its clause."""
+        for position, item in enumerate(getattr(self.expect, key)):
+            pattern = item.topic if isinstance(item, ExpectedTopic) else item
+            severity = item.severity if isinstance(item, ExpectedTopic) else None
+            yield pattern, self._clause(("expect", key, position), item, severity)
+
+    def topic_clauses(self, topic: str) -> dict[str, Clause]:
+        """Return the expectations that apply to a topic by key, without those of `fields`."""
+        clauses: dict[str, Clause] = {}
+        for name in TopicExpectations.model_fields:
+            glob = None if name in {"severity", "fields"} else self.expect.entry_of(topic, name)
+            if glob is None:
+                continue
+            entry = self.expect.topics[glob]
+            value = getattr(entry, name)
+            if value is not None:
+                path = ("expect", "topics", glob, name)
+                clauses[name] = self._clause(path, value, entry.severity, topic)
+        return clauses
+
+    def field_clauses(self, topic: str) -> Iterator[tuple[str, FieldExpectations, list[Clause]]]:
+        """Yield the expressions that apply to a topic, each with its expectations."""
+        for expression, glob in self.expect.fields_of(topic).items():
+            entry = self.expect.topics[glob]
+            expected = entry.fields[expression]
+            path = ("expect", "topics", glob, "fields", expression)
+            clauses = [
+                self._clause(
+                    (*path, name), getattr(expected, name), expected.severity or entry.severity, topic
+                )
+                for name in FieldExpectations.model_fields
+                if name != "severity" and getattr(expected, name) not in (None, False)
+            ]
+            yield expression, expected, clauses
+
+    def group_clauses(self) -> Iterator[Clause]:
+        """Yield the expectations of several recordings."""
+        section = self.expect.group
+        if section is None:
+            return
+        for position, pattern in enumerate(section.files):
+            yield self._clause(("expect", "group", "files", position), pattern, section.severity)
+        for name in ("starts", "ends", "gap"):
+            value = getattr(section, name)
+            if value is not None:
+                yield self._clause(("expect", "group", name), value, section.severity)
+
+    def _clause(
+        self,
+        path: KeyPath,
+        value: Any,  # noqa: ANN401 - any form of an expectation
+        severity: str | None,
+        topic: str | None = None,
+    ) -> Clause:
+        expected = _full_form(str(path[-1]), value)
+        own = expected.severity if isinstance(expected, Expectation) else None
+        span = self.job.span(*path)
+        first = {"recording": 2, "topics": 3, "group": 2}.get(str(path[1]), 1)
+        return Clause(
+            path, expected, Severity(own or severity or self.expect.severity), topic, span, own=first
+        )
+
+
+def _full_form(key: str, value: Any) -> Any:  # noqa: ANN401 - any form of an expectation
+    """Return the mapping that a short form stands for, and any other value unchanged."""
+    if isinstance(value, Expectation):
+        return value
+    if key in _LIMITS:
+        return Limit(max=value)
+    if key in _LISTS:
+        return AllowedNames(one_of=(value,) if isinstance(value, str) else tuple(value))
+    if key == "stamps":
+        return StampOrder(order=value)
+    return value
+
+
+def occurrence(
+    log_time_ns: int | None = None,
+    index: int | None = None,
+    value: Any = None,  # noqa: ANN401 - any value
+) -> Occurrence:
+    """Return an occurrence; numbers that JSON cannot represent become texts."""
+    if isinstance(value, float) and value - value != 0:
+        value = repr(value)
+    return Occurrence(log_time_ns=log_time_ns, index=index, value=value)

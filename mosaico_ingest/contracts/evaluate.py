@@ -1,0 +1,506 @@
+"""The results of a contract, from what the monitors observed and from the index of the recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from difflib import get_close_matches
+from fnmatch import fnmatchcase
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from mosaico_ingest.contracts import texts
+from mosaico_ingest.contracts.clauses import Clause, Contract, occurrence
+from mosaico_ingest.contracts.monitor import HEADER_KEYS, TopicMonitor
+from mosaico_ingest.contracts.order import FileOrder
+from mosaico_ingest.contracts.recorder import RecorderEvents, Windows, covered_ns, uncovered_ns
+from mosaico_ingest.contracts.row_results import field_result, header_result
+from mosaico_ingest.contracts.times import Gaps
+from mosaico_ingest.job.values import RECORDING, Limit
+from mosaico_ingest.report.contract import ContractResult, ExpectationResult
+from mosaico_ingest.report.units import count_text, counted
+from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
+
+
+class TopicFacts:
+    """What is known about one topic of the recording."""
+
+    def __init__(
+        self,
+        name: str,
+        msgtypes: tuple[str, ...],
+        *,
+        count: int | None,
+        monitor: TopicMonitor | None = None,
+        unread: str | None = None,
+    ) -> None:
+        self.name = name
+        self.msgtypes = msgtypes
+        self.count = count
+        """Number of messages; None if it is unknown."""
+        self.monitor = monitor
+        """None if the topic was not read."""
+        self.unread = unread
+        """The reason why the topic was not read."""
+
+
+class Facts:
+    """What is known about a recording after it was read, or from its index."""
+
+    def __init__(
+        self,
+        topics: Mapping[str, TopicFacts],
+        *,
+        start_ns: int | None,
+        end_ns: int | None,
+        read_events: Callable[[], RecorderEvents] = RecorderEvents,
+        order: FileOrder | None = None,
+        connections: Mapping[str, tuple[int, ...]] | None = None,
+    ) -> None:
+        self.topics = topics
+        self.start_ns = start_ns
+        self.end_ns = end_ns
+        self._read_events = read_events
+        self.order = order
+        self.connections = connections or {}
+
+    @cached_property
+    def events(self) -> RecorderEvents:
+        """The events of the recorder, read when they are first needed."""
+        return self._read_events()
+
+    @property
+    def count(self) -> int | None:
+        """Number of messages of all topics; None if it is unknown."""
+        counts = [topic.count for topic in self.topics.values()]
+        return None if None in counts else sum(count or 0 for count in counts)
+
+    def span_of(self, name: str) -> tuple[int, int] | None:
+        """Return the first and last log time of the recording or of a topic; None if there is no message."""
+        if name == RECORDING:
+            return None if self.start_ns is None or self.end_ns is None else (self.start_ns, self.end_ns)
+        topic = self.topics.get(name)
+        times = None if topic is None or topic.monitor is None else topic.monitor.times
+        if times is None or times.first_ns is None or times.last_ns is None:
+            return None
+        return times.first_ns, times.last_ns
+
+
+def evaluate(
+    contract: Contract, facts: Facts, recording_results: Mapping[str, Callable[[Clause], ExpectationResult]]
+) -> ContractResult:
+    """Return the results of all expectations.
+
+    `recording_results` evaluates the expectations of the recording that need more than its topics, by key.
+    """
+    results: list[ExpectationResult] = []
+    for clause in contract.recording_clauses():
+        special = recording_results.get(clause.key)
+        results.append(special(clause) if special else _recording_result(clause, facts))
+    results += [_required(pattern, clause, facts) for pattern, clause in contract.pattern_clauses("required")]
+    results += [
+        _forbidden(pattern, clause, facts) for pattern, clause in contract.pattern_clauses("forbidden")
+    ]
+    for topic in facts.topics.values():
+        results += _topic_results(contract, topic, facts)
+    return ContractResult(on_failure=contract.expect.on_failure.value, results=tuple(results))
+
+
+def _recording_result(clause: Clause, facts: Facts) -> ExpectationResult:
+    expected = clause.expected
+    if clause.key == "messages":
+        return _count_result(clause, facts.count, "the recording has")
+    if facts.start_ns is None or facts.end_ns is None:
+        return clause.failed("the recording has no message")
+    if clause.key == "duration":
+        length = facts.end_ns - facts.start_ns
+        limit = texts.bounds(_or_none(texts.duration, expected.min), _or_none(texts.duration, expected.max))
+        is_good = _within(length, expected.min, expected.max)
+        text = f"the recording lasts {texts.duration(length)}; expected {limit}"
+        return _result(clause, is_good, text, measured=length, unit="ns", limit=limit)
+    moment = facts.start_ns if clause.key == "start" else facts.end_ns
+    is_good = (expected.after is None or moment >= expected.after) and (
+        expected.before is None or moment < expected.before
+    )
+    limit = " and ".join(
+        f"{name} {texts.instant(bound)}"
+        for name, bound in (("not before", expected.after), ("before", expected.before))
+        if bound is not None
+    )
+    verb = "starts" if clause.key == "start" else "ends"
+    text = f"the recording {verb} at {texts.instant(moment)}; expected {limit}"
+    return _result(clause, is_good, text, measured=moment, unit="ns", limit=limit)
+
+
+def _required(pattern: str, clause: Clause, facts: Facts) -> ExpectationResult:
+    matches = [topic for topic in facts.topics.values() if fnmatchcase(topic.name, pattern)]
+    present = [topic for topic in matches if topic.count != 0]
+    if present:
+        text = f"{pattern!r} matches {counted(len(present), 'topic')} with messages"
+        return clause.passed(text, measured=len(present), unit="topics", limit="at least 1 topic")
+    if matches:
+        text = f"{pattern!r} matches only topics without messages: {', '.join(t.name for t in matches[:5])}"
+    else:
+        near = get_close_matches(pattern, facts.topics, n=1, cutoff=0.5)
+        nearest = f"; the nearest is {near[0]}" if near else ""
+        text = f"no topic matches {pattern!r}{nearest}"
+    return clause.failed(text, measured=0, unit="topics", limit="at least 1 topic")
+
+
+def _forbidden(pattern: str, clause: Clause, facts: Facts) -> ExpectationResult:
+    present = [
+        topic.name for topic in facts.topics.values() if fnmatchcase(topic.name, pattern) and topic.count != 0
+    ]
+    if not present:
+        return clause.passed(
+            f"no topic with messages matches {pattern!r}", measured=0, unit="topics", limit="no topic"
+        )
+    more = f" and {len(present) - 5} more" if len(present) > 5 else ""  # noqa: PLR2004 - names in one line
+    text = f"{pattern!r} matches {', '.join(present[:5])}{more}; expected no topic"
+    return clause.failed(
+        text, measured=len(present), unit="topics", limit="no topic", violations=len(present)
+    )
+
+
+def _topic_results(contract: Contract, topic: TopicFacts, facts: Facts) -> Iterator[ExpectationResult]:
+    for clause in contract.topic_clauses(topic.name).values():
+        yield _topic_result(clause, topic, facts)
+    for _, _, of_field in contract.field_clauses(topic.name):
+        for clause in of_field:
+            if topic.monitor is None:
+                yield clause.skipped(topic.unread or "the topic is not read")
+            else:
+                yield field_result(clause, list(topic.monitor.rows.values()))
+
+
+def _topic_result(clause: Clause, topic: TopicFacts, facts: Facts) -> ExpectationResult:
+    key, monitor = clause.key, topic.monitor
+    if key == "type":
+        result = _type_result(clause, topic)
+    elif key == "messages":
+        result = _count_result(clause, topic.count, "the topic has")
+    elif monitor is None:
+        result = clause.skipped(topic.unread or "the topic is not read")
+    elif key == "rejected":
+        result = _rejected(clause, monitor)
+    elif key == "out_of_order":
+        result = _out_of_order(clause, topic, facts)
+    elif key in HEADER_KEYS:
+        result = _header(clause, topic, facts)
+    else:
+        result = _time_result(clause, monitor, facts)
+    return result
+
+
+def _type_result(clause: Clause, topic: TopicFacts) -> ExpectationResult:
+    allowed = clause.expected.one_of
+    wrong = [
+        name for name in topic.msgtypes if normalize_msgtype(name) not in set(map(normalize_msgtype, allowed))
+    ]
+    limit = " or ".join(allowed)
+    measured = ", ".join(topic.msgtypes)
+    return _result(
+        clause, not wrong, f"the type is {measured}; expected {limit}", measured=measured, limit=limit
+    )
+
+
+def _count_result(clause: Clause, count: int | None, subject: str) -> ExpectationResult:
+    if count is None:
+        return clause.skipped("the index does not count the messages")
+    expected = clause.expected
+    limit = texts.bounds(_or_none(count_text, expected.min), _or_none(count_text, expected.max))
+    text = f"{subject} {counted(count, 'message')}; expected {limit}"
+    is_good = _within(count, expected.min, expected.max)
+    return _result(clause, is_good, text, measured=count, unit="messages", limit=limit)
+
+
+def _rejected(clause: Clause, monitor: TopicMonitor) -> ExpectationResult:
+    if monitor.rejected is None:
+        return clause.skipped("the messages are not converted")
+    return limit_result(clause, clause.expected.max, monitor.rejected, monitor.read, "messages were rejected")
+
+
+def limit_result(
+    clause: Clause,
+    limit: Limit,
+    count: int,
+    total: int,
+    what: str,
+    **details: Any,  # noqa: ANN401 - fields
+) -> ExpectationResult:
+    """Return the result of an expectation that limits a number or share of messages."""
+    is_good = count <= limit.count if limit.count is not None else count <= (limit.share or 0) * total
+    part = "" if limit.count is not None or not total else f" ({texts.share(count / total)})"
+    text = f"{count_text(count)} of {count_text(total)} {what}{part}; expected {texts.limit(limit)}"
+    measured = count if limit.count is not None else (count / total if total else 0.0)
+    unit = "messages" if limit.count is not None else "share"
+    details = {"measured": measured, "unit": unit, "limit": texts.limit(limit), **details}
+    return _result(clause, is_good, text, violations=0 if is_good else count, **details)
+
+
+def _out_of_order(clause: Clause, topic: TopicFacts, facts: Facts) -> ExpectationResult:
+    if facts.order is None:
+        return clause.skipped("the order in the files is not known")
+    steps = [facts.order.steps_back(key) for key in facts.connections.get(topic.name, ())]
+    count = sum(step.count for step in steps)
+    worst = max((step.worst for step in steps if step.worst), key=lambda step: step.size, default=None)
+    first = next((step.first for step in steps if step.first), None)
+    total = 0 if topic.monitor is None else topic.monitor.read
+    where = None if worst is None else occurrence(worst.log_time_ns, None, worst.size)
+    begin = None if first is None else occurrence(first.log_time_ns, None, first.size)
+    what = "messages have an earlier log time than the message before them"
+    back = f", the largest step back is {texts.duration(worst.size)}" if worst else ""
+    return limit_result(clause, clause.expected.max, count, total, what + back, first=begin, worst=where)
+
+
+def _header(clause: Clause, topic: TopicFacts, facts: Facts) -> ExpectationResult:
+    monitor = topic.monitor
+    if clause.key == "sequence_numbers" and facts.order is not None:
+        found = [facts.order.missing_numbers(key) for key in facts.connections.get(topic.name, ())]
+        gaps = [gap for gap in found if gap is not None]
+        if gaps:
+            missing = sum(gap.total for gap in gaps)
+            worst = max((gap.worst for gap in gaps if gap.worst), key=lambda step: step.size, default=None)
+            first = next((gap.first for gap in gaps if gap.first), None)
+            read = 0 if monitor is None else monitor.read
+            return limit_result(
+                clause,
+                clause.expected.missing,
+                missing,
+                missing + read,
+                "sequence numbers are missing",
+                first=None if first is None else occurrence(first.log_time_ns, None, first.size),
+                worst=None if worst is None else occurrence(worst.log_time_ns, None, worst.size),
+            )
+    rows = [] if monitor is None else list(monitor.rows.values())
+    return header_result(clause, rows, topic.msgtypes[0] if topic.msgtypes else "")
+
+
+def _time_result(clause: Clause, monitor: TopicMonitor, facts: Facts) -> ExpectationResult:
+    times, key = monitor.times, clause.key
+    if times.late and key in {"sliding_rate", "gap", "gaps", "coverage"}:
+        return clause.skipped("the messages are too far out of order")
+    if times.count < 2 and key in {"sliding_rate", "gap", "gaps"}:  # noqa: PLR2004 - an interval has two ends
+        return _too_few(clause, times.count)
+    return _TIME_RESULTS[key](clause, monitor, facts)
+
+
+def _too_few(clause: Clause, count: int) -> ExpectationResult:
+    low = getattr(clause.expected, "min", None)
+    if low is not None:
+        return clause.failed(f"the topic has {counted(count, 'message')}, which have no rate", measured=None)
+    return clause.skipped(f"the topic has {counted(count, 'message')}")
+
+
+def _rate(clause: Clause, monitor: TopicMonitor, facts: Facts) -> ExpectationResult:
+    times, expected = monitor.times, clause.expected
+    limit = texts.bounds(
+        *(None if hz is None else f"{texts.number(hz)} Hz" for hz in (expected.min, expected.max))
+    )
+    if times.count < 2 or times.first_ns is None or times.last_ns is None:  # noqa: PLR2004 - as above
+        return _too_few(clause, times.count)
+    if not times.span_ns:
+        return clause.failed(f"all of {counted(times.count, 'message')} have one log time", limit=limit)
+    rate = (times.count - 1) / (times.span_ns / 1e9)
+    if _within(rate, expected.min, expected.max):
+        text = f"the mean rate is {texts.number(rate)} Hz; expected {limit}"
+        return clause.passed(text, measured=rate, unit="Hz", limit=limit)
+    paused = covered_ns(times.first_ns, times.last_ns, facts.events.windows_of(monitor.name))
+    active = times.span_ns - paused
+    if paused and active > 0:
+        rate = (times.count - 1) / (active / 1e9)
+        note = f" without {texts.duration(paused)} in which the recorder was paused"
+    else:
+        note = ""
+    is_good = _within(rate, expected.min, expected.max)
+    text = f"the mean rate is {texts.number(rate)} Hz{note}; expected {limit}"
+    return _result(clause, is_good, text, measured=rate, unit="Hz", limit=limit, explained=int(is_good))
+
+
+def _sliding_rate(clause: Clause, monitor: TopicMonitor, facts: Facts) -> ExpectationResult:  # noqa: ARG001 - the signature of all
+    window, expected = monitor.times.windows[clause.key], clause.expected
+    seconds = expected.window / 1e9
+    limit = texts.bounds(
+        *(None if hz is None else f"{texts.number(hz)} Hz" for hz in (expected.min, expected.max))
+    )
+    if window.lowest is None or window.highest is None:
+        span = texts.duration(monitor.times.span_ns)
+        return clause.skipped(
+            f"the topic lasts {span}, less than a window of {texts.duration(expected.window)}"
+        )
+    low, high = window.lowest.count / seconds, window.highest.count / seconds
+    too_low = expected.min is not None and low < expected.min - 1e-9 / seconds
+    too_high = expected.max is not None and high > expected.max + 1e-9 / seconds
+    text = (
+        f"the rate in windows of {texts.duration(expected.window)} is from {texts.number(low)} Hz to "
+        f"{texts.number(high)} Hz; expected {limit}"
+    )
+    extreme = window.lowest if too_low else window.highest
+    measured = low if too_low else high
+    details: dict[str, Any] = {"measured": measured, "unit": "Hz", "limit": limit}
+    if not (too_low or too_high):
+        return clause.passed(text, **details)
+    worst = occurrence(extreme.start_ns, extreme.index, measured)
+    first = None
+    if window.first is not None:
+        first = occurrence(window.first.start_ns, window.first.index, window.first.count / seconds)
+    text += texts.extremes(first, worst)
+    return clause.failed(text, violations=window.violations, first=first, worst=worst, **details)
+
+
+def _unexplained(gaps: Gaps, name: str, facts: Facts, limit_ns: int) -> tuple[np.ndarray[Any, Any], Windows]:
+    """Return which long intervals the recorder's events do not explain, and the windows of the events."""
+    windows = facts.events.windows_of(name) if len(gaps.lengths) else RecorderEvents().paused
+    if not len(windows):
+        return np.ones(len(gaps.lengths), bool), windows
+    return uncovered_ns(gaps.ends - gaps.lengths, gaps.ends, windows) > limit_ns, windows
+
+
+def _gap(clause: Clause, monitor: TopicMonitor, facts: Facts) -> ExpectationResult:
+    gaps, longest = monitor.times.gaps[clause.key], monitor.times.longest
+    limit_ns = clause.expected.max
+    limit = f"at most {texts.duration(limit_ns)}"
+    unexplained, _ = _unexplained(gaps, monitor.name, facts, limit_ns)
+    explained = len(unexplained) - int(unexplained.sum())
+    if not unexplained.any():
+        if explained:
+            text = f"{counted(explained, 'gap')} longer than {texts.duration(limit_ns)}, while the recorder was paused"
+            return clause.passed(
+                text, measured=int(gaps.lengths.max()), unit="ns", limit=limit, explained=explained
+            )
+        length = 0 if longest is None else longest.length_ns
+        text = f"the longest gap is {texts.duration(length)}; expected {limit}"
+        return clause.passed(text, measured=length, unit="ns", limit=limit)
+    positions = np.flatnonzero(unexplained)
+    first = gaps.at(int(positions[0]))
+    worst = gaps.at(int(positions[int(gaps.lengths[positions].argmax())]))
+    where = occurrence(worst.end_ns, worst.index, worst.length_ns)
+    begin = occurrence(first.end_ns, first.index, first.length_ns)
+    many = f" ({count_text(len(positions))} gaps are longer)" if len(positions) > 1 else ""
+    text = f"the longest gap is {texts.duration(worst.length_ns)}; expected {limit}{many}{texts.extremes(begin, where)}"
+    return clause.failed(
+        text,
+        measured=worst.length_ns,
+        unit="ns",
+        limit=limit,
+        violations=len(positions),
+        first=begin,
+        worst=where,
+        explained=explained,
+    )
+
+
+def _gap_share(clause: Clause, monitor: TopicMonitor, facts: Facts) -> ExpectationResult:
+    gaps, expected = monitor.times.gaps[clause.key], clause.expected
+    limit_ns = gaps.limit_ns or 0
+    limit = f"at most {texts.share(expected.max_share)}"
+    unexplained, _ = _unexplained(gaps, monitor.name, facts, limit_ns)
+    positions = np.flatnonzero(unexplained)
+    share = len(positions) / gaps.total
+    text = (
+        f"{count_text(len(positions))} of {count_text(gaps.total)} intervals ({texts.share(share)}) are longer than "
+        f"{texts.duration(limit_ns)}; expected {limit}"
+    )
+    details: dict[str, Any] = {"measured": share, "unit": "share", "limit": limit}
+    details["explained"] = len(unexplained) - len(positions)
+    if share <= expected.max_share:
+        return clause.passed(text, **details)
+    first = gaps.at(int(positions[0]))
+    worst = gaps.at(int(positions[int(gaps.lengths[positions].argmax())]))
+    begin = occurrence(first.end_ns, first.index, first.length_ns)
+    where = occurrence(worst.end_ns, worst.index, worst.length_ns)
+    text += f"; the longest is {texts.duration(worst.length_ns)}{texts.extremes(begin, where)}"
+    return clause.failed(text, violations=len(positions), first=begin, worst=where, **details)
+
+
+def _coverage(clause: Clause, monitor: TopicMonitor, facts: Facts) -> ExpectationResult:
+    times, expected = monitor.times, clause.expected
+    subject = "the recording" if expected.of == RECORDING else expected.of
+    span = facts.span_of(expected.of)
+    limit = f"at least {texts.share(expected.min)}"
+    if span is None:
+        return clause.failed(f"{subject} has no message, so its coverage is unknown", limit=limit)
+    start, end = span
+    gaps = times.gaps[clause.key]
+    if times.first_ns is None or times.last_ns is None:
+        text = f"the topic has no message, so it covers 0% of {subject}; expected {limit}"
+        return clause.failed(text, measured=0.0, unit="share", limit=limit)
+    limit_ns = gaps.limit_ns if gaps.limit_ns is not None else 0
+    # The time before the first and after the last message counts like the time between messages.
+    starts = np.concatenate([[start], gaps.ends - gaps.lengths, [times.last_ns]])
+    ends = np.concatenate([[times.first_ns], gaps.ends, [end]])
+    starts, ends = np.maximum(starts, start), np.minimum(ends, end)
+    lengths = np.maximum(ends - starts, 0)
+    windows = facts.events.windows_of(monitor.name) if (lengths > limit_ns).any() else RecorderEvents().paused
+    rest = uncovered_ns(starts, ends, windows) if len(windows) else lengths
+    missing = (lengths > limit_ns) & (rest > limit_ns)
+    explained = int(((lengths > limit_ns) & ~missing).sum())
+    total = end - start
+    share = 1.0 if not total else 1 - int(lengths[missing].sum()) / total
+    text = f"the topic covers {texts.share(share)} of {subject}; expected {limit}"
+    details: dict[str, Any] = {"measured": share, "unit": "share", "limit": limit, "explained": explained}
+    if share >= expected.min:
+        return clause.passed(text, **details)
+    positions = np.flatnonzero(missing)
+    most = int(positions[int(lengths[positions].argmax())])
+    first = occurrence(int(ends[positions[0]]), None, int(lengths[positions[0]]))
+    worst = occurrence(int(ends[most]), None, int(lengths[most]))
+    text += (
+        f"; the longest interval without messages is {texts.duration(int(lengths[most]))}, "
+        f"until {texts.instant(int(ends[most]))}"
+    )
+    return clause.failed(text, violations=len(positions), first=first, worst=worst, **details)
+
+
+def _proximity(clause: Clause, monitor: TopicMonitor, facts: Facts) -> ExpectationResult:
+    expected, key = clause.expected, clause.key
+    subject = "the recording" if expected.of == RECORDING else expected.of
+    span, times = facts.span_of(expected.of), monitor.times
+    limit = f"at most {texts.duration(expected.within)}"
+    if span is None:
+        return clause.failed(f"{subject} has no message to compare the {key} with", limit=limit)
+    if times.first_ns is None or times.last_ns is None:
+        return clause.failed(f"the topic has no message, so it has no {key}", limit=limit)
+    own, other = (times.first_ns, span[0]) if key == "start" else (times.last_ns, span[1])
+    distance = own - other
+    side = "after" if distance >= 0 else "before"
+    verb = "starts" if key == "start" else "ends"
+    text = f"the topic {verb} {texts.duration(abs(distance))} {side} the {key} of {subject}; expected {limit}"
+    details: dict[str, Any] = {"measured": distance, "unit": "ns", "limit": limit}
+    if abs(distance) <= expected.within:
+        return clause.passed(text, **details)
+    windows = facts.events.windows_of(monitor.name)
+    first, last = min(own, other), max(own, other)
+    if len(windows) and last - first - covered_ns(first, last, windows) <= expected.within:
+        return clause.passed(f"{text}; the recorder was paused", explained=1, **details)
+    index = 0 if key == "start" else times.count - 1
+    return clause.failed(text, worst=occurrence(own, index, distance), **details)
+
+
+_TIME_RESULTS: Mapping[str, Callable[[Clause, TopicMonitor, Facts], ExpectationResult]] = {
+    "rate": _rate,
+    "sliding_rate": _sliding_rate,
+    "gap": _gap,
+    "gaps": _gap_share,
+    "coverage": _coverage,
+    "start": _proximity,
+    "end": _proximity,
+}
+"""The functions that evaluate expectations of log times, by key."""
+
+
+def _within(value: float, low: float | None, high: float | None) -> bool:
+    return (low is None or value >= low) and (high is None or value <= high)
+
+
+def _or_none(text: Callable[[Any], str], value: Any) -> str | None:  # noqa: ANN401 - the argument of `text`
+    return None if value is None else text(value)
+
+
+def _result(clause: Clause, is_good: bool, text: str, **details: Any) -> ExpectationResult:  # noqa: FBT001, ANN401 - as computed
+    if is_good:
+        details.pop("first", None)
+        details.pop("worst", None)
+        return clause.passed(text, **details)
+    return clause.failed(text + texts.extremes(details.get("first"), details.get("worst")), **details)

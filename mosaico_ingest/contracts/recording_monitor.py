@@ -1,0 +1,305 @@
+"""The monitor of one recording: it observes all topics while the recording is read, and returns the results."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from msgspec import Struct
+
+from mosaico_ingest.contracts.clauses import Clause, Contract
+from mosaico_ingest.contracts.evaluate import Facts, TopicFacts, evaluate, limit_result
+from mosaico_ingest.contracts.expressions import Rows
+from mosaico_ingest.contracts.monitor import (
+    BlockObserver,
+    TopicMonitor,
+    file_order,
+    referenced_topics,
+    row_monitor,
+    topic_monitor,
+)
+from mosaico_ingest.contracts.recorder import read_events
+from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.findings import Finding
+from mosaico_ingest.job.values import OnFailure
+from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Outcome
+from mosaico_ingest.report.units import count_text, counted
+from mosaico_ingest.rosbag.blocks import ChunkChecksum, Connection
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.model import Definition
+from mosaico_ingest.rosbag.recording import Recording
+
+
+class ReadTopic(Struct, frozen=True):
+    """A topic that is read: its connections, and the type of its rows."""
+
+    topic: str
+    """The name in the recording."""
+    connections: tuple[int, ...]
+    ontology: OntologyType
+
+
+def check_expressions(
+    contract: Contract, connections: Sequence[Connection], topics: Iterable[ReadTopic]
+) -> None:
+    """Check the expressions of a contract against the message types of the topics that they apply to.
+
+    Raises:
+        ManifestError: An expression has a mistake; `findings` has all of them, with their locations.
+    """
+    findings = _expression_findings(contract, connections, topics)
+    if not findings:
+        return
+    first = findings[0]
+    more = f" (and {len(findings) - 1} more mistakes)" if len(findings) > 1 else ""
+    where = str(first.span or "expect")
+    raise ManifestError(f"{first.message}{more}", where=where, hint=first.help, findings=tuple(findings))
+
+
+def _expression_findings(
+    contract: Contract, connections: Sequence[Connection], topics: Iterable[ReadTopic]
+) -> list[Finding]:
+    by_id = {connection.id: connection for connection in connections}
+    findings: dict[Finding, None] = {}
+    for topic in topics:
+        for key in topic.connections:
+            _, mistakes = row_monitor(contract, topic.topic, *_rows(by_id[key], topic))
+            findings.update(dict.fromkeys(mistakes))
+    return list(findings)
+
+
+class RecordingMonitor:
+    """Observes the messages of a recording for a contract whose expressions fit its topics (`check_expressions`)."""
+
+    def __init__(
+        self,
+        contract: Contract,
+        recording: Recording,
+        topics: Sequence[ReadTopic],
+        *,
+        excluded: Mapping[str, str] | None = None,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+    ) -> None:
+        """Create the monitor.
+
+        Args:
+            contract: The contract.
+            recording: The open recording.
+            topics: The topics whose messages will be observed.
+            excluded: The reasons why other topics are not read, by name.
+            start_ns: The start of the time range that is read, None for all messages.
+            end_ns: The end of the time range, exclusive.
+        """
+        self._contract = contract
+        self._recording = recording
+        self._excluded = excluded or {}
+        self._range = (start_ns, end_ns)
+        self._connections = {connection.id: connection for connection in recording.connections}
+        self._of_topic: dict[str, tuple[int, ...]] = {}
+        self._monitors: dict[str, TopicMonitor] = {}
+        references = referenced_topics(contract)
+        for topic in topics:
+            self._add(topic, references)
+        self.order = file_order(contract, self._monitors, is_mcap=recording.container == "mcap")
+        """Observes the messages in the order of the files; None if no expectation needs it."""
+
+    @property
+    def on_failure(self) -> OnFailure:
+        """The action if an expectation with the severity `error` fails."""
+        return self._contract.expect.on_failure
+
+    def observer(self, connection: int) -> BlockObserver | None:
+        """Return the observer of the blocks of a connection, None if nothing about its topic is expected."""
+        monitor = self._monitors.get(self._connections[connection].topic)
+        return (
+            None if monitor is None else monitor.observer(connection, self._connections[connection].msgtype)
+        )
+
+    @property
+    def observed(self) -> Mapping[str, TopicMonitor]:
+        """The monitors by topic."""
+        return self._monitors
+
+    def reject(self, topic: str, count: int) -> None:
+        """Add rejected messages of a topic, after its messages were converted."""
+        monitor = self._monitors.get(topic)
+        if monitor is not None:
+            monitor.rejected = (monitor.rejected or 0) + count
+
+    def finish(self) -> ContractResult:
+        """Return the results, after all messages were observed."""
+        for monitor in self._monitors.values():
+            monitor.finish()
+        facts = self._facts()
+        return evaluate(
+            self._contract,
+            facts,
+            {
+                "unreadable": lambda clause: self._unreadable(clause, facts),
+                "chunk_crcs": self._chunk_checksums,
+                "metadata_counts": lambda clause: self._metadata_counts(clause, facts),
+            },
+        )
+
+    def _add(self, topic: ReadTopic, references: frozenset[str]) -> None:
+        known = self._of_topic.get(topic.topic, ())
+        self._of_topic[topic.topic] = (*known, *topic.connections)
+        monitor = self._monitors.get(topic.topic) or topic_monitor(self._contract, topic.topic, references)
+        if monitor is None:
+            return
+        self._monitors[topic.topic] = monitor
+        for key in topic.connections:
+            rows, _ = row_monitor(self._contract, topic.topic, *_rows(self._connections[key], topic))
+            if rows is not None:
+                monitor.rows[key] = rows
+        filled = [key for key in self._of_topic[topic.topic] if self._connections[key].count != 0]
+        monitor.is_merged = len(filled) > 1
+
+    def _facts(self) -> Facts:
+        recording = self._recording
+        topics: dict[str, TopicFacts] = {}
+        for name in dict.fromkeys(connection.topic for connection in recording.connections):
+            own = [connection for connection in recording.connections if connection.topic == name]
+            filled = [connection for connection in own if connection.count != 0] or own
+            topics[name] = TopicFacts(
+                name,
+                tuple(dict.fromkeys(connection.msgtype for connection in filled)),
+                count=self._count(name, own),
+                monitor=self._monitors.get(name),
+                unread=self._excluded.get(name),
+            )
+        start_ns, end_ns = self._span()
+        return Facts(
+            topics,
+            start_ns=start_ns,
+            end_ns=end_ns,
+            read_events=lambda: read_events(recording),
+            order=self.order,
+            connections=self._of_topic,
+        )
+
+    def _count(self, name: str, connections: Sequence[Connection]) -> int | None:
+        monitor = self._monitors.get(name)
+        if monitor is not None:
+            return monitor.read
+        counts = [connection.count for connection in connections]
+        total = None if None in counts else sum(count or 0 for count in counts)
+        return None if total and self._range != (None, None) else total
+
+    def _span(self) -> tuple[int | None, int | None]:
+        """Return the first and last log time, within the time range that is read."""
+        start_ns, end_ns = self._recording.start_ns, self._recording.end_ns
+        if start_ns is None or end_ns is None:
+            spans = [(m.times.first_ns, m.times.last_ns) for m in self._monitors.values()]
+            start_ns = min((first for first, _ in spans if first is not None), default=None)
+            end_ns = max((last for _, last in spans if last is not None), default=None)
+        first, end = self._range
+        if start_ns is not None and first is not None:
+            start_ns = max(start_ns, first)
+        if end_ns is not None and end is not None:
+            end_ns = min(end_ns, end - 1)
+        return start_ns, end_ns
+
+    def _unreadable(self, clause: Clause, facts: Facts) -> ExpectationResult:
+        ranges = [item for item in self._recording.unreadable if item.count != 0]
+        count = sum(1 if item.count is None else item.count for item in ranges)
+        total = count + (facts.count or sum(monitor.read for monitor in self._monitors.values()))
+        reason = f"; the first: {ranges[0].reason}" if ranges else ""
+        result = limit_result(clause, clause.expected.max, count, total, "messages are unreadable")
+        return result.replace(text=f"{result.text}{reason}") if ranges else result
+
+    def _chunk_checksums(self, clause: Clause) -> ExpectationResult:
+        counts = self._recording.chunk_checksums
+        if counts is None:
+            return clause.skipped(f"the format {self._recording.container} has no checksums of chunks")
+        total = sum(counts.values())
+        if not total:
+            return clause.skipped("the recording has no chunks, or none was read")
+        absent, wrong = counts[ChunkChecksum.ABSENT], counts[ChunkChecksum.WRONG]
+        expected = clause.expected
+        problems = [f"{counted(absent, 'chunk')} of {count_text(total)} have no checksum"] * (
+            expected.present and absent > 0
+        )
+        problems += [f"the checksums of {counted(wrong, 'chunk')} of {count_text(total)} are wrong"] * (
+            expected.valid and wrong > 0
+        )
+        if not problems:
+            return clause.passed(f"the checksums of {counted(total - absent, 'chunk')} are valid", measured=0)
+        bad = absent * expected.present + wrong * expected.valid
+        return clause.failed(
+            " and ".join(problems), measured=bad, unit="chunks", limit="no chunk", violations=bad
+        )
+
+    def _metadata_counts(self, clause: Clause, facts: Facts) -> ExpectationResult:
+        metadata = self._recording.metadata
+        if metadata is None:
+            return clause.skipped("the recording has no metadata.yaml")
+        promised = {topic.topic: topic.count for topic in metadata.topics}
+        counts: dict[str, int | None] = {}
+        for connection in self._recording.connections:
+            before = counts.get(connection.topic, 0)
+            counts[connection.topic] = (
+                None if None in (before, connection.count) else (before or 0) + (connection.count or 0)
+            )
+        if None in counts.values() and self._range == (None, None):
+            counts = {name: topic.count for name, topic in facts.topics.items()}
+        different = [
+            f"{name}: {count_text(promised.get(name, 0))} in metadata.yaml, {count_text(count)} in the files"
+            for name in dict.fromkeys([*promised, *counts])
+            if (count := counts.get(name, 0)) is not None and promised.get(name, 0) != count
+        ]
+        if not different:
+            return clause.passed(
+                "the counts equal those in metadata.yaml", measured=0, unit="topics", limit="no topic"
+            )
+        more = f"; {len(different) - 1} more topics differ" if len(different) > 1 else ""
+        return clause.failed(
+            f"{different[0]}{more}",
+            measured=len(different),
+            unit="topics",
+            limit="no topic",
+            violations=len(different),
+        )
+
+
+def _rows(connection: Connection, topic: ReadTopic) -> tuple[Rows | None, Rows]:
+    message = None if connection.definition is None else message_rows(connection.definition)
+    return message, ontology_rows(topic.ontology)
+
+
+def message_rows(definition: Definition) -> Rows:
+    """Return the rows of messages in the ROS shape."""
+    return Rows(ros_shape(definition), definition.types, definition.root, definition.root)
+
+
+def ontology_rows(ontology: OntologyType) -> Rows:
+    """Return the rows of an ontology type."""
+    return Rows(ontology.struct, {}, None, ontology.tag)
+
+
+def summary(result: ContractResult) -> dict[str, Any]:
+    """Return the results for the metadata of a sequence: counts, the failures, and the measured values.
+
+    `measured` has a mapping per topic, with the names that metadata keys may have: `/gps/fix` is `gps_fix`.
+    """
+    measured: dict[str, dict[str, Any]] = {}
+    for one in result.results:
+        if one.measured is not None:
+            values = measured.setdefault(_metadata_key(one.topic or "recording"), {})
+            values[_metadata_key(one.key)] = one.measured
+    return {
+        "passed": result.passed,
+        "expectations": len(result.results),
+        "failed": len(result.errors),
+        "warnings": len(result.warnings),
+        "skipped": sum(one.outcome is Outcome.SKIPPED for one in result.results),
+        "failures": [one.line for one in (*result.errors, *result.warnings)],
+        "measured": measured,
+    }
+
+
+def _metadata_key(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_]+", "_", name).strip("_") or "_"

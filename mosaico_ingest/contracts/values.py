@@ -1,0 +1,495 @@
+"""Streaming accumulators over the rows of one connection: header stamps, frames, and the values of expressions.
+
+Every accumulator counts the violations of one expectation and keeps the first and the worst of them. Batches arrive in
+log-time order, and the state that is carried across batches makes the result independent of their size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from mosaico_ingest.adapters.mapping.columns import Array, arrays, field_of, pc, pt
+from mosaico_ingest.contracts.expressions import Values
+from mosaico_ingest.job.values import Limit
+
+Mask: TypeAlias = NDArray[np.bool_]
+Value: TypeAlias = "bool | int | float | str | None"
+
+
+class Violation(Struct, frozen=True):
+    """A message that violates an expectation."""
+
+    log_time_ns: int
+    index: int
+    """Position on the topic."""
+    value: Value
+
+
+class Batch(Struct, frozen=True):
+    """The messages of a batch: log times and positions on the topic of its rows, shape (n,)."""
+
+    log_times: NDArray[np.int64]
+    indexes: NDArray[np.int64]
+
+    def violation(self, row: int, value: Any) -> Violation:  # noqa: ANN401 - a numpy scalar or a Python value
+        """Return the violation of one row."""
+        plain = value.item() if isinstance(value, np.generic) else value
+        return Violation(int(self.log_times[row]), int(self.indexes[row]), plain)
+
+
+@dataclass(slots=True)
+class Violations:
+    """The number of violations, the first one, and the worst one."""
+
+    count: int = 0
+    first: Violation | None = None
+    worst: Violation | None = None
+    excess: float = -np.inf
+    """The distance of the worst value from its limit."""
+
+    def add(
+        self, batch: Batch, values: Values, bad: Mask, excess: NDArray[np.floating] | None = None
+    ) -> None:
+        """Add the violations of a batch; without `excess`, the first one counts as the worst."""
+        positions = np.flatnonzero(bad)
+        if not len(positions):
+            return
+        self.count += len(positions)
+        if self.first is None:
+            self.first = _violation(batch, values, int(positions[0]))
+        if excess is None:
+            self.worst = self.worst or self.first
+            return
+        distances = excess[positions]
+        distances = np.where(np.isnan(distances), np.inf, distances)
+        most = int(distances.argmax())
+        if float(distances[most]) > self.excess:
+            self.excess = float(distances[most])
+            self.worst = _violation(batch, values, int(positions[most]))
+
+
+def _violation(batch: Batch, values: Values, position: int) -> Violation:
+    is_null = values.null is not None and bool(values.null[position])
+    return batch.violation(values.row(position), None if is_null else values.data[position])
+
+
+def plain_values(data: NDArray[Any]) -> Values:
+    """Return values without nulls, one per row."""
+    return Values(data, None, None)
+
+
+def stamps_of(rows: Array) -> NDArray[np.int64] | None:
+    """Return the header stamps in nanoseconds, shape (n,); None if the rows have no header with a stamp."""
+    stamp = _member(rows, "header", "stamp")
+    if stamp is None:
+        return None
+    seconds, nanoseconds = _member(stamp, "sec"), _member(stamp, "nanosec")
+    if seconds is None or nanoseconds is None:
+        return None
+    return _numbers(seconds).astype(np.int64) * 1_000_000_000 + _numbers(nanoseconds).astype(np.int64)
+
+
+def ontology_stamps_of(rows: Array) -> tuple[NDArray[np.int64], Mask] | None:
+    """Return the stamps of stored rows in nanoseconds and where they are not set; None without a header."""
+    time = _member(rows, "header", "timestamp")
+    if time is None:
+        return None
+    seconds, nanoseconds = _member(time, "seconds"), _member(time, "nanoseconds")
+    unset = np.asarray(time.is_null())
+    return (
+        _numbers(seconds).astype(np.int64) * 1_000_000_000 + _numbers(nanoseconds).astype(np.int64),
+        unset,
+    )
+
+
+def frames_of(rows: Array) -> Array | None:
+    """Return the frame ids as an Arrow array; None if the rows have no header with a frame."""
+    return _member(rows, "header", "frame_id")
+
+
+def header_numbers_of(rows: Array) -> NDArray[np.int64] | None:
+    """Return `header.seq` of ROS 1, shape (n,); None if the rows have none."""
+    numbers = _member(rows, "header", "seq")
+    return None if numbers is None else _numbers(numbers).astype(np.int64)
+
+
+def _member(rows: Array, *names: str) -> Array | None:
+    for name in names:
+        if not pt.is_struct(rows.type) or rows.type.get_field_index(name) < 0:
+            return None
+        rows = field_of(rows, name)
+    return rows
+
+
+def _numbers(array: Array) -> NDArray[Any]:
+    return np.asarray(array.fill_null(0) if array.null_count else array)
+
+
+@dataclass(slots=True)
+class LatencyRange:
+    """Log time minus header stamp; a stamp of zero is a violation without a value."""
+
+    min_ns: int | None
+    max_ns: int | None
+    count: int = 0
+    unset: int = 0
+    """Number of messages whose stamp is zero."""
+    lowest: Violation | None = None
+    highest: Violation | None = None
+    violations: Violations = field(default_factory=Violations)
+
+    def add(self, batch: Batch, stamps: NDArray[np.int64]) -> None:
+        """Add the stamps of a batch."""
+        if not len(stamps):
+            return
+        latency = batch.log_times - stamps
+        unset = stamps == 0
+        self.count += len(stamps)
+        excess = np.full(len(stamps), -np.inf)
+        if self.max_ns is not None:
+            excess = np.maximum(excess, latency - float(self.max_ns))
+        if self.min_ns is not None:
+            excess = np.maximum(excess, float(self.min_ns) - latency)
+        bad = excess > 0
+        if unset.any():
+            self.unset += int(unset.sum())
+            bad |= unset
+            excess = np.where(unset, 0.0, excess)
+            known = np.flatnonzero(~unset)
+        else:
+            known = None
+        self.violations.add(batch, Values(latency, unset if unset.any() else None, None), bad, excess)
+        self._note_extremes(batch, latency, known)
+
+    def _note_extremes(
+        self, batch: Batch, latency: NDArray[np.int64], known: NDArray[np.int64] | None
+    ) -> None:
+        if known is not None and not len(known):
+            return
+        candidates = latency if known is None else latency[known]
+        low, high = int(candidates.argmin()), int(candidates.argmax())
+        if known is not None:
+            low, high = int(known[low]), int(known[high])
+        if self.lowest is None or latency[low] < self.lowest.value:
+            self.lowest = batch.violation(low, latency[low])
+        if self.highest is None or latency[high] > self.highest.value:
+            self.highest = batch.violation(high, latency[high])
+
+
+@dataclass(slots=True)
+class Steps:
+    """The differences between consecutive header stamps: negative ones (`monotonic`) or zero (`unique`)."""
+
+    monotonic: bool
+    count: int = 0
+    violations: Violations = field(default_factory=Violations)
+    _previous: int | None = None
+
+    def add(self, batch: Batch, stamps: NDArray[np.int64]) -> None:
+        """Add the stamps of a batch."""
+        if not len(stamps):
+            return
+        self.count += len(stamps)
+        first = int(stamps[0]) if self._previous is None else self._previous
+        steps = np.diff(stamps, prepend=first)
+        bad = steps < 0 if self.monotonic else steps == 0
+        if self._previous is None:
+            bad[0] = False
+        self._previous = int(stamps[-1])
+        self.violations.add(batch, plain_values(steps), bad, -steps.astype(np.float64))
+
+
+@dataclass(slots=True)
+class MissingNumbers:
+    """The sequence numbers that no message has, between consecutive messages."""
+
+    count: int = 0
+    missing: int = 0
+    violations: Violations = field(default_factory=Violations)
+    is_zero: bool = True
+    """Whether every number is zero: the writer does not count."""
+    _previous: int | None = None
+
+    def add(self, batch: Batch, numbers: NDArray[np.int64]) -> None:
+        """Add the sequence numbers of a batch, which wrap around at 2^32."""
+        if not len(numbers):
+            return
+        self.count += len(numbers)
+        first = int(numbers[0]) - 1 if self._previous is None else self._previous
+        missing = missing_between(np.diff(numbers, prepend=first))
+        self._previous = int(numbers[-1])
+        self.is_zero = self.is_zero and not numbers.any()
+        self.missing += int(missing.sum())
+        self.violations.add(batch, plain_values(missing), missing > 0, missing.astype(np.float64))
+
+
+def missing_between(steps: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return how many sequence numbers each step skips; a step back is a restart, not a gap."""
+    wrapped = np.where(steps < -(1 << 31), steps + (1 << 32), steps)
+    return np.where(wrapped > 1, wrapped - 1, 0)
+
+
+@dataclass(slots=True)
+class AllowedTexts:
+    """Texts that must be in a set, such as frame ids."""
+
+    allowed: tuple[str, ...]
+    count: int = 0
+    seen: dict[str, None] = field(default_factory=dict[str, None])
+    """The first texts that are not allowed."""
+    violations: Violations = field(default_factory=Violations)
+
+    def add(self, batch: Batch, texts: Array) -> None:
+        """Add the texts of a batch; null counts as an empty text."""
+        if not len(texts):
+            return
+        self.count += len(texts)
+        if texts.null_count:
+            texts = texts.fill_null("")
+        allowed = pc.is_in(texts, value_set=arrays.array(self.allowed, texts.type))
+        if allowed.true_count == len(texts):
+            return
+        bad = ~np.asarray(allowed)
+        for text in pc.unique(texts.filter(arrays.array(bad))).slice(0, 5).to_pylist():
+            self.seen[text] = None
+        self.violations.add(batch, plain_values(texts.to_numpy(zero_copy_only=False)), bad)
+
+
+@dataclass(slots=True)
+class NumberLimits:
+    """Numbers between two bounds; NaN is outside of every range, and null inside."""
+
+    low: float = -np.inf
+    high: float = np.inf
+    count: int = 0
+    lowest: float | None = None
+    highest: float | None = None
+    violations: Violations = field(default_factory=Violations)
+
+    def add(self, batch: Batch, values: Values) -> None:
+        """Add the values of a batch."""
+        data = values.data
+        if not len(data):
+            return
+        self.count += len(data)
+        known = data if values.null is None else data[~values.null]
+        if not len(known):
+            return
+        low, high = known.min(), known.max()
+        if np.isnan(low):
+            finite = known[~np.isnan(known)]
+            if len(finite):
+                self._widen(finite.min(), finite.max())
+        else:
+            self._widen(low, high)
+            if low >= self.low and high <= self.high:
+                return
+        bad = ~((data >= self.low) & (data <= self.high))
+        if values.null is not None:
+            bad &= ~values.null
+        numbers = data.astype(np.float64)
+        self.violations.add(batch, values, bad, np.maximum(numbers - self.high, self.low - numbers))
+
+    def _widen(self, low: Any, high: Any) -> None:  # noqa: ANN401 - numpy scalars
+        low, high = low.item(), high.item()
+        self.lowest = low if self.lowest is None else min(self.lowest, low)
+        self.highest = high if self.highest is None else max(self.highest, high)
+
+
+@dataclass(slots=True)
+class FiniteNumbers:
+    """Numbers that are neither NaN nor infinite."""
+
+    count: int = 0
+    violations: Violations = field(default_factory=Violations)
+
+    def add(self, batch: Batch, values: Values) -> None:
+        """Add the values of a batch."""
+        self.count += len(values.data)
+        if not np.issubdtype(values.data.dtype, np.floating):
+            return
+        bad = ~np.isfinite(values.data)
+        if bad.any():
+            self.violations.add(batch, values, bad if values.null is None else bad & ~values.null)
+
+
+@dataclass(slots=True)
+class Nulls:
+    """The number of nulls among the values."""
+
+    limit: Limit
+    count: int = 0
+    violations: Violations = field(default_factory=Violations)
+
+    def add(self, batch: Batch, values: Values) -> None:
+        """Add the values of a batch."""
+        self.count += len(values.data)
+        if values.null is not None:
+            self.violations.add(batch, values, values.null)
+
+
+@dataclass(slots=True)
+class AllowedValues:
+    """Values that must be in a set; null is allowed."""
+
+    allowed: tuple[Any, ...]
+    count: int = 0
+    violations: Violations = field(default_factory=Violations)
+
+    def add(self, batch: Batch, values: Values) -> None:
+        """Add the values of a batch."""
+        data = values.data
+        if not len(data):
+            return
+        self.count += len(data)
+        good = data == self.allowed[0]
+        for value in self.allowed[1:]:
+            good = good | (data == value)
+        if not good.all():
+            bad = ~good
+            self.violations.add(batch, values, bad if values.null is None else bad & ~values.null)
+
+
+@dataclass(slots=True)
+class Moments:
+    """The mean and the standard deviation of the finite values."""
+
+    count: int = 0
+    mean: float = 0.0
+    _squares: float = 0.0
+    """Sum of the squared distances from the mean."""
+
+    @property
+    def std(self) -> float | None:
+        """The standard deviation of the population; None without values."""
+        return (self._squares / self.count) ** 0.5 if self.count else None
+
+    def add(self, batch: Batch, values: Values) -> None:  # noqa: ARG002 - the signature of all accumulators
+        """Add the values of a batch."""
+        data = values.data.astype(np.float64, copy=False)
+        selected = np.isfinite(data)
+        if values.null is not None:
+            selected &= ~values.null
+        if not selected.all():
+            data = data[selected]
+        if not len(data):
+            return
+        mean = float(data.mean())
+        squares = float(np.square(data - mean).sum())
+        total = self.count + len(data)
+        step = mean - self.mean
+        self._squares += squares + step * step * self.count * len(data) / total
+        self.mean += step * len(data) / total
+        self.count = total
+
+
+@dataclass(slots=True)
+class Changes:
+    """The absolute differences between the values of consecutive messages; one without a finite value has none."""
+
+    low: float = -np.inf
+    high: float = np.inf
+    count: int = 0
+    """Number of differences."""
+    lowest: float | None = None
+    highest: float | None = None
+    violations: Violations = field(default_factory=Violations)
+    _previous: float = np.nan
+
+    def add(self, batch: Batch, values: Values) -> None:
+        """Add the values of a batch, one per row."""
+        data = values.data.astype(np.float64)
+        if not len(data):
+            return
+        if values.null is not None:
+            data[values.null] = np.nan
+        with np.errstate(invalid="ignore"):
+            changes = np.abs(np.diff(data, prepend=self._previous))
+        self._previous = float(data[-1])
+        known = changes[np.isfinite(changes)]
+        if not len(known):
+            return
+        self.count += len(known)
+        low, high = float(known.min()), float(known.max())
+        self.lowest = low if self.lowest is None else min(self.lowest, low)
+        self.highest = high if self.highest is None else max(self.highest, high)
+        if low < self.low or high > self.high:
+            with np.errstate(invalid="ignore"):
+                bad = np.isfinite(changes) & ((changes < self.low) | (changes > self.high))
+                excess = np.maximum(changes - self.high, self.low - changes)
+            self.violations.add(batch, plain_values(changes), bad, excess)
+
+
+@dataclass(slots=True)
+class Unchanged:
+    """The runs of consecutive messages with the same value; NaN equals NaN, and null equals null."""
+
+    max_ns: int
+    count: int = 0
+    longest_ns: int = 0
+    violations: Violations = field(default_factory=Violations)
+    """One per run that is longer than the limit, at the message that ends it; the value is the length in ns."""
+    _start_ns: int = 0
+    _last: Violation | None = None
+    """The last message so far."""
+    _value: Any = None
+    _is_null: bool = False
+
+    def add(self, batch: Batch, values: Values) -> None:
+        """Add the values of a batch, one per row."""
+        data = values.data
+        if not len(data):
+            return
+        self.count += len(data)
+        null = np.zeros(len(data), bool) if values.null is None else values.null
+        changed = np.ones(len(data), bool)
+        changed[1:] = ~_same(data[1:], data[:-1], null[1:], null[:-1])
+        if self._last is not None:
+            previous = np.array([self._value], data.dtype)
+            changed[0] = not bool(_same(data[:1], previous, null[:1], np.array([self._is_null]))[0])
+        starts = np.flatnonzero(changed)
+        times, indexes = batch.log_times, batch.indexes
+        if self._last is not None and len(starts):
+            ends = starts - 1
+            begins = np.concatenate([[self._start_ns], times[starts[:-1]]])
+            last_times = np.where(ends < 0, self._last.log_time_ns, times[ends])
+            last_indexes = np.where(ends < 0, self._last.index, indexes[ends])
+            self._close(begins, last_times, last_indexes)
+        elif len(starts) > 1:
+            ends = starts[1:] - 1
+            self._close(times[starts[:-1]], times[ends], indexes[ends])
+        if len(starts):
+            self._start_ns = int(times[starts[-1]])
+        self._last = batch.violation(len(data) - 1, 0)
+        self._value, self._is_null = data[-1], bool(null[-1])
+
+    def finish(self) -> None:
+        """End the last run."""
+        if self._last is not None:
+            self._close(
+                np.array([self._start_ns]), np.array([self._last.log_time_ns]), np.array([self._last.index])
+            )
+            self._last = None
+
+    def _close(self, begins: NDArray[np.int64], ends: NDArray[np.int64], indexes: NDArray[np.int64]) -> None:
+        lengths = ends - begins
+        self.longest_ns = max(self.longest_ns, int(lengths.max()))
+        excess = lengths - float(self.max_ns)
+        self.violations.add(Batch(ends, indexes), plain_values(lengths), excess > 0, excess)
+
+
+def _same(left: NDArray[Any], right: NDArray[Any], null: Mask, other_null: Mask) -> Mask:
+    equal = np.asarray(left == right)
+    if np.issubdtype(left.dtype, np.floating):
+        equal = equal | (np.isnan(left) & np.isnan(right))
+    return (equal & ~null & ~other_null) | (null & other_null)
+
+
+Accumulator: TypeAlias = (
+    "NumberLimits | FiniteNumbers | Nulls | AllowedValues | Moments | Changes | Unchanged"
+)

@@ -1,0 +1,123 @@
+"""The data contract of a run: it observes the messages while they are ingested, and decides about the commit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from mosaico_ingest.contracts.order import FileOrder
+from mosaico_ingest.contracts.recording_monitor import RecordingMonitor, summary
+from mosaico_ingest.destinations.base import AmendableSession, Session
+from mosaico_ingest.destinations.registry import destination_of
+from mosaico_ingest.errors import ContractError
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.job.values import PROVENANCE_KEY, OnFailure
+from mosaico_ingest.pipeline.plan import Plan
+from mosaico_ingest.pipeline.provenance import SequenceRequest
+from mosaico_ingest.pipeline.topic import TopicPipeline
+from mosaico_ingest.report.contract import ContractResult
+from mosaico_ingest.report.events import ContractEvaluated, Noted, Observer
+from mosaico_ingest.rosbag.blocks import MessageBlock
+from mosaico_ingest.rosbag.recording import Recording
+
+DIVERTED = "{name}__failed"
+"""The name of a diverted sequence."""
+_KEY = "contract"
+"""The key of the results in the provenance of a sequence."""
+
+
+class ContractRun(Struct, frozen=True):
+    """The contract of one run."""
+
+    plan: Plan
+    monitor: RecordingMonitor
+    topics: tuple[TopicPipeline, ...]
+
+    @classmethod
+    def start(cls, plan: Plan, recording: Recording, topics: Sequence[TopicPipeline]) -> ContractRun | None:
+        """Attach the monitors of a contract to the topics; return None without a contract."""
+        monitor = monitor_of(plan, recording)
+        if monitor is None:
+            return None
+        for topic in topics:
+            for connection in topic.plan.connections:
+                observer = monitor.observer(connection)
+                if observer is not None:
+                    topic.observers[connection] = observer
+        return cls(plan, monitor, tuple(topics))
+
+    @property
+    def order(self) -> FileOrder | None:
+        """The observer of the order in the files, if an expectation needs it."""
+        return self.monitor.order
+
+    def observe_order(self, split: int, connection: int, block: MessageBlock) -> None:
+        """Observe messages in the order of the files."""
+        if self.monitor.order is not None:
+            self.monitor.order.add(split, connection, block)
+
+    def conclude(self, request: SequenceRequest, session: Session, observe: Observer) -> None:
+        """Evaluate the contract, report the results, and add them to the metadata of the sequence.
+
+        Raises:
+            ContractError: The contract is violated, and nothing may be committed.
+        """
+        for topic in self.topics:
+            self.monitor.reject(topic.plan.topic, topic.read - topic.rows - topic.downsampled)
+        result = self.monitor.finish()
+        action = self.monitor.on_failure
+        diverts = action is OnFailure.DIVERT and not result.passed
+        can_amend = destination_of(self.plan.destination).can_amend
+        if diverts and can_amend:
+            result = result.replace(stored_as=DIVERTED.format(name=request.name))
+        observe(ContractEvaluated(result))
+        _report(result, observe, as_warnings=action is not OnFailure.FAIL)
+        if not result.passed and (action is OnFailure.FAIL or (diverts and not can_amend)):
+            raise contract_error(result)
+        if can_amend:
+            record: dict[str, Any] = {**request.metadata[PROVENANCE_KEY], _KEY: summary(result)}
+            metadata = {**request.metadata, PROVENANCE_KEY: record}
+            cast("AmendableSession", session).amend(metadata, sequence=result.stored_as)
+
+
+def monitor_of(plan: Plan, recording: Recording) -> RecordingMonitor | None:
+    """Return the monitor of a plan's contract, or None without a contract."""
+    if plan.contract is None:
+        return None
+    return RecordingMonitor(
+        plan.contract,
+        recording,
+        [topic.as_read for topic in plan.topics],
+        excluded={topic.topic: topic.why for topic in plan.excluded},
+        start_ns=plan.read_from_ns,
+        end_ns=plan.read_until_ns,
+    )
+
+
+def contract_error(result: ContractResult) -> ContractError:
+    """Return the error for a violated contract."""
+    findings = tuple(finding for one in result.errors if (finding := one.finding) is not None)
+    first = findings[0]
+    count = len(findings)
+    text = first.message if count == 1 else f"{count} expectations failed; the first: {first.message}"
+    return ContractError(
+        text,
+        where=None if first.span is None else str(first.span),
+        hint="nothing was written; set expect.on_failure to warn or divert to keep such a recording",
+        findings=findings,
+    )
+
+
+def _report(result: ContractResult, observe: Observer, *, as_warnings: bool) -> None:
+    """Report failed expectations, and those whose violations are explained."""
+    errors = set() if as_warnings else set(result.errors)
+    for one in result.results:
+        finding = one.finding
+        if finding is None or one in errors or finding.rule == "expectation-skipped":
+            continue
+        if finding.severity is Severity.ERROR:
+            finding = replace(finding, severity=Severity.WARNING)
+        observe(Noted(finding))
