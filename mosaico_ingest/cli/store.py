@@ -12,6 +12,7 @@ from mosaico_ingest.cli.console import PlainTable, Terminal, print_json, print_l
 from mosaico_ingest.cli.options import DEFAULT_STORE, JsonOption, StoreOption
 from mosaico_ingest.cli.store_pictures import image, plot
 from mosaico_ingest.cli.store_rows import describe, head, sample, tail
+from mosaico_ingest.cli.store_sql import sql
 from mosaico_ingest.job.values import PROVENANCE_KEY
 from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text, time_text
 
@@ -170,7 +171,7 @@ def show(
         print_topic(topic_info, first_rows)
 
 
-for command in (head, tail, sample, describe, plot, image):
+for command in (head, tail, sample, describe, plot, image, sql):
     store_app.command()(command)
 
 
