@@ -131,6 +131,7 @@ def quick_config(
     topic_metadata: str | None = None,
     api_key: str | None = None,
     host: str | None = None,
+    if_exists: IfExists = IfExists.FAIL,
     **options: Any,  # noqa: ANN401 - the rest of the configuration's fields
 ) -> ROSInjectionConfig:
     """Return the configuration of `ingest bag`; `sequence_name` defaults to the name of the file without suffix.
@@ -152,6 +153,7 @@ def quick_config(
         host=host,
         # The key may come from the environment, where it does not select a server.
         mosaico_api_key=api_key if host else None,
+        manifest=None if if_exists is IfExists.FAIL else {"sequence": {"if_exists": if_exists}},
         **options,
     )
 

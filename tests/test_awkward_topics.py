@@ -95,7 +95,12 @@ def test_topics_with_equal_names_in_the_sequence_are_both_stored_with_a_finding(
 ) -> None:
     number = define("std_msgs/msg/Int32", "int32 data\n")
     recording = record(tmp_path / "two.mcap", [(topic, number, 5, {"data": 1}) for topic in topics])
-    config = ROSInjectionConfig(recording, "two", rename=rename, store=tmp_path / "store")
+    config = ROSInjectionConfig(
+        recording,
+        "two",
+        store=tmp_path / "store",
+        manifest={"topic_settings": {topic: {"rename": name} for topic, name in rename.items()}},
+    )
     report = RosbagInjector(config).run()
     assert report.totals.written == 2
     first, second = (topic.target for topic in report.topics)

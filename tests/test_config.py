@@ -98,8 +98,8 @@ def test_config_words_are_converted_to_enumerations() -> None:
         ros_distro="ros2_humble",
         on_error="delete",
         topics_on_error="ignore",
-        messages_on_error="raise",
         topics="/imu",
+        manifest={"on_error": {"message": "raise"}},
     )
     assert made.bag.ros_distro is Stores.ROS2_HUMBLE
     assert made.on_error == ErrorPolicy(
@@ -123,8 +123,8 @@ def test_config_destination_is_default_store_store_or_server() -> None:
     server = job(host="h", port=1, mosaico_api_key="k", tls_cert_path="c.pem").destination
     assert server == ServerTarget("h", 1, "k", Path("c.pem"), tls=True)
     assert "api_key" not in repr(server)
-    plugin = PluginTarget("lake", {"bucket": "b"})
-    assert job(plugin=plugin).destination == plugin
+    plugin = {"target": {"type": "lake", "options": {"bucket": "b"}}}
+    assert job(manifest=plugin).destination == PluginTarget("lake", {"bucket": "b"})
 
 
 def test_config_update_if_exists_is_append() -> None:
@@ -140,7 +140,12 @@ def test_error_policy_for_topic_prefers_exact_name_then_glob_then_default() -> N
 
 
 def test_job_settings_of_topic_take_each_setting_from_first_glob_that_defines_it() -> None:
-    made = job(every={"/cam/*": 3}, images={"*": "png", "/cam/left": "raw"}, rename={"/cam/left": "/left"})
+    settings = {
+        "/cam/*": {"every": 3},
+        "*": {"image": "png"},
+        "/cam/left": {"image": "raw", "rename": "/left"},
+    }
+    made = job(manifest={"topic_settings": settings})
     left, right = made.settings_of("/cam/left"), made.settings_of("/cam/right")
     assert (left.every, left.image, left.rename) == (3, "raw", "/left")
     assert (right.every, right.image, right.rename) == (3, "png", None)
@@ -161,22 +166,27 @@ def test_config_repr_hides_api_key() -> None:
         ({"topics_on_error": {"/a": "no"}}, "topics_on_error\\['/a'\\] is 'no'"),
         ({"log_level": "LOUD"}, "log_level is 'LOUD'"),
         ({"store": "s", "host": "h"}, "store and host are two destinations"),
-        ({"store": "s", "plugin": PluginTarget("lake")}, "store and type are two destinations"),
+        ({"store": "s", "manifest": {"target": {"type": "lake"}}}, "store and type are two destinations"),
         ({"port": 0}, "port is 0"),
         ({"mosaico_api_key": "k"}, "requires host"),
-        ({"update_if_exists": True, "if_exists": "replace"}, "if_exists is 'replace'"),
-        ({"every": {"/a": 0}}, "every\\['/a'\\] is 0"),
-        ({"every": {"/a": 10**30}}, "every\\['/a'\\] is 1000"),
-        ({"images": {"/a": "jpg"}}, "images\\['/a'\\] is 'jpg'"),
-        ({"jobs": 0}, "jobs is 0"),
+        (
+            {"update_if_exists": True, "manifest": {"sequence": {"if_exists": "replace"}}},
+            "sets sequence.if_exists to 'append', and `manifest` to 'replace'",
+        ),
+        ({"manifest": {"bag": {"path": "b.bag"}}}, "sets bag.path to 'a.bag', and `manifest` to 'b.bag'"),
+        ({"manifest": {"topic_settings": {"/a": {"every": 0}}}}, r"\['/a'\]\['every'\] is 0"),
+        ({"manifest": {"topic_settings": {"/a": {"every": 10**30}}}}, r"\['/a'\]\['every'\] is 1000"),
+        ({"manifest": {"topic_settings": {"/a": {"image": "jpg"}}}}, r"\['/a'\]\['image'\] is 'jpg'"),
+        ({"manifest": {"run": {"jobs": 0}}}, r"manifest\['run'\]\['jobs'\] is 0"),
+        ({"manifest": {"nonsense": 0}}, r"manifest\['nonsense'\] is 0"),
         ({"sequence_name": "a b"}, "sequence name 'a b'"),
         ({"metadata": {"a.b": 1}}, "metadata key 'a.b'"),
         ({"metadata": {"mosaico_ingest": 1}}, "the metadata key 'mosaico_ingest'"),
         ({"metadata": [1]}, "metadata is \\[1\\]"),
         ({"custom_msgs": [("pkg", "dir")]}, "custom_msgs has \\('pkg', 'dir'\\)"),
         ({"topic_metadata": {"/a": {"x/y": 1}}}, "metadata key 'x/y'"),
-        ({"rename": {"/a": "/b c"}}, "topic name '/b c'"),
-        ({"rename": {"/a/*": "/b"}}, "'/a/\\*'.*'/b'"),
+        ({"manifest": {"topic_settings": {"/a": {"rename": "/b c"}}}}, "topic name '/b c'"),
+        ({"manifest": {"topic_settings": {"/a/*": {"rename": "/b"}}}}, r"'/a/\*'.*'/b'"),
     ],
 )
 def test_config_invalid_value_is_refused_with_name_and_value(fields: dict[str, Any], message: str) -> None:

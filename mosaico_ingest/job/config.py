@@ -12,18 +12,13 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from mosaico_ingest.errors import ManifestError
-from mosaico_ingest.job.model import AdapterReference, Job, Origin, QuarantineSettings, TimeRange
+from mosaico_ingest.job.model import AdapterReference, Job
 from mosaico_ingest.job.values import (
-    DEFAULT_MESSAGE_BYTES,
     DEFAULT_PORT,
     IfExists,
-    LoaderErrorPolicy,
-    OnSchemaChange,
-    PluginTarget,
     SessionLevelErrorPolicy,
     Stores,
     TopicLevelErrorPolicy,
-    Unmodeled,
 )
 from mosaico_ingest.remote import AnyPath, RemotePath, as_path
 
@@ -40,8 +35,8 @@ def _key(path: str) -> dict[str, tuple[str, ...]]:
 class ROSInjectionConfig:
     """The configuration for ingesting one recording; `job` is the form that the pipeline uses.
 
-    Without `store` and `host`, the destination is the embedded store `./mosaico`. None stands for the default of any
-    argument.
+    The arguments are those of the official bridge, with `store` and `manifest` in addition. Without `store` and `host`, the
+    destination is the embedded store `./mosaico`. None stands for the default of any argument.
 
     Raises:
         ManifestError: A value is invalid, two values contradict each other, or the platform refuses a name or the metadata.
@@ -85,7 +80,7 @@ class ROSInjectionConfig:
     )
     """Metadata by topic name or glob."""
     update_if_exists: bool = False
-    """True is equivalent to `if_exists=IfExists.APPEND`."""
+    """True is equivalent to `if_exists: append` in a manifest."""
     serialization_formats: Mapping[str, str] | None = field(
         default=None, metadata=_key("adapters.serialization_formats")
     )
@@ -96,43 +91,8 @@ class ROSInjectionConfig:
     """The `ROSTypeRegistry` for definitions; defaults to the process-wide one."""
     store: AnyPath | str | None = field(default=None, metadata=_key("target.store"))
     """The directory of the embedded store, or a URL such as `s3://bucket/prefix`."""
-    if_exists: IfExists | str = field(default=IfExists.FAIL, metadata=_key("sequence.if_exists"))
-    messages_on_error: LoaderErrorPolicy | str = field(
-        default=LoaderErrorPolicy.LOG_WARN, metadata=_key("on_error.message")
-    )
-    adapters: Sequence[AdapterReference] | None = field(default=None, metadata=_key("adapters.load"))
-    """Adapters for every topic of their types; they take precedence over the built-in ones."""
-    unmodeled: Unmodeled | str = field(default=Unmodeled.KEEP, metadata=_key("adapters.unmodeled"))
-    base_dir: Path = Path()
-    """The folder where the relative paths of adapters start."""
-    time_range: TimeRange | None = field(default=None, metadata=_key("bag.time"))
-    images: Mapping[str, str] | None = field(default=None, metadata=_key("topic_settings.*.image"))
-    """Encoding of raw images (raw or png) by topic name or glob."""
-    rename: Mapping[str, str] | None = field(default=None, metadata=_key("topic_settings.*.rename"))
-    """Name in the sequence by topic name."""
-    every: Mapping[str, int] | None = field(default=None, metadata=_key("topic_settings.*.every"))
-    """Keep the first of each `every` messages, by topic name or glob."""
-    report_path: Path | str | None = field(default=None, metadata=_key("run.report"))
-    memory_bytes: int | None = field(default=None, metadata=_key("run.memory"))
-    """Maximum memory of batches, in bytes."""
-    jobs: int = field(default=1, metadata=_key("run.jobs"))
-    """Maximum number of recordings to ingest at the same time."""
-    quarantine: QuarantineSettings | None = field(default=None, metadata=_key("quarantine"))
-    """The quarantine of rejected messages; without a quarantine, they are only counted."""
-    expect: Mapping[str, Any] | None = field(default=None, metadata=_key("expect"))
-    """The data contract, in the structure of the section `expect` of manifests."""
-    family: str | None = field(default=None, metadata=_key("sequence.family"))
-    """The name that sequences with the same message definitions share; defaults to `sequence_name`."""
-    on_schema_change: OnSchemaChange | str | None = field(default=None, metadata=_key("on_schema_change"))
-    """Action if a topic's definition differs from that of the family; if omitted, definitions are not compared."""
-    message_bytes: int = field(default=DEFAULT_MESSAGE_BYTES, metadata=_key("target.message_size"))
-    """Maximum size, in bytes, up to which rows are combined into one upload message to a server."""
-    metadata_from: Mapping[str, Any] | None = field(default=None, metadata=_key("sequence.metadata_from"))
-    """Sources of metadata that the recording fills, with the keys of `sequence.metadata_from`."""
-    metadata_schema: Path | str | None = field(default=None, metadata=_key("sequence.metadata_schema"))
-    """The JSON Schema of the metadata."""
-    plugin: PluginTarget | None = None
-    """A destination that an installed package provides, instead of `store` and `host`."""
+    manifest: Mapping[str, Any] | None = None
+    """Further settings, with the keys of a manifest: `{"sequence": {"if_exists": "skip"}, "run": {"jobs": 4}}`."""
     job: Job = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -142,42 +102,33 @@ class ROSInjectionConfig:
         splits = (as_path(paths),) if one else tuple(map(as_path, paths))
         if not splits:
             raise ManifestError("file_path is empty", hint="name a recording")
-        document = self._document()
-        document["bag"]["path"] = str(splits[0]) if one else tuple(map(str, splits))
+        document = self._document(str(splits[0]) if one else tuple(map(str, splits)))
         try:
-            job = Job.model_validate(
-                {
-                    **document,
-                    "paths": splits,
-                    "origin": Origin(folder=self.base_dir),
-                    "registry": self.registry,
-                }
-            )
+            job = Job.model_validate({**document, "paths": splits, "registry": self.registry})
         except ValidationError as error:
             raise self._refusal(error.errors(include_url=False)[0]) from error
         object.__setattr__(self, "job", job.check())  # frozen after its construction
 
-    def _document(self) -> dict[str, Any]:
-        """Return the arguments in the structure of a manifest."""
-        document: dict[str, Any] = {"bag": {}}
+    def _document(self, path: str | tuple[str, ...]) -> dict[str, Any]:
+        """Return the arguments in the structure of a manifest; `path` is that of the recording."""
+        document: dict[str, Any] = {"bag": {"path": path}}
         for argument in fields(self):
-            path, value = argument.metadata.get(_KEY), getattr(self, argument.name, None)
-            if path is None or value is None or value == argument.default:
+            key_path, value = argument.metadata.get(_KEY), getattr(self, argument.name, None)
+            if key_path is None or value is None or value == argument.default:
                 continue
-            if _TOPIC in path:
+            if _TOPIC in key_path:
                 if not isinstance(value, Mapping):
                     raise ManifestError(f"{argument.name} is {value!r:.80}", hint="give a mapping")
                 for topic, setting in value.items():
-                    _put(document, tuple(topic if part == _TOPIC else part for part in path), setting)
+                    _put(document, tuple(topic if part == _TOPIC else part for part in key_path), setting)
             else:
-                _put(document, path, self._plain(argument.name, value))
-        if self.plugin is not None:
-            _put(document, ("target", "type"), self.plugin.kind)
-            _put(document, ("target", "options"), dict(self.plugin.options))
+                _put(document, key_path, self._plain(argument.name, value))
         if self.adapter_overrides:
             _put(document, ("adapters", "override"), self._overrides())
         if self.update_if_exists:
-            _put(document, ("sequence", "if_exists"), self._append())
+            _put(document, ("sequence", "if_exists"), IfExists.APPEND.value)
+        if self.manifest is not None:
+            _merge(document, self.manifest)
         return document
 
     def _plain(self, name: str, value: Any) -> Any:  # noqa: ANN401 - any argument
@@ -186,11 +137,7 @@ class ROSInjectionConfig:
             return tuple(map(_custom_messages, value))
         if name == "topics" and isinstance(value, str):
             return (value,)
-        if isinstance(value, Path):
-            return str(value)
-        if isinstance(value, RemotePath):
-            return value.url
-        return _enumerated(value)
+        return _plain(value)
 
     def _overrides(self) -> dict[str, AdapterReference]:
         overrides = {**(self.adapter_override or {})}
@@ -200,14 +147,6 @@ class ROSInjectionConfig:
                     f"adapter_override and adapter_overrides differ for {topic!r}", hint="keep one of the two"
                 )
         return overrides
-
-    def _append(self) -> IfExists:
-        if self.if_exists not in {IfExists.FAIL, IfExists.APPEND}:
-            raise ManifestError(
-                f"update_if_exists is True and if_exists is {_enumerated(self.if_exists)!r}",
-                hint="keep one of the two",
-            )
-        return IfExists.APPEND
 
     def _refusal(self, error: ErrorDetails) -> ManifestError:
         """Return an error that names the argument that the model refuses."""
@@ -229,7 +168,8 @@ class ROSInjectionConfig:
                 ]
                 name = argument.name + "".join(f"[{key!r}]" for key in inner)
                 return ManifestError(f"{name} is {error['input']!r:.80}", hint=hint)
-        return ManifestError(error["msg"], hint="see the documentation of ROSInjectionConfig")
+        name = "manifest" + "".join(f"[{key!r}]" for key in location)
+        return ManifestError(f"{name} is {error['input']!r:.80}", hint=hint)
 
 
 def _put(document: dict[str, Any], path: tuple[str, ...], value: object) -> None:
@@ -238,12 +178,34 @@ def _put(document: dict[str, Any], path: tuple[str, ...], value: object) -> None
     document[path[-1]] = value
 
 
-def _enumerated(value: Any) -> Any:  # noqa: ANN401 - any argument
-    """Return the value of an enumeration's member, because rosbags and the SDK have their own enumerations."""
+def _merge(document: dict[str, Any], settings: Mapping[str, Any], path: tuple[str, ...] = ()) -> None:
+    """Add settings to a document.
+
+    Raises:
+        ManifestError: The document has another value for one of the settings.
+    """
+    for key, setting in settings.items():
+        value = _plain(setting)
+        if isinstance(value, Mapping) and isinstance(document.get(key), dict):
+            _merge(document[key], value, (*path, key))
+        elif document.setdefault(key, value) != value:
+            name = ".".join((*path, key))
+            raise ManifestError(
+                f"an argument sets {name} to {document[key]!r:.80}, and `manifest` to {value!r:.80}",
+                hint="keep one of the two",
+            )
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401 - any argument
+    """Return a value as a manifest has it; members of enumerations by value, because the SDK and rosbags have their own."""
     if isinstance(value, Enum):
         return value.value
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, RemotePath):
+        return value.url
     if isinstance(value, Mapping):
-        return {key: _enumerated(inner) for key, inner in value.items()}
+        return {key: _plain(inner) for key, inner in value.items()}
     return value
 
 
@@ -251,7 +213,7 @@ def _custom_messages(entry: tuple[str, Path | str, Stores | str | None]) -> dict
     if len(entry) != 3:  # noqa: PLR2004 - as the hint says
         raise ManifestError(f"custom_msgs has {entry!r}", hint="give package, path, and a distro or None")
     package, path, store = entry
-    return {"package": package, "path": str(path), "store": _enumerated(store)}
+    return {"package": package, "path": str(path), "store": _plain(store)}
 
 
 def _keys_of(value: object) -> tuple[object, ...]:

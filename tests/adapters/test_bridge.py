@@ -244,8 +244,7 @@ def test_bridge_for_config_applies_settings(tmp_path: Path) -> None:
         file_path=tmp_path / "x.bag",
         sequence_name="s",
         adapter_override={"/imu": MyImuAdapter},
-        adapters=["ticks.yaml"],
-        base_dir=tmp_path,
+        manifest={"adapters": {"load": [tmp_path / "ticks.yaml"]}},
     )
     bridge = ROSBridge.for_job(config.job)
     assert bridge.resolve("/imu", IMU).reason == "override"

@@ -246,7 +246,12 @@ def test_executor_retry_after_commit_stores_the_sequence_once(
     policies = ["append", "fail", "replace", "skip"]
     list(InProcess().map(tasks(tmp_path, ["append"]), ignore_batch))
     jobs = [
-        tasks(tmp_path, [policy], adapter_override={"/imu": KillerAfterCommit}, if_exists=policy)[0]
+        tasks(
+            tmp_path,
+            [policy],
+            adapter_override={"/imu": KillerAfterCommit},
+            manifest={"sequence": {"if_exists": policy}},
+        )[0]
         for policy in policies
     ]
     reports = list(elsewhere.map(jobs, ignore_batch))
@@ -289,7 +294,7 @@ def test_executor_interrupt_applies_the_session_policy_in_every_process(tmp_path
 
 def test_executor_divides_memory_among_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[int | None] = []
-    jobs = tasks(tmp_path, "abcd", memory_bytes=400 << 20)
+    jobs = tasks(tmp_path, "abcd", manifest={"run": {"memory": 400 << 20}})
     monkeypatch.setattr(
         "mosaico_ingest.executors.processes._Pool.reports",
         lambda self, _: iter(seen.extend(job.job.run.memory for job in self.batch.tasks) or ()),

@@ -80,7 +80,7 @@ def report_of(recording: Path, store: Path) -> Report:
         sequence_name="survey",
         store=store,
         topics_on_error=TopicLevelErrorPolicy.Ignore,
-        messages_on_error=LoaderErrorPolicy.IGNORE,
+        manifest={"on_error": {"message": LoaderErrorPolicy.IGNORE}},
     )
     return run([config]).recordings[0]
 

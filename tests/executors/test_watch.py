@@ -131,7 +131,11 @@ def test_is_unfinished_is_true_until_the_last_byte(name: str, tmp_path: Path) ->
 def test_run_of_recording_that_has_grown_replaces_sequence(tmp_path: Path) -> None:
     file, rest = unfinished_mcap(tmp_path)
     job = ROSInjectionConfig(
-        file, "a", store=tmp_path / "store", if_exists=IfExists.SKIP, topics=("/imu",)
+        file,
+        "a",
+        store=tmp_path / "store",
+        topics=("/imu",),
+        manifest={"sequence": {"if_exists": IfExists.SKIP}},
     ).job
     assert run_recording(Task(job)).report.status is RunStatus.WITH_ERRORS
     assert run_recording(Task(job)).report.status is RunStatus.SKIPPED

@@ -139,7 +139,7 @@ def test_export_type_that_the_container_cannot_describe_is_skipped(ingested: Ing
 
 
 def test_export_images_stored_as_png_have_the_original_pixels(ingested: Ingest, tmp_path: Path) -> None:
-    store = ingested(DRIVE, images={"/camera/image_raw": "png"})
+    store = ingested(DRIVE, manifest={"topic_settings": {"/camera/image_raw": {"image": "png"}}})
     out = tmp_path / "out.mcap"
     assert export_sequence(store, "s", out, topics=["/camera/image_raw"]).faithful
     assert set(differences(DRIVE, out).pop("/imu")) == {"(count)"}
@@ -181,7 +181,7 @@ def test_export_replaces_existing_file_only_with_force(ingested: Ingest, tmp_pat
 
 def test_export_inverts_own_adapter_if_named(ingested: Ingest, tmp_path: Path) -> None:
     own = DRIVE.parent / "adapters" / "battery_pack.yaml"
-    store, out = ingested(DRIVE, adapters=(str(own),)), tmp_path / "out.mcap"
+    store, out = ingested(DRIVE, manifest={"adapters": {"load": [own]}}), tmp_path / "out.mcap"
     with pytest.raises(NothingMatched, match="--adapter"):
         export_sequence(store, "s", out, topics=["/battery"])
     assert export_sequence(store, "s", out, topics=["/battery"], adapters=[str(own)]).faithful
@@ -196,7 +196,7 @@ def test_export_names_columns_that_cannot_be_inverted(ingested: Ingest, tmp_path
     )
     two = define("acme_msgs/msg/Two", "float64 a\nfloat64 b\n")
     source = record(tmp_path / "in.mcap", [("/t", two, 1, {"a": 1.0, "b": 2.0})])
-    store = ingested(source, adapters=(str(adapter),))
+    store = ingested(source, manifest={"adapters": {"load": [adapter]}})
     (topic,) = export_sequence(store, "s", tmp_path / "out.mcap", adapters=[str(adapter)]).topics
     assert topic.not_invertible == {"sum": "a + b"}
     assert topic.defaulted == ("b",)

@@ -169,7 +169,9 @@ def test_expect_mistake_is_reported_at_its_location(
 
 def test_config_expect_is_validated_as_section() -> None:
     config = ROSInjectionConfig(
-        file_path="a.mcap", sequence_name="a", expect={"topics": {"/imu": {"gap": {"max": "50 ms"}}}}
+        file_path="a.mcap",
+        sequence_name="a",
+        manifest={"expect": {"topics": {"/imu": {"gap": {"max": "50 ms"}}}}},
     )
     assert config.job.expect is not None
     assert config.job.expect.entry_of("/imu", "gap") == "/imu"

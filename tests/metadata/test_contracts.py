@@ -300,8 +300,12 @@ def test_configuration_accepts_metadata_schema_and_sources(tmp_path: Path) -> No
     config = ROSInjectionConfig(
         file_path=recording,
         sequence_name="s",
-        metadata_from={"file_name": "{vehicle}_{run:int}.mcap"},
-        metadata_schema=tmp_path / "vehicle.schema.json",
+        manifest={
+            "sequence": {
+                "metadata_from": {"file_name": "{vehicle}_{run:int}.mcap"},
+                "metadata_schema": tmp_path / "vehicle.schema.json",
+            }
+        },
     )
     with pytest.raises(ContractError) as error:
         api.RosbagInjector(config).plan()
@@ -310,4 +314,4 @@ def test_configuration_accepts_metadata_schema_and_sources(tmp_path: Path) -> No
 
 def test_configuration_with_invalid_pattern_names_the_argument(tmp_path: Path) -> None:
     with pytest.raises(ManifestError, match="metadata_from"):
-        ROSInjectionConfig(file_path=tmp_path, sequence_name="s", metadata_from={"file_name": "{a:itn}"})
+        ROSInjectionConfig(tmp_path, "s", manifest={"sequence": {"metadata_from": {"file_name": "{a:itn}"}}})

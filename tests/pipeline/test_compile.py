@@ -88,34 +88,34 @@ run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
         mosaico_api_key="k",
         tls_cert_path=folder / "ca.pem",
         enable_tls=True,
-        message_bytes=4_000_000,
         ros_distro=Stores.ROS2_HUMBLE,
         custom_msgs=(("p", folder / "msgs", Stores.ROS1_NOETIC),),
-        time_range=TimeRange(start=TimeBound(10**10, relative=True), end=TimeBound(1772366400 * 10**9)),
-        if_exists=IfExists.APPEND,
         topics=("/cam*",),
         topic_metadata={"/imu": {"mount": "roof"}},
-        rename={"/imu": "/sensors/imu"},
-        every={"/camera/*": 3},
-        images={"/camera/*": "png"},
-        adapters=("a.yaml",),
         adapter_override={"/lidar": "LidarAdapter"},
-        base_dir=folder,
         serialization_formats={"p/msg/Scan": "ragged"},
-        unmodeled=Unmodeled.SKIP,
         on_error=SessionLevelErrorPolicy.Delete,
         topics_on_error={"default": TopicLevelErrorPolicy.Finalize, "/gps": TopicLevelErrorPolicy.Ignore},
-        messages_on_error=LoaderErrorPolicy.RAISE,
-        family="f",
-        on_schema_change=OnSchemaChange.NEW_TOPIC,
-        expect={"required": ["/imu"]},
-        quarantine=QuarantineSettings(
-            path=str(folder / "q"), max=Limit(share=0.001), max_run=Limit(100), systematic=7
-        ),
         log_level="DEBUG",
-        report_path=folder / "r.json",
-        memory_bytes=2**20,
-        jobs=2,
+        manifest={
+            "bag": {
+                "time": TimeRange(start=TimeBound(10**10, relative=True), end=TimeBound(1772366400 * 10**9))
+            },
+            "sequence": {"family": "f", "if_exists": IfExists.APPEND},
+            "topic_settings": {
+                "/imu": {"rename": "/sensors/imu"},
+                "/camera/*": {"every": 3, "image": "png"},
+            },
+            "adapters": {"load": ["a.yaml"], "unmodeled": Unmodeled.SKIP},
+            "on_error": {"message": LoaderErrorPolicy.RAISE},
+            "on_schema_change": OnSchemaChange.NEW_TOPIC,
+            "expect": {"required": ["/imu"]},
+            "quarantine": QuarantineSettings(
+                path=str(folder / "q"), max=Limit(share=0.001), max_run=Limit(100), systematic=7
+            ),
+            "target": {"message_size": 4_000_000},
+            "run": {"report": folder / "r.json", "memory": 2**20, "jobs": 2},
+        },
     ).job
     bag = expected.bag.replace(path=("data/run_a.bag", "data/run 1.2.mcap"))
     lock = LockFile(str(folder / "job.lock.json"), "{}")

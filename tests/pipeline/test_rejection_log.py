@@ -57,7 +57,7 @@ def test_injector_log_warn_logs_undecodable_messages(
 def test_injector_ignore_logs_nothing(
     recording: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    run(recording, tmp_path, messages_on_error=LoaderErrorPolicy.IGNORE)
+    run(recording, tmp_path, manifest={"on_error": {"message": LoaderErrorPolicy.IGNORE}})
     assert caplog.records == []
 
 

@@ -74,12 +74,12 @@ def test_sample_includes_topic_that_starts_late(tmp_path: Path) -> None:
 def test_sample_respects_time_range(tmp_path: Path) -> None:
     path = recording(tmp_path, {"/a": [FLOAT[:-1]] * 5 + [FLOAT] * 5})
     window = TimeRange(start=TimeBound(5 * 10**9, relative=True))
-    assert sample(planned(path, time_range=window), "/a").rejected == 0
+    assert sample(planned(path, manifest={"bag": {"time": window}}), "/a").rejected == 0
 
 
 def test_sample_ignores_error_policies(tmp_path: Path) -> None:
     path = recording(tmp_path, {"/a": [FLOAT[:-1]] * 3})
-    plan = planned(path, messages_on_error="raise", on_error="delete")
+    plan = planned(path, on_error="delete", manifest={"on_error": {"message": "raise"}})
     assert sample(plan, "/a").rejected == 3
     assert plan.plan["on_error"]["message"] == "raise"
 
@@ -89,15 +89,18 @@ def test_estimated_bytes_depend_on_selected_rows(tmp_path: Path) -> None:
     whole = planned(path).destination.estimated_bytes
     assert whole is not None
     assert whole >= 100 * 16
-    assert planned(path, every={"/a": 10}).destination.estimated_bytes == whole // 10
+    assert (
+        planned(path, manifest={"topic_settings": {"/a": {"every": 10}}}).destination.estimated_bytes
+        == whole // 10
+    )
     half = TimeRange(start=TimeBound(int(49.5e9), relative=True))
-    assert planned(path, time_range=half).destination.estimated_bytes == whole // 2
+    assert planned(path, manifest={"bag": {"time": half}}).destination.estimated_bytes == whole // 2
 
 
 def test_plan_digest_depends_only_on_decisions(tmp_path: Path) -> None:
     path = recording(tmp_path, {"/a": [FLOAT] * 3})
     plan = planned(path)
     assert planned(path).digest == plan.digest
-    assert planned(path, memory_bytes=1 << 28).digest == plan.digest
-    assert planned(path, if_exists="replace").digest != plan.digest
+    assert planned(path, manifest={"run": {"memory": 1 << 28}}).digest == plan.digest
+    assert planned(path, manifest={"sequence": {"if_exists": "replace"}}).digest != plan.digest
     assert json.loads(plan.model_dump_json())["digest"] == plan.digest

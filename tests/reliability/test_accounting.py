@@ -148,7 +148,10 @@ def test_run_with_undefined_type_counts_its_messages_as_unreadable(undefined: Pa
 
 def test_run_with_undefined_type_and_raise_policy_fails(undefined: Path) -> None:
     config = ROSInjectionConfig(
-        undefined, "old", store=undefined.parent / "store", messages_on_error=LoaderErrorPolicy.RAISE
+        undefined,
+        "old",
+        store=undefined.parent / "store",
+        manifest={"on_error": {"message": LoaderErrorPolicy.RAISE}},
     )
     with pytest.raises(BagError, match=r"/own: the definition of own_msgs/msg/Thing is not known"):
         api.RosbagInjector(config).run()
