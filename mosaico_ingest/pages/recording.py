@@ -10,7 +10,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from mosaico_ingest.pages.timeline import Axis, Span, Track, draw_track, interval_text, time_axis
+from mosaico_ingest.pages.timeline import Axis, Span, Track, draw_track, interval_text, rate_text, time_axis
 from mosaico_ingest.report.collect import STEP_WORDS, longest_step, step_seconds
 from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Outcome
 from mosaico_ingest.report.events import RunStatus, TopicStatus
@@ -249,7 +249,7 @@ class TopicView:
     def __init__(self, report: TopicReport, axis: Axis | None, unreadable: Sequence[Span]) -> None:
         self.report = report
         timeline = report.timeline
-        self.rate = "" if report.rate_hz is None else f"{report.rate_hz:.4g} Hz"
+        self.rate = rate_text(report.rate_hz)
         self.jitter = interval_text(timeline.jitter_ns) if timeline else ""
         self.gap_count = timeline.gap_count if timeline else 0
         self.track: Track | None = None

@@ -128,6 +128,13 @@ def gaps_text(timeline: TimelineReport) -> str:
     return f"{text}, {seconds_text(longest_ns / 1e9)}" + ("" if timeline.gap_count == 1 else " the longest")
 
 
+def rate_text(rate_hz: float | None) -> str:
+    """Return a rate with four digits, such as `29.97 Hz`; empty if it is unknown."""
+    if rate_hz is None:
+        return ""
+    return f"{rate_hz:,.0f} Hz" if rate_hz >= 1000 else f"{rate_hz:.4g} Hz"  # noqa: PLR2004 - four digits
+
+
 def interval_text(interval_ns: float | None) -> str:
     """Return a short interval, such as `2.5 ms`; empty if it is unknown."""
     if interval_ns is None:

@@ -23,7 +23,7 @@ from mosaico_ingest.report.model import (
 )
 from mosaico_ingest.report.timing import TimelineReport
 
-VOID = {"meta", "input", "path", "img", "br"}
+VOID = {"meta", "link", "input", "path", "img", "br"}
 NASTY = "<script>alert('|x|')</script> & \"quoted\""
 MANIFEST = 'version: 1\nbag:\n  path: drives/*.mcap\ntarget:\n  api_key: "***"\n'
 T0 = 1_700_000_000 * 10**9
@@ -129,7 +129,8 @@ class Outline(HTMLParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         attributes = dict(attrs)
         self.ids += [value for key, value in attrs if key == "id" and value]
-        self.links += [value for key, value in attrs if key == "href" and value]
+        if tag == "a":
+            self.links += [value for key, value in attrs if key == "href" and value]
         self.loads += [str(attributes[key]) for key in ("src", "srcset", "data") if key in attributes]
         if tag not in VOID or tag == "path":
             self.open.append(tag)

@@ -1,0 +1,228 @@
+"""A web server for one user on the same machine: a searchable list of the sequences of a store, and their pages.
+
+The server listens on the loopback address only. It accepts requests whose `Host` is that address, so that a web site cannot
+read the store through a name of its own (DNS rebinding). Names are looked up in the catalog and are never used as paths.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import parse_qs, quote, unquote, urlsplit
+
+from msgspec import Struct
+
+from mosaico_ingest.destinations.store import SequenceInfo, Store
+from mosaico_ingest.errors import IngestError
+from mosaico_ingest.findings import one_line
+from mosaico_ingest.pages.design import render
+from mosaico_ingest.pages.sequence import sequence_page
+from mosaico_ingest.version import __version__
+
+HOST = "127.0.0.1"
+PAGE_SIZE = 50
+"""Sequences on one page of the list."""
+CACHED_PAGES = 16
+"""Pages of sequences that are kept until the sequence changes."""
+SEQUENCE = "/sequence/"
+"""The start of the addresses of sequences."""
+TIMEOUT_S = 30
+"""Seconds after which an idle connection is closed."""
+HEADERS = {
+    "Content-Type": "text/html; charset=utf-8",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+
+
+class Page(Struct, frozen=True):
+    """A response."""
+
+    status: HTTPStatus
+    html: str
+
+
+class StoreBrowser:
+    """The pages of one store by address; can be used by several threads."""
+
+    def __init__(self, location: str) -> None:
+        """Open the store.
+
+        Raises:
+            SinkError: The store does not exist.
+        """
+        Store.open(location, create=False)
+        self._location = location
+        self._pages: OrderedDict[str, tuple[SequenceInfo, str]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def page(self, address: str) -> Page:
+        """Return the page of an address, which may come from anyone."""
+        parts = urlsplit(address)
+        try:
+            if parts.path == "/":
+                return Page(HTTPStatus.OK, self._list(parts.query))
+            if parts.path.startswith(SEQUENCE):
+                return self._sequence(unquote(parts.path.removeprefix(SEQUENCE)))
+        except IngestError as error:
+            return _problem(HTTPStatus.SERVICE_UNAVAILABLE, "The store cannot be read", str(error))
+        return _problem(HTTPStatus.NOT_FOUND, "There is no such page", one_line(parts.path))
+
+    def _list(self, query: str) -> str:
+        values = {name: texts[-1] for name, texts in parse_qs(query).items()}
+        words = values.get("q", "").split()
+        metadata = dict(word.split("=", 1) for word in words if "=" in word)
+        text = " ".join(word for word in words if "=" not in word)
+        incomplete = "incomplete" in values
+        listing = Store.open(self._location, create=False).listing(
+            match=name_glob(text) if text else None,
+            metadata=metadata,
+            incomplete=incomplete,
+            after=values.get("after"),
+            limit=PAGE_SIZE,
+        )
+        kept = f"q={quote(values.get('q', ''))}{'&incomplete=on' if incomplete else ''}"
+        return render(
+            "browse.html",
+            store=self._location,
+            listing=listing,
+            query=values.get("q", ""),
+            incomplete=incomplete,
+            is_first="after" not in values,
+            first_link=f"/?{kept}",
+            next_link=f"/?{kept}&after={quote(listing.next_after)}" if listing.next_after else None,
+            links={each.name: sequence_link(each.name) for each in listing.sequences},
+            version=__version__,
+        )
+
+    def _sequence(self, name: str) -> Page:
+        store = Store.open(self._location, create=False)
+        info = store.find_sequence(name)
+        if info is None:
+            return _problem(HTTPStatus.NOT_FOUND, "There is no such sequence", name)
+        with self._lock:  # pages are expensive, so two requests do not compute the same one
+            known = self._pages.get(name)
+            if known is None or known[0] != info:
+                known = (info, sequence_page(store, name, list_link="/"))
+                self._pages[name] = known
+            self._pages.move_to_end(name)
+            while len(self._pages) > CACHED_PAGES:
+                self._pages.popitem(last=False)
+        return Page(HTTPStatus.OK, known[1])
+
+
+def sequence_link(name: str) -> str:
+    """Return the address of the page of a sequence."""
+    return f"{SEQUENCE}{quote(name, safe='')}"
+
+
+def name_glob(text: str) -> str:
+    """Return the glob for names that contain a text, in upper or lower case; a text with `*` or `?` is a glob itself."""
+    if "*" in text or "?" in text:
+        return text
+    return f"*{''.join(_either_case(character) for character in text)}*"
+
+
+def _either_case(character: str) -> str:
+    if character == "[":
+        return "[[]"
+    lower, upper = character.lower(), character.upper()
+    return f"[{lower}{upper}]" if lower != upper and len(lower) == len(upper) == 1 else character
+
+
+def _problem(status: HTTPStatus, title: str, text: str) -> Page:
+    return Page(status, render("problem.html", title=title, text=text))
+
+
+class BrowserServer:
+    """The web server of a store; `serve_forever` returns after `close`."""
+
+    def __init__(self, location: str, port: int = 0) -> None:
+        """Listen on the loopback address.
+
+        Raises:
+            SinkError: The store does not exist.
+            OSError: The port is in use.
+        """
+        browser = StoreBrowser(location)
+
+        class Handler(_Handler):
+            pages = browser
+
+        self._server = _Server((HOST, port), Handler)
+
+    @property
+    def address(self) -> str:
+        """The address of the list."""
+        return f"http://{HOST}:{self._server.server_address[1]}/"
+
+    def serve_forever(self) -> None:
+        """Answer requests."""
+        self._server.serve_forever(poll_interval=0.2)
+
+    def close(self) -> None:
+        """Stop the server, which must be answering requests in another thread, or not at all."""
+        self._server.server_close()
+
+    def shutdown(self) -> None:
+        """Let `serve_forever` return; it must run in another thread."""
+        self._server.shutdown()
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    allow_reuse_address = True
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answers GET and HEAD; other methods are not implemented."""
+
+    pages: StoreBrowser
+    protocol_version = "HTTP/1.1"
+    server_version = "mosaico-ingest"
+    sys_version = ""
+    timeout = TIMEOUT_S
+
+    def do_GET(self) -> None:
+        """Answer a request with its page."""
+        self._answer(has_body=True)
+
+    def do_HEAD(self) -> None:
+        """Answer a request with the headers of its page."""
+        self._answer(has_body=False)
+
+    def log_message(self, format: str, *args: Any) -> None:  # noqa: A002, ANN401 - the signature of the base class
+        """Print nothing: requests contain text of other programs."""
+
+    def _answer(self, *, has_body: bool) -> None:
+        if self._is_own_host(self.headers.get_all("Host") or []):
+            page = self.pages.page(self.path)
+        else:
+            text = f"Open {self._own_address()} instead."
+            page = _problem(HTTPStatus.MISDIRECTED_REQUEST, "This server has another address", text)
+        body = page.html.encode()
+        self.send_response(page.status)
+        for name, value in {**HEADERS, "Content-Length": str(len(body))}.items():
+            self.send_header(name, value)
+        self.end_headers()
+        if has_body:
+            self.wfile.write(body)
+
+    def _own_address(self) -> str:
+        return f"http://{HOST}:{self._port}/"
+
+    @property
+    def _port(self) -> int:
+        address: Any = self.server.server_address
+        return int(address[1])
+
+    def _is_own_host(self, hosts: list[str]) -> bool:
+        """Return whether the request names this server by a loopback address."""
+        return len(hosts) == 1 and hosts[0].lower() in {f"{HOST}:{self._port}", f"localhost:{self._port}"}

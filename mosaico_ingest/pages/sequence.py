@@ -1,0 +1,240 @@
+"""The page of a stored sequence: everything that helps to recognize and to use its data, computed from the store."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, TypeVar
+
+import pyarrow as pa
+from msgspec import Struct
+
+from mosaico_ingest.destinations.store import SequenceInfo, Store, TopicInfo
+from mosaico_ingest.errors import IngestError
+from mosaico_ingest.job.values import PROVENANCE_KEY
+from mosaico_ingest.pages.design import render
+from mosaico_ingest.pages.pictures import Map, Strip, draw_map, picture_strip
+from mosaico_ingest.pages.plots import TopicPlots, topic_plots
+from mosaico_ingest.pages.snippets import sequence_snippets
+from mosaico_ingest.pages.timeline import Axis, Track, draw_track, interval_text, rate_text, time_axis
+from mosaico_ingest.report.units import bytes_text, count_text, seconds_text, time_text
+from mosaico_ingest.version import __version__
+from mosaico_ingest.view.images import has_images
+from mosaico_ingest.view.logs import LogExcerpt, has_log, read_excerpt
+from mosaico_ingest.view.pictures import has_pictures
+from mosaico_ingest.view.statistics import ColumnStatistics, TopicStatistics, describe_topic
+from mosaico_ingest.view.tracks import has_track, read_track
+from mosaico_ingest.view.transforms import frame_trees, read_edges
+
+MAX_STRIPS = 24
+"""Topics with pictures that a page shows."""
+MAX_TOPICS = 300
+"""Topics whose values a page describes."""
+EPOCH_NS = 10**17
+"""Smaller times, before 1973, are shown as durations."""
+_Value = TypeVar("_Value")
+
+
+def sequence_page(store: Store, name: str, *, list_link: str | None = None) -> str:
+    """Return the page of a sequence; `list_link` is the address of the list of sequences, if there is one.
+
+    Raises:
+        SinkError: The sequence does not exist. Topics that cannot be read are described as problems on the page.
+    """
+    info = store.sequence(name)
+    return render("sequence.html", has_plots=True, **_Content(store, info).values(), list_link=list_link)
+
+
+class _TopicView(Struct, frozen=True):
+    """One topic on the page."""
+
+    info: TopicInfo
+    timing: str
+    """The rate."""
+    jitter: str
+    gap_count: int
+    track: Track | None
+    columns: tuple[_Column, ...]
+
+
+class _Column(Struct, frozen=True):
+    """The row of one column in the table of a topic's schema."""
+
+    path: str
+    type: str
+    unit: str
+    nulls: str
+    minimum: str
+    maximum: str
+    mean: str
+    distinct: str
+
+
+class _Content:
+    """The values of the page, with the problems that occurred while they were computed."""
+
+    def __init__(self, store: Store, info: SequenceInfo) -> None:
+        self._store, self._info = store, info
+        self._problems: list[str] = []
+        self._topics = info.topics[:MAX_TOPICS]
+        self._axis = time_axis(
+            time for topic in info.topics for time in (topic.start_ns, topic.end_ns) if time is not None
+        )
+
+    def values(self) -> dict[str, Any]:
+        """Return the variables of the template."""
+        info = self._info
+        described = {topic.name: self._attempt(topic, describe_topic) for topic in self._topics}
+        strips = list(self._strips())
+        edges = self._attempt(None, lambda _: read_edges(self._topics)) or []
+        return {
+            "info": info,
+            "version": __version__,
+            "facts": _facts(info),
+            "axis": self._axis,
+            "topics": [_topic_view(topic, described[topic.name], self._axis) for topic in self._topics],
+            "omitted_topics": len(info.topics) - len(self._topics),
+            "cameras": [strip for topic, strip in strips if has_images(topic.schema)],
+            "clouds": [strip for topic, strip in strips if not has_images(topic.schema)],
+            "maps": list(self._maps()),
+            "plots": list(self._plots(described)),
+            "frames": frame_trees(edges),
+            "frame_count": len({name for edge in edges for name in (edge.parent, edge.child)}),
+            "logs": list(self._logs()),
+            "metadata": dict(_flatten(info.metadata)),
+            "sources": list(_sources(info)),
+            "sessions": info.sessions,
+            "snippets": sequence_snippets(self._store, info),
+            "problems": self._problems,
+        }
+
+    def _attempt(self, topic: TopicInfo | None, read: Callable[[Any], _Value]) -> _Value | None:
+        """Return what `read` returns for a topic; describe the problem if its files cannot be read."""
+        try:
+            return read(topic)
+        except (IngestError, OSError, pa.ArrowException) as error:
+            name = f"{topic.name}: " if topic else ""
+            text = f"{name}{str(error).partition(chr(10))[0]}"
+            if text not in self._problems:
+                self._problems.append(text)
+            return None
+
+    def _strips(self) -> Iterator[tuple[TopicInfo, Strip]]:
+        topics = [topic for topic in self._topics if topic.rows and has_pictures(topic)]
+        for topic in topics[:MAX_STRIPS]:
+            strip = self._attempt(topic, picture_strip)
+            if strip is not None:
+                yield topic, strip
+
+    def _maps(self) -> Iterator[Map]:
+        for topic in self._topics:
+            if topic.rows and has_track(topic):
+                track = self._attempt(topic, read_track)
+                drawing = draw_map(track) if track is not None else None
+                if drawing is not None:
+                    yield drawing
+
+    def _plots(self, described: Mapping[str, TopicStatistics | None]) -> Iterator[TopicPlots]:
+        start_ns = self._info.start_ns or 0
+        for topic in self._topics:
+            statistics = described[topic.name]
+            if not topic.rows or statistics is None:
+                continue
+            plots = self._attempt(topic, lambda info: topic_plots(info, start_ns))
+            if plots is not None:
+                yield plots
+
+    def _logs(self) -> Iterator[LogExcerpt]:
+        for topic in self._topics:
+            if topic.rows and has_log(topic):
+                excerpt = self._attempt(topic, read_excerpt)
+                if excerpt is not None:
+                    yield excerpt
+
+
+def _facts(info: SequenceInfo) -> dict[str, str]:
+    start_ns, end_ns = info.start_ns, info.end_ns
+    duration = seconds_text((end_ns - start_ns) / 1e9) if start_ns is not None and end_ns is not None else "-"
+    return {
+        "Topics": count_text(len(info.topics)),
+        "Rows": count_text(info.rows),
+        "Stored": bytes_text(info.stored_bytes),
+        "Start (UTC)": time_text(start_ns),
+        "Duration": duration,
+    }
+
+
+def _topic_view(topic: TopicInfo, statistics: TopicStatistics | None, axis: Axis | None) -> _TopicView:
+    timing = statistics.timing if statistics else None
+    timeline = timing.timeline if timing else None
+    return _TopicView(
+        topic,
+        rate_text(timing.rate_hz) if timing else "",
+        interval_text(timeline.jitter_ns) if timeline else "",
+        timeline.gap_count if timeline else 0,
+        draw_track(axis, topic.name, timeline) if axis is not None else None,
+        tuple(map(_column, statistics.columns)) if statistics else (),
+    )
+
+
+def _column(column: ColumnStatistics) -> _Column:
+    nulls = "" if column.rows is None or column.nulls is None else count_text(column.nulls)
+    return _Column(
+        column.path,
+        column.type,
+        column.unit,
+        nulls,
+        _value(column.minimum, is_time=column.is_time),
+        _value(column.maximum, is_time=column.is_time),
+        _value(column.mean, is_time=False),
+        "" if column.distinct is None else count_text(column.distinct),
+    )
+
+
+def _value(value: object, *, is_time: bool) -> str:
+    if value is None:
+        return ""
+    if is_time and isinstance(value, int):
+        return time_text(value) if abs(value) >= EPOCH_NS else interval_text(value)
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    text = str(value)
+    return text if len(text) <= 40 else f"{text[:40]}…"  # noqa: PLR2004 - the width of a cell
+
+
+def _flatten(metadata: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yield dotted keys and values as text, without the provenance."""
+    for key, value in metadata.items():
+        if isinstance(value, dict) and value and key != PROVENANCE_KEY:
+            yield from _flatten(value, f"{prefix}{key}.")
+        elif key != PROVENANCE_KEY:
+            yield f"{prefix}{key}", str(value)
+
+
+class _Source(Struct, frozen=True):
+    """A file that a session read."""
+
+    session: str
+    stored: str
+    tool: str
+    name: str
+    size: str
+    checksum: str
+
+
+def _sources(info: SequenceInfo) -> Iterator[_Source]:
+    for session in info.sessions:
+        record: Any = session.metadata.get(PROVENANCE_KEY)
+        sources: Any = record.get("sources") if isinstance(record, dict) else None
+        for source in sources if isinstance(sources, list) else ():
+            if isinstance(source, dict):
+                size = source.get("size_bytes")
+                yield _Source(
+                    session.id,
+                    time_text(session.completed_ns),
+                    str(record.get("tool", "")),
+                    str(source.get("name", "")),
+                    bytes_text(size) if isinstance(size, int) else "",
+                    str(source.get("content", "")),
+                )
