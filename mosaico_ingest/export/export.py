@@ -5,17 +5,17 @@ from __future__ import annotations
 import heapq
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
-from typing import Any, cast
+from typing import Any
 
 import pyarrow as pa
 from msgspec import Struct
 from pydantic import BaseModel, ConfigDict
 
-from mosaico_ingest.adapters.adapter import ROS_METADATA_KEY, Adapter, AdapterSpec, Envelope, UnmodeledSpec
+from mosaico_ingest.adapters.adapter import Adapter, AdapterSpec, Envelope, UnmodeledSpec, recorded_schema
 from mosaico_ingest.adapters.bridge import ROSBridge, adapter_spec
 from mosaico_ingest.adapters.builtin import BUILTIN
 from mosaico_ingest.adapters.inverse import Inverse, Restored, invert
@@ -30,11 +30,10 @@ from mosaico_ingest.findings import suggest_names
 from mosaico_ingest.job.patterns import select
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.rosbag.blocks import Encoding
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
-from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
+from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, Language, normalize_msgtype
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver, store_of
-from mosaico_ingest.rosbag.serialization import Serializer
+from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS, encoding_of
 from mosaico_ingest.rosbag.writers import RecordingWriter, open_writer
 
 
@@ -99,32 +98,35 @@ class Origin(Struct, frozen=True):
     text: str
     """The definition with its dependencies."""
     source_file: str
+    language: Language = Language.ROS
 
     @property
     def version(self) -> int | None:
         """The version of ROS that the definition requires; None if it fits both, because it contains no time."""
+        if self.language is not Language.ROS:
+            return None
         return 1 if _TIME_1.search(self.text) else 2 if _TIME_2.search(self.text) else None
 
     def definition(self, version: int) -> Definition:
-        """Return the parsed definition for a version of ROS.
+        """Return the parsed definition; `version` is the version of ROS of a ROS definition.
 
         Raises:
             BagError: The text is not a valid definition.
         """
+        entry = next(one for one in MESSAGE_ENCODINGS.values() if one.language is self.language)
+        if entry.read_schema is not None:
+            schema = Embedded(entry.schema_encoding, self.text) if self.text else None
+            return entry.read_schema(self.msgtype, schema)
         embedded = Embedded(f"ros{version}msg", self.text)
         return TypeResolver(Stores.EMPTY).resolve(self.msgtype, embedded, ros_version=version)
 
 
 def origin_of(topic: SourceTopic) -> Origin | None:
     """Return the original messages of a topic, or None if its metadata does not describe them."""
-    metadata = topic.metadata.get(ROS_METADATA_KEY)
-    if not isinstance(metadata, dict):
+    schema = recorded_schema(topic.metadata)
+    if schema is None:
         return None
-    values = cast("Mapping[str, Any]", metadata)
-    fields = [values.get(key, "") for key in ("msgtype", "msgdef", "source_file")]
-    if not all(isinstance(value, str) for value in fields) or not fields[0]:
-        return None
-    return Origin(*fields)
+    return Origin(schema.msgtype, schema.text, schema.source_file, schema.language)
 
 
 def version_of(origin: Origin, others: Sequence[Origin], possible: Collection[int]) -> int:
@@ -166,8 +168,7 @@ class Restorer:
         Raises:
             BagError: A value does not fit its message field.
         """
-        encoding = Encoding.ROS1 if self.definition.ros_version == 1 else Encoding.CDR
-        serializer = Serializer(self.definition, encoding)
+        serializer = MESSAGE_ENCODINGS[encoding_of(self.definition)].writer(self.definition)
         for batch in batches:
             all_times: Any = batch.column("timestamp_ns").to_numpy()
             all_rows = self._rows(batch)
@@ -243,9 +244,10 @@ def _candidates(
     info: SourceTopic, definition: Definition, specs: Sequence[AdapterSpec]
 ) -> Iterator[AdapterSpec]:
     """Yield the adapters that can have produced a topic: the named ones, the default one, other built-in ones."""
-    yield from (spec for spec in specs if not spec.ros_types or definition.root in spec.ros_types)
-    yield ROSBridge().resolve(info.name, definition.root).spec
-    yield from (spec for spec in BUILTIN if definition.root in spec.ros_types)
+    msgtype = normalize_msgtype(definition.root)
+    yield from (spec for spec in specs if not spec.ros_types or msgtype in spec.ros_types)
+    yield ROSBridge().resolve(info.name, msgtype).spec
+    yield from (spec for spec in BUILTIN if msgtype in spec.ros_types)
     yield UnmodeledSpec(serialization_format=info.ontology.serialization_format)
 
 

@@ -31,6 +31,7 @@ _NOT_IN_THE_DISTROS = {
         for b in BUILTIN
         if (text := b.mapping.model.definition)
         for name in b.ros_types
+        if "/" in name  # the names of protobuf and JSON types have no package with a slash
     },
     "tf/msg/tfMessage": _OLD_TF,
     **{f"example_interfaces/msg/{name}": f"{kind} data\n" for name, kind in _DATA.items()},

@@ -202,7 +202,7 @@ def test_struct_written_as_plain_mapping_suggests_fields() -> None:
         ("adapter: PackAdapter\n", "", "missing-key", "v"),
         ("ros_type: acme_msgs/msg/Pack\n", "", "adapter-file", "adapter"),
         ("acme_msgs/msg/Pack\n", "acme_msgs/msg/Pack\nvariants: {a/b: {}}\n", "adapter-file", "adapter"),
-        ("acme_msgs/msg/Pack\n", "Pack\n", "wrong-value", "Pack"),
+        ("acme_msgs/msg/Pack\n", "acme-msgs/Pack\n", "wrong-value", "acme-msgs/Pack"),
         ("ros_type:", "ros_typ:", "unknown-key", "ros_typ"),
         ("  volts: voltage_mv * 0.001\n", "  count: status\n", "missing-column", "fields"),
         ("  volts: voltage_mv * 0.001\n", "  volts: null\n", "missing-column", "null"),

@@ -25,8 +25,12 @@ from mosaico_ingest.rosbag.definitions.model import Definition
 DOCS = Path(__file__).parents[2] / "docs" / "export.md"
 MESSAGES = 60
 SEEDS = 3
-NOT_THE_SAME_AGAIN = {"GPSFixAdapter": {"velocity"}, "Pose2DAdapter": {"orientation"}}
-"""Columns that come out otherwise: one is not undone, one is computed with rounding."""
+NOT_THE_SAME_AGAIN = {
+    "FoxgloveLaserScanAdapter": {"angle_increment"},
+    "GPSFixAdapter": {"velocity"},
+    "Pose2DAdapter": {"orientation"},
+}
+"""Columns that differ after the round trip: `velocity` is not restored, the others are computed with rounding."""
 
 
 @cache

@@ -138,9 +138,13 @@ def _special_conversion(source: DataType, target: DataType) -> Callable[[RejectR
     """Return the conversion to a header or time stamp, None for any other struct."""
     if target == HEADER_TYPE and {field.name for field in source} >= {"stamp", "frame_id"}:
         return as_header
-    if target == STAMP_TYPE and {field.name for field in source} == {"sec", "nanosec"}:
+    if target == STAMP_TYPE and {field.name for field in source} in _TIMES:
         return as_stamp
     return None
+
+
+_TIMES = ({"sec", "nanosec"}, {"sec", "nsec"}, {"seconds", "nanos"})
+"""The fields of times in ROS, Foxglove's JSON and `google.protobuf.Timestamp`."""
 
 
 def convert(array: Array, target: DataType, refuse: RejectRows) -> Array:

@@ -38,8 +38,8 @@ __all__ = ["MappingAdapter", "MappingSpec", "adapter_from_model", "load_adapter"
 _BINDING: ContextVar[tuple[tuple[str, str], ...]] = ContextVar("binding", default=())
 """The adapters being bound with their message types, to detect adapters that use each other in a cycle."""
 _MAX_CACHED_BINDINGS = 64
-_BindingKey: TypeAlias = tuple[str, int, tuple[MessageType, ...]]
-"""The parts of a definition that the compiled mapping depends on: root type, ROS version, message types."""
+_BindingKey: TypeAlias = tuple[str, int, tuple[MessageType, ...], pa.StructType]
+"""What the compiled mapping depends on: root type, ROS version, message types, type of the rows."""
 
 
 class MappingAdapter(Struct, frozen=True):
@@ -134,7 +134,7 @@ class MappingSpec:
         Raises:
             AdapterError: The mapping does not fit; `findings` has one finding per mistake, with its location.
         """
-        key = (definition.root, definition.ros_version, tuple(definition.types.values()))
+        key = (definition.root, definition.ros_version, tuple(definition.types.values()), shape)
         if key in self._bindings:
             return self._bindings[key]
         adapter, findings = self._compile(definition, shape)
@@ -151,7 +151,10 @@ class MappingSpec:
     def _compile(
         self, definition: Definition, shape: pa.StructType
     ) -> tuple[MappingAdapter | None, tuple[Finding, ...]]:
-        variant = next((n for n in self.model.ros_types if normalize_msgtype(n) == definition.root), None)
+        variant = next(
+            (n for n in self.model.ros_types if normalize_msgtype(n) == normalize_msgtype(definition.root)),
+            None,
+        )
         if variant is None:
             location = self.source.span(("variants",) if self.model.variants else ("ros_type",))
             message = f"{self.name} takes {', '.join(self.ros_types)}, not {definition.root}"

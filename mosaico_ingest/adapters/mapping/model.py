@@ -35,7 +35,11 @@ def _plain(value: object) -> object:
 
 Scalar: TypeAlias = Annotated[bool | int | float | str | None, BeforeValidator(_plain)]
 TypeName: TypeAlias = Annotated[
-    str, Field(pattern=r"^[A-Za-z]\w*/(msg/)?[A-Za-z]\w*$", examples=["sensor_msgs/msg/Imu"])
+    str,
+    Field(
+        pattern=r"^[A-Za-z]\w*(/(msg/)?[A-Za-z]\w*|(\.[A-Za-z_]\w*)*)$",
+        examples=["sensor_msgs/msg/Imu", "foxglove.PoseInFrame"],
+    ),
 ]
 _NAME = r"^[A-Za-z_]\w*$"
 

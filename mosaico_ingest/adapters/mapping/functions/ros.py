@@ -58,32 +58,65 @@ STAMP = struct_with(
     "a time or duration",
     {"sec": pt.is_integer, "nanosec": pt.is_integer},
     {"seconds": pt.is_integer, "nanoseconds": pt.is_integer},
+    {"seconds": pt.is_integer, "nanos": pt.is_integer},
+    {"sec": pt.is_integer, "nsec": pt.is_integer},
 )
+"""The times of ROS, the ontology, `google.protobuf.Timestamp`, and Foxglove's JSON."""
 _INT32 = (-(2**31), 2**31 - 1)
 
 
 def stamp_parts(t: Array) -> tuple[Array, Array]:
-    """Return the seconds and the nanoseconds of a ROS or ontology time."""
-    names = ("sec", "nanosec") if t.type.get_field_index("sec") >= 0 else ("seconds", "nanoseconds")
-    return field_of(t, names[0]), field_of(t, names[1])
+    """Return the seconds and the nanoseconds of a time in any of the forms of `STAMP`."""
+    names = {field.name for field in t.type}
+    seconds = "sec" if "sec" in names else "seconds"
+    nanoseconds = next(name for name in ("nanosec", "nsec", "nanos", "nanoseconds") if name in names)
+    return field_of(t, seconds), field_of(t, nanoseconds)
 
 
 def as_stamp(refuse: RejectRows, t: Array) -> Array:
-    """Convert `{sec, nanosec}` to the ontology's time, without copying fields of matching type."""
+    """Convert a time to the ontology's time, without copying fields of matching type."""
     sec, nanosec = stamp_parts(t)
-    over = true_mask(pc.greater_equal(nanosec, SECOND_NS))
-    if over.any():
-        refuse(over, "nanosec", lambda i: f"nanosec is {nanosec[i]}, it must be below 1e9")
-        nanosec = set_null(nanosec, over)
-    children = [pc.cast(sec, arrays.int32()), pc.cast(nanosec, arrays.uint32())]
     absent = null_mask(t)
+    if sec.null_count or nanosec.null_count:
+        sec, nanosec = _complete_parts(refuse, sec, nanosec, absent)
+    over = true_mask(pc.greater_equal(nanosec, SECOND_NS))
+    if nanosec.type != arrays.uint32():
+        over |= true_mask(pc.less(nanosec, 0))
+    if over.any():
+        refuse(over, "nanosec", lambda i: f"nanosec is {nanosec[i]}, it must be below 1e9 and not negative")
+        nanosec = set_null(nanosec, over)
+    if sec.type != arrays.int32():
+        sec = _in_int32(refuse, sec)
+    children = [pc.cast(sec, arrays.int32()), pc.cast(nanosec, arrays.uint32())]
     mask = None if absent is None else arrays.array(absent)
     return arrays.StructArray.from_arrays(children, fields=list(STAMP_TYPE), mask=mask)
 
 
+def _complete_parts(
+    refuse: RejectRows, sec: Array, nanosec: Array, absent: Mask | None
+) -> tuple[Array, Array]:
+    """Reject times of which one part is null, and fill in zeros, which are invisible in absent times."""
+    partial = np.asarray(pc.or_(sec.is_null(), nanosec.is_null()))
+    if absent is not None:
+        partial &= ~absent
+    if partial.any():
+        refuse(partial, "null", lambda _: "the time has no seconds or no nanoseconds")
+    return pc.fill_null(sec, 0), pc.fill_null(nanosec, 0)
+
+
+def _in_int32(refuse: RejectRows, sec: Array) -> Array:
+    """Reject times whose seconds do not fit the ontology's time."""
+    values = np.asarray(sec)
+    bad = (values < _INT32[0]) | (values > _INT32[1])
+    if bad.any():
+        refuse(bad, "out-of-range", lambda i: f"{sec[i]} seconds do not fit int32")
+        return set_null(sec, bad)
+    return sec
+
+
 @function(STAMP, returns=STAMP_TYPE)
 def ros_time(refuse: RejectRows, t: Array) -> Array:
-    """`{sec, nanosec}` as `{seconds, nanoseconds}`; rejects rows with nanosec of 1e9 or more."""
+    """A time such as `{sec, nanosec}` as `{seconds, nanoseconds}`; rejects rows with nanosec of 1e9 or more."""
     return as_stamp(refuse, t)
 
 

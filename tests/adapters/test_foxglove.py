@@ -1,0 +1,70 @@
+"""Foxglove's well-known schemas become the same rows in their ROS 2, protobuf and JSON forms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from foxglove_schemas import MESSAGES, json_definition, json_payload, protobuf_definition, protobuf_payload
+
+from mosaico_ingest.adapters.adapter import AdapterSpec, Envelope
+from mosaico_ingest.adapters.builtin import BUILTIN, BY_TYPE
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.model import Definition
+from mosaico_ingest.rosbag.encodings.json_messages import JsonCodec
+from mosaico_ingest.rosbag.encodings.protobuf import ProtobufCodec
+
+
+def adapter_of(name: str) -> AdapterSpec:
+    return next(spec for spec in BUILTIN if f"foxglove.{name}" in spec.ros_types)
+
+
+def row_of(name: str, definition: Definition, message: dict[str, Any]) -> dict[str, Any]:
+    adapted = adapter_of(name).bind(definition, ros_shape(definition))
+    rows: Any = pa.array([message], ros_shape(definition))
+    result = adapted.adapt(rows, Envelope("/t", definition.root, np.zeros(1, np.int64)))
+    assert not result.failures
+    return result.rows[0].as_py()
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_foxglove_message_becomes_the_same_row_in_every_form(
+    name: str, define: Callable[..., Definition]
+) -> None:
+    message = MESSAGES[name]
+    ros = define(f"foxglove_msgs/msg/{name}")
+    proto, text = protobuf_definition(name), json_definition(name)
+    expected = row_of(name, ros, message)
+    assert row_of(name, proto, ProtobufCodec(proto).to_dict(protobuf_payload(name, message))) == expected
+    assert row_of(name, text, JsonCodec(text).to_dict(json_payload(message))) == expected
+
+
+def test_foxglove_types_have_a_default_adapter_except_log() -> None:
+    names = [name for name in MESSAGES if name != "Log"]
+    assert all(f"foxglove.{name}" in BY_TYPE and f"foxglove_msgs/msg/{name}" in BY_TYPE for name in names)
+    assert "foxglove.Log" not in BY_TYPE
+
+
+@pytest.mark.parametrize(
+    ("seconds", "nanos", "rule"), [(2**31, 0, "out-of-range"), (0, 10**9, "nanosec"), (0, -1, "nanosec")]
+)
+def test_foxglove_time_that_does_not_fit_rejects_the_row(seconds: int, nanos: int, rule: str) -> None:
+    definition = protobuf_definition("PoseInFrame")
+    adapter = adapter_of("PoseInFrame").bind(definition, ros_shape(definition))
+    stamps = [{"seconds": seconds, "nanos": nanos}, {"seconds": 1, "nanos": 2}]
+    rows: Any = pa.array([{"timestamp": stamp, "frame_id": "a"} for stamp in stamps], ros_shape(definition))
+    adapted = adapter.adapt(rows, Envelope("/t", definition.root, np.zeros(2, np.int64)))
+    assert [(failure.row, failure.rule) for failure in adapted.failures] == [(0, rule)]
+    assert adapted.rows[0].as_py()["header"]["timestamp"] == {"seconds": 1, "nanoseconds": 2}
+
+
+def test_foxglove_absent_time_is_null_and_partial_time_is_rejected() -> None:
+    definition = json_definition("PoseInFrame")
+    adapter = adapter_of("PoseInFrame").bind(definition, ros_shape(definition))
+    rows: Any = pa.array([{"frame_id": "a"}, {"timestamp": {"sec": 1}}], ros_shape(definition))
+    adapted = adapter.adapt(rows, Envelope("/t", definition.root, np.zeros(2, np.int64)))
+    assert [(failure.row, failure.rule) for failure in adapted.failures] == [(1, "null")]
+    assert adapted.rows[0].as_py()["header"] == {"timestamp": None, "frame_id": "a", "sample_counter": None}
