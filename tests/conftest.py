@@ -25,7 +25,9 @@ SHARED = Path(os.environ.get("MOSAICO_SHARED", ROOT.parent / "shared"))
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--slow", action="store_true", help="also run the tests marked slow")
-    parser.addoption("--portable", action="store_true", help="remove the calls that only Linux has")
+    parser.addoption(
+        "--portable", action="store_true", help="remove the calls that only Linux, or only POSIX systems have"
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -105,5 +105,5 @@ def limit_heaps(count: int = 2) -> None:
     import pyarrow as pa
 
     pa.set_memory_pool(pa.system_memory_pool())
-    with suppress(OSError, AttributeError):
+    with suppress(OSError, AttributeError, TypeError):  # TypeError: Windows has no default library
         ctypes.CDLL(None).mallopt(M_ARENA_MAX, count)

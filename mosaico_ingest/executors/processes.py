@@ -36,6 +36,8 @@ _SHUTDOWN_S = 10.0
 _POLL_S = 0.2
 """Seconds between two checks for a request to stop."""
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_SIGKILL = 9
+"""`signal.SIGKILL`, which Windows does not define."""
 
 
 class Processes(Struct, frozen=True):
@@ -165,17 +167,22 @@ class _Pool:
         self.batch.waiting.clear()
         for worker in self.workers:
             if worker.task is not None:
-                _signal(worker, signal.SIGKILL if self.interrupts else signal.SIGINT)
+                if self.interrupts:
+                    worker.process.kill()
+                else:
+                    _signal(worker, signal.SIGINT)
         self.interrupts += 1
 
 
 def work(pipe: Connection, registrations: Registrations, prepare: Callable[[], None], processes: int) -> None:
     """Run jobs from a pipe until its other end is closed; the main function of a worker process."""
-    os.setsid()  # Ctrl-C reaches only the parent, which passes it on
+    if hasattr(os, "setsid"):
+        os.setsid()  # Ctrl-C reaches only the parent, which passes it on
     stop = StopHandler()
     for number in _STOP_SIGNALS:
         signal.signal(number, stop)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOP_SIGNALS)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOP_SIGNALS)
     pa.set_cpu_count(max(1, (os.cpu_count() or 1) // processes))
     prepare()
     registrations.register()
@@ -234,6 +241,9 @@ def _spawn_worker(prepare: Callable[[], None], processes: int) -> _Worker:
 @contextmanager
 def _stop_signals_blocked() -> Generator[None]:
     """Block signals to stop; a new process inherits the mask, so Ctrl-C cannot interrupt its imports."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, _STOP_SIGNALS)
     try:
         yield
@@ -264,7 +274,7 @@ def _worker_died(exit_code: int | None, attempts: int) -> IngestError:
         cause = f"was killed by {signal.Signals(-exit_code).name}"
     else:
         cause = f"ended with exit code {exit_code}"
-    killed = exit_code == -signal.SIGKILL
+    killed = exit_code == -_SIGKILL
     return IngestError(
         f"the worker process {cause} in each of {attempts} attempts",
         hint="memory may have run out: use fewer jobs or a smaller run.memory" if killed else None,

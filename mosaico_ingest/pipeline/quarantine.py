@@ -159,7 +159,7 @@ class Quarantine:
                 messages.finish()
                 index.close()
                 for path in (self.messages_path, self.messages_path.with_suffix(INDEX)):
-                    with path.open("rb") as file:
+                    with path.open("rb+") as file:
                         os.fsync(file.fileno())
 
     def supersede(self) -> None:

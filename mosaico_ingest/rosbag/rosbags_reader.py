@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.interfaces.typing import Typesdict
+from rosbags.serde import SerdeError
 from rosbags.typesys import Stores as RosbagsStores
 from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 
@@ -22,7 +23,16 @@ from mosaico_ingest.rosbag.definitions.parser import BYTES
 
 __all__ = ["RosbagsRecording"]
 
-_ERRORS = (AnyReaderError, TypesysError, AssertionError, ArithmeticError, LookupError, TypeError, ValueError)
+_ERRORS = (
+    AnyReaderError,
+    TypesysError,
+    SerdeError,
+    AssertionError,
+    ArithmeticError,
+    LookupError,
+    TypeError,
+    ValueError,
+)
 """Exceptions that rosbags raises for recordings, definitions and messages that it cannot read."""
 
 

@@ -80,6 +80,27 @@ class Source(Protocol):
         ...
 
 
+_SEEKING = threading.Lock()
+"""Held for each read on systems without `pread`, where a read moves the position of the file."""
+
+
+def _read_at(fd: int, size: int, offset: int) -> bytes:
+    if hasattr(os, "pread"):
+        return os.pread(fd, size, offset)
+    with _SEEKING:
+        os.lseek(fd, offset, os.SEEK_SET)
+        return os.read(fd, size)
+
+
+def _fill(fd: int, target: memoryview, offset: int) -> int:
+    """Fill the start of `target`, and return the number of bytes read."""
+    if hasattr(os, "preadv"):
+        return os.preadv(fd, [target], offset)
+    data = _read_at(fd, len(target), offset)
+    target[: len(data)] = data
+    return len(data)
+
+
 class FileSource:
     """A local file.
 
@@ -90,7 +111,7 @@ class FileSource:
         self.path: AnyPath = name or path
         self.notes: list[str] = []
         try:
-            self._fd = os.open(path, os.O_RDONLY)
+            self._fd = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
             self.size = os.fstat(self._fd).st_size
         except OSError as err:
             raise BagError(f"cannot be opened: {err.strerror}", where=str(path)) from err
@@ -115,7 +136,7 @@ class FileSource:
         check_inside(self, offset, len(target))
         filled = 0
         try:
-            while filled < len(target) and (more := os.preadv(self._fd, [target[filled:]], offset + filled)):
+            while filled < len(target) and (more := _fill(self._fd, target[filled:], offset + filled)):
                 filled += more
         except OSError as err:
             raise self._read_error(offset, err) from err
@@ -128,8 +149,8 @@ class FileSource:
             BagError: The operating system reports an error.
         """
         try:
-            data = os.pread(self._fd, size, offset)
-            while len(data) < size and (more := os.pread(self._fd, size - len(data), offset + len(data))):
+            data = _read_at(self._fd, size, offset)
+            while len(data) < size and (more := _read_at(self._fd, size - len(data), offset + len(data))):
                 data += more
         except OSError as err:
             raise self._read_error(offset, err) from err

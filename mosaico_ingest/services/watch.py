@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import fcntl
 import re
 import struct
 import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
-from typing import BinaryIO, TypeAlias
+from typing import Any, BinaryIO, TypeAlias
 
 from mosaico_ingest.containers import MCAP, RECORDING_NAME
 
@@ -178,14 +179,18 @@ def _file_states(path: Path) -> _FileStates:
     return tuple((name, state.st_size, state.st_mtime_ns) for name, state in states if state.st_size)
 
 
+_fcntl: Any = import_module("fcntl") if find_spec("fcntl") else None
+"""File leases; None on Windows."""
+
+
 def _is_open(file: Path) -> bool:
     """Return whether a process has the file open for writing; Linux grants no read lease in this case."""
-    if not hasattr(fcntl, "F_SETLEASE"):
+    if _fcntl is None or not hasattr(_fcntl, "F_SETLEASE"):
         return False
     try:
         with file.open("rb") as opened:
-            fcntl.fcntl(opened, fcntl.F_SETLEASE, fcntl.F_RDLCK)
-            fcntl.fcntl(opened, fcntl.F_SETLEASE, fcntl.F_UNLCK)
+            _fcntl.fcntl(opened, _fcntl.F_SETLEASE, _fcntl.F_RDLCK)
+            _fcntl.fcntl(opened, _fcntl.F_SETLEASE, _fcntl.F_UNLCK)
     except BlockingIOError:
         return True
     except OSError:  # a file of another user, or a file system without leases: only the time of rest decides

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import subprocess
 import sys
 import time
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,7 @@ from mosaico_ingest.report.events import RunStatus
 from mosaico_ingest.services.status import recording_statuses
 from mosaico_ingest.services.watch import Arrivals, is_unfinished
 
+_fcntl = import_module("fcntl") if find_spec("fcntl") else None
 DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
 JOB = 'bag: {path: "nothing/*.mcap"}\ntopics: [/imu]\ntarget: {store: store}\n'
 
@@ -68,7 +70,7 @@ def test_arrivals_rosbag2_directory_settles_with_its_metadata(tmp_path: Path) ->
 
 
 @pytest.mark.skipif(
-    not hasattr(fcntl, "F_SETLEASE"), reason="only Linux reports files that are open for writing"
+    not hasattr(_fcntl, "F_SETLEASE"), reason="only Linux reports files that are open for writing"
 )
 def test_arrivals_file_open_for_writing_does_not_settle(tmp_path: Path) -> None:
     file = tmp_path / "a.mcap"

@@ -238,3 +238,10 @@ def test_text_members_exist(text: str) -> None:
     assert policies == set(ros_bridge.LoaderErrorPolicy.__members__)
     for name, member in re.findall(r"\b(\w+Policy|Stores|APIKeyPermissionEnum)\.(\w+)", text):
         assert hasattr(getattr(mosaico_ingest, name), member), (name, member)
+
+
+def test_text_r2b_sequences_have_a_manifest(text: str, request: pytest.FixtureRequest) -> None:
+    names = {row.split()[0] for row in table(text, "Sequence Name Compression Factor")}
+    assert len(names) == 4
+    folder = request.config.rootpath / "configs" / "r2b"
+    assert {f"{name}.yaml" for name in names} <= {path.name for path in folder.glob("*.yaml")}

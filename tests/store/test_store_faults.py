@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
+from importlib.util import find_spec
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -241,6 +242,7 @@ except SinkError as err:
 """
 
 
+@pytest.mark.skipif(find_spec("resource") is None, reason="limits file sizes with the module resource")
 def test_session_beyond_file_size_limit_fails_and_leaves_no_files(store: Store) -> None:
     done = subprocess.run(  # noqa: S603 - this interpreter, our own script
         [sys.executable, "-c", FULL, str(store.path), str(Path(__file__).parent)],
@@ -269,6 +271,7 @@ def test_lease_is_live_until_released(tmp_path: Path) -> None:
     assert not is_live(path)
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
 def test_store_opened_by_many_processes_is_never_seen_uninitialized(tmp_path: Path) -> None:
     """A process that finds the catalog while another one creates it must be able to open it."""
     context = get_context("fork")

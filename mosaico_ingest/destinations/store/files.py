@@ -239,8 +239,10 @@ def _move(staged: Path, target: Path) -> None:
 
 
 def fsync(path: Path) -> None:
-    """Wait until the file's or folder's content is on the disk."""
-    handle = os.open(path, os.O_RDONLY)
+    """Wait until the file's or folder's content is on the disk; Windows cannot open folders, and needs no such call."""
+    if path.is_dir() and not hasattr(os, "O_DIRECTORY"):
+        return
+    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:
         os.fsync(handle)
     finally:
