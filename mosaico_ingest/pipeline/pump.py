@@ -22,6 +22,7 @@ from mosaico_ingest.pipeline.quarantine import Quarantine
 from mosaico_ingest.pipeline.topic import TopicPipeline
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.report.events import (
+    CommitStarted,
     Noted,
     Observer,
     Quarantined,
@@ -73,6 +74,7 @@ def write_sequence(
     missing: list[str] = []
     failure: BaseException | None = None
     quarantine = _open_quarantine(plan, request)
+    buffer = WriteBuffer(max_bytes=plan.memory.queue_bytes)
     try:
         with (
             DeferredInterrupt() as interrupt,
@@ -84,17 +86,19 @@ def write_sequence(
             contract = ContractRun.start(plan, recording, topics)
             reported = frozenset(recording.unreadable)
             try:
-                _pump(plan, recording, topics, stopwatch, contract)
+                _pump(plan, recording, topics, buffer, stopwatch, contract)
                 _report_reading(recording, topics, observe, reported=reported)
                 missing = check_counts(plan, recording, topics, observe)
                 if contract is not None:
                     contract.conclude(request, session, observe)
                 _check_not_empty(plan, recording, topics)
+                observe(CommitStarted())
             except BaseException as error:
                 failure = _as_interrupt(error)
-                if not _keeps_partial(plan, request, topics, failure):
+                if not _keeps_partial(plan, request, failure, rows=buffer.written_rows):
                     raise failure from error
                 session.note_error(str(failure))
+                observe(CommitStarted())
             if quarantine is not None:
                 quarantine.close()
             if not isinstance(failure, Interrupted):
@@ -217,12 +221,12 @@ def _pump(
     plan: Plan,
     recording: Recording,
     topics: tuple[TopicPipeline, ...],
+    buffer: WriteBuffer,
     stopwatch: Stopwatch,
     contract: ContractRun | None,
 ) -> None:
     """Move every message block of the recording through its topic; a thread of the buffer writes the rows."""
     by_connection = {connection: topic for topic in topics for connection in topic.plan.connections}
-    buffer = WriteBuffer(max_bytes=plan.memory.queue_bytes)
     try:
         _process(plan, recording, by_connection, buffer, stopwatch, contract=contract)
     finally:
@@ -324,10 +328,8 @@ def _check_not_empty(plan: Plan, recording: Recording, topics: tuple[TopicPipeli
     raise IngestError(f"all of {read} messages were rejected", where=where, hint=reason)
 
 
-def _keeps_partial(
-    plan: Plan, request: SequenceRequest, topics: tuple[TopicPipeline, ...], failure: BaseException
-) -> bool:
-    """Return whether the rows accepted before an error are committed.
+def _keeps_partial(plan: Plan, request: SequenceRequest, failure: BaseException, *, rows: int) -> bool:
+    """Return whether the rows that the destination accepted before an error are committed; without rows, nothing is.
 
     A partial result never replaces a stored sequence. A stopped `append` is discarded, so that repeating the command
     does not append the same rows twice.
@@ -338,7 +340,7 @@ def _keeps_partial(
         return False  # an incomplete recording cannot fulfill its contract
     if isinstance(failure, Interrupted) and request.if_exists is IfExists.APPEND:
         return False
-    return plan.on_error.session is SessionLevelErrorPolicy.Report and any(topic.rows for topic in topics)
+    return plan.on_error.session is SessionLevelErrorPolicy.Report and rows > 0
 
 
 def _as_interrupt(error: BaseException) -> BaseException:

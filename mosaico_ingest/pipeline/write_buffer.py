@@ -39,6 +39,8 @@ class WriteBuffer:
         self._error: BaseException | None = None
         self.busy_s = 0.0
         """Seconds that the thread spent writing."""
+        self.written_rows = 0
+        """Number of rows that the writers accepted."""
         self._thread = threading.Thread(target=self._run, name="mosaico-ingest-write", daemon=True)
         self._finished = threading.Event()
 
@@ -119,5 +121,6 @@ class WriteBuffer:
                 return
             with self._changed:
                 self.busy_s += time.perf_counter() - start
+                self.written_rows += batch.num_rows
                 self._queued_bytes -= size
                 self._changed.notify_all()

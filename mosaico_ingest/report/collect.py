@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from mosaico_ingest.findings import Stage
 from mosaico_ingest.report.contract import ContractResult
 from mosaico_ingest.report.events import (
+    CommitStarted,
     ContractEvaluated,
     Event,
     Expected,
@@ -162,6 +163,8 @@ class Collector:
                 self._contract = event.result
             case Quarantined():
                 self._quarantine = event.messages
+            case CommitStarted():
+                pass
             case Timed():
                 self._steps = Steps(**{step.value: round(s, 6) for step, s in event.seconds.items()})
             case RunFinished():

@@ -142,6 +142,10 @@ class ContractEvaluated(Struct, frozen=True):
     result: ContractResult
 
 
+class CommitStarted(Struct, frozen=True):
+    """The session is about to be committed. An observer that raises here discards it."""
+
+
 class Timed(Struct, frozen=True):
     """The seconds that each step of the run took."""
 
@@ -167,6 +171,7 @@ Event: TypeAlias = (
     | Quarantined
     | TopicClosed
     | ContractEvaluated
+    | CommitStarted
     | Timed
     | RunFinished
 )

@@ -20,7 +20,8 @@ from mosaico_ingest.destinations.base import topic_schema
 from mosaico_ingest.destinations.server.client import connect
 from mosaico_ingest.destinations.server.destination import ServerDestination, ServerSink
 from mosaico_ingest.destinations.server.errors import Address
-from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
+from mosaico_ingest.destinations.server.session import ServerSession
+from mosaico_ingest.errors import Interrupted, SequenceExists, SinkError, SinkUnavailable
 from mosaico_ingest.job.values import IfExists, ServerTarget, SessionLevelErrorPolicy
 from mosaico_ingest.ontology import Integer64
 from mosaico_ingest.ontology.types import OntologyType
@@ -187,10 +188,25 @@ def test_replace_deletes_old_sequence(server: Mosaicod) -> None:
 def test_replace_with_refused_create_reports_deleted_sequence(server: Mosaicod) -> None:
     write(server, 1)
     server.faults.refuse["sequence_create"] = [pa.ArrowInvalid("odd name")]
-    with pytest.raises(
-        SinkError, match="sequence_create is refused: odd name — the stored sequence is deleted"
-    ):
+    with pytest.raises(SinkError, match="sequence_create is refused: odd name") as raised:
         write(server, 2, if_exists=IfExists.REPLACE)
+    assert str(raised.value.hint).endswith("run the same command again to upload it")
+    assert server.sequences == {}
+    write(server, 2, if_exists=IfExists.REPLACE)
+    assert server.topics["seq/n"].table()["timestamp_ns"].to_pylist() == [2]
+
+
+def test_replace_interrupted_during_upload_reports_deleted_sequence(
+    server: Mosaicod, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(_: ServerSession) -> None:
+        raise KeyboardInterrupt
+
+    write(server, 1)
+    monkeypatch.setattr(ServerSession, "_delete_broken_topics", interrupt)
+    with pytest.raises(Interrupted) as raised:
+        write(server, 2, if_exists=IfExists.REPLACE)
+    assert str(raised.value.hint).endswith("run the same command again to upload it")
 
 
 def test_open_sequence_created_concurrently_raises_sequence_exists(server: Mosaicod) -> None:

@@ -165,6 +165,34 @@ def test_server_run_killed_leaves_all_or_nothing_and_next_run_completes(
     assert nothing, "the moments were not where they matter"
 
 
+def test_server_replacement_killed_leaves_old_new_or_nothing_and_next_run_completes(
+    write_bag: WriteBag, write_job: WriteJob, tmp_path: Path, port: int
+) -> None:
+    moments = random.Random()  # noqa: S311 - any moment will do
+    job = write_job(sequence={**SKIP, "if_exists": "replace"}, **to(port))
+    write_bag({"/speed": [number(0)] * ROWS})
+    assert ran("run", job)[0] == 0
+    began = time.monotonic()
+    assert ran("run", job)[0] == 0
+    took = time.monotonic() - began
+    for value in range(1, 7):
+        (tmp_path / "drive.db3").unlink()
+        write_bag({"/speed": [number(value)] * ROWS})
+        process = subprocess.Popen(command("run", "-q", job), stderr=subprocess.DEVNULL)  # noqa: S603 - our own command
+        try:
+            process.wait(took * moments.uniform(0.4, 1.1))
+        except subprocess.TimeoutExpired:
+            process.kill()
+        process.wait(timeout=20)
+        store = Store.open(tmp_path / "served")
+        rows = store.sequence("drive").rows if "drive" in store.names() else 0
+        assert rows in {0, ROWS}
+        assert not rows or speeds(tmp_path) in ([value - 1.0] * ROWS, [float(value)] * ROWS)
+        code, said = ran("run", job)
+        assert code == 0, said
+        assert speeds(tmp_path) == [float(value)] * ROWS
+
+
 def test_run_with_killed_server_fails_and_next_run_completes(
     write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -12,10 +13,10 @@ import pytest
 from mosaico_ingest import api
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.interrupts import Abandoned
-from mosaico_ingest.report.events import Event, RunStatus, TopicProgress
+from mosaico_ingest.report.events import CommitStarted, Event, RunStatus, TopicProgress
 from mosaico_ingest.report.model import Report
 
-from .conftest import RunJob, WriteBag, number
+from .conftest import CUT, RunJob, WriteBag, number
 
 WriteJob = Callable[..., Path]
 
@@ -99,6 +100,45 @@ def test_run_abandoned_by_observer_discards_session(
     with pytest.raises(Abandoned):
         stop_after_rows(write_job(), Abandoned)
     assert rows(tmp_path) == 0
+
+
+@pytest.mark.parametrize("if_exists", ["fail", "replace"])
+def test_run_interrupted_before_first_row_is_written_publishes_nothing(
+    if_exists: str, write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
+) -> None:
+    def stop(_position: int, event: Event) -> None:
+        if isinstance(event, TopicProgress) and event.written:
+            raise KeyboardInterrupt
+
+    write_bag({"/speed": [number(1)] * 10})
+    if if_exists == "replace":
+        assert run_job(write_job()).status is RunStatus.COMPLETED
+    job = write_job(sequence={"name": "drive", "if_exists": if_exists})
+    (report,) = api.run(api.compile_job(job), observe=stop).recordings
+    assert (report.status, report.totals.written) == (RunStatus.INTERRUPTED, 0)
+    info = Store.open(tmp_path / "store").find_sequence("drive")
+    assert (info.rows if info else None, info.notes if info else ()) == (
+        10 if if_exists == "replace" else None,
+        (),
+    )
+
+
+@pytest.mark.parametrize("on_error", ["report", "delete"])
+@pytest.mark.parametrize(
+    "payloads", [[number(1)] * 10, [number(1)] * 70_000 + [CUT]], ids=["complete", "failed"]
+)
+def test_run_abandoned_at_commit_publishes_nothing(
+    payloads: list[bytes], on_error: str, write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
+) -> None:
+    def stop(_position: int, event: Event) -> None:
+        if isinstance(event, CommitStarted):
+            raise Abandoned
+
+    write_bag({"/speed": payloads})
+    job = write_job(on_error={"session": on_error, "message": "raise"})
+    with suppress(Abandoned):
+        api.run(api.compile_job(job), observe=stop)
+    assert Store.open(tmp_path / "store").names() == ()
 
 
 def test_error_of_commit_after_error_of_run_reports_first_error(

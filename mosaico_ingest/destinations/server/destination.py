@@ -22,7 +22,7 @@ from mosaico_ingest.destinations.server.client import ServerClient
 from mosaico_ingest.destinations.server.client import connect as connect_to
 from mosaico_ingest.destinations.server.errors import Refused, add_hint
 from mosaico_ingest.destinations.server.session import ServerSession
-from mosaico_ingest.errors import IngestError, SinkError
+from mosaico_ingest.errors import IngestError, Interrupted, SinkError
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.values import IfExists, ServerTarget, SessionLevelErrorPolicy
 from mosaico_ingest.protocol import messages
@@ -124,6 +124,8 @@ class ServerSink(Struct, frozen=True):
                 session.commit()
             except BaseException as error:
                 left = session.discard()
+                if left and isinstance(error, KeyboardInterrupt):
+                    raise Interrupted("stopped during the upload", where=sequence, hint=left) from error
                 if left and isinstance(error, IngestError):
                     add_hint(error, left)
                 raise

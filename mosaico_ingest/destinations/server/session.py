@@ -32,7 +32,9 @@ from mosaico_ingest.protocol.batches import with_offsets
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.protocol.messages import Action, topic_locator
 
-_OLD_IS_DELETED = "the stored sequence is deleted"
+_OLD_IS_DELETED = (
+    "the old sequence is deleted and the new one is not stored; run the same command again to upload it"
+)
 _UNCHECKED = (
     "the session is finalized, so the sequence is stored, but its rows were not counted;"
     " `ingest status` shows whether it is complete"

@@ -1,0 +1,137 @@
+"""SIGKILL of a parent, of its workers, or of both: each sequence is the old or the new one, and the next run completes."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from mosaico_ingest.destinations.store import Store
+
+from .conftest import WriteBag, number
+
+WriteJob = Callable[..., Path]
+NAMES = ("one", "two", "three")
+ROWS = 20_000
+VICTIMS = ("parent", "worker", "both")
+
+
+def start(job: Path) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "mosaico_ingest", "run", "-q", "--jobs", "2", str(job)]
+    return subprocess.Popen(command, stderr=subprocess.DEVNULL)  # noqa: S603 - our own command
+
+
+def children(pid: int) -> list[int]:
+    try:
+        return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    except OSError:
+        return []
+
+
+def kill(process: subprocess.Popen[bytes], victim: str) -> list[int]:
+    """Kill the parent, its workers, or both; return the ids of the workers."""
+    workers = children(process.pid)
+    victims = {"parent": [process.pid], "worker": workers, "both": [process.pid, *workers]}
+    for pid in victims[victim]:
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    return workers
+
+
+def wait_for_end(workers: list[int]) -> None:
+    """Wait for workers that lost their parent; a process that nobody waits for is a zombie or gone."""
+    end = time.monotonic() + 60
+    for pid in workers:
+        stat = Path(f"/proc/{pid}/stat")
+        while time.monotonic() < end:
+            try:
+                state = stat.read_text().rpartition(")")[2].split()[0]
+            except OSError:
+                break
+            if state == "Z":
+                break
+            time.sleep(0.02)
+        else:
+            pytest.fail("a worker without a parent does not end")
+
+
+def content(store: Path) -> dict[str, float]:
+    """Return the value that all rows of each sequence have."""
+    if not (store / "catalog.sqlite").exists():
+        return {}
+    opened = Store.open(store)
+    values: dict[str, float] = {}
+    for info in opened.sequences():
+        speeds = opened.scan(info.name, "/speed").read_all()["data"].to_pylist()
+        assert speeds == [speeds[0]] * ROWS, "a part of a sequence was published"
+        assert info.notes == ()
+        values[info.name] = speeds[0]
+    return values
+
+
+def kill_and_look(write_bag: WriteBag, job: Path, store: Path, rounds: int) -> dict[str, set[bool]]:
+    """Write or replace three sequences repeatedly and kill processes of each run.
+
+    Return per victim whether sequences were written before the kill.
+    """
+    moments = random.Random()  # noqa: S311 - any moment will do
+
+    def write(value: float) -> None:
+        for name in NAMES:
+            (job.parent / f"{name}.db3").unlink(missing_ok=True)
+            write_bag({"/speed": [number(value)] * ROWS}, name=name)
+
+    def finish(value: float) -> float:
+        started = time.monotonic()
+        assert start(job).wait(120) == 0
+        assert content(store) == dict.fromkeys(NAMES, value)
+        return time.monotonic() - started
+
+    write(0)
+    finish(0)
+    duration = finish(0)
+    outcomes: dict[str, set[bool]] = {victim: set() for victim in VICTIMS}
+    before = content(store)
+    for value in range(1, rounds + 1):
+        victim = VICTIMS[value % len(VICTIMS)]
+        if value % 2:  # nothing is replaced, so `on_error.session` could keep a part
+            for name in before:
+                Store.open(store).delete(name)
+            before = {}
+        write(value)
+        process = start(job)
+        workers: list[int] = []
+        try:
+            process.wait(duration * moments.uniform(0.3, 1.1))
+        except subprocess.TimeoutExpired:
+            workers = kill(process, victim)
+        process.wait(120)
+        wait_for_end(workers)
+        after = content(store)
+        assert all(after.get(name) in {before.get(name), value} for name in NAMES)
+        outcomes[victim] |= {after.get(name) == value for name in NAMES}
+        before = after
+    finish(rounds)
+    return outcomes
+
+
+@pytest.fixture
+def job(write_job: WriteJob) -> Path:
+    bag = {"path": "*.db3", "custom_msgs": [{"package": "own_msgs", "path": "definitions"}]}
+    return write_job(bag=bag, sequence={"name": "{stem}", "if_exists": "replace"})
+
+
+@pytest.mark.slow
+def test_batch_with_killed_processes_leaves_old_or_new_sequences_and_next_run_completes(
+    write_bag: WriteBag, job: Path, tmp_path: Path
+) -> None:
+    outcomes = kill_and_look(write_bag, job, tmp_path / "store", 30)
+    assert outcomes["parent"] | outcomes["both"] == {False, True}, "the moments were not where they matter"
