@@ -104,7 +104,7 @@ def kill_and_look(write_bag: WriteBag, job: Path, store: Path, rounds: int) -> d
         victim = VICTIMS[value % len(VICTIMS)]
         if value % 2:  # nothing is replaced, so `on_error.session` could keep a part
             for name in before:
-                Store.open(store).delete(name)
+                Store.open(store).delete_sequence(name)
             before = {}
         write(value)
         process = start(job)
