@@ -277,8 +277,10 @@ def _report_reading(
             observe(Noted(_undeclared(topic)))
     targets = {connection: topic.plan.target for topic in topics for connection in topic.plan.connections}
     for item in recording.unreadable:
+        if item.connection is not None and item.connection not in targets:
+            continue  # the topic is not selected
         if item.count != 0:
-            target = None if item.connection is None else targets.get(item.connection)
+            target = None if item.connection is None else targets[item.connection]
             observe(
                 Unreadable(
                     target, item.count, item.offset, item.reason, item.start_ns or None, item.end_ns or None

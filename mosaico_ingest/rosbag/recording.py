@@ -56,6 +56,7 @@ from mosaico_ingest.rosbag.definitions.model import (
 )
 from mosaico_ingest.rosbag.discovery import Metadata, MetadataTopic, RecordingFiles, discover, parse_metadata
 from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS, MessageEncoding, refusal
+from mosaico_ingest.rosbag.listed_counts import add_missing_messages, listed_counts, missing_after_reading
 from mosaico_ingest.rosbag.opening import open_split
 
 __all__ = [
@@ -158,14 +159,22 @@ class Recording:
         self.container: str = splits[0].container
         """`mcap`, `sqlite3` or `ros1`."""
         self.size_bytes: int = sum(file.stat().st_size for file in files.files)
-        self.connections: tuple[Connection, ...] = self._table.connections
+        self._listed = {} if unreadable else listed_counts(files)
+        self._metadata_path = "" if files.metadata is None else str(files.metadata.path)
+        lost = [gap for split in splits for gap in split.unreadable]
+        self.connections, missing = add_missing_messages(
+            self._table.connections, self._listed, lost, file=self._metadata_path
+        )
         self.start_ns: int | None = min((s.start_ns for s in splits if s.start_ns is not None), default=None)
         self.end_ns: int | None = max((s.end_ns for s in splits if s.end_ns is not None), default=None)
         """Log time of the last message, inclusive."""
         counts = [split.message_count for split in splits]
         self.message_count: int | None = None if None in counts else sum(count or 0 for count in counts)
+        if self.message_count is not None:
+            self.message_count += sum(gap.count or 0 for gap in missing)
         for number, split in enumerate(splits):
             self._report(number, split.unreadable)
+        self._unreadable |= dict.fromkeys(missing)
         self._infer_definitions()
         findings = recording_findings(splits, self.connections, self.unreadable, files.metadata)
         self._unreadable |= dict.fromkeys(
@@ -278,7 +287,9 @@ class Recording:
             if (keys := self._table.split_connections(number, ids))
         }
         coalescer = BlockCoalescer(max_rows=max_rows, memory_bytes=memory_bytes)
-        iterator = self._coalesced(requests, coalescer, observe, prefetch=prefetch)
+        is_unlimited = first <= EARLIEST_NS and end > LATEST_NS
+        read = dict.fromkeys(ids, 0) if is_unlimited else None
+        iterator = self._coalesced(requests, coalescer, observe, read, prefetch=prefetch)
         self._iterators.add(iterator)
         return iterator
 
@@ -307,17 +318,26 @@ class Recording:
         requests: dict[int, ReadRequest],
         coalescer: BlockCoalescer,
         observe: BlockObserver | None,
+        read: dict[int, int] | None,
         *,
         prefetch: bool,
     ) -> Generator[MessageBlock, None, None]:
+        """Yield blocks; count their messages in `read`, which is None if the request is limited in time."""
         source = self._loaded(requests, observe)
         with Prefetcher(source) if prefetch else closing(source) as loaded_tasks:
             for loaded in loaded_tasks:
                 self._report(loaded.split, loaded.unreadable)
                 for block in loaded.blocks:
+                    if read is not None:
+                        read[block.connection] += len(block)
                     yield from coalescer.add(block, loaded.start_ns)
                 yield from coalescer.flush_ready(loaded.next_ns)
             yield from coalescer.flush_all()
+        if read is not None and self._listed:
+            missing = missing_after_reading(
+                self.connections, self._listed, read, self.unreadable, file=self._metadata_path
+            )
+            self._unreadable |= dict.fromkeys(missing)
 
     def _loaded(
         self, requests: dict[int, ReadRequest], observe: BlockObserver | None
@@ -576,15 +596,13 @@ def _metadata_differences(connections: Sequence[Connection], metadata: Metadata)
 
 def _topic_differences(topic: MetadataTopic, connections: Sequence[Connection]) -> Iterator[str]:
     if not connections:
-        if topic.count:
-            yield f"{topic.count} messages in the metadata, no such topic in the files"
         return
     types = {connection.msgtype for connection in connections}
     if {name.replace("/msg/", "/") for name in types} != {topic.msgtype.replace("/msg/", "/")}:
         yield f"type {topic.msgtype} in the metadata, {', '.join(sorted(types))} in the files"
     counts = [connection.count for connection in connections]
     total = sum(count or 0 for count in counts)
-    if None not in counts and total != topic.count:
+    if None not in counts and total > topic.count:
         yield f"{topic.count} messages in the metadata, {total} in the files"
     attributes = connections[0].attributes
     if topic.qos and attributes.get("offered_qos_profiles", topic.qos).strip() != topic.qos.strip():

@@ -4,9 +4,13 @@ SQLite has no checksums, and a damaged file often yields fewer rows without an e
 most of these cases: the rows of the table, the entries of the index on the timestamp, and the range of the row ids. If
 they disagree, `PRAGMA quick_check` decides whether the file is damaged or rows were deleted.
 
-* An intact file is read by timestamp. Afterwards the rows are compared with the counts.
+* An intact file is read by timestamp. Afterwards the rows are compared with the counts, and `PRAGMA integrity_check`
+  compares the table with its index and follows the payloads that span several pages.
 * A damaged file, and the remainder of a file whose read fails or ends early, is read by row id (`RowScan`), which steps
   over unreadable pages. Rows that are still missing become an unreadable range.
+
+If SQLite reports damage, a result that looks complete may contain wrong values, so it has an unreadable range of unknown
+size. Only bytes of values that changed in place remain unnoticed.
 """
 
 from __future__ import annotations
@@ -104,9 +108,12 @@ class SqliteReader:
             except DAMAGE as err:
                 damage = str(err)
             else:
-                if not any(self._missing_rows(request, rows_read).values()):
+                if any(self._missing_rows(request, rows_read).values()):
+                    damage = "the index on the timestamp is damaged"
+                else:
+                    damage = _check(self._database, "integrity_check")
+                if damage is None:
                     return
-                damage = "the index on the timestamp is damaged"
         yield from self._remaining_tasks(request, rows_read, damage, last_ns)
 
     def index_times(self, connections: Collection[int]) -> dict[int, list[Int64s]] | None:
@@ -153,18 +160,15 @@ class SqliteReader:
                 for key, count in self._missing_rows(request, rows_read).items()
                 if count > 0
             ]
-            return missing or [UnreadableRange(0, f"{damage}; all rows could be read by row id", count=0)]
+            if missing:
+                return missing
         if scan.gaps:
             return scan.gaps
         totals = self._totals
-        if totals.damage is None:
-            return [UnreadableRange(0, f"{damage}; all rows could be read by row id", count=0)]
-        if totals.index_rows is None or totals.table_rows is None:
+        counts = (totals.index_rows, totals.table_rows)
+        if None in counts or len(scan.rowids) < max(*(count or 0 for count in counts), totals.rowid_range):
             return [UnreadableRange(0, f"{damage}: an unknown number of rows is missing")]
-        is_complete = len(scan.rowids) >= max(totals.index_rows, totals.table_rows, totals.rowid_range)
-        if is_complete:
-            return [UnreadableRange(0, f"{damage}; all rows could be read by row id", count=0)]
-        return [UnreadableRange(0, f"{damage}: an unknown number of rows is missing")]
+        return [UnreadableRange(0, f"{damage}: every row was read, but some may have wrong values")]
 
     def _missing_rows(self, request: ReadRequest, rows_read: _RowSet) -> dict[int, int]:
         """Return the number of missing rows by topic; empty if the request is limited in time."""
@@ -361,7 +365,7 @@ def _read_totals(database: sqlite3.Connection) -> _Totals:
         damage = f"the messages cannot be counted: {err}"
     else:
         if not table_rows == index_rows == last_rowid - first_rowid + 1:
-            damage = _check(database)
+            damage = _check(database, "quick_check")
         if damage is None and table_rows != index_rows:
             damage = f"the table has {table_rows} rows, its index {index_rows}"
     typed = {key: count for key, count in by_topic.items() if isinstance(key, int)}
@@ -369,10 +373,10 @@ def _read_totals(database: sqlite3.Connection) -> _Totals:
     return _Totals(typed, table_rows, untyped_rows, index_rows, first_rowid, last_rowid, damage)
 
 
-def _check(database: sqlite3.Connection) -> str | None:
-    """Return the first problem that SQLite finds in the file, None if it finds none."""
+def _check(database: sqlite3.Connection, check: str) -> str | None:
+    """Return the first problem that `quick_check` or `integrity_check` finds in the file, None if it finds none."""
     try:
-        (result,) = database.execute("PRAGMA quick_check(1)").fetchone()
+        (result,) = database.execute(f"PRAGMA {check}(1)").fetchone()
     except DAMAGE as err:
         return str(err)
     return None if result == "ok" else " ".join(str(result).replace("*", " ").split())

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
+from collections import Counter
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -92,15 +95,81 @@ def test_open_metadata_differing_from_files_is_finding(split: Path, recordings: 
     info = read_info(split)
     for entry in info["topics_with_message_count"]:
         entry["topic_metadata"] |= {"type": "std_msgs/msg/Bool"}
-        entry["message_count"] += 1
+        entry["message_count"] -= 1
     info["topics_with_message_count"].pop()
     write_metadata(split, info)
     with open_recording(split, resolve=recordings.blind) as recording:
         assert len(recordings.received(recording)) == 90
+        assert recording.unreadable == ()
         messages = [finding.message for finding in recording.findings if finding.rule == "metadata-differs"]
     assert sum("std_msgs/msg/Bool in the metadata" in message for message in messages) == 3
     assert sum("is not in the metadata" in message for message in messages) == 1
     assert sum("messages in the metadata" in message for message in messages) == 3
+
+
+def test_open_recording_with_fewer_messages_than_metadata_reports_missing_messages(
+    split: Path, recordings: Any
+) -> None:
+    info = read_info(split)
+    first = info["topics_with_message_count"][0]
+    first["message_count"] += 3
+    other = {"topic_metadata": {**first["topic_metadata"], "name": "/other"}, "message_count": 5}
+    info["topics_with_message_count"].append(other)
+    write_metadata(split, info)
+    with open_recording(split, resolve=recordings.blind) as recording:
+        assert len(recordings.received(recording)) == 90
+        topics = {connection.id: connection.topic for connection in recording.connections}
+        missing = {topics.get(item.connection, "/other"): item.count for item in recording.unreadable}
+        assert missing == {first["topic_metadata"]["name"]: 3, "/other": 5}
+        assert recording.message_count == 98
+        assert sum(finding.rule == "unreadable-range" for finding in recording.findings) == 2
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_recording_cut_at_message_reports_messages_of_metadata_as_missing(
+    storage: str, tmp_path: Path, recordings: Any
+) -> None:
+    messages = recordings.sent(60)
+    if storage == "sqlite3":
+        folder = recordings.rosbag2(tmp_path / "bag", messages, storage="sqlite3")
+        with closing(sqlite3.connect(next(folder.glob("*.db3")))) as database, database:
+            database.execute("DELETE FROM messages WHERE id > 40")
+    else:
+        folder = tmp_path / "bag"
+        folder.mkdir()
+        path = recordings.mcap(folder / "bag_0.mcap", messages, chunked=False)
+        counts = Counter((message.topic, message.msgtype) for message in messages)
+        listed = [
+            {"topic_metadata": {"name": topic, "type": msgtype}, "message_count": count}
+            for (topic, msgtype), count in counts.items()
+        ]
+        write_metadata(
+            folder,
+            {
+                "version": 5,
+                "relative_file_paths": ["bag_0.mcap"],
+                "message_count": 60,
+                "topics_with_message_count": listed,
+            },
+        )
+        path.write_bytes(path.read_bytes()[: record_ends(path)[40]])
+    with open_recording(folder, resolve=recordings.blind) as recording:
+        read = recordings.received(recording)
+        assert 0 < len(read) < 60
+        losses = [item.count for item in recording.unreadable]
+        assert None in losses or len(read) + sum(losses) == 60
+        assert losses
+
+
+def record_ends(path: Path) -> list[int]:
+    """Return the offsets behind the messages of an MCAP file without chunks."""
+    content = path.read_bytes()
+    position, ends = 8, list[int]()
+    while position < len(content) - 8:
+        position += 9 + int.from_bytes(content[position + 1 : position + 9], "little")
+        if content[position : position + 1] == b"\x05":
+            ends.append(position)
+    return ends
 
 
 @pytest.mark.parametrize(
