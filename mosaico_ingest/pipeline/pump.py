@@ -86,7 +86,7 @@ def write_sequence(
             contract = ContractRun.start(plan, recording, topics)
             reported = frozenset(recording.unreadable)
             try:
-                _pump(plan, recording, topics, buffer, stopwatch, contract)
+                _pump(plan, recording, topics, buffer, stopwatch, contract=contract)
                 _report_reading(recording, topics, observe, reported=reported)
                 missing = check_counts(plan, recording, topics, observe)
                 if contract is not None:
@@ -223,6 +223,7 @@ def _pump(
     topics: tuple[TopicPipeline, ...],
     buffer: WriteBuffer,
     stopwatch: Stopwatch,
+    *,
     contract: ContractRun | None,
 ) -> None:
     """Move every message block of the recording through its topic; a thread of the buffer writes the rows."""

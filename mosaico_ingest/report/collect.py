@@ -137,7 +137,7 @@ class Collector:
         self._contract: ContractResult | None = None
         self._finish = RunFinished(status=RunStatus.FAILED, exit_code=1)
 
-    def __call__(self, event: Event) -> None:
+    def __call__(self, event: Event) -> None:  # noqa: C901 - one case per event
         """Add an event."""
         match event:
             case TopicProgress() | Rejected() | TopicClosed():
