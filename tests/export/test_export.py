@@ -17,7 +17,7 @@ from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import BagError, IngestError, NothingMatched
 from mosaico_ingest.export import export_sequence
 from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.job.values import LoaderErrorPolicy, TopicLevelErrorPolicy
+from mosaico_ingest.job.values import TopicLevelErrorPolicy
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 
 DRIVE = Path(__file__).parents[2] / "configs" / "quickstart" / "drive.mcap"
@@ -271,7 +271,7 @@ def round_trip(path: Path, folder: Path) -> int:
     folder.mkdir()
     options = {
         "topics_on_error": TopicLevelErrorPolicy.Ignore,
-        "messages_on_error": LoaderErrorPolicy.IGNORE,
+        "manifest": {"on_error": {"message": "ignore"}},
     }
     done = run([ROSInjectionConfig(file_path=path, sequence_name="s", store=folder / "s", **options)])
     rejected = {topic.target for topic in done.recordings[0].topics if topic.rejected}

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import foxglove_schemas
 import numpy as np
 import pyarrow as pa
 import pyarrow.flight as fl
@@ -32,6 +33,7 @@ from mosaico_ingest.job.values import ServerTarget, Stores
 from mosaico_ingest.ontology import Integer64
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
+from mosaico_ingest.rosbag.writers import open_writer
 from mosaico_ingest.serve import Server, serve
 
 DRIVE = Path(__file__).parents[2] / "configs" / "quickstart" / "drive.mcap"
@@ -241,3 +243,28 @@ def test_export_from_server_unknown_sequence_names_the_nearest(server: Server) -
         pytest.raises(SinkError, match="there is no sequence 'ss' — the nearest is s"),
     ):
         ServerSequence(client, "ss")
+
+
+def test_export_from_server_of_protobuf_and_json_equals_export_from_store(
+    server: Server, tmp_path: Path
+) -> None:
+    source = tmp_path / "in.mcap"
+    with open_writer(source) as writer:
+        for at, (name, values) in enumerate(foxglove_schemas.MESSAGES.items()):
+            for form, definition, payload in (
+                (
+                    "protobuf",
+                    foxglove_schemas.protobuf_definition(name),
+                    foxglove_schemas.protobuf_payload(name, values),
+                ),
+                ("json", foxglove_schemas.json_definition(name), foxglove_schemas.json_payload(values)),
+            ):
+                writer.write(writer.add_connection(f"/{form}/{name}", definition), 10 + at, payload)
+    ingest(server.port, source)
+    report = run([ROSInjectionConfig(source, "s", store=tmp_path / "store")]).recordings[0]
+    assert report.error is None
+    served = export(server.port, tmp_path / "served.mcap")
+    stored = export_sequence(Store.open(tmp_path / "store"), "s", tmp_path / "stored.mcap")
+    assert served.topics == stored.topics
+    assert len([topic for topic in served.topics if not topic.excluded]) == 2 * len(foxglove_schemas.MESSAGES)
+    assert (tmp_path / "served.mcap").read_bytes() == (tmp_path / "stored.mcap").read_bytes()
