@@ -220,7 +220,7 @@ CASES: tuple[tuple[str, int, Make, float], ...] = (
     ("sensor_msgs/msg/CompressedImage", 300, jpeg, 0),
     ("visualization_msgs/msg/MarkerArray", 5, markers, 1),
 )
-"""Type and what is special, messages, how one is made, and how many times rosbags' speed it has to reach (0: no target)."""
+"""Type with its peculiarity, number of messages, function that builds a message, and target speed relative to rosbags (0: none)."""
 
 
 def joined(payloads: list[bytes]) -> MessageBlock:
@@ -268,7 +268,7 @@ def main() -> None:
         recent: deque[Decoded] = deque(
             maxlen=3
         )  # as in a pipeline, memory is used again, not returned and asked for
-        fast = count / seconds(lambda: recent.append(columnar.decode(batch)), 12)  # noqa: B023 - called at once
+        fast = count / seconds(lambda: recent.append(columnar.decode(batch)), 12)  # noqa: B023 - called immediately
         peer = count / seconds(lambda: [store.deserialize_cdr(raw, name) for raw in payloads], 2)  # noqa: B023 - the same
         slow = count / seconds(lambda: rowwise.decode(batch), 1)  # noqa: B023 - the same
         mark = "" if fast >= max(target * peer, slow) else "  MISSED"

@@ -43,7 +43,7 @@ def job(**fields: Any) -> Job:
 
 @pytest.mark.promise("config-arguments")
 def test_config_reference_example_builds_job() -> None:
-    made = ROSInjectionConfig(
+    result = ROSInjectionConfig(
         file_path=Path("data/session_01.db3"),
         sequence_name="test_ros_sequence",
         metadata={"driver_version": "v2.1", "weather": "sunny", "location": "test_track_A"},
@@ -55,11 +55,11 @@ def test_config_reference_example_builds_job() -> None:
         on_error=SessionLevelErrorPolicy.Report,
         topics_on_error=TopicLevelErrorPolicy.Raise,
     )
-    assert made.job.paths == (Path("data/session_01.db3"),)
-    assert made.job.topics == ("/cam*",)
-    assert made.job.adapters.override == {"/camera/depth/points": MyCustomRGBDAdapter}
-    assert made.job.destination == StoreTarget(Path("mosaico"))
-    assert pickle.loads(pickle.dumps(made)).job == made.job  # noqa: S301 - our own bytes
+    assert result.job.paths == (Path("data/session_01.db3"),)
+    assert result.job.topics == ("/cam*",)
+    assert result.job.adapters.override == {"/camera/depth/points": MyCustomRGBDAdapter}
+    assert result.job.destination == StoreTarget(Path("mosaico"))
+    assert pickle.loads(pickle.dumps(result)).job == result.job  # noqa: S301 - our own bytes
 
 
 def test_config_key_of_each_argument_exists_in_manifest() -> None:
@@ -88,26 +88,26 @@ def test_config_other_enumerations_are_converted_by_value() -> None:
     class Policy(Enum):  # as the official SDK has it
         Ignore = "ignore"
 
-    made = job(ros_distro=RosbagsStores.ROS2_HUMBLE, topics_on_error={"/gps": Policy.Ignore})
-    assert made.bag.ros_distro is Stores.ROS2_HUMBLE
-    assert made.on_error.for_topic("/gps") is TopicLevelErrorPolicy.Ignore
+    result = job(ros_distro=RosbagsStores.ROS2_HUMBLE, topics_on_error={"/gps": Policy.Ignore})
+    assert result.bag.ros_distro is Stores.ROS2_HUMBLE
+    assert result.on_error.for_topic("/gps") is TopicLevelErrorPolicy.Ignore
 
 
 def test_config_words_are_converted_to_enumerations() -> None:
-    made = job(
+    result = job(
         ros_distro="ros2_humble",
         on_error="delete",
         topics_on_error="ignore",
         topics="/imu",
         manifest={"on_error": {"message": "raise"}},
     )
-    assert made.bag.ros_distro is Stores.ROS2_HUMBLE
-    assert made.on_error == ErrorPolicy(
+    assert result.bag.ros_distro is Stores.ROS2_HUMBLE
+    assert result.on_error == ErrorPolicy(
         session=SessionLevelErrorPolicy.Delete,
         topic=TopicLevelErrorPolicy.Ignore,
         message=LoaderErrorPolicy.RAISE,
     )
-    assert made.topics == ("/imu",)
+    assert result.topics == ("/imu",)
 
 
 def test_config_plural_spelling_of_overrides_is_equivalent() -> None:
@@ -145,16 +145,16 @@ def test_job_settings_of_topic_take_each_setting_from_first_glob_that_defines_it
         "*": {"image": "png"},
         "/cam/left": {"image": "raw", "rename": "/left"},
     }
-    made = job(manifest={"topic_settings": settings})
-    left, right = made.settings_of("/cam/left"), made.settings_of("/cam/right")
+    result = job(manifest={"topic_settings": settings})
+    left, right = result.settings_of("/cam/left"), result.settings_of("/cam/right")
     assert (left.every, left.image, left.rename) == (3, "raw", "/left")
     assert (right.every, right.image, right.rename) == (3, "png", None)
 
 
 def test_config_repr_hides_api_key() -> None:
-    made = config(host="h", mosaico_api_key="s3cret")
-    assert "s3cret" not in repr(made)
-    assert "s3cret" not in repr(made.job)
+    result = config(host="h", mosaico_api_key="s3cret")
+    assert "s3cret" not in repr(result)
+    assert "s3cret" not in repr(result.job)
 
 
 @pytest.mark.parametrize(

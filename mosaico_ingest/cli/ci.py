@@ -20,7 +20,7 @@ class CheckedRecording(Struct, frozen=True):
     """The outcome of one recording: the results of its contract, and the error that ended its run."""
 
     name: str
-    """The name of the sequence, or of what was checked."""
+    """The name of the sequence or of the check."""
     contract: ContractResult | None = None
     error: str | None = None
     findings: tuple[Finding, ...] = ()

@@ -72,7 +72,7 @@ class Map(Struct, frozen=True):
 
 
 def picture_strip(topic: TopicInfo) -> Strip:
-    """Return the pictures of rows at equal distances, with the reasons for those that cannot be shown."""
+    """Return the pictures of rows at equal distances, with the reason for each picture that cannot be shown."""
     is_image = has_images(topic.schema)
     pictures: list[Picture] = []
     problems: dict[str, None] = {}

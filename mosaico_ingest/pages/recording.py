@@ -314,7 +314,7 @@ def _times(report: Report) -> Iterator[int]:
 
 
 def _spans(report: Report, topic: str | None) -> list[Span]:
-    """Return the times of the unreadable ranges of a topic, or of those that affect unknown topics."""
+    """Return the times of the unreadable ranges of a topic; None selects the ranges that affect unknown topics."""
     return [
         (item.start_ns, item.end_ns)
         for item in report.unreadable_ranges

@@ -30,7 +30,7 @@ class _Pending:
 
 @dataclass(slots=True)
 class RejectionLog:
-    """An observer that logs undecodable messages: the first of each topic and rule at once, the others in groups."""
+    """An observer that logs undecodable messages: the first of each topic and rule immediately, the others in groups."""
 
     sequence: str
     _pending: dict[tuple[str, str], _Pending] = field(default_factory=dict[tuple[str, str], _Pending])

@@ -190,7 +190,7 @@ class _RunEvents:
         self._observe(event)
 
     def start(self, plan: Plan) -> None:
-        """Report the plan, its findings, and what is known to be unreadable before the first message is read."""
+        """Report the plan, its findings, and the unreadable ranges that opening the recording found."""
         self._started = True
         self(_run_started(plan))
         for finding in plan.findings:

@@ -189,7 +189,7 @@ class TopicPipeline:
     def _apply_policies(
         self, block: MessageBlock, converted: _Converted
     ) -> tuple[_Rejection | None, set[int]]:
-        """Quarantine rejected messages in order; return the one that ends the topic, and the quarantined positions."""
+        """Quarantine rejected messages in order; return the rejection that ends the topic, and the quarantined positions."""
         quarantined: set[int] = set()
         first_row = int(converted.index[0]) if len(converted.index) else len(block)
         for rejection in converted.rejections:

@@ -1,4 +1,4 @@
-"""The report: what was read, written, excluded, rejected and unreadable, per topic and in total."""
+"""The report: the numbers of read, written, excluded, rejected and unreadable messages, per topic and in total."""
 
 from __future__ import annotations
 
@@ -323,5 +323,5 @@ def _parse_by_recording(content: bytes) -> RunReport | None:
 def _parse_part(raw: msgspec.Raw, model: type[_Model]) -> _Model:
     part = model.model_validate_json(bytes(raw))
     if part.model_dump_json().encode() != msgspec.json.format(bytes(raw), indent=-1):
-        raise ValueError("the values differ from those that the model writes")
+        raise ValueError("the values differ from the values that the model writes")
     return part

@@ -370,7 +370,7 @@ class RemoteSource:
             self.notes.append(f"it has no index, so all {self.size} bytes were downloaded")
 
     def check_unchanged(self) -> None:
-        """Raise Unreachable if the file is no longer the one that was opened."""
+        """Raise Unreachable if the file has been replaced since it was opened."""
         self._stop_prefetching()
         self._check_version()
 

@@ -298,7 +298,7 @@ class _RowSet:
         self.by_topic: Counter[Any] = Counter()
 
     def add(self, page: list[Row]) -> list[Row]:
-        """Add the rows of a page; return those that were not in the set."""
+        """Add the rows of a page; return the new ones."""
         positions = np.fromiter((row[0] for row in page), np.int64, len(page)) - self._first
         is_inside = bool((positions >= 0).all()) and bool((positions < len(self._bitmap)).all())
         if is_inside and not self._bitmap[positions].any() and len(np.unique(positions)) == len(page):

@@ -192,7 +192,7 @@ def _beam_points(row: Mapping[str, Any]) -> Points:
 
 
 def _finite(axes: Sequence[Any], values: Any) -> Points:  # noqa: ANN401 - lists or arrays
-    """Return the points without those that have a coordinate that is not finite."""
+    """Return the points whose coordinates are finite."""
     lengths = {len(axis) for axis in axes}
     if len(lengths) > 1:
         raise ViewError(f"the coordinates have different lengths: {', '.join(map(str, sorted(lengths)))}")

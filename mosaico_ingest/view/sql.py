@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["connect", "read_only", "run_query", "table_names"]
 
 MAX_SEQUENCES = 100
-"""Number of sequences above which a query sees only those that it names."""
+"""Number of sequences above which a query sees only the sequences that it names."""
 BATCH_ROWS = 10_000
 """Rows per batch of a result."""
 _READ_ONLY = frozenset({"SELECT", "EXPLAIN", "MULTI", "RELATION"})

@@ -79,19 +79,19 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
 
 
 def test_resolve_without_other_source_uses_builtin(tmp_path: Path) -> None:
-    found = ROSBridge(base_dir=tmp_path).resolve("/imu", "sensor_msgs/Imu")
-    assert (found.spec.name, found.reason, found.unmodeled) == ("IMUAdapter", "built-in", False)
+    choice = ROSBridge(base_dir=tmp_path).resolve("/imu", "sensor_msgs/Imu")
+    assert (choice.spec.name, choice.reason, choice.unmodeled) == ("IMUAdapter", "built-in", False)
 
 
 @pytest.mark.promise("no-adapter")
 def test_resolve_unknown_type_is_unmodeled() -> None:
     bridge = ROSBridge(formats={"visualization_msgs/Marker": "ragged"})
-    found = bridge.resolve("/m", "visualization_msgs/msg/Marker")
-    assert (found.spec.name, found.reason, found.unmodeled) == ("Unmodeled", "unmodeled", True)
-    assert found.spec.serialization_format is SerializationFormat.RAGGED
+    choice = bridge.resolve("/m", "visualization_msgs/msg/Marker")
+    assert (choice.spec.name, choice.reason, choice.unmodeled) == ("Unmodeled", "unmodeled", True)
+    assert choice.spec.serialization_format is SerializationFormat.RAGGED
     with pytest.raises(AdapterError, match="no serialization format 'raged'"):
         ROSBridge(formats={"visualization_msgs/Marker": "raged"})
-    assert found.why == "no adapter takes visualization_msgs/msg/Marker; its messages keep their shape"
+    assert choice.why == "no adapter takes visualization_msgs/msg/Marker; its messages keep their shape"
 
 
 def test_resolve_sources_follow_precedence(tmp_path: Path, installed: Callable[[str], None]) -> None:
@@ -100,8 +100,8 @@ def test_resolve_sources_follow_precedence(tmp_path: Path, installed: Callable[[
     )
     installed(f"{__name__}:MyImuAdapter")
     sys.modules.setdefault(__name__, sys.modules[MyImuAdapter.__module__])
-    found = ROSBridge().resolve("/imu", IMU)
-    assert (found.spec.name, found.reason) == ("MyImuAdapter", "entry point")
+    choice = ROSBridge().resolve("/imu", IMU)
+    assert (choice.spec.name, choice.reason) == ("MyImuAdapter", "entry point")
 
     @register_default_adapter
     class RegisteredAdapter(MyImuAdapter): ...
@@ -111,8 +111,12 @@ def test_resolve_sources_follow_precedence(tmp_path: Path, installed: Callable[[
     assert loaded.resolve("/imu", IMU).why == "loaded from imu.yaml"
     assert loaded.resolve("/imu", IMU).spec.name == "LoadedAdapter"
     both = ROSBridge(loaded=["imu.yaml"], overrides={"/i*": RegisteredAdapter}, base_dir=tmp_path)
-    found = both.resolve("/imu", IMU)
-    assert (found.spec.name, found.reason, found.why) == ("RegisteredAdapter", "override", "override '/i*'")
+    choice = both.resolve("/imu", IMU)
+    assert (choice.spec.name, choice.reason, choice.why) == (
+        "RegisteredAdapter",
+        "override",
+        "override '/i*'",
+    )
     assert both.resolve("/other", IMU).reason == "loaded"
 
 
@@ -137,9 +141,9 @@ def test_resolve_override_accepts_every_reference_form(form: str, tmp_path: Path
         "yaml": "imu.yaml",
         "catalog class": BY_NAME["IMUAdapter"],
     }[form]
-    found = ROSBridge(overrides={"/imu": reference}, base_dir=tmp_path).resolve("/imu", IMU)
-    assert found.reason == "override"
-    assert found.spec.name in {"MyImuAdapter", "IMUAdapter"}
+    choice = ROSBridge(overrides={"/imu": reference}, base_dir=tmp_path).resolve("/imu", IMU)
+    assert choice.reason == "override"
+    assert choice.spec.name in {"MyImuAdapter", "IMUAdapter"}
 
 
 def test_resolve_override_of_other_type_raises_with_both_types() -> None:
@@ -152,8 +156,8 @@ def test_resolve_override_of_other_type_raises_with_both_types() -> None:
 
 
 def test_resolve_override_unmodeled_keeps_ros_shape() -> None:
-    found = ROSBridge(overrides={"/imu": "Unmodeled"}).resolve("/imu", IMU)
-    assert (found.spec.name, found.reason) == ("Unmodeled", "override")
+    choice = ROSBridge(overrides={"/imu": "Unmodeled"}).resolve("/imu", IMU)
+    assert (choice.spec.name, choice.reason) == ("Unmodeled", "override")
 
 
 def test_resolve_override_finds_loaded_adapter_by_name(tmp_path: Path) -> None:
@@ -183,9 +187,9 @@ def test_bridge_broken_entry_point_raises_with_its_name(installed: Callable[[str
 
 def test_mapping_with_inline_ontology_adapts_rows(tmp_path: Path, define: Callable[..., Definition]) -> None:
     (tmp_path / "ticks.yaml").write_text(TEN_LINES)
-    found = ROSBridge(loaded=["ticks.yaml"], base_dir=tmp_path).resolve("/ticks", "std_msgs/Int32")
+    choice = ROSBridge(loaded=["ticks.yaml"], base_dir=tmp_path).resolve("/ticks", "std_msgs/Int32")
     definition = define("std_msgs/msg/Int32")
-    bound = found.spec.bind(definition, ros_shape(definition))
+    bound = choice.spec.bind(definition, ros_shape(definition))
     rows = pa.array([{"data": 3}], ros_shape(definition))
     adapted = bound.adapt(rows, Envelope("/ticks", definition.root, np.zeros(1, np.int64)))
     assert (bound.ontology.tag, adapted.rows.to_pylist()) == ("BridgeTicks", [{"ticks": 3}])
@@ -201,8 +205,8 @@ def test_mapping_uses_adapter_of_same_folder(tmp_path: Path, define: Callable[..
         "version: 1\nadapter: OutlineAdapter\nros_type: geometry_msgs/msg/Polygon\nontology: Polygon\n"
         "fields: {points: {use: FlatPointAdapter, of: 'points[]'}}\n"
     )
-    found = ROSBridge(loaded=["outline.yaml"], base_dir=tmp_path).resolve("/p", "geometry_msgs/msg/Polygon")
-    spec = pickle.loads(pickle.dumps(found.spec))  # noqa: S301 - what was just pickled
+    choice = ROSBridge(loaded=["outline.yaml"], base_dir=tmp_path).resolve("/p", "geometry_msgs/msg/Polygon")
+    spec = pickle.loads(pickle.dumps(choice.spec))  # noqa: S301 - what was just pickled
     definition = define("geometry_msgs/msg/Polygon")
     rows = pa.array([{"points": [{"x": 1.0, "y": 2.0, "z": 3.0}]}], ros_shape(definition))
     adapted = spec.bind(definition, rows.type).adapt(

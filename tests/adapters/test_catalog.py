@@ -69,8 +69,8 @@ def test_catalog_types_have_one_default_adapter() -> None:
 @EVERY
 def test_catalog_entry_matches_its_file(builtin: Builtin) -> None:
     mapping = builtin.mapping
-    said = (mapping.name, mapping.ontology.tag, mapping.ros_types, mapping.default)
-    assert said == (builtin.name, builtin.tag, builtin.ros_types, builtin.default)
+    attributes = (mapping.name, mapping.ontology.tag, mapping.ros_types, mapping.default)
+    assert attributes == (builtin.name, builtin.tag, builtin.ros_types, builtin.default)
     assert mapping.model.description
     assert not mapping.model.description.endswith(".")
 
@@ -101,12 +101,12 @@ def test_catalog_adapter_pickles(builtin: Builtin) -> None:
 
 def _definitions(define: Define, msgtype: str) -> list[Definition]:
     """Return the definitions of the type in ROS 1 and ROS 2, as far as they exist."""
-    found: list[Definition] = []
+    actual: list[Definition] = []
     for distro in (Stores.LATEST, Stores.ROS2_FOXY, Stores.ROS1_NOETIC):
         with suppress(BagError):
-            found.append(define(msgtype, distro))
-    assert found
-    return found
+            actual.append(define(msgtype, distro))
+    assert actual
+    return actual
 
 
 @PAIRS
@@ -262,5 +262,5 @@ def test_catalog_import_reads_no_adapter_file() -> None:
         "b.BY_TYPE['sensor_msgs/msg/Imu'].mapping\n"
         "print([name for name in opened if name.endswith('.yaml')])\n"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)  # noqa: S603 - our own script
-    assert done.stdout.strip() == "[]"
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)  # noqa: S603 - our own script
+    assert result.stdout.strip() == "[]"

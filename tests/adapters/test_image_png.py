@@ -45,8 +45,8 @@ def images(
 ) -> Callable[..., list[dict[str, Any]]]:
     def run(*messages: dict[str, Any]) -> list[dict[str, Any]]:
         spec = PngImageSpec(BY_NAME["ImageAdapter"])
-        given = [{"encoding": "mono8", **message} for message in messages]
-        return adapt(spec, define("sensor_msgs/msg/Image"), given).rows.to_pylist()
+        inputs = [{"encoding": "mono8", **message} for message in messages]
+        return adapt(spec, define("sensor_msgs/msg/Image"), inputs).rows.to_pylist()
 
     return run
 

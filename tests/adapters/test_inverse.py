@@ -164,10 +164,10 @@ TYPE = pa.struct([("a", pa.float32()), ("b", pa.list_(pa.float32()))])
 def test_differences_returns_rows_with_different_text(left: list[Any], right: list[Any]) -> None:
     size = min(len(left), len(right))
     left, right = left[:size], right[:size]
-    found = differences(pa.array(left, TYPE), pa.array(right, TYPE))
+    actual = differences(pa.array(left, TYPE), pa.array(right, TYPE))
     for name in ("a", "b"):
         wrong = [spell(one[name]) != spell(other[name]) for one, other in zip(left, right, strict=True)]
-        assert found.get(name, np.zeros(size, bool)).tolist() == wrong
+        assert actual.get(name, np.zeros(size, bool)).tolist() == wrong
 
 
 def spell(value: Any) -> str:

@@ -156,7 +156,7 @@ def test_adapt_empty_batch_returns_empty_batch() -> None:
     ],
 )  # fmt: skip
 def test_adapt_moved_fields_share_memory(types: str, fields: str, of: Callable[[Any], Any]) -> None:
-    given = {
+    messages = {
         "header": {"frame_id": "f"},
         "serial": "a",
         "blob": [1, 2],
@@ -164,19 +164,21 @@ def test_adapt_moved_fields_share_memory(types: str, fields: str, of: Callable[[
         "cells": [{"voltage_mv": 1}],
         "poses": [{"header": {"frame_id": "p"}}],
     }
-    rows = rows_of(given, given)
+    rows = rows_of(messages, messages)
     adapted = adapt(spec_of(types, fields), rows)
     assert addresses(of(rows)) <= addresses(adapted.rows.field("a"))
 
 
 def test_adapt_sliced_batch_returns_slice() -> None:
-    given = [{"volts": float(k), "cells": [{"voltage_mv": k}] * k, "nine": [float(k)] * 9} for k in range(6)]
+    messages = [
+        {"volts": float(k), "cells": [{"voltage_mv": k}] * k, "nine": [float(k)] * 9} for k in range(6)
+    ]
     spec = spec_of(
         "a: float64\nc: list[float32]\nn: list[float64]\nz: 'list[float64, 9]'",
         "a: volts\nc: 'cells[].voltage_mv * 2'\nn: nine\nz: 'nine[]'",
     )
-    whole = adapt(spec, rows_of(*given)).rows.to_pylist()
-    assert adapt(spec, rows_of(*given).slice(2, 3)).rows.to_pylist() == whole[2:5]
+    whole = adapt(spec, rows_of(*messages)).rows.to_pylist()
+    assert adapt(spec, rows_of(*messages).slice(2, 3)).rows.to_pylist() == whole[2:5]
 
 
 @pytest.mark.parametrize(
@@ -209,14 +211,14 @@ def test_adapt_invalid_row_is_rejected_with_rule_and_value(
     good = {"flag": 1, "serial": "1", "status": 1, "any_length": [1.0] * 9} if "length[] +" in fields else {
         "flag": 1, "serial": "1", "status": 1, "any_length": [1.0, 2.0]
     }  # fmt: skip
-    found = reasons(types, fields, good, {**good, **bad}, good)
-    assert found.keys() == {1}
-    assert found[1][0] == rule
-    assert says in found[1][1]
+    actual = reasons(types, fields, good, {**good, **bad}, good)
+    assert actual.keys() == {1}
+    assert actual[1][0] == rule
+    assert says in actual[1][1]
 
 
 def test_adapt_rows_with_different_mistakes_are_all_rejected() -> None:
-    given = [
+    messages = [
         {"count": 1, "flag": 1},
         {"count": 300, "flag": 1},
         {"count": 1},
@@ -224,7 +226,7 @@ def test_adapt_rows_with_different_mistakes_are_all_rejected() -> None:
         {"count": 2, "flag": 2},
     ]
     spec = spec_of("a: int8\nb: int64", "a: cast(count)\nb: 8 // flag")
-    adapted = adapt(spec, rows_of(*given))
+    adapted = adapt(spec, rows_of(*messages))
     assert [failure.row for failure in adapted.failures] == [1, 2, 3]
     assert adapted.index.tolist() == [0, 4]
     assert adapted.rows.to_pylist() == [{"a": 1, "b": 8}, {"a": 2, "b": 4}]
@@ -254,19 +256,19 @@ def test_adapt_constant_fills_every_row() -> None:
 
 
 def test_adapt_map_replaces_values_and_constants() -> None:
-    given = [{"status": 0}, {"status": 1}, {"status": 7}]
+    messages = [{"status": 0}, {"status": 1}, {"status": 7}]
     assert [
         r["a"]
         for r in values(
-            "a: string", "a: {value: status, map: {0: idle, CHARGING: busy}, else: \"'?'\"}", *given
+            "a: string", "a: {value: status, map: {0: idle, CHARGING: busy}, else: \"'?'\"}", *messages
         )
     ] == ["idle", "busy", "?"]
-    assert [r["a"] for r in values("a: uint8", "a: {value: status, map: {0: 9}, else: keep}", *given)] == [
+    assert [r["a"] for r in values("a: uint8", "a: {value: status, map: {0: 9}, else: keep}", *messages)] == [
         9,
         1,
         7,
     ]
-    assert [r["a"] for r in values("a: uint8", "a: {value: status, map: {0: 9}, else: null}", *given)] == [
+    assert [r["a"] for r in values("a: uint8", "a: {value: status, map: {0: 9}, else: null}", *messages)] == [
         9,
         None,
         None,
@@ -279,9 +281,9 @@ def test_adapt_map_replaces_values_and_constants() -> None:
 
 
 def test_adapt_with_and_when_change_struct() -> None:
-    given = {"pose": {"position": {"x": 1.0}}, "nine": [1.0] * 9}
+    messages = {"pose": {"position": {"x": 1.0}}, "nine": [1.0] * 9}
     fields = "p: {value: pose.position, with: {covariance: nine, covariance_type: status}, when: volts > 0}"
-    first, second = values("p: Point3d", fields, {**given, "volts": 1.0, "status": 3}, given)
+    first, second = values("p: Point3d", fields, {**messages, "volts": 1.0, "status": 3}, messages)
     assert first["p"] == {
         "header": None,
         "covariance": [1.0] * 9,

@@ -31,8 +31,8 @@ TYPES: dict[str, Path | str] = {
 
 
 def block(start: str) -> str:
-    [found] = [block for block in BLOCKS if block.startswith(start)]
-    return found
+    [actual] = [block for block in BLOCKS if block.startswith(start)]
+    return actual
 
 
 def test_mapping_page_first_example_passes_its_tests() -> None:

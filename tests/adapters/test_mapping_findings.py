@@ -67,13 +67,13 @@ def findings_of(text: str) -> list[tuple[Finding, str]]:
     except AdapterError as error:
         findings = error.findings
     lines = text.splitlines()
-    found = []
+    actual = []
     for finding in findings:
         assert finding.span is not None
         line = lines[finding.span.line - 1]
         end = finding.span.end_column if finding.span.end_line == finding.span.line else len(line) + 1
-        found.append((finding, line[finding.span.column - 1 : end - 1]))
-    return found
+        actual.append((finding, line[finding.span.column - 1 : end - 1]))
+    return actual
 
 
 @pytest.mark.parametrize(
@@ -220,10 +220,10 @@ def test_struct_written_as_plain_mapping_suggests_fields() -> None:
 )
 def test_adapter_file_mistake_is_one_finding_at_the_value(old: str, new: str, rule: str, under: str) -> None:
     assert old in FILE
-    found = findings_of(FILE.replace(old, new, 1))
-    assert len(found) == 1, [str(f) for f, _ in found]
+    actual = findings_of(FILE.replace(old, new, 1))
+    assert len(actual) == 1, [str(f) for f, _ in actual]
     if rule != "yaml-duplicate":
-        assert (found[0][0].rule, found[0][1]) == (rule, under)
+        assert (actual[0][0].rule, actual[0][1]) == (rule, under)
 
 
 def test_ontology_unknown_suggests_nearest_tag() -> None:
@@ -235,8 +235,8 @@ def test_ontology_unknown_suggests_nearest_tag() -> None:
 
 
 def test_expression_with_two_unknown_fields_has_two_findings() -> None:
-    found = findings_of(f"{FILE}  count: nope + 2 * nada\n")
-    assert [under for _, under in found] == ["nope", "nada"]
+    actual = findings_of(f"{FILE}  count: nope + 2 * nada\n")
+    assert [under for _, under in actual] == ["nope", "nada"]
 
 
 def test_unknown_field_hint_lists_fields() -> None:

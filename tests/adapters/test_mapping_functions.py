@@ -174,13 +174,13 @@ def test_compressed_format_returns_codec(said: str, stored: str) -> None:
 
 
 def test_ros_header_empty_header_is_null() -> None:
-    given = [
+    messages = [
         {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""},
         {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "map"},
         {"stamp": {"sec": 0, "nanosec": 1}, "frame_id": ""},
         None,
     ]
-    silent, named, stamped, absent = column("ros_header(x)", given, HEADER)
+    silent, named, stamped, absent = column("ros_header(x)", messages, HEADER)
     assert silent is None
     assert absent is None
     assert named == {"timestamp": {"seconds": 0, "nanoseconds": 0}, "frame_id": "map", "sample_counter": None}
@@ -188,11 +188,11 @@ def test_ros_header_empty_header_is_null() -> None:
 
 
 def test_ros_header_ros1_seq_becomes_sample_counter() -> None:
-    given = [
+    messages = [
         {"seq": 7, "stamp": {"sec": 0, "nanosec": 0}, "frame_id": "map"},
         {"seq": 7, "stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""},
     ]
-    named, silent = column("ros_header(x)", given, HEADER_1)
+    named, silent = column("ros_header(x)", messages, HEADER_1)
     assert (named["sample_counter"], silent) == (7, None)
 
 

@@ -74,8 +74,10 @@ class Writer:
         if form == 5:
             return f"cast({inner()}, '{pick.choice(TYPES)}')"
         called = pick.choice(CALLED)
-        taken = [called.parameter(k) for k in range(len(called.parameter_types) + called.variadic)]
-        texts = (pick.choice(["'a'", "''", "'(a)'", "'('"]) if take.literal else inner() for take in taken)
+        parameters = [called.parameter(k) for k in range(len(called.parameter_types) + called.variadic)]
+        texts = (
+            pick.choice(["'a'", "''", "'(a)'", "'('"]) if take.literal else inner() for take in parameters
+        )
         return f"{called.name}({', '.join(texts)})"
 
     def value(self, type_: Any) -> Any:  # noqa: PLR0911 - a return for each type

@@ -91,28 +91,28 @@ def test_show_unknown_adapter_suggests_nearest(ingest: Ingest) -> None:
 def test_explain_built_in_adapter_lists_every_column() -> None:
     types = DefinitionFinder()
     for builtin in BUILTIN:
-        found = explain_adapter(builtin.name, types).description
+        explanation = explain_adapter(builtin.name, types).description
         struct = builtin.mapping.ontology.struct
-        origins = {column.name: column.origin for column in found.columns}
-        assert found.ontology == builtin.tag
+        origins = {column.name: column.origin for column in explanation.columns}
+        assert explanation.ontology == builtin.tag
         assert {field.name for field in struct} <= origins.keys()
         assert all(origins[field.name] is not None for field in struct if not field.nullable)
 
 
 def test_explain_type_explains_its_default_adapter(ingest: Ingest) -> None:
-    found = json.loads(ingest("explain", "sensor_msgs/PointCloud2", "--json")[1])
-    assert found["description"]["name"] == "PointCloudAdapter"
-    assert found["why"] == "built-in for sensor_msgs/msg/PointCloud2"
-    assert "LidarAdapter" in found["others"]
+    output = json.loads(ingest("explain", "sensor_msgs/PointCloud2", "--json")[1])
+    assert output["description"]["name"] == "PointCloudAdapter"
+    assert output["why"] == "built-in for sensor_msgs/msg/PointCloud2"
+    assert "LidarAdapter" in output["others"]
     assert "Unmodeled" in ingest("explain", "std_msgs/msg/ColorRGBA")[1]
 
 
 def test_explain_variant_type_lists_its_additional_columns(ingest: Ingest) -> None:
-    found = json.loads(ingest("explain", "geometry_msgs/msg/PoseStamped", "--json")[1])
-    origins = {column["name"]: column["origin"] for column in found["description"]["columns"]}
+    output = json.loads(ingest("explain", "geometry_msgs/msg/PoseStamped", "--json")[1])
+    origins = {column["name"]: column["origin"] for column in output["description"]["columns"]}
     assert origins["header"] == "header"
     assert origins["covariance"] is None
-    assert found["description"]["takes"]["geometry_msgs/msg/PoseWithCovarianceStamped"] == "pose.pose"
+    assert output["description"]["takes"]["geometry_msgs/msg/PoseWithCovarianceStamped"] == "pose.pose"
 
 
 def test_explain_adapter_lists_fields_without_column(ingest: Ingest) -> None:

@@ -318,15 +318,15 @@ def test_expand_undecodable_file_name_with_strict_stdout_succeeds(tmp_path: Path
     (tmp_path / name).write_text(
         "version: 1\nbag: {path: '{a}.mcap'}\nsequence: {name: s}\nmatrix: {a: [x, y]}\n"
     )
-    done = subprocess.run(  # noqa: S603 - our own command
+    result = subprocess.run(  # noqa: S603 - our own command
         [sys.executable, "-m", "mosaico_ingest", "expand", name],
         cwd=tmp_path,
         env=os.environ | {"PYTHONIOENCODING": "utf-8:strict"},
         capture_output=True,
         check=False,
     )
-    assert (done.returncode, done.stderr) == (0, b"")
-    assert rb"# job\udcff.yaml: a=x" in done.stdout
+    assert (result.returncode, result.stderr) == (0, b"")
+    assert rb"# job\udcff.yaml: a=x" in result.stdout
 
 
 @pytest.mark.parametrize(
@@ -355,7 +355,7 @@ def test_run_closed_pipe_keeps_exit_code(arguments: tuple[str, ...], code: int, 
 @pytest.mark.slow
 def test_run_closed_stdout_keeps_exit_code(tmp_path: Path) -> None:
     command = f"{sys.executable} -m mosaico_ingest inspect {QUICKSTART} >&-"
-    done = subprocess.run(  # noqa: S602 - our own command
+    result = subprocess.run(  # noqa: S602 - our own command
         command, shell=True, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60
     )
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (result.returncode, result.stderr) == (0, "")

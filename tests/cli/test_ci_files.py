@@ -97,8 +97,8 @@ def test_run_and_plan_write_metadata_violation_as_failed_test(tmp_path: Path) ->
         [case] = cases(junit)
         assert case[0].startswith("metadata-schema: ")
         assert case[1:] == ("failure", "job.yaml", "3")
-        [found] = json.loads(sarif.read_text())["runs"][0]["results"]
-        assert found["ruleId"] == "metadata-schema"
+        [actual] = json.loads(sarif.read_text())["runs"][0]["results"]
+        assert actual["ruleId"] == "metadata-schema"
 
 
 def test_run_without_contract_writes_one_passed_test_per_recording(tmp_path: Path) -> None:

@@ -45,23 +45,23 @@ def ingest(folder: Path, *arguments: str) -> Done:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a store that holds the sequence `drive`."""
     folder = tmp_path_factory.mktemp("export")
-    done = ingest(folder, "bag", str(DRIVE), "--name", "drive", "--quiet")
-    assert done.returncode == 0, done.stderr
+    result = ingest(folder, "bag", str(DRIVE), "--name", "drive", "--quiet")
+    assert result.returncode == 0, result.stderr
     return folder
 
 
 def test_export_prints_every_topic_and_file(folder: Path) -> None:
-    done = ingest(folder, "export", "drive", "--to", "a.mcap")
-    assert done.returncode == 0, done.stderr
-    assert "FrameTransformAdapter" in done.stdout
-    assert "a.mcap: 2,130 messages" in done.stdout
+    result = ingest(folder, "export", "drive", "--to", "a.mcap")
+    assert result.returncode == 0, result.stderr
+    assert "FrameTransformAdapter" in result.stdout
+    assert "a.mcap: 2,130 messages" in result.stdout
 
 
 def test_export_with_json_prints_report(folder: Path) -> None:
-    done = ingest(
+    result = ingest(
         folder, "export", "drive", "--to", "b.mcap", "-t", "/imu", "--start", "+2s", "--end", "-3s", "--json"
     )
-    account = json.loads(done.stdout)
+    account = json.loads(result.stdout)
     assert [topic["topic"] for topic in account["topics"]] == ["/imu"]
     assert account["topics"][0]["messages"] == 499
 
@@ -71,9 +71,9 @@ def test_export_excluded_topic_exits_4(folder: Path) -> None:
     (folder / "quickstart").symlink_to(DRIVE.parent)
     (folder / "job.yaml").write_text(job.read_text().replace("../mosaico", "mosaico"))
     assert ingest(folder, "run", "job.yaml", "--quiet").returncode == 0
-    done = ingest(folder, "export", "quickstart_drive", "--to", "c.mcap")
-    assert done.returncode == 4
-    assert "/battery: excluded: no known adapter converts acme_msgs/msg/BatteryPack" in done.stdout
+    result = ingest(folder, "export", "quickstart_drive", "--to", "c.mcap")
+    assert result.returncode == 4
+    assert "/battery: excluded: no known adapter converts acme_msgs/msg/BatteryPack" in result.stdout
 
 
 @pytest.mark.parametrize(
@@ -90,9 +90,9 @@ def test_export_excluded_topic_exits_4(folder: Path) -> None:
 def test_export_invalid_arguments_leave_no_file(
     folder: Path, arguments: tuple[str, ...], code: int, says: str
 ) -> None:
-    done = ingest(folder, "export", *arguments)
-    assert done.returncode == code
-    assert says in done.stderr
+    result = ingest(folder, "export", *arguments)
+    assert result.returncode == code
+    assert says in result.stderr
     assert not list(folder.glob("x.*"))
 
 
@@ -121,9 +121,11 @@ def test_export_from_server_writes_the_selected_part(secured: tuple[str, Keyring
         ring.add(Permission.READ),
         "--json",
     )
-    done = ingest(tmp_path, "export", "drive", "--from", f"mosaico://{address}", "--to", "imu.mcap", *options)
-    assert done.returncode == 0, done.stderr
-    (topic,) = json.loads(done.stdout)["topics"]
+    result = ingest(
+        tmp_path, "export", "drive", "--from", f"mosaico://{address}", "--to", "imu.mcap", *options
+    )
+    assert result.returncode == 0, result.stderr
+    (topic,) = json.loads(result.stdout)["topics"]
     assert (topic["topic"], topic["messages"]) == ("/imu", 299)
 
 
@@ -138,9 +140,9 @@ def test_export_from_server_writes_the_selected_part(secured: tuple[str, Keyring
 def test_export_from_server_refused_option_leaves_no_file(
     secured: tuple[str, Keyring], tmp_path: Path, options: tuple[str, ...], code: int, words: str
 ) -> None:
-    done = ingest(tmp_path, "export", "drive", "--from", secured[0], "--to", "out.mcap", *options)
-    assert done.returncode == code
-    assert words in done.stderr
+    result = ingest(tmp_path, "export", "drive", "--from", secured[0], "--to", "out.mcap", *options)
+    assert result.returncode == code
+    assert words in result.stderr
     assert not (tmp_path / "out.mcap").exists()
 
 

@@ -85,9 +85,9 @@ def test_quickstart_run_twice_fails_because_the_sequence_exists(project: Path) -
 def test_bag_existing_sequence_is_skipped_or_replaced_with_if_exists(project: Path) -> None:
     command = ("bag", "configs/quickstart/drive.mcap", "--name", "drive", "--store", "again")
     assert ingest(*command, cwd=project).returncode == 0
-    taken = ingest(*command, cwd=project)
-    assert taken.returncode == 1
-    assert "`ingest bag` has --if-exists" in taken.stderr.replace("\n", " ")
+    result = ingest(*command, cwd=project)
+    assert result.returncode == 1
+    assert "`ingest bag` has --if-exists" in result.stderr.replace("\n", " ")
     for choice, says in (("skip", "skipped"), ("replace", "2,130 of 2,130 messages written")):
         finished = ingest(*command, "--if-exists", choice, cwd=project)
         assert finished.returncode == 0, finished.stderr

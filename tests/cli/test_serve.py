@@ -74,9 +74,9 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Generator[dict[str, str]
 def test_bag_to_server_is_in_its_store(served: tuple[Path, str, str]) -> None:
     folder, port, key = served
     arguments = ("bag", str(RECORDING), "--name", "drive", "--host", "127.0.0.1", "--port", port)
-    done = ingest(*arguments, cwd=folder, key=key)
-    assert done.returncode == 0, done.stderr
-    assert key not in done.stdout + done.stderr
+    result = ingest(*arguments, cwd=folder, key=key)
+    assert result.returncode == 0, result.stderr
+    assert key not in result.stdout + result.stderr
     topics = Store.open(folder / "mosaico", create=False).sequence("drive").topics
     assert sum(topic.rows for topic in topics) == 2130
 
@@ -86,10 +86,10 @@ def test_bag_with_read_key_is_refused(served: tuple[Path, str, str]) -> None:
     folder, port, _ = served
     key = ingest("keys", "new", "--permission", "read", "--api-keys", "other.json", cwd=folder).stdout.strip()
     arguments = ("bag", str(RECORDING), "--name", "drive", "--host", "127.0.0.1", "--port", port)
-    done = ingest(*arguments, cwd=folder, key=key)
-    assert done.returncode == 1
-    assert "Traceback" not in done.stderr
-    assert key not in done.stdout + done.stderr
+    result = ingest(*arguments, cwd=folder, key=key)
+    assert result.returncode == 1
+    assert "Traceback" not in result.stderr
+    assert key not in result.stdout + result.stderr
 
 
 def test_keys_ls_does_not_print_keys(served: tuple[Path, str, str]) -> None:
@@ -125,13 +125,13 @@ def test_keys_ls_does_not_print_keys(served: tuple[Path, str, str]) -> None:
 def test_bag_server_error_is_one_line(
     places: dict[str, str], tmp_path: Path, options: tuple[str, ...], said: str
 ) -> None:
-    given = [option.format(**places) for option in options]
-    done = ingest("bag", str(RECORDING), "--name", "refused", "--quiet", *given, cwd=tmp_path)
-    assert done.returncode == 1
-    (line,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    arguments = [option.format(**places) for option in options]
+    result = ingest("bag", str(RECORDING), "--name", "refused", "--quiet", *arguments, cwd=tmp_path)
+    assert result.returncode == 1
+    (line,) = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
     assert said in line
-    assert "Traceback" not in done.stderr
-    assert places["expired"] not in done.stderr
+    assert "Traceback" not in result.stderr
+    assert places["expired"] not in result.stderr
 
 
 def test_serve_interrupt_with_open_upload_stops_immediately(served: tuple[Path, str, str]) -> None:
@@ -156,12 +156,12 @@ def test_serve_interrupt_with_open_upload_stops_immediately(served: tuple[Path, 
 
 
 def test_serve_certificate_without_key_exits_2(tmp_path: Path) -> None:
-    done = ingest("serve", "--tls-cert", "cert.pem", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "--tls-key" in done.stderr
+    result = ingest("serve", "--tls-cert", "cert.pem", cwd=tmp_path)
+    assert result.returncode == 2
+    assert "--tls-key" in result.stderr
 
 
 def test_serve_help_lists_options(tmp_path: Path) -> None:
-    done = ingest("serve", "--help", cwd=tmp_path)
-    assert done.returncode == 0
-    assert "--api-keys" in done.stdout
+    result = ingest("serve", "--help", cwd=tmp_path)
+    assert result.returncode == 0
+    assert "--api-keys" in result.stdout

@@ -182,10 +182,10 @@ def test_executor_failed_recording_does_not_stop_others(executor: Executor, tmp_
 
 
 def test_executor_events_state_their_recording(executor: Executor, tmp_path: Path) -> None:
-    told: list[tuple[int, Event]] = []
-    list(executor.map(tasks(tmp_path, "abc"), lambda position, event: told.append((position, event))))
+    caught: list[tuple[int, Event]] = []
+    list(executor.map(tasks(tmp_path, "abc"), lambda position, event: caught.append((position, event))))
     for position, name in enumerate("abc"):
-        events = [event for at, event in told if at == position]
+        events = [event for at, event in caught if at == position]
         assert isinstance(events[0], RunStarted)
         assert events[0].sequence == name
         assert isinstance(events[-1], RunFinished)

@@ -183,8 +183,8 @@ BY_URL = pytest.param(in_bucket, marks=pytest.mark.slow, id="in_bucket")
 )
 def there(request: pytest.FixtureRequest, tmp_path: Path) -> Generator[Destination, None, None]:
     needs = (request.getfixturevalue("objects"),) if request.param is in_bucket else ()
-    made: AbstractContextManager[Destination] = request.param(tmp_path, *needs)
-    with made as destination:
+    result: AbstractContextManager[Destination] = request.param(tmp_path, *needs)
+    with result as destination:
         yield destination
 
 

@@ -159,22 +159,24 @@ def main() -> int:
     parser.add_argument("patterns", nargs="*", help="globs on the path in INDEX.tsv; none: all")
     parser.add_argument("--out", type=Path, help="also write the table to this file, tab-separated")
     parser.add_argument("--corpus", type=Path, default=CORPUS)
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     rows = list[Row]()
-    for done in survey(given.corpus, given.patterns):
-        rows.append(done)
-        sys.stdout.write(f"{done.outcome:8}{done.read:8}{done.written:8}{done.rejected:6}  {done.path}\n")
-        for detail in filter(None, (done.why, done.wrong and f"WRONG {done.wrong}")):
+    for result in survey(arguments.corpus, arguments.patterns):
+        rows.append(result)
+        sys.stdout.write(
+            f"{result.outcome:8}{result.read:8}{result.written:8}{result.rejected:6}  {result.path}\n"
+        )
+        for detail in filter(None, (result.why, result.wrong and f"WRONG {result.wrong}")):
             sys.stdout.write(f"{'':32}{detail}\n")
         sys.stdout.flush()
     sys.stdout.write(totals(rows))
-    if given.out:
-        with given.out.open("w", encoding="utf-8", newline="") as file:
+    if arguments.out:
+        with arguments.out.open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, delimiter="\t", lineterminator="\n")
             names = [field.name for field in fields(Row) if field.name != "seconds"]
             writer.writerow(names)
-            writer.writerows([getattr(done, name) for name in names] for done in rows)
-    return 1 if any(done.wrong for done in rows) else 0
+            writer.writerows([getattr(result, name) for name in names] for result in rows)
+    return 1 if any(result.wrong for result in rows) else 0
 
 
 def totals(rows: Sequence[Row]) -> str:

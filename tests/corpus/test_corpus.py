@@ -42,15 +42,15 @@ def tables(recording: Path, folder: Path) -> dict[str, bytes]:
     """Ingest a recording and return its topics as Arrow IPC, which equals itself where a column has NaN."""
     report = SURVEY.report_of(recording, folder)
     assert report.error is None
-    store, found = Store.open(folder), dict[str, bytes]()
+    store, actual = Store.open(folder), dict[str, bytes]()
     for topic in report.topics:
         if topic.status is TopicStatus.WRITTEN:
             rows = store.scan("survey", topic.target).read_all().combine_chunks()
             sink = pa.BufferOutputStream()
             with pa.ipc.new_stream(sink, rows.schema) as writer:
                 writer.write_table(rows)
-            found[topic.target] = sink.getvalue().to_pybytes()
-    return found
+            actual[topic.target] = sink.getvalue().to_pybytes()
+    return actual
 
 
 @pytest.mark.slow

@@ -48,17 +48,17 @@ def same(ours: Any, theirs: Any) -> bool:
 
 def known_to_rosbags(path: Path) -> dict[tuple[int, str], list[Any]]:
     """Return rosbags' messages by time and topic; none where it cannot read the recording."""
-    found: dict[tuple[int, str], list[Any]] = {}
+    actual: dict[tuple[int, str], list[Any]] = {}
     try:
         with AnyReader([path], default_typestore=get_typestore(RosbagsStores.ROS2_HUMBLE)) as reader:
             for number, (connection, time, raw) in enumerate(reader.messages()):
                 if number >= _MAX_MESSAGES:
                     break
                 message = reader.deserialize(raw, connection.msgtype)
-                found.setdefault((time, connection.topic), []).append(plain(message, reader.typestore))
+                actual.setdefault((time, connection.topic), []).append(plain(message, reader.typestore))
     except (AnyReaderError, KeyError, AssertionError):
         return {}
-    return found
+    return actual
 
 
 @pytest.mark.slow

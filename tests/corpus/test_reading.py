@@ -36,10 +36,10 @@ def test_corpus_recording_every_message_is_read(corpus: Path) -> None:
         expected = MORE_THAN_KNOWN.get(name, int(entry["messages"]))
         try:
             with open_recording(corpus / name, resolve=BlindResolver()) as recording:
-                found = sum(len(batch) for batch in recording.message_blocks())
-                if found != expected or recording.message_count not in {None, found}:
+                actual = sum(len(batch) for batch in recording.message_blocks())
+                if actual != expected or recording.message_count not in {None, actual}:
                     wrong.append(
-                        f"{name}: {found} read, {recording.message_count} promised, {expected} known"
+                        f"{name}: {actual} read, {recording.message_count} promised, {expected} known"
                     )
         except BagError as err:
             if REFUSED.get(name, "\n") not in str(err):

@@ -25,8 +25,8 @@ def slow_spans(at: list[int], sizes: list[int]) -> bytes:
 def test_copy_slices_returns_bytes_in_order(data: st.DataObject, largest: int) -> None:
     pairs = data.draw(st.lists(st.tuples(st.integers(0, 40_000), st.integers(0, largest)), max_size=20))
     at, sizes = [start for start, _ in pairs], [size for _, size in pairs]
-    found = copy_slices(DATA, np.array(at, np.int64), np.array(sizes, np.int64))
-    assert found.tobytes() == slow_spans(at, sizes)
+    cells = copy_slices(DATA, np.array(at, np.int64), np.array(sizes, np.int64))
+    assert cells.tobytes() == slow_spans(at, sizes)
 
 
 @given(pairs=st.lists(st.tuples(st.integers(0, 40_000), st.integers(0, 300)), max_size=20))
@@ -34,8 +34,8 @@ def test_copy_slices_distant_slices_are_copied_without_take(pairs: list[tuple[in
     at, sizes = [start for start, _ in pairs], [size for _, size in pairs]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gather, "_FAR_BYTES", 100)
-        found = copy_slices(DATA, np.array(at, np.int64), np.array(sizes, np.int64))
-    assert found.tobytes() == slow_spans(at, sizes)
+        cells = copy_slices(DATA, np.array(at, np.int64), np.array(sizes, np.int64))
+    assert cells.tobytes() == slow_spans(at, sizes)
 
 
 def bytes_of(found: Cells, size: int) -> bytes:
@@ -44,18 +44,18 @@ def bytes_of(found: Cells, size: int) -> bytes:
 
 @given(at=st.lists(st.integers(0, 50_000), max_size=20), size=st.integers(1, 5000))
 def test_fixed_cells_returns_bytes_at_offsets(at: list[int], size: int) -> None:
-    found = fixed_cells(DATA, np.array(at, np.int64), size)
-    assert bytes_of(found, size) == slow_spans(at, [size] * len(at))
+    cells = fixed_cells(DATA, np.array(at, np.int64), size)
+    assert bytes_of(cells, size) == slow_spans(at, [size] * len(at))
 
 
 @given(st.integers(0, 9000), st.integers(1, 500), st.integers(1, 90), st.integers(1, 5000))
 def test_fixed_cells_equidistant_offsets_are_a_view(begin: int, stride: int, count: int, size: int) -> None:
     at = begin + stride * np.arange(count)
-    found = fixed_cells(DATA, at, size)
-    assert np.shares_memory(found.data, DATA)
-    assert bytes_of(found, size) == slow_spans(at.tolist(), [size] * count)
+    cells = fixed_cells(DATA, at, size)
+    assert np.shares_memory(cells.data, DATA)
+    assert bytes_of(cells, size) == slow_spans(at.tolist(), [size] * count)
     assert bytes_at(DATA, at).tobytes() == DATA[at].tobytes()
-    assert copy_slices(DATA, at, np.full(count, size)).tobytes() == bytes_of(found, size)
+    assert copy_slices(DATA, at, np.full(count, size)).tobytes() == bytes_of(cells, size)
 
 
 def test_fixed_cells_of_size_zero_read_nothing() -> None:
@@ -63,6 +63,6 @@ def test_fixed_cells_of_size_zero_read_nothing() -> None:
 
 
 def test_copy_slices_adjacent_slices_are_a_view() -> None:
-    found = copy_slices(DATA, np.array([10, 15, 20]), np.array([5, 5, 1]))
-    assert np.shares_memory(found, DATA)
-    assert found.tobytes() == DATA[10:21].tobytes()
+    cells = copy_slices(DATA, np.array([10, 15, 20]), np.array([5, 5, 1]))
+    assert np.shares_memory(cells, DATA)
+    assert cells.tobytes() == DATA[10:21].tobytes()

@@ -47,8 +47,8 @@ def test_template_equal_lengths_are_one_group(batch_of: BatchOf) -> None:
 def test_template_equal_size_different_lengths_are_separate_groups(batch_of: BatchOf) -> None:
     one, other = ["ab", "abcdef"] * 5, ["abcdef", "ab"] * 5
     clusters = clusters_of(batch_of, [one, other, other] * 50)
-    found = sorted(cluster.rows.tolist() for cluster in clusters)
-    assert found == [list(range(0, 150, 3)), [row for row in range(150) if row % 3]]
+    actual = sorted(cluster.rows.tolist() for cluster in clusters)
+    assert actual == [list(range(0, 150, 3)), [row for row in range(150) if row % 3]]
 
 
 def test_template_different_layouts_are_omitted(batch_of: BatchOf) -> None:

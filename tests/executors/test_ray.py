@@ -91,11 +91,11 @@ def ingest(folder: Path, *arguments: str) -> subprocess.Popen[str]:
 
 def ended(process: subprocess.Popen[str]) -> tuple[int, str]:
     try:
-        _, said = process.communicate(timeout=120)
+        _, output = process.communicate(timeout=120)
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
-    return process.returncode, said
+    return process.returncode, output
 
 
 def outcome(folder: Path) -> list[dict[str, Any]]:
@@ -109,18 +109,18 @@ def test_ray_cluster_gives_the_same_result_as_one_machine(cluster: Any, tmp_path
     here, there = tmp_path / "here", tmp_path / "there"
     for folder in (here, there):
         make_job(folder, "abcd")
-    code, said = ended(ingest(here))
-    assert code == 0, said
-    code, said = ended(
+    code, output = ended(ingest(here))
+    assert code == 0, output
+    code, output = ended(
         ingest(there, "--executor", "ray", "--address", cluster.address, "--log-format", "json")
     )
-    assert code == 0, said
+    assert code == 0, output
     assert outcome(there) == outcome(here)
     ours, theirs = Store.open(here / "store"), Store.open(there / "store")
     assert theirs.names() == ours.names() == tuple("abcd")
     for name in ours.names():
         assert theirs.scan(name, "/imu").read_all() == ours.scan(name, "/imu").read_all()
-    lines = [json.loads(line) for line in said.splitlines()]
+    lines = [json.loads(line) for line in output.splitlines()]
     assert sorted(line["sequence"] for line in lines if line["event"] == "finished") == list("abcd")
     assert {line["message"] for line in lines if line["event"] == "log"} == {"at work"}
     assert not list((there / "store").glob(".run-*"))
@@ -137,8 +137,8 @@ def test_run_interrupted_follows_session_policy_and_exits_130(cluster: Any, tmp_
             break
     time.sleep(0.5)
     os.killpg(process.pid, signal.SIGINT)
-    code, said = ended(process)
-    assert code == 130, said
+    code, output = ended(process)
+    assert code == 130, output
     assert {one["status"] for one in outcome(tmp_path)} == {"interrupted"}
     assert Store.open(tmp_path / "store").names() == ()
 
@@ -163,16 +163,16 @@ def test_ray_lost_node_restarts_its_recording(cluster: Any, tmp_path: Path) -> N
 
 def test_ray_without_address_starts_on_this_machine(tmp_path: Path) -> None:
     make_job(tmp_path, "ab")
-    code, said = ended(ingest(tmp_path, "--executor", "ray", "--jobs", "1"))
-    assert code == 0, said
+    code, output = ended(ingest(tmp_path, "--executor", "ray", "--jobs", "1"))
+    assert code == 0, output
     assert Store.open(tmp_path / "store").names() == ("a", "b")
 
 
 def test_ray_unreachable_address_fails(tmp_path: Path) -> None:
     make_job(tmp_path, "a")
-    code, said = ended(ingest(tmp_path, "--executor", "ray", "--address", "127.0.0.1:9"))
+    code, output = ended(ingest(tmp_path, "--executor", "ray", "--address", "127.0.0.1:9"))
     assert code == 1
-    assert "127.0.0.1:9: cannot connect to Ray" in " ".join(said.split())
+    assert "127.0.0.1:9: cannot connect to Ray" in " ".join(output.split())
 
 
 def test_ray_node_without_access_to_files_fails(tmp_path: Path) -> None:

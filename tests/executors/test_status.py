@@ -71,8 +71,8 @@ def test_shard_without_recordings_exits_0(job: Path) -> None:
 
 def test_json_lines_and_metrics_report_the_run(job: Path) -> None:
     metrics = job.parent / "ingest.prom"
-    done = ingest("run", job, "--log-format", "json", "--metrics", metrics)
-    events = [json.loads(line) for line in done.stderr.splitlines()]
+    result = ingest("run", job, "--log-format", "json", "--metrics", metrics)
+    events = [json.loads(line) for line in result.stderr.splitlines()]
     assert [one["event"] for one in events if one["sequence"] == "b"] == ["started", "finished"]
     assert {one["read"] for one in events if one["event"] == "finished"} == {1000}
     lines = metrics.read_text().splitlines()

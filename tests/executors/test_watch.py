@@ -161,11 +161,11 @@ STRICT = os.environ | {"PYTHONIOENCODING": "utf-8:strict"}
 def watch_once(folder: Path, code: int = 0) -> list[str]:
     command = [sys.executable, "-m", "mosaico_ingest", "watch", "in", "job.yaml", "--once"]
     pace = ["--rest", "0.2", "--every", "0.1"]
-    done = subprocess.run(  # noqa: S603 - our own command
+    result = subprocess.run(  # noqa: S603 - our own command
         [*command, *pace], cwd=folder, capture_output=True, text=True, check=False, timeout=60, env=STRICT
     )
-    assert done.returncode == code, done.stderr
-    return done.stdout.splitlines()
+    assert result.returncode == code, result.stderr
+    return result.stdout.splitlines()
 
 
 @pytest.mark.slow

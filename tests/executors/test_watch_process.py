@@ -33,13 +33,13 @@ class Watch:
 
     def start(self) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", "mosaico_ingest", "watch", "in", "job.yaml"]
-        with (self.folder / "said.txt").open("ab") as said:
+        with (self.folder / "said.txt").open("ab") as output:
             process = subprocess.Popen(  # noqa: S603 - our own command
                 [*command, "--rest", "0.5", "--every", "0.1"],
                 cwd=self.folder,
                 stdin=subprocess.DEVNULL,
-                stdout=said,
-                stderr=said,
+                stdout=output,
+                stderr=output,
                 start_new_session=True,
             )
         self.started.append(process)
@@ -136,12 +136,12 @@ def test_watch_restarted_after_kill_ingests_interrupted_recording_exactly_once(w
 def test_systemd_unit_is_valid(tmp_path: Path) -> None:
     text = UNIT.read_text().replace("/srv/ingest/.venv/bin/ingest", sys.executable)
     (tmp_path / UNIT.name).write_text(text)
-    done = subprocess.run(  # noqa: S603 - the unit is ours
+    result = subprocess.run(  # noqa: S603 - the unit is ours
         ["systemd-analyze", "verify", str(tmp_path / UNIT.name)],  # noqa: S607 - wherever the system has it
         capture_output=True,
         text=True,
         timeout=30,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    assert UNIT.name not in done.stderr
+    assert result.returncode == 0, result.stderr
+    assert UNIT.name not in result.stderr

@@ -37,12 +37,12 @@ NOT_THE_SAME_AGAIN = {
 def listed() -> tuple[tuple[str, str], ...]:
     """Return adapter and field of the losses in the documentation; `*` stands for every adapter."""
     table = DOCS.read_text().split("<!-- losses -->")[1].split("<!-- end of losses -->")[0]
-    found: list[tuple[str, str]] = []
+    actual: list[tuple[str, str]] = []
     for line in table.strip().splitlines()[2:]:
         adapters, fields, _ = (cell.strip() for cell in line.strip("|").split("|"))
         names = re.findall(r"`(\w+)`", adapters) if "`" in adapters else ["*"]
-        found += [(name, field) for name in names for field in re.findall(r"`([^`]+)`", fields)]
-    return tuple(found)
+        actual += [(name, field) for name in names for field in re.findall(r"`([^`]+)`", fields)]
+    return tuple(actual)
 
 
 def covers(name: str, known: str, adapter: str, field: str) -> bool:
@@ -66,8 +66,8 @@ def definition_of(spec: Builtin, msgtype: str, distro: Stores) -> Definition | N
 @cache
 def definitions(spec: Builtin) -> list[Definition]:
     distros = (Stores.LATEST, Stores.ROS1_NOETIC)
-    found = (definition_of(spec, msgtype, distro) for distro in distros for msgtype in spec.ros_types)
-    return [definition for definition in found if definition is not None]
+    actual = (definition_of(spec, msgtype, distro) for distro in distros for msgtype in spec.ros_types)
+    return [definition for definition in actual if definition is not None]
 
 
 def there_and_back(spec: Builtin, definition: Definition, rows: pa.StructArray) -> tuple[set[str], set[str]]:
@@ -137,11 +137,11 @@ def test_round_trip_distinguishes_unmeasured_quantity_from_nan() -> None:
     nan, none = float("nan"), [-1.0] + [0.0] * 8
     message = random_rows(ros_shape(definition), 1)[0].as_py()
     vector = {"x": nan, "y": 1.0, "z": 2.0}
-    given = [
+    messages = [
         message | {"linear_acceleration": vector},
         message | {"linear_acceleration_covariance": none, "orientation_covariance": none},
     ]
-    rows = pa.array(given, ros_shape(definition))
+    rows = pa.array(messages, ros_shape(definition))
     fields, changed = there_and_back(spec, definition, rows)
     assert all(field.startswith("linear_acceleration.") for field in fields)
     assert not changed
@@ -159,7 +159,7 @@ def test_round_trip_of_unpacked_point_cloud_has_the_same_points() -> None:
         for name, offset, datatype in (("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("ring", 12, 4))
     ]
     empty = random_rows(ros_shape(definition), 1)[0].as_py()
-    given = [
+    messages = [
         empty
         | {
             "height": 1,
@@ -171,7 +171,7 @@ def test_round_trip_of_unpacked_point_cloud_has_the_same_points() -> None:
         | {"data": cloud(points)}
         for points in ([(1.0, 2.0, 3.0, 3), (4.0, float("nan"), 0.0, 6)], [])
     ]
-    rows = pa.array(given, ros_shape(definition))
+    rows = pa.array(messages, ros_shape(definition))
     fields_that_differ, changed = there_and_back(spec, definition, rows)
     assert not changed
     assert "header" not in fields_that_differ

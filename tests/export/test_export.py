@@ -273,18 +273,18 @@ def round_trip(path: Path, folder: Path) -> int:
         "topics_on_error": TopicLevelErrorPolicy.Ignore,
         "manifest": {"on_error": {"message": "ignore"}},
     }
-    done = run([ROSInjectionConfig(file_path=path, sequence_name="s", store=folder / "s", **options)])
-    rejected = {topic.target for topic in done.recordings[0].topics if topic.rejected}
+    reports = run([ROSInjectionConfig(file_path=path, sequence_name="s", store=folder / "s", **options)])
+    rejected = {topic.target for topic in reports.recordings[0].topics if topic.rejected}
     try:
         report = export_sequence(Store.open(folder / "s", create=False), "s", folder / "out.mcap")
-        found = differences(path, folder / "out.mcap")
+        actual = differences(path, folder / "out.mcap")
     except IngestError:
-        assert done.recordings[0].totals.written == 0 or done.recordings[0].error
+        assert reports.recordings[0].totals.written == 0 or reports.recordings[0].error
         return 0
     for topic in report.topics:
         assert not topic.excluded
         assert not topic.changed
-        wrong = found.get(topic.topic, set()) - LISTED.get(topic.msgtype.rpartition("/")[2], set())
+        wrong = actual.get(topic.topic, set()) - LISTED.get(topic.msgtype.rpartition("/")[2], set())
         wrong = {field for field in wrong if not field.endswith(("header.seq", "covariance"))}
         assert not wrong or topic.topic in rejected, f"{path}: {topic.topic}: {wrong}"
     return len(report.topics)

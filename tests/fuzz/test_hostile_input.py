@@ -36,7 +36,7 @@ def ingest(tmp_path: Path) -> Ingest:
     """Run the command in the test's folder, within limits; a traceback or a control character fails the test."""
 
     def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-        done = subprocess.run(  # noqa: S603 - our own command
+        result = subprocess.run(  # noqa: S603 - our own command
             [sys.executable, "-m", "mosaico_ingest", *map(str, arguments)],
             cwd=tmp_path,
             env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
@@ -47,11 +47,11 @@ def ingest(tmp_path: Path) -> Ingest:
             preexec_fn=_limited,
             check=False,
         )
-        said = done.stdout + done.stderr
-        assert "Traceback" not in said
-        assert not {c for c in said if unicodedata.category(c) in {"Cc", "Cs"}} - {"\n"}
-        assert "\u202e" not in said
-        return done
+        output = result.stdout + result.stderr
+        assert "Traceback" not in output
+        assert not {c for c in output if unicodedata.category(c) in {"Cc", "Cs"}} - {"\n"}
+        assert "\u202e" not in output
+        return result
 
     return run
 

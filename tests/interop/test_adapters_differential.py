@@ -203,8 +203,8 @@ def _compare(adapter: Any, builtin: Builtin, definition: Definition, messages: l
         theirs, error = _theirs(adapter, message, adapted.rows.type)
         both += row in ours and theirs is not None
         refusal = next((failure.reason for failure in adapted.failures if failure.row == row), error)
-        found = _explained(definition.root, ours.get(row), theirs, refusal)
-        problems += [f"row {row}: {problem}\n  in {message}" for problem in found]
+        explanation = _explained(definition.root, ours.get(row), theirs, refusal)
+        problems += [f"row {row}: {problem}\n  in {message}" for problem in explanation]
     assert problems[:3] == []
     assert both > len(messages) / 4, "too few messages that both take"
 

@@ -118,9 +118,9 @@ def test_override_can_name_a_builtin_adapter_of_the_sdk(folder: Path) -> None:
     bridge = ROSBridge(
         overrides={"/imu": "mosaicolabs.bridges.ros.adapters.sensor_msgs:IMUAdapter"}, base_dir=folder
     )
-    found = bridge.resolve("/imu", "sensor_msgs/msg/Imu")
+    choice = bridge.resolve("/imu", "sensor_msgs/msg/Imu")
     definition = TypeResolver(Stores.LATEST).resolve("sensor_msgs/msg/Imu", None, ros_version=2)
-    bound: Any = found.spec.bind(definition, ros_shape(definition))
+    bound: Any = choice.spec.bind(definition, ros_shape(definition))
     assert (bound.ontology.tag, bound.ontology.fingerprint) == ("IMU", "2d6a4121b0")
 
 

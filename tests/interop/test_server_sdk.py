@@ -107,23 +107,23 @@ def differences(store: Store, ours: str, theirs: str) -> set[tuple[str, str]]:
     mine = {topic.name: topic for topic in store.sequence(ours).topics}
     other = {topic.name: topic for topic in store.sequence(theirs).topics}
     assert list(mine) == list(other)
-    found: set[tuple[str, str]] = set()
+    actual: set[tuple[str, str]] = set()
     for name, topic in mine.items():
         if kind_of(topic.ontology) != kind_of(other[name].ontology):
-            found.add((name, "type"))
+            actual.add((name, "type"))
             continue
         keys = topic.metadata.keys() | other[name].metadata.keys()
-        found |= {
+        actual |= {
             (name, f"metadata.{key}")
             for key in keys
             if topic.metadata.get(key) != other[name].metadata.get(key)
         }
         columns = [store.scan(sequence, name).read_all().to_pydict() for sequence in (ours, theirs)]
         assert list(columns[0]) == list(columns[1])
-        found |= {
+        actual |= {
             (name, column) for column in columns[0] if bare(columns[0][column]) != bare(columns[1][column])
         }
-    return found
+    return actual
 
 
 def kind_of(ontology: OntologyType) -> tuple[object, ...]:
@@ -192,18 +192,18 @@ def test_sdk_query_builder_finds_the_same_as_a_scan(served: Server, client: Any,
         ):
             expected.add((sequence, "/imu"))
     after = store.scan("ours", "/imu").read_all()["timestamp_ns"][10].as_py()
-    found = client.query(QueryOntologyCatalog(IMU.Q.acceleration.x.gt(low), IMU.Q.timestamp_ns.gt(after)))
-    assert {(item.sequence.name, topic.name) for item in found for topic in item.topics} == expected
+    response = client.query(QueryOntologyCatalog(IMU.Q.acceleration.x.gt(low), IMU.Q.timestamp_ns.gt(after)))
+    assert {(item.sequence.name, topic.name) for item in response for topic in item.topics} == expected
 
 
 def test_sdk_query_builder_selects_by_name_tag_and_metadata(client: Any) -> None:
-    found = client.query(
+    response = client.query(
         QuerySequence().with_name_match("o*"), QueryTopic().with_ontology_tag("IMU"), QueryOntologyCatalog()
     )
-    assert [(item.sequence.name, [topic.name for topic in item.topics]) for item in found] == [
+    assert [(item.sequence.name, [topic.name for topic in item.topics]) for item in response] == [
         ("ours", ["/imu"])
     ]
-    again = client.query(found.to_query_sequence(), QueryTopic().with_name_match("/gps/*"))
+    again = client.query(response.to_query_sequence(), QueryTopic().with_name_match("/gps/*"))
     assert [[topic.ontology_tag for topic in item.topics] for item in again] == [["GPS"]]
     narrowed = client.query(again.to_query_topic(), QueryOntologyCatalog(GPS.Q.position.z.gt(-1e6)))
     assert {item.sequence.name for item in narrowed} == {"ours", "theirs"}
@@ -217,11 +217,11 @@ def test_sdk_clusters_and_intersects_topics_of_a_query(served: Server, client: A
         name: store.scan("ours", name).read_all()["timestamp_ns"].to_pylist() for name in ("/imu", "/gps/fix")
     }
     high = rows["/imu"][-1] - rows["/imu"][0]
-    found = client.query(
+    response = client.query(
         QuerySequence().with_name("ours"),
         QueryOntologyCatalog(IMU.Q.timestamp_ns.geq(0), GPS.Q.timestamp_ns.geq(0)),
     )
-    topics = {topic.name: topic for item in found for topic in item.topics}
+    topics = {topic.name: topic for item in response for topic in item.topics}
 
     def spans(clusters: Any) -> list[tuple[int, int]]:
         return [(cluster.timerange.start, cluster.timerange.end) for cluster in clusters]

@@ -114,7 +114,9 @@ def traffic(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Traffic,
 
 def test_both_injectors_make_the_same_calls_with_the_same_keys(traffic: tuple[Traffic, Traffic]) -> None:
     """The handshake aside, which older SDKs make by `version`."""
-    ours, theirs = ([call for call in said.actions if call[0] not in {"info", "version"}] for said in traffic)
+    ours, theirs = (
+        [call for call in output.actions if call[0] not in {"info", "version"}] for output in traffic
+    )
     assert Counter(ours) == Counter(theirs)
     for calls in (ours, theirs):
         names = [name for name, _ in calls]
@@ -134,7 +136,9 @@ def test_both_injectors_upload_equal_rows_and_ours_fewer_messages(
     traffic: tuple[Traffic, Traffic],
 ) -> None:
     ours, theirs = traffic
-    assert {topic: said[:2] for topic, said in ours.uploads.items()} == {
-        topic: said[:2] for topic, said in theirs.uploads.items()
+    assert {topic: output[:2] for topic, output in ours.uploads.items()} == {
+        topic: output[:2] for topic, output in theirs.uploads.items()
     }
-    assert sum(said[2] for said in ours.uploads.values()) <= sum(said[2] for said in theirs.uploads.values())
+    assert sum(output[2] for output in ours.uploads.values()) <= sum(
+        output[2] for output in theirs.uploads.values()
+    )

@@ -163,8 +163,8 @@ def test_matrix_expands_to_all_or_listed_combinations(folder: Path) -> None:
     ],
 )
 def test_matrix_invalid_value_is_one_located_finding(folder: Path, matrix: str, location: str) -> None:
-    found = findings(job(folder, f"matrix: {matrix}\nbag: {{path: x}}"))
-    assert [where for _, where in found] == [location]
+    actual = findings(job(folder, f"matrix: {matrix}\nbag: {{path: x}}"))
+    assert [where for _, where in actual] == [location]
 
 
 def test_matrix_findings_of_all_combinations_are_deduplicated(folder: Path) -> None:

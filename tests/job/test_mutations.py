@@ -111,11 +111,11 @@ def test_check_manifest_misspelled_key_is_located_and_corrected(path: KeyPath, s
     key = str(path[-1])
     wrong = {"double": key + key[-1], "drop": key[:-1], "upper": key.upper()}[slip]
     span = SOURCE.key_span(path)
-    found = findings_of(replaced((span.line, span.column), (span.end_line, span.end_column), wrong))
-    assert [(rule, line, column) for rule, line, column, _ in found] == [
+    actual = findings_of(replaced((span.line, span.column), (span.end_line, span.end_column), wrong))
+    assert [(rule, line, column) for rule, line, column, _ in actual] == [
         ("unknown-key", span.line, span.column)
     ]
-    assert f"did you mean '{key}'" in found[0][3]
+    assert f"did you mean '{key}'" in actual[0][3]
 
 
 def cases() -> Iterator[tuple[KeyPath, str]]:
@@ -140,9 +140,9 @@ def schema_refuses(path: KeyPath, value: object) -> bool:
 def test_check_manifest_wrong_value_is_one_located_finding(path: KeyPath, written: str) -> None:
     span = SOURCE.span(path)
     text = replaced((span.line, span.column), (span.end_line, span.end_column), written)
-    found = findings_of(text)
-    assert len(found) == 1
-    rule, line, column, remedy = found[0]
+    actual = findings_of(text)
+    assert len(actual) == 1
+    rule, line, column, remedy = actual[0]
     assert rule in {"wrong-type", "wrong-value", "newer-version", "unknown-key"}
     assert line == span.line
     assert column >= span.column

@@ -117,9 +117,9 @@ def check_topic(topic: TopicReport, wanted: dict[str, Any], store: Store, sequen
     if rules is not None:
         assert {rejection.rule: rejection.count for rejection in topic.rejections} == rules
     if rows is not None:
-        found = store.scan(sequence, topic.target).read_all().to_pylist()
-        assert len(found) == len(rows)
-        for one, expected in zip(found, rows, strict=True):
+        actual = store.scan(sequence, topic.target).read_all().to_pylist()
+        assert len(actual) == len(rows)
+        for one, expected in zip(actual, rows, strict=True):
             assert matches(one, expected), one
 
 

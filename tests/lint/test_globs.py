@@ -27,7 +27,7 @@ NAMES = st.text(alphabet="/ab", max_size=8)
         ("/a/[bc]", "/a/b", True),
     ],
 )
-def test_covers_decides_known_pairs(general: str, special: str, expected: bool) -> None:  # noqa: FBT001
+def test_covers_decides_known_pairs(general: str, special: str, expected: bool) -> None:  # noqa: FBT001 - a parameter of the test
     assert covers(general, special) is expected
 
 

@@ -204,9 +204,9 @@ def test_metadata_from_without_match_is_a_finding_per_source(tmp_path: Path) -> 
 def test_invalid_sidecar_is_refused_with_location(tmp_path: Path, text: str) -> None:
     write(tmp_path / "r1_7.mcap", sidecar=text)
     job = manifest(tmp_path, '  metadata_from: {sidecar: "{stem}.json"}\n')
-    code, found = plan_error(job)
+    code, actual = plan_error(job)
     assert code == 2
-    assert [place[:3] for place in found] == [("invalid-sidecar", "r1_7.json", 1)]
+    assert [place[:3] for place in actual] == [("invalid-sidecar", "r1_7.json", 1)]
 
 
 def test_violation_of_source_has_location_of_source(tmp_path: Path) -> None:

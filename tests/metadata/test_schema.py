@@ -21,9 +21,9 @@ def findings_of(folder: Path, schema: object, text: str) -> list[tuple[str, int,
     spans = Spans(source.spans, source.key_spans)
     metadata = source.at(("metadata",))
     assert isinstance(metadata, dict)
-    found = violations(load_schema(path), metadata, ("metadata",), spans)  # type: ignore[arg-type] # text keys
-    assert {finding.rule for finding in found} <= {"metadata-schema"}
-    return [(f.message, f.span.line, f.span.column) for f in found if f.span]
+    actual = violations(load_schema(path), metadata, ("metadata",), spans)  # type: ignore[arg-type] # text keys
+    assert {finding.rule for finding in actual} <= {"metadata-schema"}
+    return [(f.message, f.span.line, f.span.column) for f in actual if f.span]
 
 
 def mistakes_of(path: Path) -> list[tuple[str, str, int, int]]:
@@ -59,7 +59,7 @@ def mistakes_of(path: Path) -> list[tuple[str, str, int, int]]:
 def test_violations_have_location_of_value_or_key(
     tmp_path: Path, schema: object, text: str, location: tuple[int, int]
 ) -> None:
-    assert [found[1:] for found in findings_of(tmp_path, schema, text)] == [location]
+    assert [actual[1:] for actual in findings_of(tmp_path, schema, text)] == [location]
 
 
 def test_violations_of_valid_metadata_are_empty(tmp_path: Path) -> None:
@@ -85,7 +85,7 @@ def test_violations_of_misspelled_required_key_are_one_finding_with_suggestion_a
 
 
 def test_violations_of_endless_schema_are_a_finding(tmp_path: Path) -> None:
-    assert [found[1:] for found in findings_of(tmp_path, {"$ref": "#"}, "metadata: {a: 1}\n")] == [(1, 11)]
+    assert [actual[1:] for actual in findings_of(tmp_path, {"$ref": "#"}, "metadata: {a: 1}\n")] == [(1, 11)]
 
 
 def test_load_schema_follows_references_to_neighbors(tmp_path: Path) -> None:
@@ -93,7 +93,7 @@ def test_load_schema_follows_references_to_neighbors(tmp_path: Path) -> None:
     (tmp_path / "common" / "id.json").write_text('{"$defs": {"id": {"$ref": "../word.json"}}}')
     (tmp_path / "word.json").write_text('{"type": "string"}')
     schema = {"properties": {"a": {"$ref": "common/id.json#/$defs/id"}}}
-    assert [found[1:] for found in findings_of(tmp_path, schema, "metadata: {a: 1}\n")] == [(1, 15)]
+    assert [actual[1:] for actual in findings_of(tmp_path, schema, "metadata: {a: 1}\n")] == [(1, 15)]
     names = {path.name for path in schema_files(tmp_path / "schema.json")}
     assert names == {"schema.json", "id.json", "word.json"}
 
@@ -101,7 +101,7 @@ def test_load_schema_follows_references_to_neighbors(tmp_path: Path) -> None:
 def test_load_schema_with_id_url_finds_neighbors(tmp_path: Path) -> None:
     (tmp_path / "word.json").write_text('{"$id": "https://fleet.example/word.json", "type": "string"}')
     schema = {"$id": "https://fleet.example/vehicle.json", "properties": {"a": {"$ref": "word.json"}}}
-    assert [found[1:] for found in findings_of(tmp_path, schema, "metadata: {a: 1}\n")] == [(1, 15)]
+    assert [actual[1:] for actual in findings_of(tmp_path, schema, "metadata: {a: 1}\n")] == [(1, 15)]
 
 
 def test_load_schema_reloads_changed_neighbor(tmp_path: Path) -> None:

@@ -58,11 +58,11 @@ def test_connect_with_trusted_certificate_returns_client(
 
 
 def test_connect_unresolvable_host_raises() -> None:
-    found = refusal("no-such-host.invalid", 6726)
-    assert str(found) == (
+    error = refusal("no-such-host.invalid", 6726)
+    assert str(error) == (
         "grpc://no-such-host.invalid:6726: the host 'no-such-host.invalid' cannot be resolved — check target.host"
     )
-    assert not found.retryable
+    assert not error.retryable
 
 
 @pytest.mark.parametrize("host", ["", "grpc://127.0.0.1:6726", "127.0.0.1:6726", "a b", "[::1]"])
@@ -82,11 +82,11 @@ def test_connect_to_web_server_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     with HTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as web:
         thread = threading.Thread(target=web.serve_forever, kwargs={"poll_interval": 0.05})
         thread.start()
-        found = refusal("127.0.0.1", web.server_port)
+        error = refusal("127.0.0.1", web.server_port)
         web.shutdown()
         thread.join()
     assert "the program at this address is not a Mosaico server — check target.host and target.port" in str(
-        found
+        error
     )
 
 
@@ -94,9 +94,9 @@ def test_connect_to_closed_port_raises_sink_unavailable(monkeypatch: pytest.Monk
     monkeypatch.setattr("mosaico_ingest.destinations.server.client._DELAYS_S", (0.01,))
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    found = refusal("127.0.0.1", port)
-    assert isinstance(found, SinkUnavailable)
-    assert "the connection is refused — check target.host and target.port" in str(found)
+    error = refusal("127.0.0.1", port)
+    assert isinstance(error, SinkUnavailable)
+    assert "the connection is refused — check target.host and target.port" in str(error)
 
 
 def test_connect_to_silent_port_raises_sink_unavailable(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,28 +109,28 @@ def test_connect_to_silent_port_raises_sink_unavailable(monkeypatch: pytest.Monk
 
 def test_connect_with_tls_to_server_without_tls_raises() -> None:
     with running(Mosaicod()) as server:
-        found = refusal("127.0.0.1", server.port, tls=True)
-    assert str(found).endswith("the server does not use TLS — set target.tls: false")
-    assert not found.retryable
+        error = refusal("127.0.0.1", server.port, tls=True)
+    assert str(error).endswith("the server does not use TLS — set target.tls: false")
+    assert not error.retryable
 
 
 def test_connect_without_tls_to_tls_server_raises(secure: Mosaicod) -> None:
-    found = refusal("127.0.0.1", secure.port)
-    assert str(found).endswith(
+    error = refusal("127.0.0.1", secure.port)
+    assert str(error).endswith(
         "the server accepts only TLS connections — set target.tls: true, or target.tls_cert"
     )
-    assert not found.retryable
+    assert not error.retryable
 
 
 def test_connect_untrusted_certificate_raises(secure: Mosaicod) -> None:
-    found = refusal("localhost", secure.port, tls=True)
-    assert "the certificate is not trusted: self" in str(found)
-    assert "set target.tls_cert" in str(found)
+    error = refusal("localhost", secure.port, tls=True)
+    assert "the certificate is not trusted: self" in str(error)
+    assert "set target.tls_cert" in str(error)
 
 
 def test_connect_certificate_for_other_name_raises(secure: Mosaicod, certificate: tuple[Path, Path]) -> None:
-    found = refusal("127.0.0.1", secure.port, tls_cert=certificate[0])
-    assert "the certificate is not for '127.0.0.1' — use the name the certificate is for" in str(found)
+    error = refusal("127.0.0.1", secure.port, tls_cert=certificate[0])
+    assert "the certificate is not for '127.0.0.1' — use the name the certificate is for" in str(error)
 
 
 def test_connect_invalid_or_missing_certificate_file_raises(

@@ -91,8 +91,8 @@ def test_stored_returns_rows_and_time_range_of_server(server: Mosaicod) -> None:
     with ServerSink(target(server)).open("seq", {}) as session:
         session.topic("/n", NUMBER, {}).write(numbers(3, 1, 2))
         session.topic("/empty", NUMBER, {})
-    held, empty = session.stored()
-    assert (held.topic, held.rows, held.start_ns, held.end_ns) == ("/n", 3, 1, 3)
+    contents, empty = session.stored()
+    assert (contents.topic, contents.rows, contents.start_ns, contents.end_ns) == ("/n", 3, 1, 3)
     assert (empty.rows, empty.start_ns, empty.stored_bytes) == (0, None, 0)
     assert server.topics["seq/empty"].state == "final"
 
@@ -239,8 +239,8 @@ def test_stored_on_older_server_counts_rows_by_reading(server: Mosaicod) -> None
         assert client.limit_bytes == 50_000_000
     with ServerSink(target(server)).open("seq", {}) as session:
         session.topic("/n", NUMBER, {}).write(numbers(3, 1))
-    (held,) = session.stored()
-    assert (held.rows, held.start_ns, held.end_ns) == (2, 1, 3)
+    (contents,) = session.stored()
+    assert (contents.rows, contents.start_ns, contents.end_ns) == (2, 1, 3)
 
 
 class TestFaults:

@@ -17,9 +17,9 @@ GOLDEN: dict[str, list[str]] = json.loads(Path(__file__).with_name("fingerprints
 
 @pytest.mark.parametrize("tag", sorted(MODULES))
 def test_ontology_fingerprints_and_formats_are_unchanged(tag: str) -> None:
-    found = ontology_type(tag)
-    assert [found.fingerprint, found.serialization_format.value] == GOLDEN[tag]
-    assert found.tag == tag
+    ontology = ontology_type(tag)
+    assert [ontology.fingerprint, ontology.serialization_format.value] == GOLDEN[tag]
+    assert ontology.tag == tag
 
 
 def test_ontology_fingerprints_cover_every_model() -> None:
@@ -28,9 +28,9 @@ def test_ontology_fingerprints_cover_every_model() -> None:
 
 @pytest.mark.parametrize("tag", sorted(MODULES))
 def test_columns_json_entry_matches_model(tag: str) -> None:
-    known, made = ontology_type(tag), model(tag).ontology_type()
-    assert known == made
-    assert known.struct.equals(made.struct, check_metadata=True)
+    known, result = ontology_type(tag), model(tag).ontology_type()
+    assert known == result
+    assert known.struct.equals(result.struct, check_metadata=True)
 
 
 def test_columns_json_is_up_to_date() -> None:
@@ -41,10 +41,10 @@ def test_ontology_columns_equal_reference(shared: Path) -> None:
     reference = json.loads((shared / "spec" / "ontology.json").read_text())["classes"]
     assert {entry["ontology_tag"] for entry in reference} == set(MODULES)
     for entry in reference:
-        found = ontology_type(entry["ontology_tag"])
-        assert str(found.struct) == entry["arrow_type_str"]
-        assert found.fingerprint == entry["schema_fingerprint"]
-        assert found.serialization_format.value == entry["serialization_format"]
+        ontology = ontology_type(entry["ontology_tag"])
+        assert str(ontology.struct) == entry["arrow_type_str"]
+        assert ontology.fingerprint == entry["schema_fingerprint"]
+        assert ontology.serialization_format.value == entry["serialization_format"]
 
 
 def values(data_type: pa.DataType) -> st.SearchStrategy[Any]:
@@ -86,8 +86,8 @@ def within_a_second(value: Any) -> Any:
 @settings(deadline=None, max_examples=5)
 @given(data=st.data())
 def test_model_row_round_trip_restores_row(tag: str, data: st.DataObject) -> None:
-    found = model(tag)
+    ontology = model(tag)
     row = within_a_second(data.draw(values(ontology_type(tag).struct)))
-    batch = found.to_batch([found.from_row(row)])
+    batch = ontology.to_batch([ontology.from_row(row)])
     assert batch.type == ontology_type(tag).struct
     assert batch[0].as_py() == row

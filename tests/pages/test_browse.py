@@ -125,14 +125,14 @@ def test_browse_pages_of_many_sequences_are_reached_by_links(tmp_path: Path) -> 
     for name in names:
         store.create_sequence(name, {})
     browser = StoreBrowser(str(store.path))
-    found: list[str] = []
+    actual: list[str] = []
     address = "/?q=drive"
     while address:
         page = browser.page(address).html
-        found += re.findall(r'href="/sequence/(\w+)"', page)
+        actual += re.findall(r'href="/sequence/(\w+)"', page)
         following = re.search(r'href="([^"]+)">Next page', page)
         address = unescape(following[1]) if following else ""
-    assert found == names
+    assert actual == names
 
 
 def test_browse_page_is_computed_again_after_the_sequence_changed(tmp_path: Path) -> None:
@@ -161,7 +161,7 @@ def test_browse_any_address_has_a_page(store: Store, address: str) -> None:
 
 @given(st.text(max_size=20), st.text(max_size=5), st.text(max_size=5))
 def test_name_glob_matches_names_that_contain_the_text(text: str, before: str, after: str) -> None:
-    from fnmatch import fnmatchcase  # noqa: PLC0415
+    from fnmatch import fnmatchcase  # noqa: PLC0415 - only this test needs it
 
     if "*" not in text and "?" not in text:
         assert fnmatchcase(f"{before}{text}{after}", name_glob(text))

@@ -130,10 +130,10 @@ def test_report_command_writes_page_and_summary(tmp_path: Path) -> None:
     source = tmp_path / "run.json"
     source.write_text(RUNS["small"].model_dump_json())
     page, summary = tmp_path / "out.html", tmp_path / "out.md"
-    done = CliRunner().invoke(
+    result = CliRunner().invoke(
         command_line(), ["report", str(source), "--html", str(page), "--markdown", str(summary)]
     )
-    assert done.exit_code == 0, done.output
+    assert result.exit_code == 0, result.output
     assert page.read_text() == run_page(RUNS["small"], tmp_path)
     assert summary.read_text() == markdown_summary(RUNS["small"])
 
@@ -144,10 +144,10 @@ def test_report_command_dash_writes_to_stdout(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "run.json").write_text(RUNS["small"].model_dump_json())
-    done = CliRunner().invoke(command_line(), ["report", "run.json", option, "-"])
-    assert done.exit_code == 0, done.output
+    result = CliRunner().invoke(command_line(), ["report", "run.json", option, "-"])
+    assert result.exit_code == 0, result.output
     expected = run_page(RUNS["small"]) if option == "--html" else markdown_summary(RUNS["small"])
-    assert done.stdout == expected
+    assert result.stdout == expected
     assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
 
 
@@ -208,7 +208,7 @@ def test_report_command_compare_lists_changes_on_all_outputs(
     Path("run.json").write_text(run(recording(1, topics=2)).model_dump_json())
     words = ["report", "run.json", "--compare", "last.json"]
     for options in ([], ["--html", "-"], ["--markdown", "-"]):
-        done = CliRunner().invoke(command_line(), [*words, *options])
-        assert done.exit_code == 0, done.output
-        assert "/sensor_1" in done.stdout
-        assert "missing now" in done.stdout
+        result = CliRunner().invoke(command_line(), [*words, *options])
+        assert result.exit_code == 0, result.output
+        assert "/sensor_1" in result.stdout
+        assert "missing now" in result.stdout

@@ -95,41 +95,41 @@ def test_sequence_page_damaged_file_is_a_problem_and_other_topics_are_shown(
 def test_sequence_page_empty_sequence_has_no_empty_sections(tmp_path: Path) -> None:
     store = Store.open(tmp_path / "store")
     store.create_sequence("empty", {})
-    found = sections(sequence_page(store, "empty"))
-    assert "topics" in found
-    assert not {"cameras", "tracks", "plots", "frames", "logs", "code"} & found
+    page_sections = sections(sequence_page(store, "empty"))
+    assert "topics" in page_sections
+    assert not {"cameras", "tracks", "plots", "frames", "logs", "code"} & page_sections
 
 
 def test_snippets_run_and_print_rows(store: Store) -> None:
     snippets = {one.title: one.code for one in sequence_snippets(store, store.sequence("quickstart_drive"))}
     assert {"DuckDB", "Polars", "Python"} < set(snippets)
     for title in ("DuckDB", "Polars", "Python"):
-        done = subprocess.run(  # noqa: S603 - a program of ours
+        result = subprocess.run(  # noqa: S603 - a program of ours
             [sys.executable, "-c", snippets[title]], capture_output=True, text=True, check=False
         )
-        assert done.returncode == 0, f"{title}: {done.stderr}"
-        assert "acceleration" in done.stdout or '"x"' in done.stdout or "x" in done.stdout
+        assert result.returncode == 0, f"{title}: {result.stderr}"
+        assert "acceleration" in result.stdout or '"x"' in result.stdout or "x" in result.stdout
 
 
 def test_snippets_quote_names(tmp_path: Path) -> None:
-    from stored_sequences import T0, TEXT  # noqa: PLC0415
+    from stored_sequences import T0, TEXT  # noqa: PLC0415 - only this test needs it
 
     store = Store.open(tmp_path / "it's here")
     write_sequence(store, "drive", {"/a": (TEXT, [{"timestamp_ns": T0, "data": "x"}])})
     for snippet in sequence_snippets(store, store.sequence("drive")):
         if snippet.title in {"DuckDB", "Polars", "Python"}:
-            done = subprocess.run(  # noqa: S603 - a program of ours
+            result = subprocess.run(  # noqa: S603 - a program of ours
                 [sys.executable, "-c", snippet.code], capture_output=True, text=True, check=False
             )
-            assert done.returncode == 0, f"{snippet.title}: {done.stderr}"
+            assert result.returncode == 0, f"{snippet.title}: {result.stderr}"
 
 
 def test_store_page_command_writes_file_named_after_the_sequence(
     store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(
+    result = CliRunner().invoke(
         command_line(), ["store", "page", "quickstart_drive", "--store", str(store.path)]
     )
-    assert done.exit_code == 0, done.output
+    assert result.exit_code == 0, result.output
     assert "<title>quickstart_drive</title>" in Path("quickstart_drive.html").read_text()

@@ -133,21 +133,21 @@ def test_changed_definition_is_a_named_difference(
     tmp_path: Path, text: str, values: Any, expected: list[str]
 ) -> None:
     used = {key: value for key, value in values.items() if f" {key}\n" in text}
-    found = changes(tmp_path, lambda path: make(path, text + CELL, values=used))
-    assert names(found) == [f"/pack: {message}" for message in expected]
+    differences = changes(tmp_path, lambda path: make(path, text + CELL, values=used))
+    assert names(differences) == [f"/pack: {message}" for message in expected]
 
 
 def test_changed_nested_type_is_a_named_difference(tmp_path: Path) -> None:
-    found = changes(tmp_path, lambda path: make(path, PACK + CELL.replace("float32", "float64")))
-    assert names(found) == ["/pack: changed field acme_msgs/msg/Cell.level: float32 → float64"]
-    assert [message for message, _ in found if "column" in message] == [
+    differences = changes(tmp_path, lambda path: make(path, PACK + CELL.replace("float32", "float64")))
+    assert names(differences) == ["/pack: changed field acme_msgs/msg/Cell.level: float32 → float64"]
+    assert [message for message, _ in differences if "column" in message] == [
         "/pack: changed column first.level: float → double"
     ]
 
 
 def test_changed_topics_and_types_are_named_differences(tmp_path: Path) -> None:
-    found = changes(tmp_path, lambda path: make(path, number=1, topic="/other"))
-    assert names(found) == [
+    differences = changes(tmp_path, lambda path: make(path, number=1, topic="/other"))
+    assert names(differences) == [
         "/number: new topic std_msgs/msg/Int32",
         "/other: new topic acme_msgs/msg/Pack",
         "/pack: missing topic acme_msgs/msg/Pack",
@@ -156,15 +156,17 @@ def test_changed_topics_and_types_are_named_differences(tmp_path: Path) -> None:
 
 def test_changed_type_is_a_named_difference(tmp_path: Path) -> None:
     number = define("std_msgs/msg/Int32", "int32 data\n")
-    found = changes(tmp_path, lambda path: record(path, [("/pack", number, 1, {"data": 1})]))
-    assert "/pack: changed type acme_msgs/msg/Pack → std_msgs/msg/Int32" in names(found)
-    assert any("changed ontology type" in message for message, _ in found)
+    differences = changes(tmp_path, lambda path: record(path, [("/pack", number, 1, {"data": 1})]))
+    assert "/pack: changed type acme_msgs/msg/Pack → std_msgs/msg/Int32" in names(differences)
+    assert any("changed ontology type" in message for message, _ in differences)
 
 
 def test_difference_has_line_of_lock_file(tmp_path: Path) -> None:
-    found = changes(tmp_path, lambda path: make(path, PACK.replace("int32 cells", "int64 cells") + CELL))
+    differences = changes(
+        tmp_path, lambda path: make(path, PACK.replace("int32 cells", "int64 cells") + CELL)
+    )
     lines = (tmp_path / "job.lock.json").read_text().splitlines()
-    texts = {message: lines[line - 1].strip() for message, line in found}
+    texts = {message: lines[line - 1].strip() for message, line in differences}
     assert texts == {
         "/pack: changed field acme_msgs/msg/Pack.cells: int32 → int64": '"int32 cells",',
         "/pack: changed column cells: int32 → int64": '"cells": "int32",',
@@ -271,8 +273,8 @@ def test_lock_differences_are_empty_only_for_equal_definitions(
         text = tuple(f"{kind} {name}" for kind, name in lines)
         return LockDocument(topics={"/a": topic}, definitions={"p/msg/A": {"p/msg/A": text}})
 
-    found = lock_differences(document(old), document(new))
-    assert (found == ()) == (old == new)
+    differences = lock_differences(document(old), document(new))
+    assert (differences == ()) == (old == new)
     by_name = {name: kind for kind, name in old}
     changed = {name for kind, name in new if by_name.get(name, kind) != kind}
-    assert len([one for one in found if one.change is Change.CHANGED_FIELD]) == len(changed)
+    assert len([one for one in differences if one.change is Change.CHANGED_FIELD]) == len(changed)

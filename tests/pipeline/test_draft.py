@@ -25,7 +25,7 @@ def draft(
         ontology="A",
         problem="is not known" if definition == "none" else None,
     )
-    found = Inspection(
+    inspection = Inspection(
         files=("a.db3",),
         container="sqlite3",
         size_bytes=2_000,
@@ -34,7 +34,7 @@ def draft(
         end_ns=0,
         topics=(topic,),
     )
-    return draft_manifest(found, Path("a.db3"), folder=Path(), ros_distro=ros_distro)
+    return draft_manifest(inspection, Path("a.db3"), folder=Path(), ros_distro=ros_distro)
 
 
 @pytest.mark.parametrize(
@@ -56,10 +56,10 @@ def test_draft_manifest_asks_for_definitions_of_ros_messages_only() -> None:
 
 def test_draft_manifest_asks_for_distro_if_distros_differ() -> None:
     marker = "visualization_msgs/msg/Marker"
-    said = draft("none", msgtype=marker)
-    assert f"# {marker} differs between distros" in said
-    assert "# ros_distro: ros2_humble" in said
-    assert "custom_msgs" not in said
+    output = draft("none", msgtype=marker)
+    assert f"# {marker} differs between distros" in output
+    assert "# ros_distro: ros2_humble" in output
+    assert "custom_msgs" not in output
     assert "custom_msgs" in draft("none", msgtype=marker, ros_distro="ros2_dashing")
 
 
@@ -68,7 +68,7 @@ def test_draft_manifest_starts_with_summary() -> None:
 
 
 def test_absolute_keeps_url_of_recording() -> None:
-    found = Inspection(
+    inspection = Inspection(
         files=("s3://fleet/a/my drive.mcap",),
         container="mcap",
         size_bytes=1,
@@ -77,7 +77,7 @@ def test_absolute_keeps_url_of_recording() -> None:
         end_ns=None,
         topics=(),
     )
-    text = draft_manifest(found, as_path("s3://fleet/a/my drive.mcap?region=eu"), folder=Path("jobs"))
+    text = draft_manifest(inspection, as_path("s3://fleet/a/my drive.mcap?region=eu"), folder=Path("jobs"))
     assert '  path: "s3://fleet/a/my drive.mcap?region=eu"\n' in text
     assert "  name: my_drive\n" in text
 

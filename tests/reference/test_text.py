@@ -137,8 +137,11 @@ def test_text_override_converts_its_topic_only(placeholders: Path, text: str) ->
     # The program shows only the import that it adds; its ellipses stand for the others.
     names = {name: getattr(ros_bridge, name) for name in ("ROSInjectionConfig", "RosbagInjector")}
     run_module(placeholders, "main", program_with(text, "custom_lidar_run"), Path=Path, **names)
-    found = tags("custom_lidar_run")
-    assert (found["/lidar/front/pointcloud"], found["/lidar/rear/pointcloud"]) == ("MyLidar", "PointCloud2")
+    stored_tags = tags("custom_lidar_run")
+    assert (stored_tags["/lidar/front/pointcloud"], stored_tags["/lidar/rear/pointcloud"]) == (
+        "MyLidar",
+        "PointCloud2",
+    )
 
 
 def test_text_registered_types_are_used_without_custom_msgs(project: Path, text: str) -> None:
@@ -153,8 +156,8 @@ def test_text_registered_types_are_used_without_custom_msgs(project: Path, text:
 
 def commands(text: str) -> list[list[str]]:
     lines = re.sub(r"\\\n\s*", "", text).splitlines()
-    found = [shlex.split(line) for line in lines if line.startswith("mosaico_ingest.ros_injector")]
-    return [["bag", *command[1:]] for command in found]
+    actual = [shlex.split(line) for line in lines if line.startswith("mosaico_ingest.ros_injector")]
+    return [["bag", *command[1:]] for command in actual]
 
 
 def test_text_commands_run(project: Path, text: str) -> None:

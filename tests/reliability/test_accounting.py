@@ -92,9 +92,9 @@ def test_counts_of_damaged_recording_add_up(tmp_path: Path) -> None:
     (report,) = api.run([ROSInjectionConfig(bag, "drive", store=tmp_path / "store")]).recordings
     assert (report.status, report.exit_code) == (RunStatus.WITH_ERRORS, 4)
     assert report.unreadable_ranges
-    taken = [topic for topic in report.topics if topic.promised is not None]
-    assert sum(topic.unreadable for topic in taken) > 0
-    for topic in taken:
+    topics = [topic for topic in report.topics if topic.promised is not None]
+    assert sum(topic.unreadable for topic in topics) > 0
+    for topic in topics:
         assert topic.promised == topic.read + topic.unreadable
         assert topic.read == topic.written + topic.filtered + topic.downsampled + topic.rejected
 
@@ -237,9 +237,9 @@ def test_verify_detects_changed_rows(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     write_bag({"/speed": [number(value) for value in range(500)]})
-    (told,) = run_job(write_job()).topics
+    (topic,) = run_job(write_job()).topics
     store = Store.open(tmp_path / "store")
-    assert told.checksum == store.topic("drive", "/speed").checksum is not None
+    assert topic.checksum == store.topic("drive", "/speed").checksum is not None
     (segment,) = store.paths("drive", "/speed")
     rows = pq.read_table(segment)
     other = rows.set_column(1, rows.schema.field(1), pc.add(rows["data"], 1))
@@ -249,9 +249,9 @@ def test_verify_detects_changed_rows(
     with pytest.raises(SystemExit) as ended:
         main(["verify", "--store", str(store.path)])
     assert ended.value.code == 5
-    said = capsys.readouterr().err
-    assert f"drive/speed: {segment}: its rows have the checksum" in said
-    assert f"those that were written {told.checksum}" in said
+    output = capsys.readouterr().err
+    assert f"drive/speed: {segment}: its rows have the checksum" in output
+    assert f"the catalog has {topic.checksum}" in output
 
 
 def test_checksums_of_same_recording_are_equal_in_every_store(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ REPLACE = {"name": "drive", "if_exists": "replace"}
 
 def ran(*arguments: object, **environment: str) -> tuple[int, str]:
     """Run the command; return its exit code and standard error."""
-    done = subprocess.run(  # noqa: S603 - our own command
+    result = subprocess.run(  # noqa: S603 - our own command
         [sys.executable, "-m", "mosaico_ingest", *map(str, arguments)],
         capture_output=True,
         text=True,
@@ -34,8 +34,8 @@ def ran(*arguments: object, **environment: str) -> tuple[int, str]:
         timeout=120,
         env={**os.environ, **environment},
     )
-    assert "Traceback" not in done.stderr, done.stderr
-    return done.returncode, done.stderr
+    assert "Traceback" not in result.stderr, result.stderr
+    return result.returncode, result.stderr
 
 
 def the_error(said: str) -> str:
@@ -73,10 +73,10 @@ def test_replacing_run_on_full_disk_names_cause_and_keeps_old_sequence(
     (job.parent / "drive.db3").unlink()
     write_bag({"/speed": noise})
     with filled(disk, free_bytes=300_000):
-        code, said = ran("run", "-q", job)
+        code, output = ran("run", "-q", job)
         assert code == 1
-        assert "No space left" in the_error(said)
-        assert "free some space" in the_error(said)
+        assert "No space left" in the_error(output)
+        assert "free some space" in the_error(output)
         assert speeds(store) == [1.0]
         assert len(list(store.rglob("*.parquet"))) == 1
         assert ran("verify", "--store", store)[0] == 0
@@ -93,9 +93,9 @@ def test_first_run_on_full_disk_publishes_nothing(
     job = write_job(target={"store": str(store)})
     write_bag({"/speed": noise})
     with filled(disk, free_bytes=left_bytes):
-        code, said = ran("run", "-q", job)
+        code, output = ran("run", "-q", job)
         assert code == 1
-        assert str(disk) in the_error(said)
+        assert str(disk) in the_error(output)
     assert not list(store.rglob("*.parquet"))
     assert ran("run", "-q", job) == (0, "")
     assert len(speeds(store)) == len(noise)
@@ -112,16 +112,16 @@ def test_read_only_store_refuses_writes_and_allows_reads(
     (tmp_path / "drive.db3").unlink()
     write_bag({"/speed": [number(2)]})
     with read_only(store):
-        code, said = ran("run", "-q", job)
+        code, output = ran("run", "-q", job)
         assert code == 1
-        assert str(store) in the_error(said)
+        assert str(store) in the_error(output)
         assert speeds(store) == [1.0]
         for reading in (("store", "ls"), ("store", "show", "drive"), ("verify",)):
             assert ran(*reading, "--store", store)[0] == 0
         for writing in (("store", "rm", "drive", "--yes"), ("store", "gc")):
-            code, said = ran(*writing, "--store", store)
+            code, output = ran(*writing, "--store", store)
             assert code == 1, writing
-            assert str(store) in the_error(said)
+            assert str(store) in the_error(output)
     assert ran("run", "-q", job) == (0, "")
     assert speeds(store) == [2.0]
 
@@ -132,9 +132,9 @@ def test_run_with_full_quarantine_disk_fails_and_publishes_nothing(
     write_bag({"/speed": [number(1), CUT, number(2)]})
     job = write_job(quarantine={"path": str(disk / "quarantine")})
     with filled(disk):
-        code, said = ran("run", "-q", job)
+        code, output = ran("run", "-q", job)
         assert code == 1
-        assert str(disk) in the_error(said)
+        assert str(disk) in the_error(output)
     assert "drive" not in Store.open(tmp_path / "store").names()
     assert ran("run", "-q", job)[0] == 4
     assert speeds(tmp_path / "store") == [1.0, 2.0]
@@ -145,9 +145,9 @@ def test_run_with_full_report_disk_fails_after_commit(
 ) -> None:
     write_bag({"/speed": [number(1)]})
     with filled(disk):
-        code, said = ran("run", "-q", write_job(), "--report", disk / "run.json")
+        code, output = ran("run", "-q", write_job(), "--report", disk / "run.json")
     assert code == 1
-    assert str(disk / "run.json") in the_error(said)
+    assert str(disk / "run.json") in the_error(output)
     assert speeds(tmp_path / "store") == [1.0]
 
 
@@ -159,10 +159,10 @@ def test_run_with_full_temporary_folder_names_tmpdir(
     custom = [{"package": "own_msgs", "path": "definitions"}]
     job = write_job(bag={"path": packed.name, "custom_msgs": custom})
     with filled(disk, free_bytes=100_000):
-        code, said = ran("run", "-q", job, TMPDIR=str(disk))
+        code, output = ran("run", "-q", job, TMPDIR=str(disk))
         assert code == 1
-        assert "cannot be decompressed" in the_error(said)
-        assert "TMPDIR" in the_error(said)
+        assert "cannot be decompressed" in the_error(output)
+        assert "TMPDIR" in the_error(output)
         assert {path.name for path in disk.iterdir()} == {"ballast"}
     assert ran("run", "-q", job, TMPDIR=str(tmp_path)) == (0, "")
     assert len(speeds(tmp_path / "store")) == len(noise)

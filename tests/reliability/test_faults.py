@@ -59,11 +59,11 @@ def kill_and_look(write_bag: WriteBag, job: Path, store: Path, rounds: int) -> i
         if not (store / "catalog.sqlite").exists() or "drive" not in Store.open(store).names():
             assert not survivor, "the old state is gone"
             continue
-        found = speeds(Store.open(store))
-        assert found == [found[0]] * 3000
-        assert found[0] in {survivor, source}
-        through += found[0] == source
-        survivor = found[0]
+        actual = speeds(Store.open(store))
+        assert actual == [actual[0]] * 3000
+        assert actual[0] in {survivor, source}
+        through += actual[0] == source
+        survivor = actual[0]
     return through
 
 
@@ -96,11 +96,11 @@ def test_run_stops_within_seconds_of_a_signal(
     while process.poll() is None and not list((tmp_path / "store").glob("staging/*")):
         time.sleep(0.005)
     process.send_signal(number_of_signal)
-    _, said = process.communicate(timeout=10)
+    _, output = process.communicate(timeout=10)
     if process.returncode == 0:
         pytest.skip("the machine was faster than the signal")
     assert process.returncode == 130
-    assert said.startswith("error: ")
+    assert output.startswith("error: ")
     assert Store.open(tmp_path / "store").names() == ()
 
 
@@ -119,15 +119,15 @@ def test_run_with_other_file_at_store_path_fails(
 
 def interrupted_by(job: Path, act: Callable[[], object]) -> tuple[RunStatus, int, str]:
     """Run a job and change its files after the first rows are written."""
-    done: list[bool] = []
+    result: list[bool] = []
 
     def tell(_position: int, event: Event) -> None:
-        if isinstance(event, TopicProgress) and event.written and not done:
-            done.append(True)
+        if isinstance(event, TopicProgress) and event.written and not result:
+            result.append(True)
             act()
 
     (report,) = api.run(api.compile_job(job), observe=tell).recordings
-    assert done
+    assert result
     return report.status, report.exit_code, str(report.error)
 
 
@@ -135,20 +135,20 @@ def test_run_with_store_deleted_during_run_fails(
     write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
 ) -> None:
     write_bag({"/speed": [number(1)] * 70_000})
-    status, code, said = interrupted_by(write_job(), lambda: shutil.rmtree(tmp_path / "store"))
+    status, code, output = interrupted_by(write_job(), lambda: shutil.rmtree(tmp_path / "store"))
     assert (status, code) == (RunStatus.FAILED, 1)
-    assert "store" in said
+    assert "store" in output
 
 
 def test_run_of_recording_truncated_during_reading_reports_it(
     write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
 ) -> None:
     bag = write_bag({"/speed": [number(1)] * 500_000})
-    status, code, said = interrupted_by(write_job(), lambda: os.truncate(bag, bag.stat().st_size // 2))
+    status, code, output = interrupted_by(write_job(), lambda: os.truncate(bag, bag.stat().st_size // 2))
     if status is RunStatus.COMPLETED:  # all of it had been read before
         assert Store.open(tmp_path / "store").sequence("drive").rows == 500_000
     else:
-        assert code in {1, 4, 5}, said
+        assert code in {1, 4, 5}, output
 
 
 def test_two_runs_write_two_sequences_of_one_store(

@@ -26,13 +26,13 @@ def kept(folder: Path) -> list[dict[str, object]]:
         lines = [json.loads(line) for line in index.read_text().splitlines()]
         own = [("own_msgs", folder.parent / "definitions", None)]
         with open_recording(index.with_suffix(".mcap"), resolve=TypeResolver(None, own)) as recording:
-            found = {
+            actual = {
                 (recording.connections[batch.connection].topic, int(time), int(length))
                 for batch in recording.message_blocks()
                 for time, length in zip(batch.log_times, batch.lengths, strict=True)
             }
             assert recording.message_count == len(lines)
-        assert found == {(line["topic"], line["log_time_ns"], line["bytes"]) for line in lines}
+        assert actual == {(line["topic"], line["log_time_ns"], line["bytes"]) for line in lines}
         entries += lines
     return entries
 

@@ -74,8 +74,8 @@ def values(store: Store, topic: str = "/speed") -> list[float]:
 
 def waiting(folder: Path, job: Path) -> int:
     """Return the number of messages that a replay processes."""
-    found = find_replays(folder, api.compile_job(job))
-    files = [one.file.messages for one in found if one.state is ReplayState.WAITING]
+    entries = find_replays(folder, api.compile_job(job))
+    files = [one.file.messages for one in entries if one.state is ReplayState.WAITING]
     return sum(len(path.with_suffix(".jsonl").read_text().splitlines()) for path in files)
 
 
@@ -188,9 +188,9 @@ def test_replay_with_fixed_mapping_appends_messages(
     (topic,) = first.topics
     assert (topic.read, topic.written, topic.rejected, topic.quarantined) == (7, 3, 4, 4)
     mapping("data")
-    folder, store, said = tmp_path / "quarantine", Store.open(tmp_path / "store"), tmp_path / "replay.json"
-    assert command("replay", "-q", folder, "-m", job, "--report", said) == 4
-    (replayed,) = json.loads(said.read_text())["recordings"][0]["topics"]
+    folder, store, output = tmp_path / "quarantine", Store.open(tmp_path / "store"), tmp_path / "replay.json"
+    assert command("replay", "-q", folder, "-m", job, "--report", output) == 4
+    (replayed,) = json.loads(output.read_text())["recordings"][0]["topics"]
     assert (replayed["read"], replayed["written"], replayed["rejected"]) == (4, 3, 1)
     assert topic.written + replayed["written"] + replayed["quarantined"] == topic.read
     assert values(store) == list(range(6))

@@ -43,8 +43,8 @@ def test_schema_change_fail_lists_differing_lines(session: Session, tmp_path: Pa
     assert session("two", "float32", "fail").status is RunStatus.COMPLETED
     report = session("three", "float64", "fail")
     assert (report.status, report.exit_code) == (RunStatus.FAILED, 1)
-    said = "/speed: own_msgs/msg/Number differs from its definition in two: -float32 data, +float64 data"
-    assert said in str(report.error)
+    message = "/speed: own_msgs/msg/Number differs from its definition in two: -float32 data, +float64 data"
+    assert message in str(report.error)
     assert Store.open(tmp_path / "store").names() == ("one", "two")
 
 

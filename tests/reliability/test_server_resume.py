@@ -35,11 +35,11 @@ def command(*arguments: object) -> list[str]:
 
 def ran(*arguments: object) -> tuple[int, str]:
     """Run the command; return its exit code and output."""
-    done = subprocess.run(  # noqa: S603 - our own command
+    result = subprocess.run(  # noqa: S603 - our own command
         command(*arguments), capture_output=True, text=True, check=False, timeout=120
     )
-    assert "Traceback" not in done.stderr, done.stderr
-    return done.returncode, done.stdout + done.stderr
+    assert "Traceback" not in result.stderr, result.stderr
+    return result.returncode, result.stdout + result.stderr
 
 
 @contextmanager
@@ -50,10 +50,10 @@ def serving(folder: Path, port: int = 0) -> Generator[tuple[int, subprocess.Pope
         arguments, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=folder
     )
     assert server.stdout is not None
-    found = re.search(r":(\d+)$", server.stdout.readline())
+    match = re.search(r":(\d+)$", server.stdout.readline())
     try:
-        assert found is not None
-        yield int(found[1]), server
+        assert match is not None
+        yield int(match[1]), server
     finally:
         server.send_signal(signal.SIGTERM)
         try:
@@ -66,8 +66,8 @@ def serving(folder: Path, port: int = 0) -> Generator[tuple[int, subprocess.Pope
 @pytest.fixture
 def port(tmp_path: Path) -> Generator[int, None, None]:
     """The port of a server of the store `served`."""
-    with serving(tmp_path) as (found, _):
-        yield found
+    with serving(tmp_path) as (actual, _):
+        yield actual
 
 
 def to(port: int) -> dict[str, Any]:
@@ -85,9 +85,9 @@ def test_skip_of_same_job_reports_skipped(
     job = write_job(sequence=SKIP, **to(port))
     assert ran("run", job)[0] == 0
     before = Store.open(tmp_path / "served").sequence("drive")
-    code, said = ran("run", job)
+    code, output = ran("run", job)
     assert code == 0
-    assert "it already has the same content" in said
+    assert "it already has the same content" in output
     assert Store.open(tmp_path / "served").sequence("drive") == before
 
 
@@ -99,9 +99,9 @@ def test_changed_content_is_refused_by_skip_and_replaced_by_replace(
     assert ran("run", job)[0] == 0
     (tmp_path / "drive.db3").unlink()
     write_bag({"/speed": [number(2)]})
-    code, said = ran("run", job)
+    code, output = ran("run", job)
     assert code == 1
-    assert "made from other content (drive.db3)" in " ".join(said.split())
+    assert "made from other content (drive.db3)" in " ".join(output.split())
     assert speeds(tmp_path) == [1]
     write_job(sequence={**SKIP, "if_exists": "replace"}, **to(port))
     assert ran("run", job)[0] == 0
@@ -121,9 +121,9 @@ def test_server_append_adds_new_topics_once(
     write_job(sequence=add, topics=["/height"], **to(port))
     assert ran("run", job)[0] == 0
     assert (speeds(tmp_path), speeds(tmp_path, "/height")) == ([1], [3])
-    code, said = ran("run", job)
+    code, output = ran("run", job)
     assert code == 1
-    assert "the server cannot append rows" in " ".join(said.split())
+    assert "the server cannot append rows" in " ".join(output.split())
     assert (speeds(tmp_path), speeds(tmp_path, "/height")) == ([1], [3])
 
 
@@ -148,9 +148,9 @@ def kill_and_look(job: Path, folder: Path, rounds: int) -> tuple[int, int]:
         rows = store.sequence("drive").rows if "drive" in store.names() else 0
         assert rows in {0, ROWS}, "a reader sees all of it or nothing"
         whole, nothing = whole + (rows == ROWS), nothing + (rows == 0)
-        code, said = ran("run", job)
-        assert code == 0, said
-        assert ("it already has the same content" in said) == (rows == ROWS)
+        code, output = ran("run", job)
+        assert code == 0, output
+        assert ("it already has the same content" in output) == (rows == ROWS)
         assert speeds(folder) == [1.0] * ROWS
         assert ran("run", job)[0] == 0
         assert ran("store", "rm", "drive", "--yes", "--store", folder / "served")[0] == 0
@@ -205,13 +205,13 @@ def test_run_with_killed_server_fails_and_next_run_completes(
         while not list((tmp_path / "served" / "staging").glob("*")) and client.poll() is None:
             time.sleep(0.01)
         server.kill()
-        _, said = client.communicate(timeout=60)
-    assert client.returncode == 1, said
-    assert said.startswith("error: ")
-    assert "Traceback" not in said
+        _, output = client.communicate(timeout=60)
+    assert client.returncode == 1, output
+    assert output.startswith("error: ")
+    assert "Traceback" not in output
     with serving(tmp_path, port):
-        code, said = ran("run", job)
-        assert code == 0, said
+        code, output = ran("run", job)
+        assert code == 0, output
         assert speeds(tmp_path) == [1.0] * ROWS
         assert "it already has the same content" in ran("run", job)[1]
 
@@ -255,9 +255,9 @@ def test_server_run_with_lost_response_writes_nothing_twice(
     write_bag({"/speed": [number(1), number(2)]})
     line = Forgetful(port, word)
     job = write_job(sequence={**SKIP, "if_exists": if_exists}, **to(line.port))
-    code, said = ran("run", job)
+    code, output = ran("run", job)
     assert line.asked.is_set()
-    assert code == 0, said
+    assert code == 0, output
     assert speeds(tmp_path) == [1, 2]
 
 
@@ -275,8 +275,8 @@ def test_run_killed_before_response_to_commit_is_skipped_by_the_next(
     process.kill()
     process.wait(timeout=20)
     assert speeds(tmp_path) == [1, 2]
-    code, said = ran("run", write_job(sequence=sequence, **to(port)))
-    assert code == (1 if if_exists == "append" else 0), said
+    code, output = ran("run", write_job(sequence=sequence, **to(port)))
+    assert code == (1 if if_exists == "append" else 0), output
     assert speeds(tmp_path) == [1, 2]
 
 
@@ -289,9 +289,9 @@ def test_replay_of_topic_without_rows_appends_it_once(
     replay = ("replay", "-q", tmp_path / "quarantine", "-m", write_job(**kept))
     assert ran(*replay)[0] == 0
     assert (speeds(tmp_path), speeds(tmp_path, "/std/speed")) == ([1, 2], [3])
-    for done in (tmp_path / "quarantine").glob("*.replayed"):
-        done.rename(done.with_suffix(""))  # as where the replay was killed before it could say so
-    code, said = ran(*replay)
+    for result in (tmp_path / "quarantine").glob("*.replayed"):
+        result.rename(result.with_suffix(""))  # as where the replay was killed before it could say so
+    code, output = ran(*replay)
     assert code == 1
-    assert "the server cannot append rows" in " ".join(said.split())
+    assert "the server cannot append rows" in " ".join(output.split())
     assert speeds(tmp_path) == [1, 2]

@@ -50,15 +50,15 @@ def opened(*paths: AnyPath) -> Recording:
 
 def messages(recording: Recording) -> list[tuple[str, int, bytes]]:
     """Return topic, time and payload of each message, in the order of time within its topic."""
-    found: list[tuple[str, int, bytes]] = []
+    actual: list[tuple[str, int, bytes]] = []
     for batch in recording.message_blocks():
         ends = (batch.starts + batch.lengths).tolist()
         places = zip(batch.log_times.tolist(), batch.starts.tolist(), ends, strict=True)
-        found += [
+        actual += [
             (recording.connections[batch.connection].topic, at, batch.data[start:end].tobytes())
             for at, start, end in places
         ]
-    return sorted(found)
+    return sorted(actual)
 
 
 @pytest.fixture(scope="module")

@@ -90,8 +90,8 @@ def job(folder: Path, recording: str, store: str, if_exists: str = "fail") -> st
 
 def test_store_by_url_has_the_same_rows_as_a_store_on_disk(recording: Path, url: str, tmp_path: Path) -> None:
     for store in ("here", url):
-        done = ingest("run", job(tmp_path, str(recording), store), cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
+        result = ingest("run", job(tmp_path, str(recording), store), cwd=tmp_path)
+        assert result.returncode == 0, result.stderr
     here, there = Store.open(tmp_path / "here", create=False), Store.open(url, create=False)
     assert there.names() == here.names() == ("drive",)
     one, other = here.sequence("drive"), there.sequence("drive")
@@ -114,9 +114,9 @@ def test_every_store_command_accepts_a_url(recording: Path, url: str, tmp_path: 
     store = f"{root_of(url)}/store?{root_of(url).options}"
 
     def run(*arguments: str, exits: int = 0) -> str:
-        done = ingest(*arguments, cwd=tmp_path)
-        assert done.returncode == exits, (arguments, done.stdout, done.stderr)
-        return done.stdout + done.stderr
+        result = ingest(*arguments, cwd=tmp_path)
+        assert result.returncode == exits, (arguments, result.stdout, result.stderr)
+        return result.stdout + result.stderr
 
     first = job(tmp_path, source.url, store)
     assert "/b/c" in run("inspect", source.url)
@@ -153,12 +153,12 @@ def test_quarantine_and_replay_work_with_a_store_by_url(url: str, tmp_path: Path
     )
     adapter = "version: 1\nadapter: Read\nros_type: std_msgs/msg/Float64\nontology: Floating64\nfields: {data: %s}\n"
     (tmp_path / "read.yaml").write_text(adapter % '"null_if(data, 3.0)"')
-    done = ingest("run", "job.yaml", cwd=tmp_path)
-    assert done.returncode == 4, done.stderr
+    result = ingest("run", "job.yaml", cwd=tmp_path)
+    assert result.returncode == 4, result.stderr
     assert Store.open(url).sequence("drive").rows == 9
     (tmp_path / "read.yaml").write_text(adapter % "data")
-    done = ingest("replay", "quarantine", "-m", "job.yaml", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    result = ingest("replay", "quarantine", "-m", "job.yaml", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
     assert Store.open(url).scan("drive", "/x").read_all()["data"].to_pylist() == list(range(10))
 
 
@@ -214,10 +214,10 @@ def test_store_that_becomes_unavailable_ends_the_run(
 ) -> None:
     store = own_objects.url("store")
     own_objects.fail_after(0, containing="PUT /bucket/store/segments")
-    done = ingest("run", job(tmp_path, str(recording), store), cwd=tmp_path)
-    assert done.returncode == 1
-    assert "does not respond" in done.stderr
-    assert "Traceback" not in done.stderr
+    result = ingest("run", job(tmp_path, str(recording), store), cwd=tmp_path)
+    assert result.returncode == 1
+    assert "does not respond" in result.stderr
+    assert "Traceback" not in result.stderr
     assert not (tmp_path / "s3:").exists()
 
 
@@ -254,9 +254,9 @@ def test_run_whose_last_request_is_lost_fails(
     own_objects: ObjectStore, recording: Path, tmp_path: Path
 ) -> None:
     own_objects.fail_after(0, containing="PUT /bucket/store/catalog")
-    done = ingest("run", job(tmp_path, str(recording), own_objects.url("store")), cwd=tmp_path)
-    assert done.returncode == 1
-    assert "does not respond" in done.stderr
+    result = ingest("run", job(tmp_path, str(recording), own_objects.url("store")), cwd=tmp_path)
+    assert result.returncode == 1
+    assert "does not respond" in result.stderr
 
 
 def test_two_writers_of_one_name_exclude_each_other(url: str) -> None:

@@ -6,10 +6,10 @@ from run_reports import recording, run, topic
 
 from mosaico_ingest.report.compare import ALL, Change, compare_reports
 from mosaico_ingest.report.events import RunStatus
-from mosaico_ingest.report.model import TopicReport
+from mosaico_ingest.report.model import Report, TopicReport
 
 
-def with_topics(number: int, *topics: TopicReport):  # type: ignore[no-untyped-def]  # noqa: ANN201
+def with_topics(number: int, *topics: TopicReport) -> Report:
     return recording(number).model_copy(update={"topics": topics})
 
 
@@ -64,8 +64,8 @@ def test_compare_recordings_with_other_names_are_compared_together() -> None:
     before = run(*(with_topics(at, topic("/a"), topic("/b")) for at in (1, 2)))
     after = run(*(with_topics(at, topic("/a", counts=(25,) * 20)) for at in (11, 12, 13)))
     changes = compare_reports(after, before).changes
-    found = {(one.topic, one.aspect) for one in changes}
-    assert {("/b", "topic"), ("/a", "rate")} <= found
+    actual = {(one.topic, one.aspect) for one in changes}
+    assert {("/b", "topic"), ("/a", "rate")} <= actual
     assert {one.recording for one in changes} == {ALL}
 
 

@@ -29,8 +29,10 @@ def test_report_steps_add_up_to_duration(tmp_path: Path) -> None:
         f"bag: {{path: {DRIVE}}}\ntopics: [/imu, /odom]\ntarget: {{store: s}}\n"
     )
     run = tmp_path / "run.json"
-    done = CliRunner().invoke(command_line(), ["run", str(tmp_path / "job.yaml"), "--report", str(run), "-q"])
-    assert done.exit_code == 0, done.output
+    result = CliRunner().invoke(
+        command_line(), ["run", str(tmp_path / "job.yaml"), "--report", str(run), "-q"]
+    )
+    assert result.exit_code == 0, result.output
     report = read_report(run)
     one = report.recordings[0]
     steps = one.steps.model_dump()

@@ -65,13 +65,13 @@ def plain(attributes: Any) -> dict[str, str]:
 
 @pytest.fixture
 def collector() -> Iterator[Collector]:
-    found = Collector()
+    actual = Collector()
 
     class Handler(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
             body = self.rfile.read(int(self.headers["Content-Length"]))
-            found.paths[self.path] += 1
-            (found.metrics if self.path.endswith("/metrics") else found.traces)(body)
+            actual.paths[self.path] += 1
+            (actual.metrics if self.path.endswith("/metrics") else actual.traces)(body)
             self.send_response(200)
             self.end_headers()
 
@@ -81,9 +81,9 @@ def collector() -> Iterator[Collector]:
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
-        found.url = f"http://127.0.0.1:{server.server_address[1]}"
+        actual.url = f"http://127.0.0.1:{server.server_address[1]}"
         try:
-            yield found
+            yield actual
         finally:
             server.shutdown()
             thread.join(10)
@@ -122,8 +122,8 @@ def ingest(folder: Path, *arguments: str, **variables: str) -> subprocess.Comple
 
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_telemetry_exports_counts_of_report(jobs: str, collector: Collector, tmp_path: Path) -> None:
-    done = ingest(tmp_path, "--jobs", jobs, OTEL_EXPORTER_OTLP_ENDPOINT=collector.url)
-    assert done.returncode == 1, done.stderr
+    result = ingest(tmp_path, "--jobs", jobs, OTEL_EXPORTER_OTLP_ENDPOINT=collector.url)
+    assert result.returncode == 1, result.stderr
     report = read_report(tmp_path / "run.json")
     totals = [one.totals for one in report.recordings]
     for fate in ("read", "written"):
@@ -160,11 +160,13 @@ def test_telemetry_follows_standard_variables(collector: Collector, tmp_path: Pa
 
 def test_telemetry_unreachable_collector_prints_one_line(tmp_path: Path) -> None:
     began = time.monotonic()
-    done = ingest(tmp_path, OTEL_EXPORTER_OTLP_ENDPOINT="http://127.0.0.1:9", OTEL_EXPORTER_OTLP_TIMEOUT="2")
+    result = ingest(
+        tmp_path, OTEL_EXPORTER_OTLP_ENDPOINT="http://127.0.0.1:9", OTEL_EXPORTER_OTLP_TIMEOUT="2"
+    )
     assert time.monotonic() - began < 60
-    assert done.returncode == 1
-    assert "Traceback" not in done.stderr
-    assert "127.0.0.1" in done.stderr or "Failed to export" in done.stderr
+    assert result.returncode == 1
+    assert "Traceback" not in result.stderr
+    assert "127.0.0.1" in result.stderr or "Failed to export" in result.stderr
     assert len(read_report(tmp_path / "run.json").recordings) == 3
 
 
@@ -172,6 +174,6 @@ def test_telemetry_without_extra_states_package(tmp_path: Path) -> None:
     blocked = "raise ImportError('blocked')"
     (tmp_path / "opentelemetry").mkdir()
     (tmp_path / "opentelemetry" / "__init__.py").write_text(blocked)
-    done = ingest(tmp_path, PYTHONPATH=str(tmp_path))
-    assert done.returncode == 1
-    assert "error: OpenTelemetry is not installed — pip install 'mosaico-ingest[otel]'" in done.stderr
+    result = ingest(tmp_path, PYTHONPATH=str(tmp_path))
+    assert result.returncode == 1
+    assert "error: OpenTelemetry is not installed — pip install 'mosaico-ingest[otel]'" in result.stderr

@@ -56,7 +56,7 @@ def sent(count: int = 300, *, seed: int = 0, big: bool = False, cdr: bool = True
     """Return messages of a few topics in time order, of fixed and random lengths, some with equal times."""
     rng = random.Random(seed)  # noqa: S311 - test data
     head = b"\x00\x01\x00\x00" if cdr else b""
-    found: list[Sent] = []
+    actual: list[Sent] = []
     for number in range(count):
         topic, msgtype, size = rng.choice(
             [
@@ -66,8 +66,8 @@ def sent(count: int = 300, *, seed: int = 0, big: bool = False, cdr: bool = True
                 ("/image", "sensor_msgs/msg/Image", rng.randrange(20_000, 90_000) if big else 700),
             ]
         )
-        found.append(Sent(topic, msgtype, START_NS + number // 2 * 10_000_000, head + rng.randbytes(size)))
-    return found
+        actual.append(Sent(topic, msgtype, START_NS + number // 2 * 10_000_000, head + rng.randbytes(size)))
+    return actual
 
 
 def write_rosbag2(
@@ -195,9 +195,9 @@ class _McapWriter:
         head = struct.pack("<QQQI", *times, len(data), zlib.crc32(data)) + _text(self.compression)
         self.record(6, head + struct.pack("<Q", len(packed)) + packed)
         length, offsets = len(self.out) - start, b""
-        for key, found in entries.items() if self.indexed else ():
+        for key, actual in entries.items() if self.indexed else ():
             offsets += struct.pack("<HQ", key, len(self.out))
-            self.record(7, struct.pack("<HI", key, len(found)) + found)
+            self.record(7, struct.pack("<HI", key, len(actual)) + actual)
         body = struct.pack("<QQQQI", *times, start, length, len(offsets)) + offsets
         body += struct.pack("<Q", len(self.out) - start - length) + _text(self.compression)
         self.chunk_indexes.append(_record(8, body + struct.pack("<QQ", len(packed), len(data))))
@@ -223,7 +223,7 @@ class _McapWriter:
 
 def received(recording: Recording, **selection: object) -> list[Sent]:
     """Return all messages by time, and check the invariants of each block."""
-    found: list[Sent] = []
+    actual: list[Sent] = []
     last: dict[int, int] = {}
     for batch in recording.message_blocks(**selection):  # type: ignore[arg-type]  # the tests name what batches() takes
         assert len(batch)
@@ -233,11 +233,11 @@ def received(recording: Recording, **selection: object) -> list[Sent]:
         assert last.get(batch.connection, 0) <= batch.log_times[0]
         last[batch.connection] = int(batch.log_times[-1])
         channel = recording.connections[batch.connection]
-        found += [
+        actual += [
             Sent(channel.topic, channel.msgtype, int(time), batch.payload(row))
             for row, time in enumerate(batch.log_times)
         ]
-    return sorted(found)
+    return sorted(actual)
 
 
 class Recordings:

@@ -67,8 +67,8 @@ def test_pack_rows_of_large_block_keeps_no_reference_to_its_buffers(lengths: lis
     """Messages of a rare topic stay pending for long; a view would keep the complete buffer in memory."""
     whole = block_of([(number, b"x" * length) for number, length in enumerate(lengths)])
     for part in (pack(whole.rows(slice(1, 3))), pack(whole.rows(np.array([1, 2])))):
-        held = [part.log_times, part.data, part.starts, part.lengths, part.offsets]
-        owners = [values if values.base is None else values.base for values in held]
+        contents = [part.log_times, part.data, part.starts, part.lengths, part.offsets]
+        owners = [values if values.base is None else values.base for values in contents]
         assert all(
             isinstance(owner, np.ndarray) and owner.size <= max(2, sum(lengths[1:3]) + 6) for owner in owners
         )
@@ -89,8 +89,8 @@ def test_sort_by_time_equal_times_keep_their_order(rows: list[Row]) -> None:
 
 @given(st.lists(st.integers(0, 5)))
 def test_rows_by_connection_keeps_order_of_rows(keys: list[int]) -> None:
-    found = {key: rows.tolist() for key, rows in rows_by_connection(np.array(keys, np.int64))}
-    assert found == {key: [n for n, other in enumerate(keys) if other == key] for key in set(keys)}
+    actual = {key: rows.tolist() for key, rows in rows_by_connection(np.array(keys, np.int64))}
+    assert actual == {key: [n for n, other in enumerate(keys) if other == key] for key in set(keys)}
 
 
 @given(st.lists(ROWS, min_size=1, max_size=8), st.integers(1, 40), st.integers(1, 4000))
@@ -105,8 +105,8 @@ def test_coalescer_little_memory_yields_every_message_once_within_row_limit(
         batches += coalescer.add(pack(block_of(block)), floor_ns)
         batches += coalescer.flush_ready(next_ns)
     batches += coalescer.flush_all()
-    found = [(int(time), batch.payload(n)) for batch in batches for n, time in enumerate(batch.log_times)]
-    assert sorted(found) == sorted(row for block in blocks for row in block)
+    actual = [(int(time), batch.payload(n)) for batch in batches for n, time in enumerate(batch.log_times)]
+    assert sorted(actual) == sorted(row for block in blocks for row in block)
     assert all(0 < len(batch) <= rows for batch in batches)
 
 
@@ -150,29 +150,29 @@ def test_prefetcher_failing_source_yields_items_then_raises() -> None:
         yield from range(10)
         raise ValueError("here")
 
-    found: list[int] = []
+    actual: list[int] = []
     with Prefetcher(source()) as items, pytest.raises(ValueError, match="here"):
-        found.extend(items)
-    assert found == list(range(10))
+        actual.extend(items)
+    assert actual == list(range(10))
 
 
 def test_prefetcher_context_exit_stops_thread() -> None:
-    made: list[int] = []
+    result: list[int] = []
 
     def source() -> Generator[int, None, None]:
         try:
             while True:
-                made.append(1)
+                result.append(1)
                 yield 1
         finally:
-            made.append(0)
+            result.append(0)
 
     before = threading.active_count()
     with Prefetcher(source(), ahead=2) as items:
         next(items)
     assert threading.active_count() == before
-    assert len(made) <= 6
-    assert made[-1] == 0
+    assert len(result) <= 6
+    assert result[-1] == 0
 
 
 def test_group_by_bytes_failing_iterator_yields_doubling_groups_then_raises() -> None:
@@ -180,10 +180,10 @@ def test_group_by_bytes_failing_iterator_yields_doubling_groups_then_raises() ->
         yield from [FIRST_GROUP_BYTES] * 8
         raise ValueError("here")
 
-    found: list[int] = []
+    actual: list[int] = []
     with pytest.raises(ValueError, match="here"):
-        found.extend(len(group) for group in group_by_bytes(pieces(), int, 4 * FIRST_GROUP_BYTES))
-    assert found == [1, 2, 4, 1]
+        actual.extend(len(group) for group in group_by_bytes(pieces(), int, 4 * FIRST_GROUP_BYTES))
+    assert actual == [1, 2, 4, 1]
     assert [len(group) for group in group_by_bytes([1] * 5, int, 0)] == [1] * 5
     assert [len(group) for group in group_by_bytes([1] * 5, int, FIRST_GROUP_BYTES, max_length=2)] == [
         2,

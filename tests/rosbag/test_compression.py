@@ -86,17 +86,17 @@ def test_decompress_file_several_frames_concatenates_them(tmp_path: Path) -> Non
 def _packed(chunks: Sequence[tuple[str, bytes, int]]) -> tuple[NDArray[np.uint8], list[CompressedChunk]]:
     """Return a buffer with the chunks, each after other bytes, and their offsets in it."""
     data, packed = b"", list[CompressedChunk]()
-    for name, held, size in chunks:
+    for name, contents, size in chunks:
         begin = len(data) + len(_BETWEEN)
-        data += _BETWEEN + held
+        data += _BETWEEN + contents
         packed.append(CompressedChunk(begin, len(data), name, size))
     return np.frombuffer(data, np.uint8), packed
 
 
 def _decompress_all(chunks: Sequence[tuple[str, bytes, int]]) -> tuple[list[bytes], dict[int, BagError]]:
-    found = decompress_chunks(*_packed(chunks))
-    held = [found.data[begin:end].tobytes() for begin, end in found.bounds]
-    return held, found.errors
+    actual = decompress_chunks(*_packed(chunks))
+    contents = [actual.data[begin:end].tobytes() for begin, end in actual.bounds]
+    return contents, actual.errors
 
 
 @given(
@@ -107,10 +107,10 @@ def _decompress_all(chunks: Sequence[tuple[str, bytes, int]]) -> tuple[list[byte
 def test_decompress_chunks_several_equal_individual_results(
     chunks: list[tuple[str, bytes]], more: int, one: str | None
 ) -> None:
-    given = [(one or name, data * (1 + more)) for name, data in chunks]
-    found, failures = _decompress_all([(name, PACK[name](data), len(data)) for name, data in given])
+    messages = [(one or name, data * (1 + more)) for name, data in chunks]
+    actual, failures = _decompress_all([(name, PACK[name](data), len(data)) for name, data in messages])
     assert not failures
-    assert found == [data for _, data in given]
+    assert actual == [data for _, data in messages]
 
 
 def test_decompress_chunks_plain_returns_same_buffer() -> None:
@@ -122,14 +122,16 @@ def test_decompress_chunks_plain_returns_same_buffer() -> None:
 @pytest.mark.parametrize("size", [0, 10, len(DATA) - 1, len(DATA) + 1, 1 << 50, (1 << 64) - 1])
 def test_decompress_chunks_one_damaged_returns_others(name: str, size: int) -> None:
     chunks = [(b"before", 6), (DATA, size), (b"after", 5)]
-    found, failures = _decompress_all([(name, PACK[name](data), announced) for data, announced in chunks])
+    actual, failures = _decompress_all([(name, PACK[name](data), announced) for data, announced in chunks])
     assert list(failures) == [1]
     assert "announced" in failures[1].what
-    assert (found[0], found[2]) == (b"before", b"after")
+    assert (actual[0], actual[2]) == (b"before", b"after")
 
 
 @pytest.mark.parametrize("cut", [1, 5, 1000])
 @pytest.mark.parametrize("name", ["zstd", "lz4"])
 def test_decompress_chunks_one_truncated_returns_others(name: str, cut: int) -> None:
     whole = PACK[name](DATA)
-    assert list(_decompress_all([(name, held, len(DATA)) for held in (whole, whole[:-cut])])[1]) == [1]
+    assert list(_decompress_all([(name, contents, len(DATA)) for contents in (whole, whole[:-cut])])[1]) == [
+        1
+    ]

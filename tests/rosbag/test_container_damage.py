@@ -31,8 +31,10 @@ def whole(tmp_path_factory: pytest.TempPathFactory, recordings: Any) -> dict[str
     recordings.ros1(folder / "ros1", ros1)
     recordings.ros1(folder / "ros1 lz4", ros1, compression="lz4")
     for kind, compression in (("sqlite3", "none"), ("message", "message")):
-        made = recordings.rosbag2(folder / f"{kind}.d", messages, storage="sqlite3", compression=compression)
-        shutil.copy(next(made.glob("*.db3*")), folder / kind)
+        result = recordings.rosbag2(
+            folder / f"{kind}.d", messages, storage="sqlite3", compression=compression
+        )
+        shutil.copy(next(result.glob("*.db3*")), folder / kind)
     (folder / "zstd").write_bytes(zstandard.compress((folder / "mcap").read_bytes()))
     return {kind: folder / kind for kind in KINDS}
 
@@ -73,11 +75,11 @@ def test_open_truncated_file_yields_remaining_messages_and_unreadable_range(
         file = tmp_path / "cut"
         file.write_bytes(content[:size])
         with open_recording(file, resolve=recordings.blind) as recording:
-            found = recordings.received(recording)
+            actual = recordings.received(recording)
             assert recording.unreadable
-        assert set(found) <= set(everything)
-        assert len(found) >= most
-        most = len(found)
+        assert set(actual) <= set(everything)
+        assert len(actual) >= most
+        most = len(actual)
     assert most > len(everything) // 2
 
 
@@ -146,12 +148,12 @@ def test_sqlite_damaged_page_is_skipped_and_reported(tmp_path: Path, recordings:
     content[middle : middle + 4096] = b"\xa5" * 4096
     path.write_bytes(content)
     with open_recording(path, resolve=recordings.blind) as recording:
-        found = list(recording.message_blocks())
-        assert 550 < sum(len(batch) for batch in found) < 600
+        actual = list(recording.message_blocks())
+        assert 550 < sum(len(batch) for batch in actual) < 600
         assert any("rows are missing" in loss.reason for loss in recording.unreadable)
         read = {
             (recording.connections[batch.connection].topic, batch.payload(row))
-            for batch in found
+            for batch in actual
             for row in range(len(batch))
         }
     assert read <= {(message.topic, message.payload) for message in messages}
@@ -164,9 +166,9 @@ def test_sqlite_truncated_file_yields_remaining_rows(tmp_path: Path, recordings:
     content = path.read_bytes()
     path.write_bytes(content[: int(len(content) * share)])
     with open_recording(path, resolve=recordings.blind) as recording:
-        found = recordings.received(recording)
-        assert set(found) < set(messages)
-        assert len(found) > (share - 0.1) * len(messages)
+        actual = recordings.received(recording)
+        assert set(actual) < set(messages)
+        assert len(actual) > (share - 0.1) * len(messages)
         assert any("rows are missing" in loss.reason for loss in recording.unreadable)
 
 
@@ -257,10 +259,10 @@ def test_walk_zeroed_range_resumes_at_next_chunk(tmp_path: Path, recordings: Any
     content[middle : middle + 4096] = bytes(4096)
     path.write_bytes(content)
     with open_recording(path, resolve=recordings.blind) as recording:
-        found = recordings.received(recording)
+        actual = recordings.received(recording)
         altered = 8 if kind == "ros1" else 0  # such chunks have no checksum
-        assert len(set(found) - set(messages)) <= altered
-        assert len(messages) - 120 <= len(found) < len(messages)
+        assert len(set(actual) - set(messages)) <= altered
+        assert len(messages) - 120 <= len(actual) < len(messages)
         assert recording.unreadable
 
 

@@ -199,10 +199,10 @@ def test_discover_old_metadata_finds_listed_files(tmp_path: Path, split: Path, r
 
 def test_open_detects_format_by_content(tmp_path: Path, recordings: Any) -> None:
     messages = recordings.sent(20)
-    made = recordings.rosbag2(tmp_path / "x.bag", messages, storage="sqlite3")
-    with open_recording(made, resolve=recordings.blind) as recording:
+    result = recordings.rosbag2(tmp_path / "x.bag", messages, storage="sqlite3")
+    with open_recording(result, resolve=recordings.blind) as recording:
         assert recording.container == "sqlite3"
-    shutil.copy(next(made.glob("*.db3")), tmp_path / "y.mcap")
+    shutil.copy(next(result.glob("*.db3")), tmp_path / "y.mcap")
     with open_recording(tmp_path / "y.mcap", resolve=recordings.blind) as recording:
         assert recording.container == "sqlite3"
         assert recordings.received(recording) == sorted(messages)
@@ -219,17 +219,17 @@ def test_open_other_file_raises_with_first_bytes(tmp_path: Path, recordings: Any
     }
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
-    found: dict[str, str] = {}
+    actual: dict[str, str] = {}
     for name in files:
         with pytest.raises(BagError) as caught:
             open_recording(tmp_path / name, resolve=recordings.blind)
-        found[name] = str(caught.value)
-        assert str(tmp_path / name) in found[name]
-        assert "\n" not in found[name]
-    assert "the file is empty" in found["empty.bag"]
-    assert "68 65 6c 6c 6f" in found["text.mcap"]
-    assert "'#ROSRECORD V1.1'" in found["old.bag"]
-    assert "28 b5 2f fd" in found["twice.zstd"]
+        actual[name] = str(caught.value)
+        assert str(tmp_path / name) in actual[name]
+        assert "\n" not in actual[name]
+    assert "the file is empty" in actual["empty.bag"]
+    assert "68 65 6c 6c 6f" in actual["text.mcap"]
+    assert "'#ROSRECORD V1.1'" in actual["old.bag"]
+    assert "28 b5 2f fd" in actual["twice.zstd"]
 
 
 def test_discover_directory_without_recording_raises_with_entries(tmp_path: Path) -> None:

@@ -96,7 +96,7 @@ def test_package_type_is_used_with_finding(tmp_path: Path, distro: Stores | None
     path = recorded(tmp_path / "a.db3", "example_interfaces/msg/String")
     with ROSLoader(path, typestore_or_distro=distro) as loader:
         assert [message.data for message in loader] == [{"data": "hi"}]
-        (finding,) = [found for found in loader.findings if found.rule == "assumed-definition"]
+        (finding,) = [actual for actual in loader.findings if actual.rule == "assumed-definition"]
     assert "the public package example_interfaces are used: example_interfaces/msg/String" in finding.message
     assert finding.help == "if your types have other fields, provide them with custom_msgs"
 
@@ -108,7 +108,7 @@ def test_package_type_yields_to_recording_and_job(tmp_path: Path) -> None:
         assert [message.data for message in loader] == [{"text": "hi"}]
     with ROSLoader(recorded(tmp_path / "b.db3", name), custom_types={name: "string mine"}) as loader:
         assert [message.data for message in loader] == [{"mine": "hi"}]
-        assert not any(found.rule == "assumed-definition" for found in loader.findings)
+        assert not any(actual.rule == "assumed-definition" for actual in loader.findings)
 
 
 def test_definition_with_another_hash_is_not_used(tmp_path: Path) -> None:

@@ -94,10 +94,10 @@ def test_message_blocks_selects_connections_and_times(tmp_path: Path, recordings
     start, end = messages[60].time_ns, messages[200].time_ns
     with open_recording(path, resolve=recordings.blind) as recording:
         ids = [channel.id for channel in recording.connections if channel.topic in {"/imu", "/chatter"}]
-        found = recordings.received(recording, connection_ids=ids, start_ns=start, end_ns=end)
+        actual = recordings.received(recording, connection_ids=ids, start_ns=start, end_ns=end)
         assert recordings.received(recording, connection_ids=[]) == []
     wanted = [m for m in messages if m.topic in {"/imu", "/chatter"} and start <= m.time_ns < end]
-    assert found == sorted(wanted)
+    assert actual == sorted(wanted)
 
 
 def test_splits_are_merged_by_time(tmp_path: Path, recordings: Any) -> None:
@@ -199,9 +199,9 @@ def test_file_truncated_during_read_loses_only_its_end(
     path = recordings.mcap(tmp_path / "k.mcap", messages, chunk_messages=20, compression="")
     with open_recording(path, resolve=recordings.blind) as recording:
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-        found = recordings.received(recording)
-        assert found
-        assert set(found) < set(messages)
+        actual = recordings.received(recording)
+        assert actual
+        assert set(actual) < set(messages)
         assert any("truncated" in loss.reason for loss in recording.unreadable)
 
 

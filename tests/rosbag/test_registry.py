@@ -46,8 +46,8 @@ def test_registry_distro_overlays_types_of_all_distros() -> None:
 
 def test_registered_types_yield_to_types_of_job() -> None:
     ROSTypeRegistry.register("a/msg/B", "int8 announced")
-    found = TypeResolver().resolve("a/msg/B", None, ros_version=2)
-    assert (found.message.fields[0].name, found.source) == ("announced", Source.CUSTOM)
+    definition = TypeResolver().resolve("a/msg/B", None, ros_version=2)
+    assert (definition.message.fields[0].name, definition.source) == ("announced", Source.CUSTOM)
     own = TypeResolver(types={"a/msg/B": "int8 own"}).resolve("a/msg/B", None, ros_version=2)
     assert own.message.fields[0].name == "own"
 
@@ -59,8 +59,8 @@ def test_register_directory_registers_every_file(tmp_path: Path) -> None:
     (tmp_path / "README").write_text("not a message")
     ROSTypeRegistry.register_directory("pkg", tmp_path, store=Stores.ROS2_HUMBLE)
     assert sorted(ROSTypeRegistry.get_types("ros2_humble")) == ["pkg/msg/One", "pkg/msg/Two"]
-    found = TypeResolver("ros2_humble").resolve("pkg/msg/One", None, ros_version=2)
-    assert found.message.fields[0].type == "pkg/msg/Two"
+    definition = TypeResolver("ros2_humble").resolve("pkg/msg/One", None, ros_version=2)
+    assert definition.message.fields[0].type == "pkg/msg/Two"
 
 
 def test_register_invalid_file_raises_with_line_and_registers_nothing(tmp_path: Path) -> None:

@@ -45,22 +45,22 @@ class TestNames:
 class TestOrder:
     def test_resolve_prefers_recording(self) -> None:
         resolver = TypeResolver(Stores.ROS2_HUMBLE, types={"std_msgs/msg/String": "int8 custom"})
-        found = resolve(resolver, "std_msgs/String", "int8 embedded")
-        assert (found.message.fields[0].name, found.source) == ("embedded", Source.BAG)
+        definition = resolve(resolver, "std_msgs/String", "int8 embedded")
+        assert (definition.message.fields[0].name, definition.source) == ("embedded", Source.BAG)
 
     def test_resolve_prefers_custom_types_to_distro(self) -> None:
         resolver = TypeResolver(Stores.ROS2_HUMBLE, types={"std_msgs/msg/String": "int8 custom"})
-        found = resolve(resolver, "std_msgs/msg/String")
-        assert (found.message.fields[0].name, found.source) == ("custom", Source.CUSTOM)
+        definition = resolve(resolver, "std_msgs/msg/String")
+        assert (definition.message.fields[0].name, definition.source) == ("custom", Source.CUSTOM)
 
     def test_resolve_searches_each_nested_type(self) -> None:
         resolver = TypeResolver(Stores.ROS2_HUMBLE, types={"mine/msg/Part": "float32 size"})
-        found = resolve(
+        definition = resolve(
             resolver,
             "mine/msg/Whole",
             "mine/Part part\nPart[] parts\ngeometry_msgs/Point where\nHeader header",
         )
-        assert set(found.types) == {
+        assert set(definition.types) == {
             "mine/msg/Whole", "mine/msg/Part", "geometry_msgs/msg/Point", "std_msgs/msg/Header",
             "builtin_interfaces/msg/Time",
         }  # fmt: skip
@@ -81,18 +81,21 @@ class TestOrder:
             f"service_msgs/ServiceEventInfo info\nexample_interfaces/AddTwoInts_Request[<=1] request\n{BAR}\n"
             f"MSG: service_msgs/ServiceEventInfo\nuint8 event_type\n{BAR}\nMSG: example_interfaces/srv/AddTwoInts_Request\nint64 a\n"
         )
-        found = resolve(TypeResolver(), "example_interfaces/srv/AddTwoInts_Event", text)
-        assert found.message.fields[1].type == "example_interfaces/srv/AddTwoInts_Request"
+        definition = resolve(TypeResolver(), "example_interfaces/srv/AddTwoInts_Event", text)
+        assert definition.message.fields[1].type == "example_interfaces/srv/AddTwoInts_Request"
 
     def test_resolve_service_event_from_srv_text(self) -> None:
         text = f"int64 a\nThing thing\n---\nint64 sum\n{BAR}\nMSG: mine/Thing\nint8 x\n"
-        found = resolve(TypeResolver(), "mine/srv/Add_Event", text)
-        assert [(f.name, f.type, f.size) for f in found.message.fields] == [
+        definition = resolve(TypeResolver(), "mine/srv/Add_Event", text)
+        assert [(f.name, f.type, f.size) for f in definition.message.fields] == [
             ("info", "service_msgs/msg/ServiceEventInfo", 0),
             ("request", "mine/srv/Add_Request", 1),
             ("response", "mine/srv/Add_Response", 1),
         ]
-        assert [f.type for f in found.types["mine/srv/Add_Request"].fields] == ["int64", "mine/msg/Thing"]
+        assert [f.type for f in definition.types["mine/srv/Add_Request"].fields] == [
+            "int64",
+            "mine/msg/Thing",
+        ]
 
     def test_resolve_empty_text_is_empty_type_unless_known(self) -> None:
         assert resolve(TypeResolver(), "mine/msg/Signal", "").message.fields == ()
@@ -231,7 +234,7 @@ def test_flatten_standard_types_equal_rosbags_and_round_trip(distro: Stores) -> 
     assert version
     store, resolver = get_typestore(RosbagsStores(distro.value)), TypeResolver(distro)
     for name in store.fielddefs:
-        found = resolver.resolve(name, None, ros_version=version)
-        assert found.text == store.generate_msgdef(name, ros_version=version)[0], name
-        again = resolver.resolve(name, Embedded("ros2msg", found.text), ros_version=version)
-        assert {**again.types} == {**found.types}, name
+        definition = resolver.resolve(name, None, ros_version=version)
+        assert definition.text == store.generate_msgdef(name, ros_version=version)[0], name
+        again = resolver.resolve(name, Embedded("ros2msg", definition.text), ros_version=version)
+        assert {**again.types} == {**definition.types}, name

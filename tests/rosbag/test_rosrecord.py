@@ -70,9 +70,9 @@ def bag(messages: Sequence[Any], *, indexed: bool = True, line: bytes = b"#ROSRE
         entries[sent.topic] += struct.pack("<IIQ", sec, nsec, len(out))
         out += message(sent.topic, sent.msgtype, sent.time_ns, sent.payload)
     out = out.replace(b"INDEXPOS", struct.pack("<Q", len(out)))
-    for topic, found in entries.items() if indexed else ():
-        count = struct.pack("<I", len(found) // 16)
-        out += record(found, count=count, op=b"\4", topic=topic.encode(), ver=bytes(4))
+    for topic, actual in entries.items() if indexed else ():
+        count = struct.pack("<I", len(actual) // 16)
+        out += record(actual, count=count, op=b"\4", topic=topic.encode(), ver=bytes(4))
     return out
 
 
@@ -106,8 +106,8 @@ def test_rosrecord_selects_topics_and_times(tmp_path: Path, recordings: Any) -> 
     middle = messages[150].time_ns
     with open_recording(path, resolve=recordings.blind) as recording:
         (imu,) = [channel.id for channel in recording.connections if channel.topic == "/imu"]
-        found = recordings.received(recording, connection_ids=[imu], start_ns=middle)
-    assert found == sorted(sent for sent in messages if sent.topic == "/imu" and sent.time_ns >= middle)
+        actual = recordings.received(recording, connection_ids=[imu], start_ns=middle)
+    assert actual == sorted(sent for sent in messages if sent.topic == "/imu" and sent.time_ns >= middle)
 
 
 def test_rosrecord_uses_definition_of_recording(tmp_path: Path) -> None:
@@ -182,9 +182,9 @@ def test_rosrecord_damage_loses_only_damaged_messages(
     path = tmp_path / "damaged.bag"
     path.write_bytes(content)
     with open_recording(path, resolve=recordings.blind) as recording:
-        found = recordings.received(recording)
+        actual = recordings.received(recording)
         assert len(recording.unreadable) == 1
-    assert found == sorted(texts[:10] + texts[11:])
+    assert actual == sorted(texts[:10] + texts[11:])
 
 
 @settings(max_examples=80, deadline=20_000, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -35,12 +35,12 @@ def test_writer_many_chunks_are_indexed(tmp_path: Path, suffix: str) -> None:
         counts = {channel.topic: channel.count for channel in recording.connections}
         assert counts == {"/a": 90, "/b": 1}
         assert (recording.start_ns, recording.end_ns) == (0, 890)
-        found = {channel.topic: channel.id for channel in recording.connections}
-        batches = list(recording.message_blocks((found["/a"],), start_ns=300, end_ns=500))
+        actual = {channel.topic: channel.id for channel in recording.connections}
+        batches = list(recording.message_blocks((actual["/a"],), start_ns=300, end_ns=500))
         times = np.concatenate([batch.log_times for batch in batches])
         assert times.tolist() == list(range(300, 500, 10))
         assert batches[0].payload(0)[:4] == (30).to_bytes(4, "little")
-        late = next(iter(recording.message_blocks((found["/b"],))))
+        late = next(iter(recording.message_blocks((actual["/b"],))))
         assert late.payload(0) == b"late"
         assert not recording.unreadable
 

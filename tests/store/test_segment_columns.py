@@ -128,9 +128,9 @@ def test_catalog_bounds_cover_columns_with_exact_bounds_only(store: Store, sink:
         topic = session.topic("/t", kind, {})
         topic.write(pa.RecordBatch.from_pylist(rows, topic.schema))
     with sqlite3.connect(store.layout.catalog) as db:
-        found = {
+        actual = {
             path: (low, high) for path, low, high in db.execute("SELECT column_path, low, high FROM bounds")
         }
     db.close()
-    assert found == {"timestamp_ns": (3, 5), "pose.x": (-0.5, float("inf")), "ok": (0, 1)}
-    assert json.dumps(list(found)) == '["ok", "pose.x", "timestamp_ns"]'
+    assert actual == {"timestamp_ns": (3, 5), "pose.x": (-0.5, float("inf")), "ok": (0, 1)}
+    assert json.dumps(list(actual)) == '["ok", "pose.x", "timestamp_ns"]'

@@ -88,7 +88,7 @@ def test_keyring_stores_hashes_and_refuses_expired_key(tmp_path: Path) -> None:
 
 def test_server_with_certificate_accepts_tls_only(tmp_path: Path, rows: Rows) -> None:
     certificate, key = tmp_path / "cert.pem", tmp_path / "key.pem"
-    made = [
+    command = [
         "openssl",
         "req",
         "-x509",
@@ -100,9 +100,9 @@ def test_server_with_certificate_accepts_tls_only(tmp_path: Path, rows: Rows) ->
         "-subj",
         "/CN=localhost",
     ]
-    made += ["-addext", "subjectAltName=DNS:localhost", "-keyout", str(key), "-out", str(certificate)]
+    command += ["-addext", "subjectAltName=DNS:localhost", "-keyout", str(key), "-out", str(certificate)]
     try:
-        subprocess.run(made, check=True, capture_output=True)  # noqa: S603 - fixed arguments
+        subprocess.run(command, check=True, capture_output=True)  # noqa: S603 - fixed arguments
     except (OSError, subprocess.CalledProcessError):
         pytest.skip("openssl is not here")
     with serve(tmp_path / "served", "localhost", 0, tls=Tls(certificate, key)) as running:

@@ -108,12 +108,12 @@ def test_notifications_are_stored_listed_and_purged(client: Client, rows: Rows) 
     client.call("session_finalize", session_uuid=session["uuid"])
     client.call("topic_notification_create", locator="drive/imu", msg="late", **note)
     client.call("sequence_notification_create", locator="drive", msg="all", **note)
-    told = client.call("topic_notification_list", locator="drive/imu")["notifications"]
-    assert [(each["name"], each["notification_type"], each["msg"]) for each in told] == [
+    response = client.call("topic_notification_list", locator="drive/imu")["notifications"]
+    assert [(each["name"], each["notification_type"], each["msg"]) for each in response] == [
         ("drive/imu", "error", "early"),
         ("drive/imu", "error", "late"),
     ]
-    assert datetime.fromisoformat(told[0]["created_datetime"]).tzinfo is not None
+    assert datetime.fromisoformat(response[0]["created_datetime"]).tzinfo is not None
     assert len(client.call("sequence_notification_list", locator="drive")["notifications"]) == 1
     client.call("topic_notification_purge", locator="drive/imu")
     client.call("sequence_notification_purge", locator="drive")
@@ -218,10 +218,10 @@ def test_refusal_contains_no_cause_and_no_other_names(client: Client) -> None:
         lambda: client.call("sequence_delete", locator="nobodys"),
         lambda: client.call("sequence_create", locator="a b", user_metadata={}),
     ):
-        with pytest.raises(pa.ArrowException) as told:
+        with pytest.raises(pa.ArrowException) as caught:
             call()
-        assert "direct cause" not in str(told.value)
-        assert "somebody_elses" not in str(told.value)
+        assert "direct cause" not in str(caught.value)
+        assert "somebody_elses" not in str(caught.value)
 
 
 def test_do_put_requires_uuid_and_time_column_and_is_accepted_once(client: Client, rows: Rows) -> None:
@@ -328,8 +328,8 @@ def test_concurrent_clients_write_and_read_their_own_rows(server: Server, rows: 
             return client.rows(f"s{number}/t")
 
     with ThreadPoolExecutor(6) as pool:
-        found = list(pool.map(work, range(6)))
-    assert found == [[step * 10 + number for step in range(20)] for number in range(6)]
+        actual = list(pool.map(work, range(6)))
+    assert actual == [[step * 10 + number for step in range(20)] for number in range(6)]
 
 
 def test_server_shutdown_discards_open_sessions(tmp_path: Path, rows: Rows) -> None:

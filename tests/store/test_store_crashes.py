@@ -42,12 +42,12 @@ def sources(store: Store, sequence: str) -> set[int]:
     """Check that the sequence is complete, and return the numbers of the writers of its rows."""
     info = store.sequence(sequence)
     assert [topic.name for topic in info.topics] == ["/t0", "/t1", "/t2", "/t3"]
-    found: set[int] = set()
+    actual: set[int] = set()
     for topic in info.topics:
         table = store.scan(sequence, topic.name).read_all()
         assert table["timestamp_ns"].to_pylist() == list(range(2000))
-        found |= set(table["source"].to_pylist())
-    return found
+        actual |= set(table["source"].to_pylist())
+    return actual
 
 
 def assert_tidy(store: Store) -> None:
@@ -207,20 +207,20 @@ def test_commit_syncs_files_and_folders_before_catalog(
 ) -> None:
     """Check the order of fsync calls, since a test cannot cut the power."""
     names = ("/a", "/b/c", "/d", "/e", "/f")
-    done: list[tuple[str, Path]] = []
+    calls: list[tuple[str, Path]] = []
     settle, move, enter = layout.fsync, layout._move, Catalog.commit
 
     def fsync(path: Path) -> None:
         time.sleep(disk_s)
         settle(path)
-        done.append(("fsync", path))
+        calls.append(("fsync", path))
 
     def moved(staged: Path, target: Path) -> None:
         move(staged, target)
-        done.append((f"from {staged}", target))
+        calls.append((f"from {staged}", target))
 
     def commit(self: Catalog, *given: Any) -> list[str]:
-        done.append(("commit", self.path))
+        calls.append(("commit", self.path))
         return enter(self, *given)
 
     monkeypatch.setattr(layout, "fsync", fsync)
@@ -229,11 +229,11 @@ def test_commit_syncs_files_and_folders_before_catalog(
     with sink.open("drive", {}) as session:
         for name in names:
             session.topic(name, sample, {}).write(rows([1, 2]))
-    named = done.index(("commit", store.path / "catalog.sqlite"))
+    named = calls.index(("commit", store.path / "catalog.sqlite"))
     for name in names:
         (path,) = store.paths("drive", name)
-        at, step = next((at, step) for at, (step, target) in enumerate(done) if target == path)
-        assert done.index(("fsync", Path(step.removeprefix("from ")))) < at
+        at, step = next((at, step) for at, (step, target) in enumerate(calls) if target == path)
+        assert calls.index(("fsync", Path(step.removeprefix("from ")))) < at
         folders = [folder for folder in path.parents if folder.is_relative_to(store.path / "segments")]
         assert len(folders) > 2
-        assert all(at < done.index(("fsync", folder)) < named for folder in folders)
+        assert all(at < calls.index(("fsync", folder)) < named for folder in folders)

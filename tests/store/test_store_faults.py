@@ -56,14 +56,14 @@ def test_open_empty_catalog_without_create_raises(tmp_path: Path) -> None:
 
 def test_open_locked_new_catalog_waits_for_lock(tmp_path: Path) -> None:
     """SQLite does not wait for a lock when it switches to the write-ahead log."""
-    held = sqlite3.connect(tmp_path / "catalog.sqlite", isolation_level=None, check_same_thread=False)
-    with closing(held):
-        held.execute("BEGIN EXCLUSIVE")
-        timer = threading.Timer(0.3, held.rollback)
+    connection = sqlite3.connect(tmp_path / "catalog.sqlite", isolation_level=None, check_same_thread=False)
+    with closing(connection):
+        connection.execute("BEGIN EXCLUSIVE")
+        timer = threading.Timer(0.3, connection.rollback)
         timer.start()
         assert Store.open(tmp_path).names() == ()
         timer.join()
-        assert held.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+        assert connection.execute("PRAGMA journal_mode").fetchone() == ("wal",)
 
 
 def open_catalogs(store: Store) -> int:
@@ -244,15 +244,15 @@ except SinkError as err:
 
 @pytest.mark.skipif(find_spec("resource") is None, reason="limits file sizes with the module resource")
 def test_session_beyond_file_size_limit_fails_and_leaves_no_files(store: Store) -> None:
-    done = subprocess.run(  # noqa: S603 - this interpreter, our own script
+    result = subprocess.run(  # noqa: S603 - this interpreter, our own script
         [sys.executable, "-c", FULL, str(store.path), str(Path(__file__).parent)],
         capture_output=True,
         text=True,
         check=True,
     )
-    last = done.stdout.splitlines()[-1]
+    last = result.stdout.splitlines()[-1]
     assert last.startswith("0 ")
-    assert "done" not in done.stdout
+    assert "done" not in result.stdout
     assert store.sequences() == ()
     assert list(store.path.rglob("*.parquet")) == []
 

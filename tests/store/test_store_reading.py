@@ -64,8 +64,8 @@ def test_segments_of_unordered_writes_are_sorted_by_time(
             topic.write(rows(times))
             topic.flush()
     segments = store.topic("s", "/t").segments
-    found = [ds.dataset(segment.path).to_table()["timestamp_ns"].to_pylist() for segment in segments]
-    assert found == [[1], [3, 5, 7], [6, 9]]
+    actual = [ds.dataset(segment.path).to_table()["timestamp_ns"].to_pylist() for segment in segments]
+    assert actual == [[1], [3, 5, 7], [6, 9]]
     assert [(segment.start_ns, segment.end_ns) for segment in segments] == [(1, 1), (3, 7), (6, 9)]
 
 

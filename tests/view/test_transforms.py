@@ -47,7 +47,7 @@ def test_trees_of_a_long_chain_need_no_recursion() -> None:
 
 
 def test_edges_of_quickstart_count_transforms(quickstart: Store) -> None:
-    (found,) = read_edges(quickstart.sequence("quickstart_drive").topics)
-    assert (found.parent, found.child, found.rows) == ("odom", "base_link", 200)
-    assert found.translation is not None
-    assert round(found.translation[0], 3) == 5
+    (actual,) = read_edges(quickstart.sequence("quickstart_drive").topics)
+    assert (actual.parent, actual.child, actual.rows) == ("odom", "base_link", 200)
+    assert actual.translation is not None
+    assert round(actual.translation[0], 3) == 5

@@ -325,7 +325,7 @@ def _collect_rules(rules: list[str]) -> Report:
 
 
 def _literal_problem(parameter: Parameter, argument: TypedExpression) -> str | None:
-    """Return what is wrong with the argument of a parameter that takes a literal."""
+    """Return the problem of an argument whose parameter takes a literal, None if it is valid."""
     if not parameter.literal:
         return None
     if not isinstance(argument, Constant) or not isinstance(argument.value, str):

@@ -193,7 +193,7 @@ class LocalFiles(Struct, frozen=True):
             fsync(folder)
 
     def remove(self, paths: Iterable[AnyPath]) -> None:
-        """Remove segments and empty folders; garbage collection removes files that cannot be removed now."""
+        """Remove segments and empty folders; garbage collection retries failed removals."""
         for path in (Path(str(one)) for one in paths):
             with suppress(OSError):
                 path.unlink()
@@ -332,7 +332,7 @@ class ObjectFiles:
             shutil.copyfileobj(source, target, _COPY_BYTES)
 
     def remove(self, paths: Iterable[AnyPath]) -> None:
-        """Remove segments; garbage collection removes those that cannot be removed now."""
+        """Remove segments; garbage collection retries failed removals."""
         with ThreadPoolExecutor(_THREADS, thread_name_prefix="remove") as pool:
             list(pool.map(_remove, paths))
 

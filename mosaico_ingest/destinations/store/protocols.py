@@ -64,7 +64,7 @@ class Files(Protocol):
         ...
 
     def remove(self, paths: Iterable[AnyPath]) -> None:
-        """Remove segments; garbage collection removes those that cannot be removed now."""
+        """Remove segments; garbage collection retries failed removals."""
         ...
 
     def discard(self, session: str) -> None:

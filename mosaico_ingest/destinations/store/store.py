@@ -56,7 +56,7 @@ def _problem(topic: TopicInfo, segment: SegmentInfo) -> str | None:
         form = "{} bytes, {} rows in [{}, {}]"
         return f"the catalog has {form.format(*expected)}, the file has {form.format(*actual)}"
     if segment.checksum not in {None, content.hexdigest()}:
-        return f"its rows have the checksum {content.hexdigest()}, those that were written {segment.checksum}"
+        return f"its rows have the checksum {content.hexdigest()}, the catalog has {segment.checksum}"
     return None
 
 

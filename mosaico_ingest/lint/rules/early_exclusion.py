@@ -9,7 +9,7 @@ from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Report exclusions above the first inclusion, except those that `overridden-pattern` reports."""
+    """Report each exclusion above the first inclusion, unless `overridden-pattern` reports it."""
     patterns = job.manifest.topics
     first = next((i for i, pattern in enumerate(patterns) if not pattern.startswith("!")), 0)
     for i, pattern in enumerate(patterns[:first]):

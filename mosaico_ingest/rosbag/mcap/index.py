@@ -110,7 +110,7 @@ def read_index(source: Source, max_chunk_bytes: int = MAX_CHUNK_BYTES) -> McapIn
 def read_extents(
     source: Source, index: McapIndex, max_chunk_bytes: int = MAX_CHUNK_BYTES
 ) -> tuple[list[Extent], list[UnreadableRange]]:
-    """Return all extents by time, including those that the summary does not list, and damage between chunks."""
+    """Return all extents by time, also extents that the summary lacks, and damage between chunks."""
     listed = sorted(index.extents, key=lambda extent: extent.offset)
     unlisted = McapIndex()
     position = len(MCAP)

@@ -1,4 +1,4 @@
 """The readers of ROS 1 bags, versions 2.0 and 1.2: a file in, connections, index and message blocks out.
 
-They recover what is readable from unindexed or damaged bags. They must not depend on the other containers.
+They recover the readable messages of unindexed or damaged bags. They must not depend on the other containers.
 """

@@ -66,7 +66,7 @@ class Parameter(Struct, frozen=True):
     literal: bool = False
     """The argument must be a literal in the expression; the function receives it as a Python value."""
     check_literal: Callable[[str], str | None] | None = None
-    """Returns what is wrong with a literal text, None if it is valid."""
+    """Returns the problem of a literal text, None if it is valid."""
 
     def takes(self, expr_type: ExprType) -> bool:
         """Return whether an argument of a type is accepted; null always is."""
@@ -103,7 +103,7 @@ class Function(Struct, frozen=True):
         return f"{self.name}({', '.join(self.parameters)}{', …' if self.variadic else ''})"
 
     def arity_problem(self, count: int) -> str | None:
-        """Return what is wrong with a number of arguments, None if it is valid."""
+        """Return the problem of a number of arguments, None if it is valid."""
         maximum = len(self.parameter_types)
         if count < maximum - self.optional or (count > maximum and not self.variadic):
             return f"{self.signature} takes {self._arity()}, not {count}"
