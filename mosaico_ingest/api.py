@@ -11,7 +11,7 @@ Functions import what only they need, because a short run would otherwise spend 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from mosaico_ingest.executors.base import Executor
     from mosaico_ingest.pipeline.plan import Plan
     from mosaico_ingest.pipeline.plan_document import Difference, PlanDocument
+    from mosaico_ingest.services.check import Checked
     from mosaico_ingest.services.inspection import Inspection
     from mosaico_ingest.services.status import RecordingStatus
 
@@ -168,6 +169,29 @@ def inspect_recording(path: AnyPath | str, *, ros_distro: str | None = None) -> 
 
     config = ROSInjectionConfig(file_path=path, sequence_name="inspected", ros_distro=ros_distro)
     return inspect(config.job)
+
+
+def check_recordings(manifest: Path) -> Iterator[Checked]:
+    """Yield the results of the data contract of a manifest for each of its recordings; write nothing.
+
+    Raises:
+        IngestError: The manifest cannot be compiled.
+    """
+    from mosaico_ingest.services.check import check_jobs
+
+    return check_jobs(compile_job(manifest))
+
+
+def check_sequence(store: str, sequence: str, expect: Path) -> Checked:
+    """Return the results of the section `expect` of a file for a stored sequence.
+
+    Raises:
+        ManifestError: The file has mistakes, or no section `expect`.
+        SinkError: The store does not exist or has no such sequence.
+    """
+    from mosaico_ingest.services.check import check_sequence as check
+
+    return check(store, sequence, expect)
 
 
 def plan_job(

@@ -21,8 +21,8 @@ from mosaico_ingest.findings import one_line
 from mosaico_ingest.version import __version__
 
 COMMANDS = {
-    "run": "run", "bag": "run", "inspect": "report", "plan": "plan", "diff": "plan", "init": "plan", "expand": "plan",
-    "verify": "store", "replay": "run", "export": "export", "lint": "lint", "serve": "serve", "browse": "pages", "watch": "watch",
+    "run": "run", "bag": "run", "inspect": "report", "plan": "plan", "check": "check", "diff": "plan", "init": "plan",
+    "expand": "plan", "verify": "store", "replay": "run", "export": "export", "lint": "lint", "serve": "serve", "browse": "pages", "watch": "watch",
     "status": "watch", "report": "report",
 }  # fmt: skip
 """The module in `cli` that defines each command, in the order of `--help`."""

@@ -84,4 +84,6 @@ def run_outcomes(report: RunReport, ends: Mapping[int, RunFinished]) -> list[Che
 
 def plan_outcomes(recordings: Sequence[RecordingPlan]) -> list[CheckedRecording]:
     """Return the outcome of each planned recording, with the warnings and errors of its plan."""
-    return [CheckedRecording(recording.plan["sequence"]["name"]) for recording in recordings]
+    return [
+        CheckedRecording(recording.plan["sequence"]["name"], recording.contract) for recording in recordings
+    ]

@@ -112,6 +112,10 @@ class RowMonitor:
             self.frames.add(batch, frames)
         if self.numbers is not None and (numbers := header_numbers_of(rows)) is not None:
             self.numbers.add(batch, numbers)
+        self.add_values(rows, batch, envelope)
+
+    def add_values(self, rows: Array, batch: Batch, envelope: Envelope) -> None:
+        """Add the values of messages in the ROS shape, without their headers."""
         self._add_values(rows, batch, envelope, is_ontology=False)
 
     def add_ontology(self, rows: Array, batch: Batch, envelope: Envelope) -> None:

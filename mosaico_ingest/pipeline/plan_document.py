@@ -16,6 +16,7 @@ from mosaico_ingest.documents import Part, document_schema, read_document
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import Finding, Severity, Stage
 from mosaico_ingest.pipeline.plan import Plan
+from mosaico_ingest.report.contract import ContractResult
 from mosaico_ingest.textfile import read_limited
 
 __all__ = [
@@ -104,12 +105,19 @@ class RecordingPlan(Part):
     """The serialized plan, see `Plan.document`."""
     destination: DestinationState
     samples: tuple[Sample, ...]
+    contract: ContractResult | None = None
+    """The expectations that the index of the recording decides, and those that the sample violates."""
     notes: tuple[Note, ...]
 
     @property
     def rejected(self) -> int:
         """The number of sampled messages that would be rejected."""
         return sum(sample.rejected for sample in self.samples)
+
+    @property
+    def violates_contract(self) -> bool:
+        """Whether a run would fail or be diverted because of its data contract."""
+        return self.contract is not None and not self.contract.passed and self.contract.on_failure != "warn"
 
     @property
     def is_empty(self) -> bool:
@@ -129,9 +137,15 @@ class PlanDocument(Part):
 
     @property
     def exit_code(self) -> int:
-        """1 if a destination refuses, 3 if a recording has no message, 4 if sampled messages would be rejected, else 0."""
+        """The exit code of the plan.
+
+        1 if a destination refuses, 6 if a data contract is violated and `expect.on_failure` is not `warn`, 3 if a recording
+        has no message, 4 if sampled messages would be rejected, else 0.
+        """
         if any(recording.destination.problem for recording in self.recordings):
             return 1
+        if any(recording.violates_contract for recording in self.recordings):
+            return 6
         if any(recording.is_empty for recording in self.recordings):
             return 3
         return 4 if any(recording.rejected for recording in self.recordings) else 0

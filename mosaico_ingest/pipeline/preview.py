@@ -13,6 +13,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from mosaico_ingest.adapters.bridge import ROSBridge
+from mosaico_ingest.contracts.recording_monitor import RecordingMonitor
 from mosaico_ingest.destinations.base import ExistingSequence, Session, StoredTopic, check_same_type
 from mosaico_ingest.destinations.memory import MemorySink
 from mosaico_ingest.destinations.registry import destination_of
@@ -21,6 +22,8 @@ from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.patterns import first_match
 from mosaico_ingest.job.values import IfExists, LoaderErrorPolicy, TopicLevelErrorPolicy
+from mosaico_ingest.pipeline.contract import monitor_of
+from mosaico_ingest.pipeline.contract_check import index_results, sample_results
 from mosaico_ingest.pipeline.plan import Plan, TopicPlan, digest_of
 from mosaico_ingest.pipeline.plan_document import (
     DestinationState,
@@ -37,6 +40,7 @@ from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.pipeline.topic import TopicPipeline
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.protocol import check_topic_name
+from mosaico_ingest.report.contract import ContractResult, ExpectationResult
 from mosaico_ingest.report.events import Event, Rejected
 from mosaico_ingest.rosbag.blocks import MessageBlock
 from mosaico_ingest.rosbag.recording import Recording
@@ -130,11 +134,18 @@ _SAMPLE_BYTES = 64 << 20
 _SAMPLE_S = 5.0
 
 
-def try_messages(plan: Plan, recording: Recording) -> tuple[Sample, ...]:
-    """Decode and adapt the first messages of every topic of the plan, without writing."""
+def try_messages(
+    plan: Plan, recording: Recording, monitor: RecordingMonitor | None = None
+) -> tuple[Sample, ...]:
+    """Decode and adapt the first messages of every topic of the plan, without writing; `monitor` observes them."""
     with MemorySink().open(plan.sequence.name, plan.sequence.metadata) as session:
         trials = tuple(_trial(topic, recording, session) for topic in plan.topics)
         by_connection = {connection: trial for trial in trials for connection in trial.topic.plan.connections}
+        if monitor is not None:
+            for connection, trial in by_connection.items():
+                observer = monitor.observer(connection)
+                if observer is not None:
+                    trial.topic.observers[connection] = observer
         with WriteBuffer(max_bytes=_MEMORY_BYTES) as buffer:
             for block in _blocks(plan, recording, by_connection):
                 by_connection[block.connection].topic.process(block, buffer)
@@ -265,7 +276,11 @@ def preview(job: Job, *, connect: bool) -> RecordingPlan:
     bridge = ROSBridge.for_job(job)
     with open_job(job) as (recording, resolver):
         plan = plan_recording(Task(job), recording, bridge=bridge, resolver=resolver)
-        samples = try_messages(plan, recording)
+        results = index_results(plan, recording)
+        monitor = monitor_of(plan, recording)
+        samples = try_messages(plan, recording, monitor)
+        if monitor is not None:
+            results += sample_results(monitor)
         unreadable_ranges = tuple(_unreadable(recording))
     document = plan.document(folder=job.folder)
     state = ask_destination(plan, samples, connect=connect)
@@ -276,7 +291,19 @@ def preview(job: Job, *, connect: bool) -> RecordingPlan:
         plan=document,
         destination=state,
         samples=samples,
-        notes=notes((*plan.findings, *unreadable_ranges, *_chosen(job, plan), *_excluded(plan), *found)),
+        contract=None
+        if plan.contract is None
+        else ContractResult(on_failure=plan.contract.expect.on_failure.value, results=tuple(results)),
+        notes=notes(
+            (
+                *plan.findings,
+                *unreadable_ranges,
+                *_chosen(job, plan),
+                *_excluded(plan),
+                *found,
+                *_violations(results),
+            )
+        ),
     )
 
 
@@ -289,6 +316,10 @@ def decide(job: Job, *, folder: Path) -> dict[str, Any]:
     bridge = ROSBridge.for_job(job)
     with open_job(job) as (recording, resolver):
         return plan_recording(Task(job), recording, bridge=bridge, resolver=resolver).document(folder=folder)
+
+
+def _violations(results: Iterable[ExpectationResult]) -> Iterator[Finding]:
+    return (finding for result in results if (finding := result.finding) is not None)
 
 
 def _unreadable(recording: Recording) -> Iterator[Finding]:

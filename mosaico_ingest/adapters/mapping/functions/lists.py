@@ -11,6 +11,7 @@ from mosaico_ingest.adapters.mapping.columns import (
     Array,
     Axis,
     arrays,
+    field_of,
     open_list,
     pc,
     pt,
@@ -124,6 +125,32 @@ def mean(x: Array) -> Array:
     total = _fold(_plain(elements).astype(np.float64), axis, np.add, 0)
     mask = _absent(elements, axis) | (axis.lengths == 0)
     return arrays.array(total / np.maximum(axis.lengths, 1), mask=mask)
+
+
+def _is_vector(expr_type: ExprType) -> bool:
+    if pt.is_struct(expr_type.arrow):
+        members = list(expr_type.arrow)
+        return bool(members) and all(is_number(member.type) for member in members)
+    return NUMBERS.accepts(expr_type)
+
+
+@function(
+    Parameter("a list of numbers, or a message of numbers such as a vector", _is_vector),
+    returns=arrays.float64(),
+)
+def norm(x: Array) -> Array:
+    """Euclidean norm of a list or of the fields of a vector or quaternion; null if an element is null."""
+    if pt.is_struct(x.type):
+        members = [pc.cast(field_of(x, member.name), arrays.float64()) for member in x.type]
+        absent = np.zeros(len(x), bool)
+        total = np.zeros(len(x))
+        for member in members:
+            absent |= np.asarray(member.is_null())
+            total += np.square(np.asarray(pc.fill_null(member, 0.0)))
+        return arrays.array(np.sqrt(total), mask=absent)
+    elements, axis = open_list(x)
+    total = _fold(np.square(_plain(elements).astype(np.float64)), axis, np.add, 0.0)
+    return arrays.array(np.sqrt(total), mask=_absent(elements, axis))
 
 
 def _extreme(x: Array, run: np.ufunc) -> Array:

@@ -1,0 +1,115 @@
+"""`ingest check`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.text import Text
+
+from mosaico_ingest.cli.console import Terminal, print_json, print_line, read_sources, render_findings
+from mosaico_ingest.cli.options import JsonOption, JunitOption, SarifOption
+from mosaico_ingest.report.units import counted
+
+if TYPE_CHECKING:
+    from mosaico_ingest.cli.ci import CheckedRecording
+    from mosaico_ingest.report.contract import ContractResult
+
+
+def check(
+    target: Annotated[
+        str, typer.Argument(metavar="JOB.yaml|SEQUENCE", help="A job manifest, or a sequence of --store.")
+    ],
+    *,
+    store: Annotated[
+        str | None,
+        typer.Option(
+            "--store", help="Check a sequence of this store instead of recordings.", metavar="DIR|URL"
+        ),
+    ] = None,
+    expect: Annotated[
+        Path | None,
+        typer.Option("--expect", help="The file with the section expect, for --store.", metavar="FILE"),
+    ] = None,
+    show_all: Annotated[
+        bool, typer.Option("--all", "-a", help="Also print expectations that hold or are not evaluated.")
+    ] = False,
+    junit: JunitOption = None,
+    sarif: SarifOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Check recordings, or a stored sequence, against a data contract. Read-only.
+
+    Exit codes: 0 the contract holds, 6 an expectation with the severity `error` failed, 1 a recording cannot be read,
+    2 the manifest is wrong, 3 nothing matches.
+    """
+    from mosaico_ingest import api
+    from mosaico_ingest.cli.ci import CheckedRecording, write_ci_files
+    from mosaico_ingest.cli.process import collect_garbage_as_usual
+    from mosaico_ingest.report.model import gravest
+
+    collect_garbage_as_usual()
+    if (store is None) != (expect is None):
+        raise typer.BadParameter("--store and --expect belong together", param_hint="--store, --expect")
+    checked: list[CheckedRecording] = []
+    codes: list[int] = []
+    results = (
+        api.check_recordings(Path(target))
+        if store is None or expect is None
+        else [api.check_sequence(store, target, expect)]
+    )
+    for result in results:
+        one = CheckedRecording(
+            result.name,
+            result.contract,
+            None if result.error is None else str(result.error),
+            () if result.error is None else result.error.findings,
+        )
+        checked.append(one)
+        codes.append(result.exit_code)
+        if not as_json:
+            _print(one, show_all=show_all)
+    if as_json:
+        print_json([_document(one) for one in checked])
+    write_ci_files(checked, junit=junit, sarif=sarif)
+    code = gravest(codes)
+    if code:
+        raise typer.Exit(code)
+
+
+def _print(one: CheckedRecording, *, show_all: bool) -> None:
+    if one.contract is None:
+        print_line(f"{one.name}: {one.error}", style="red")
+        return
+    findings = [finding for result in one.contract.results if (finding := result.finding) is not None]
+    shown = [finding for finding in findings if show_all or finding.rule != "expectation-skipped"]
+    if show_all:
+        for result in one.contract.results:
+            if result.finding is None:
+                Terminal(soft_wrap=True).print(
+                    Text(f"passed: {result.expectation}: {result.line}", style="green")
+                )
+    if shown:
+        Terminal(soft_wrap=True).print(render_findings(shown, read_sources(shown)))
+        print_line("")
+    print_line(_summary(one.name, one.contract), style="green" if one.contract.passed else "bold red")
+
+
+def _summary(name: str, contract: ContractResult) -> str:
+    counts = Counter(result.outcome.value for result in contract.results)
+    warnings = len(contract.warnings)
+    parts = [f"{counts['passed']} passed"]
+    if contract.errors:
+        parts.append(f"{len(contract.errors)} failed")
+    if warnings:
+        parts.append(f"{counted(warnings, 'warning')}")
+    if counts["skipped"]:
+        parts.append(f"{counts['skipped']} not evaluated")
+    return f"{name}: {counted(len(contract.results), 'expectation')}: {', '.join(parts)}"
+
+
+def _document(one: CheckedRecording) -> dict[str, object]:
+    contract = None if one.contract is None else one.contract.model_dump(mode="json")
+    return {"sequence": one.name, "error": one.error, "contract": contract}

@@ -1,0 +1,97 @@
+"""The mistakes in the expressions of data contracts that are visible without a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from mosaico_ingest.adapters.bridge import ROSBridge
+from mosaico_ingest.contracts.expressions import Rows, bind_expression, syntax_findings, type_findings
+from mosaico_ingest.contracts.recording_monitor import message_rows, ontology_rows
+from mosaico_ingest.errors import AdapterError, BagError, ManifestError
+from mosaico_ingest.findings import Finding, Span
+from mosaico_ingest.job.expect import AllowedNames, Expectations, TopicExpectations
+from mosaico_ingest.job.yaml_source import KeyPath
+from mosaico_ingest.lint.job import Job
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+
+
+def expectation_findings(job: Job) -> Iterator[Finding]:
+    """Yield the mistakes of all expressions.
+
+    Names are checked against the message type that `type` expects, if its definition is known, and against the columns
+    of its ontology type.
+    """
+    expect = job.manifest.expect
+    if expect is None:
+        return
+    for topic, entry in expect.topics.items():
+        for text, expected in entry.fields.items():
+            path = ("expect", "topics", topic, "fields", text)
+
+            def locate(start: int, end: int, path: KeyPath = path) -> Span | None:
+                return _inside(job.source.key_span(path), str(path[-1]), start, end)
+
+            mistakes = syntax_findings(text, locate)
+            if not mistakes:
+                for message, ontology in _rows(job, expect, topic, entry):
+                    expression, mistakes = bind_expression(text, message, ontology, locate)
+                    if expression is not None:
+                        mistakes = list(type_findings(expression, expected, locate))
+                    if mistakes:
+                        break
+            yield from mistakes
+
+
+def _inside(span: Span, text: str, start: int, end: int) -> Span:
+    """Return the location of some characters of a key."""
+    if span.line != span.end_line:
+        return span
+    first = span.column + (span.end_column - span.column > len(text))
+    return Span(span.file, span.line, first + start, span.line, first + max(end, start + 1))
+
+
+def _rows(
+    job: Job, expect: Expectations, topic: str, entry: TopicExpectations
+) -> Iterator[tuple[Rows, Rows | None]]:
+    """Yield the message type and the ontology type of each type that a topic is expected to have."""
+    expected = entry.type
+    if expected is None and (other := expect.entry_of(topic, "type")) is not None:
+        expected = expect.topics[other].type
+    if expected is None:
+        return
+    names = expected.one_of if isinstance(expected, AllowedNames) else expected
+    resolver = _resolver(job)
+    for name in (names,) if isinstance(names, str) else names:
+        for version in (2, 1):
+            try:
+                definition = resolver.resolve(name, None, ros_version=version)
+            except BagError:
+                continue
+            message = message_rows(definition)
+            yield message, _ontology(job, topic, message, definition.root)
+            break
+
+
+def _ontology(job: Job, topic: str, message: Rows, msgtype: str) -> Rows | None:
+    adapters = job.manifest.adapters
+    try:
+        bridge = ROSBridge(overrides=adapters.override, loaded=adapters.load, base_dir=job.folder)
+        spec = bridge.resolve(topic, msgtype).spec
+        definition = _resolver(job).resolve(msgtype, None, ros_version=2)
+        return ontology_rows(spec.bind(definition, message.struct).ontology)
+    except (AdapterError, BagError, ManifestError):
+        return None
+
+
+def _resolver(job: Job) -> TypeResolver:
+    bag = job.manifest.bag
+    custom = [
+        (messages.package, Path(job.resolve(messages.path)), messages.store)
+        for messages in bag.custom_msgs
+        if job.is_expanded(messages.path)
+    ]
+    try:
+        return TypeResolver(bag.ros_distro, custom)
+    except BagError:  # other rules report definitions that cannot be used
+        return TypeResolver(bag.ros_distro, [])

@@ -1,0 +1,182 @@
+"""Data contracts without a run: the complete check of a recording, and the part of it that the index reveals."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mosaico_ingest.adapters.adapter import Envelope
+from mosaico_ingest.adapters.bridge import ROSBridge
+from mosaico_ingest.contracts.clauses import Contract
+from mosaico_ingest.contracts.monitor import TIME_KEYS, BlockObserver
+from mosaico_ingest.contracts.recording_monitor import RecordingMonitor
+from mosaico_ingest.decode.decoder import decoder_for
+from mosaico_ingest.errors import AdapterError, ManifestError
+from mosaico_ingest.job.model import Job
+from mosaico_ingest.pipeline.contract import monitor_of
+from mosaico_ingest.pipeline.plan import Plan, TopicPlan
+from mosaico_ingest.pipeline.planning import plan_recording
+from mosaico_ingest.pipeline.run import open_job
+from mosaico_ingest.pipeline.task import Task
+from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Outcome
+from mosaico_ingest.rosbag.blocks import Connection, MessageBlock
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.recording import Recording
+
+_WHOLE_FILE_KEYS = frozenset({"unreadable", "chunk_crcs"})
+"""Expectations of the recording that require reading every chunk."""
+_INDEX_KEYS = frozenset({"duration", "start", "end", "messages", "metadata_counts"})
+"""Expectations of the recording that the index decides."""
+_SAMPLE_KEYS = frozenset(
+    {"latency", "stamps", "frame_id", "between", "min", "max", "finite", "equals", "one_of"}
+)
+"""Expectations of rows that a few messages can violate."""
+
+
+def check_contract(job: Job) -> ContractResult:
+    """Return the results of a job's contract for its recording, without writing.
+
+    Only topics with expectations of their rows are decoded. If log times are all that is needed, the messages are not
+    read: the index has their times.
+
+    Raises:
+        ManifestError: The job has no contract, or an expression does not fit the messages of a topic.
+        IngestError: The recording cannot be opened or planned.
+    """
+    if job.expect is None:
+        raise ManifestError(
+            "the manifest has no data contract", where=job.origin.file, hint="add the section expect"
+        )
+    bridge = ROSBridge.for_job(job)
+    with open_job(job) as (recording, resolver):
+        plan = plan_recording(Task(job), recording, bridge=bridge, resolver=resolver)
+        monitor = monitor_of(plan, recording)
+        if monitor is None or plan.contract is None:
+            raise AssertionError
+        _observe(plan, plan.contract, recording, monitor)
+        return monitor.finish()
+
+
+def index_results(plan: Plan, recording: Recording) -> list[ExpectationResult]:
+    """Return the results that the index of the recording decides; no message is read."""
+    monitor = monitor_of(plan, recording)
+    if monitor is None:
+        return []
+    topics = tuple(key for topic in plan.topics for key in topic.connections)
+    observed = [key for key in topics if monitor.observer(key) is not None]
+    times = recording.index_times(observed, start_ns=plan.read_from_ns, end_ns=plan.read_until_ns)
+    if times is None:
+        monitor = monitor_of(plan.replace(topics=()), recording)
+    else:
+        _add_times(monitor, times)
+    results = () if monitor is None else monitor.finish().results
+    return [result for result in results if _is_known(result, has_times=times is not None)]
+
+
+def sample_results(monitor: RecordingMonitor) -> list[ExpectationResult]:
+    """Return the expectations that some of the messages that a monitor observed violate."""
+    return [
+        result
+        for result in monitor.finish().results
+        if result.outcome is Outcome.FAILED
+        and result.topic is not None
+        and result.key.rpartition(".")[2] in _SAMPLE_KEYS
+    ]
+
+
+def _is_known(result: ExpectationResult, *, has_times: bool) -> bool:
+    if result.outcome is Outcome.SKIPPED:
+        return False
+    if result.topic is None:
+        return result.key in _INDEX_KEYS or not result.expectation.startswith("expect.recording.")
+    return result.key == "type" or (result.key in TIME_KEYS and (has_times or result.key == "messages"))
+
+
+def _observe(plan: Plan, contract: Contract, recording: Recording, monitor: RecordingMonitor) -> None:
+    """Observe every message for which something is expected, through the index where that is enough."""
+    topics = {key: topic for topic in plan.topics for key in topic.connections}
+    observers = {key: monitor.observer(key) for key in topics}
+    reads_all = any(clause.key in _WHOLE_FILE_KEYS for clause in contract.recording_clauses())
+    if not reads_all:
+        observers = {key: observer for key, observer in observers.items() if observer is not None}
+    timed = [key for key, observer in observers.items() if observer is None or observer.rows is None]
+    if reads_all or monitor.order is not None:
+        timed = []
+    times = (
+        recording.index_times(timed, start_ns=plan.read_from_ns, end_ns=plan.read_until_ns) if timed else {}
+    )
+    if times is not None:
+        _add_times(monitor, times)
+    read = [key for key in observers if times is None or key not in times]
+    if not read:
+        return
+    connections = {connection.id: connection for connection in recording.connections}
+    rows = {
+        key: _Rows(topics[key], connections[key], observer, monitor)
+        for key in read
+        if (observer := observers[key]) is not None
+    }
+    order = monitor.order
+    blocks = recording.message_blocks(
+        tuple(read),
+        start_ns=plan.read_from_ns,
+        end_ns=plan.read_until_ns,
+        observe=None if order is None else order.add,
+    )
+    for block in blocks:
+        if block.connection in rows:
+            rows[block.connection].add(block)
+
+
+def _add_times(
+    monitor: RecordingMonitor, times: dict[int, np.ndarray[tuple[int], np.dtype[np.int64]]]
+) -> None:
+    for key, of_connection in times.items():
+        observer = monitor.observer(key)
+        if observer is not None:
+            observer.block(of_connection)
+
+
+class _Rows:
+    """Decodes and adapts the blocks of one connection, as far as an expectation needs it."""
+
+    def __init__(
+        self, topic: TopicPlan, connection: Connection, observer: BlockObserver, monitor: RecordingMonitor
+    ) -> None:
+        self._topic = topic
+        self._connection = connection
+        self._observer = observer
+        self._monitor = monitor
+        self._read = 0
+        rows = observer.rows
+        self._decodes = rows is not None
+        self._adapts = rows is not None and rows.needs_ontology
+        self._decoder = decoder_for(connection) if self._decodes else None
+        definition = connection.definition
+        self._adapter = (
+            topic.adapter.bind(definition, ros_shape(definition))
+            if self._adapts and definition is not None
+            else None
+        )
+
+    def add(self, block: MessageBlock) -> None:
+        """Add a block."""
+        self._observer.block(block.log_times)
+        positions = np.arange(len(block), dtype=np.int64)
+        sample = positions[(positions + self._read) % self._topic.every == 0]
+        self._read += len(block)
+        if self._decoder is None:
+            return
+        decoded = self._decoder.decode(block if len(sample) == len(block) else block.rows(sample))
+        index = sample[decoded.index]
+        self._observer.messages(decoded.rows, index)
+        rejected = len(decoded.failures)
+        if self._adapter is not None:
+            envelope = Envelope(self._topic.topic, self._topic.msgtype, block.log_times[index])
+            try:
+                adapted = self._adapter.adapt(decoded.rows, envelope)
+            except AdapterError:
+                rejected += len(index)
+            else:
+                self._observer.ontology(adapted.rows, index[adapted.index])
+                rejected += len(adapted.failures)
+            self._monitor.reject(self._topic.topic, rejected)
