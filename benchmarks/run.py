@@ -43,6 +43,8 @@ class Case:
     for_peer: Path
     min_peer_ratio: float = 0.0
     max_floor_ratio: float = 0.0
+    injector: str = "mosaicolabs.ros_injector"
+    """The program of the official SDK that ingests the recording."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ def measure(case: Case, runs: int, peer: Path | None) -> Result:
         messages = sum(
             topic["written"] for topic in json.loads(report.read_text())["recordings"][0]["topics"]
         )
-    peer_per_s = peer_speed(case.for_peer, runs, peer) if peer else None
+    peer_per_s = peer_speed(case.for_peer, runs, peer, case.injector) if peer else None
     return Result(case, messages, typical(samples), sorted(floors)[runs // 2], stored_bytes, peer_per_s)
 
 
@@ -114,13 +116,13 @@ def floor_seconds(recording: Path, store: Path) -> float:
     return sample.wall_s - json.loads(sample.output)["load_s"]
 
 
-def peer_speed(recording: Path, runs: int, python: Path) -> float:
+def peer_speed(recording: Path, runs: int, python: Path, injector: str = "mosaicolabs.ros_injector") -> float:
     """Return the speed of the official injector, in messages per second."""
     samples: list[Sample] = []
     rows = 0
     for _ in range(runs):
         with discard_server() as (port, counted):
-            program = python.parent / "mosaicolabs.ros_injector"
+            program = python.parent / injector
             command = [program, recording, "--name", "run", "--host", "127.0.0.1", "--port", port]
             samples.append(run([*command, "--log", "ERROR"]))
         rows = counted[0]
@@ -156,7 +158,8 @@ def cases(arguments: argparse.Namespace) -> list[Case]:
 def _case(workload: Workload, folder: Path) -> Case:
     path = workload.path(folder)
     short = BY_NAME[workload.peer].path(folder) if workload.peer else path
-    return Case(workload.name, path, short, workload.min_peer_ratio, workload.max_floor_ratio)
+    injector = "mosaicolabs.mcap_injector" if workload.write else "mosaicolabs.ros_injector"
+    return Case(workload.name, path, short, workload.min_peer_ratio, workload.max_floor_ratio, injector)
 
 
 def print_result(result: Result) -> None:

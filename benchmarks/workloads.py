@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
+from encodings_mcap import write_json, write_protobuf
 from messages import Message, Messages, Values
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
@@ -90,6 +91,8 @@ class Workload:
     """The minimum speed relative to the official injector; 0: no target."""
     max_floor_ratio: float = 0.0
     """The maximum time relative to the floor; 0: no target."""
+    write: Callable[[Path], None] | None = None
+    """Writes the recording, if its messages are not from ROS."""
 
     def path(self, folder: Path) -> Path:
         """Return the path of the recording, and generate it if it does not exist."""
@@ -97,7 +100,11 @@ class Workload:
         if not target.exists():
             folder.mkdir(parents=True, exist_ok=True)
             unfinished = folder / f"new-{target.name}"
-            (_write_ros1 if self.suffix == ".bag" else _write_ros2)(self, unfinished)
+            unfinished.unlink(missing_ok=True)
+            if self.write is not None:
+                self.write(unfinished)
+            else:
+                (_write_ros1 if self.suffix == ".bag" else _write_ros2)(self, unfinished)
             unfinished.rename(target)
         return target
 
@@ -111,6 +118,8 @@ WORKLOADS = (
     Workload("mixed-ros1", MIXED, 20, 4, ".bag", "none", min_peer_ratio=20, max_floor_ratio=2),
     Workload("mixed-ros1-lz4", MIXED, 20, 4, ".bag", "lz4", min_peer_ratio=20, max_floor_ratio=2),
     Workload("layouts", LAYOUTS, 30, 5, min_peer_ratio=20),
+    Workload("protobuf", (), 100, 6, min_peer_ratio=10, write=write_protobuf),
+    Workload("json", (), 100, 6, min_peer_ratio=10, write=write_json),
 )
 SHORT = (
     Workload("telemetry-30s", TELEMETRY, 30, 1),
