@@ -45,6 +45,7 @@ NOT_IN_THE_DISTROS = {
     for b in BUILTIN
     if (text := b.mapping.model.definition)
     for name in b.ros_types
+    if "/" in name  # the SDK's ROS bridge knows no types of protobuf and JSON
 }
 
 

@@ -126,6 +126,8 @@ _ONTOLOGY_NAMES = {
     "seq": "sample_counter",
     "sec": "seconds",
     "nanosec": "nanoseconds",
+    "nsec": "nanoseconds",
+    "nanos": "nanoseconds",
 }
 """The names in the ontology of the fields of headers and times."""
 
