@@ -175,7 +175,9 @@ _TABLE = (
     Rule("ING609", "unexpected-messages", _WARNING, "more messages than the recording's index promises"),
     Rule("ING610", "quarantined", _WARNING, "rejected messages in the quarantine"),
     Rule("ING611", "old-server", _WARNING, "a server whose own clients cannot decode the rows"),
-    Rule("ING612", "static-topic", _WARNING, "a static topic with messages before the time range"),
+    Rule(
+        "ING612", "static-topic", _WARNING, "a static topic whose messages before the time range are not read"
+    ),
     Rule("ING613", "time-range-outside", _ERROR, "a time range that selects nothing of the recording"),
     Rule("ING614", "expectation-failed", _ERROR, "a recording that violates its data contract"),
     Rule("ING615", "expectation-skipped", _INFO, "an expectation that cannot be evaluated"),
@@ -187,6 +189,8 @@ _TABLE = (
     Rule("ING619", "invalid-sidecar", _ERROR, "a side-car file of `metadata_from` that is not a JSON object"),
     Rule("ING620", "definition-difference", _ERROR, "a definition or column that differs from the lock file"),
     Rule("ING621", "run-failed", _ERROR, "a recording whose run ended with an error"),
+    Rule("ING630", "latched-topic", _INFO, "a topic whose messages before the time range are included"),
+    Rule("ING631", "no-publish-times", _WARNING, "`stamp: publish` for a recording without publish times"),
     Rule("ING701", "decode", _WARNING, "bytes that do not fit their message type"),
     Rule("ING702", "definition", _WARNING, "a message type without a usable definition"),
     Rule("ING703", "encoding", _WARNING, "a message in an encoding that cannot be decoded"),

@@ -28,7 +28,7 @@ from typing_extensions import Self
 
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.findings import Span
-from mosaico_ingest.job.expect import Expectations
+from mosaico_ingest.job.expect import Expectations, Frequency, SignedDuration
 from mosaico_ingest.job.fields import AdapterRef, FilePath, Literally, Parsed, PathRole, Secret, TopicGlob
 from mosaico_ingest.job.file_names import FileNamePattern
 from mosaico_ingest.job.patterns import first_match, is_glob
@@ -47,6 +47,7 @@ from mosaico_ingest.job.values import (
     PluginTarget,
     ServerTarget,
     SessionLevelErrorPolicy,
+    StampSource,
     Stores,
     StoreTarget,
     Target,
@@ -141,6 +142,11 @@ class TimeRange(Section):
     """The start, inclusive."""
     end: Time | None = Field(default=None, examples=["-5s", "2026-03-01T12:30:00Z"])
     """The end, exclusive."""
+    include_latched: bool = True
+    """Whether to include the latest message before the start of each latched topic (ROS 1: latching, ROS 2: transient local), and
+    all messages of `/tf_static` before the start."""
+    latched: tuple[Topic, ...] = Field(default=(), examples=[["/map", "/robot_description"]])
+    """Names or globs of further topics whose latest message before the start is included."""
 
 
 class BagSource(Section):
@@ -216,8 +222,16 @@ class TopicSettings(Section):
     """Metadata of the topic."""
     metadata_schema: SchemaPath | None = Field(default=None, examples=["fleet/sensor.schema.json"])
     """A JSON Schema for the metadata of the topic, see `sequence.metadata_schema`."""
+    stamp: StampSource = StampSource.LOG
+    """The time that becomes `timestamp_ns`, and that `bag.time` and `rate` refer to: log, publish or header. Messages without
+    the selected time have their log time; the report counts them."""
+    time_offset: SignedDuration = Field(default=0, examples=["-250ms"])
+    """A duration to add to every time of the topic, for a clock that is known to be wrong."""
     every: Count = Field(default=1, examples=[3])
     """Keep the first of each `every` messages."""
+    rate: Frequency | None = Field(default=None, examples=["10 Hz"])
+    """Keep the first message of each interval of this frequency; the first interval starts at the topic's first message. It
+    applies after `every`."""
     image: Literal["raw", "png"] = "raw"
     """The encoding of raw images: as recorded, or PNG."""
 

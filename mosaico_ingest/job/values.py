@@ -94,6 +94,17 @@ class OnFailure(str, Enum):
     """Commit under the name `<name>__failed`."""
 
 
+class StampSource(str, Enum):
+    """The time of a message that becomes `timestamp_ns` of its row."""
+
+    LOG = "log"
+    """The time at which the recorder received the message."""
+    PUBLISH = "publish"
+    """The time at which the publisher sent the message, which only MCAP files contain; in other files the log time."""
+    HEADER = "header"
+    """The stamp of the message's header; the log time if the type has no header or the stamp is zero."""
+
+
 class Unmodeled(str, Enum):
     """The action for a topic whose type has no adapter."""
 

@@ -66,7 +66,7 @@ class ContractRun(Struct, frozen=True):
             ContractError: The contract is violated, and nothing may be committed.
         """
         for topic in self.topics:
-            self.monitor.reject(topic.plan.topic, topic.read - topic.rows - topic.downsampled)
+            self.monitor.reject(topic.plan.topic, topic.read - topic.rows - topic.dropped)
         result = self.monitor.finish()
         action = self.monitor.on_failure
         diverts = action is OnFailure.DIVERT and not result.passed

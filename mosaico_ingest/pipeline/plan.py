@@ -25,7 +25,7 @@ from mosaico_ingest.job.model import (
     QuarantineSettings,
     SequenceSettings,
 )
-from mosaico_ingest.job.values import Target, TopicLevelErrorPolicy
+from mosaico_ingest.job.values import StampSource, Target, TopicLevelErrorPolicy
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.pipeline.memory import MemoryBudget
 from mosaico_ingest.pipeline.task import Attempt
@@ -138,6 +138,14 @@ class TopicPlan(Part):
     """The number of messages in the recording's index."""
     every: int = 1
     """Keep the first of each `every` messages."""
+    rate: float | None = None
+    """Keep the first message of each interval of this frequency, in Hz."""
+    stamp: StampSource = StampSource.LOG
+    """The time that becomes `timestamp_ns`."""
+    time_offset_ns: int = 0
+    """The duration that is added to every time."""
+    latched: bool = False
+    """True if messages before the time range are included, see `bag.time.latched`."""
     on_error: TopicLevelErrorPolicy
     metadata: Annotated[Mapping[str, Any], Unchecked(), PlainSerializer(_own_metadata)]
 
@@ -145,6 +153,11 @@ class TopicPlan(Part):
     def as_read(self) -> ReadTopic:
         """The topic as a data contract observes it."""
         return ReadTopic(self.topic, self.connections, self.ontology)
+
+    @property
+    def has_log_times(self) -> bool:
+        """Whether the times of the rows are the log times."""
+        return self.stamp is StampSource.LOG and self.time_offset_ns == 0
 
 
 class ExcludedTopic(Part):
@@ -195,6 +208,12 @@ class Plan(Part):
     """The data contract. It is not part of the document, because it does not change the stored rows."""
     attempt: Annotated[Attempt | None, Unchecked()] = Field(default=None, exclude=True)
     """The attempt of an executor that may start a recording more than once."""
+
+    @property
+    def selects_after_reading(self) -> bool:
+        """Whether the time range is applied to the rows, because the times of some rows are not the log times."""
+        bounded = self.read_from_ns is not None or self.read_until_ns is not None
+        return bounded and not all(topic.has_log_times for topic in self.topics)
 
     def document(self, *, folder: Path) -> dict[str, Any]:
         """Return the decisions as JSON; paths are relative to `folder`."""

@@ -23,10 +23,11 @@ from mosaico_ingest.job.fields import TopicGlob, marked_fields, values_at
 from mosaico_ingest.job.model import Job, JobSettings
 from mosaico_ingest.job.patterns import Selection, first_match, select
 from mosaico_ingest.job.units import format_time
-from mosaico_ingest.job.values import LoaderErrorPolicy, TimeBound, Unmodeled
+from mosaico_ingest.job.values import LoaderErrorPolicy, StampSource, TimeBound, Unmodeled
 from mosaico_ingest.metadata.contract import check_metadata_contracts
 from mosaico_ingest.metadata.sources import fill_in_metadata
 from mosaico_ingest.pipeline.definition_lock import check_lock, lock_of
+from mosaico_ingest.pipeline.latched import is_static
 from mosaico_ingest.pipeline.memory import MemoryBudget
 from mosaico_ingest.pipeline.plan import ExcludedTopic, Plan, TopicPlan, digest_of
 from mosaico_ingest.pipeline.schema_changes import follow_schema_changes
@@ -81,9 +82,12 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
     contract = Contract.of(job)
     if contract is not None:
         check_expressions(contract, recording.connections, [topic.as_read for topic in topics])
-    read_from_ns, read_until_ns = _time_range(job, recording)
+    read_from_ns, read_until_ns = _time_range(
+        job, recording, has_log_times=all(topic.has_log_times for topic in topics)
+    )
     findings += _image_settings(job, topics)
-    findings += _static_before(job, topics, recording.start_ns, read_from_ns)
+    findings += _missing_publish_times(job, recording, topics)
+    findings += _latched_before(job, topics, recording.start_ns, read_from_ns)
     plan = Plan(
         sequence=job.sequence.replace(family=job.family, metadata_from=None, metadata_schema=None),
         files=recording.files,
@@ -157,6 +161,10 @@ def plan_connection(
         },
         on_error=job.on_error.for_topic(connection.topic),
         every=settings.every,
+        rate=settings.rate,
+        stamp=settings.stamp,
+        time_offset_ns=settings.time_offset,
+        latched=_is_latched(job, connection),
         definitions=(_describe_definition(connection.definition),),
     )
 
@@ -174,6 +182,15 @@ def _fitting(resolution: Resolution, definition: Definition) -> Resolution:
         why = f"{resolution.spec.name} does not fit: {error.what}; the messages keep their shape"
         return Resolution(UnmodeledSpec(), "unmodeled", why)
     return resolution
+
+
+def _is_latched(job: Job, connection: Connection) -> bool:
+    """Return whether messages of a connection before the time range are included."""
+    time = job.bag.time
+    if time.start is None or not time.include_latched:
+        return False
+    listed = first_match(time.latched, connection.topic) is not None
+    return listed or connection.latched or is_static(connection.topic)
 
 
 def _describe_definition(definition: Definition) -> str:
@@ -215,6 +232,7 @@ def merge(topics: list[TopicPlan], addition: TopicPlan) -> Finding | None:
                 connections=(*plan.connections, *addition.connections),
                 count=count,
                 definitions=tuple(dict.fromkeys((*plan.definitions, *addition.definitions))),
+                latched=plan.latched or addition.latched,
             )
             return None
     if not same_name:
@@ -261,6 +279,10 @@ def _unmatched(job: Job, selection: Selection, topics: tuple[str, ...]) -> Itera
     """Yield a finding for each topic name or glob of the job that matches no topic of the recording."""
     for position in selection.unused:
         yield _unmatched_pattern("topics", job.topics[position], topics, job.span("topics", position))
+    for position, glob in enumerate(job.bag.time.latched):
+        if not any(first_match((glob,), topic) for topic in topics):
+            span = job.span("bag", "time", "latched", position)
+            yield _unmatched_pattern("bag.time.latched", glob, topics, span, ())
     for field in marked_fields(JobSettings, TopicGlob):
         if not field.is_key:
             continue
@@ -356,8 +378,10 @@ def _exclusion_hint(job: Job, excluded: list[ExcludedTopic]) -> str | None:
     return None
 
 
-def _time_range(job: Job, recording: Recording) -> tuple[int | None, int | None]:
+def _time_range(job: Job, recording: Recording, *, has_log_times: bool) -> tuple[int | None, int | None]:
     """Return the start (inclusive) and the end (exclusive) of the time range, ns since the epoch.
+
+    The range must overlap the recording if the times of all rows are log times.
 
     Raises:
         BagError: The range has an offset, and the recording has no index.
@@ -375,7 +399,8 @@ def _time_range(job: Job, recording: Recording) -> tuple[int | None, int | None]
         return bound.at(recording.start_ns, recording.end_ns)
 
     start_ns, end_ns = instant(job.bag.time.start), instant(job.bag.time.end)
-    _check_time_range(job, recording, start_ns, end_ns)
+    if has_log_times:
+        _check_time_range(job, recording, start_ns, end_ns)
     return start_ns, end_ns
 
 
@@ -402,21 +427,53 @@ def _check_time_range(job: Job, recording: Recording, start_ns: int | None, end_
     )
 
 
-def _static_before(
+def _missing_publish_times(job: Job, recording: Recording, topics: Iterable[TopicPlan]) -> Iterator[Finding]:
+    """Yield a finding for each pattern with `stamp: publish` if the container has no publish times."""
+    if recording.container == "mcap":
+        return
+    stamps = {
+        glob: settings.stamp
+        for glob, settings in job.topic_settings.items()
+        if "stamp" in settings.model_fields_set
+    }
+    globs = dict.fromkeys(
+        glob
+        for topic in topics
+        if (glob := first_match(stamps, topic.topic)) and topic.stamp is StampSource.PUBLISH
+    )
+    for glob in globs:
+        yield Finding(
+            "no-publish-times",
+            Severity.WARNING,
+            f"stamp: publish has no effect, because {recording.container} recordings contain log times only",
+            job.span("topic_settings", glob, "stamp"),
+            "set stamp to log or header",
+        )
+
+
+def _latched_before(
     job: Job, topics: list[TopicPlan], start_ns: int | None, read_from_ns: int | None
 ) -> Iterator[Finding]:
-    """Yield a finding for each selected static topic whose messages may all be earlier than the time range."""
+    """Yield a finding for each latched topic whose messages before the time range are included or not."""
     if start_ns is None or read_from_ns is None or read_from_ns <= start_ns:
         return
     for topic in topics:
-        if topic.topic.rpartition("/")[2] == "tf_static":
+        if topic.latched:
+            included = "all of them" if is_static(topic.topic) else "the latest one"
+            yield Finding(
+                "latched-topic",
+                Severity.INFO,
+                f"messages of {topic.topic} before the time range are included: {included}",
+                job.span("bag", "time", "start"),
+            )
+        elif is_static(topic.topic):
             yield Finding(
                 "static-topic",
                 Severity.WARNING,
                 f"the messages of {topic.topic} before the time range are not read; most recordings have them"
                 " at the start",
-                job.span("bag", "time", "start"),
-                "remove bag.time.start if the sequence needs these transforms",
+                job.span("bag", "time", "include_latched"),
+                "remove bag.time.include_latched if the sequence needs these transforms",
             )
 
 

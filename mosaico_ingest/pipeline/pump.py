@@ -16,9 +16,11 @@ from mosaico_ingest.findings import Finding, Severity, Stage
 from mosaico_ingest.interrupts import Abandoned, DeferredInterrupt
 from mosaico_ingest.job.values import IfExists, OnFailure, SessionLevelErrorPolicy
 from mosaico_ingest.pipeline.contract import ContractRun
+from mosaico_ingest.pipeline.latched import latched_blocks
 from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.provenance import SequenceRequest
 from mosaico_ingest.pipeline.quarantine import Quarantine
+from mosaico_ingest.pipeline.selection import row_selector
 from mosaico_ingest.pipeline.topic import TopicPipeline
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.report.events import (
@@ -209,7 +211,14 @@ def _open_topics(
     topics: list[TopicPipeline] = []
     for topic_plan in plan.topics:
         topic = TopicPipeline(
-            topic_plan, plan.on_error.message, session, observe, quarantine=quarantine, stopwatch=stopwatch
+            topic_plan,
+            plan.on_error.message,
+            session,
+            observe,
+            quarantine=quarantine,
+            stopwatch=stopwatch,
+            selector=row_selector(plan, topic_plan),
+            range_start_ns=plan.read_from_ns,
         )
         for connection in topic_plan.connections:
             topic.bind(connections[connection])
@@ -245,14 +254,16 @@ def _process(
     contract: ContractRun | None,
 ) -> None:
     with buffer:
+        stopwatch.lap(Step.PREPARE)
+        for block in latched_blocks(plan, recording):
+            topics[block.connection].process(block, buffer, latched=True)
         blocks = recording.message_blocks(
             tuple(topics),
-            start_ns=plan.read_from_ns,
-            end_ns=plan.read_until_ns,
+            start_ns=None if plan.selects_after_reading else plan.read_from_ns,
+            end_ns=None if plan.selects_after_reading else plan.read_until_ns,
             memory_bytes=plan.memory.read_bytes,
             observe=None if contract is None else contract.observe_order,
         )
-        stopwatch.lap(Step.PREPARE)
         for block in blocks:
             stopwatch.lap(Step.READ)
             topics[block.connection].process(block, buffer)
@@ -327,6 +338,9 @@ def _check_not_empty(plan: Plan, recording: Recording, topics: tuple[TopicPipeli
         in_window = plan.read_from_ns is not None or plan.read_until_ns is not None
         scope = "in the time range" if in_window else "on the selected topics"
         raise NothingMatched(f"there is no message {scope}", where=where, hint="nothing was written")
+    if read == sum(topic.dropped for topic in topics):
+        what = f"the settings of the topics and the time range drop all of {read} messages"
+        raise NothingMatched(what, where=where, hint="nothing was written")
     reason = next((topic.error for topic in topics if topic.error), "see the report for the reasons")
     raise IngestError(f"all of {read} messages were rejected", where=where, hint=reason)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,6 +30,7 @@ from mosaico_ingest.job.values import LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.ontology.types import OntologyType, RequiredFields
 from mosaico_ingest.pipeline.plan import TopicPlan
 from mosaico_ingest.pipeline.quarantine import Quarantine
+from mosaico_ingest.pipeline.selection import RowSelector, row_times
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.report.events import (
     Observer,
@@ -41,7 +42,10 @@ from mosaico_ingest.report.timing import Step, Stopwatch, Timeline
 from mosaico_ingest.rosbag.blocks import Connection, MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 
-__all__ = ["TopicPipeline"]
+__all__ = ["LATCHED_KEY", "TopicPipeline"]
+
+LATCHED_KEY = "_latched_"
+"""Key of topic metadata: `before_ns` is the time before which rows are messages from before the time range."""
 
 
 class _Rejection(Struct, frozen=True):
@@ -60,8 +64,10 @@ class _Converted(Struct, frozen=True):
     """The position of each row's message."""
     rejections: tuple[_Rejection, ...]
     """In the order of the messages."""
-    downsampled: NDArray[np.int64]
-    """Positions of the messages that `every` drops."""
+    dropped: Mapping[str, NDArray[np.int64]]
+    """Positions of the messages that each rule of `topic_settings` and the time range drops."""
+    fallbacks: NDArray[np.int64]
+    """Positions of the messages whose time is the log time, because they do not have the selected time."""
 
 
 @dataclass(slots=True)
@@ -88,14 +94,20 @@ class TopicPipeline:
     end_ns: int | None = None
     status: TopicStatus = TopicStatus.EMPTY
     error: str | None = None
-    downsampled: int = 0
-    """Number of messages that `every` dropped."""
     observers: dict[int, BlockObserver] = field(default_factory=dict[int, BlockObserver])
     """The observers of the data contract by connection."""
     quarantine: Quarantine | None = None
     """Keeps rejected messages; the error policies apply to messages beyond its limits."""
     timeline: Timeline = field(default_factory=Timeline)
     stopwatch: Stopwatch = field(default_factory=Stopwatch)
+    selector: RowSelector | None = None
+    """Selects the rows by time; None keeps all rows."""
+    range_start_ns: int | None = None
+    """The start of the time range; earlier rows are those of latched messages."""
+    dropped: int = 0
+    """Number of messages that the settings of the topic and the time range dropped so far."""
+    _latched: int = 0
+    """Number of messages from before the time range."""
     _leading_failures: int = 0
     """Number of messages that failed before the first row."""
     _connections: dict[int, Connection] = field(default_factory=dict[int, Connection])
@@ -120,13 +132,15 @@ class TopicPipeline:
             connection.definition, ros_shape(connection.definition)
         )
 
-    def process(self, block: MessageBlock, buffer: WriteBuffer) -> None:
+    def process(self, block: MessageBlock, buffer: WriteBuffer, *, latched: bool = False) -> None:
         """Decode, adapt and write a message block, and account for every message of it.
+
+        Messages before the time range (`latched`) become rows regardless of the settings that drop messages.
 
         Raises:
             IngestError: An error policy ends the run.
         """
-        observer = self.observers.get(block.connection)
+        observer = None if latched else self.observers.get(block.connection)
         if observer is not None:
             observer.block(block.log_times)
         if self.status in {TopicStatus.FINALIZED, TopicStatus.FAILED}:
@@ -134,10 +148,10 @@ class TopicPipeline:
             self._count(block, len(block))
             self._reject_from(block, 0)
             return
-        converted = self._convert(block, observer)
+        converted = self._convert(block, observer, latched=latched)
         fatal, quarantined = self._apply_policies(block, converted)
         end = len(block) if fatal is None else fatal.failure.row + 1
-        self._count(block, end, downsampled=int((converted.downsampled < end).sum()))
+        self._count(block, end, converted, latched=latched)
         self._report_rejections(
             block, (one for one in converted.rejections if one.failure.row < end), quarantined
         )
@@ -150,11 +164,15 @@ class TopicPipeline:
         if fatal is not None:
             self._stop(fatal, block, end)
 
-    def _convert(self, block: MessageBlock, observer: BlockObserver | None) -> _Converted:
-        """Downsample, decode and adapt a message block."""
+    def _convert(self, block: MessageBlock, observer: BlockObserver | None, *, latched: bool) -> _Converted:
+        """Decode, select and adapt the messages of a block."""
         positions = np.arange(len(block), dtype=np.int64)
-        selected = (positions + self.read) % self.plan.every == 0
+        selected = (positions + self.read - self._latched) % self.plan.every == 0
+        if latched:
+            selected[:] = True
+            self._latched += len(block)
         self.read += len(block)
+        dropped = {} if selected.all() else {"every": positions[~selected]}
         sample = positions[selected]
         decoded = self._decoders[block.connection].decode(block if selected.all() else block.rows(sample))
         self.stopwatch.lap(Step.DECODE)
@@ -164,18 +182,27 @@ class TopicPipeline:
             _Rejection(Stage.DECODE, replace(failure, row=int(sample[failure.row])))
             for failure in decoded.failures
         ]
-        index = sample[decoded.index]
+        rows, index = decoded.rows, sample[decoded.index]
         if observer is not None:
-            observer.messages(decoded.rows, index)
+            observer.messages(rows, index)
+        publish_times = None if block.publish_times is None else block.publish_times[index]
+        times = row_times(self.plan, rows, block.log_times[index], publish_times)
+        fallbacks = index[:0] if times.fallback is None else index[times.fallback]
+        stamps = times.values
+        if self.selector is not None and not latched:
+            keep, excluded = self.selector.select(stamps)
+            dropped |= {rule: index[mask] for rule, mask in excluded.items()}
+            if keep is not None:
+                rows, index, stamps = rows.filter(pa.array(keep)), index[keep], stamps[keep]
         envelope = Envelope(self.plan.topic, self.plan.msgtype, block.log_times[index])
         adapter = self._adapters[block.connection]
         try:
-            if self._adapter_metadata is None and len(decoded.rows):
-                self._adapter_metadata = adapter.topic_metadata(decoded.rows[0])
-            adapted = adapter.adapt(decoded.rows, envelope)
+            if self._adapter_metadata is None and len(rows):
+                self._adapter_metadata = adapter.topic_metadata(rows[0])
+            adapted = adapter.adapt(rows, envelope)
         except AdapterError as error:
             failures = tuple(RowFailure(row, "adapter-error", str(error)) for row in range(len(index)))
-            adapted = Adapted(decoded.rows[:0], index[:0], failures)
+            adapted = Adapted(rows[:0], index[:0], failures)
         rejections += [
             _Rejection(Stage.ADAPT, replace(failure, row=int(index[failure.row])))
             for failure in adapted.failures
@@ -183,8 +210,14 @@ class TopicPipeline:
         if observer is not None:
             observer.ontology(adapted.rows, index[adapted.index])
         rejections.sort(key=lambda rejection: rejection.failure.row)
-        times = envelope.log_times[adapted.index] if adapted.log_times is None else adapted.log_times
-        return _Converted(adapted.rows, times, index[adapted.index], tuple(rejections), positions[~selected])
+        return _Converted(
+            adapted.rows,
+            stamps[adapted.index] if adapted.log_times is None else adapted.log_times,
+            index[adapted.index],
+            tuple(rejections),
+            dropped,
+            fallbacks,
+        )
 
     def _apply_policies(
         self, block: MessageBlock, converted: _Converted
@@ -269,6 +302,8 @@ class TopicPipeline:
         if self._writer is None:
             try:
                 metadata = {**(self._adapter_metadata or {}), **self.plan.metadata}
+                if self._latched:
+                    metadata[LATCHED_KEY] = {"before_ns": self.range_start_ns}
                 self._writer = self.session.topic(self.plan.target, self.plan.ontology, metadata)
             except SinkError as error:
                 self._fail(error, rows, block, index)
@@ -307,13 +342,21 @@ class TopicPipeline:
         if self.plan.on_error is TopicLevelErrorPolicy.Raise:
             raise error
 
-    def _count(self, block: MessageBlock, end: int, *, downsampled: int = 0) -> None:
-        self.downsampled += downsampled
+    def _count(
+        self, block: MessageBlock, end: int, converted: _Converted | None = None, *, latched: bool = False
+    ) -> None:
+        dropped = {
+            rule: int((positions < end).sum())
+            for rule, positions in (converted.dropped.items() if converted else ())
+        }
+        self.dropped += sum(dropped.values())
         self.observe(
             TopicProgress(
                 self.plan.target,
                 read=end,
-                downsampled=downsampled,
+                dropped=dropped,
+                latched=end if latched else 0,
+                stamp_fallbacks=int((converted.fallbacks < end).sum()) if converted else 0,
                 payload_bytes=int(block.lengths[:end].sum()),
             )
         )

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from mosaico_ingest.findings import Stage
 from mosaico_ingest.report.contract import ContractResult
 from mosaico_ingest.report.events import (
+    DOWNSAMPLING,
     CommitStarted,
     ContractEvaluated,
     Event,
@@ -73,8 +74,9 @@ class _Sum:
     quarantined: int = 0
     read: int = 0
     written: int = 0
-    filtered: int = 0
-    downsampled: int = 0
+    dropped: Counter[str] = field(default_factory=Counter[str])
+    latched: int = 0
+    stamp_fallbacks: int = 0
     payload_bytes: int = 0
     start_ns: int | None = None
     end_ns: int | None = None
@@ -93,8 +95,9 @@ class _Sum:
     def _add(self, more: TopicProgress) -> None:
         self.read += more.read
         self.written += more.written
-        self.filtered += more.filtered
-        self.downsampled += more.downsampled
+        self.dropped.update(more.dropped)
+        self.latched += more.latched
+        self.stamp_fallbacks += more.stamp_fallbacks
         self.payload_bytes += more.payload_bytes
         if more.start_ns is not None:
             self.start_ns = more.start_ns if self.start_ns is None else min(self.start_ns, more.start_ns)
@@ -227,8 +230,11 @@ class Collector:
             unreadable=total.unreadable,
             read=total.read,
             written=total.written,
-            filtered=total.filtered,
-            downsampled=total.downsampled,
+            filtered=sum(count for rule, count in total.dropped.items() if rule not in DOWNSAMPLING),
+            downsampled=sum(total.dropped[rule] for rule in DOWNSAMPLING),
+            dropped={rule: count for rule, count in total.dropped.items() if count},
+            latched=total.latched,
+            stamp_fallbacks=total.stamp_fallbacks,
             rejected=sum(rejection.count for rejection in rejections),
             quarantined=total.quarantined,
             rejections=rejections,

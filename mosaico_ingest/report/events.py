@@ -15,6 +15,10 @@ if TYPE_CHECKING:  # pydantic and NumPy are slow to import
     from mosaico_ingest.report.timing import Step, TimelineReport
 
 
+DOWNSAMPLING = ("every", "rate")
+"""The rules that drop messages regardless of their content."""
+
+
 class RunStatus(str, Enum):
     """How the ingestion of one recording ended."""
 
@@ -73,8 +77,12 @@ class TopicProgress(Struct, frozen=True):
     target: str
     read: int = 0
     written: int = 0
-    filtered: int = 0
-    downsampled: int = 0
+    dropped: Mapping[str, int] = {}
+    """Number of messages by the rule that drops them: `every`, `rate`, `where`, `on_change` or `time_range`."""
+    latched: int = 0
+    """Number of messages from before the time range."""
+    stamp_fallbacks: int = 0
+    """Number of messages without the time that `stamp` selects."""
     payload_bytes: int = 0
     start_ns: int | None = None
     end_ns: int | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeVar
@@ -102,7 +102,15 @@ class TopicReport(_Part):
     read: int = 0
     written: int = 0
     filtered: int = 0
+    """Number of messages that `where`, `on_change` or the time range dropped after they were read."""
     downsampled: int = 0
+    """Number of messages that `every` or `rate` dropped."""
+    dropped: Mapping[str, int] = {}
+    """Number of filtered and downsampled messages by rule: `every`, `rate`, `where`, `on_change`, `time_range`."""
+    latched: int = 0
+    """Number of messages from before the time range, see `bag.time.include_latched`."""
+    stamp_fallbacks: int = 0
+    """Number of messages that have their log time, because they do not have the time that `stamp` selects."""
     rejected: int = 0
     quarantined: int = 0
     """Number of rejected messages in the quarantine."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.report.events import (
+    DOWNSAMPLING,
     Event,
     Rejected,
     RunFinished,
@@ -113,8 +114,8 @@ class Telemetry:
         recording.read += event.read
         recording.written[event.target] += event.written
         self._count(event.target, "read", event.read)
-        self._count(event.target, "filtered", event.filtered)
-        self._count(event.target, "downsampled", event.downsampled)
+        for rule, count in event.dropped.items():
+            self._count(event.target, "downsampled" if rule in DOWNSAMPLING else "filtered", count)
         if event.payload_bytes:
             self._bytes.add(event.payload_bytes, {"kind": "payload", "topic": event.target})
 

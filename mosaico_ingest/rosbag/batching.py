@@ -259,6 +259,7 @@ def _join(blocks: Sequence[MessageBlock]) -> MessageBlock:
     if len(blocks) == 1:
         return blocks[0]
     bases = np.cumsum([0, *(len(block.data) for block in blocks[:-1])])
+    has_publish_times = any(block.publish_times is not None for block in blocks)
     return MessageBlock(
         blocks[0].connection,
         np.concatenate([block.log_times for block in blocks]),
@@ -266,4 +267,9 @@ def _join(blocks: Sequence[MessageBlock]) -> MessageBlock:
         np.concatenate([block.starts + base for block, base in zip(blocks, bases.tolist(), strict=True)]),
         np.concatenate([block.lengths for block in blocks]),
         np.concatenate([block.offsets for block in blocks]),
+        np.concatenate(
+            [block.log_times if block.publish_times is None else block.publish_times for block in blocks]
+        )
+        if has_publish_times
+        else None,
     )

@@ -236,7 +236,13 @@ def decompress_messages(block: MessageBlock, unreadable: list[UnreadableRange]) 
     lengths = np.array([len(payload) for payload in payloads], np.int64)
     data = np.frombuffer(b"".join(payloads), np.uint8)
     return MessageBlock(
-        block.connection, rows.log_times, data, np.cumsum(lengths) - lengths, lengths, rows.offsets
+        block.connection,
+        rows.log_times,
+        data,
+        np.cumsum(lengths) - lengths,
+        lengths,
+        rows.offsets,
+        rows.publish_times,
     )
 
 

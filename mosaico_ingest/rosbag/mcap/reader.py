@@ -420,4 +420,6 @@ def _block(records: Bytes, heads: NDArray[np.void], starts: Int64s, offsets: Int
     """Return messages of any channels whose records have been checked."""
     lengths = heads["length"].astype(np.int64) - _FIXED_BYTES
     times = np.ascontiguousarray(heads["time"])
-    return MessageBlock(-1, times, records, starts + _MESSAGE_HEAD.itemsize, lengths, offsets)
+    published = heads["published"]
+    publish_times = None if np.array_equal(published, times) else np.ascontiguousarray(published)
+    return MessageBlock(-1, times, records, starts + _MESSAGE_HEAD.itemsize, lengths, offsets, publish_times)

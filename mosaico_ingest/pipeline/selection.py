@@ -1,0 +1,123 @@
+"""The times of a topic's rows, and which decoded messages of a topic become rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from mosaico_ingest.job.values import StampSource
+from mosaico_ingest.pipeline.plan import Plan, TopicPlan
+
+Int64s = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+_SECOND_NS = 1_000_000_000
+_HEADER = ("header", "stamp")
+
+
+class RowTimes(Struct, frozen=True):
+    """The times of some decoded messages."""
+
+    values: Int64s
+    """Nanoseconds since the epoch, shape (n,)."""
+    fallback: Mask | None = None
+    """Where a message has no selected time, and therefore its log time; None if all messages have it."""
+
+
+def row_times(
+    plan: TopicPlan, rows: pa.StructArray, log_times: Int64s, publish_times: Int64s | None
+) -> RowTimes:
+    """Return the times of decoded messages, according to `stamp` and `time_offset`.
+
+    Without `publish_times`, publish times equal the log times.
+    """
+    times = RowTimes(log_times)
+    if plan.stamp is StampSource.PUBLISH and publish_times is not None:
+        times = _or_log_times(publish_times, log_times)
+    elif plan.stamp is StampSource.HEADER:
+        times = _or_log_times(header_stamps(rows), log_times)
+    if plan.time_offset_ns:
+        return RowTimes(times.values + plan.time_offset_ns, times.fallback)
+    return times
+
+
+def _or_log_times(stamps: Int64s | None, log_times: Int64s) -> RowTimes:
+    """Return the stamps, and the log time in place of each zero stamp."""
+    if stamps is None:
+        return RowTimes(log_times, np.ones(len(log_times), bool))
+    missing = stamps == 0
+    return RowTimes(np.where(missing, log_times, stamps), missing if missing.any() else None)
+
+
+def header_stamps(rows: pa.StructArray) -> Int64s | None:
+    """Return `header.stamp` of each row in nanoseconds, shape (n,), with 0 for null; None if the type has no header."""
+    column: Any = rows
+    for name in _HEADER:
+        if not pa.types.is_struct(column.type) or column.type.get_field_index(name) < 0:
+            return None
+        column = pc.struct_field(column, name)
+    names = {field.name for field in column.type} if pa.types.is_struct(column.type) else set()
+    if not {"sec", "nanosec"} <= names:
+        return None
+    seconds, fraction = (
+        pc.struct_field(column, part).cast(pa.int64()).fill_null(0).to_numpy(zero_copy_only=False)
+        for part in ("sec", "nanosec")
+    )
+    return seconds * _SECOND_NS + fraction
+
+
+def row_selector(plan: Plan, topic: TopicPlan) -> RowSelector | None:
+    """Return the selector of a topic, or None if it keeps all rows."""
+    if plan.selects_after_reading:
+        return RowSelector(topic, plan.read_from_ns, plan.read_until_ns)
+    return None if topic.rate is None else RowSelector(topic)
+
+
+@dataclass(slots=True)
+class RowSelector:
+    """Selects the rows of one topic by time range and rate; its state spans all blocks of the topic."""
+
+    plan: TopicPlan
+    start_ns: int | None = None
+    """Earlier rows are dropped; None if the reader has applied the time range already."""
+    end_ns: int | None = None
+    """Rows of this time or later are dropped."""
+    _origin_ns: int | None = None
+    _last_interval: int = -1
+
+    def select(self, times: Int64s) -> tuple[Mask | None, Mapping[str, Mask]]:
+        """Return the rows to keep, or None for all of them, and the rows that each rule drops.
+
+        A row counts for the first rule that drops it.
+        """
+        keep = np.ones(len(times), bool)
+        dropped: dict[str, Mask] = {}
+        if self.start_ns is not None or self.end_ns is not None:
+            start = times.min(initial=0) if self.start_ns is None else self.start_ns
+            inside = times >= start if self.end_ns is None else (times >= start) & (times < self.end_ns)
+            dropped["time_range"] = keep & ~inside
+            keep &= inside
+        if self.plan.rate is not None:
+            selected = np.zeros(len(times), bool)
+            selected[keep] = self._first_of_intervals(times[keep], self.plan.rate)
+            dropped["rate"] = keep & ~selected
+            keep = selected
+        return (None, {}) if keep.all() else (keep, dropped)
+
+    def _first_of_intervals(self, times: Int64s, rate: float) -> Mask:
+        """Return the rows whose interval is later than that of every earlier row."""
+        if not len(times):
+            return np.zeros(0, bool)
+        if self._origin_ns is None:
+            self._origin_ns = int(times[0])
+        intervals = np.floor_divide(times - self._origin_ns, _SECOND_NS / rate).astype(np.int64)
+        latest = np.maximum.accumulate(np.concatenate(([self._last_interval], intervals)))
+        self._last_interval = int(latest[-1])
+        return intervals > latest[:-1]
