@@ -18,7 +18,6 @@ from mosaico_ingest.cli.options import (
     JsonOption,
     JunitOption,
     ManifestArgument,
-    RecordingArgument,
     SarifOption,
     write_output,
 )
@@ -267,17 +266,70 @@ def _cell_comment(manifest: Path, job: Expanded) -> str:
 
 
 def init(
-    path: RecordingArgument,
+    recordings: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="BAG...",
+            help="A .bag, .db3 or .mcap file, a rosbag2 directory, or a URL; with --expect also several.",
+        ),
+    ],
+    *,
+    expect: Annotated[
+        bool,
+        typer.Option(
+            "--expect", help="Draft the section `expect` instead, which all of the recordings fulfill."
+        ),
+    ] = False,
+    tolerance: Annotated[
+        float,
+        typer.Option(
+            "--tolerance",
+            min=0,
+            max=1000,
+            metavar="PERCENT",
+            help="With --expect: how far to widen the range of the recordings' values.",
+        ),
+    ] = 20,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", "-o", help="Write the manifest to this file.", metavar="JOB.yaml", show_default="stdout"
-        ),
+        typer.Option("--out", "-o", help="Write to this file.", metavar="FILE.yaml", show_default="stdout"),
     ] = None,
     ros_distro: DistroOption = None,
     force: ForceOption = False,
 ) -> None:
-    """Draft a manifest for a recording: every topic with its type, count and adapter, and common options."""
+    """Draft a manifest for a recording: every topic with its type, count and adapter, and common options.
+
+    With --expect, draft a data contract from good recordings.
+    """
+    if out is not None and out != STANDARD_OUTPUT and out.exists() and not force:
+        raise typer.BadParameter(f"{out} exists; replace it with --force", param_hint="--out")
+    if expect:
+        _draft_contract(recordings, tolerance=tolerance, out=out, ros_distro=ros_distro)
+        return
+    if len(recordings) > 1:
+        raise typer.BadParameter("several recordings need --expect", param_hint="BAG")
+    _draft_manifest(recordings[0], out=out, ros_distro=ros_distro)
+
+
+def _draft_contract(
+    recordings: Sequence[str], *, tolerance: float, out: Path | None, ros_distro: str | None
+) -> None:
+    from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas
+    from mosaico_ingest.remote import as_path
+    from mosaico_ingest.services.draft_contract import draft_contract, measure_recording
+
+    collect_garbage_as_usual()
+    hide_pandas()
+    measured = [measure_recording(as_path(path), ros_distro=ros_distro) for path in recordings]
+    write_output(out or STANDARD_OUTPUT, draft_contract(measured, tolerance=tolerance))
+    if out is not None and out != STANDARD_OUTPUT:
+        topics = len({topic for one in measured for topic in one.topics})
+        print_line(
+            f"{out}: expectations of {counted(topics, 'topic')}, from {counted(len(measured), 'recording')}"
+        )
+
+
+def _draft_manifest(path: str, *, out: Path | None, ros_distro: str | None) -> None:
     from shlex import quote
 
     from mosaico_ingest import api
@@ -285,8 +337,6 @@ def init(
     from mosaico_ingest.remote import as_path
     from mosaico_ingest.services.draft import draft_manifest
 
-    if out is not None and out != STANDARD_OUTPUT and out.exists() and not force:
-        raise typer.BadParameter(f"{out} exists; replace it with --force", param_hint="--out")
     inspection = api.inspect_recording(path, ros_distro=ros_distro)
     if not inspection.topics:
         raise NothingMatched("the recording has no topics", where=path)

@@ -1,0 +1,285 @@
+"""A draft of the section `expect`, derived from good recordings: their values with a tolerance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
+from glob import escape
+
+from msgspec import Struct
+
+from mosaico_ingest.adapters.bridge import ROSBridge
+from mosaico_ingest.contracts.monitor import TopicMonitor
+from mosaico_ingest.contracts.texts import duration, number
+from mosaico_ingest.decode.decoder import decoder_for
+from mosaico_ingest.job.config import ROSInjectionConfig
+from mosaico_ingest.job.expand import plain
+from mosaico_ingest.job.values import Stores
+from mosaico_ingest.pipeline.contract import monitor_of
+from mosaico_ingest.pipeline.planning import plan_recording
+from mosaico_ingest.pipeline.run import open_job
+from mosaico_ingest.pipeline.task import Task
+from mosaico_ingest.remote import AnyPath
+from mosaico_ingest.report.contract import ContractResult, Outcome
+from mosaico_ingest.report.units import count_text, counted
+
+DEFAULT_TOLERANCE = 20.0
+"""Percentage by which the range of the recordings' values is widened."""
+
+_FEW_MESSAGES = 10
+"""Topics with fewer messages have no meaningful rate."""
+_REGULAR_GAP = 10
+"""The longest gap of a regular topic, in mean periods; the rate of other topics is not limited."""
+_MAX_FRAMES = 4
+_NO_FRAME = "\x00"
+"""A frame id that no message has, so that the probe collects all of them."""
+_DIGITS = 3
+_COMMENT_COLUMN = 60
+_UNITS = ((60_000_000_000, "min"), (1_000_000_000, "s"), (1_000_000, "ms"), (1_000, "us"), (1, "ns"))
+_LONG_NS = 600_000_000_000
+"""Durations below ten minutes are written in seconds or smaller units."""
+_PROBE = {
+    "on_failure": "warn",
+    "recording": {"unreadable": "0", "chunk_crcs": {"present": True, "valid": True}, "metadata_counts": {}},
+    "topics": {
+        "*": {
+            "gap": {"max": "100000 d"},
+            "latency": {"max": "100000 d", "min": "-100000 d"},
+            "stamps": ["monotonic", "unique"],
+            "frame_id": [_NO_FRAME],
+            "out_of_order": "0",
+            "sequence_numbers": {"missing": "0"},
+        }
+    },
+}
+"""A contract whose evaluation measures everything that a draft limits."""
+
+
+class MeasuredTopic(Struct, frozen=True):
+    """The values of one topic in one recording; None for a value that it does not have."""
+
+    msgtype: str
+    count: int
+    rate_hz: float | None
+    gap_ns: int | None
+    latency_ns: tuple[int, int] | None
+    """The smallest and the largest latency."""
+    frames: frozenset[str]
+    stamps: frozenset[str]
+    """The properties that the header stamps have: `monotonic`, `unique`."""
+    fulfilled: frozenset[str]
+    """The keys of further expectations that the topic fulfills."""
+
+    @property
+    def is_regular(self) -> bool:
+        """Whether messages come at a regular rate."""
+        if self.rate_hz is None or self.gap_ns is None or self.count < _FEW_MESSAGES:
+            return False
+        return self.gap_ns * self.rate_hz <= _REGULAR_GAP * 1e9
+
+
+class MeasuredRecording(Struct, frozen=True):
+    """The values of one recording."""
+
+    topics: Mapping[str, MeasuredTopic]
+    """The topics with messages, by name."""
+    duration_ns: int
+    fulfilled: frozenset[str]
+    """The keys of the expectations of the recording that it fulfills."""
+
+
+def measure_recording(path: AnyPath, *, ros_distro: Stores | str | None = None) -> MeasuredRecording:
+    """Read a recording and return the values that expectations limit.
+
+    Raises:
+        IngestError: The recording cannot be read.
+    """
+    job = ROSInjectionConfig(
+        file_path=path, sequence_name="draft", ros_distro=ros_distro, manifest={"expect": _PROBE}
+    ).job
+    with open_job(job) as (recording, resolver):
+        plan = plan_recording(Task(job), recording, bridge=ROSBridge.for_job(job), resolver=resolver)
+        monitor = monitor_of(plan, recording)
+        if monitor is None:
+            raise AssertionError("the probe has expectations")
+        connections = [
+            recording.connections[connection] for topic in plan.topics for connection in topic.connections
+        ]
+        order = monitor.order
+        blocks = recording.message_blocks(
+            [connection.id for connection in connections], observe=None if order is None else order.add
+        )
+        observers = {one.id: monitor.observer(one.id) for one in connections}
+        decoders = {one.id: decoder_for(one) for one in connections if _has_header(one.definition)}
+        for block in blocks:
+            observer, decoder = observers[block.connection], decoders.get(block.connection)
+            if observer is not None:
+                observer.block(block.log_times)
+            if observer is not None and decoder is not None:
+                decoded = decoder.decode(block)
+                observer.messages(decoded.rows, decoded.index)
+        result = monitor.finish()
+        types = {connection.topic: connection.msgtype for connection in connections}
+        start_ns, end_ns = recording.start_ns or 0, recording.end_ns or 0
+        return MeasuredRecording(
+            {
+                name: _measured_topic(topic, types[name], result)
+                for name, topic in monitor.observed.items()
+                if topic.read
+            },
+            end_ns - start_ns,
+            frozenset(one.key for one in result.results if one.topic is None and _holds(one.outcome)),
+        )
+
+
+def draft_contract(recordings: Sequence[MeasuredRecording], *, tolerance: float = DEFAULT_TOLERANCE) -> str:
+    """Return the text of a file with the section `expect`, which all of these recordings fulfill.
+
+    The range of the recordings' values is widened by `tolerance` percent on both sides, and rounded outward.
+    """
+    share = tolerance / 100
+    names = dict.fromkeys(name for one in recordings for name in one.topics)
+    required = [name for name in names if all(name in one.topics for one in recordings)]
+    lines = [
+        f"# Drafted by `ingest init --expect` from {counted(len(recordings), 'recording')}: each limit is the range of their values,",
+        f"# widened by {number(tolerance)}%. Review the limits, then write `extends: expect.yaml` in the manifests of the fleet.",
+        "expect:",
+        _line("  # on_failure: divert", "after a failure: fail (the default), warn, or divert"),
+        *_recording_lines(recordings, share),
+    ]
+    if required:
+        lines += ["  required:", *(f"    - {_quoted(name)}" for name in sorted(required))]
+    if names:
+        lines.append("  topics:")
+    for name in sorted(names):
+        lines += _topic_lines(name, [one.topics[name] for one in recordings if name in one.topics], share)
+    return "\n".join(lines) + "\n"
+
+
+def _has_header(definition: object) -> bool:
+    fields = getattr(getattr(definition, "message", None), "fields", ())
+    return any(field.name == "header" for field in fields)
+
+
+def _holds(outcome: Outcome) -> bool:
+    return outcome is Outcome.PASSED
+
+
+def _measured_topic(topic: TopicMonitor, msgtype: str, result: ContractResult) -> MeasuredTopic:
+    times = topic.times
+    rows = [monitor for monitor in topic.rows.values() if monitor.has_header]
+    latencies = [monitor.latency for monitor in rows if monitor.latency is not None and monitor.latency.count]
+    lows = [int(one.lowest.value or 0) for one in latencies if one.lowest is not None]
+    highs = [int(one.highest.value or 0) for one in latencies if one.highest is not None]
+    is_stamped = bool(lows) and bool(highs) and not any(one.unset for one in latencies)
+    steps = [(name, one) for monitor in rows for name, one in monitor.steps.items() if one.count]
+    broken = {name for name, one in steps if one.violations.count}
+    has_rate = times.count > 1 and times.span_ns > 0
+    return MeasuredTopic(
+        msgtype=msgtype,
+        count=topic.read,
+        rate_hz=(times.count - 1) / (times.span_ns / 1e9) if has_rate else None,
+        gap_ns=None if times.late or times.longest is None else times.longest.length_ns,
+        latency_ns=(min(lows), max(highs)) if is_stamped else None,
+        frames=frozenset(text for monitor in rows if monitor.frames for text in monitor.frames.seen),
+        stamps=frozenset(name for name, _ in steps) - broken if is_stamped else frozenset(),
+        fulfilled=frozenset(
+            one.key for one in result.results if one.topic == topic.name and _holds(one.outcome)
+        ),
+    )
+
+
+def _recording_lines(recordings: Sequence[MeasuredRecording], share: float) -> Iterator[str]:
+    fulfilled = frozenset[str].intersection(*(one.fulfilled for one in recordings))
+    lengths = [one.duration_ns for one in recordings]
+    yield "  recording:"
+    if min(lengths) > 0:
+        low, high = _range(lengths, share)
+        limits = f"{{min: {_written(low, up=False)}, max: {_written(high, up=True)}}}"
+        yield _line(f"    duration: {limits}", _span_text(lengths, duration))
+    if "unreadable" in fulfilled:
+        yield "    unreadable: 0"
+    if "chunk_crcs" in fulfilled:
+        yield "    chunk_crcs: {present: true, valid: true}"
+    if "metadata_counts" in fulfilled:
+        yield "    metadata_counts: {equal: true}"
+    if min(lengths) <= 0 and not fulfilled & {"unreadable", "chunk_crcs", "metadata_counts"}:
+        yield "    messages: {min: 1}"
+
+
+def _topic_lines(name: str, topics: Sequence[MeasuredTopic], share: float) -> Iterator[str]:
+    counts = [topic.count for topic in topics]
+    yield _line(f"    {_quoted(name)}:", f"{_span_text(counts, count_text)} messages")
+    types = sorted({topic.msgtype for topic in topics})
+    yield f"      type: {types[0] if len(types) == 1 else _flow(types)}"
+    rates = [topic.rate_hz for topic in topics if topic.rate_hz is not None]
+    gaps = [topic.gap_ns for topic in topics if topic.gap_ns is not None]
+    if all(topic.is_regular for topic in topics):
+        low, high = _range(rates, share)
+        limits = f"{{min: {_rounded(low, up=False)} Hz, max: {_rounded(high, up=True)} Hz}}"
+        yield _line(f"      rate: {limits}", f"{_span_text(rates, number)} Hz")
+        longest = _written(_range(gaps, share)[1], up=True)
+        yield _line(f"      gap: {{max: {longest}}}", _span_text(gaps, duration))
+    else:
+        yield f"      messages: {{min: {max(1, int(min(counts) * (1 - share)))}}}"
+    yield from _header_lines(topics, share)
+    fulfilled = frozenset[str].intersection(*(topic.fulfilled for topic in topics))
+    if "out_of_order" in fulfilled:
+        yield "      out_of_order: 0"
+    if "sequence_numbers" in fulfilled:
+        yield "      sequence_numbers: {missing: 0}"
+
+
+def _header_lines(topics: Sequence[MeasuredTopic], share: float) -> Iterator[str]:
+    latencies = [topic.latency_ns for topic in topics if topic.latency_ns is not None]
+    if len(latencies) == len(topics):
+        lows, highs = [low for low, _ in latencies], [high for _, high in latencies]
+        low, high = _range([*lows, *highs], share)
+        limits = f"{{min: {_written(low, up=False)}, max: {_written(high, up=True)}}}"
+        yield _line(f"      latency: {limits}", _span_text([*lows, *highs], duration))
+    stamps = frozenset[str].intersection(*(topic.stamps for topic in topics))
+    if stamps:
+        names = sorted(stamps)
+        yield f"      stamps: {names[0] if len(names) == 1 else _flow(names)}"
+    frames = {frame for topic in topics for frame in topic.frames}
+    if frames and all(frames) and len(frames) <= _MAX_FRAMES and all(topic.frames for topic in topics):
+        yield f"      frame_id: {_flow(sorted(frames))}"
+
+
+def _range(values: Sequence[float], share: float) -> tuple[float, float]:
+    """Return the smallest and the largest value, moved apart by a share of their size."""
+    low, high = min(values), max(values)
+    return low - abs(low) * share, high + abs(high) * share
+
+
+def _rounded(value: float | Decimal, *, up: bool) -> str:
+    """Return a number with few significant digits that is not smaller (`up`) or not larger than the value."""
+    exact = Decimal(value)
+    step = Decimal(1).scaleb(exact.adjusted() - _DIGITS + 1) if exact else Decimal(1)
+    rounded = exact.quantize(step, ROUND_CEILING if up else ROUND_FLOOR)
+    return f"{rounded.normalize():f}"
+
+
+def _written(ns: float, *, up: bool) -> str:
+    """Return a duration in the notation of manifests, rounded as in `_rounded`, in whole nanoseconds."""
+    units = _UNITS if abs(ns) >= _LONG_NS else _UNITS[1:]
+    unit, name = next(((unit, name) for unit, name in units if abs(ns) >= unit), (1, "ns"))
+    return f"{_rounded(Decimal(ns) / unit, up=up)} {name}"
+
+
+def _span_text(values: Sequence[float], text: Callable[[float], str]) -> str:
+    """Return the range of the values that the recordings have."""
+    low, high = text(min(values)), text(max(values))
+    return low if low == high else f"{low} .. {high}"
+
+
+def _line(text: str, comment: str) -> str:
+    return f"{text:{_COMMENT_COLUMN}}  # {comment}"
+
+
+def _flow(texts: Iterable[str]) -> str:
+    return f"[{', '.join(map(plain, texts))}]"
+
+
+def _quoted(topic: str) -> str:
+    return plain(escape(topic))
