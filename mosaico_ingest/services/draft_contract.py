@@ -21,7 +21,7 @@ from mosaico_ingest.pipeline.run import open_job
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.report.contract import ContractResult, Outcome
-from mosaico_ingest.report.units import count_text, counted
+from mosaico_ingest.report.units import counted
 
 DEFAULT_TOLERANCE = 20.0
 """Percentage by which the range of the recordings' values is widened."""
@@ -209,7 +209,7 @@ def _recording_lines(recordings: Sequence[MeasuredRecording], share: float) -> I
 
 def _topic_lines(name: str, topics: Sequence[MeasuredTopic], share: float) -> Iterator[str]:
     counts = [topic.count for topic in topics]
-    yield _line(f"    {_quoted(name)}:", f"{_span_text(counts, count_text)} messages")
+    yield _line(f"    {_quoted(name)}:", f"{_span_text(counts, number)} messages")
     types = sorted({topic.msgtype for topic in topics})
     yield f"      type: {types[0] if len(types) == 1 else _flow(types)}"
     rates = [topic.rate_hz for topic in topics if topic.rate_hz is not None]
