@@ -1,6 +1,20 @@
 """Declarative ingestion of ROS recordings into typed, queryable Mosaico sequences.
 
-The public names are imported on first access, so that `import mosaico_ingest` loads neither Arrow nor pydantic.
+Start with these names:
+
+    run("job.yaml")                  ingest the recordings of a manifest; returns the report
+    plan("job.yaml")                 decide everything and try a few messages; writes nothing
+    inspect("drive.mcap")            list the topics of a recording
+    Store.open("mosaico")            open a store; then .sequence("drive").topic("/imu").to_pandas()
+    ROSInjectionConfig               a job in Python instead of a manifest
+    RosbagInjector                   plan or run one ROSInjectionConfig
+    ROSLoader                        iterate over the messages of a recording
+    ROSBridge                        the adapters of message types
+    ROSAdapterBase                   the base class of your own adapters
+    register_default_adapter         register your own adapter
+
+Reports, plans, stores, sequences and topics are shown as tables in notebooks. The public names are imported on first
+access, so that `import mosaico_ingest` loads neither Arrow nor pydantic.
 """
 
 from __future__ import annotations
@@ -13,7 +27,10 @@ from mosaico_ingest.version import __version__
 if TYPE_CHECKING:
     from mosaico_ingest.adapters import ROSAdapterBase, register_default_adapter
     from mosaico_ingest.adapters.bridge import ROSBridge
-    from mosaico_ingest.api import RosbagInjector
+    from mosaico_ingest.api import RosbagInjector, run
+    from mosaico_ingest.api import inspect_recording as inspect
+    from mosaico_ingest.api import plan_job as plan
+    from mosaico_ingest.destinations.store import Store
     from mosaico_ingest.job.config import ROSInjectionConfig
     from mosaico_ingest.job.values import (
         IfExists,
@@ -42,10 +59,14 @@ __all__ = [
     "RosbagInjector",
     "Serializable",
     "SessionLevelErrorPolicy",
+    "Store",
     "Stores",
     "TopicLevelErrorPolicy",
     "__version__",
+    "inspect",
+    "plan",
     "register_default_adapter",
+    "run",
 ]
 
 _MODULES = {
@@ -61,19 +82,28 @@ _MODULES = {
     "RosbagInjector": "api",
     "Serializable": "ontology",
     "SessionLevelErrorPolicy": "job.values",
+    "Store": "destinations.store",
     "Stores": "job.values",
     "TopicLevelErrorPolicy": "job.values",
+    "inspect": "api",
+    "plan": "api",
     "register_default_adapter": "adapters",
+    "run": "api",
 }
 """The module of each public name; it is imported on first access, so that `ingest --help` does not load Arrow."""
 
 
-def __getattr__(name: str) -> object:
-    if name == "APIKeyPermissionEnum":
-        return import_module(f"{__name__}.protocol.messages").Permission
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+_FULL_NAMES = {"inspect": "inspect_recording", "plan": "plan_job"}
+"""The name in its module, where the public name differs."""
+
+if not TYPE_CHECKING:  # type checkers report unknown names
+
+    def __getattr__(name: str) -> object:
+        if name == "APIKeyPermissionEnum":
+            return import_module(f"{__name__}.protocol.messages").Permission
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(import_module(f"{__name__}.{_MODULES[name]}"), _FULL_NAMES.get(name, name))
 
 
 def __dir__() -> list[str]:

@@ -195,7 +195,11 @@ def check_sequence(store: str, sequence: str, expect: Path) -> Checked:
 
 
 def plan_job(
-    manifest: Path, *, jobs: Sequence[Job] | None = None, folder: Path | None = None, connect: bool = False
+    manifest: Path | str,
+    *,
+    jobs: Sequence[Job] | None = None,
+    folder: Path | None = None,
+    connect: bool = False,
 ) -> PlanDocument:
     """Return the plan of a manifest with the result of a sample of each topic; write nothing.
 
@@ -207,9 +211,8 @@ def plan_job(
     """
     from mosaico_ingest.pipeline.preview import plan_document
 
-    return plan_document(
-        jobs or compile_job(manifest), manifest=manifest, folder=folder or Path(), connect=connect
-    )
+    path = Path(manifest)
+    return plan_document(jobs or compile_job(path), manifest=path, folder=folder or Path(), connect=connect)
 
 
 def plan_differences(path: Path, document: PlanDocument) -> tuple[Difference, ...]:
@@ -262,17 +265,24 @@ def compile_plan(path: Path) -> tuple[Task, ...]:
 
 
 def run(
-    jobs: Sequence[Job | Task | ROSInjectionConfig],
+    jobs: Path | str | Sequence[Job | Task | ROSInjectionConfig],
     *,
     executor: Executor | None = None,
     observe: BatchObserver = ignore_batch,
     manifests: Sequence[UsedManifest] = (),
 ) -> RunReport:
-    """Run every job and return the report; a failed recording is part of the report.
+    """Run a manifest, or every job of a list, and return the report; a failed recording is part of the report.
 
     The default executor runs as many recordings at a time as `run.jobs` of the first job. `manifests` are added to
-    the report for its readers.
+    the report for its readers; a manifest that is run is added by itself.
+
+    Raises:
+        ManifestError: The manifest has mistakes.
+        NothingMatched: The manifest matches no recording.
     """
+    if isinstance(jobs, str | Path):
+        manifests = (*manifests, used_manifest(Path(jobs)))
+        jobs = compile_job(Path(jobs))
     tasks = [_task(job) for job in jobs]
     chosen = executor or choose_executor(tasks)
     return RunReport(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from os.path import relpath
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,13 +26,15 @@ from mosaico_ingest.job.model import (
     SequenceSettings,
 )
 from mosaico_ingest.job.values import StampSource, Target, TopicLevelErrorPolicy
+from mosaico_ingest.notebook import html_table
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.pipeline.memory import MemoryBudget
 from mosaico_ingest.pipeline.task import Attempt
 from mosaico_ingest.remote import RemotePath
+from mosaico_ingest.report.units import count_text, counted
 from mosaico_ingest.rosbag.definitions.model import Resolver
 
-__all__ = ["ExcludedTopic", "Plan", "TopicPlan", "digest_of"]
+__all__ = ["ExcludedTopic", "Plan", "TopicPlan", "digest_of", "plan_headline"]
 
 
 class AdapterDocument(TypedDict):
@@ -215,9 +217,38 @@ class Plan(Part):
         bounded = self.read_from_ns is not None or self.read_until_ns is not None
         return bounded and not all(topic.has_log_times for topic in self.topics)
 
+    def __repr__(self) -> str:
+        """Return the counts of the plan, such as `<Plan yard: 9 topics, 2,110 messages, 31 excluded>`."""
+        return f"<Plan {plan_headline(self.sequence.name, [topic.count for topic in self.topics], len(self.excluded))}>"
+
+    def _repr_html_(self) -> str:
+        """Return a table of the topics for a notebook."""
+        rows = (
+            (
+                topic.topic,
+                topic.msgtype,
+                "?" if topic.count is None else count_text(topic.count),
+                topic.ontology.tag,
+                topic.why,
+            )
+            for topic in self.topics
+        )
+        names = ("topic", "type", "messages", "becomes", "because")
+        notes = [str(finding) for finding in self.findings]
+        return html_table(
+            repr(self)[1:-1], names, rows, count=len(self.topics), numbers={"messages"}, notes=notes
+        )
+
     def document(self, *, folder: Path) -> dict[str, Any]:
         """Return the decisions as JSON; paths are relative to `folder`."""
         return self.model_dump(mode="json", context={"folder": folder})
+
+
+def plan_headline(sequence: str, counts: Sequence[int | None], excluded: int) -> str:
+    """Return the number of selected topics, of their messages, and of excluded topics."""
+    messages = "? messages" if None in counts else counted(sum(count or 0 for count in counts), "message")
+    more = f", {count_text(excluded)} excluded" if excluded else ""
+    return f"{sequence}: {counted(len(counts), 'topic')}, {messages}{more}"
 
 
 def digest_of(document: Mapping[str, Any]) -> str:

@@ -15,8 +15,10 @@ from pydantic_core import CoreSchema
 from mosaico_ingest.documents import Part, document_schema, read_document
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import Finding, Severity, Stage
-from mosaico_ingest.pipeline.plan import Plan
+from mosaico_ingest.notebook import html_table
+from mosaico_ingest.pipeline.plan import Plan, plan_headline
 from mosaico_ingest.report.contract import ContractResult
+from mosaico_ingest.report.units import count_text
 from mosaico_ingest.textfile import read_limited
 
 __all__ = [
@@ -134,6 +136,40 @@ class PlanDocument(Part):
     job: str = Field(examples=["job.yaml"])
     """The manifest, relative to this file's folder."""
     recordings: tuple[RecordingPlan, ...]
+
+    def __repr__(self) -> str:
+        """Return the counts of each plan, one line per recording."""
+        return "\n".join(f"<Plan {self._headline(recording)}>" for recording in self.recordings) or "<Plan>"
+
+    def _repr_html_(self) -> str:
+        """Return a table of the topics of each recording for a notebook."""
+        names = ("topic", "type", "messages", "becomes", "because")
+        return "".join(
+            html_table(
+                f"Plan {self._headline(recording)}",
+                names,
+                (
+                    (
+                        topic["topic"],
+                        topic["msgtype"],
+                        "?" if topic["count"] is None else count_text(topic["count"]),
+                        topic["ontology"]["tag"],
+                        topic["why"],
+                    )
+                    for topic in recording.plan["topics"]
+                ),
+                count=len(recording.plan["topics"]),
+                numbers={"messages"},
+                notes=[f"{note.severity.value}[{note.rule}] {note.message}" for note in recording.notes],
+            )
+            for recording in self.recordings
+        )
+
+    @staticmethod
+    def _headline(recording: RecordingPlan) -> str:
+        plan = recording.plan
+        counts = [topic["count"] for topic in plan["topics"]]
+        return plan_headline(plan["sequence"]["name"], counts, len(plan["excluded"]))
 
     @property
     def exit_code(self) -> int:

@@ -16,11 +16,12 @@ from pydantic import BaseModel, ConfigDict, Field, computed_field
 
 from mosaico_ingest.documents import Part, document_schema, read_document
 from mosaico_ingest.errors import ManifestError
-from mosaico_ingest.findings import Stage
+from mosaico_ingest.findings import Stage, one_line
+from mosaico_ingest.notebook import html_table
 from mosaico_ingest.report.contract import ContractResult
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.timing import TimelineReport
-from mosaico_ingest.report.units import count_text, counted
+from mosaico_ingest.report.units import bytes_text, count_text, counted, written_text
 
 _GRAVEST_FIRST = (130, 5, 1, 2, 6, 3, 4)
 
@@ -216,6 +217,15 @@ class Report(_Part):
             stored_bytes=sum(t.stored_bytes for t in topics),
         )
 
+    def __repr__(self) -> str:
+        """Return the outcome, such as `<Report yard: completed, 2,110 of 2,110 messages written>`."""
+        outcome = self.error or written_text(self)
+        return one_line(f"<Report {self.sequence}: {self.status.value}, {outcome}>")
+
+    def _repr_html_(self) -> str:
+        """Return a table of the topics for a notebook."""
+        return _topic_table(self)
+
     @computed_field
     @property
     def compression(self) -> float | None:
@@ -250,11 +260,54 @@ class RunReport(_Part):
         parts += [f"{count_text(skipped)} skipped"] if skipped else []
         return f"{', '.join(parts)}, {counted(written, 'message')} written"
 
+    def __repr__(self) -> str:
+        """Return the outcome, such as `<RunReport: 2 recordings, 0 failed, 4,220 messages written>`."""
+        return f"<RunReport: {self.headline}>"
+
+    def _repr_html_(self) -> str:
+        """Return a table of the recordings for a notebook, or of the topics of a single recording."""
+        if len(self.recordings) == 1:
+            return _topic_table(self.recordings[0])
+        rows = (
+            (
+                each.sequence,
+                each.status.value,
+                *(
+                    count_text(count)
+                    for count in (each.totals.read, each.totals.written, each.totals.rejected)
+                ),
+                each.error or "",
+            )
+            for each in self.recordings
+        )
+        names = ("sequence", "status", "read", "written", "rejected", "error")
+        return html_table(
+            self.headline, names, rows, count=len(self.recordings), numbers={"read", "written", "rejected"}
+        )
+
     @computed_field
     @property
     def exit_code(self) -> int:
         """The first of 130, 5, 1, 2, 6, 3, 4, 0 that any recording produced."""
         return gravest([report.exit_code for report in self.recordings])
+
+
+def _topic_table(report: Report) -> str:
+    """Return the topics that were read as a table for a notebook."""
+    topics = [topic for topic in report.topics if topic.status is not TopicStatus.EXCLUDED]
+    excluded = len(report.topics) - len(topics)
+    rows = (
+        (
+            topic.target,
+            topic.ontology,
+            *(count_text(count) for count in (topic.read, topic.written, topic.rejected)),
+            bytes_text(topic.stored_bytes),
+        )
+        for topic in topics
+    )
+    names = ("topic", "ontology", "read", "written", "rejected", "stored")
+    notes = [*([f"excluded: {counted(excluded, 'topic')}"] if excluded else []), *report.findings]
+    return html_table(repr(report)[1:-1], names, rows, count=len(topics), numbers=names[2:], notes=notes)
 
 
 def gravest(codes: Sequence[int]) -> int:

@@ -5,11 +5,14 @@ from __future__ import annotations
 from mosaico_ingest.adapters.bridge import ROSBridge
 from mosaico_ingest.documents import Part
 from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.findings import one_line
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.patterns import select
+from mosaico_ingest.notebook import html_table
 from mosaico_ingest.pipeline.plan import ExcludedTopic
 from mosaico_ingest.pipeline.planning import plan_connection
 from mosaico_ingest.pipeline.run import open_job
+from mosaico_ingest.report.units import bytes_text, count_text, counted, rate_text
 from mosaico_ingest.rosbag.blocks import Connection
 
 
@@ -44,6 +47,28 @@ class Inspection(Part):
     end_ns: int | None
     topics: tuple[InspectedTopic, ...]
     findings: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        """Return the counts, such as `<Inspection drive.mcap: 9 topics, 2,110 messages, 497.3 kB>`."""
+        messages = "? messages" if self.messages is None else counted(self.messages, "message")
+        facts = f"{counted(len(self.topics), 'topic')}, {messages}, {bytes_text(self.size_bytes)}"
+        return one_line(f"<Inspection {', '.join(self.files)}: {facts}>")
+
+    def _repr_html_(self) -> str:
+        """Return a table of the topics for a notebook."""
+        rows = (
+            (
+                topic.topic,
+                topic.msgtype,
+                "?" if topic.count is None else count_text(topic.count),
+                rate_text(topic.rate_hz),
+                topic.ontology or topic.problem or "-",
+            )
+            for topic in self.topics
+        )
+        names = ("topic", "type", "messages", "rate", "becomes")
+        caption, numbers = repr(self)[1:-1], {"messages", "rate"}
+        return html_table(caption, names, rows, count=len(self.topics), numbers=numbers, notes=self.findings)
 
     @property
     def duration_s(self) -> float | None:

@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 from msgspec import Struct
 
 from mosaico_ingest.destinations.store.checksum import combined
+from mosaico_ingest.destinations.store.errors import NotInStore
 from mosaico_ingest.destinations.store.segment import Segment
+from mosaico_ingest.errors import missing_library
+from mosaico_ingest.findings import suggest_names
 from mosaico_ingest.job.values import IfExists
+from mosaico_ingest.notebook import html_table
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote import AnyPath
+from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text, time_text
+
+if TYPE_CHECKING:
+    import duckdb
+    import pandas as pd
+    import polars as pl
+
+    from mosaico_ingest.destinations.store.tables import Moment
 
 
 class SegmentInfo(Struct, frozen=True):
@@ -69,6 +81,109 @@ class TopicInfo(Struct, frozen=True):
         """Checksum of the row values, or None if a segment has none."""
         return combined(segment.checksum for segment in self.segments)
 
+    def __repr__(self) -> str:
+        """Return name, ontology, rows and size, such as `<Topic yard/imu: IMU, 1,000 rows, 43.6 kB>`."""
+        facts = f"{self.ontology.tag}, {counted(self.rows, 'row')}, {bytes_text(self.stored_bytes)}"
+        return f"<Topic {self.sequence}{self.name}: {facts}>"
+
+    def _repr_html_(self) -> str:
+        """Return a table of the columns for a notebook."""
+        rows = ((field.name, str(field.type), "" if field.nullable else "not null") for field in self.schema)
+        notes = [f"{time_text(self.start_ns)} .. {time_text(self.end_ns)} UTC"] if self.rows else []
+        return html_table(repr(self)[1:-1], ("column", "type", ""), rows, count=len(self.schema), notes=notes)
+
+    def to_arrow(
+        self,
+        start: Moment | None = None,
+        end: Moment | None = None,
+        columns: Sequence[str] | None = None,
+        *,
+        flatten: bool = False,
+    ) -> pa.Table:
+        """Return the rows from `start` (inclusive) to `end` (exclusive) as an Arrow table, ordered by time.
+
+        Args:
+            start: The start: ns since the epoch, a `datetime` (UTC by default), or a text such as `2026-03-01T12:00:00Z`,
+                `+10s` (after the first row) or `-5s` (before the last row).
+            end: The end, in the same notations.
+            columns: Columns (`pose`) and members of structs (`pose.position.x`); `timestamp_ns` is always the first column.
+            flatten: Replace each struct with one column per member, such as `pose.position.x`.
+
+        Raises:
+            SinkError: A column does not exist, or a text is not a time.
+        """
+        from mosaico_ingest.destinations.store.tables import read_table  # noqa: PLC0415 - it reads topics
+
+        return read_table(self, start=start, end=end, columns=columns, flatten=flatten)
+
+    def to_reader(
+        self,
+        start: Moment | None = None,
+        end: Moment | None = None,
+        columns: Sequence[str] | None = None,
+    ) -> pa.RecordBatchReader:
+        """Return a reader of the rows, for topics larger than memory; `columns` are names of top-level columns."""
+        from mosaico_ingest.destinations.store.tables import topic_reader  # noqa: PLC0415 - it reads topics
+
+        return topic_reader(self, start=start, end=end, columns=columns)
+
+    def to_pandas(
+        self,
+        start: Moment | None = None,
+        end: Moment | None = None,
+        columns: Sequence[str] | None = None,
+        *,
+        flatten: bool = False,
+    ) -> pd.DataFrame:
+        """Return the rows as a pandas frame; the arguments are those of `to_arrow`.
+
+        Raises:
+            IngestError: pandas is not installed.
+        """
+        table = self.to_arrow(start, end, columns, flatten=flatten)
+        try:
+            return table.to_pandas()
+        except ImportError as error:
+            raise missing_library("pandas", "frames") from error
+
+    def to_polars(
+        self,
+        start: Moment | None = None,
+        end: Moment | None = None,
+        columns: Sequence[str] | None = None,
+        *,
+        flatten: bool = False,
+    ) -> pl.DataFrame:
+        """Return the rows as a Polars frame; the arguments are those of `to_arrow`.
+
+        Raises:
+            IngestError: Polars is not installed.
+        """
+        try:
+            import polars as pl  # noqa: PLC0415 - an optional library
+        except ImportError as error:
+            raise missing_library("Polars", "frames") from error
+        return pl.DataFrame(self.to_arrow(start, end, columns, flatten=flatten))
+
+    def to_duckdb(
+        self,
+        start: Moment | None = None,
+        end: Moment | None = None,
+        columns: Sequence[str] | None = None,
+        *,
+        flatten: bool = False,
+    ) -> duckdb.DuckDBPyRelation:
+        """Return the rows as a DuckDB relation; the arguments are those of `to_arrow`.
+
+        Raises:
+            IngestError: DuckDB is not installed.
+        """
+        try:
+            import duckdb  # noqa: PLC0415 - an optional library
+        except ImportError as error:
+            raise missing_library("DuckDB", "sql") from error
+        return duckdb.from_arrow(self.to_arrow(start, end, columns, flatten=flatten))
+
 
 class SessionInfo(Struct, frozen=True):
     """A committed writing session."""
@@ -124,6 +239,39 @@ class SequenceInfo(Struct, frozen=True):
     def end_ns(self) -> int | None:
         """The largest time stamp, inclusive, or None without rows."""
         return max(_not_none(topic.end_ns for topic in self.topics), default=None)
+
+    def topic(self, name: str) -> TopicInfo:
+        """Return a topic; the leading slash of its name is optional.
+
+        Raises:
+            NotInStore: It does not exist; the hint names existing ones.
+        """
+        topics = {topic.name: topic for topic in self.topics}
+        full_name = f"/{name.removeprefix('/')}"
+        if full_name not in topics:
+            raise NotInStore(
+                f"there is no topic {full_name!r}", where=self.name, hint=suggest_names(topics, [full_name])
+            )
+        return topics[full_name]
+
+    def __repr__(self) -> str:
+        """Return name, counts and size, such as `<Sequence yard: 9 topics, 2,110 rows, 493.1 kB>`."""
+        facts = f"{counted(len(self.topics), 'topic')}, {counted(self.rows, 'row')}, {bytes_text(self.stored_bytes)}"
+        return f"<Sequence {self.name}: {facts}>"
+
+    def _repr_html_(self) -> str:
+        """Return a table of the topics for a notebook."""
+        rows = (
+            (topic.name, topic.ontology.tag, count_text(topic.rows), bytes_text(topic.stored_bytes))
+            for topic in self.topics
+        )
+        span = ""
+        if self.start_ns is not None and self.end_ns is not None:
+            span = f", {time_text(self.start_ns)} UTC, {seconds_text((self.end_ns - self.start_ns) / 1e9)}"
+        names = ("topic", "ontology", "rows", "size")
+        caption = f"{repr(self)[1:-1]}{span}"
+        notes = [] if self.incomplete is None else [f"incomplete: {self.incomplete}"]
+        return html_table(caption, names, rows, count=len(self.topics), numbers={"rows", "size"}, notes=notes)
 
 
 class Collected(Struct, frozen=True):

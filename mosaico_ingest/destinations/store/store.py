@@ -21,8 +21,10 @@ from mosaico_ingest.destinations.store.model import Collected, NewNote, SegmentI
 from mosaico_ingest.destinations.store.protocols import Files, StoreCatalog
 from mosaico_ingest.destinations.store.segment import sorted_rows, time_span
 from mosaico_ingest.errors import SinkError
-from mosaico_ingest.findings import suggest_names
+from mosaico_ingest.findings import one_line, suggest_names
+from mosaico_ingest.notebook import MAX_ROWS, html_table
 from mosaico_ingest.remote import AnyPath, RemotePath, as_path
+from mosaico_ingest.report.units import bytes_text, count_text, time_text
 
 
 class Checked(Struct, frozen=True):
@@ -201,6 +203,28 @@ class Store(Struct, frozen=True):
             is_there = LocalFiles(path).catalog.is_file()
         return cls.open(path, create=False) if is_there else None
 
+    def __repr__(self) -> str:
+        """Return the location, such as `<Store mosaico>`."""
+        return one_line(f"<Store {self.path}>")
+
+    def _repr_html_(self) -> str:
+        """Return a table of the first sequences for a notebook."""
+        listing = self.listing(limit=MAX_ROWS)
+        rows = (
+            (
+                each.name,
+                count_text(each.topics),
+                count_text(each.rows),
+                bytes_text(each.stored_bytes),
+                time_text(each.start_ns),
+            )
+            for each in listing.sequences
+        )
+        names = ("sequence", "topics", "rows", "size", "start")
+        return html_table(
+            repr(self)[1:-1], names, rows, count=len(self.names()), numbers={"topics", "rows", "size"}
+        )
+
     @property
     def path(self) -> AnyPath:
         """The folder or URL of the store."""
@@ -263,13 +287,7 @@ class Store(Struct, frozen=True):
         Raises:
             SinkError: It does not exist; the hint names existing ones.
         """
-        topics = {info.name: info for info in self.sequence(sequence).topics}
-        name = f"/{topic.removeprefix('/')}"
-        if name not in topics:
-            raise NotInStore(
-                f"there is no topic {name!r}", where=sequence, hint=suggest_names(topics, [name])
-            )
-        return topics[name]
+        return self.sequence(sequence).topic(topic)
 
     def create_sequence(self, sequence: str, metadata: Mapping[str, Any]) -> None:
         """Create a sequence without sessions; a `StoreSink` creates sequences itself.
