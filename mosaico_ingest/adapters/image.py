@@ -1,4 +1,4 @@
-"""Lossless PNG storage of raw images: the buffer's bytes as an 8-bit greyscale picture."""
+"""Lossless PNG storage of raw images: the buffer's bytes as an 8-bit grayscale picture."""
 
 from __future__ import annotations
 
@@ -21,47 +21,47 @@ from mosaico_ingest.errors import AdapterError, missing_library
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.rosbag.definitions.model import Definition
 
-__all__ = ["IMAGE_TAG", "PngImageSpec", "greyscale_pixels", "greyscale_png", "without_png"]
+__all__ = ["IMAGE_TAG", "PngImageSpec", "grayscale_pixels", "grayscale_png", "without_png"]
 
 IMAGE_TAG = "Image"
 """The tag of the ontology type whose rows can be stored as PNG."""
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_GREYSCALE_8_BIT = bytes((8, 0, 0, 0, 0))
+_GRAYSCALE_8_BIT = bytes((8, 0, 0, 0, 0))
 _FASTEST = 1
 
 
-def greyscale_png(data: bytes | memoryview, *, width: int, height: int) -> bytes:
-    """Encode `height` rows of `width` bytes; `data` contains exactly these bytes, and both are positive."""
+def grayscale_png(data: bytes | memoryview, *, width: int, height: int) -> bytes:
+    """Return `data`, which contains `height` rows of `width` bytes, as a PNG; both are positive."""
     scanlines = np.empty((height, width + 1), np.uint8)
     scanlines[:, 0] = 0  # the filter type "none"
     scanlines[:, 1:] = np.frombuffer(data, np.uint8).reshape(height, width)
-    header = struct.pack(">II", width, height) + _GREYSCALE_8_BIT
+    header = struct.pack(">II", width, height) + _GRAYSCALE_8_BIT
     chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(scanlines.data, _FASTEST)), (b"IEND", b""))
     return _SIGNATURE + b"".join(_chunk(kind, body) for kind, body in chunks)
 
 
-def greyscale_pixels(png: bytes) -> bytes:
-    """Return the bytes of an 8-bit greyscale PNG; one with filtered lines, as the official SDK writes, needs Pillow.
+def grayscale_pixels(png: bytes) -> bytes:
+    """Return the bytes of an 8-bit grayscale PNG. Pillow reads PNGs with filtered lines, as the official SDK writes.
 
     Raises:
-        AdapterError: The picture is not such a PNG.
+        AdapterError: The picture is not an 8-bit grayscale PNG.
         IngestError: Pillow is not installed.
     """
-    at, packed = len(_SIGNATURE), b""
+    offset, compressed = len(_SIGNATURE), b""
     width = height = 0
     try:
-        while at < len(png):
-            (size,) = struct.unpack_from(">I", png, at)
-            kind, body = png[at + 4 : at + 8], png[at + 8 : at + 8 + size]
-            at += size + 12
+        while offset < len(png):
+            (size,) = struct.unpack_from(">I", png, offset)
+            kind, body = png[offset + 4 : offset + 8], png[offset + 8 : offset + 8 + size]
+            offset += size + 12
             if kind == b"IHDR":
                 width, height = struct.unpack(">II", body[:8])
-                if body[8:] != _GREYSCALE_8_BIT:
-                    raise AdapterError("the picture is no 8-bit greyscale PNG")
-            packed += body if kind == b"IDAT" else b""
-        scanlines = np.frombuffer(zlib.decompress(packed), np.uint8).reshape(height, width + 1)
+                if body[8:] != _GRAYSCALE_8_BIT:
+                    raise AdapterError("the picture is not an 8-bit grayscale PNG")
+            compressed += body if kind == b"IDAT" else b""
+        scanlines = np.frombuffer(zlib.decompress(compressed), np.uint8).reshape(height, width + 1)
     except (struct.error, zlib.error, ValueError) as error:
-        raise AdapterError(f"the picture is no PNG: {error}") from error
+        raise AdapterError(f"the picture is not a PNG: {error}") from error
     return _unfiltered(png) if scanlines[:, 0].any() else scanlines[:, 1:].tobytes()
 
 
@@ -75,17 +75,17 @@ def _unfiltered(png: bytes) -> bytes:
 
 
 def without_png(rows: pa.StructArray) -> pa.StructArray:
-    """Return images with the raw buffers of those stored as PNG."""
+    """Return images with their raw buffers; images that are stored as PNG are decoded."""
     columns = {field.name: rows.field(field.name) for field in rows.type}
     formats = columns["format"].to_pylist()
     if "png" not in formats:
         return rows
     data: list[bytes | memoryview] = [
-        greyscale_pixels(raw.as_py()) if formats[row] == "png" else memoryview(raw.as_buffer())
+        grayscale_pixels(raw.as_py()) if formats[row] == "png" else memoryview(raw.as_buffer())
         for row, raw in enumerate(columns["data"])
     ]
     columns["data"] = pa.array(data, rows.type.field("data").type)
-    columns["format"] = pa.array(["raw" if one == "png" else one for one in formats], pa.string())
+    columns["format"] = pa.array(["raw" if name == "png" else name for name in formats], pa.string())
     return pa.StructArray.from_arrays(list(columns.values()), fields=list(rows.type))
 
 
@@ -136,7 +136,7 @@ class _PngImages(Struct, frozen=True):
 
 
 def _as_png(rows: pa.StructArray) -> pa.StructArray:
-    """Encode the images whose buffer has height x stride bytes; the others stay raw."""
+    """Encode each image whose buffer has height x stride bytes as PNG; other images stay raw."""
     columns = {field.name: rows.field(field.name) for field in rows.type}
     heights, strides = columns["height"].to_numpy(), columns["stride"].to_numpy()
     formats = columns["format"].to_pylist()
@@ -144,7 +144,7 @@ def _as_png(rows: pa.StructArray) -> pa.StructArray:
     for row, raw in enumerate(columns["data"]):
         buffer, height, width = raw.as_buffer(), int(heights[row]), int(strides[row])
         if formats[row] == "raw" and height > 0 and width > 0 and buffer.size == height * width:
-            data.append(greyscale_png(memoryview(buffer), width=width, height=height))
+            data.append(grayscale_png(memoryview(buffer), width=width, height=height))
             formats[row] = "png"
         else:
             data.append(memoryview(buffer))

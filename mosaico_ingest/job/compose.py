@@ -102,13 +102,13 @@ def fill_in(source: Source, env: Mapping[str, str] | None, cell: Mapping[str, st
     to the first job of the document's matrix.
     """
     matrix = source.at((MATRIX_KEY,))
-    known = _Variables(
+    known_variables = _Variables(
         combinations(source.value)[0] if cell is None else cell,
         env,
         variables(source.at(("defaults",))),
         frozenset(map(str, matrix)) if isinstance(matrix, dict) else frozenset(),
     )
-    return _filled(source, known)
+    return _filled(source, known_variables)
 
 
 def fill_in_cell(source: Source, cell: Mapping[str, str]) -> Filled:
@@ -269,8 +269,8 @@ class _Join:
         return joined
 
     def spans(self, own: dict[KeyPath, Span], base: dict[KeyPath, Span]) -> dict[KeyPath, Span]:
-        kept = {path: span for path, span in own.items() if not _below(path, self.dropped)}
-        return {**kept, **{path: span for path, span in base.items() if _below(path, self.inherited)}}
+        own_spans = {path: span for path, span in own.items() if not _below(path, self.dropped)}
+        return {**own_spans, **{path: span for path, span in base.items() if _below(path, self.inherited)}}
 
 
 def _below(path: KeyPath, roots: set[KeyPath]) -> bool:

@@ -70,11 +70,11 @@ def explain(
     `schema` is the JSON Schema of the model that refused the document.
     """
     problems = [_problem(details, source, schema) for details in error.errors(include_url=False)]
-    meant = {(*problem.path[:-1], _suggestion(problem)) for problem in problems}
+    suggestions = {(*problem.path[:-1], _suggestion(problem)) for problem in problems}
     return [
         (problem.path, _describe(problem))
         for problem in problems
-        if problem.error["type"] != "missing" or (*problem.path, problem.error["loc"][-1]) not in meant
+        if problem.error["type"] != "missing" or (*problem.path, problem.error["loc"][-1]) not in suggestions
         if problem.error["type"] != "too_short" or not _any_below(problem.path, problems)
     ]
 
@@ -249,8 +249,8 @@ def _list_example(problem: _Problem, node: dict[str, Any]) -> str | None:
 def _example(problem: _Problem) -> str | None:
     """Return a hint with the examples of the field."""
     examples = _node_at(problem.schema, problem.path).get("examples", ())
-    shown = [str(example) for example in examples if isinstance(example, str | int | float)]
-    return f"write a value such as {' or '.join(shown)}" if shown else None
+    texts = [str(example) for example in examples if isinstance(example, str | int | float)]
+    return f"write a value such as {' or '.join(texts)}" if texts else None
 
 
 def _fits(text: str, node: dict[str, Any], schema: dict[str, Any]) -> bool:
@@ -281,7 +281,7 @@ def _not_a_choice(problem: _Problem) -> Finding:
     allowed = problem.error.get("ctx", {}).get("expected", "")
     if problem.value is None:
         return _wrong_type(problem, "text")
-    shown = repr(problem.value) if isinstance(problem.value, str) else _kind(problem.value)
+    value_text = repr(problem.value) if isinstance(problem.value, str) else _kind(problem.value)
     words = re.findall(r"'([^']*)'", allowed)
     close = nearest(problem.value, words) if isinstance(problem.value, str) else None
     remedy = f"did you mean {close!r}? " if close else ""
@@ -291,7 +291,7 @@ def _not_a_choice(problem: _Problem) -> Finding:
     )
     fix = Edit(problem.span, close) if close and exact else None
     return problem.finding(
-        "wrong-value", f"{problem.name} cannot be {shown}", f"{remedy}allowed: {choices}", fix=fix
+        "wrong-value", f"{problem.name} cannot be {value_text}", f"{remedy}allowed: {choices}", fix=fix
     )
 
 

@@ -52,10 +52,10 @@ def resolve_plain(text: str) -> tuple[Scalar, Trap | None]:
     """Return the value of an unquoted scalar, and a trap if YAML readers interpret the scalar differently."""
     if text in _CONSTANTS:
         return _CONSTANTS[text], None
-    meant = _OLD_BOOLEANS.get(text.lower()) if text in {text.lower(), text.upper(), text.title()} else None
-    if meant is not None:
+    boolean = _OLD_BOOLEANS.get(text.lower()) if text in {text.lower(), text.upper(), text.title()} else None
+    if boolean is not None:
         message = f"{text} is a boolean to some YAML readers and text to others"
-        return text, Trap("yaml-boolean", message, f'write {meant}, or "{text}" for the text')
+        return text, Trap("yaml-boolean", message, f'write {boolean}, or "{text}" for the text')
     if text[:1] not in "+-.0123456789":
         return text, None
     if len(text) > _LONGEST_NUMBER and _WHOLE.fullmatch(text):
@@ -257,12 +257,12 @@ class Composer:
         tag: str | None = event.tag
         if tag is None or tag in {"!", "tag:yaml.org,2002:str"}:
             return None
-        shown = tag.replace("tag:yaml.org,2002:", "!!")
+        short_tag = tag.replace("tag:yaml.org,2002:", "!!")
         span = self._span(event)
-        if shown[:2] != "!!" and isinstance(event, yaml.ScalarEvent) and not event.value:
+        if short_tag[:2] != "!!" and isinstance(event, yaml.ScalarEvent) and not event.value:
             self._indicator(self._original[slice(*_indices(event))], span)
-            return shown
-        self._report("yaml-tag", f"the YAML tag {shown} has no effect here", event, "remove the tag")
+            return short_tag
+        self._report("yaml-tag", f"the YAML tag {short_tag} has no effect here", event, "remove the tag")
         return None
 
     def _sequence(self, event: yaml.Event, *, depth: int) -> _Node:

@@ -41,8 +41,8 @@ def ignores_in(text: str, *, file: str) -> list[Ignore]:
 
 def apply_ignores(findings: Iterable[Finding], ignores: Sequence[Ignore]) -> list[Finding]:
     """Return the findings that no comment suppresses, and a finding for each comment that suppresses nothing."""
-    kept = [finding for finding in findings if not _is_suppressed(finding, ignores)]
-    return kept + [_useless(ignore) for ignore in ignores if not ignore.used]
+    remaining = [finding for finding in findings if not _is_suppressed(finding, ignores)]
+    return remaining + [_useless(ignore) for ignore in ignores if not ignore.used]
 
 
 def _ignores(comment: re.Match[str], line: Span, file_lines: range) -> Iterable[Ignore]:

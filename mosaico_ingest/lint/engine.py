@@ -235,8 +235,8 @@ def _apply_comments(document: Document, findings: list[Finding]) -> Iterator[Fin
     for file in sorted({finding.span.file for finding in findings if finding.span} - {document.file}):
         others = [finding for finding in findings if finding.span and finding.span.file == file]
         ignores = ignores_in(read_text(Path(file)), file=file)
-        kept = (finding for finding in apply_ignores(others, ignores) if finding in others)
-        yield from (replace(finding, fix=None) for finding in kept)
+        remaining = (finding for finding in apply_ignores(others, ignores) if finding in others)
+        yield from (replace(finding, fix=None) for finding in remaining)
 
 
 def _unfiltered_findings(document: Document, env: Mapping[str, str] | None) -> Iterator[Finding]:
@@ -305,8 +305,8 @@ def _message_folders(package: str, folder: Path) -> tuple[tuple[str, Path], ...]
     """Return the folders of a package's `.msg` files: `PACKAGE` next to an adapter or up to two levels above it."""
     folder = folder.resolve()
     above = [folder, *folder.parents][: _MESSAGE_FOLDER_LEVELS + 1]
-    found = (path for start in above for path in (start / package, *sorted(start.glob(f"*/{package}"))))
-    return next((((package, path),) for path in found if any(path.glob("**/*.msg"))), ())
+    folders = (path for start in above for path in (start / package, *sorted(start.glob(f"*/{package}"))))
+    return next((((package, path),) for path in folders if any(path.glob("**/*.msg"))), ())
 
 
 @cache

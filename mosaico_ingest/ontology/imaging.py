@@ -31,7 +31,7 @@ class Image(Stamped, Serializable):
     data: bytes
     """The image rows of `stride` bytes each, encoded as `format`."""
     format: ImageFormat
-    """The encoding of `data`; `png` is a lossless greyscale picture `stride` bytes wide, whatever the pixel encoding."""
+    """The encoding of `data`; `png` is a lossless grayscale picture `stride` bytes wide, whatever the pixel encoding."""
     width: Int32
     """pixels."""
     height: Int32

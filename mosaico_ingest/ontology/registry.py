@@ -63,8 +63,8 @@ _arrow: Any = pa
 @cache
 def builtin_type(tag: str) -> OntologyType:
     """Return the ontology type of a built-in tag; raises KeyError for any other tag."""
-    known = _known()[tag]
-    return OntologyType(tag, pa.struct(_fields(known["columns"])), SerializationFormat(known["format"]))
+    entry = _known()[tag]
+    return OntologyType(tag, pa.struct(_fields(entry["columns"])), SerializationFormat(entry["format"]))
 
 
 @cache

@@ -112,8 +112,8 @@ class _Sum:
             stretches.append((event.first_log_time_ns, event.last_log_time_ns))
             if len(stretches) > 2 * MAX_STRETCHES:
                 self.stretches[key] = _merged(stretches)
-        known = self.rejections.get(key)
-        if known is None:
+        rejection = self.rejections.get(key)
+        if rejection is None:
             self.rejections[key] = Rejection(
                 stage=event.stage,
                 rule=event.rule,
@@ -123,7 +123,7 @@ class _Sum:
                 first_offset=event.first_offset,
             )
         else:
-            self.rejections[key] = known.model_copy(update={"count": known.count + event.count})
+            self.rejections[key] = rejection.model_copy(update={"count": rejection.count + event.count})
 
 
 class Collector:

@@ -437,18 +437,18 @@ class _Block:
         self._parts.append((path, letter, count))
 
     def write(self, out: bytearray, values: Mapping[str, Any]) -> None:
-        found: list[Any] = []
+        flat_values: list[Any] = []
         for path, _, count in self._parts:
             value = _at(values, path)
             if count is None:
-                found.append(value)
+                flat_values.append(value)
             else:
                 _check_length(path[-1], value, count)
-                found.extend(value)
+                flat_values.extend(value)
         start = len(out) % 8 if self._aligned else 0
         if start not in self._packers:
             self._packers[start] = self._packer(start)
-        out += self._packers[start].pack(*found)
+        out += self._packers[start].pack(*flat_values)
 
     def _packer(self, start: int) -> struct.Struct:
         spelled, at = self._order, start
@@ -544,10 +544,10 @@ class _Messages:
 
 
 def _at(values: Mapping[str, Any], path: _Path) -> Any:  # noqa: ANN401 - a field's value
-    found: Any = values
+    value: Any = values
     for name in path:
-        found = found[name]
-    return found
+        value = value[name]
+    return value
 
 
 def _check_length(name: str, value: Sequence[Any], size: int) -> None:

@@ -24,6 +24,26 @@ from mosaico_ingest.serve.flights import Flights
 from mosaico_ingest.serve.keys import MIDDLEWARE, KeyCheck, Keyring, count_refused_schema, require
 from mosaico_ingest.serve.uploads import Uploads
 
+PORT = 6726
+"""The default port of Mosaico clients."""
+IDLE_S = 3600.0
+"""Idle time after which an open session is discarded, in seconds."""
+REQUEST_S = 60.0
+"""Time limit of a query, in seconds."""
+_GRACE_S = 10.0
+"""Time for calls in progress to finish during a shutdown, in seconds."""
+_CLEANUP_INTERVAL_S = 30.0
+"""Maximum time between two checks for idle sessions, in seconds."""
+_SIGNAL_INTERVAL_S = 0.5
+"""Maximum delay of the response to a signal, in seconds."""
+
+
+class Tls(Struct, frozen=True):
+    """The PEM files of the certificate chain of a server and of its private key."""
+
+    certificate: Path
+    key: Path
+
 
 class Service(fl.FlightServerBase):
     """The Flight service of one store; Flight runs each call on its own thread."""
@@ -43,11 +63,11 @@ class Service(fl.FlightServerBase):
         middleware = {MIDDLEWARE: KeyCheck(keyring)}
         super().__init__(location, tls_certificates=certificates, middleware=middleware)  # pyright: ignore[reportArgumentType] - PEM is bytes
 
-    def drop_idle(self, idle_s: float) -> None:
+    def discard_idle(self, idle_s: float) -> None:
         """Discard the sessions without a call for `idle_s` seconds."""
         self._uploads.discard_idle(idle_s)
 
-    def drop_uploads(self) -> None:
+    def discard_unfinished(self) -> None:
         """Discard the sessions that are not finalized."""
         self._uploads.close()
 
@@ -138,41 +158,8 @@ class Service(fl.FlightServerBase):
         raise as_flight_error(Condition.UNIMPLEMENTED, "DoExchange is not implemented")
 
 
-# the traceback that Flight sends names no path of this machine
+# Flight sends the traceback to the client, which must not see a path of this machine.
 Service.get_schema.__code__ = Service.get_schema.__code__.replace(co_filename="mosaico_ingest")
-
-
-def _with_translated_errors(batches: Iterator[pa.RecordBatch]) -> Generator[pa.RecordBatch, None, None]:
-    with translate_errors():
-        yield from batches
-
-
-def _batches(reader: fl.MetadataRecordBatchReader) -> Iterator[pa.RecordBatch]:
-    for chunk in reader:
-        if chunk.data is None:
-            raise Refusal(Condition.INVALID, "the upload contains a message without rows")
-        yield chunk.data
-
-
-PORT = 6726
-"""The default port of Mosaico clients."""
-IDLE_S = 3600.0
-"""Idle time after which an open session is discarded, in seconds."""
-REQUEST_S = 60.0
-"""Time limit of a query, in seconds."""
-_GRACE_S = 10.0
-"""Time for calls in progress to finish during a shutdown, in seconds."""
-_CLEANUP_INTERVAL_S = 30.0
-"""Maximum time between two checks for idle sessions, in seconds."""
-_SIGNAL_INTERVAL_S = 0.5
-"""Maximum delay of the response to a signal, in seconds."""
-
-
-class Tls(Struct, frozen=True):
-    """The PEM files of the certificate chain of a server and of its private key."""
-
-    certificate: Path
-    key: Path
 
 
 class Server:
@@ -204,13 +191,13 @@ class Server:
         stopping = threading.Thread(target=self._service.shutdown, name="mosaico-ingest-stop", daemon=True)
         stopping.start()
         stopping.join(grace_s)
-        self._service.drop_uploads()
+        self._service.discard_unfinished()
         self._stopped.set()
         return not stopping.is_alive()
 
     def _discard_idle_sessions(self, idle_s: float) -> None:
         while not self._stopped.wait(min(idle_s / 4, _CLEANUP_INTERVAL_S)):
-            self._service.drop_idle(idle_s)
+            self._service.discard_idle(idle_s)
 
     def __enter__(self) -> Self:
         return self
@@ -268,3 +255,15 @@ def _read(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise SinkError(f"the PEM file cannot be read: {error.strerror}", where=str(path)) from error
+
+
+def _with_translated_errors(batches: Iterator[pa.RecordBatch]) -> Generator[pa.RecordBatch, None, None]:
+    with translate_errors():
+        yield from batches
+
+
+def _batches(reader: fl.MetadataRecordBatchReader) -> Iterator[pa.RecordBatch]:
+    for chunk in reader:
+        if chunk.data is None:
+            raise Refusal(Condition.INVALID, "the upload contains a message without rows")
+        yield chunk.data

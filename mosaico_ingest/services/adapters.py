@@ -84,18 +84,18 @@ def message_in(
 def _connections(
     recording: Recording, *, topic: str | None = None, msgtype: str | None = None
 ) -> list[Connection]:
-    found = [
+    connections = [
         one for one in recording.connections if topic in {None, one.topic} and msgtype in {None, one.msgtype}
     ]
-    if found:
-        return found
+    if connections:
+        return connections
     wanted = topic or msgtype or ""
-    known = sorted({one.topic if topic else one.msgtype for one in recording.connections})
-    near = get_close_matches(wanted, known, n=1)
+    names = sorted({one.topic if topic else one.msgtype for one in recording.connections})
+    near = get_close_matches(wanted, names, n=1)
     raise NothingMatched(
         f"no topic {'is called' if topic else 'has the type'} {wanted}",
         where=str(recording.files[0]),
-        hint=f"did you mean {near[0]}?" if near else f"there are {', '.join(known) or 'none'}",
+        hint=f"did you mean {near[0]}?" if near else f"there are {', '.join(names) or 'none'}",
     )
 
 
@@ -224,8 +224,8 @@ def explain_adapter(given: str, types: DefinitionFinder) -> Explained:
     """
     if _is_type(given):
         msgtype = normalize_msgtype(given)
-        found = ROSBridge().resolve("", msgtype)
-        spec, why = found.spec, found.why
+        choice = ROSBridge().resolve("", msgtype)
+        spec, why = choice.spec, choice.why
     else:
         spec, why = find_adapter(given), ""
         msgtype = spec.ros_types[0] if spec.ros_types else ""
@@ -350,7 +350,7 @@ def draft_adapter(
 def _in_distros(definition: Definition) -> bool:
     """Return whether a distro has the same type, so that the adapter file does not need to embed it."""
     try:
-        known = DefinitionFinder().find(definition.root)
+        distro_definition = DefinitionFinder().find(definition.root)
     except BagError:
         return False
-    return replace(known.message, constants=()) == replace(definition.message, constants=())
+    return replace(distro_definition.message, constants=()) == replace(definition.message, constants=())

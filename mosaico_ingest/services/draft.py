@@ -140,8 +140,8 @@ def _merged(topics: Sequence[InspectedTopic]) -> list[InspectedTopic]:
     """Return one entry per topic; of several connections, prefer one that can be ingested."""
     best: dict[str, InspectedTopic] = {}
     for topic in topics:
-        known = best.get(topic.topic)
-        if known is None or (known.problem is not None and topic.problem is None):
+        previous = best.get(topic.topic)
+        if previous is None or (previous.problem is not None and topic.problem is None):
             best[topic.topic] = topic
     return list(best.values())
 

@@ -113,7 +113,7 @@ def _topic(job: Job, connection: Connection, bridge: ROSBridge, duration_ns: int
     if connection.count and connection.count > 1 and duration_ns:
         rate = estimate_rate_hz(connection.count, duration_ns)
     source = connection.definition.source.value if connection.definition else "none"
-    left = isinstance(outcome, ExcludedTopic)
+    is_excluded = isinstance(outcome, ExcludedTopic)
     return InspectedTopic(
         topic=connection.topic,
         msgtype=connection.msgtype,
@@ -121,9 +121,9 @@ def _topic(job: Job, connection: Connection, bridge: ROSBridge, duration_ns: int
         count=connection.count,
         rate_hz=rate,
         definition=source,
-        adapter="" if left else outcome.adapter.name,
-        ontology=None if left else outcome.ontology.tag,
-        problem=outcome.why if left else None,
+        adapter="" if is_excluded else outcome.adapter.name,
+        ontology=None if is_excluded else outcome.ontology.tag,
+        problem=outcome.why if is_excluded else None,
     )
 
 

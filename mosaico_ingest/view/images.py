@@ -87,7 +87,7 @@ def decode_image(row: Mapping[str, Any], *, ros_format: str = "") -> Pixels:
     if row.get("format") in {None, "", "raw"}:
         return raw_pixels(_raw_image(row, data))
     samples = _file_samples(bytes(data))
-    if samples.ndim == 2 and samples.dtype == np.uint8:  # noqa: PLR2004 - the buffer, stored as a greyscale picture
+    if samples.ndim == 2 and samples.dtype == np.uint8:  # noqa: PLR2004 - the buffer, stored as a grayscale picture
         return raw_pixels(_raw_image(row, samples.tobytes()))
     return _sample_pixels(samples, str(encoding))
 

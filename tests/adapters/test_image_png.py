@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from mosaico_ingest.adapters.adapter import Adapted
 from mosaico_ingest.adapters.builtin import BY_NAME
-from mosaico_ingest.adapters.image import PngImageSpec, greyscale_png
+from mosaico_ingest.adapters.image import PngImageSpec, grayscale_png
 from mosaico_ingest.rosbag.definitions.model import Definition
 
 
@@ -34,9 +34,9 @@ def _pixels(png: bytes) -> tuple[int, int, bytes]:
 
 
 @given(data=st.data(), width=st.integers(1, 40), height=st.integers(1, 40))
-def test_greyscale_png_round_trip_restores_bytes(data: st.DataObject, width: int, height: int) -> None:
+def test_grayscale_png_round_trip_restores_bytes(data: st.DataObject, width: int, height: int) -> None:
     raw = data.draw(st.binary(min_size=width * height, max_size=width * height))
-    assert _pixels(greyscale_png(raw, width=width, height=height)) == (width, height, raw)
+    assert _pixels(grayscale_png(raw, width=width, height=height)) == (width, height, raw)
 
 
 @pytest.fixture

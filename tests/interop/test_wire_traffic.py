@@ -109,7 +109,7 @@ def traffic(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Traffic,
     subprocess.run(command, check=True, capture_output=True)  # noqa: S603 - the SDK's own command
     yield ours, theirs
     server.shutdown()
-    server.drop_uploads()
+    server.discard_unfinished()
 
 
 def test_both_injectors_make_the_same_calls_with_the_same_keys(traffic: tuple[Traffic, Traffic]) -> None:

@@ -123,11 +123,11 @@ class ServerSink(Struct, frozen=True):
                 yield session
                 session.commit()
             except BaseException as error:
-                left = session.discard()
-                if left and isinstance(error, KeyboardInterrupt):
-                    raise Interrupted("stopped during the upload", where=sequence, hint=left) from error
-                if left and isinstance(error, IngestError):
-                    add_hint(error, left)
+                hint = session.discard()
+                if hint and isinstance(error, KeyboardInterrupt):
+                    raise Interrupted("stopped during the upload", where=sequence, hint=hint) from error
+                if hint and isinstance(error, IngestError):
+                    add_hint(error, hint)
                 raise
 
 

@@ -131,11 +131,11 @@ def _diagnosed(address: Address, text: str) -> SinkError:
         why = error.strerror or f"no response within {_PATIENCE_S:g} s"
         return SinkUnavailable(why, where=where, hint="check target.host and the network")
     with connection:
-        found = _tls_fault(connection, address) if address.tls else _plain_fault(connection, address)
-    if found is None and _NO_HTTP2 in text:
+        fault = _tls_fault(connection, address) if address.tls else _plain_fault(connection, address)
+    if fault is None and _NO_HTTP2 in text:
         hint = "check target.host and target.port"
         return SinkError("the program at this address is not a Mosaico server", where=where, hint=hint)
-    return found or SinkUnavailable(f"the server does not respond: {text}", where=where, hint="try again")
+    return fault or SinkUnavailable(f"the server does not respond: {text}", where=where, hint="try again")
 
 
 def _tls_fault(connection: socket.socket, address: Address) -> SinkError | None:

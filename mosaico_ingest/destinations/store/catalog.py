@@ -181,8 +181,8 @@ class Catalog:
     def sequences(self) -> tuple[SequenceInfo, ...]:
         """See `StoreCatalog.sequences`."""
         with self.read() as db:
-            found = (_find_sequence(db, name, self.root) for name in _names(db))
-            return tuple(info for info in found if info is not None)
+            infos = (_find_sequence(db, name, self.root) for name in _names(db))
+            return tuple(info for info in infos if info is not None)
 
     def listing(self, selection: SequenceFilter, *, after: str | None, limit: int | None) -> Listing:
         """See `StoreCatalog.listing`."""

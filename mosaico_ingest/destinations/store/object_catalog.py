@@ -290,17 +290,17 @@ class ObjectCatalog:
         marker = self._root / MARKER
         with explained(self._root):
             try:
-                found = _number(marker.read_bytes())
+                version = _number(marker.read_bytes())
             except FileNotFoundError:
                 if not create:
                     raise SinkError(
                         "there is no store here", where=str(self._root), hint="check the URL"
                     ) from None
                 marker.write_bytes(json.dumps({"format": FORMAT}).encode())
-                found = FORMAT
-        if found > FORMAT:
+                version = FORMAT
+        if version > FORMAT:
             raise SinkError(
-                f"the store has format {found}, this version supports up to {FORMAT}",
+                f"the store has format {version}, this version supports up to {FORMAT}",
                 where=str(self._root),
                 hint="upgrade mosaico-ingest",
             )
@@ -313,15 +313,15 @@ class ObjectCatalog:
         self, session: str, sequence: str, if_exists: IfExists, *, is_live: Callable[[str], bool]
     ) -> Claim:
         """See `StoreCatalog.claim`."""
-        found = self._load(sequence)
-        if found is not None and if_exists in {IfExists.FAIL, IfExists.SKIP}:
+        document = self._load(sequence)
+        if document is not None and if_exists in {IfExists.FAIL, IfExists.SKIP}:
             raise sequence_exists(sequence)
         if if_exists is not IfExists.APPEND:
             self._reserve(session, sequence, is_live)
-        if found is None:
+        if document is None:
             return Claim(sequence, if_exists, None, (), {})
-        types = found.types if if_exists is IfExists.APPEND else {}
-        return Claim(sequence, if_exists, found.created_ns, found.session_ids, types)
+        types = document.types if if_exists is IfExists.APPEND else {}
+        return Claim(sequence, if_exists, document.created_ns, document.session_ids, types)
 
     def commit(self, claimed: Claim, new: NewSession) -> list[str]:
         """See `StoreCatalog.commit`."""
@@ -360,8 +360,8 @@ class ObjectCatalog:
 
     def sequence(self, name: str) -> SequenceInfo | None:
         """See `StoreCatalog.sequence`."""
-        found = self._load(name)
-        return None if found is None else found.info(self._root)
+        document = self._load(name)
+        return None if document is None else document.info(self._root)
 
     def sequences(self) -> tuple[SequenceInfo, ...]:
         """See `StoreCatalog.sequences`; the sequences are not read at the same moment."""
@@ -381,10 +381,10 @@ class ObjectCatalog:
 
     def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
         """See `StoreCatalog.bounds`."""
-        found = self._load(topic.sequence)
+        document = self._load(topic.sequence)
         segments = [
             segment
-            for one in (found.topics if found else ())
+            for one in (document.topics if document else ())
             if one.name == topic.name
             for segment in one.segments
         ]
@@ -398,10 +398,10 @@ class ObjectCatalog:
     def delete_sequence(self, sequence: str) -> list[str]:
         """See `StoreCatalog.delete_sequence`."""
         with self._holding(sequence):
-            found = self._known(sequence)
+            document = self._known(sequence)
             with explained(self._root):
                 self._document(sequence).unlink()
-        return found.paths
+        return document.paths
 
     def delete_topic(self, sequence: str, topic: str) -> list[str]:
         """See `StoreCatalog.delete_topic`."""
@@ -439,16 +439,16 @@ class ObjectCatalog:
     def _change(self, sequence: str, change: Callable[[SequenceDocument], SequenceDocument]) -> list[str]:
         """Apply a change to a document; return the segments that it no longer contains."""
         with self._holding(sequence):
-            found = self._known(sequence)
-            changed = change(found)
+            document = self._known(sequence)
+            changed = change(document)
             self._put(changed)
-        return sorted(set(found.paths) - set(changed.paths))
+        return sorted(set(document.paths) - set(changed.paths))
 
     def _known(self, sequence: str) -> SequenceDocument:
-        found = self._load(sequence)
-        if found is None:
+        document = self._load(sequence)
+        if document is None:
             raise NotInStore(f"there is no sequence {sequence!r}")
-        return found
+        return document
 
     @contextmanager
     def _holding(self, sequence: str, *, session: str | None = None) -> Generator[None, None, None]:

@@ -270,10 +270,10 @@ def _bounds(columns: tuple[Leaf, ...], footer: pq.FileMetaData) -> Iterable[Boun
     groups = [footer.row_group(i) for i in range(footer.num_row_groups)]
     for number, leaf in enumerate(columns):
         statistics = [group.column(number).statistics for group in groups]
-        known = [each for each in statistics if each is not None and each.has_min_max]
-        if len(known) == len(groups):
-            lows: list[Any] = [each.min for each in known]
-            highs: list[Any] = [each.max for each in known]
+        bounded = [each for each in statistics if each is not None and each.has_min_max]
+        if len(bounded) == len(groups):
+            lows: list[Any] = [each.min for each in bounded]
+            highs: list[Any] = [each.max for each in bounded]
             low, high = min(lows), max(highs)
             if _fits(low) and _fits(high):
                 yield leaf.path, low, high

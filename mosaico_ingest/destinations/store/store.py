@@ -275,9 +275,9 @@ class Store(Struct, frozen=True):
         """
         info = self.catalog.sequence(name)
         if info is None:
-            known = self.catalog.names()
+            names = self.catalog.names()
             raise NotInStore(
-                f"there is no sequence {name!r}", where=str(self.path), hint=suggest_names(known, [name])
+                f"there is no sequence {name!r}", where=str(self.path), hint=suggest_names(names, [name])
             )
         return info
 
@@ -353,8 +353,8 @@ class Store(Struct, frozen=True):
             files = list(self.layout.segment_files())
             sessions = self.layout.open_sessions()
             live = {session for session in sessions if self.layout.in_use(session, grace_s)}
-            known = self.catalog.forget(live)
-            orphans = [file for file in files if self._is_orphan(file, known, live)]
+            paths = self.catalog.forget(live)
+            orphans = [file for file in files if self._is_orphan(file, paths, live)]
             dead = sorted(set(sessions) - live)
             staged = [file for session in dead for file in self.layout.staged_files(session)]
             stored_bytes = sum(file.stat().st_size for file in (*orphans, *staged))

@@ -344,19 +344,20 @@ class TypeResolver:
 
     def _resolve(self, root: str, embedded: Embedded | None, version: int) -> Definition:
         sources = self._sources(root, embedded, version)
-        found = next(
-            ((known, candidate.source) for candidate in sources if (known := candidate.find(root))), None
+        entry = next(
+            ((message, candidate.source) for candidate in sources if (message := candidate.find(root))),
+            None,
         )
         hint = self._hint(sources, version)
-        if not found:
+        if not entry:
             elsewhere = self._other_distros.get(root)
             limited = f"; custom_msgs has it for {elsewhere} only" if elsewhere else ""
             raise BagError(f"the definition of {root} is not known{limited}", hint=hint)
-        message, source = found
+        message, source = entry
 
         def find(name: str) -> MessageType | None:
-            known = (candidate.find(name) for candidate in sources)
-            return next((message for message in known if message), BUILTIN.get(name))
+            messages = (candidate.find(name) for candidate in sources)
+            return next((message for message in messages if message), BUILTIN.get(name))
 
         types = link(message, find, ros_version=version, hint=hint)
         return Definition(root, types, source, flatten(root, types, ros_version=version), version)
@@ -411,18 +412,18 @@ class TypeResolver:
         def find(name: str) -> MessageType | None:
             if name in BUILTIN:
                 return BUILTIN[name]  # embedded texts never define them; loading the distros is slow
-            known = agreed_type(name, distros)
-            if known and known.fields:  # a type without fields needs no assumption
+            message = agreed_type(name, distros)
+            if message and message.fields:  # a type without fields needs no assumption
                 self._assumed.setdefault(name, who)
-            return known
+            return message
 
         return _TypeSource(f"what {who.partition(',')[0]} agree on", Source.DISTRO, find)
 
     def _package(self, name: str) -> MessageType | None:
-        known = package_type(name)
-        if known:
+        message = package_type(name)
+        if message:
             self._assumed.setdefault(name, f"{_PACKAGE}{name.partition('/')[0]}")
-        return known
+        return message
 
     def _hint(self, sources: list[_TypeSource], version: int) -> str:
         searched = f"searched: {', '.join(candidate.label for candidate in sources)}"

@@ -111,8 +111,8 @@ def _read_index_section(source: Source, window: Window, head: Record, index_at: 
             chunks.append(_chunk_info(record, data, index_at))
         position = record.end
     if (len(index.connections), len(chunks)) != expected:
-        found = f"{len(index.connections)} connections and {len(chunks)} chunks"
-        raise BagError(f"{expected[0]} connections and {expected[1]} chunks announced, {found} listed")
+        contents = f"{len(index.connections)} connections and {len(chunks)} chunks"
+        raise BagError(f"{expected[0]} connections and {expected[1]} chunks announced, {contents} listed")
     starts = sorted(chunk[0] for chunk in chunks)
     stops = dict(zip(starts, [*starts[1:], index_at], strict=False))
     if any(key not in index.connections for chunk in chunks for key in chunk[3]):
