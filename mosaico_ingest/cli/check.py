@@ -10,7 +10,7 @@ import typer
 from rich.text import Text
 
 from mosaico_ingest.cli.console import Terminal, print_json, print_line, read_sources, render_findings
-from mosaico_ingest.cli.options import JsonOption, JunitOption, SarifOption
+from mosaico_ingest.cli.options import JsonOption, JunitOption, SarifOption, write_output
 from mosaico_ingest.report.units import counted
 
 if TYPE_CHECKING:
@@ -36,6 +36,14 @@ def check(
     show_all: Annotated[
         bool, typer.Option("--all", "-a", help="Also print expectations that hold or are not evaluated.")
     ] = False,
+    metrics: Annotated[
+        Path | None,
+        typer.Option(
+            "--metrics",
+            help="Write the number of expectations by outcome for the textfile collector of Prometheus.",
+            metavar="FILE",
+        ),
+    ] = None,
     junit: JunitOption = None,
     sarif: SarifOption = None,
     as_json: JsonOption = False,
@@ -74,6 +82,10 @@ def check(
     if as_json:
         print_json([_document(one) for one in checked])
     write_ci_files(checked, junit=junit, sarif=sarif)
+    if metrics is not None:
+        from mosaico_ingest.report.metrics import contract_metrics
+
+        write_output(metrics, contract_metrics([one.contract for one in checked if one.contract is not None]))
     code = gravest(codes)
     if code:
         raise typer.Exit(code)

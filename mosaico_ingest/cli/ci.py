@@ -83,7 +83,7 @@ def run_outcomes(report: RunReport, ends: Mapping[int, RunFinished]) -> list[Che
 
 
 def plan_outcomes(recordings: Sequence[RecordingPlan]) -> list[CheckedRecording]:
-    """Return the outcome of each planned recording, with the warnings and errors of its plan."""
+    """Return the outcome of each planned recording: what the index and the sample reveal about its contract."""
     return [
         CheckedRecording(recording.plan["sequence"]["name"], recording.contract) for recording in recordings
     ]

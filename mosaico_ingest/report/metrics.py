@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from mosaico_ingest.findings import Severity
-from mosaico_ingest.report.contract import Outcome
+from mosaico_ingest.report.contract import ContractResult, Outcome
 from mosaico_ingest.report.events import RunStatus
 from mosaico_ingest.report.model import RunReport
 from mosaico_ingest.report.timing import Step
@@ -17,6 +17,29 @@ _PREFIX = "mosaico_ingest"
 def prometheus_text(report: RunReport) -> str:
     """Return the totals of a run as gauges; they have no label per sequence, which keeps their number small."""
     return "\n".join(_lines(report)) + "\n"
+
+
+def contract_metrics(contracts: Sequence[ContractResult]) -> str:
+    """Return the number of contracts and expectations by outcome as gauges."""
+    return "".join(f"{line}\n" for line in _contract_lines(contracts))
+
+
+def _contract_lines(contracts: Sequence[ContractResult]) -> Iterator[str]:
+    """Yield the numbers of contracts and expectations; nothing without a contract."""
+    if not contracts:
+        return
+    yield from _gauge("contracts", "Recordings of the last run by the outcome of their data contracts.")
+    passed = sum(contract.passed for contract in contracts)
+    for outcome, count in ((Outcome.PASSED, passed), (Outcome.FAILED, len(contracts) - passed)):
+        yield f'{_PREFIX}_contracts{{outcome="{outcome.value}"}} {count}'
+    counts = Counter(
+        (result.outcome, result.severity) for contract in contracts for result in contract.results
+    )
+    yield from _gauge("expectations", "Expectations of the last run by outcome and severity.")
+    for outcome in Outcome:
+        for severity in (Severity.ERROR, Severity.WARNING):
+            labels = f'outcome="{outcome.value}",severity="{severity.value}"'
+            yield f"{_PREFIX}_expectations{{{labels}}} {counts[outcome, severity]}"
 
 
 def _lines(report: RunReport) -> Iterator[str]:
@@ -30,14 +53,7 @@ def _lines(report: RunReport) -> Iterator[str]:
         yield f'{_PREFIX}_messages{{fate="{fate}"}} {sum(getattr(one, fate) for one in totals)}'
     unread = sum(item.count or 0 for one in report.recordings for item in one.unreadable_ranges)
     yield f'{_PREFIX}_messages{{fate="unreadable"}} {unread}'
-    results = [result for one in report.recordings if one.contract for result in one.contract.results]
-    if results:
-        counts = Counter((result.outcome, result.severity) for result in results)
-        yield from _gauge("expectations", "Expectations of the last run by outcome and severity.")
-        for outcome in Outcome:
-            for severity in (Severity.ERROR, Severity.WARNING):
-                labels = f'outcome="{outcome.value}",severity="{severity.value}"'
-                yield f"{_PREFIX}_expectations{{{labels}}} {counts[outcome, severity]}"
+    yield from _contract_lines([one.contract for one in report.recordings if one.contract is not None])
     yield from _gauge(
         "step_seconds", "Time of the last run by step; the write step runs in parallel to the others."
     )

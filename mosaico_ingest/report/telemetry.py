@@ -7,8 +7,10 @@ from collections import defaultdict
 from dataclasses import dataclass, field
 
 from mosaico_ingest.errors import IngestError
+from mosaico_ingest.report.contract import ContractResult
 from mosaico_ingest.report.events import (
     DOWNSAMPLING,
+    ContractEvaluated,
     Event,
     Rejected,
     RunFinished,
@@ -35,6 +37,8 @@ except ImportError as missing:
     ) from missing
 
 _NAME = "mosaico_ingest"
+_MAX_FAILURES = 20
+"""Failed expectations in the attributes of a span."""
 _SERVICE = "mosaico-ingest"
 
 
@@ -46,6 +50,7 @@ class _Recording:
     seconds: dict[Step, float] = field(default_factory=dict[Step, float])
     read: int = 0
     rejected: int = 0
+    contract: ContractResult | None = None
     written: dict[str, int] = field(default_factory=lambda: defaultdict[str, int](int))
 
 
@@ -75,6 +80,9 @@ class Telemetry:
         self._bytes = meter.create_counter(
             f"{_NAME}.io", "By", "Bytes of opened recordings, read messages and stored rows."
         )
+        self._expectations = meter.create_counter(
+            f"{_NAME}.expectations", "{expectation}", "Expectations by outcome and severity."
+        )
         self._duration = meter.create_histogram(
             f"{_NAME}.recording.duration", "s", "Duration of a recording."
         )
@@ -94,6 +102,11 @@ class Telemetry:
                 self._count(event.target, "rejected", event.count)
             case TopicClosed():
                 self._bytes.add(event.stored_bytes or 0, {"kind": "stored", "topic": event.target})
+            case ContractEvaluated():
+                self._recordings[position].contract = event.result
+                for result in event.result.results:
+                    labels = {"outcome": result.outcome.value, "severity": result.severity.value}
+                    self._expectations.add(1, labels)
             case Timed():
                 self._recordings[position].seconds = dict(event.seconds)
             case RunFinished():
@@ -149,6 +162,15 @@ class Telemetry:
                 **{f"{_NAME}.step.{step.value}": spent for step, spent in recording.seconds.items()},
             }
         )
+        if recording.contract is not None:
+            failed = (*recording.contract.errors, *recording.contract.warnings)
+            span.set_attributes(
+                {
+                    f"{_NAME}.contract.passed": recording.contract.passed,
+                    f"{_NAME}.contract.expectations": len(recording.contract.results),
+                    f"{_NAME}.contract.failures": [one.line for one in failed[:_MAX_FAILURES]],
+                }
+            )
         if event.error is not None:
             span.set_status(Status(StatusCode.ERROR, event.error))
         span.end(end_ns)

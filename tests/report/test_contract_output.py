@@ -8,7 +8,7 @@ from mosaico_ingest.findings import Severity
 from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Location, Outcome
 from mosaico_ingest.report.events import RunStatus
 from mosaico_ingest.report.markdown import markdown_summary
-from mosaico_ingest.report.metrics import prometheus_text
+from mosaico_ingest.report.metrics import contract_metrics, prometheus_text
 from mosaico_ingest.report.model import Report, RunReport
 
 LOCATION = Location(file="job.yaml", line=7, column=5, end_line=7, end_column=9)
@@ -73,6 +73,13 @@ def test_metrics_count_expectations_by_outcome_and_severity() -> None:
         'mosaico_ingest_expectations{outcome="skipped",severity="error"} 1',
         'mosaico_ingest_expectations{outcome="skipped",severity="warning"} 0',
     ]
+
+
+def test_metrics_count_contracts_by_outcome() -> None:
+    lines = prometheus_text(MIXED).splitlines()
+    assert 'mosaico_ingest_contracts{outcome="passed"} 0' in lines
+    assert 'mosaico_ingest_contracts{outcome="failed"} 1' in lines
+    assert contract_metrics([]) == ""
 
 
 def test_metrics_without_contract_have_no_expectations() -> None:

@@ -96,6 +96,7 @@ def ingest(folder: Path, *arguments: str, **variables: str) -> subprocess.Comple
     (folder / "in" / "torn.mcap").write_bytes(b"torn")
     (folder / "job.yaml").write_text(
         'bag: {path: "in/*.mcap"}\nsequence: {name: "{stem}"}\ntopics: [/imu, /odom]\ntarget: {store: store}\n'
+        "expect: {on_failure: warn, required: [/imu, /gps2], topics: {/imu: {rate: {min: 99 Hz}}}}\n"
     )
     command = [
         sys.executable,
@@ -130,6 +131,8 @@ def test_telemetry_exports_counts_of_report(jobs: str, collector: Collector, tmp
         assert collector.total("messages", fate=fate) == sum(getattr(one, fate) for one in totals) == 2400
         assert collector.total("messages", fate=fate, topic="/odom") == 400
     assert collector.total("recordings", status="completed") == 2
+    assert collector.total("expectations", outcome="passed") == 4
+    assert collector.total("expectations", outcome="failed", severity="error") == 2
     assert collector.total("recordings", status="failed") == 1
     assert collector.total("io", kind="stored") == sum(one.stored_bytes for one in totals)
     assert collector.total("io", kind="source") == 2 * DRIVE.stat().st_size
@@ -142,6 +145,10 @@ def test_telemetry_exports_counts_of_report(jobs: str, collector: Collector, tmp
     assert spans["torn"].status.code == 2
     assert "torn.mcap" in spans["torn"].status.message
     assert plain(spans["a"].attributes)["mosaico_ingest.written"] == 1200
+    attributes = {one.key: one.value for one in spans["a"].attributes}
+    assert attributes["mosaico_ingest.contract.passed"].bool_value is False
+    [failure] = attributes["mosaico_ingest.contract.failures"].array_value.values
+    assert "/gps2" in failure.string_value
     assert spans["a"].end_time_unix_nano > spans["a"].start_time_unix_nano
 
 
@@ -174,6 +181,7 @@ def test_telemetry_without_extra_states_package(tmp_path: Path) -> None:
     blocked = "raise ImportError('blocked')"
     (tmp_path / "opentelemetry").mkdir()
     (tmp_path / "opentelemetry" / "__init__.py").write_text(blocked)
-    result = ingest(tmp_path, PYTHONPATH=str(tmp_path))
+    paths = os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH"))))
+    result = ingest(tmp_path, PYTHONPATH=paths)
     assert result.returncode == 1
     assert "error: OpenTelemetry is not installed — pip install 'mosaico-ingest[otel]'" in result.stderr
