@@ -22,6 +22,7 @@ from mosaico_ingest.errors import AdapterError, ManifestError, NothingMatched
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.compose import PLACEHOLDERS, Placeholder, placeholders_in
 from mosaico_ingest.job.fields import FilePath, PathRole, marked_fields, replace_values
+from mosaico_ingest.job.impossible_patterns import pattern_problems
 from mosaico_ingest.job.manifest import LoadedManifest, refusal
 from mosaico_ingest.job.model import Job, JobSettings, Manifest, Origin, SequenceSettings
 from mosaico_ingest.job.values import LockFile
@@ -192,6 +193,7 @@ def compile_manifest(loaded: LoadedManifest, *, locked: bool = True) -> tuple[Jo
         ManifestError: Two recordings would have the same name, the platform refuses a name or metadata, or a file that
             the manifest names cannot be used.
     """
+    _check_patterns(loaded)
     recordings = find_recordings(loaded)
     names = [sequence_name(loaded, recording) for recording in recordings]
     _refuse_duplicates(loaded, names)
@@ -210,6 +212,16 @@ def compile_manifest(loaded: LoadedManifest, *, locked: bool = True) -> tuple[Jo
 
 def _job(sections: dict[str, Any], paths: tuple[AnyPath, ...], origin: Origin) -> Job:
     return Job.model_construct(None, **sections, paths=paths, origin=origin).check()
+
+
+def _check_patterns(loaded: LoadedManifest) -> None:
+    """Raise ManifestError if a topic pattern cannot match any topic name."""
+    findings = tuple(
+        Finding("topic-pattern", Severity.ERROR, problem.message, problem.span, problem.hint)
+        for problem in pattern_problems(loaded.manifest, loaded.source)
+    )
+    if findings:
+        raise refusal(findings, str(loaded.path))
 
 
 def _refuse_duplicates(loaded: LoadedManifest, names: list[str]) -> None:
@@ -345,8 +357,22 @@ def _load_adapter(
             suggest_reference(str(reference), {*BY_NAME, *names}) if rule == "unknown-adapter" else error.hint
         )
         message = f"{error.where}: {error.what}" if error.where else error.what
+        if rule == "missing-adapter":
+            message, hint = _missing_adapter(str(reference), job.folder)
         findings.append(Finding(rule, Severity.ERROR, message, job.value_span(*path), hint))
         return None
+
+
+def _missing_adapter(reference: str, folder: Path) -> tuple[str, str]:
+    """Return the message and the hint for a reference whose file or module does not exist."""
+    module, colon, _ = reference.rpartition(":")
+    file = module if colon else reference
+    if file.endswith((".py", ".yaml", ".yml")):
+        return (
+            f"the file {folder / file} does not exist",
+            "correct the path; it starts at the manifest's folder",
+        )
+    return f"the module {module} does not exist", f"install it, or put it into {folder}"
 
 
 def _reference_rule(reference: str, error: AdapterError, folder: Path) -> str:

@@ -49,19 +49,70 @@ def located(findings: tuple[Finding, ...]) -> set[tuple[str, str]]:
         ('adapters: {load: ["no_such_module_at_all:Adapter"]}', "missing-adapter", "job.yaml:2:19"),
         ('adapters: {load: ["mine.py:Adapter"]}', "broken-adapter", "job.yaml:2:19"),
         ("adapters: {load: [one.yaml, other.yaml]}", "adapter-clash", "job.yaml:2:29"),
+        ('adapters: {load: ["nothing*.yaml"]}', "missing-adapter", "job.yaml:2:19"),
+        ('topics: [/imu, "/cam["]', "topic-pattern", "job.yaml:2:21"),
+        ('topics: [/imu, "/cam.*"]', "topic-pattern", "job.yaml:2:21"),
+        ('topics: [/imu, "!"]', "topic-pattern", "job.yaml:2:16"),
     ],
 )
-def test_adapter_mistake_has_same_rule_and_location_in_lint_and_plan(
-    folder: Path, text: str, rule: str, location: str
+@pytest.mark.usefixtures("folder")
+def test_mistake_has_same_rule_location_and_message_in_lint_plan_and_run(
+    text: str, rule: str, location: str
 ) -> None:
-    path = manifest(text)
-    linted = lint_paths([path], env={})
-    assert (rule, location) in located(tuple(linted.findings))
-    with pytest.raises(IngestError) as caught:
-        api.plan_job(path)
-    assert caught.value.exit_code == 2
-    assert located(caught.value.findings) == {(rule, location)}
-    assert folder.is_dir()
+    assert_same_error(manifest(text), rule, location)
+
+
+def assert_same_error(path: Path, rule: str, location: str) -> None:
+    linted = [finding for finding in lint_paths([path], env={}).findings if finding.rule == rule]
+    assert located(tuple(linted)) == {(rule, location)}
+    for command in (lambda: api.plan_job(path), lambda: api.run(api.compile_job(path))):
+        try:
+            report = command()
+        except IngestError as error:
+            code, findings = error.exit_code, error.findings
+        else:
+            pytest.fail(f"no error: {report}")
+        assert code == 2
+        assert located(findings) == {(rule, location)}
+        if rule != "broken-adapter":
+            assert {finding.help for finding in findings} == {finding.help for finding in linted}
+
+
+@pytest.mark.parametrize(
+    ("text", "location"),
+    [
+        ("float64 a\nint32 b\nfloat64 a\n", "msgs/Twice.msg:3:9"),
+        ("# twice\nstring a  # a\nstring<=5[]  a  # a\n", "msgs/Twice.msg:3:14"),
+    ],
+)
+def test_field_defined_twice_has_same_rule_and_location_in_lint_plan_and_run(
+    text: str, location: str, folder: Path
+) -> None:
+    (folder / "msgs").mkdir()
+    (folder / "msgs" / "Twice.msg").write_text(text)
+    path = folder / "job.yaml"
+    path.write_text("bag: {path: a.mcap, custom_msgs: [{package: p, path: msgs}]}\ntarget: {store: s}\n")
+    rule = "msg-repeated-name"
+    assert (rule, location) in located(tuple(lint_paths([Path("job.yaml")], env={}).findings))
+    for command in (api.plan_job, lambda job: run_recording(Task(*compile_manifest(load_manifest(job))))):
+        try:
+            error = command(Path("job.yaml")).error
+        except IngestError as raised:
+            error = raised
+        assert error.exit_code == 2
+        assert located(error.findings) == {(rule, location)}
+
+
+@pytest.mark.usefixtures("folder")
+def test_misspelled_default_of_topic_errors_suggests_default() -> None:
+    path = manifest("on_error: {topic: {defualt: ignore}}")
+    (finding,) = lint_paths([path], env={}).findings
+    assert (finding.rule, str(finding.span)) == ("relative-topic", "job.yaml:2:20")
+    assert str(finding.help).startswith("did you mean default?")
+    planned = next(
+        note for note in api.plan_job(path).recordings[0].notes if note.rule == "unmatched-pattern"
+    )
+    assert (planned.location, planned.help) == ("job.yaml:2:20", "the nearest is default")
 
 
 @pytest.mark.parametrize(

@@ -137,5 +137,5 @@ def job(write_job: WriteJob) -> Path:
 def test_batch_with_killed_processes_leaves_old_or_new_sequences_and_next_run_completes(
     write_bag: WriteBag, job: Path, tmp_path: Path
 ) -> None:
-    outcomes = kill_and_look(write_bag, job, tmp_path / "store", 30)
+    outcomes = kill_and_look(write_bag, job, tmp_path / "store", 21)
     assert outcomes["parent"] | outcomes["both"] == {False, True}, "the moments were not where they matter"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
 
@@ -83,6 +82,15 @@ def sections(text: str) -> Iterator[Section]:
             yield Section(kind, name, text[body:end], text.count("\n", 0, body))
 
 
+class RepeatedFieldError(BagError):
+    """A field has the name of an earlier field; `where` ends in the number of its line."""
+
+    def __init__(self, name: str, what: str, *, where: str) -> None:
+        """Create the error for the field `name`."""
+        super().__init__(what, where=where, hint="rename one of the two")
+        self.name = name
+
+
 def parse_msg(text: str, name: str, *, where: str | None = None, line: int = 0) -> MessageType:
     """Return the type that `text` defines; field types keep the notation of the text.
 
@@ -92,6 +100,7 @@ def parse_msg(text: str, name: str, *, where: str | None = None, line: int = 0) 
         BagError: A line is not a field, constant or comment.
     """
     fields, constants = list[Field](), list[Constant]()
+    lines: dict[str, int] = {}
     for number, raw in enumerate(text.lstrip("\ufeff").split("\n"), start=line + 1):
         content = raw.strip(" \t\r\0\f")
         if not content or content.startswith("#"):
@@ -104,10 +113,13 @@ def parse_msg(text: str, name: str, *, where: str | None = None, line: int = 0) 
                 f"cannot parse {content!r}: {error}", where=f"{where or name}:{number}", hint=hint
             ) from None
         if isinstance(item, Field):
+            if item.name in lines:
+                message = f"{item.name!r} is already declared in line {lines[item.name]}"
+                raise RepeatedFieldError(item.name, message, where=f"{where or name}:{number}")
+            lines[item.name] = number
             fields.append(item)
         elif item:
             constants.append(item)
-    _check_unique(fields, where or name)
     return MessageType(name, tuple(fields), tuple(constants))
 
 
@@ -171,13 +183,6 @@ def _integer(text: str) -> int:
     digits = text.lstrip("+-")
     octal = len(digits) > 1 and digits.startswith("0") and digits.isdecimal()
     return int(text, 8 if octal else 0)
-
-
-def _check_unique(fields: list[Field], where: str) -> None:
-    counts = Counter(field.name for field in fields)
-    duplicate = next((name for name, count in counts.items() if count > 1), None)
-    if duplicate:
-        raise BagError(f"the field {duplicate!r} is defined twice", where=where)
 
 
 def flatten(root: str, types: Mapping[str, MessageType], *, ros_version: int) -> str:

@@ -33,7 +33,7 @@ from mosaico_ingest.rosbag.definitions.model import (
     Source,
     normalize_msgtype,
 )
-from mosaico_ingest.rosbag.definitions.parser import PRIMITIVES, flatten, read_types
+from mosaico_ingest.rosbag.definitions.parser import PRIMITIVES, RepeatedFieldError, flatten, read_types
 from mosaico_ingest.textfile import read_limited
 
 __all__ = [
@@ -148,19 +148,25 @@ def register_source(msg_type: str, source: Path | str) -> Registered:
     try:
         types = dict(read_types(str(text), name, where=where))
     except BagError as error:
-        raise error if file is None else _syntax_error(error, file) from error
+        raise error if file is None else _syntax_error(error, file, str(text)) from error
     if name not in types:
         raise BagError(f"the text does not define {name}", where=where, hint=f"it defines {', '.join(types)}")
     return Registered(name, str(text), types, file)
 
 
-def _syntax_error(error: BagError, file: Path) -> BagError:
+def _syntax_error(error: BagError, file: Path, text: str) -> BagError:
     """Return the error with a finding at its line of a definition file."""
     line = (error.where or "").rpartition(":")[2]
     if not line.isdigit():
         return error
     span = Span(str(file), int(line), 1, int(line), 1)
-    finding = Finding("msg-syntax", Severity.ERROR, error.what, span, error.hint)
+    rule = "msg-syntax"
+    if isinstance(error, RepeatedFieldError):
+        rule = "msg-repeated-name"
+        declaration = re.search(rf"\s({re.escape(error.name)})\b", text.split("\n")[int(line) - 1])
+        column = declaration.start(1) + 1 if declaration else 1
+        span = Span(str(file), int(line), column, int(line), column + len(error.name))
+    finding = Finding(rule, Severity.ERROR, error.what, span, error.hint)
     return DefinitionError(error.what, where=str(span), hint=error.hint, findings=(finding,))
 
 
