@@ -12,6 +12,9 @@ import pytest
     [
         ("ros_bridge", "ROSBridge"),
         ("ros_bridge", "FrameTransform"),
+        ("ros_bridge", "ROSHeader"),
+        ("bridges.ros", "ROSExtractorConfig"),
+        ("bridges.ros", "ROSSequenceExtractor"),
         ("ros_bridge.adapters", "IMUAdapter"),
         ("ros_bridge.adapters.sensor_msgs", "IMUAdapter"),
         ("ros_bridge.adapters.override_msgs", "LidarAdapter"),

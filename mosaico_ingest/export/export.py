@@ -32,9 +32,9 @@ from mosaico_ingest.job.values import Stores
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, Language, normalize_msgtype
-from mosaico_ingest.rosbag.definitions.registry import TypeResolver, store_of
+from mosaico_ingest.rosbag.definitions.registry import CustomMessages, TypeResolver, store_of
 from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS, encoding_of
-from mosaico_ingest.rosbag.writers import RecordingWriter, open_writer
+from mosaico_ingest.rosbag.writers import RecordingWriter, check_new_recording, open_writer
 
 
 class _Record(BaseModel):
@@ -259,24 +259,30 @@ def _produces(adapter: Adapter, info: SourceTopic) -> bool:
     )
 
 
+class _Definitions(Struct, frozen=True):
+    """The definitions of topics that were stored without one."""
+
+    distro: Stores
+    finder: DefinitionFinder
+
+
 def _assumed_restorer(
-    source: SourceSequence, info: SourceTopic, specs: Sequence[AdapterSpec], distro: Stores
+    source: SourceSequence, info: SourceTopic, specs: Sequence[AdapterSpec], known: _Definitions
 ) -> Restorer | None:
     """Return the restorer of a topic whose metadata has no definition, or None if no adapter produces its columns.
 
     The message type is the one of an adapter's types, as defined by the distro, that changes the fewest values of the first rows.
     """
-    finder = DefinitionFinder(distro)
-    version = 1 if distro.value.startswith("ros1") else 2
+    version = 1 if known.distro.value.startswith("ros1") else 2
     restorers: list[Restorer] = []
     for spec in (*specs, *(spec for spec in BUILTIN if spec.tag == info.ontology.tag)):
         for msgtype in spec.ros_types:
             with suppress(AdapterError, BagError):
-                definition = finder.find(msgtype, spec)
+                definition = known.finder.find(msgtype, spec)
                 adapter = spec.bind(definition, ros_shape(definition))
                 if definition.ros_version == version and _produces(adapter, info):
                     inverse = invert(adapter, ros_shape(definition), info.metadata)
-                    assumed = f"{definition.root} of {distro.value}"
+                    assumed = f"{definition.root} of {known.distro.value}"
                     restorers.append(
                         Restorer(info, definition, spec.name, adapter.ontology, inverse, assumed)
                     )
@@ -297,13 +303,16 @@ def export_sequence(
     end_ns: int | None = None,
     adapters: Sequence[str] = (),
     ros_distro: Stores | str | None = None,
+    custom_msgs: Sequence[CustomMessages] = (),
     replace: bool = False,
+    dry_run: bool = False,
 ) -> ExportReport:
     """Write a sequence, or the selected topics and time range of it, to a recording.
 
     `source` is a store, or a sequence of another source, such as `sources.ServerSequence`. The suffix of the file selects the
     container: `.mcap`, `.db3` (ROS 2) or `.bag` (ROS 1). `start_ns` is inclusive, `end_ns` exclusive. `ros_distro` defines the
-    message types of topics whose metadata has no definition; it defaults to the newest distro that the container can store.
+    message types of topics whose metadata has no definition; it defaults to the newest distro that the container can store, and
+    `custom_msgs` adds types. With `dry_run`, no message is read and no file is written.
 
     Raises:
         NothingMatched: No topic or message is selected, or no topic can be exported.
@@ -312,16 +321,24 @@ def export_sequence(
         AdapterError: One of `adapters` cannot be loaded.
     """
     path = Path(path)
+    check_new_recording(path, replace=replace)
     opened = StoreSequence(source, sequence) if isinstance(source, Store) else source
-    default = Stores.LATEST if 2 in ROS_VERSIONS.get(path.suffix, (2,)) else Stores.ROS1_NOETIC  # noqa: PLR2004 - ROS 2
+    default = Stores.LATEST if 2 in ROS_VERSIONS[path.suffix] else Stores.ROS1_NOETIC  # noqa: PLR2004 - ROS 2
     distro = store_of(ros_distro) or default
+    definitions = _Definitions(distro, DefinitionFinder(distro, custom_msgs))
     selected = _selected(opened, topics)
     specs = [adapter_spec(reference, Path()) for reference in adapters]
+    candidates = [
+        _restorer(opened, info, selected, specs, suffix=path.suffix, definitions=definitions)
+        for info in selected
+    ]
+    if dry_run:
+        results = [one.result() if isinstance(one, Restorer) else one for one in candidates]
+        return ExportReport(sequence=sequence, path=str(path), bytes=0, topics=tuple(results))
     with open_writer(path, replace=replace) as writer:
         restorers: list[tuple[int, Restorer]] = []
         excluded: list[TopicExport] = []
-        for info in selected:
-            restorer = _restorer(opened, info, selected, specs, suffix=path.suffix, distro=distro)
+        for restorer in candidates:
             outcome = _connected(restorer, writer) if isinstance(restorer, Restorer) else restorer
             if isinstance(outcome, TopicExport):
                 excluded.append(outcome)
@@ -367,14 +384,14 @@ def _restorer(
     specs: Sequence[AdapterSpec],
     *,
     suffix: str,
-    distro: Stores,
+    definitions: _Definitions,
 ) -> Restorer | TopicExport:
     """Return the restorer of a topic, or the reason why the topic cannot be exported."""
     if info.problem:
         return _excluded(info, "", info.problem)
     origin = origin_of(info)
     if origin is None:
-        restorer = _assumed_restorer(source, info, specs, distro)
+        restorer = _assumed_restorer(source, info, specs, definitions)
         reason = "its metadata does not describe the original messages"
         return restorer or _excluded(info, "", f"{reason}, and no adapter produces {info.ontology.tag}")
     others = [other for topic in selected if (other := origin_of(topic)) is not None]

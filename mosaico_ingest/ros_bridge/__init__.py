@@ -6,6 +6,7 @@ code of its own, and no other module of this project may depend on it.
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 import mosaico_ingest
@@ -24,7 +25,9 @@ if TYPE_CHECKING:
         Stores,
         register_default_adapter,
     )
+    from mosaico_ingest.export.extractor import ROSExtractorConfig, ROSSequenceExtractor
     from mosaico_ingest.ontology import BatteryState, FrameTransform, PointCloud2, PointField
+    from mosaico_ingest.rosbag.blocks import ROSHeader
 
 __all__ = [
     "BatteryState",
@@ -34,17 +37,29 @@ __all__ = [
     "PointField",
     "ROSAdapterBase",
     "ROSBridge",
+    "ROSExtractorConfig",
+    "ROSHeader",
     "ROSInjectionConfig",
     "ROSLoader",
     "ROSMessage",
+    "ROSSequenceExtractor",
     "ROSTypeRegistry",
     "RosbagInjector",
     "Stores",
     "register_default_adapter",
 ]
 
+_MODULES = {
+    "ROSExtractorConfig": "mosaico_ingest.export.extractor",
+    "ROSHeader": "mosaico_ingest.rosbag.blocks",
+    "ROSSequenceExtractor": "mosaico_ingest.export.extractor",
+}
+"""The module of each name that the package `mosaico_ingest` does not export."""
+
 
 def __getattr__(name: str) -> object:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name in _MODULES:
+        return getattr(import_module(_MODULES[name]), name)
     return getattr(mosaico_ingest if name in mosaico_ingest.__all__ else ontology, name)

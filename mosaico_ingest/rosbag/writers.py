@@ -25,6 +25,7 @@ __all__ = [
     "RecordingWriter",
     "Ros1Writer",
     "SqliteWriter",
+    "check_new_recording",
     "open_writer",
 ]
 
@@ -139,6 +140,20 @@ _WRITERS: dict[str, Callable[[Path], RecordingWriter]] = {
 }
 
 
+def check_new_recording(path: Path, *, replace: bool = False) -> None:
+    """Check that a recording can be created at a path.
+
+    Raises:
+        BagError: The suffix is unknown, or the file exists.
+    """
+    if path.suffix not in _WRITERS:
+        raise BagError("no container has this suffix", where=str(path), hint=f"use one of {SUFFIX_LIST}")
+    if path.exists() and not replace:
+        raise BagError("the file exists", where=str(path), hint="choose another name, or use --force")
+    if path.is_dir():
+        raise BagError("it is a folder", where=str(path), hint="choose another name")
+
+
 @contextmanager
 def open_writer(path: Path, *, replace: bool = False) -> Generator[RecordingWriter]:
     """Open a writer for the container of the file's suffix; an exception leaves no file behind.
@@ -146,13 +161,8 @@ def open_writer(path: Path, *, replace: bool = False) -> Generator[RecordingWrit
     Raises:
         BagError: The suffix is unknown, the file exists, or it cannot be written.
     """
-    make = _WRITERS.get(path.suffix)
-    if make is None:
-        raise BagError("no container has this suffix", where=str(path), hint=f"use one of {SUFFIX_LIST}")
-    if path.exists() and not replace:
-        raise BagError("the file exists", where=str(path), hint="choose another name, or use --force")
-    if path.is_dir():
-        raise BagError("it is a folder", where=str(path), hint="choose another name")
+    check_new_recording(path, replace=replace)
+    make = _WRITERS[path.suffix]
     try:
         folder = Path(tempfile.mkdtemp(prefix=f".{path.stem}-", dir=path.parent))
     except OSError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from made_recordings import define, record
 from message_differences import differences
 from mosaicod import Mosaicod, Topic, running
 from random_messages import random_rows
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.typesys import Stores as RosbagsStores
 
 from mosaico_ingest.adapters.builtin import BUILTIN, Builtin
 from mosaico_ingest.adapters.standalone import DefinitionFinder
@@ -27,6 +30,7 @@ from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import BagError, SinkError
 from mosaico_ingest.export import ExportReport, export_sequence
 from mosaico_ingest.export.columns import as_type, comparable
+from mosaico_ingest.export.extractor import ROSExtractorConfig, ROSSequenceExtractor
 from mosaico_ingest.export.sources import ServerSequence
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.values import ServerTarget, Stores
@@ -268,3 +272,57 @@ def test_export_from_server_of_protobuf_and_json_equals_export_from_store(
     assert served.topics == stored.topics
     assert len([topic for topic in served.topics if not topic.excluded]) == 2 * len(foxglove_schemas.MESSAGES)
     assert (tmp_path / "served.mcap").read_bytes() == (tmp_path / "stored.mcap").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("plugin", "name"), [(StoragePlugin.MCAP, "s.mcap"), (StoragePlugin.SQLITE3, "s.db3"), ("mcap", "s.mcap")]
+)
+def test_extractor_writes_the_recording_in_the_folder_of_the_sequence(
+    server: Server, tmp_path: Path, plugin: Any, name: str
+) -> None:
+    ingest(server.port, DRIVE)
+    config = ROSExtractorConfig(
+        saving_path=tmp_path / "out",
+        sequence_name="s",
+        port=server.port,
+        topics=["/imu", "/battery"],
+        ros_distro=RosbagsStores.ROS2_HUMBLE,
+        storage_plugin=plugin,
+    )
+    preview = ROSSequenceExtractor(replace(config, dry_run=True)).run()
+    assert ([topic.msgtype for topic in preview.topics], (tmp_path / "out").exists()) == (
+        ["acme_msgs/msg/BatteryPack", "sensor_msgs/msg/Imu"],
+        False,
+    )
+    assert ROSSequenceExtractor(config).run().messages == 1010
+    path = tmp_path / "out" / "s" / name
+    assert differences(DRIVE, path, topics=["/imu", "/battery"]) == {}
+    with pytest.raises(BagError, match="exists"):
+        ROSSequenceExtractor(config).run()
+    assert ROSSequenceExtractor(replace(config, overwrite=True)).run().messages == 1010
+
+
+def test_extractor_path_follows_distro_and_plugin() -> None:
+    assert ROSExtractorConfig("out", "s", ros_distro="ros1_noetic").path == Path("out/s/s.bag")
+    with pytest.raises(BagError, match="unknown storage plugin 'bag'"):
+        _ = ROSExtractorConfig("out", "s", storage_plugin="bag").path
+
+
+def test_extractor_uses_custom_msgs_for_topics_without_definition(server: Server, tmp_path: Path) -> None:
+    ingest(server.port, DRIVE, topics=["/imu"])
+    store = Store.open(tmp_path / "served")
+    with store.catalog.write() as db:
+        db.execute("UPDATE topics SET metadata = '{}'")
+    folder = tmp_path / "sensor_msgs"
+    folder.mkdir()
+    (folder / "Imu.msg").write_text(
+        "std_msgs/Header header\ngeometry_msgs/Quaternion orientation\nfloat64[9] orientation_covariance\n"
+        "geometry_msgs/Vector3 angular_velocity\nfloat64[9] angular_velocity_covariance\n"
+        "geometry_msgs/Vector3 linear_acceleration\nfloat64[9] linear_acceleration_covariance\nuint8 own\n"
+    )
+    config = ROSExtractorConfig(
+        tmp_path / "out", "s", port=server.port, custom_msgs=[("sensor_msgs", folder, None)]
+    )
+    (topic,) = ROSSequenceExtractor(config).run().topics
+    assert topic.assumed.startswith("sensor_msgs/msg/Imu of ")
+    assert topic.defaulted == ("own",)
