@@ -284,6 +284,10 @@ def run(
         manifests = (*manifests, used_manifest(Path(jobs)))
         jobs = compile_job(Path(jobs))
     tasks = [_task(job) for job in jobs]
+    if any(task.job.expect is not None and task.job.expect.group is not None for task in tasks):
+        from mosaico_ingest.pipeline.contract_group import add_group_results
+
+        tasks = add_group_results(tasks)
     chosen = executor or choose_executor(tasks)
     return RunReport(
         tool=f"mosaico-ingest {__version__}",

@@ -84,11 +84,13 @@ class Contract(Struct, frozen=True):
 
     job: Job
     expect: Expectations
+    group: tuple[ExpectationResult, ...] = ()
+    """The results of the expectations of the group that the recording belongs to."""
 
     @classmethod
-    def of(cls, job: Job) -> Contract | None:
+    def of(cls, job: Job, group: tuple[ExpectationResult, ...] = ()) -> Contract | None:
         """Return the contract of a job, or None."""
-        return None if job.expect is None else cls(job, job.expect)
+        return None if job.expect is None else cls(job, job.expect, group)
 
     def recording_clauses(self) -> Iterator[Clause]:
         """Yield the expectations of the recording."""

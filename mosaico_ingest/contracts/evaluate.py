@@ -94,7 +94,7 @@ def evaluate(
 
     `recording_results` evaluates the expectations of the recording that need more than its topics, by key.
     """
-    results: list[ExpectationResult] = []
+    results: list[ExpectationResult] = list(contract.group)
     for clause in contract.recording_clauses():
         special = recording_results.get(clause.key)
         results.append(special(clause) if special else _recording_result(clause, facts))

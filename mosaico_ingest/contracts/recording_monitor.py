@@ -240,10 +240,8 @@ class RecordingMonitor:
         promised = {topic.topic: topic.count for topic in metadata.topics}
         counts: dict[str, int | None] = {}
         for connection in self._recording.connections:
-            before = counts.get(connection.topic, 0)
-            counts[connection.topic] = (
-                None if None in (before, connection.count) else (before or 0) + (connection.count or 0)
-            )
+            before, count = counts.get(connection.topic, 0), self._count_in_files(connection)
+            counts[connection.topic] = None if before is None or count is None else before + count
         if None in counts.values() and self._range == (None, None):
             counts = {name: topic.count for name, topic in facts.topics.items()}
         different = [
@@ -263,6 +261,15 @@ class RecordingMonitor:
             limit="no topic",
             violations=len(different),
         )
+
+    def _count_in_files(self, connection: Connection) -> int | None:
+        """Return the number of messages in the index, without those that only `metadata.yaml` promises."""
+        absent = sum(
+            item.count or 0
+            for item in self._recording.unreadable
+            if item.connection == connection.id and item.file.endswith("metadata.yaml")
+        )
+        return None if connection.count is None else connection.count - absent
 
 
 def _rows(connection: Connection, topic: ReadTopic) -> tuple[Rows | None, Rows]:

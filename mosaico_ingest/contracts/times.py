@@ -140,7 +140,9 @@ class SlidingWindow:
     def _count(self, starts: int, inside: int) -> None:
         """Count the windows of the first `starts` messages; only `inside` of them end within the time span."""
         times, begins = self._times, self._times[:starts]
-        most = np.searchsorted(times, begins + self.length_ns, "left") - np.arange(starts)
+        most = np.searchsorted(times, begins + self.length_ns, "left") - np.searchsorted(
+            times, begins, "left"
+        )
         self._note(most, most > self.max_count, highest=True)
         if inside:
             left = np.searchsorted(times, begins[:inside], "right")

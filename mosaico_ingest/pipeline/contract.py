@@ -97,6 +97,20 @@ def monitor_of(plan: Plan, recording: Recording) -> RecordingMonitor | None:
     )
 
 
+def check_group(plan: Plan) -> None:
+    """Check the expectations of the group that a recording belongs to, before it is read.
+
+    Raises:
+        ContractError: An expectation failed, and nothing may be committed.
+    """
+    contract = plan.contract
+    if contract is None or contract.expect.on_failure is not OnFailure.FAIL:
+        return
+    result = ContractResult(on_failure=OnFailure.FAIL.value, results=contract.group)
+    if not result.passed:
+        raise contract_error(result)
+
+
 def contract_error(result: ContractResult) -> ContractError:
     """Return the error for a violated contract."""
     findings = tuple(finding for one in result.errors if (finding := one.finding) is not None)

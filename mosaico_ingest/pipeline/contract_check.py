@@ -32,10 +32,10 @@ _SAMPLE_KEYS = frozenset(
 """Expectations of rows that a few messages can violate."""
 
 
-def check_contract(job: Job) -> ContractResult:
+def check_contract(job: Job, group: tuple[ExpectationResult, ...] = ()) -> ContractResult:
     """Return the results of a job's contract for its recording, without writing.
 
-    Only topics with expectations of their rows are decoded. If log times are all that is needed, the messages are not
+    `group` has the results of the group that the recording belongs to. Only topics with expectations of their rows are decoded. If log times are all that is needed, the messages are not
     read: the index has their times.
 
     Raises:
@@ -48,7 +48,7 @@ def check_contract(job: Job) -> ContractResult:
         )
     bridge = ROSBridge.for_job(job)
     with open_job(job) as (recording, resolver):
-        plan = plan_recording(Task(job), recording, bridge=bridge, resolver=resolver)
+        plan = plan_recording(Task(job, group=group), recording, bridge=bridge, resolver=resolver)
         monitor = monitor_of(plan, recording)
         if monitor is None or plan.contract is None:
             raise AssertionError
@@ -157,6 +157,9 @@ class _Rows:
             if self._adapts and definition is not None
             else None
         )
+
+        if self._adapts:
+            monitor.reject(topic.topic, 0)
 
     def add(self, block: MessageBlock) -> None:
         """Add a block."""

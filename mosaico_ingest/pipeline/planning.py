@@ -79,7 +79,7 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
     if not topics:
         raise _nothing_selected(job, recording, excluded)
     check_metadata_contracts(job, dict.fromkeys(topic.topic for topic in topics))
-    contract = Contract.of(job)
+    contract = Contract.of(job, task.group)
     if contract is not None:
         check_expressions(contract, recording.connections, [topic.as_read for topic in topics])
     read_from_ns, read_until_ns = _time_range(

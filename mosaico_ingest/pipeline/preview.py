@@ -24,6 +24,7 @@ from mosaico_ingest.job.patterns import first_match
 from mosaico_ingest.job.values import IfExists, LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.pipeline.contract import monitor_of
 from mosaico_ingest.pipeline.contract_check import index_results, sample_results
+from mosaico_ingest.pipeline.contract_group import results_by_job
 from mosaico_ingest.pipeline.plan import Plan, TopicPlan, digest_of
 from mosaico_ingest.pipeline.plan_document import (
     DestinationState,
@@ -235,7 +236,10 @@ def plan_document(jobs: Sequence[Job], *, manifest: Path, folder: Path, connect:
     Raises:
         IngestError: A job cannot be done; `findings` states the reason for each of them.
     """
-    tried = [_tried(job, connect=connect) for job in jobs]
+    groups = results_by_job(jobs)
+    tried = [
+        _tried(job, connect=connect, group=groups.get(position, ())) for position, job in enumerate(jobs)
+    ]
     planned = tuple(one for one in tried if isinstance(one, RecordingPlan))
     refused = [one for one in tried if isinstance(one, IngestError)]
     if refused:
@@ -247,9 +251,9 @@ def plan_document(jobs: Sequence[Job], *, manifest: Path, folder: Path, connect:
     )
 
 
-def _tried(job: Job, *, connect: bool) -> RecordingPlan | IngestError:
+def _tried(job: Job, *, connect: bool, group: tuple[ExpectationResult, ...]) -> RecordingPlan | IngestError:
     try:
-        return preview(job, connect=connect)
+        return preview(job, connect=connect, group=group)
     except IngestError as error:
         return error
 
@@ -267,7 +271,7 @@ def _all_of(refused: Sequence[IngestError], count: int) -> IngestError:
     return one
 
 
-def preview(job: Job, *, connect: bool) -> RecordingPlan:
+def preview(job: Job, *, connect: bool, group: tuple[ExpectationResult, ...] = ()) -> RecordingPlan:
     """Plan a recording, convert a sample of its messages, and inspect the destination (a server only with `connect`).
 
     Raises:
@@ -275,7 +279,7 @@ def preview(job: Job, *, connect: bool) -> RecordingPlan:
     """
     bridge = ROSBridge.for_job(job)
     with open_job(job) as (recording, resolver):
-        plan = plan_recording(Task(job), recording, bridge=bridge, resolver=resolver)
+        plan = plan_recording(Task(job, group=group), recording, bridge=bridge, resolver=resolver)
         results = index_results(plan, recording)
         monitor = monitor_of(plan, recording)
         samples = try_messages(plan, recording, monitor)

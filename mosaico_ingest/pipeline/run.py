@@ -16,7 +16,7 @@ from mosaico_ingest.errors import ContractError, IngestError, Interrupted
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import LoaderErrorPolicy
-from mosaico_ingest.pipeline.contract import contract_error
+from mosaico_ingest.pipeline.contract import check_group, contract_error
 from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.planning import plan_recording
 from mosaico_ingest.pipeline.provenance import check_provenance
@@ -78,6 +78,8 @@ def run_recording(task: Task, observe: Observer = ignore_events) -> Outcome:
         with _log_level(job.run.log_level), open_job(job) as (recording, resolver):
             plan = _plan(task, recording, resolver)
             events.start(plan)
+            if not task.dry_run:
+                check_group(plan)
             request = None if task.dry_run else check_provenance(plan)
             if request is None:
                 return events.skip()

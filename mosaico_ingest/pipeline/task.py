@@ -7,6 +7,7 @@ from pathlib import Path
 from msgspec import Struct, structs
 
 from mosaico_ingest.job.model import Job
+from mosaico_ingest.report.contract import ExpectationResult
 
 __all__ = ["Attempt", "Task"]
 
@@ -28,6 +29,8 @@ class Task(Struct, frozen=True):
     attempt: Attempt | None = None
     dry_run: bool = False
     """Whether to plan only, and write nothing."""
+    group: tuple[ExpectationResult, ...] = ()
+    """The results of the expectations of the recordings that belong together (`expect.group`)."""
     code_dir: Path | None = None
     """The folder where the relative paths of adapters start on a machine that they were shipped to."""
 

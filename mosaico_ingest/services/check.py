@@ -17,7 +17,8 @@ from mosaico_ingest.errors import ContractError, IngestError, ManifestError
 from mosaico_ingest.job.manifest import check_manifest, read_manifest, refusal
 from mosaico_ingest.job.model import Job, JobSettings, Origin
 from mosaico_ingest.pipeline.contract_check import check_contract
-from mosaico_ingest.report.contract import ContractResult
+from mosaico_ingest.pipeline.contract_group import results_by_job
+from mosaico_ingest.report.contract import ContractResult, ExpectationResult
 
 
 class Checked(Struct, frozen=True):
@@ -39,13 +40,15 @@ class Checked(Struct, frozen=True):
 
 def check_jobs(jobs: Iterable[Job]) -> Iterator[Checked]:
     """Yield the results of each recording; an unreadable recording does not stop the others."""
-    for job in jobs:
-        yield _checked(job)
+    jobs = tuple(jobs)
+    groups = results_by_job(jobs)
+    for position, job in enumerate(jobs):
+        yield _checked(job, groups.get(position, ()))
 
 
-def _checked(job: Job) -> Checked:
+def _checked(job: Job, group: tuple[ExpectationResult, ...]) -> Checked:
     try:
-        return Checked(job.sequence.name, check_contract(job))
+        return Checked(job.sequence.name, check_contract(job, group))
     except IngestError as error:
         return Checked(job.sequence.name, error=error)
 
