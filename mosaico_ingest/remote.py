@@ -41,7 +41,7 @@ _SDK = re.compile(r"^.*?AWS Error |\s*\(Request ID: [^)]*\)")
 
 
 @contextmanager
-def reaching(where: str) -> Generator[None, None, None]:
+def translate_errors(where: str) -> Generator[None, None, None]:
     """Raise IngestError for errors of a file system; a missing object remains a FileNotFoundError.
 
     Raises:
@@ -53,10 +53,10 @@ def reaching(where: str) -> Generator[None, None, None]:
     except FileNotFoundError:
         raise
     except OSError as err:
-        raise explained(err, where) from err
+        raise as_ingest_error(err, where) from err
 
 
-def explained(err: OSError, where: str) -> IngestError:
+def as_ingest_error(err: OSError, where: str) -> IngestError:
     """Return the IngestError for an error of a file system at `where`."""
     message = _SDK.sub("", str(err).strip().splitlines()[0] if str(err).strip() else type(err).__name__)
     if is_transient(err):
@@ -119,7 +119,7 @@ def _s3(bucket: str, options: dict[str, str]) -> FileSystem:
 
     region = options.get("region")
     if region is None and "endpoint_override" not in options:
-        with reaching(f"s3://{bucket}"):
+        with translate_errors(f"s3://{bucket}"):
             region = fs.resolve_s3_region(bucket)
     return fs.S3FileSystem(
         region=region,
@@ -265,7 +265,7 @@ class RemotePath:
         from pyarrow.fs import FileSelector  # noqa: PLC0415 - slow to import, and only jobs with URLs need it
 
         selector = FileSelector(self.filesystem_path, allow_not_found=True, recursive=recursive)
-        with reaching(str(self)):
+        with translate_errors(str(self)):
             infos = self.filesystem.get_file_info(selector)
         bucket = self.root.partition("://")[2]
         for info in sorted(infos, key=lambda info: info.path):
@@ -294,17 +294,17 @@ class RemotePath:
         """
         if mode != "rb":
             raise ValueError(f"mode {mode!r} is not supported for URLs; use 'rb'")
-        with reaching(str(self)):
+        with translate_errors(str(self)):
             return self.filesystem.open_input_stream(self.filesystem_path, compression=None)
 
     def open_input(self) -> pa.NativeFile:
         """Open the object for random access."""
-        with reaching(str(self)):
+        with translate_errors(str(self)):
             return self.filesystem.open_input_file(self.filesystem_path)
 
     def open_output(self) -> pa.NativeFile:
         """Open the object for writing; it becomes visible when the file is closed."""
-        with reaching(str(self)):
+        with translate_errors(str(self)):
             return self.filesystem.open_output_stream(self.filesystem_path, compression=None)
 
     def version(self, file: pa.NativeFile | None = None) -> str:
@@ -313,7 +313,7 @@ class RemotePath:
         Raises:
             FileNotFoundError: The object does not exist.
         """
-        with reaching(str(self)):
+        with translate_errors(str(self)):
             opened = file or self.open_input()
             metadata = {str(name).lower(): bytes(value).decode() for name, value in opened.metadata().items()}
             tag = next((metadata[name] for name in ("etag", "generation") if metadata.get(name)), None)
@@ -321,12 +321,12 @@ class RemotePath:
 
     def read_bytes(self) -> bytes:
         """Return the content of the object."""
-        with reaching(str(self)), self.open() as file:
+        with translate_errors(str(self)), self.open() as file:
             return bytes(file.read())
 
     def write_bytes(self, content: bytes) -> None:
         """Write the content of the object atomically."""
-        with reaching(str(self)), self.open_output() as file:
+        with translate_errors(str(self)), self.open_output() as file:
             file.write(content)
 
     def unlink(self) -> None:
@@ -335,13 +335,13 @@ class RemotePath:
         Raises:
             FileNotFoundError: The object does not exist.
         """
-        with reaching(str(self)):
+        with translate_errors(str(self)):
             self.filesystem.delete_file(self.filesystem_path)
 
     def _stat_or_none(self) -> RemoteStat | None:
         if self.listed is not None:
             return self.listed
-        with reaching(str(self)):
+        with translate_errors(str(self)):
             return _stat(self.filesystem.get_file_info(self.filesystem_path))
 
 

@@ -93,8 +93,10 @@ def serve(
     try:
         typer.echo(f"serving {store} at {server.location}")
         if keyring is None:
-            who = "on this machine" if host in LOOPBACK else "who can reach this machine"
-            typer.echo(f"warning: without --api-keys, everyone {who} can read, write and delete", err=True)
+            callers = "on this machine" if host in LOOPBACK else "who can reach this machine"
+            typer.echo(
+                f"warning: without --api-keys, everyone {callers} can read, write and delete", err=True
+            )
         server.wait()
     except KeyboardInterrupt:
         typer.echo("stopping")

@@ -16,7 +16,7 @@ from typing import Any
 from msgspec import Struct, structs
 
 from mosaico_ingest.destinations.registry import destination_of
-from mosaico_ingest.destinations.store.errors import explained
+from mosaico_ingest.destinations.store.errors import translate_errors
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.batch import Batch, Registrations
 from mosaico_ingest.executors.processes import ATTEMPTS
@@ -278,7 +278,7 @@ def _beacon(tasks: Sequence[Task], run: str) -> Generator[str]:
     stores = {destination_of(task.job.destination).local_folder for task in tasks}
     folders = [path for path in stores if path is not None]
     for folder in folders:
-        with explained(folder):
+        with translate_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
             (folder / name).touch()
     try:

@@ -23,6 +23,7 @@ from mosaico_ingest.rosbag.definitions.registry import definition_files
 _FILES = "files"
 """The folder of the shipment that mirrors the paths of this machine."""
 _HERE = ".here"
+"""The name of the empty file that keeps a folder in the shipment."""
 _YAML = frozenset({".yaml", ".yml"})
 _CODE = _YAML | {".py"}
 _SHIPPED = {PathRole.WORKER_FILE, PathRole.DEFINITIONS, PathRole.SCHEMA}
@@ -54,11 +55,11 @@ def pack(tasks: Iterable[Task], folder: Path) -> list[Task]:
     Adapters keep their names, so the plan stays the same. Adapters with an absolute path and installed packages are not
     copied and must exist on every machine.
     """
-    box = _Box(folder)
-    return [box.add(task) for task in tasks]
+    packer = _Packer(folder)
+    return [packer.add(task) for task in tasks]
 
 
-class _Box(Struct, frozen=True):
+class _Packer(Struct, frozen=True):
     folder: Path
 
     def add(self, task: Task) -> Task:
@@ -106,20 +107,20 @@ class _Box(Struct, frozen=True):
         if source.parent == base_dir:
             self._add_all(files)
         else:
-            for one in files:
-                _copy(one, self.folder / one.relative_to(source.parent))
+            for code in files:
+                _copy(code, self.folder / code.relative_to(source.parent))
 
     def _add_all(self, files: Iterable[Path], *, folder: Path | None = None) -> None:
         for file in files:
             _copy(file, self.folder / _shipped(file))
-        if folder is not None:  # `../adapters` needs its folder, and a shipment drops empty ones
-            kept = self.folder / _shipped(folder) / _HERE
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            kept.touch()
+        if folder is not None:  # `../adapters` needs its folder, and shipments contain no empty folders
+            marker = self.folder / _shipped(folder) / _HERE
+            marker.parent.mkdir(parents=True, exist_ok=True)
+            marker.touch()
 
 
 def _beside(file: Path, suffixes: frozenset[str]) -> Iterator[Path]:
-    """Yield the files in the folder of a file and those of its packages."""
+    """Yield the files in the folder of a file, and the files of the packages in that folder."""
     folder = _absolute(file).parent
     yield from _matching(folder.iterdir(), suffixes)
     for package in folder.glob("*/__init__.py"):

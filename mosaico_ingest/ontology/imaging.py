@@ -33,9 +33,9 @@ class Image(Stamped, Serializable):
     format: ImageFormat
     """The encoding of `data`; `png` is a lossless grayscale picture `stride` bytes wide, whatever the pixel encoding."""
     width: Int32
-    """pixels."""
+    """Width in pixels."""
     height: Int32
-    """pixels."""
+    """Height in pixels."""
     stride: Int32
     """Bytes per image row."""
     encoding: str
@@ -59,11 +59,11 @@ class ROI(Serializable):
     """A rectangle within an image."""
 
     offset: Vector2d
-    """Upper left corner, pixels."""
+    """Upper left corner in pixels."""
     height: UInt32
-    """pixels."""
+    """Height in pixels."""
     width: UInt32
-    """pixels."""
+    """Width in pixels."""
     do_rectify: bool | None = None
     """Whether the rectangle also applies to the rectified image."""
 
@@ -72,9 +72,9 @@ class CameraInfo(Stamped, Serializable):
     """The calibration of a camera; matrices are in row-major order."""
 
     height: UInt32
-    """pixels, at calibration."""
+    """Height in pixels at calibration."""
     width: UInt32
-    """pixels, at calibration."""
+    """Width in pixels at calibration."""
     distortion_model: str
     """The distortion model, such as `plumb_bob`."""
     distortion_parameters: list[Float64]
@@ -88,4 +88,4 @@ class CameraInfo(Stamped, Serializable):
     binning: Vector2d | None = None
     """Number of sensor pixels combined into one, horizontally and vertically; null without binning."""
     roi: ROI | None = None
-    """The part of the sensor in use; null for all of it."""
+    """The part of the sensor in use; null for the complete sensor."""

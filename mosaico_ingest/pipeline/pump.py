@@ -48,7 +48,7 @@ class Written(Struct, frozen=True):
 
     topics: tuple[TopicPipeline, ...]
     stored: tuple[StoredTopic, ...]
-    """What the destination reports after the commit."""
+    """The topics as the destination reports them after the commit."""
     missing: tuple[str, ...] = ()
     """One line per topic with messages that the index promises and that were neither read nor unreadable."""
     failure: BaseException | None = None
@@ -309,7 +309,7 @@ def _padded(topic: TopicPipeline) -> Finding:
         Severity.WARNING,
         f"{topic.plan.topic}: {topic.padded} messages end in 4 to 7 zero bytes that {topic.plan.msgtype} does not"
         " explain",
-        help="check that the definition is the one the messages were written with",
+        help="check that the messages were written with this definition",
     )
 
 

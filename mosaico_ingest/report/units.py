@@ -68,7 +68,7 @@ def stored_text(source_bytes: int, stored_bytes: int) -> str:
 
 
 def written_text(report: Report) -> str:
-    """Return how many messages were written, out of those read or, if the run stopped early, of the recording."""
+    """Return the number of written messages, out of the messages read or, if the run stopped early, of the recording."""
     written, read = report.totals.written, report.totals.read
     promised = sum(topic.promised or 0 for topic in report.topics if topic.status.value != "excluded")
     if report.status.value in {"failed", "interrupted"} and promised > read:
@@ -77,7 +77,7 @@ def written_text(report: Report) -> str:
 
 
 def unreadable_text(reports: Iterable[Report]) -> str:
-    """Return how many messages could not be read, such as `12`, `at least 12` or `unknown`."""
+    """Return the number of unreadable messages, such as `12`, `at least 12` or `unknown`."""
     counts = [item.count for report in reports for item in report.unreadable_ranges]
     total = sum(count or 0 for count in counts)
     if None not in counts:

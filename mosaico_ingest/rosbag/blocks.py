@@ -228,7 +228,7 @@ class SplitReader(Protocol):
     path: AnyPath
     """The path that the caller named, even if a temporary copy is read."""
     container: str
-    """Name of the container format, see `formats.CONTAINERS`."""
+    """Name of the container format, see `containers.CONTAINERS`."""
     connections: tuple[SplitConnection, ...]
     message_count: int | None
     """Number of messages according to the index; None if there is no index."""

@@ -16,7 +16,7 @@ from typing import Protocol
 from msgspec import Struct
 
 from mosaico_ingest.errors import BagError, Unreachable
-from mosaico_ingest.remote import AnyPath, RemotePath, reaching
+from mosaico_ingest.remote import AnyPath, RemotePath, translate_errors
 from mosaico_ingest.rosbag.compression import allocate
 
 __all__ = [
@@ -328,7 +328,7 @@ class RemoteSource:
         self._pages: deque[_Range] = deque(maxlen=_CACHED_PAGES)
         try:
             self._file = path.open_input()
-            with reaching(str(path)):
+            with translate_errors(str(path)):
                 self.size: int = self._file.size()
                 self._version = path.version(self._file)
         except FileNotFoundError as err:
@@ -406,7 +406,7 @@ class RemoteSource:
 
     def _fetch(self, start: int, stop: int) -> bytes:
         try:
-            with reaching(str(self.path)):
+            with translate_errors(str(self.path)):
                 data = self._file.read_at(stop - start, start)  # pyright: ignore[reportCallIssue] - the stubs lack the arguments
         except Unreachable:
             raise

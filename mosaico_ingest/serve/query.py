@@ -23,7 +23,7 @@ import pyarrow.dataset as ds
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from mosaico_ingest.destinations.store.errors import explained
+from mosaico_ingest.destinations.store.errors import translate_errors
 from mosaico_ingest.destinations.store.model import SegmentInfo, SequenceInfo, TopicInfo
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.protocol import messages
@@ -475,7 +475,7 @@ def _matching_batches(
     if condition is None:
         return
     for segment in _candidate_segments(store, topic, tests):
-        with explained(segment.path):
+        with translate_errors(segment.path):
             rows = ds.dataset(str(segment.path), schema=topic.schema, format="parquet")
             for batch in rows.to_batches(columns=[topic.schema.names[0]], filter=condition):
                 deadline.check()

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import pyarrow as pa
 from msgspec import Struct
 
-from mosaico_ingest.destinations.store.errors import explained
+from mosaico_ingest.destinations.store.errors import translate_errors
 from mosaico_ingest.destinations.store.files import opened
 from mosaico_ingest.destinations.store.model import SegmentInfo, TopicInfo
 from mosaico_ingest.destinations.store.segment import time_span
@@ -130,7 +130,7 @@ def _start_of_last(topic: TopicInfo, count: int, end_ns: int | None) -> int | No
 
 def _row_groups(segments: Sequence[SegmentInfo]) -> Iterator[_RowGroup]:
     for segment in segments:
-        with explained(str(segment.path)), opened(segment.path) as file:
+        with translate_errors(str(segment.path)), opened(segment.path) as file:
             for number in range(file.num_row_groups):
                 start_ns, end_ns = time_span(file.metadata, number)
                 rows = file.metadata.row_group(number).num_rows
@@ -153,12 +153,12 @@ def _nearest(groups: Sequence[_RowGroup], at_ns: int, name: str) -> tuple[_RowGr
 
 
 def _times(group: _RowGroup, name: str) -> npt.NDArray[np.int64]:
-    with explained(str(group.segment.path)), opened(group.segment.path) as file:
+    with translate_errors(str(group.segment.path)), opened(group.segment.path) as file:
         return file.read_row_group(group.number, columns=[name]).column(0).to_numpy()
 
 
 def _read(group: _RowGroup, schema: pa.Schema) -> pa.Table:
-    with explained(str(group.segment.path)), opened(group.segment.path) as file:
+    with translate_errors(str(group.segment.path)), opened(group.segment.path) as file:
         return _as(schema, file.read_row_group(group.number, columns=schema.names))
 
 
@@ -166,7 +166,7 @@ def _rows_of(segment: SegmentInfo, schema: pa.Schema, positions: npt.NDArray[np.
     """Return the rows at these positions of a segment."""
     tables: list[pa.Table] = []
     start = 0
-    with explained(str(segment.path)), opened(segment.path) as file:
+    with translate_errors(str(segment.path)), opened(segment.path) as file:
         for number in range(file.num_row_groups):
             rows = file.metadata.row_group(number).num_rows
             inside = positions[(positions >= start) & (positions < start + rows)] - start

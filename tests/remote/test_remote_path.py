@@ -12,7 +12,7 @@ from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.manifest import load_manifest
 from mosaico_ingest.job.values import StoreTarget
 from mosaico_ingest.pipeline.compile import compile_manifest
-from mosaico_ingest.remote import RemotePath, as_path, filesystem, is_url, reaching
+from mosaico_ingest.remote import RemotePath, as_path, filesystem, is_url, translate_errors
 
 
 def test_remote_path_has_the_parts_of_a_path() -> None:
@@ -92,7 +92,7 @@ def test_filesystem_of_gs_url_is_the_google_client() -> None:
     ],
 )  # fmt: skip
 def test_client_error_becomes_a_typed_error(error: OSError, kind: type[Exception], said: str) -> None:
-    with pytest.raises(kind, match=said) as raised, reaching("s3://bucket/a"):
+    with pytest.raises(kind, match=said) as raised, translate_errors("s3://bucket/a"):
         raise error
     assert type(raised.value) is kind
 

@@ -23,7 +23,7 @@ from disks import MEBIBYTE, read_only, small_disk
 
 from mosaico_ingest.destinations.store import Store, StoreSink, catalog
 from mosaico_ingest.destinations.store.catalog import FORMAT, Catalog
-from mosaico_ingest.destinations.store.errors import explained
+from mosaico_ingest.destinations.store.errors import translate_errors
 from mosaico_ingest.destinations.store.files import Lease, is_live
 from mosaico_ingest.destinations.store.segment import SegmentWriter
 from mosaico_ingest.errors import SinkError, SinkUnavailable
@@ -258,7 +258,7 @@ def test_session_beyond_file_size_limit_fails_and_leaves_no_files(store: Store) 
 
 
 def test_explained_locked_database_raises_sink_unavailable() -> None:
-    with pytest.raises(SinkUnavailable, match="busy"), explained("store"):
+    with pytest.raises(SinkUnavailable, match="busy"), translate_errors("store"):
         raise sqlite3.OperationalError("database is locked")
 
 

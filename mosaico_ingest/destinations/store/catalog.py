@@ -20,7 +20,7 @@ from typing import Any
 import pyarrow as pa
 
 from mosaico_ingest.destinations.base import check_same_type, sequence_exists
-from mosaico_ingest.destinations.store.errors import NotInStore, explained, sequence_changed
+from mosaico_ingest.destinations.store.errors import NotInStore, sequence_changed, translate_errors
 from mosaico_ingest.destinations.store.listing import Listing, SequenceFilter, listing
 from mosaico_ingest.destinations.store.model import (
     Claim,
@@ -117,7 +117,7 @@ class Catalog:
     def __init__(self, path: Path, *, create: bool) -> None:
         self.path = path
         self.root = path.parent
-        with explained(path):
+        with translate_errors(path):
             if create:
                 path.parent.mkdir(parents=True, exist_ok=True)
             elif not path.is_file():
@@ -138,7 +138,7 @@ class Catalog:
 
     def keep_open(self) -> sqlite3.Connection:
         """Return an idle connection, since only closing the last connection costs a checkpoint."""
-        with explained(self.path):
+        with translate_errors(self.path):
             return self._connect("rw")
 
     def claim(
@@ -223,7 +223,7 @@ class Catalog:
     def _task(
         self, begin: str, *, mode: str, lasting: bool = True
     ) -> Generator[sqlite3.Connection, None, None]:
-        with explained(self.path), closing(self._connect(mode)) as db:
+        with translate_errors(self.path), closing(self._connect(mode)) as db:
             if not lasting:
                 # The WAL stays consistent, but its last transactions may be missing after a power cut.
                 db.execute("PRAGMA synchronous = NORMAL")

@@ -11,8 +11,7 @@ from contextlib import contextmanager
 import pyarrow as pa
 
 from mosaico_ingest.errors import SinkError, SinkUnavailable, Unreachable
-from mosaico_ingest.remote import AnyPath, is_transient
-from mosaico_ingest.remote import explained as unreachable
+from mosaico_ingest.remote import AnyPath, as_ingest_error, is_transient
 
 _HINTS = {
     errno.ENOSPC: "free some space, or choose another target.store",
@@ -37,7 +36,7 @@ def sequence_changed(sequence: str) -> SinkError:
 
 
 @contextmanager
-def explained(where: AnyPath | str) -> Generator[None, None, None]:
+def translate_errors(where: AnyPath | str) -> Generator[None, None, None]:
     """Raise SinkError, with the location and a hint, for errors of the disk, SQLite or Arrow inside."""
     try:
         yield
@@ -45,7 +44,7 @@ def explained(where: AnyPath | str) -> Generator[None, None, None]:
         raise SinkUnavailable(err.what, where=err.where, hint=err.hint) from err
     except OSError as err:
         if is_transient(err):
-            cause = unreachable(err, str(where))
+            cause = as_ingest_error(err, str(where))
             raise SinkUnavailable(cause.what, where=cause.where, hint=cause.hint) from err
         code = err.errno or 0
         what = os.strerror(code) if code else _first_line(err)
@@ -53,12 +52,12 @@ def explained(where: AnyPath | str) -> Generator[None, None, None]:
     except pa.ArrowException as err:
         raise SinkError(_first_line(err), where=str(where)) from err
     except sqlite3.OperationalError as err:
-        raise _explain(err, str(where)) from err
+        raise _sqlite_error(err, str(where)) from err
     except sqlite3.Error as err:
         raise SinkError(f"the catalog cannot be used: {_first_line(err)}", where=str(where)) from err
 
 
-def _explain(err: sqlite3.OperationalError, where: str) -> SinkError:
+def _sqlite_error(err: sqlite3.OperationalError, where: str) -> SinkError:
     text = str(err)
     if "locked" in text:
         return SinkUnavailable("the catalog is busy with another process", where=where, hint="try again")

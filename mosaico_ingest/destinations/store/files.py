@@ -42,7 +42,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from msgspec import Struct
 
-from mosaico_ingest.destinations.store.errors import explained
+from mosaico_ingest.destinations.store.errors import translate_errors
 from mosaico_ingest.errors import IngestError, SinkUnavailable
 from mosaico_ingest.remote import AnyPath, RemotePath
 
@@ -159,7 +159,7 @@ class LocalFiles(Struct, frozen=True):
 
     def begin(self, session: str) -> Lease:
         """Create a session's folder and lock it while its writer is alive."""
-        with explained(self.staging):
+        with translate_errors(self.staging):
             self.session(session).mkdir(parents=True)
             return Lease(self.lock(session))
 
@@ -276,7 +276,7 @@ class ObjectFiles:
 
     def is_there(self) -> bool:
         """Return whether the store exists."""
-        with explained(self.root):
+        with translate_errors(self.root):
             return (self.root / MARKER).is_file()
 
     def topic(self, sequence: str, topic: str) -> RemotePath:
@@ -296,13 +296,13 @@ class ObjectFiles:
 
     def begin(self, session: str) -> Heartbeat:
         """Start the heartbeat of a session, which runs until the lease is released."""
-        with explained(self.root):
+        with translate_errors(self.root):
             beat = self._beats[session] = Heartbeat(self._session(session))
         return beat
 
     def is_live(self, session: str) -> bool:
         """Return whether the session has a recent heartbeat, by the clock of the store."""
-        with explained(self.root):
+        with translate_errors(self.root):
             try:
                 last_beat_ns = self._session(session).stat().st_mtime_ns
             except FileNotFoundError:

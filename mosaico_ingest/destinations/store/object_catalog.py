@@ -24,7 +24,7 @@ import pyarrow as pa
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mosaico_ingest.destinations.base import check_same_type, sequence_exists
-from mosaico_ingest.destinations.store.errors import NotInStore, explained, sequence_changed
+from mosaico_ingest.destinations.store.errors import NotInStore, sequence_changed, translate_errors
 from mosaico_ingest.destinations.store.files import MARKER, ObjectFiles, encoded, new_session_id
 from mosaico_ingest.destinations.store.listing import Listing, SequenceFilter, SequenceSummary
 from mosaico_ingest.destinations.store.model import (
@@ -288,7 +288,7 @@ class ObjectCatalog:
         self._bucket = bucket
         self._root = bucket.root
         marker = self._root / MARKER
-        with explained(self._root):
+        with translate_errors(self._root):
             try:
                 version = _number(marker.read_bytes())
             except FileNotFoundError:
@@ -328,7 +328,7 @@ class ObjectCatalog:
         if claimed.if_exists is IfExists.APPEND:
             with self._holding(claimed.sequence, session=new.id):
                 return self._enter(claimed, new)
-        with explained(self._root):
+        with translate_errors(self._root):
             if not self._claim(new.id, claimed.sequence).exists():
                 raise sequence_changed(claimed.sequence)
         replaced = self._enter(claimed, new)
@@ -338,7 +338,7 @@ class ObjectCatalog:
 
     def release(self, session: str, sequence: str) -> None:
         """See `StoreCatalog.release`."""
-        with explained(self._root), suppress(FileNotFoundError):
+        with translate_errors(self._root), suppress(FileNotFoundError):
             self._claim(session, sequence).unlink()
 
     def create(self, sequence: str, metadata: str) -> None:
@@ -399,7 +399,7 @@ class ObjectCatalog:
         """See `StoreCatalog.delete_sequence`."""
         with self._holding(sequence):
             document = self._known(sequence)
-            with explained(self._root):
+            with translate_errors(self._root):
                 self._document(sequence).unlink()
         return document.paths
 
@@ -417,7 +417,7 @@ class ObjectCatalog:
 
     def forget(self, live: Collection[str]) -> set[str]:
         """See `StoreCatalog.forget`."""
-        with explained(self._root):
+        with translate_errors(self._root):
             for claim in (self._root / "claims").listing(recursive=True):
                 if claim.is_file() and claim.name not in live:
                     with suppress(FileNotFoundError):
@@ -480,7 +480,7 @@ class ObjectCatalog:
     def _reserve(self, session: str, sequence: str, is_live: Callable[[str], bool]) -> None:
         """Claim a sequence, then check for other claims; see the module docstring."""
         own = self._claim(session, sequence)
-        with explained(self._root):
+        with translate_errors(self._root):
             own.write_bytes(b"")
             others = [one for one in own.parent.iterdir() if one.is_file() and one.name != session]
             for other in others:
@@ -499,7 +499,7 @@ class ObjectCatalog:
         return self._root / f"claims/{encoded(sequence)}/{session}"
 
     def _paths(self) -> list[RemotePath]:
-        with explained(self._root):
+        with translate_errors(self._root):
             below = (self._root / "catalog").iterdir()
             return [path for path in below if path.is_file() and path.suffix == _SUFFIX]
 
@@ -523,7 +523,7 @@ class ObjectCatalog:
             return None
 
     def _read(self, path: RemotePath) -> SequenceDocument:
-        with explained(path):
+        with translate_errors(path):
             try:
                 return SequenceDocument.model_validate(json.loads(path.read_bytes()))
             except FileNotFoundError as err:
@@ -534,7 +534,7 @@ class ObjectCatalog:
 
     def _put(self, document: SequenceDocument) -> None:
         content = json.dumps(document.model_dump(mode="python"), default=str).encode()
-        with explained(self._root):
+        with translate_errors(self._root):
             self._document(document.name).write_bytes(content)
 
 

@@ -20,13 +20,14 @@ from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote import AnyPath
 
 _LEVEL = 1
+"""Compression level of zstd."""
 _SAMPLE_BYTES = 1 << 18
 _SAMPLES = 16
 _PIECE_BYTES = _SAMPLE_BYTES // _SAMPLES
-_TOO_LITTLE = 1 << 12
-_TOO_LITTLE_A_COLUMN = 1 << 8
-"""Below these sizes, compression takes longer than writing the uncompressed bytes."""
-_WORTH_IT = 0.9
+_MIN_BYTES, _MIN_COLUMN_BYTES = 1 << 12, 1 << 8
+"""Sizes of rows, in total and per column, below which compression takes longer than writing the uncompressed bytes."""
+_MAX_COMPRESSED_SHARE = 0.9
+"""Compressed size of a sample, relative to its size, above which a column is not compressed."""
 
 
 class Leaf(Struct, frozen=True):
@@ -47,7 +48,7 @@ class Leaf(Struct, frozen=True):
 
 
 class Columns:
-    """The Parquet columns of one schema, and how each is written.
+    """The Parquet columns of one schema, with the writer options of each.
 
     Raises:
         pa.ArrowInvalid: Parquet cannot store the columns; raised before a file is created.
@@ -63,9 +64,9 @@ class Columns:
             for field in schema
             for leaf in _walk(Leaf(field.name, (field.name,), field.type, repeated=False))
         )
-        """In the order of Parquet's column numbers."""
+        """The columns in the order of Parquet's column numbers."""
         self.makers = column_makers(schema)
-        self._few = _options(self.leaves, {leaf.parquet_path for leaf in self.leaves})
+        self._options_of_few_rows = _options(self.leaves, {leaf.parquet_path for leaf in self.leaves})
 
     def writer_options(self, rows: pa.Table) -> dict[str, Any]:
         """Return the options of `pq.ParquetWriter`, chosen by type, and for blobs by the compression of a sample.
@@ -73,10 +74,10 @@ class Columns:
         Byte stream split makes floats smaller and faster to write than plain or dictionary pages. Compressed images do
         not shrink further, and compressing a few rows saves no disk block.
         """
-        if rows.nbytes < max(_TOO_LITTLE, _TOO_LITTLE_A_COLUMN * len(self.leaves)):
-            return self._few
-        packed = (leaf for leaf in self.leaves if _is_blob(leaf) and not _shrinks(leaf, rows))
-        return _options(self.leaves, {leaf.parquet_path for leaf in packed})
+        if rows.nbytes < max(_MIN_BYTES, _MIN_COLUMN_BYTES * len(self.leaves)):
+            return self._options_of_few_rows
+        dense = (leaf for leaf in self.leaves if _is_blob(leaf) and not _is_compressible(leaf, rows))
+        return _options(self.leaves, {leaf.parquet_path for leaf in dense})
 
 
 @cache_by_identity
@@ -102,13 +103,13 @@ def _walk(at: Leaf) -> Iterator[Leaf]:
         yield at
 
 
-def _options(columns: tuple[Leaf, ...], packed: Collection[str]) -> dict[str, Any]:
-    """Return the writer's options; `packed` are the paths of columns that are not compressed."""
-    zstd = [leaf.parquet_path for leaf in columns if leaf.parquet_path not in packed]
-    encodings = {leaf.parquet_path: "BYTE_STREAM_SPLIT" for leaf in columns if _splits(leaf.type)}
+def _options(columns: tuple[Leaf, ...], uncompressed: Collection[str]) -> dict[str, Any]:
+    """Return the writer's options; `uncompressed` are the paths of columns that are not compressed."""
+    zstd = [leaf.parquet_path for leaf in columns if leaf.parquet_path not in uncompressed]
+    encodings = {leaf.parquet_path: "BYTE_STREAM_SPLIT" for leaf in columns if _is_float(leaf.type)}
     encodings[columns[0].parquet_path] = "DELTA_BINARY_PACKED"
     return {
-        "compression": dict.fromkeys(zstd, "zstd") | dict.fromkeys(packed, "none"),
+        "compression": dict.fromkeys(zstd, "zstd") | dict.fromkeys(uncompressed, "none"),
         "compression_level": dict.fromkeys(zstd, _LEVEL),
         "use_dictionary": [leaf.parquet_path for leaf in columns if _is_text(leaf.type)],
         "column_encoding": encodings,
@@ -128,16 +129,17 @@ def _is_binary(kind: pa.DataType) -> bool:
     return pa.types.is_binary(kind) or pa.types.is_large_binary(kind) or pa.types.is_binary_view(kind)
 
 
-def _splits(kind: pa.DataType) -> bool:
+def _is_float(kind: pa.DataType) -> bool:
     return pa.types.is_float32(kind) or pa.types.is_float64(kind)
 
 
-def _shrinks(leaf: Leaf, rows: pa.Table) -> bool:
+def _is_compressible(leaf: Leaf, rows: pa.Table) -> bool:
+    """Return whether zstd shrinks a sample of the column; true if the sample is too small to tell."""
     sample = b"".join(_samples(leaf, rows))
-    if len(sample) < _TOO_LITTLE:
+    if len(sample) < _MIN_BYTES:
         return True
-    packed = pa.Codec("zstd", compression_level=_LEVEL).compress(sample)
-    return len(packed) < _WORTH_IT * len(sample)
+    compressed = pa.Codec("zstd", compression_level=_LEVEL).compress(sample)
+    return len(compressed) < _MAX_COMPRESSED_SHARE * len(sample)
 
 
 def _samples(leaf: Leaf, rows: pa.Table) -> Iterator[bytes]:
@@ -239,7 +241,7 @@ class SegmentWriter:
 
     def abandon(self) -> None:
         """Close the file, whose content is discarded."""
-        # a RuntimeError is raised if there is no footer to collect
+        # pyarrow raises RuntimeError if there is no footer to collect.
         with suppress(OSError, pa.ArrowException, RuntimeError):
             self._writer.close()
         with suppress(OSError, pa.ArrowException):

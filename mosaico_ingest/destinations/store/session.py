@@ -25,7 +25,7 @@ from mosaico_ingest.destinations.base import (
 )
 from mosaico_ingest.destinations.store import files
 from mosaico_ingest.destinations.store.checksum import combined
-from mosaico_ingest.destinations.store.errors import explained
+from mosaico_ingest.destinations.store.errors import translate_errors
 from mosaico_ingest.destinations.store.files import new_session_id
 from mosaico_ingest.destinations.store.model import NewNote, NewSession, NewTopic
 from mosaico_ingest.destinations.store.protocols import Files, StoreCatalog
@@ -138,7 +138,7 @@ class StoreTopic:
     def sync(self) -> None:
         """Wait until the finished segments are on the disk."""
         for segment in self.segments[self._synced :]:
-            with explained(self._staging.where):
+            with translate_errors(self._staging.where):
                 files.sync(segment.path)
             self._synced += 1
 
@@ -153,7 +153,7 @@ class StoreTopic:
     @contextmanager
     def _writing(self) -> Generator[None, None, None]:
         """Hold the lock; after an error inside, the file is incomplete and the topic cannot be committed."""
-        with self._lock, explained(self._staging.where):
+        with self._lock, translate_errors(self._staging.where):
             self._check_usable()
             self._broken = True
             yield
@@ -237,7 +237,7 @@ class StoreSession:
         existing = self._claim.types.get(path)
         if existing is not None:
             check_same_type(existing, ontology, where=name)
-        with explained(name):
+        with translate_errors(name):
             folder = self._layout.topic(self._claim.sequence, path)
             topic = StoreTopic(self._staging, path, ontology, described, folder=folder)
         self._staging.topics[path] = self._topics[name] = topic
@@ -257,7 +257,7 @@ class StoreSession:
         name = protocol.check_sequence_name(sequence)
         self._catalog.release(self.id, self._claim.sequence)
         self._claim = self._catalog.claim(self.id, name, IfExists.REPLACE, is_live=self._layout.is_live)
-        with explained(name):
+        with translate_errors(name):
             for topic in self._staging.topics.values():
                 topic.folder = self._layout.topic(name, topic.name)
 
@@ -279,7 +279,7 @@ class StoreSession:
         topics = tuple(map(self._placed, self._staging.topics.values()))
         new = NewSession(self.id, self._metadata, self.created_ns, topics, tuple(self._notes))
         try:
-            with explained(self._layout.root):
+            with translate_errors(self._layout.root):
                 self._layout.publish(moves)
             replaced = self._catalog.commit(self._claim, new)
         except BaseException:
@@ -335,7 +335,7 @@ class StoreSession:
         times: list[int] = []
         for segment in topic.segments:
             path = topic.folder / segment.path.name
-            with explained(path):
+            with translate_errors(path):
                 footer = files.footer(path)
                 stored_bytes += path.stat().st_size
                 rows += footer.num_rows

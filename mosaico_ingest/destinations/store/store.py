@@ -14,7 +14,7 @@ from msgspec import Struct
 from mosaico_ingest import protocol
 from mosaico_ingest.destinations.store.catalog import Catalog
 from mosaico_ingest.destinations.store.checksum import ContentHash, column_makers
-from mosaico_ingest.destinations.store.errors import NotInStore, explained
+from mosaico_ingest.destinations.store.errors import NotInStore, translate_errors
 from mosaico_ingest.destinations.store.files import LocalFiles, opened
 from mosaico_ingest.destinations.store.listing import Listing, SequenceFilter
 from mosaico_ingest.destinations.store.model import Collected, NewNote, SegmentInfo, SequenceInfo, TopicInfo
@@ -141,7 +141,7 @@ def _overlapping(segments: Iterable[SegmentInfo]) -> Iterator[list[SegmentInfo]]
 
 
 def _read(segment: SegmentInfo, schema: pa.Schema, window: Window) -> Iterator[pa.RecordBatch]:
-    with explained(str(segment.path)), opened(segment.path) as file:
+    with translate_errors(str(segment.path)), opened(segment.path) as file:
         for group in range(file.num_row_groups):
             if not window.overlaps(*time_span(file.metadata, group)):
                 continue
@@ -349,7 +349,7 @@ class Store(Struct, frozen=True):
 
         Live sessions are kept, and so are staging folders younger than `grace_s`, which may be locked soon.
         """
-        with explained(self.path):
+        with translate_errors(self.path):
             files = list(self.layout.segment_files())
             sessions = self.layout.open_sessions()
             live = {session for session in sessions if self.layout.in_use(session, grace_s)}
