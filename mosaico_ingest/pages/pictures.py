@@ -89,10 +89,10 @@ def picture_strip(topic: TopicInfo) -> Strip:
 
 
 def draw_map(track: Track) -> Map | None:
-    """Return the map of a track; None without finite positions."""
+    """Return the map of a track; None if it has fewer than two different positions."""
     meters = local_metres(track)
     meters = meters[np.isfinite(meters).all(axis=1)]
-    if not len(meters):
+    if not len(meters) or (meters == meters[0]).all():
         return None
     every = -(-len(meters) // MAX_MAP_POINTS)
     points = np.concatenate((meters[::every], meters[-1:]))

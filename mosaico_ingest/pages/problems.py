@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 from msgspec import Struct
 
-from mosaico_ingest.pages.recording import FAILED, contract_of
+from mosaico_ingest.pages.recording import FAILED
 from mosaico_ingest.report.events import TopicStatus
 from mosaico_ingest.report.model import Report, RunReport, replay_command
 from mosaico_ingest.report.units import counted
@@ -116,8 +116,7 @@ def _failures(at: int, report: Report) -> Iterator[_Entry]:
 
 
 def _violations(at: int, report: Report) -> Iterator[_Entry]:
-    contract = contract_of(report)
-    for result in contract.errors if contract else ():
+    for result in report.contract.errors if report.contract else ():
         location = f"{result.location.span}" if result.location else result.expectation
         yield _Entry(
             key=("contract", result.expectation, result.topic or ""),

@@ -12,7 +12,7 @@ from msgspec import Struct
 
 from mosaico_ingest.pages.timeline import Axis, Span, Track, draw_track, interval_text, rate_text, time_axis
 from mosaico_ingest.report.collect import STEP_WORDS, longest_step, step_seconds
-from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Outcome
+from mosaico_ingest.report.contract import ExpectationResult, Outcome
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.model import Report, RunReport, TopicReport, folder_link, replay_command
 from mosaico_ingest.report.units import (
@@ -25,11 +25,11 @@ from mosaico_ingest.report.units import (
     written_text,
 )
 
-FAILED = {RunStatus.DIVERTED, RunStatus.FAILED, RunStatus.INTERRUPTED}
+FAILED = {RunStatus.FAILED, RunStatus.INTERRUPTED}
 STATUS_WORDS = {
     RunStatus.COMPLETED: "completed",
     RunStatus.WITH_ERRORS: "some messages are missing",
-    RunStatus.DIVERTED: "data contract violated",
+    RunStatus.DIVERTED: "diverted, contract violated",
     RunStatus.SKIPPED: "already stored",
     RunStatus.FAILED: "failed",
     RunStatus.INTERRUPTED: "interrupted",
@@ -42,17 +42,14 @@ STATUS_COLORS = {
     RunStatus.FAILED: "bad",
     RunStatus.INTERRUPTED: "bad",
 }
+OUTCOMES = {"failed": 0, "warning": 1, "skipped": 2, "passed": 3}
+"""The words for outcomes of expectations, in the order of lists."""
 MAX_EXAMPLES = 3
 """Quarantined messages that the page shows for each topic and rule."""
 MAX_INDEX_BYTES = 1 << 20
 """Bytes of a quarantine's index that are searched for examples."""
 MAX_SEARCH_TOPICS = 200
 """Topics by whose names a recording can be found."""
-
-
-def contract_of(report: Report) -> ContractResult | None:
-    """Return the contract results of a recording, if its job has a contract."""
-    return getattr(report, "contract", None)
 
 
 class ContractRow(Struct, frozen=True):
@@ -83,16 +80,34 @@ class ContractRow(Struct, frozen=True):
         return time_text(first.log_time_ns) if first and first.log_time_ns is not None else ""
 
 
-def contract_rows(recordings: Sequence[Report]) -> list[ContractRow]:
-    """Return the results of all recordings: errors first, then warnings, skipped and passed expectations."""
-    rows = [
-        ContractRow(f"r{at}", report.sequence, result)
-        for at, report in enumerate(recordings)
-        if (contract := contract_of(report)) is not None
-        for result in contract.results
-    ]
-    order = {"failed": 0, "warning": 1, "skipped": 2, "passed": 3}
-    return sorted(rows, key=lambda row: order[row.word])
+def contract_rows(recording_id: str, report: Report) -> list[ContractRow]:
+    """Return the results of a recording: errors first, then warnings, skipped and passed expectations."""
+    results = report.contract.results if report.contract else ()
+    rows = [ContractRow(recording_id, report.sequence, result) for result in results]
+    return sorted(rows, key=lambda row: OUTCOMES[row.word])
+
+
+class ContractSummary(Struct, frozen=True):
+    """The results of one expectation for all recordings."""
+
+    row: ContractRow
+    """The first of the gravest results."""
+    counts: dict[str, int]
+    """Number of recordings by outcome, the gravest first."""
+
+
+def contract_summaries(recordings: Sequence[Report]) -> list[ContractSummary]:
+    """Return the results by expectation and topic, those with the gravest outcome first."""
+    groups: dict[tuple[str, str | None], list[ContractRow]] = {}
+    for at, report in enumerate(recordings):
+        for row in contract_rows(f"r{at}", report):
+            groups.setdefault((row.result.expectation, row.result.topic), []).append(row)
+    summaries: list[ContractSummary] = []
+    for rows in groups.values():
+        counts = {word: sum(row.word == word for row in rows) for word in OUTCOMES}
+        gravest = min(rows, key=lambda row: OUTCOMES[row.word])
+        summaries.append(ContractSummary(gravest, {word: count for word, count in counts.items() if count}))
+    return sorted(summaries, key=lambda summary: OUTCOMES[summary.row.word])
 
 
 class StepShare(Struct, frozen=True):
@@ -125,7 +140,7 @@ class RecordingView:
         self.id = f"r{at}"
         self.status = STATUS_WORDS[report.status]
         self.color = STATUS_COLORS[report.status]
-        contract = contract_of(report)
+        contract = report.contract
         self.violations = len(contract.errors) if contract else 0
         self.warnings = len(contract.warnings) if contract else 0
         self.totals = report.totals
@@ -235,7 +250,7 @@ class RecordingView:
     @property
     def contract_rows(self) -> list[ContractRow]:
         """The results of the contract."""
-        return contract_rows([self.report])
+        return contract_rows(self.id, self.report)
 
     @cached_property
     def examples(self) -> list[QuarantinedMessage]:

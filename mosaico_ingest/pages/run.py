@@ -14,8 +14,7 @@ from mosaico_ingest.pages.recording import (
     FAILED,
     RecordingView,
     StepShare,
-    contract_of,
-    contract_rows,
+    contract_summaries,
     step_shares,
 )
 from mosaico_ingest.report.collect import slowest, total_seconds
@@ -39,21 +38,21 @@ PACK_SIZE = 25
 """Recordings whose content is packed together."""
 MAX_SLOWEST = 10
 MAX_RESULTS = 200
-"""Contract results that the table lists; failed ones come first."""
+"""Expectations that the table lists; failed ones come first."""
 
 
 def run_page(report: RunReport, folder: Path | None = None, comparison: Comparison | None = None) -> str:
     """Return the page; links to files are relative to `folder` (default: the current one), the page's folder."""
     several = len(report.recordings) > 1
     started = min((one.started_at for one in report.recordings), default=None)
-    results = contract_rows(report.recordings)
+    expectations = contract_summaries(report.recordings)
     return render(
         "run.html",
         report=report,
         verdict=_verdict(report.recordings),
         problems=run_problems(report),
-        results=results[:MAX_RESULTS],
-        result_count=len(results),
+        expectations=expectations[:MAX_RESULTS],
+        expectation_count=len(expectations),
         comparison=comparison,
         started_at=f"{started:%Y-%m-%d %H:%M:%S}" if started else None,
         totals=_totals(report),
@@ -75,9 +74,7 @@ def _verdict(recordings: Sequence[Report]) -> _Verdict:
     if not recordings:
         return _Verdict("none", "No recording was ingested", "The job selected no recording.")
     failed = sum(one.status in FAILED for one in recordings)
-    violations = sum(
-        contract is not None and not contract.passed for contract in map(contract_of, recordings)
-    )
+    violations = sum(one.contract is not None and not one.contract.passed for one in recordings)
     incomplete = sum(one.status is RunStatus.WITH_ERRORS for one in recordings)
     skipped = sum(one.status is RunStatus.SKIPPED for one in recordings)
     counts = {

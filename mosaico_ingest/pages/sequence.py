@@ -22,6 +22,7 @@ from mosaico_ingest.view.images import has_images
 from mosaico_ingest.view.logs import LogExcerpt, has_log, read_excerpt
 from mosaico_ingest.view.pictures import has_pictures
 from mosaico_ingest.view.statistics import ColumnStatistics, TopicStatistics, describe_topic
+from mosaico_ingest.view.tracks import Track as Positions
 from mosaico_ingest.view.tracks import has_track, read_track
 from mosaico_ingest.view.transforms import frame_trees, read_edges
 
@@ -75,6 +76,7 @@ class _Content:
     def __init__(self, store: Store, info: SequenceInfo) -> None:
         self._store, self._info = store, info
         self._problems: list[str] = []
+        self._fixed: list[str] = []
         self._topics = info.topics[:MAX_TOPICS]
         self._axis = time_axis(
             time for topic in info.topics for time in (topic.start_ns, topic.end_ns) if time is not None
@@ -96,6 +98,7 @@ class _Content:
             "cameras": [strip for topic, strip in strips if has_images(topic.schema)],
             "clouds": [strip for topic, strip in strips if not has_images(topic.schema)],
             "maps": list(self._maps()),
+            "fixed": self._fixed,
             "plots": list(self._plots(described)),
             "frames": frame_trees(edges),
             "frame_count": len({name for edge in edges for name in (edge.parent, edge.child)}),
@@ -132,6 +135,8 @@ class _Content:
                 drawing = draw_map(track) if track is not None else None
                 if drawing is not None:
                     yield drawing
+                elif track is not None and len(track.positions):
+                    self._fixed.append(_fixed_position(track))
 
     def _plots(self, described: Mapping[str, TopicStatistics | None]) -> Iterator[TopicPlots]:
         start_ns = self._info.start_ns or 0
@@ -161,6 +166,13 @@ def _facts(info: SequenceInfo) -> dict[str, str]:
         "Start (UTC)": time_text(start_ns),
         "Duration": duration,
     }
+
+
+def _fixed_position(track: Positions) -> str:
+    """Return the position of a topic that does not move."""
+    position = track.positions[0].tolist()
+    unit = "°, ".join(f"{value:.7g}" for value in position[:2]) + "°" if track.is_gps else ""
+    return f"{track.topic} stays at {unit or ', '.join(f'{value:.4g} m' for value in position)}"
 
 
 def _topic_view(topic: TopicInfo, statistics: TopicStatistics | None, axis: Axis | None) -> _TopicView:

@@ -7,12 +7,14 @@ from pathlib import Path
 from urllib.parse import unquote
 
 import pytest
-from run_reports import NASTY, RUNS, Outline, recording, run, unpacked
+from run_reports import NASTY, RUNS, T0, Outline, recording, run, unpacked
 from typer.testing import CliRunner
 
 from mosaico_ingest.cli.app import command_line
-from mosaico_ingest.pages.run import run_page
+from mosaico_ingest.findings import Severity
+from mosaico_ingest.pages.run import MAX_OPEN, run_page
 from mosaico_ingest.report.compare import compare_reports
+from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Occurrence, Outcome
 from mosaico_ingest.report.events import RunStatus
 from mosaico_ingest.report.markdown import markdown_summary
 from mosaico_ingest.report.model import Steps, UnreadableRange
@@ -212,3 +214,37 @@ def test_report_command_compare_lists_changes_on_all_outputs(
         assert result.exit_code == 0, result.output
         assert "/sensor_1" in result.stdout
         assert "missing now" in result.stdout
+
+
+def expectation(topic: str, outcome: Outcome) -> ExpectationResult:
+    return ExpectationResult(
+        expectation="expect.topics./imu.rate",
+        severity=Severity.ERROR,
+        outcome=outcome,
+        text=f"the rate of {topic} is 3 Hz <b>",
+        topic=topic,
+        first=Occurrence(log_time_ns=T0),
+    )
+
+
+def test_run_page_contract_results_are_counted_per_expectation_and_violations_are_problems() -> None:
+    recordings = [
+        recording(at).model_copy(
+            update={
+                "contract": ContractResult(
+                    on_failure="warn",
+                    results=(expectation("/imu", Outcome.FAILED if at == 3 else Outcome.PASSED),),
+                )
+            }
+        )
+        for at in range(60)
+    ]
+    page = run_page(run(*recordings))
+    assert "1 failed, 59 passed" in page
+    assert "The data violate the contract" in page
+    assert page.index("Expectation expect.topics./imu.rate failed") < page.index('id="contract-title"')
+    assert "3 Hz &lt;b&gt;" in page
+    assert '<a href="#r3">drive_003</a>' in page
+    assert "2023-11-14 22:13:20.000" in page
+    # The list of all recordings repeats those that the page also has without scripts.
+    assert unpacked(page).count("<h3>Contract</h3>") == 60 + MAX_OPEN

@@ -62,7 +62,7 @@ def test_sequence_page_plots_related_fields_together(quickstart_page: str) -> No
     assert ["x", "y"] in plots
     assert ["[0]", "[1]"] in plots
     assert ["voltage"] in plots
-    assert quickstart_page.count("<h4>acceleration (m/s²)</h4>") == 1
+    assert quickstart_page.count("<h3>acceleration (m/s²)</h3>") == 1
 
 
 def test_sequence_page_hostile_texts_are_escaped_and_control_characters_visible(store: Store) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import select
 import shutil
 import subprocess
 import tempfile
@@ -46,6 +47,9 @@ class Browser:
 
     def open(self, url: str, *, width: int = 1200, height: int = 900, dark: bool = False) -> None:
         """Load a page and wait until its scripts have run."""
+        self._call(
+            "Page.navigate", url="about:blank"
+        )  # otherwise another fragment of the same page loads nothing
         self.requests.clear()
         self.console.clear()
         features = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
@@ -111,6 +115,8 @@ class Browser:
 
     def _receive(self) -> dict[str, Any]:
         while b"\0" not in self._buffer:
+            if not select.select([self._read], [], [], TIMEOUT_S)[0]:
+                raise TimeoutError("Chromium does not respond")
             more = os.read(self._read, 1 << 16)
             if not more:
                 raise RuntimeError("Chromium has ended")
