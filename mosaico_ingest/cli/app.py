@@ -22,7 +22,7 @@ from mosaico_ingest.version import __version__
 
 COMMANDS = {
     "run": "run", "bag": "run", "inspect": "report", "plan": "plan", "check": "check", "diff": "plan", "init": "plan",
-    "expand": "plan", "verify": "store", "replay": "run", "export": "export", "lint": "lint", "serve": "serve", "browse": "pages", "watch": "watch",
+    "expand": "plan", "view": "view", "verify": "store", "replay": "run", "export": "export", "lint": "lint", "serve": "serve", "browse": "pages", "watch": "watch",
     "status": "watch", "report": "report",
 }  # fmt: skip
 """The module in `cli` that defines each command, in the order of `--help`."""

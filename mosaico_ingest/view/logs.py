@@ -55,7 +55,7 @@ def read_excerpt(topic: TopicInfo, count: int = 50) -> LogExcerpt | None:
     first: list[LogLine] = []
     severe: list[LogLine] = []
     counts: Counter[str] = Counter()
-    for line in _lines(topic):
+    for line in log_lines(topic):
         counts[line.level] += 1
         if len(first) < count:
             first.append(line)
@@ -79,7 +79,8 @@ def _kind(schema: pa.Schema) -> str | None:
     return None
 
 
-def _lines(topic: TopicInfo) -> Iterator[LogLine]:
+def log_lines(topic: TopicInfo) -> Iterator[LogLine]:
+    """Yield the lines of the first `MAX_ROWS` rows in order of time; none if the topic has no lines."""
     kind = _kind(topic.schema)
     used = {"log": ["level", "name", "msg"], "diagnostics": ["status"], "text": ["data"]}.get(kind or "", [])
     names = [topic.schema.names[0], *(name for name in used if name in topic.schema.names)]

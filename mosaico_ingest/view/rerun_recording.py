@@ -1,0 +1,274 @@
+"""A sequence as a recording of the Rerun viewer: images, clouds, transforms, tracks, maps, plots and logs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mosaico_ingest.destinations.store.model import SequenceInfo, TopicInfo
+from mosaico_ingest.destinations.store.store import Window, scan
+from mosaico_ingest.errors import ViewError, missing_library
+from mosaico_ingest.view.clouds import grid_pixels, has_grid, has_points, row_points
+from mosaico_ingest.view.depth import colour_map
+from mosaico_ingest.view.images import decode_image, has_images
+from mosaico_ingest.view.logs import has_log, log_lines
+from mosaico_ingest.view.series import plot_fields, read_series
+from mosaico_ingest.view.tracks import has_track, read_track
+
+__all__ = ["ViewedTopic", "send_sequence"]
+
+TIMELINE = "log_time"
+MAX_POINTS = 100_000
+"""Points per scalar series and track; extreme values are kept."""
+MAX_PLOTS = 6
+"""Topics with a plot of their own in the layout."""
+_JPEG_QUALITY = 90
+_DIRECT = {b"\xff\xd8\xff": "image/jpeg", b"\x89PNG": "image/png"}
+"""Image files that the viewer decodes itself, by their first bytes."""
+_CODECS = {"h264": "H264", "hevc": "H265", "h265": "H265"}
+_LEVELS = {"debug": "DEBUG", "warning": "WARN", "error": "ERROR", "stale": "WARN", "fatal": "CRITICAL"}
+"""The viewer's name of each level that is not INFO."""
+
+
+class ViewedTopic:
+    """What the viewer shows of one topic: the kinds of views, and rows that it cannot show."""
+
+    def __init__(self, topic: TopicInfo) -> None:
+        self.topic = topic
+        self.kinds: list[str] = []
+        self.problems: dict[str, int] = {}
+        """Number of rows by the reason why they are not shown."""
+
+    @property
+    def path(self) -> str:
+        """The path of the entity."""
+        return self.topic.name
+
+    def add_problem(self, error: Exception) -> None:
+        """Count a row that cannot be shown."""
+        self.problems[str(error)] = self.problems.get(str(error), 0) + 1
+
+
+def send_sequence(
+    info: SequenceInfo, *, save: Path | None, start_ns: int | None = None, end_ns: int | None = None
+) -> list[ViewedTopic]:
+    """Open the viewer with a sequence, or write a `.rrd` file, and return what is shown of each topic.
+
+    Topics are read batch by batch, so memory does not depend on the size of the sequence.
+
+    Raises:
+        IngestError: The Rerun SDK is not installed.
+    """
+    rerun = _rerun()
+    recording: Any = rerun.RecordingStream("mosaico_ingest", recording_id=info.name)
+    if save is not None:
+        recording.save(save)
+    else:
+        recording.spawn()
+    sender = _Sender(rerun, recording, Window(start_ns, end_ns))
+    viewed = [sender.send(topic) for topic in info.topics]
+    recording.send_blueprint(_blueprint(viewed))
+    recording.flush()
+    return viewed
+
+
+class _Sender:
+    def __init__(self, rerun: Any, recording: Any, window: Window) -> None:  # noqa: ANN401 - modules and classes without stubs
+        self._rerun = rerun
+        self._recording = recording
+        self._window = window
+
+    def send(self, topic: TopicInfo) -> ViewedTopic:
+        """Send one topic in every form in which the viewer can show it."""
+        viewed = ViewedTopic(topic)
+        schema = topic.schema
+        if has_images(schema) or has_grid(schema):
+            viewed.kinds.append("image")
+            self._send_rows(viewed, self._image)
+        elif has_points(schema):
+            viewed.kinds.append("points")
+            self._send_rows(viewed, self._points)
+        elif "transforms" in schema.names:
+            viewed.kinds.append("transforms")
+            self._send_rows(viewed, self._transforms)
+        else:
+            if has_track(topic):
+                self._send_track(viewed)
+            if has_log(topic):
+                self._send_logs(viewed)
+            self._send_scalars(viewed)
+        return viewed
+
+    def _send_rows(self, viewed: ViewedTopic, log: Any) -> None:  # noqa: ANN401 - a function of a row
+        for row in self._rows(viewed.topic):
+            self._set_time(row[viewed.topic.schema.names[0]])
+            try:
+                log(viewed, row)
+            except ViewError as error:
+                viewed.add_problem(error)
+
+    def _rows(self, topic: TopicInfo) -> Iterator[dict[str, Any]]:
+        for batch in scan(topic.segments, topic.schema, self._window):
+            for at in range(batch.num_rows):  # one row at a time: a batch of images is large
+                yield batch.slice(at, 1).to_pylist()[0]
+
+    def _set_time(self, time_ns: int) -> None:
+        self._recording.set_time(TIMELINE, timestamp=np.datetime64(time_ns, "ns"))
+
+    def _image(self, viewed: ViewedTopic, row: Mapping[str, Any]) -> None:
+        rerun, path = self._rerun, viewed.path
+        data = row["data"]
+        ros_format = str(viewed.topic.metadata.get("ros_format", ""))
+        if has_grid(viewed.topic.schema):
+            self._recording.log(path, rerun.Image(grid_pixels(row)))
+            return
+        codec = _CODECS.get(str(row.get("format")))
+        if codec is not None:
+            self._recording.log(path, rerun.VideoStream(getattr(rerun.VideoCodec, codec), sample=data))
+            return
+        direct = next((kind for start, kind in _DIRECT.items() if bytes(data[:4]).startswith(start)), None)
+        is_colour = not any(word in ros_format for word in ("UC1", "FC1", "bayer", "mono16"))
+        if "encoding" not in row and direct is not None and is_colour:
+            self._recording.log(path, rerun.EncodedImage(contents=data, media_type=direct))
+            return
+        pixels = decode_image(row, ros_format=ros_format)
+        self._recording.log(path, rerun.Image(pixels).compress(jpeg_quality=_JPEG_QUALITY))
+
+    def _points(self, viewed: ViewedTopic, row: Mapping[str, Any]) -> None:
+        points = row_points(row)
+        self._frame(viewed.path, row)
+        shades = points.xyz[:, 2] if points.values is None else points.values
+        colours = colour_map(shades[np.newaxis].astype(np.float64) + 1e-9)[0] if len(shades) else None
+        self._recording.log(viewed.path, self._rerun.Points3D(points.xyz, colors=colours))
+
+    def _frame(self, path: str, row: Mapping[str, Any]) -> None:
+        """Attach an entity to the coordinate frame of a row."""
+        frame = (row.get("header") or {}).get("frame_id")
+        if frame:
+            self._recording.log(path, self._rerun.CoordinateFrame(str(frame).removeprefix("/")))
+
+    def _transforms(self, viewed: ViewedTopic, row: Mapping[str, Any]) -> None:
+        for transform in row["transforms"] or ():
+            inner = transform.get("transform") or transform  # the message of ROS nests the transform
+            parent = (transform.get("header") or {}).get("frame_id")
+            child = transform.get("target_frame_id") or transform.get("child_frame_id")
+            if not parent or not child:
+                viewed.add_problem(ViewError("a transform does not name its frames"))
+                continue
+            translation, rotation = inner["translation"], inner["rotation"]
+            self._recording.log(
+                f"{viewed.path}/{str(child).strip('/')}",
+                self._rerun.Transform3D(
+                    translation=[translation[axis] for axis in "xyz"],
+                    quaternion=[rotation[axis] for axis in "xyzw"],
+                    parent_frame=str(parent).removeprefix("/"),
+                    child_frame=str(child).removeprefix("/"),
+                ),
+            )
+
+    def _send_track(self, viewed: ViewedTopic) -> None:
+        track = read_track(viewed.topic, max_points=MAX_POINTS)
+        if track is None or not len(track.positions):
+            return
+        rerun = self._rerun
+        index = [self._times(track.times_ns)]
+        if track.is_gps:
+            viewed.kinds.append("map")
+            degrees = track.positions[:, :2]
+            line = rerun.GeoLineStrings(lat_lon=[degrees])
+            self._recording.log(f"{viewed.path}/track", line, static=True)
+            columns = rerun.GeoPoints.columns(positions=degrees)
+        else:
+            viewed.kinds.append("trajectory")
+            if track.frame_id:
+                frame = rerun.CoordinateFrame(track.frame_id.removeprefix("/"))
+                for path in (f"{viewed.path}/track", f"{viewed.path}/position"):
+                    self._recording.log(path, frame, static=True)
+            self._recording.log(f"{viewed.path}/track", rerun.LineStrips3D([track.positions]), static=True)
+            columns = rerun.Points3D.columns(positions=track.positions)
+        self._recording.send_columns(f"{viewed.path}/position", index, columns)
+
+    def _send_logs(self, viewed: ViewedTopic) -> None:
+        viewed.kinds.append("logs")
+        for line in log_lines(viewed.topic):
+            if self._window.overlaps(line.time_ns, line.time_ns):
+                self._set_time(line.time_ns)
+                text = f"[{line.source}] {line.text}" if line.source else line.text
+                level = _LEVELS.get(line.level, "INFO")
+                self._recording.log(viewed.path, self._rerun.TextLog(text, level=level))
+
+    def _send_scalars(self, viewed: ViewedTopic) -> None:
+        fields = plot_fields(viewed.topic)
+        if not fields:
+            return
+        for series in read_series(
+            viewed.topic,
+            fields,
+            max_points=MAX_POINTS,
+            start_ns=self._window.start_ns,
+            end_ns=self._window.end_ns,
+        ):
+            finite = np.isfinite(series.values)
+            if not finite.any():
+                continue
+            path = f"{viewed.path}/plot/{series.label}"
+            name = f"{series.label} [{series.unit}]" if series.unit else series.label
+            self._recording.log(path, self._rerun.SeriesLines(names=name), static=True)
+            index = [self._times(series.times_ns[finite])]
+            self._recording.send_columns(
+                path, index, self._rerun.Scalars.columns(scalars=series.values[finite])
+            )
+            if "plot" not in viewed.kinds:
+                viewed.kinds.append("plot")
+
+    def _times(self, times_ns: np.ndarray[Any, np.dtype[np.int64]]) -> Any:  # noqa: ANN401 - as above
+        return self._rerun.TimeColumn(TIMELINE, timestamp=times_ns.astype("datetime64[ns]"))
+
+
+def _blueprint(viewed: list[ViewedTopic]) -> Any:  # noqa: ANN401 - a class of the SDK, which has no stubs for it
+    """Return the layout: space and map above, cameras in the middle, plots and logs below."""
+    blueprint = import_module("rerun.blueprint")
+    by_kind = {
+        kind: [each for each in viewed if kind in each.kinds]
+        for kind in ("points", "trajectory", "transforms", "map", "image", "plot", "logs")
+    }
+    space = [each for kind in ("points", "trajectory", "transforms") for each in by_kind[kind]]
+    rows: list[Any] = []
+    above: list[Any] = []
+    if space:
+        contents = [f"{each.path}/**" for each in space]
+        above.append(blueprint.Spatial3DView(origin="/", contents=contents, name="space"))
+    if by_kind["map"]:
+        above.append(
+            blueprint.MapView(origin="/", contents=[f"{each.path}/**" for each in by_kind["map"]], name="map")
+        )
+    if above:
+        rows.append(blueprint.Horizontal(*above))
+    if by_kind["image"]:
+        rows.append(
+            blueprint.Grid(
+                *(blueprint.Spatial2DView(origin=each.path, name=each.path) for each in by_kind["image"])
+            )
+        )
+    below = [
+        blueprint.TimeSeriesView(origin=f"{each.path}/plot", name=each.path)
+        for each in by_kind["plot"][:MAX_PLOTS]
+    ]
+    if by_kind["logs"]:
+        below.append(
+            blueprint.TextLogView(origin="/", contents=[each.path for each in by_kind["logs"]], name="logs")
+        )
+    if below:
+        rows.append(blueprint.Tabs(*below) if len(below) > 3 else blueprint.Horizontal(*below))  # noqa: PLR2004 - views that fit side by side
+    return blueprint.Blueprint(blueprint.Vertical(*rows), collapse_panels=True)
+
+
+def _rerun() -> Any:  # noqa: ANN401 - a module
+    try:
+        return import_module("rerun")
+    except ImportError as error:
+        raise missing_library("The Rerun SDK", "view") from error
