@@ -75,6 +75,19 @@ class Values(Struct, frozen=True):
         return position if self.rows is None else int(self.rows[position])
 
 
+def locator(span: Span | None, text: str) -> Locate:
+    """Return a function that locates characters of an expression inside of the span of a key or value."""
+
+    def locate(start: int, end: int) -> Span | None:
+        if span is None or span.line != span.end_line or span.end_column - span.column < len(text):
+            return span  # the text is folded or escaped
+        quote = (span.end_column - span.column - len(text)) // 2
+        first = span.column + quote
+        return Span(span.file, span.line, first + start, span.line, first + max(end, start + 1))
+
+    return locate
+
+
 def syntax_findings(text: str, locate: Locate) -> list[Finding]:
     """Return the mistakes of an expression that are independent of the message type."""
     analyzer = _analyzer(locate)

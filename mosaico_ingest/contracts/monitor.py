@@ -21,6 +21,7 @@ from mosaico_ingest.contracts.expressions import (
     Rows,
     Values,
     bind_expression,
+    locator,
     type_findings,
 )
 from mosaico_ingest.contracts.order import FileOrder
@@ -44,7 +45,7 @@ from mosaico_ingest.contracts.values import (
     ontology_stamps_of,
     stamps_of,
 )
-from mosaico_ingest.findings import Finding, Span
+from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.values import RECORDING, Interval
 
 TIME_KEYS = frozenset({"rate", "sliding_rate", "gap", "gaps", "messages", "coverage", "start", "end"})
@@ -281,7 +282,7 @@ def row_monitor(
     findings: list[Finding] = []
     for text, expected, of_field in contract.field_clauses(topic):
         path = of_field[0].path[:-1] if of_field else ()
-        locate = _locator(contract, path)
+        locate = locator(contract.job.span(*path) if path else None, text)
         expression, mistakes = bind_expression(text, message, ontology, locate)
         if expression is not None:
             mistakes = list(type_findings(expression, expected, locate))
@@ -305,20 +306,6 @@ def file_order(contract: Contract, topics: Iterable[str], *, is_mcap: bool) -> F
     if "out_of_order" in wanted or (is_mcap and wanted):
         return FileOrder(has_numbers=is_mcap)
     return None
-
-
-def _locator(contract: Contract, path: tuple[str | int, ...]) -> Any:  # noqa: ANN401 - a function
-    """Return a function that locates a part of an expression, which is the last key of a key path."""
-    span = contract.job.span(*path) if path else None
-
-    def locate(start: int, end: int) -> Span | None:
-        if span is None or span.line != span.end_line or span.end_column - span.column < end:
-            return span
-        quote = int(span.end_column - span.column > len(str(path[-1])))
-        first = span.column + quote
-        return Span(span.file, span.line, first + start, span.line, first + max(end, start + 1))
-
-    return locate
 
 
 _ACCUMULATORS: Mapping[str, Callable[[Any], Accumulator]] = {

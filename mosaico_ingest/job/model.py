@@ -227,11 +227,15 @@ class TopicSettings(Section):
     the selected time have their log time; the report counts them."""
     time_offset: SignedDuration = Field(default=0, examples=["-250ms"])
     """A duration to add to every time of the topic, for a clock that is known to be wrong."""
+    where: Text | None = Field(default=None, examples=["linear_acceleration.z > 5", "status.status >= 0"])
+    """Keep messages for which this expression over their fields is true; its language is that of mappings."""
+    on_change: tuple[Text, ...] = Field(default=(), examples=[["mode", "header.frame_id"]])
+    """Keep messages for which one of these expressions differs from the previous message that `where` keeps."""
     every: Count = Field(default=1, examples=[3])
     """Keep the first of each `every` messages."""
     rate: Frequency | None = Field(default=None, examples=["10 Hz"])
-    """Keep the first message of each interval of this frequency; the first interval starts at the topic's first message. It
-    applies after `every`."""
+    """Keep the first message of each interval of this frequency; the first interval starts at the topic's first message.
+    The rules apply in the order `every`, `where`, `on_change`, `rate`."""
     image: Literal["raw", "png"] = "raw"
     """The encoding of raw images: as recorded, or PNG."""
 

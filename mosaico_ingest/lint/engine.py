@@ -20,7 +20,7 @@ from mosaico_ingest.job.manifest import read_text
 from mosaico_ingest.job.yaml_source import load_source
 from mosaico_ingest.lint.comments import apply_ignores, ignores_in
 from mosaico_ingest.lint.documents import Document, Kind, documents_in, files_below, looks_like_ours
-from mosaico_ingest.lint.expectations import expectation_findings
+from mosaico_ingest.lint.expectations import condition_findings, expectation_findings
 from mosaico_ingest.lint.job import Job, read_job
 from mosaico_ingest.lint.message import MessageFile, read_message
 from mosaico_ingest.lint.rules import CHECKS
@@ -259,6 +259,7 @@ def _job_findings(document: Document, env: Mapping[str, str] | None) -> Iterator
         spans = {finding.span for finding in findings}
         yield from (item for item in _check_job(job, example=document.example) if item.span not in spans)
         yield from expectation_findings(job)
+        yield from condition_findings(job)
         if not document.example:
             yield from _definition_findings(job)
 

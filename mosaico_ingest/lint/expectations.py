@@ -1,4 +1,4 @@
-"""The mistakes in the expressions of data contracts that are visible without a recording."""
+"""The mistakes in the expressions of a manifest that are visible without a recording."""
 
 from __future__ import annotations
 
@@ -6,12 +6,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from mosaico_ingest.adapters.bridge import ROSBridge
-from mosaico_ingest.contracts.expressions import Rows, bind_expression, syntax_findings, type_findings
+from mosaico_ingest.contracts.expressions import (
+    Rows,
+    bind_expression,
+    locator,
+    syntax_findings,
+    type_findings,
+)
 from mosaico_ingest.contracts.recording_monitor import message_rows, ontology_rows
 from mosaico_ingest.errors import AdapterError, BagError, ManifestError
-from mosaico_ingest.findings import Finding, Span
+from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.expect import AllowedNames, Expectations, TopicExpectations
-from mosaico_ingest.job.yaml_source import KeyPath
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 
@@ -28,10 +33,7 @@ def expectation_findings(job: Job) -> Iterator[Finding]:
     for topic, entry in expect.topics.items():
         for text, expected in entry.fields.items():
             path = ("expect", "topics", topic, "fields", text)
-
-            def locate(start: int, end: int, path: KeyPath = path) -> Span | None:
-                return _inside(job.source.key_span(path), str(path[-1]), start, end)
-
+            locate = locator(job.source.key_span(path), text)
             mistakes = syntax_findings(text, locate)
             if not mistakes:
                 for message, ontology in _rows(job, expect, topic, entry):
@@ -43,12 +45,14 @@ def expectation_findings(job: Job) -> Iterator[Finding]:
             yield from mistakes
 
 
-def _inside(span: Span, text: str, start: int, end: int) -> Span:
-    """Return the location of some characters of a key."""
-    if span.line != span.end_line:
-        return span
-    first = span.column + (span.end_column - span.column > len(text))
-    return Span(span.file, span.line, first + start, span.line, first + max(end, start + 1))
+def condition_findings(job: Job) -> Iterator[Finding]:
+    """Yield the mistakes of `where` and `on_change` that do not depend on the message type."""
+    for topic, settings in job.manifest.topic_settings.items():
+        conditions = [] if settings.where is None else [(("where",), settings.where)]
+        conditions += [(("on_change", position), text) for position, text in enumerate(settings.on_change)]
+        for keys, text in conditions:
+            span = job.source.span(("topic_settings", topic, *keys))
+            yield from syntax_findings(text, locator(span, text))
 
 
 def _rows(

@@ -140,6 +140,10 @@ class TopicPlan(Part):
     """The number of messages in the recording's index."""
     every: int = 1
     """Keep the first of each `every` messages."""
+    where: str | None = None
+    """Keep messages for which this expression is true."""
+    on_change: tuple[str, ...] = ()
+    """Keep messages for which one of these expressions differs from the previous message."""
     rate: float | None = None
     """Keep the first message of each interval of this frequency, in Hz."""
     stamp: StampSource = StampSource.LOG

@@ -26,6 +26,7 @@ from mosaico_ingest.job.units import format_time
 from mosaico_ingest.job.values import LoaderErrorPolicy, StampSource, TimeBound, Unmodeled
 from mosaico_ingest.metadata.contract import check_metadata_contracts
 from mosaico_ingest.metadata.sources import fill_in_metadata
+from mosaico_ingest.pipeline.conditions import check_conditions
 from mosaico_ingest.pipeline.definition_lock import check_lock, lock_of
 from mosaico_ingest.pipeline.latched import is_static
 from mosaico_ingest.pipeline.memory import MemoryBudget
@@ -51,7 +52,7 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
         AdapterError: An adapter does not fit its topic, or a type has no adapter and `adapters.unmodeled` is `fail`;
             `findings` has every such topic.
         ContractError: The metadata violates its schema, or the definitions differ from the lock file.
-        ManifestError: An expression of the data contract does not fit the messages of its topic.
+        ManifestError: An expression of `where`, `on_change` or the data contract does not fit the messages of its topic.
         IngestError: The task is for another plan, or a definition has changed and `on_schema_change` is `fail`.
     """
     job, metadata_findings = fill_in_metadata(task.job, recording)
@@ -78,6 +79,7 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
         raise _misfit(job, misfits)
     if not topics:
         raise _nothing_selected(job, recording, excluded)
+    check_conditions(job, topics, recording.connections)
     check_metadata_contracts(job, dict.fromkeys(topic.topic for topic in topics))
     contract = Contract.of(job, task.group)
     if contract is not None:
@@ -161,6 +163,8 @@ def plan_connection(
         },
         on_error=job.on_error.for_topic(connection.topic),
         every=settings.every,
+        where=settings.where,
+        on_change=settings.on_change,
         rate=settings.rate,
         stamp=settings.stamp,
         time_offset_ns=settings.time_offset,

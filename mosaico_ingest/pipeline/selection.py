@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from msgspec import Struct
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from mosaico_ingest.adapters.adapter import Envelope
+from mosaico_ingest.contracts.values import stamps_of
 from mosaico_ingest.job.values import StampSource
+from mosaico_ingest.pipeline.conditions import ConditionFilter, Conditions
 from mosaico_ingest.pipeline.plan import Plan, TopicPlan
 
 Int64s = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 _SECOND_NS = 1_000_000_000
-_HEADER = ("header", "stamp")
 
 
 class RowTimes(Struct, frozen=True):
@@ -42,7 +43,7 @@ def row_times(
     if plan.stamp is StampSource.PUBLISH and publish_times is not None:
         times = _or_log_times(publish_times, log_times)
     elif plan.stamp is StampSource.HEADER:
-        times = _or_log_times(header_stamps(rows), log_times)
+        times = _or_log_times(stamps_of(rows), log_times)
     if plan.time_offset_ns:
         return RowTimes(times.values + plan.time_offset_ns, times.fallback)
     return times
@@ -56,43 +57,30 @@ def _or_log_times(stamps: Int64s | None, log_times: Int64s) -> RowTimes:
     return RowTimes(np.where(missing, log_times, stamps), missing if missing.any() else None)
 
 
-def header_stamps(rows: pa.StructArray) -> Int64s | None:
-    """Return `header.stamp` of each row in nanoseconds, shape (n,), with 0 for null; None if the type has no header."""
-    column: Any = rows
-    for name in _HEADER:
-        if not pa.types.is_struct(column.type) or column.type.get_field_index(name) < 0:
-            return None
-        column = pc.struct_field(column, name)
-    names = {field.name for field in column.type} if pa.types.is_struct(column.type) else set()
-    if not {"sec", "nanosec"} <= names:
-        return None
-    seconds, fraction = (
-        pc.struct_field(column, part).cast(pa.int64()).fill_null(0).to_numpy(zero_copy_only=False)
-        for part in ("sec", "nanosec")
-    )
-    return seconds * _SECOND_NS + fraction
-
-
 def row_selector(plan: Plan, topic: TopicPlan) -> RowSelector | None:
     """Return the selector of a topic, or None if it keeps all rows."""
     if plan.selects_after_reading:
         return RowSelector(topic, plan.read_from_ns, plan.read_until_ns)
-    return None if topic.rate is None else RowSelector(topic)
+    drops = topic.rate is not None or topic.where is not None or bool(topic.on_change)
+    return RowSelector(topic) if drops else None
 
 
 @dataclass(slots=True)
 class RowSelector:
-    """Selects the rows of one topic by time range and rate; its state spans all blocks of the topic."""
+    """Selects the rows of one topic by time range, conditions and rate; its state spans all blocks of the topic."""
 
     plan: TopicPlan
     start_ns: int | None = None
     """Earlier rows are dropped; None if the reader has applied the time range already."""
     end_ns: int | None = None
     """Rows of this time or later are dropped."""
+    _filter: ConditionFilter = field(default_factory=ConditionFilter)
     _origin_ns: int | None = None
     _last_interval: int = -1
 
-    def select(self, times: Int64s) -> tuple[Mask | None, Mapping[str, Mask]]:
+    def select(
+        self, times: Int64s, rows: pa.StructArray, envelope: Envelope, conditions: Conditions | None
+    ) -> tuple[Mask | None, Mapping[str, Mask]]:
         """Return the rows to keep, or None for all of them, and the rows that each rule drops.
 
         A row counts for the first rule that drops it.
@@ -104,9 +92,18 @@ class RowSelector:
             inside = times >= start if self.end_ns is None else (times >= start) & (times < self.end_ns)
             dropped["time_range"] = keep & ~inside
             keep &= inside
+        if conditions is not None:
+            remaining = rows if keep.all() else rows.filter(pa.array(keep))
+            where, on_change = (
+                _scattered(mask, keep)
+                for mask in self._filter.select(
+                    conditions, remaining, replace(envelope, log_times=envelope.log_times[keep])
+                )
+            )
+            dropped |= {"where": keep & ~where, "on_change": where & ~on_change}
+            keep = on_change
         if self.plan.rate is not None:
-            selected = np.zeros(len(times), bool)
-            selected[keep] = self._first_of_intervals(times[keep], self.plan.rate)
+            selected = _scattered(self._first_of_intervals(times[keep], self.plan.rate), keep)
             dropped["rate"] = keep & ~selected
             keep = selected
         return (None, {}) if keep.all() else (keep, dropped)
@@ -121,3 +118,10 @@ class RowSelector:
         latest = np.maximum.accumulate(np.concatenate(([self._last_interval], intervals)))
         self._last_interval = int(latest[-1])
         return intervals > latest[:-1]
+
+
+def _scattered(mask: Mask, rows: Mask) -> Mask:
+    """Return a mask over all rows from a mask over some rows."""
+    result = np.zeros(len(rows), bool)
+    result[rows] = mask
+    return result

@@ -28,6 +28,7 @@ from mosaico_ingest.errors import (
 from mosaico_ingest.findings import RowFailure, Stage
 from mosaico_ingest.job.values import LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.ontology.types import OntologyType, RequiredFields
+from mosaico_ingest.pipeline.conditions import Conditions, bind_conditions
 from mosaico_ingest.pipeline.plan import TopicPlan
 from mosaico_ingest.pipeline.quarantine import Quarantine
 from mosaico_ingest.pipeline.selection import RowSelector, row_times
@@ -113,6 +114,7 @@ class TopicPipeline:
     _connections: dict[int, Connection] = field(default_factory=dict[int, Connection])
     _decoders: dict[int, Decoder] = field(default_factory=dict[int, Decoder])
     _adapters: dict[int, Adapter] = field(default_factory=dict[int, Adapter])
+    _conditions: dict[int, Conditions | None] = field(default_factory=dict[int, Conditions | None])
     _writer: TopicWriter | None = None
     _adapter_metadata: dict[str, Any] | None = None
     """Topic metadata that the adapter derives from the first message."""
@@ -127,6 +129,7 @@ class TopicPipeline:
         if connection.definition is None:
             raise BagError(connection.problem or "no definition of the type is known", where=connection.topic)
         self._connections[connection.id] = connection
+        self._conditions[connection.id] = bind_conditions(self.plan, connection.definition)
         self._decoders[connection.id] = decoder_for(connection)
         self._adapters[connection.id] = self.plan.adapter.bind(
             connection.definition, ros_shape(connection.definition)
@@ -190,7 +193,9 @@ class TopicPipeline:
         fallbacks = index[:0] if times.fallback is None else index[times.fallback]
         stamps = times.values
         if self.selector is not None and not latched:
-            keep, excluded = self.selector.select(stamps)
+            envelope = Envelope(self.plan.topic, self.plan.msgtype, block.log_times[index])
+            conditions = self._conditions[block.connection]
+            keep, excluded = self.selector.select(stamps, rows, envelope, conditions)
             dropped |= {rule: index[mask] for rule, mask in excluded.items()}
             if keep is not None:
                 rows, index, stamps = rows.filter(pa.array(keep)), index[keep], stamps[keep]

@@ -17,15 +17,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_recordings import define, record
 from mcap.writer import Writer as OfficialWriter
+from numpy.typing import NDArray
 
 from mosaico_ingest import api
+from mosaico_ingest.adapters.adapter import Envelope
+from mosaico_ingest.contracts.expressions import Rows, bind_expression
 from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.lint.engine import lint_paths
+from mosaico_ingest.pipeline.conditions import ConditionFilter, Conditions, bind_conditions
 from mosaico_ingest.pipeline.plan import TopicPlan
 from mosaico_ingest.pipeline.run import Outcome, make_plan, run_recording
-from mosaico_ingest.pipeline.selection import RowSelector, header_stamps
+from mosaico_ingest.pipeline.selection import RowSelector
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.pipeline.topic import LATCHED_KEY
 from mosaico_ingest.rosbag.blocks import Encoding
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.mcap.writer import McapWriter
 from mosaico_ingest.rosbag.serialization import Serializer
 from mosaico_ingest.rosbag.writers import open_writer
@@ -196,6 +203,15 @@ def test_run_with_time_settings_equals_message_by_message_computation(
             assert (sorted(rows(store, topic, "value")) if kept else []) == kept
 
 
+def select(
+    selector: RowSelector, times: NDArray[np.int64], rows: pa.StructArray | None = None
+) -> tuple[NDArray[np.bool_] | None, Mapping[str, NDArray[np.bool_]]]:
+    """Select rows by their times, and by the conditions of the selector's plan if there are rows."""
+    conditions = None if rows is None else bind_conditions(selector.plan, STAMPED)
+    rows = pa.array([{}] * len(times), pa.struct([])) if rows is None else rows
+    return selector.select(times, rows, Envelope("/a", "", times), conditions)
+
+
 @given(
     times=st.lists(st.integers(0, 10 * SECOND), max_size=30),
     rate=st.sampled_from([0.3, 1.0, 2.5, 10.0]),
@@ -205,12 +221,12 @@ def test_rate_result_does_not_depend_on_batch_size(times: list[int], rate: float
     plan = TopicPlan.model_construct(rate=rate)
     complete, batched = RowSelector(plan), RowSelector(plan)
     values = np.array(times, np.int64)
-    expected, _ = complete.select(values)
+    expected, _ = select(complete, values)
     bounds = [0, *sorted(min(cut, len(times)) for cut in cuts), len(times)]
     masks = [
         np.ones(end - start, bool) if mask is None else mask
         for start, end in itertools.pairwise(bounds)
-        for mask, _ in [batched.select(values[start:end])]
+        for mask, _ in [select(batched, values[start:end])]
     ]
     assert np.concatenate(masks).tolist() == ([True] * len(times) if expected is None else expected.tolist())
 
@@ -223,18 +239,119 @@ def test_rate_keeps_first_message_of_each_interval(tmp_path: Path) -> None:
     assert outcome.report.topics[0].downsampled == 70
 
 
-@pytest.mark.parametrize("null", [False, True])
-def test_header_stamps_of_rows_with_and_without_null(null: bool) -> None:  # noqa: FBT001 - a parameter
-    header = {"header": {"stamp": {"sec": 3, "nanosec": 5}}}
-    rows_array = pa.array([header, {"header": None}] if null else [header])
-    stamps = header_stamps(rows_array)
-    assert stamps is not None
-    assert stamps.tolist() == ([3 * SECOND + 5, 0] if null else [3 * SECOND + 5])
+ROWS = st.lists(
+    st.tuples(st.integers(-2, 3), st.sampled_from(["a", "b"]), st.integers(0, 5 * SECOND)), max_size=20
+)
 
 
-def test_header_stamps_of_type_without_header_are_missing() -> None:
-    assert header_stamps(pa.array([{"data": 1}])) is None
-    assert header_stamps(pa.array([{"header": {"stamp": 1.5}}])) is None
+@given(
+    messages=ROWS,
+    where=st.sampled_from([None, "value > 0", "value != 1 and header.frame_id == 'a'"]),
+    on_change=st.sampled_from([(), ("value",), ("header.frame_id",), ("value", "header.frame_id")]),
+    rate=st.sampled_from([None, 1.0]),
+    cuts=st.lists(st.integers(0, 20), max_size=3),
+)
+def test_conditions_equal_message_by_message_evaluation(
+    *,
+    messages: list[tuple[int, str, int]],
+    where: str | None,
+    on_change: tuple[str, ...],
+    rate: float | None,
+    cuts: list[int],
+) -> None:
+    selector = RowSelector(TopicPlan.model_construct(where=where, on_change=on_change, rate=rate))
+    conditions = {
+        None: lambda _value, _frame: True,
+        "value > 0": lambda value, _frame: value > 0,
+        "value != 1 and header.frame_id == 'a'": lambda value, frame: value != 1 and frame == "a",
+    }
+    fields = {"value": 0, "header.frame_id": 1}
+    expected: list[bool] = []
+    previous = origin = None
+    last = -1
+    for message in messages:
+        keep = bool(conditions[where](*message[:2]))
+        current = [message[fields[name]] for name in on_change]
+        if keep and on_change:
+            keep, previous = current != previous, current
+        if keep and rate is not None:
+            origin = message[2] if origin is None else origin
+            interval = (message[2] - origin) // SECOND
+            keep = interval > last
+            last = max(last, interval)
+        expected.append(keep)
+    times = np.array([time for _, _, time in messages], np.int64)
+    columns = pa.array(
+        [
+            {"header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame}, "value": value}
+            for value, frame, _ in messages
+        ],
+        ros_shape(STAMPED),
+    )
+    bounds = [0, *sorted(min(cut, len(messages)) for cut in cuts), len(messages)]
+    actual: list[bool] = []
+    for start, end in itertools.pairwise(bounds):
+        mask, dropped = select(selector, times[start:end], columns[start:end])
+        keep_mask = np.ones(end - start, bool) if mask is None else mask
+        actual += keep_mask.tolist()
+        assert sum(one.sum() for one in dropped.values()) == (~keep_mask).sum()
+    assert actual == expected
+
+
+def test_on_change_compares_nan_and_null_by_identity() -> None:
+    shape = pa.struct([("x", pa.float64())])
+    column = pa.array([{"x": x} for x in (1.0, float("nan"), float("nan"), None, None, 1.0)], shape)
+    expression, _ = bind_expression("x", Rows(shape), None, lambda *_: None)
+    assert expression is not None
+    conditions = Conditions(None, (expression,))
+    expected = [True, True, False, True, False, True]
+    for size in (1, 2, 6):
+        changes = ConditionFilter()
+        actual = [
+            kept
+            for start in range(0, 6, size)
+            for kept in changes.select(
+                conditions, column[start : start + size], Envelope("/a", "", np.zeros(size, np.int64))
+            )[1].tolist()
+        ]
+        assert actual == expected
+
+
+def test_run_with_conditions_counts_what_each_rule_drops(tmp_path: Path) -> None:
+    values = [0, 1, 1, 2, 2, 2, 0, 3]
+    sent = [("/a", PLAIN, START_NS + i, {"data": value}) for i, value in enumerate(values)]
+    outcome, store = run(
+        record(tmp_path / "drive.mcap", sent),
+        topic_settings={"/a": {"where": "data > 0", "on_change": ["data"]}},
+    )
+    assert [value for _, value in rows(store, "/a", "data")] == [1, 2, 3]
+    report = outcome.report.topics[0]
+    assert (report.filtered, dict(report.dropped)) == (5, {"where": 2, "on_change": 3})
+
+
+@pytest.mark.parametrize(
+    ("settings_of_topic", "rule", "column"),
+    [
+        ({"where": "dta > 0"}, "unknown-field", 1),
+        ({"where": "data"}, "operand-type", 1),
+        ({"where": "data >"}, "expression-syntax", None),
+        ({"on_change": ["header.stmp"]}, "unknown-field", None),
+    ],
+)
+def test_condition_with_mistake_is_located_in_plan_and_run(
+    tmp_path: Path, settings_of_topic: dict[str, object], rule: str, column: int | None
+) -> None:
+    path = record(tmp_path / "drive.mcap", [("/a", PLAIN, START_NS, {"data": 1})])
+    outcome, _ = run(path, topic_settings={"/a": settings_of_topic})
+    assert outcome.report.exit_code == 2
+    with pytest.raises(ManifestError) as raised:
+        make_plan(Task(api.compile_job(tmp_path / "job.yaml")[0]))
+    finding = raised.value.findings[0]
+    assert finding.span is not None
+    text = (tmp_path / "job.yaml").read_text()
+    place = text[finding.span.column - 1 :]
+    assert finding.rule == rule
+    assert column is None or place.startswith(str(settings_of_topic["where"])[:3])
 
 
 def test_stamp_of_type_without_header_falls_back_to_log_time(tmp_path: Path) -> None:
@@ -355,3 +472,14 @@ def test_stamp_publish_without_publish_times_is_reported(tmp_path: Path, suffix:
     _, store = run(path, topic_settings={"/a": {"stamp": "publish"}})
     assert rows(store, "/a", "data") == [(START_NS + i, i) for i in range(3)]
     assert "no-publish-times" in rules(path)
+
+
+def test_lint_locates_syntax_mistakes_of_conditions(tmp_path: Path) -> None:
+    job = tmp_path / "job.yaml"
+    job.write_text(
+        'version: 1\nbag: {path: "*.mcap"}\ntopic_settings:\n  /a:\n    where: data >\n    on_change: [x, "y +"]\n'
+    )
+    findings = [
+        finding for finding in lint_paths([job], env={}).findings if finding.rule == "expression-syntax"
+    ]
+    assert [finding.span.line for finding in findings if finding.span] == [5, 6]
