@@ -36,6 +36,7 @@ STORED: Mapping[str, Tags] = {
         "matrix_gps": {"/gps/fix": ("GPS", 50)},
         "matrix_imu": {"/imu": ("IMU", 1000)},
     },
+    "contract.yaml": {"contract": {"/gps/fix": ("GPS", 50), "/imu": ("IMU", 1000)}},
     "split_recording.yaml": {"split_recording": {"/gps/fix": ("GPS", 50), "/imu": ("IMU", 1000)}},
 }
 OWN_TEST = {"quarantine.yaml", "replay.yaml", "server.yaml", "s3.yaml"}
@@ -95,6 +96,14 @@ def test_quarantine_example_rejects_one_message_and_replay_adds_it(project: Path
     command = re.findall(r"# Then run: ingest (.*)", comment)[0]
     ingest(*command.split(), cwd=project)
     assert stored(store) == {"quarantine": {"/battery": ("ChargeLevel", 10)}}
+
+
+def test_contract_example_refuses_a_recording_that_violates_it(project: Path) -> None:
+    contract = project / "configs/examples/fleet/expect.yaml"
+    contract.write_text(contract.read_text().replace("max: 50 ms", "max: 5 ms"))
+    ingest("check", "configs/examples/contract.yaml", cwd=project, code=6)
+    ingest("configs/examples/contract.yaml", cwd=project, code=6)
+    assert not any((project / "mosaico").glob("segments/*"))
 
 
 @contextmanager

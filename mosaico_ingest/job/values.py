@@ -26,6 +26,10 @@ RECORDING = "recording"
 """The word for the whole recording where a contract may also name a topic."""
 
 
+LOCK_SUFFIX = ".lock.json"
+"""Suffix of a lock file, in place of that of its manifest."""
+
+
 class LockFile(Struct, frozen=True):
     """The lock file of a manifest: its path, and the text that was read when the job was compiled."""
 

@@ -13,6 +13,7 @@ from msgspec import Struct
 
 from mosaico_ingest.containers import SUFFIXES
 from mosaico_ingest.job.model import Manifest
+from mosaico_ingest.job.values import LOCK_SUFFIX
 
 _YAML_SUFFIXES = (".yaml", ".yml", ".json")
 _MARKDOWN_SUFFIXES = (".md", ".markdown")
@@ -80,6 +81,8 @@ def documents_in(text: str, *, file: str, path: Path | None, folder: Path, named
     If the file is `named` on the command line, it is a job unless it looks like another kind of document.
     """
     suffix = Path(file).suffix.lower()
+    if file.endswith(LOCK_SUFFIX):
+        return  # a lock file has keys of a manifest; lint checks it with its manifest
     if suffix in _MARKDOWN_SUFFIXES:
         for block in _yaml_blocks(text):
             keys = set(_top_level_keys(block))

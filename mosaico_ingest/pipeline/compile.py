@@ -25,7 +25,7 @@ from mosaico_ingest.job.fields import FilePath, PathRole, marked_fields, replace
 from mosaico_ingest.job.impossible_patterns import pattern_problems
 from mosaico_ingest.job.manifest import LoadedManifest, refusal
 from mosaico_ingest.job.model import Job, JobSettings, Manifest, Origin, SequenceSettings
-from mosaico_ingest.job.values import LockFile
+from mosaico_ingest.job.values import LOCK_SUFFIX, LockFile
 from mosaico_ingest.job.yaml_source import Source
 from mosaico_ingest.metadata.schema import read_json
 from mosaico_ingest.metadata.sources import source_spans, with_spans
@@ -284,7 +284,7 @@ def _metadata(loaded: LoadedManifest, sequence: SequenceSettings) -> tuple[dict[
 
 def lock_path(manifest: Path) -> Path:
     """Return the path of a manifest's lock file, such as `job.lock.json` for `job.yaml`."""
-    return manifest.with_suffix(".lock.json")
+    return manifest.with_suffix(LOCK_SUFFIX)
 
 
 def read_lock_file(manifest: Path, origin: Origin = Origin()) -> LockFile:  # noqa: B008 - origins are immutable
