@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from msgspec import Struct, field
 from msgspec.structs import replace
@@ -19,6 +19,7 @@ from mosaico_ingest.findings import Finding, Severity, Span
 from mosaico_ingest.job.compose import Filled, combinations, extended, fill_in, fill_in_cell
 from mosaico_ingest.job.model import Manifest, Origin
 from mosaico_ingest.job.reference import job_schema
+from mosaico_ingest.job.section import Section
 from mosaico_ingest.job.validation import explain
 from mosaico_ingest.job.yaml_source import KeyPath, Source, Value, load_source, member, resolve_plain
 from mosaico_ingest.remote import AnyPath, is_url, parse_url
@@ -238,9 +239,34 @@ def _validate(source: Source, filled: Filled) -> tuple[Manifest | None, list[Fin
 def _attempt(source: Source, value: Value) -> tuple[Manifest | None, list[tuple[KeyPath, Finding]]]:
     try:
         # In JSON mode, `strict` refuses text for numbers and accepts lists for tuples and words for enumerations.
-        return Manifest.model_validate_json(json.dumps(value), strict=True), []
+        manifest = Manifest.model_validate_json(json.dumps(value), strict=True)
     except ValidationError as error:
         return None, explain(error, source=source, schema=_schema())
+    mistakes = [(path, _empty_value(source, path)) for path in _nulls(manifest)]
+    return None if mistakes else manifest, mistakes
+
+
+def _nulls(section: object, path: KeyPath = ()) -> Iterator[KeyPath]:
+    """Yield the key path of each null that a manifest contains; free values, such as metadata, may contain null."""
+    if isinstance(section, Section):
+        for name in section.model_fields_set:
+            value = getattr(section, name)
+            if value is None:
+                yield (*path, name)
+            else:
+                yield from _nulls(value, (*path, name))
+    elif isinstance(section, dict):
+        for key, value in cast("dict[str, object]", section).items():
+            yield from _nulls(value, (*path, key))
+    elif isinstance(section, tuple):
+        for position, value in enumerate(cast("tuple[object, ...]", section)):
+            yield from _nulls(value, (*path, position))
+
+
+def _empty_value(source: Source, path: KeyPath) -> Finding:
+    message = f"{'.'.join(map(str, path))} is empty"
+    hint = "give it a value, or remove the key"
+    return Finding("empty-value", Severity.ERROR, message, source.key_span(path), hint)
 
 
 def _reread(filled: Filled, key_path: KeyPath) -> None:

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 import jsonschema
 import pytest
 import yaml
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 from mosaico_ingest.job.manifest import check_manifest
 from mosaico_ingest.job.reference import job_schema
@@ -162,3 +164,46 @@ def test_check_manifest_mutated_value_agrees_with_json_schema(path: KeyPath, wri
 def is_about_one_another(source: Source) -> bool:
     """Return whether a document has a text that JSON Schema cannot check beyond its pattern."""
     return bool(re.search("zzz", json.dumps(source.value)))
+
+
+SCALARS = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-2, 2**70),
+    st.floats(allow_nan=False, allow_infinity=False),
+    st.sampled_from(
+        ["", "1", "1.5", "true", "no", "5s", "10MB", "1 %", "2026-01-01", "ignore", "/imu", "${X}"]
+    ),
+)
+VALUES = st.one_of(
+    SCALARS,
+    st.lists(SCALARS, max_size=2),
+    st.dictionaries(st.sampled_from(["a", "/imu", "default"]), SCALARS),
+)
+OPTIONAL = [
+    (name, *inner)
+    for name, section in SCHEMA.schema["properties"].items()
+    for inner in (
+        (),
+        *(
+            (key,)
+            for key in SCHEMA.schema["$defs"].get(str(section.get("$ref", ""))[8:], {}).get("properties", ())
+        ),
+    )
+]
+
+
+@settings(deadline=None, max_examples=600)
+@example(path=("quarantine",), value=None)
+@example(path=("run", "jobs"), value="2")
+@given(path=st.sampled_from(list(dict.fromkeys([*PATHS, *OPTIONAL]))), value=VALUES)
+def test_check_manifest_accepts_no_value_that_the_schema_rejects(path: KeyPath, value: Value) -> None:
+    document = json.loads(json.dumps(SOURCE.value))
+    parent = document
+    for part in path[:-1]:
+        parent = parent[part] if isinstance(parent, list) else parent.setdefault(part, {})
+        if not isinstance(parent, dict | list):
+            return
+    parent[path[-1]] = value
+    _, findings = check_manifest(load_source(json.dumps(document), file="j"), env={"X": "x"})
+    assert findings or SCHEMA.is_valid(document)
