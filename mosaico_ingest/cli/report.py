@@ -32,6 +32,8 @@ WIDE = 100
 """Terminal columns from which all columns of a report's table fit."""
 MAX_TABLES = 3
 """Recordings above which each gets one row in a common table instead of a table of its topics."""
+MAX_NAMED_TOPICS = 3
+"""Topics above which a reason of rejections names their number instead."""
 MAX_REASONS = 20
 """Reasons of rejections printed for a batch."""
 STATUS_STYLES = {
@@ -183,7 +185,7 @@ def _print_batch(report: RunReport, *, stderr: bool) -> None:
     reasons = [
         f"{recording.sequence}: {reason}"
         for recording in report.recordings
-        for reason in _rejections(recording)
+        for reason in rejection_lines(recording)
     ]
     for reason in reasons[:MAX_REASONS]:
         print_line(reason, style="yellow", stderr=stderr)
@@ -210,7 +212,7 @@ def _print_recording(report: Report, *, stderr: bool) -> None:
             table.add_row(*(cells[name] for name in names))
     console.print(table)
     _print_excluded(report, stderr=stderr)
-    for reason in _rejections(report):
+    for reason in rejection_lines(report):
         print_line(reason, style="yellow", stderr=stderr)
     line = f"{report.sequence} in {report.destination}: {', '.join(_totals(report))}"
     print_line(line, style=STATUS_STYLES[report.status], stderr=stderr)
@@ -239,12 +241,16 @@ def _print_excluded(report: Report, *, stderr: bool) -> None:
         print_line(f"excluded {', '.join(topics)}: {reason}", style="dim", stderr=stderr)
 
 
-def _rejections(report: Report) -> Iterator[str]:
-    """Yield a line for each topic and reason of rejected messages."""
+def rejection_lines(report: Report) -> Iterator[str]:
+    """Yield a line for each reason of rejected messages, with its topics."""
+    counts: dict[tuple[str, str], dict[str, int]] = {}
     for topic in report.topics:
         for rejection in topic.rejections:
-            count = count_text(rejection.count)
-            yield f"{topic.target}: {count} rejected [{rejection.rule}]: {rejection.reason}"
+            by_topic = counts.setdefault((rejection.rule, rejection.reason), {})
+            by_topic[topic.target] = by_topic.get(topic.target, 0) + rejection.count
+    for (rule, reason), by_topic in counts.items():
+        topics = ", ".join(by_topic) if len(by_topic) <= MAX_NAMED_TOPICS else f"{len(by_topic)} topics"
+        yield f"{topics}: {count_text(sum(by_topic.values()))} rejected [{rule}]: {reason}"
 
 
 def _totals(report: Report) -> Iterator[str]:

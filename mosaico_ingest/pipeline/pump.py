@@ -380,8 +380,9 @@ def _discard(
         quarantine.discard()
     if isinstance(error, Abandoned):
         return
+    cause = error.what if isinstance(error, IngestError) else str(error)
     for topic in topics:
-        _subtract(topic, topic.rows, f"the session was discarded: {error}", observe)
+        _subtract(topic, topic.rows, f"the session was discarded: {cause}", observe)
         observe(TopicClosed(topic.plan.target, topic.status, 0, error=topic.error))
 
 

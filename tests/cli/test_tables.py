@@ -10,11 +10,12 @@ from mosaico_ingest import api
 from mosaico_ingest.cli import plan as plan_command
 from mosaico_ingest.cli import report as report_command
 from mosaico_ingest.cli import store as store_command
+from mosaico_ingest.cli.report import rejection_lines
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.findings import Stage
 from mosaico_ingest.ontology.registry import ontology_type
 from mosaico_ingest.report.events import RunStatus, TopicStatus
-from mosaico_ingest.report.model import Rejection, RunReport
+from mosaico_ingest.report.model import Rejection, Report, RunReport, TopicReport
 from mosaico_ingest.report.units import rate_text, written_text
 from mosaico_ingest.services.draft import draft_manifest
 from mosaico_ingest.services.inspection import estimate_rate_hz
@@ -152,3 +153,29 @@ def test_rates_of_inspect_init_and_run_agree(tmp_path: Path) -> None:
 )
 def test_estimate_rate_hz_returns_roundest_rate_that_fits(count: int, seconds: float, rate: float) -> None:
     assert estimate_rate_hz(count, round(seconds * 1e9)) == pytest.approx(rate, rel=0.02)
+
+
+def test_rejections_of_many_topics_for_one_reason_are_one_line() -> None:
+    rejection = Rejection(
+        stage="write", rule="not-written", count=5, reason="discarded", first_log_time_ns=0, first_offset=0
+    )
+    topics = tuple(
+        TopicReport(
+            topic=f"/t{number}",
+            target=f"/t{number}",
+            msgtype="std_msgs/msg/String",
+            adapter="",
+            ontology="",
+            why="",
+            status="written",
+            promised=5,
+            read=5,
+            rejected=5,
+            rejections=(rejection,),
+        )
+        for number in range(4)
+    )
+    report = Report.model_construct(topics=topics)
+    assert list(rejection_lines(report)) == ["4 topics: 20 rejected [not-written]: discarded"]
+    few = Report.model_construct(topics=topics[:2])
+    assert list(rejection_lines(few)) == ["/t0, /t1: 10 rejected [not-written]: discarded"]
