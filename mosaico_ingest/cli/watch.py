@@ -84,9 +84,18 @@ def watch(
             "--rest",
             min=0.0,
             metavar="SECONDS",
-            help="Time without a change after which a recording is complete; 600 s if its end is missing.",
+            help="Time without a change after which a recording is complete.",
         ),
     ] = 10.0,
+    unfinished_rest: Annotated[
+        float,
+        typer.Option(
+            "--unfinished-rest",
+            min=0.0,
+            metavar="SECONDS",
+            help="The same for a recording whose end is missing: it may still be written, or its recorder crashed.",
+        ),
+    ] = 600.0,
     every: Annotated[
         float,
         typer.Option("--every", min=0.05, metavar="SECONDS", help="Time between two checks of the folder."),
@@ -97,7 +106,8 @@ def watch(
     once: Annotated[
         bool,
         typer.Option(
-            "--once", help="Ingest the current recordings once they are complete, then exit like a run."
+            "--once",
+            help="Ingest the complete recordings, then exit like a run; with 4 if a recording is unfinished.",
         ),
     ] = False,
     log: Annotated[str, log_level()] = "WARNING",
@@ -115,7 +125,7 @@ def watch(
     set_up_logging(log)
     interrupt_on_sigterm()
     collect_garbage_as_usual()
-    arrivals = Arrivals(folder, rest)
+    arrivals = Arrivals(folder, rest, max(rest, unfinished_rest))
     load_manifests(manifest)  # report mistakes now, not with the first recording
     _print(f"watching {folder}")
     codes: list[int] = []

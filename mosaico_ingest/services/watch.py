@@ -15,8 +15,6 @@ from typing import Any, BinaryIO, TypeAlias
 
 from mosaico_ingest.containers import MCAP, RECORDING_NAME
 
-UNFINISHED_REST_S = 600.0
-"""Seconds without a change after which a recording is ingested although its end is missing."""
 _METADATA = "metadata.yaml"
 _FIRST_RETRY_S, _LAST_RETRY_S = 60.0, 3600.0
 _ROS1 = b"#ROSBAG V2.0\n"
@@ -44,7 +42,7 @@ class Arrivals:
     folder: Path
     rest_s: float
     """Seconds without a change after which a recording is complete."""
-    unfinished_rest_s: float = UNFINISHED_REST_S
+    unfinished_rest_s: float = 600.0
     """The same for a recording whose end is missing: its upload may have stalled, or its recorder crashed."""
     _arrivals: dict[Path, _Arrival] = field(default_factory=dict[Path, _Arrival])
 

@@ -158,11 +158,17 @@ STRICT = os.environ | {"PYTHONIOENCODING": "utf-8:strict"}
 """An environment with strict UTF-8 standard output, as in most locales: it rejects file names that are not UTF-8."""
 
 
-def watch_once(folder: Path, code: int = 0) -> list[str]:
+def watch_once(folder: Path, *options: str, code: int = 0) -> list[str]:
     command = [sys.executable, "-m", "mosaico_ingest", "watch", "in", "job.yaml", "--once"]
     pace = ["--rest", "0.2", "--every", "0.1"]
     result = subprocess.run(  # noqa: S603 - our own command
-        [*command, *pace], cwd=folder, capture_output=True, text=True, check=False, timeout=60, env=STRICT
+        [*command, *pace, *options],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+        env=STRICT,
     )
     assert result.returncode == code, result.stderr
     return result.stdout.splitlines()
@@ -180,6 +186,19 @@ def test_watch_once_ingests_recordings_and_skips_them_again(tmp_path: Path) -> N
     assert "in/c.mcap: failed as c" in lines[2]
     assert "tried again" not in lines[2]
     assert Store.open(tmp_path / "store").names() == ("a",)
+
+
+@pytest.mark.slow
+def test_watch_once_ingests_unfinished_recording_only_after_its_rest(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    (tmp_path / "job.yaml").write_text(JOB)
+    content = DRIVE.read_bytes()
+    (tmp_path / "in" / "a.mcap").write_bytes(content[: len(content) // 2])
+    lines = watch_once(tmp_path, code=4)
+    assert "in/a.mcap: not ingested" in lines[1]
+    assert not (tmp_path / "store").exists()
+    lines = watch_once(tmp_path, "--unfinished-rest", "0", code=4)
+    assert "in/a.mcap: completed_with_errors as a" in lines[1]
 
 
 @pytest.mark.slow
