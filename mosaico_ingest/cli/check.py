@@ -94,6 +94,8 @@ def check(
 def _print(one: CheckedRecording, *, show_all: bool) -> None:
     if one.contract is None:
         print_line(f"{one.name}: {one.error}", style="red")
+        if len(one.findings) > 1:
+            Terminal(soft_wrap=True).print(render_findings(one.findings, read_sources(one.findings)))
         return
     findings = [finding for result in one.contract.results if (finding := result.finding) is not None]
     shown = [finding for finding in findings if show_all or finding.rule != "expectation-skipped"]

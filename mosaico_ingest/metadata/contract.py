@@ -12,6 +12,7 @@ from mosaico_ingest.job.patterns import first_match
 from mosaico_ingest.job.yaml_source import KeyPath
 from mosaico_ingest.metadata.schema import load_schema
 from mosaico_ingest.metadata.validation import Spans, violations
+from mosaico_ingest.report.units import counted
 
 
 def check_metadata_contracts(job: Job, topics: Iterable[str]) -> None:
@@ -34,7 +35,7 @@ def check_metadata_contracts(job: Job, topics: Iterable[str]) -> None:
     unique = tuple(dict.fromkeys(findings))
     if unique:
         first = unique[0]
-        more = f" (and {len(unique) - 1} more violations)" if len(unique) > 1 else ""
+        more = f" (and {counted(len(unique) - 1, 'more violation')})" if len(unique) > 1 else ""
         where = str(first.span) if first.span else job.origin.file
         raise ContractError(f"{first.message}{more}", where=where, hint=first.help, findings=unique)
 

@@ -18,6 +18,7 @@ from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import Finding, Severity, Span
 from mosaico_ingest.job.yaml_source import KeyPath, Source, load_source
 from mosaico_ingest.remote import AnyPath
+from mosaico_ingest.report.units import counted
 from mosaico_ingest.textfile import read_limited
 
 if TYPE_CHECKING:
@@ -208,7 +209,7 @@ def _not_json(message: str, span: Span) -> Finding:
 
 def _refusal(findings: Sequence[Finding]) -> ManifestError:
     first = findings[0]
-    more = f" (and {len(findings) - 1} more mistakes)" if len(findings) > 1 else ""
+    more = f" (and {counted(len(findings) - 1, 'more mistake')})" if len(findings) > 1 else ""
     return ManifestError(
         f"{first.message}{more}", where=str(first.span), hint=first.help, findings=tuple(findings)
     )

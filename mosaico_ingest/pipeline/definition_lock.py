@@ -18,6 +18,7 @@ from mosaico_ingest.job.values import LockFile
 from mosaico_ingest.job.yaml_source import KeyPath, load_source
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.pipeline.plan import Plan
+from mosaico_ingest.report.units import counted
 from mosaico_ingest.rosbag.blocks import Connection
 from mosaico_ingest.rosbag.definitions.model import Definition
 from mosaico_ingest.rosbag.definitions.parser import spell
@@ -179,7 +180,7 @@ def check_lock(file: LockFile, actual: LockDocument, *, recording: str) -> None:
         )
         for one in found
     )
-    more = f" (and {len(found) - 1} more differences)" if len(found) > 1 else ""
+    more = f" (and {counted(len(found) - 1, 'more difference')})" if len(found) > 1 else ""
     raise ContractError(
         f"the recording differs from {file.path}: {first}{more}",
         where=recording,

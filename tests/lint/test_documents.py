@@ -21,6 +21,11 @@ def rules(report: LintReport) -> list[str]:
     return [finding.rule for finding in report.findings]
 
 
+def test_lint_folder_with_lock_file_skips_it(tmp_path: Path) -> None:
+    report = lint_folder(tmp_path, "job.lock.json", '{"version": 1, "topics": {}, "definitions": {}}')
+    assert (rules(report), [Path(skipped.file).name for skipped in report.skipped]) == ([], ["job.lock.json"])
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
