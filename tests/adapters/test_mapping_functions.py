@@ -228,3 +228,9 @@ def test_functions_are_documented_and_tested() -> None:
 
 def test_floor_division_of_null_by_zero_is_null() -> None:
     assert column("x[0] // 0", [[]], pa.list_(pa.int64())) == [None]
+
+
+def test_sum_of_null_and_large_unsigned_number_is_null() -> None:
+    rows = [{"w": 2**64 - 1, "x": []}, {"w": 3, "x": [4]}]
+    kind = pa.struct({"w": pa.uint64(), "x": pa.list_(pa.int64())})
+    assert column("x.w + x.x[0]", rows, kind) == [None, 7]

@@ -8,13 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mosaico_ingest.adapters.mapping.columns import (
-    Array,
-    arrays,
-    pc,
-    pt,
-    true_mask,
-)
+from mosaico_ingest.adapters.mapping.columns import Array, Mask, arrays, null_mask, pc, pt, true_mask
 from mosaico_ingest.adapters.mapping.functions.registry import (
     ANY,
     BOOLEAN,
@@ -92,12 +86,15 @@ def _ordered(left: ExprType, right: ExprType) -> ExprType:
     return ExprType(arrays.bool_())
 
 
-def _to_int64(refuse: RejectRows, values: Array) -> Array:
+def _to_int64(refuse: RejectRows, values: Array, nulls: Mask | None) -> Array:
+    """Cast integers; refuse larger ones, unless they are in a row of `nulls`, whose result is null anyway."""
     if values.type != arrays.uint64():
         return values if values.type == arrays.int64() else pc.cast(values, arrays.int64())
     bad = true_mask(pc.greater(values, arrays.scalar(INT64[1], arrays.uint64())))
     if bad.any():
-        refuse(bad, "overflow", lambda i: f"{values[i]} has more than 63 bits")
+        refused = bad if nulls is None else bad & ~nulls
+        if refused.any():
+            refuse(refused, "overflow", lambda i: f"{values[i]} has more than 63 bits")
         values = set_null(values, bad)
     return pc.cast(values, arrays.int64())
 
@@ -105,7 +102,9 @@ def _to_int64(refuse: RejectRows, values: Array) -> Array:
 def numbers(refuse: RejectRows, *values: Array) -> list[Array]:
     """Cast numbers to int64 if all are integers, else to float64."""
     if all(pt.is_integer(v.type) for v in values):
-        return [_to_int64(refuse, v) for v in values]
+        masks = [mask for v in values if hasattr(v, "null_count") and (mask := null_mask(v)) is not None]
+        nulls = np.logical_or.reduce(masks) if masks else None
+        return [_to_int64(refuse, v, nulls) for v in values]
     return [v if pt.is_float64(v.type) else pc.cast(v, arrays.float64(), safe=False) for v in values]
 
 
