@@ -3,7 +3,8 @@
     ./dev bench r2b [SEQUENCE ...] [--scale 0.05] [--runs 3] [--data FOLDER] [--generate] [--page docs/r2b.md]
 
 A stand-in has the topics, types, rates and storage of its sequence as far as they are known (`r2b_sequences.py`); images and
-points are random. `--scale` shortens it, `--generate` only writes it, and `--page` writes the tables of the documentation.
+points are random. `--scale` shortens it, `--generate` only writes it, and `--page` writes the tables of the documentation, with `--runs 0` without
+a measurement.
 """
 
 from __future__ import annotations
@@ -290,7 +291,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("sequences", nargs="*", metavar="SEQUENCE", help="default: all")
     parser.add_argument("--scale", type=float, default=0.05, help="part of the duration (default: 0.05)")
-    parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--runs", type=int, default=3, help="runs per sequence; 0 only writes the page")
     parser.add_argument("--data", type=Path, default=HERE / "data" / "r2b")
     parser.add_argument("--generate", action="store_true", help="write the recordings only")
     parser.add_argument("--page", type=Path, help="page whose tables are written")
@@ -302,7 +303,9 @@ def main() -> None:
     selected = [
         sequence for sequence in SEQUENCES if not options.sequences or sequence.name in options.sequences
     ]
-    rows = results(selected, options.data, options.scale, options.runs, generate=options.generate)
+    rows = []
+    if options.runs:
+        rows = results(selected, options.data, options.scale, options.runs, generate=options.generate)
     head = "| sequence | stand-in | saved | time | CPU | peak memory | content |"
     table = "\n".join([head, "|---|---:|---:|---:|---:|---:|---|", *rows])
     text = f"{hardware()}, {platform.platform(terse=True)}, Python {platform.python_version()}, scale {options.scale}:\n\n{table}"

@@ -56,6 +56,13 @@ def ingest(*arguments: str, cwd: Path, code: int = 0, environment: Mapping[str, 
     return finished.stdout
 
 
+def command_of(name: str) -> list[str]:
+    """Return the arguments of the command that the README states for an example."""
+    rows = (EXAMPLES / "README.md").read_text().splitlines()
+    (row,) = [row for row in rows if f"]({name})" in row]
+    return re.findall(r"`ingest ([^`]+)`", row)[0].split()
+
+
 def stored(store: Store) -> Tags:
     return {
         sequence.name: {topic.name: (topic.ontology.tag, topic.rows) for topic in sequence.topics}
@@ -84,17 +91,18 @@ def test_every_link_in_the_readme_leads_to_a_file() -> None:
 
 @pytest.mark.parametrize("name", STORED)
 def test_example_run_stores_typed_topics(project: Path, name: str) -> None:
-    ingest(f"configs/examples/{name}", cwd=project)
+    ingest(*command_of(name), cwd=project)
     assert stored(Store.open(project / "mosaico")) == STORED[name]
 
 
 def test_quarantine_example_rejects_one_message_and_replay_adds_it(project: Path) -> None:
-    ingest("configs/examples/quarantine.yaml", cwd=project, code=4)
+    ingest(*command_of("quarantine.yaml"), cwd=project, code=4)
     store = Store.open(project / "mosaico")
     assert stored(store) == {"quarantine": {"/battery": ("ChargeLevel", 9)}}
     comment = (EXAMPLES / "quarantine.yaml").read_text()
     command = re.findall(r"# Then run: ingest (.*)", comment)[0]
-    ingest(*command.split(), cwd=project)
+    assert command.split() == command_of("replay.yaml")
+    ingest(*command_of("replay.yaml"), cwd=project)
     assert stored(store) == {"quarantine": {"/battery": ("ChargeLevel", 10)}}
 
 
@@ -124,7 +132,7 @@ def test_server_example_uploads_to_a_served_store(project: Path) -> None:
     assert "port: 6726" in text
     manifest.write_text(text.replace("6726", "6759"))  # a developer may serve a store on the default port
     with served(project / "served", 6759):
-        ingest(str(manifest), cwd=project)
+        ingest(*command_of("server.yaml"), cwd=project)
     assert stored(Store.open(project / "served")) == {
         "server": {"/gps/fix": ("GPS", 50), "/imu": ("IMU", 1000)}
     }
@@ -137,7 +145,7 @@ def test_s3_example_reads_and_writes_behind_urls(project: Path, objects: ObjectS
     recording.write_bytes((ROOT / "configs/quickstart/drive.mcap").read_bytes())
     options = objects.url("").partition("?")[2]
     environment = {**os.environ, "BUCKET": BUCKET, "S3_OPTIONS": f"?{options}"}
-    ingest("configs/examples/s3.yaml", cwd=project, environment=environment)
+    ingest(*command_of("s3.yaml"), cwd=project, environment=environment)
     names = ingest("store", "ls", "--json", "--store", objects.url("store"), cwd=project)
     assert '"s3_drive"' in names
 

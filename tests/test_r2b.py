@@ -136,7 +136,7 @@ def test_benchmark_prints_size_and_time_of_a_stand_in(r2b: ModuleType, tmp_path:
 def test_page_tables_are_current(r2b: ModuleType) -> None:
     page = (ROOT / "docs" / "r2b.md").read_text()
     table = page.split("<!-- sequences -->")[1].split("<!-- end of sequences -->")[0]
-    assert table.strip() == r2b.topic_tables(), "run python benchmarks/r2b.py --page docs/r2b.md"
+    assert table.strip() == r2b.topic_tables(), "run ./dev docs"
     assert {
         row.split("|")[1].strip() for row in page.split("<!-- results -->")[1].splitlines() if "| r2b_" in row
     } == set(NAMES)
