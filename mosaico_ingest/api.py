@@ -171,15 +171,17 @@ def inspect_recording(path: AnyPath | str, *, ros_distro: str | None = None) -> 
     return inspect(config.job)
 
 
-def check_recordings(manifest: Path) -> Iterator[Checked]:
+def check_recordings(manifest: Path, *, jobs: Sequence[Job] | None = None) -> Iterator[Checked]:
     """Yield the results of the data contract of a manifest for each of its recordings; write nothing.
+
+    `jobs` avoids compiling the manifest a second time.
 
     Raises:
         IngestError: The manifest cannot be compiled.
     """
     from mosaico_ingest.services.check import check_jobs
 
-    return check_jobs(compile_job(manifest))
+    return check_jobs(jobs or compile_job(manifest))
 
 
 def check_sequence(store: str, sequence: str, expect: Path) -> Checked:

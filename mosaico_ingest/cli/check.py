@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,8 +15,8 @@ from mosaico_ingest.cli.options import JsonOption, JunitOption, SarifOption, wri
 from mosaico_ingest.report.units import counted
 
 if TYPE_CHECKING:
-    from mosaico_ingest.cli.ci import CheckedRecording
     from mosaico_ingest.report.contract import ContractResult
+    from mosaico_ingest.services.check import Checked
 
 
 def check(
@@ -54,44 +55,56 @@ def check(
     2 the manifest is wrong, 3 nothing matches.
     """
     from mosaico_ingest import api
-    from mosaico_ingest.cli.ci import CheckedRecording, write_ci_files
-    from mosaico_ingest.cli.process import collect_garbage_as_usual
+    from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas
     from mosaico_ingest.report.model import gravest
 
     collect_garbage_as_usual()
     if (store is None) != (expect is None):
         raise typer.BadParameter("--store and --expect belong together", param_hint="--store, --expect")
-    checked: list[CheckedRecording] = []
-    codes: list[int] = []
+    checked: list[Checked] = []
+    jobs = api.compile_job(Path(target)) if store is None else ()
+    hide_pandas(jobs)
     results = (
-        api.check_recordings(Path(target))
+        api.check_recordings(Path(target), jobs=jobs)
         if store is None or expect is None
         else [api.check_sequence(store, target, expect)]
     )
-    for result in results:
-        one = CheckedRecording(
-            result.name,
-            result.contract,
-            None if result.error is None else str(result.error),
-            () if result.error is None else result.error.findings,
-        )
+    for one in results:
         checked.append(one)
-        codes.append(result.exit_code)
         if not as_json:
             _print(one, show_all=show_all)
     if as_json:
         print_json([_document(one) for one in checked])
-    write_ci_files(checked, junit=junit, sarif=sarif)
+    if junit is not None or sarif is not None:
+        _write_ci_files(checked, junit, sarif)
     if metrics is not None:
         from mosaico_ingest.report.metrics import contract_metrics
 
         write_output(metrics, contract_metrics([one.contract for one in checked if one.contract is not None]))
-    code = gravest(codes)
+    code = gravest([one.exit_code for one in checked])
     if code:
         raise typer.Exit(code)
 
 
-def _print(one: CheckedRecording, *, show_all: bool) -> None:
+def _write_ci_files(checked: Sequence[Checked], junit: Path | None, sarif: Path | None) -> None:
+    from mosaico_ingest.cli.ci import (  # the formats of lint take 30 ms to import
+        CheckedRecording,
+        write_ci_files,
+    )
+
+    recordings = [
+        CheckedRecording(
+            one.name,
+            one.contract,
+            None if one.error is None else str(one.error),
+            () if one.error is None else one.error.findings,
+        )
+        for one in checked
+    ]
+    write_ci_files(recordings, junit=junit, sarif=sarif)
+
+
+def _print(one: Checked, *, show_all: bool) -> None:
     if one.contract is None:
         print_line(f"{one.name}: {one.error}", style="red")
         if len(one.findings) > 1:
@@ -124,6 +137,10 @@ def _summary(name: str, contract: ContractResult) -> str:
     return f"{name}: {counted(len(contract.results), 'expectation')}: {', '.join(parts)}"
 
 
-def _document(one: CheckedRecording) -> dict[str, object]:
+def _document(one: Checked) -> dict[str, object]:
     contract = None if one.contract is None else one.contract.model_dump(mode="json")
-    return {"sequence": one.name, "error": one.error, "contract": contract}
+    return {
+        "sequence": one.name,
+        "error": None if one.error is None else str(one.error),
+        "contract": contract,
+    }

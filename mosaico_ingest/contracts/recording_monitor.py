@@ -38,7 +38,8 @@ class ReadTopic(Struct, frozen=True):
     topic: str
     """The name in the recording."""
     connections: tuple[int, ...]
-    ontology: OntologyType
+    ontology: OntologyType | None = None
+    """The type of its rows; None if no expectation refers to them."""
 
 
 def check_expressions(
@@ -272,9 +273,9 @@ class RecordingMonitor:
         return None if connection.count is None else connection.count - absent
 
 
-def _rows(connection: Connection, topic: ReadTopic) -> tuple[Rows | None, Rows]:
+def _rows(connection: Connection, topic: ReadTopic) -> tuple[Rows | None, Rows | None]:
     message = None if connection.definition is None else message_rows(connection.definition)
-    return message, ontology_rows(topic.ontology)
+    return message, None if topic.ontology is None else ontology_rows(topic.ontology)
 
 
 def message_rows(definition: Definition) -> Rows:
