@@ -112,6 +112,7 @@ def _state(file: QuarantineFile, job: Job) -> ReplayState:
 def _replay_job(file: QuarantineFile, job: Job) -> Job:
     """Return the job that appends quarantined messages to their sequence: all of them, or none.
 
+    The contracts of the job describe recordings, so they do not apply to these messages.
     Messages that fail again are quarantined again without a limit, because the current copy is set aside.
     """
     folder = job.quarantine.path if job.quarantine else str(file.messages.parent)
@@ -131,6 +132,7 @@ def _replay_job(file: QuarantineFile, job: Job) -> Job:
             )
             for topic, settings in job.topic_settings.items()
         },
+        expect=None,
         definitions=None,
         lock=None,
         quarantine=QuarantineSettings(path=folder).replace(systematic=sys.maxsize),
