@@ -93,12 +93,7 @@ def _write_ci_files(checked: Sequence[Checked], junit: Path | None, sarif: Path 
     )
 
     recordings = [
-        CheckedRecording(
-            one.name,
-            one.contract,
-            None if one.error is None else str(one.error),
-            () if one.error is None else one.error.findings,
-        )
+        CheckedRecording(one.name, one.contract, None if one.error is None else str(one.error), one.findings)
         for one in checked
     ]
     write_ci_files(recordings, junit=junit, sarif=sarif)

@@ -14,6 +14,7 @@ from mosaico_ingest.contracts.clauses import Contract
 from mosaico_ingest.contracts.stored import check_stored
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import ContractError, IngestError, ManifestError
+from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.manifest import check_manifest, read_manifest, refusal
 from mosaico_ingest.job.model import Job, JobSettings, Origin
 from mosaico_ingest.pipeline.contract_check import check_contract
@@ -29,6 +30,11 @@ class Checked(Struct, frozen=True):
     contract: ContractResult | None = None
     error: IngestError | None = None
     """The error that prevented the check."""
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """The findings of the error."""
+        return () if self.error is None else self.error.findings
 
     @property
     def exit_code(self) -> int:
