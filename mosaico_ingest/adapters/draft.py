@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 from msgspec import Struct
 
-from mosaico_ingest.adapters.adapter import Envelope
+from mosaico_ingest.adapters.adapter import Envelope, short_name
 from mosaico_ingest.adapters.builtin import BY_TYPE, find_builtin
 from mosaico_ingest.adapters.explain import unread_fields
 from mosaico_ingest.adapters.mapping.columns import DataType, pt
@@ -29,7 +29,7 @@ from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.job.yaml_source import resolve_plain
 from mosaico_ingest.ontology.registry import ontology_type, tags
 from mosaico_ingest.rosbag.definitions.linking import TEXTS, ros_shape
-from mosaico_ingest.rosbag.definitions.model import Container, Definition, Field
+from mosaico_ingest.rosbag.definitions.model import Container, Definition, Field, Language
 from mosaico_ingest.rosbag.definitions.parser import BYTES
 
 __all__ = [
@@ -345,15 +345,19 @@ def draft(
     spec = load_adapter("\n".join(head) + "\n", file="<draft>", adapters=find_builtin)
     adapter = spec.bind(definition, shape)
     parts = ["\n".join([*head, *_unread(adapter, definition, shape)])]
-    if embed:
+    is_ros = definition.language is Language.ROS
+    if embed and is_ros:
         parts.append("definition: |\n" + indent(definition.text.rstrip("\n"), "  ", lambda _: True))
-    parts.append("tests:\n" + "\n".join(_test(spec, adapter, definition, example)))
+    if (
+        is_ros or example is not None
+    ):  # a file can only contain `.msg` texts, without which `given: {}` has no type
+        parts.append("tests:\n" + "\n".join(_test(spec, adapter, definition, example)))
     return "\n\n".join(parts) + "\n"
 
 
 def _tag(definition: Definition) -> str:
     """Return a tag that no built-in ontology type has."""
-    short = definition.root.rpartition("/")[2]
+    short = short_name(definition.root)
     return f"{short}Message" if short in tags() else short
 
 
@@ -363,7 +367,7 @@ def _head(definition: Definition) -> Iterator[str]:
     if constants:
         yield f"# Constants of the message, usable by name: {constants}"
     yield "version: 1"
-    yield f"adapter: {definition.root.rpartition('/')[2]}Adapter"
+    yield f"adapter: {short_name(definition.root)}Adapter"
     yield f"ros_type: {definition.root}"
 
 
@@ -406,7 +410,8 @@ def _test(
     adapted = adapter.adapt(example.row, Envelope("", definition.root, np.zeros(1, np.int64)))
     given = flow_style(_without_defaults(cast("Any", example.row)[0].as_py()))
     yield f"  - name: a message of {example.location['topic']}"
-    yield f"    given: {given if len(given) <= _LONG else flow_style(example.location)}"
+    is_short = len(given) <= _LONG and definition.language is Language.ROS
+    yield f"    given: {given if is_short else flow_style(example.location)}"
     if adapted.failures:
         yield f"    # {spec.name} rejects it: {adapted.failures[0].reason}"
         yield f"    rejects: {flow_style(adapted.failures[0].reason)}"

@@ -142,6 +142,8 @@ def adapter_findings(document: Document) -> Iterator[Finding]:
             f"the fields were not checked, because no definition of {', '.join(spec.ros_types)} is known"
         )
         hint = "put the .msg text under `definition`, or run `ingest adapters test --msg-dir DIR`"
+        if not any("/" in msgtype for msgtype in spec.ros_types):
+            hint = "run `ingest plan` with a recording that contains the type"
         location = spec.source.span(("variants",) if spec.model.variants else ("ros_type",))
         yield Finding("unchecked-adapter", Severity.INFO, message, location, hint)
 

@@ -121,7 +121,7 @@ def _topics(inspection: Inspection) -> Iterator[str]:
 def _adapters(inspection: Inspection) -> Iterator[str]:
     unmodeled = [topic for topic in _merged(inspection.topics) if topic.adapter == UnmodeledSpec().name]
     if unmodeled:
-        yield f"# No adapter accepts {', '.join(sorted({topic.msgtype for topic in unmodeled}))}: the ROS shape is kept."
+        yield f"# No adapter accepts {', '.join(sorted({topic.msgtype for topic in unmodeled}))}: their messages keep their shape."
     yield "adapters:"
     yield "  unmodeled: keep                     # a type without an adapter: keep, skip, fail"
     yield "  # load: [adapters/mine.yaml]        # your adapters, for every topic of their types"

@@ -9,9 +9,12 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from foxglove_schemas import MESSAGES, json_definition, json_payload, protobuf_definition, protobuf_payload
+from protobuf_schemas import definition_of, proto3_file
 
 from mosaico_ingest.adapters.adapter import AdapterSpec, Envelope
 from mosaico_ingest.adapters.builtin import BUILTIN, BY_TYPE
+from mosaico_ingest.adapters.draft import draft
+from mosaico_ingest.adapters.mapping.loader import load_adapter
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
 from mosaico_ingest.rosbag.encodings.json_messages import JsonCodec
@@ -68,3 +71,17 @@ def test_foxglove_absent_time_is_null_and_partial_time_is_rejected() -> None:
     adapted = adapter.adapt(rows, Envelope("/t", definition.root, np.zeros(2, np.int64)))
     assert [(failure.row, failure.rule) for failure in adapted.failures] == [(1, "null")]
     assert adapted.rows[0].as_py()["header"] == {"timestamp": None, "frame_id": "a", "sample_counter": None}
+
+
+@pytest.mark.parametrize("definition", [protobuf_definition("PointCloud"), json_definition("PointCloud")])
+def test_draft_of_protobuf_and_json_types_binds(definition: Definition) -> None:
+    text = draft(definition)
+    spec = load_adapter(text)
+    assert spec.check(definition, ros_shape(definition)) == ()
+    assert "ros_type: foxglove.PointCloud" in text
+    assert "definition:" not in text
+
+
+def test_draft_of_all_protobuf_features_binds() -> None:
+    definition = definition_of(proto3_file(), "all.Message")
+    assert load_adapter(draft(definition)).check(definition, ros_shape(definition)) == ()
