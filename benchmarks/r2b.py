@@ -308,7 +308,8 @@ def main() -> None:
         rows = results(selected, options.data, options.scale, options.runs, generate=options.generate)
     head = "| sequence | stand-in | saved | time | CPU | peak memory | content |"
     table = "\n".join([head, "|---|---:|---:|---:|---:|---:|---|", *rows])
-    text = f"{hardware()}, {platform.platform(terse=True)}, Python {platform.python_version()}, scale {options.scale}:\n\n{table}"
+    system = f"{hardware()}, {platform.system()}, Python {platform.python_version()}"
+    text = f"{system}; scale {options.scale}, median of {options.runs}:\n\n{table}"
     if rows:
         print(text)
     if options.page:
