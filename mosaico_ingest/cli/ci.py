@@ -67,7 +67,8 @@ def _findings(recording: CheckedRecording) -> Iterator[Finding]:
 
 def _other_findings(recording: CheckedRecording) -> Iterable[Finding]:
     """Return the findings of the error that are not results of the contract, or the error itself if it has none."""
-    others = [finding for finding in recording.findings if finding.rule != "expectation-failed"]
+    has_results = recording.contract is not None
+    others = [one for one in recording.findings if not has_results or one.rule != "expectation-failed"]
     if others or recording.error is None or recording.findings:
         return others
     return [Finding("run-failed", Severity.ERROR, recording.error)]

@@ -117,3 +117,14 @@ def test_run_with_failed_recording_writes_its_error(tmp_path: Path) -> None:
     assert exit_code("run", "-q", str(manifest), "--junit", str(tmp_path / "a.xml")) == 1
     [(name, outcome, _, _)] = cases(tmp_path / "a.xml")
     assert (name.partition(":")[0], outcome) == ("run-failed", "failure")
+
+
+def test_run_with_failed_group_writes_failed_tests(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap")
+    manifest = tmp_path / "job.yaml"
+    manifest.write_text(
+        f"bag: {{path: '*.mcap'}}\ntarget: {{store: {tmp_path}/s}}\nexpect: {{group: {{files: [b.mcap]}}}}\n"
+    )
+    assert exit_code("run", "-q", str(manifest), "--junit", str(tmp_path / "a.xml")) == 6
+    [(name, outcome, file, line)] = cases(tmp_path / "a.xml")
+    assert (name.partition(":")[0], outcome, file, line) == ("expectation-failed", "failure", "job.yaml", "3")
