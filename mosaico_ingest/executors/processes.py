@@ -197,8 +197,10 @@ def work(pipe: Connection, registrations: Registrations, prepare: Callable[[], N
 def _run_job(pipe: Connection, pickled: bytes, stop: StopHandler, keep_open: KeepOpen) -> None:
     def tell(event: Event) -> None:
         stop.disable()  # an interrupt in the middle of a message would leave half of it in the pipe
+        # `pipe.send` would leave a view of a BytesIO in the traceback, whose collection crashes CPython before 3.12.3.
+        pickled_event = pickle.dumps(event)
         try:
-            pipe.send(event)
+            pipe.send_bytes(pickled_event)
         except OSError as error:  # the parent is gone, so the result has no reader
             raise Abandoned from error
         stop.enable()
