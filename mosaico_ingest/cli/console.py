@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from rich.cells import cell_len
-from rich.console import Console, ConsoleOptions, RenderableType
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.padding import Padding
 from rich.segment import Segment
 from rich.style import StyleType
 from rich.table import Table
@@ -24,6 +25,12 @@ FILE_WIDTH = 240
 """Columns of output that goes to a file or a pipe, where long lines do no harm."""
 EXCERPT_WIDTH = 160
 """Columns of a source line below a finding."""
+COLUMN_GAP = 2
+"""Spaces between the columns of a table."""
+INDENT = "  "
+"""Start of the lines below the first cell of a row, if they have lines of their own."""
+MAX_CELL_LINES = 3
+"""Lines of a cell above which a table gets another layout."""
 SEVERITY_STYLES = {Severity.ERROR: "bold red", Severity.WARNING: "bold yellow", Severity.INFO: "bold cyan"}
 
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -62,16 +69,21 @@ class Terminal(Console):
 
 
 class PlainTable(Table):
-    """A table without borders. Text cells are single lines, with control characters escaped.
+    """A table without borders that does not break words. Text cells are single lines, with control characters escaped.
 
-    Columns in `numbers` are right-aligned and never wrapped. Other columns fold long text, or end in an
-    ellipsis if `ellipsis` is set.
+    Columns in `numbers` are right-aligned and never wrapped. If the table is wider than the terminal, other columns wrap
+    between words; if that is not enough, the first cell of a row has a line of its own, above the other cells; and at
+    last, every cell has a line of its own. With `ellipsis`, long text is cut instead.
     """
 
     def __init__(
         self, *names: str, numbers: Collection[str] = (), ellipsis: bool = False, header: bool = True
     ) -> None:
         super().__init__(box=None, pad_edge=False, header_style="dim", show_header=header)
+        self._names = names
+        self._numbers = numbers
+        self._ellipsis = ellipsis
+        self._rows: list[list[Text]] = []
         for name in names:
             number = name in numbers
             self.add_column(
@@ -85,8 +97,91 @@ class PlainTable(Table):
         self, *renderables: RenderableType | None, style: StyleType | None = None, end_section: bool = False
     ) -> None:
         """Add a row; a line break inside a name must not look like a line of our own."""
-        cells = (Text(one_line(cell)) if isinstance(cell, str) else cell for cell in renderables)
+        cells = [Text(one_line(cell)) if isinstance(cell, str) else cell for cell in renderables]
         super().add_row(*cells, style=style, end_section=end_section)
+        texts = [cell.copy() if isinstance(cell, Text) else Text() for cell in cells]
+        for text in texts if style is not None else ():
+            text.stylize_before(style or "")
+        self._rows.append(texts)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Render in the first layout that fits the width."""
+        if not self._ellipsis and _table_width(self._natural_widths()) > options.max_width:
+            widths = self._wrapped_widths(options.max_width)
+            if widths is None:
+                yield from self._stacked(console, options)
+                return
+            for column, width in zip(self.columns, widths, strict=True):
+                column.width = width
+        yield from super().__rich_console__(console, options)
+
+    def _natural_widths(self) -> list[int]:
+        headers = [cell_len(name) if self.show_header else 0 for name in self._names]
+        return [
+            max((header, *(row[column].cell_len for row in self._rows)))
+            for column, header in enumerate(headers)
+        ]
+
+    def _wrapped_widths(self, width: int) -> list[int] | None:
+        """Return widths of columns that wrap between words, or None if rows become narrow and high even so."""
+        natural = self._natural_widths()
+        widths = [
+            full if name in self._numbers else self._longest_word(column)
+            for column, (name, full) in enumerate(zip(self._names, natural, strict=True))
+        ]
+        spare = width - _table_width(widths)
+        while spare > 0 and widths != natural:
+            narrowest = max(range(len(widths)), key=lambda column: natural[column] / max(1, widths[column]))
+            widths[narrowest] += 1
+            spare -= 1
+        fits = spare >= 0 and all(
+            full <= MAX_CELL_LINES * least for full, least in zip(natural, widths, strict=True)
+        )
+        return widths if fits else None
+
+    def _longest_word(self, column: int) -> int:
+        texts = [self._names[column] if self.show_header else "", *(row[column].plain for row in self._rows)]
+        return max((cell_len(word) for text in texts for word in text.split()), default=0)
+
+    def _stacked(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Yield the first cell of each row on a line of its own, and the other cells below it."""
+        others = PlainTable(*self._names[1:], numbers=self._numbers, header=self.show_header)
+        for column, source in zip(others.columns, self.columns[1:], strict=True):
+            column.justify, column.style = source.justify, source.style
+        for row in self._rows:
+            others.add_row(*row[1:])
+        indented = options.update(width=options.max_width - len(INDENT))
+        lines: list[list[Segment]] = []
+        if _table_width(others._natural_widths()) <= indented.max_width:
+            lines = console.render_lines(others, indented, pad=False)
+        if lines and self.show_header:
+            yield from (Segment(INDENT), *lines.pop(0), Segment.line())
+        for number, row in enumerate(self._rows):
+            yield row[0]
+            if lines:
+                yield from (Segment(INDENT), *lines[number], Segment.line())
+                continue
+            pairs = (
+                Text.assemble((f"{name}: ", "dim"), cell)
+                for name, cell in zip(self._names[1:], row[1:], strict=True)
+                if cell.plain
+            )
+            yield Padding(_packed(pairs, indented.max_width), (0, 0, 0, len(INDENT)), expand=False)
+
+
+def _packed(parts: Iterable[Text], width: int) -> Text:
+    """Return the parts in lines of at most `width` columns, broken between parts; a longer part has its own line."""
+    lines: list[Text] = []
+    for part in parts:
+        if lines and lines[-1].cell_len + COLUMN_GAP + part.cell_len <= width:
+            lines[-1] = Text("  ").join((lines[-1], part))
+        else:
+            lines.append(part)
+    return Text("\n").join(lines)
+
+
+def _table_width(widths: Sequence[int]) -> int:
+    return sum(widths) + COLUMN_GAP * (len(widths) - 1)
 
 
 def print_line(line: str, *, style: str = "", stderr: bool = False) -> None:

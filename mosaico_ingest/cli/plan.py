@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from os.path import normpath
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -22,7 +22,7 @@ from mosaico_ingest.cli.options import (
     write_output,
 )
 from mosaico_ingest.errors import IngestError
-from mosaico_ingest.findings import Severity
+from mosaico_ingest.findings import Severity, join_names
 from mosaico_ingest.remote import is_url
 from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text, time_text
 
@@ -134,7 +134,7 @@ def _print_recording(recording: RecordingPlan, folder: Path) -> None:
     samples = {sample.target: sample for sample in recording.samples}
     names = ("topic", "type", "messages", "becomes", "adapter", "because", "sample")
     table = PlainTable(*names, numbers={"messages"})
-    for topic in plan["topics"]:
+    for topic in sorted(plan["topics"], key=lambda topic: str(topic["topic"])):
         renamed = "" if topic["target"] == topic["topic"] else f" → {topic['target']}"
         every = "" if topic["every"] == 1 else f" / {topic['every']}"
         count = "?" if topic["count"] is None else f"{count_text(topic['count'])}{every}"
@@ -144,7 +144,7 @@ def _print_recording(recording: RecordingPlan, folder: Path) -> None:
             count,
             topic["ontology"]["tag"],
             topic["adapter"]["name"],
-            topic["why"],
+            str(topic["why"]).replace(f" for {topic['msgtype']}", ""),
             _sample_text(samples[topic["target"]]),
         )
     Terminal().print(table)
@@ -185,11 +185,28 @@ def _sample_text(sample: Sample) -> Text:
 
 
 def _print_notes(notes: Sequence[Note]) -> None:
-    for note in notes:
+    for note in _grouped(notes):
         location = f"{note.location}: " if note.location else ""
         hint = f" — {note.help}" if note.help else ""
         line = f"{location}{note.severity.value}[{note.rule}] {note.message}{hint}"
         print_line(line, style=NOTE_STYLES[note.severity])
+
+
+def _grouped(notes: Sequence[Note]) -> Iterator[Note]:
+    """Yield the notes, with one for all topics that are excluded for the same reason."""
+    topics: dict[tuple[Severity, str], list[str]] = {}
+    for note in notes:
+        if note.rule == "skipped-topic":
+            topic, _, reason = note.message.partition(": ")
+            topics.setdefault((note.severity, reason), []).append(topic)
+    for note in notes:
+        _, _, reason = note.message.partition(": ")
+        names = topics.get((note.severity, reason), []) if note.rule == "skipped-topic" else []
+        if len(names) <= 1:
+            yield note
+        elif note.message.startswith(f"{names[0]}: "):
+            message = f"{counted(len(names), 'topic')} {reason}: {join_names(names)}"
+            yield note.model_copy(update={"message": message})
 
 
 def _print_destination(state: DestinationState, sequence: Mapping[str, Any], destination: str) -> None:

@@ -31,7 +31,7 @@ from mosaico_ingest.report.events import (
     TopicProgress,
     Unreadable,
 )
-from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text
+from mosaico_ingest.report.units import bytes_text, count_text, counted, percent_text, seconds_text
 
 if TYPE_CHECKING:
     from mosaico_ingest.job.model import Job
@@ -201,7 +201,7 @@ def _size(path: AnyPath) -> int:
 
 
 def headline(tally: Tally) -> str:
-    """Return one line with the totals, the rates and the remaining time."""
+    """Return one line with the totals, the percentage, the rates, and the elapsed and the remaining time."""
     alone = tally.recordings == 1
     parts: list[str] = []
     if not alone:
@@ -212,8 +212,10 @@ def headline(tally: Tally) -> str:
         share = f"{count_text(tally.read)} of " if promised else ""
         parts += [f"{share}{counted(promised or tally.read, 'message')}"]
         parts += [f"{count_text(tally.rejected)} rejected"] if tally.rejected else []
+        parts += [percent_text(tally.share)] if 0 < tally.share < 1 else []
         rate = count_text(round(tally.read / tally.elapsed_s))
         parts += [f"{rate} msg/s, {bytes_text(tally.payload_bytes / tally.elapsed_s)}/s"]
+    parts += [f"{seconds_text(tally.elapsed_s)} elapsed"] if tally.read else []
     parts += [f"{seconds_text(tally.remaining_s)} left"] if tally.remaining_s is not None else []
     name = next((f"{recording.start.sequence}: " for recording in tally.active.values()), "")
     return one_line(f"{name if alone else ''}{', '.join(parts)}")

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from mosaico_ingest.cli.console import PlainTable, Terminal, print_line
 from mosaico_ingest.cli.options import DistroOption, JsonOption, RecordingArgument, write_output
+from mosaico_ingest.findings import join_names
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.units import (
     bytes_text,
@@ -238,7 +239,9 @@ def _print_excluded(report: Report, *, stderr: bool) -> None:
         if topic.status is TopicStatus.EXCLUDED:
             reasons.setdefault(topic.why, []).append(topic.topic)
     for reason, topics in reasons.items():
-        print_line(f"excluded {', '.join(topics)}: {reason}", style="dim", stderr=stderr)
+        print_line(
+            f"{counted(len(topics), 'topic')} {reason}: {join_names(topics)}", style="dim", stderr=stderr
+        )
 
 
 def rejection_lines(report: Report) -> Iterator[str]:
@@ -268,7 +271,6 @@ def _totals(report: Report) -> Iterator[str]:
         selected = [topic for topic in report.topics if topic.status is not TopicStatus.EXCLUDED]
         is_part = len(selected) < len(report.topics) or totals.read < sum(t.promised or 0 for t in selected)
         size = totals.payload_bytes if is_part else report.source_bytes
-        source = f"{bytes_text(size)} of messages" if is_part else bytes_text(size)
-        yield f"{source} {stored_text(size, totals.stored_bytes)}"
+        yield stored_text(size, totals.stored_bytes, of=" of messages" if is_part else "")
     rate = totals.read / report.duration_s if report.duration_s else 0
     yield f"{seconds_text(report.duration_s)}, {count_text(round(rate))} msg/s"

@@ -165,7 +165,7 @@ class RecordingView:
     def size(self) -> str:
         """The size of the files, and the stored size."""
         source, stored = self.report.source_bytes, self.totals.stored_bytes
-        return f"{bytes_text(source)}{f', {stored_text(source, stored)}' if stored else ''}"
+        return stored_text(source, stored) if stored else bytes_text(source)
 
     @property
     def messages_per_s(self) -> int:

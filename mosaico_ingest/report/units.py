@@ -61,9 +61,16 @@ def time_text(instant_ns: int | None) -> str:
     return f"{instant:%Y-%m-%d %H:%M:%S}.{instant_ns % 10**9 // 10**6:03}"
 
 
-def stored_text(source_bytes: int, stored_bytes: int) -> str:
-    """Return the stored size and its share of the source, such as `stored in 28.4 kB (17 %)`."""
-    share = f" ({percent_text(stored_bytes / source_bytes)})" if source_bytes else ""
+def stored_text(source_bytes: int, stored_bytes: int, *, of: str = "") -> str:
+    """Return the stored size and its share of the source, such as `stored in 28.4 kB (17 % of 172.0 kB)`.
+
+    `of` names the source if it is not the files of the recording, such as ` of messages`.
+    """
+    share = (
+        f" ({percent_text(stored_bytes / source_bytes)} of {bytes_text(source_bytes)}{of})"
+        if source_bytes
+        else ""
+    )
     return f"stored in {bytes_text(stored_bytes)}{share}"
 
 

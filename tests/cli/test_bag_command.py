@@ -79,7 +79,7 @@ def test_bag_dry_run_prints_plan_and_writes_nothing(capsys: pytest.CaptureFixtur
     assert bag("Drive 1.mcap", "--dry-run", "--host", "127.0.0.1", "--port", "1", "--topics", "/imu") == 0
     output = capsys.readouterr().out
     assert "IMUAdapter" in output
-    assert "[skipped-topic] /odom" in output
+    assert "/odom and 1 more" in output
     assert [path.name for path in Path().iterdir()] == ["Drive 1.mcap"]
 
 

@@ -51,7 +51,9 @@ def test_tally_recordings_of_different_size_weighted_by_size(tally: Tally) -> No
     tally.add(1, TopicProgress("/a", read=50, payload_bytes=5000))
     assert tally.share == 0.5
     assert tally.remaining_s == 10.0
-    assert headline(tally) == "1 of 3 recordings, 150 messages, 15 msg/s, 600 B/s, 10.00 s left"
+    assert headline(tally) == (
+        "1 of 3 recordings, 150 messages, 50 %, 15 msg/s, 600 B/s, 10.00 s elapsed, 10.00 s left"
+    )
 
 
 def test_tally_skipped_recording_does_not_affect_estimate(tally: Tally) -> None:

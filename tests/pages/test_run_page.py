@@ -115,7 +115,7 @@ def test_run_page_single_healthy_recording_is_open() -> None:
 
 def test_run_page_stored_size_states_share() -> None:
     page = run_page(run(recording(1)))
-    assert "(5.0 MB, stored in 200.0 kB (4 %))" in page
+    assert "(stored in 200.0 kB (4 % of 5.0 MB))" in page
 
 
 def test_markdown_summary_lists_problems_first_and_escapes_cells() -> None:

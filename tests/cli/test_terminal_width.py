@@ -1,0 +1,113 @@
+"""Output in a real (pseudo) terminal of 60 and of 200 columns: every line fits, and no word is broken."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import re
+import struct
+import subprocess
+import sys
+import termios
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+TOPICS = ("/camera/image_raw/compressed", "/joint_states", "/lidar/points")
+COMMANDS = {
+    "ls": ["store", "ls"],
+    "show": ["store", "show", "quickstart_drive"],
+    "describe": ["store", "describe", "quickstart_drive"],
+    "describe topic": ["store", "describe", "quickstart_drive/odom"],
+    "head": ["store", "head", "quickstart_drive/odom", "-n", "2", "--flatten"],
+    "plot": ["store", "plot", "quickstart_drive/imu", "acceleration"],
+    "sql": ["store", "sql"],
+    "inspect": ["inspect", "configs/quickstart/drive.mcap"],
+    "plan": ["plan", "configs/quickstart.yaml"],
+    "report": ["report", "run.json"],
+}
+LONG = {"inspect", "plan", "report", "show", "describe topic"}
+"""Commands that also print sentences, which the terminal wraps."""
+
+
+def in_terminal(words: list[str], width: int, folder: Path) -> list[str]:
+    """Return the lines that a command prints to a terminal of this width."""
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 50, width, 0, 0))
+    command = [sys.executable, "-m", "mosaico_ingest", *words]
+    environment = {name: value for name, value in os.environ.items() if name not in {"COLUMNS", "LINES"}}
+    with subprocess.Popen(  # noqa: S603 - our own code
+        command, stdin=theirs, stdout=theirs, stderr=theirs, cwd=folder, env={**environment, "TERM": "xterm"}
+    ) as process:
+        os.close(theirs)
+        output = b""
+        while True:
+            try:
+                part = os.read(ours, 1 << 16)
+            except OSError:  # Linux reports the end of a terminal as an error
+                break
+            if not part:
+                break
+            output += part
+    os.close(ours)
+    assert process.returncode in {0, 1}, output.decode()
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", output.decode())
+    return [line.rstrip() for line in text.replace("\r\n", "\n").splitlines()]
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("terminal")
+    (folder / "configs").symlink_to(ROOT / "configs")
+    manifest = (ROOT / "configs" / "quickstart.yaml").read_text()
+    (folder / "configs.yaml").write_text(manifest)
+    command = [
+        sys.executable,
+        "-m",
+        "mosaico_ingest",
+        "bag",
+        "configs/quickstart/drive.mcap",
+        "--name",
+        "quickstart_drive",
+    ]
+    arguments = ["--store", "mosaico", "--report", "run.json", "-q"]
+    subprocess.run([*command, *arguments], cwd=folder, check=True)  # noqa: S603 - our own code
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [60, 200])
+@pytest.mark.parametrize("name", COMMANDS)
+def test_command_output_fits_terminal_without_breaking_words(project: Path, name: str, width: int) -> None:
+    lines = in_terminal(COMMANDS[name], width, project)
+    assert lines
+    sentences = (": ", " .. ")
+    table = [
+        line
+        for line in lines
+        if name not in LONG or line[:1] == " " or not any(mark in line for mark in sentences)
+    ]
+    assert max(map(len, table)) <= width, max(table, key=len)
+    words = {word.rstrip(",:") for line in lines for word in line.split()}
+    if name in {"show", "describe", "inspect", "plan", "report"}:
+        assert set(TOPICS) <= words
+    if name in {"inspect", "plan"}:
+        assert {"sensor_msgs/msg/CompressedImage", "CompressedImageAdapter"} <= words
+
+
+@pytest.mark.slow
+def test_wide_terminal_has_one_line_per_topic(project: Path) -> None:
+    for name in ("show", "describe", "inspect"):
+        lines = in_terminal(COMMANDS[name], 200, project)
+        (line,) = [line for line in lines if line.startswith("/joint_states ")]
+        assert {"RobotJoint", "500"} <= set(line.split())
+
+
+@pytest.mark.slow
+def test_narrow_terminal_keeps_values_with_their_names(project: Path) -> None:
+    lines = in_terminal(COMMANDS["describe"], 60, project)
+    at = lines.index("/joint_states")
+    assert "rows: 500" in lines[at + 1]
+    assert any("rate: 50.0 Hz" in line for line in lines[at + 1 : at + 4])
