@@ -12,7 +12,7 @@ import pytest
 from mosaicod import Mosaicod, running
 from object_store import ObjectStore
 
-from mosaico_ingest.destinations.base import Sink, topic_schema
+from mosaico_ingest.destinations.base import AmendableSession, Sink, topic_schema
 from mosaico_ingest.destinations.memory import MemorySink
 from mosaico_ingest.destinations.server.destination import ServerSink
 from mosaico_ingest.destinations.store import Store, StoreSink
@@ -424,3 +424,59 @@ def test_sink_invalid_metadata_is_refused(there: Destination, metadata: dict[str
         pytest.fail("the session opened")
     with there.sink.open("drive", {}) as session, pytest.raises(SinkError, match="/imu"):
         session.topic("/imu", FLAG, metadata)
+
+
+def amendable(
+    there: Destination, if_exists: IfExists = IfExists.FAIL
+) -> AbstractContextManager[AmendableSession]:
+    sink: Any = there.sink
+    session: AbstractContextManager[AmendableSession] = sink.open(
+        "drive", {"car": 7}, if_exists=if_exists, amendable=True
+    )
+    return session
+
+
+def test_amend_metadata_is_stored_with_the_commit(there: Destination) -> None:
+    with amendable(there) as session:
+        session.topic("/gps/fix", POINT, {}).write(points(1, 2))
+        assert there.sequences() == []
+        session.amend({"car": 8, "passed": True})
+    assert there.metadata("drive") == {"car": 8, "passed": True}
+    assert there.rows("drive", "/gps/fix").num_rows == 2
+    assert [topic.rows for topic in session.stored()] == [2]
+
+
+def test_amend_sequence_stores_content_under_the_other_name_only(there: Destination) -> None:
+    for times in ((1, 2), (3, 4, 5)):  # the second session replaces the content of the first one
+        with amendable(there) as session:
+            session.topic("/gps/fix", POINT, {}).write(points(*times))
+            session.amend({"car": 9}, sequence="drive__failed")
+    assert there.sequences() == ["drive__failed"]
+    assert there.metadata("drive__failed") == {"car": 9}
+    assert there.rows("drive__failed", "/gps/fix").column(0).to_pylist() == [3, 4, 5]
+    write(there, 1)
+    assert there.sequences() == ["drive", "drive__failed"]
+
+
+def test_amendable_session_exception_leaves_nothing(there: Destination) -> None:
+    with pytest.raises(CrashError), amendable(there) as session:
+        session.topic("/gps/fix", POINT, {}).write(points(1))
+        session.amend({}, sequence="drive__failed")
+        raise CrashError
+    assert there.sequences() == []
+    write(there, 1)
+
+
+def test_amendable_session_without_changes_behaves_as_any_session(there: Destination) -> None:
+    with amendable(there) as session:
+        session.topic("/gps/fix", POINT, {}).write(points(1))
+    assert (there.sequences(), there.metadata("drive")) == (["drive"], {"car": 7})
+
+
+def test_amend_during_replace_swaps_the_stored_sequence(keeping: Destination) -> None:
+    write(keeping, 1)
+    with amendable(keeping, IfExists.REPLACE) as session:
+        session.topic("/gps/fix", POINT, {}).write(points(8, 9))
+        session.amend({"car": 1})
+    assert keeping.rows("drive", "/gps/fix").column(0).to_pylist() == [8, 9]
+    assert keeping.metadata("drive") == {"car": 1}

@@ -327,8 +327,9 @@ class ObjectFiles:
     def _copy(self, path: AnyPath, final: AnyPath) -> None:
         """Copy a segment; the original stays unpublished, so that the end of its session removes it."""
         session = next(key for key, unpublished in self._unpublished.items() if path in unpublished)
-        self._unpublished[session].append(cast("RemotePath", final))
-        with path.open("rb") as source, final.open("wb") as target:
+        remote = cast("RemotePath", final)
+        self._unpublished[session].append(remote)
+        with translate_errors(remote), path.open("rb") as source, remote.open_output() as target:
             shutil.copyfileobj(source, target, _COPY_BYTES)
 
     def remove(self, paths: Iterable[AnyPath]) -> None:
