@@ -297,3 +297,27 @@ def test_validator_never_downloads_schemas() -> None:
     assert validator_of(
         '{"$schema": "http://json-schema.org/draft-07/schema#", "type": "object"}', "T"
     ).is_valid({})
+
+
+@pytest.mark.parametrize(
+    "schema",
+    [
+        {"$ref": "#"},
+        {"properties": {"a": {"$ref": "#/properties/a"}}},
+        {"$dynamicRef": "#missing", "properties": {"a": {"type": "integer"}}},
+        {"properties": {"a": {"pattern": "("}}},
+        {"type": "object", "properties": {"": {"type": "integer"}, "a b": {"minimum": 10**30}}},
+    ],
+    ids=json.dumps,
+)
+def test_hostile_schema_rejects_rows_or_raises_own_error(schema: Any) -> None:
+    payloads = [b'{"a": 1}', b'{"": 2, "a b": 3}', b"{}", b'{"a": "x"}', b"[]"]
+    try:
+        definition = definition_of(schema)
+    except BagError:
+        return
+    definition = (
+        definition if definition.shape is not None else infer_definition(definition, [block_of(payloads)])
+    )
+    decoded = check_agreement(definition, payloads)
+    assert len(decoded.index) + len(decoded.failures) == len(payloads)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from protobuf_schemas import SCALARS, definition_of, message_class, proto2_file, proto3_file
+from protobuf_schemas import SCALARS, definition_of, file_set, message_class, proto2_file, proto3_file
 
 from mosaico_ingest.decode.base import Decoded, DictDecoder
 from mosaico_ingest.decode.protobuf import ProtobufDecoder
@@ -223,3 +223,14 @@ def test_definition_has_types_and_constants_of_enums() -> None:
 def test_read_schema_unusable_schema_raises(embedded: Embedded | None, text: str) -> None:
     with pytest.raises(BagError, match=text):
         read_schema("all.Message", embedded)
+
+
+@given(st.integers(0, 400), st.integers(0, 255))
+def test_read_schema_damaged_schema_raises_only_own_errors(position: int, value: int) -> None:
+    data = bytearray(file_set(FILE2))
+    data[position % len(data)] = value
+    try:
+        definition = read_schema("all.Old", Embedded.from_bytes("protobuf", bytes(data)))
+    except BagError:
+        return
+    assert len(ProtobufDecoder(definition).decode(block_of([b"\x08\x01"] * 6)).rows) <= 6

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from typing import Any
 
 from jsonschema.exceptions import best_match
+from referencing.exceptions import Unresolvable
 
 from mosaico_ingest.errors import BagError, DecodeError
 from mosaico_ingest.rosbag.definitions.model import Definition
@@ -73,7 +75,11 @@ class JsonCodec:
     def _validate(self, value: Any) -> None:  # noqa: ANN401 - any JSON value
         if self._validator is None:
             return
-        error: Any = best_match(self._validator.iter_errors(value))
+        try:
+            error: Any = best_match(self._validator.iter_errors(value))
+        except (RecursionError, Unresolvable, re.error, ArithmeticError) as reason:
+            text = f"the schema cannot be evaluated: {type(reason).__name__}"
+            raise DecodeError(text, rule="json-schema") from None
         if error is not None:
             reason = f"{error.json_path}: {error.message}"
             shown = reason if len(reason) <= _MAX_REASON else f"{reason[:_MAX_REASON]}…"

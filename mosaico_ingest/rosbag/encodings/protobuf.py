@@ -19,7 +19,6 @@ from typing import Any
 import pyarrow as pa
 from google.protobuf import descriptor_pool, json_format, message_factory
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
-from google.protobuf.descriptor_database import DescriptorDatabase
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import DecodeError as WireError
 from google.protobuf.message import EncodeError, Message
@@ -114,16 +113,29 @@ def _descriptor(name: str, text: str) -> Descriptor:
         files = FileDescriptorSet.FromString(Embedded("protobuf", text).to_bytes())
     except (WireError, ValueError) as error:
         raise BagError(f"the schema is not a FileDescriptorSet: {error}", where=name) from error
-    database = DescriptorDatabase()
-    names = {file.name for file in files.file}
+    pool = descriptor_pool.DescriptorPool()
     try:
-        for file in files.file:
-            database.Add(file)
-        for missing in {path for file in files.file for path in file.dependency} - names:
-            database.Add(_well_known(missing))
-        return descriptor_pool.DescriptorPool(database).FindMessageTypeByName(name)
-    except (KeyError, TypeError, ValueError) as error:
+        _add_files(pool, {file.name: file for file in files.file})
+        return pool.FindMessageTypeByName(name)
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise BagError(f"the FileDescriptorSet does not define {name}: {error}", where=name) from error
+
+
+def _add_files(pool: Any, files: dict[str, Any]) -> None:  # noqa: ANN401 - a DescriptorPool
+    """Add files to a pool, each after the files that it imports."""
+    added: set[str] = set()
+
+    def add(path: str) -> None:
+        if path in added:
+            return
+        added.add(path)
+        file = files.get(path) or _well_known(path)
+        for imported in file.dependency:
+            add(imported)
+        pool.Add(file)
+
+    for path in files:
+        add(path)
 
 
 def _well_known(path: str) -> Any:  # noqa: ANN401 - a FileDescriptorProto
