@@ -119,11 +119,13 @@ def report(
     ] = None,
 ) -> None:
     """Show report files as tables, as an HTML page, or as a Markdown summary."""
+    from mosaico_ingest.cli.process import collect_garbage_as_usual
     from mosaico_ingest.pages.run import run_page
     from mosaico_ingest.report.compare import compare_reports
     from mosaico_ingest.report.markdown import markdown_summary
     from mosaico_ingest.report.model import read_report
 
+    collect_garbage_as_usual()
     reports = [read_report(path) for path in paths]
     combined = reports[0].model_copy(
         update={

@@ -124,7 +124,7 @@ def _violations(at: int, report: Report) -> Iterator[_Entry]:
             messages=0,
             title=lambda _, name=result.expectation: f"Expectation {name} failed",
             reason=f"{result.topic}: {result.text}" if result.topic else result.text,
-            advice=f"Check the sensor or its driver; if the data are right, change the expectation at {location}.",
+            advice=f"Correct the source of the data, or the expectation at {location} if the data are right.",
             is_error=True,
         )
 

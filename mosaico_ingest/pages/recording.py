@@ -274,7 +274,14 @@ class TopicView:
                 for rejection in report.rejections
                 for stretch in rejection.stretches
             ]
-            self.track = draw_track(axis, report.target, timeline, rejected=rejected, unreadable=unreadable)
+            self.track = draw_track(
+                axis,
+                report.target,
+                timeline,
+                span=_row_span(report),
+                rejected=rejected,
+                unreadable=unreadable,
+            )
 
 
 class QuarantinedMessage(Struct, frozen=True):
@@ -315,6 +322,10 @@ def _examples(report: Report) -> Iterator[QuarantinedMessage]:
         counts[key] = counts.get(key, 0) + 1
         if counts[key] <= MAX_EXAMPLES:
             yield message
+
+
+def _row_span(topic: TopicReport) -> Span | None:
+    return None if topic.start_ns is None or topic.end_ns is None else (topic.start_ns, topic.end_ns)
 
 
 def _times(report: Report) -> Iterator[int]:

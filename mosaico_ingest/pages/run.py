@@ -92,7 +92,8 @@ def _verdict(recordings: Sequence[Report]) -> _Verdict:
         title = "The run failed" if failed == len(recordings) else "The run failed for some recordings"
         return _Verdict("bad", title, text)
     if violations:
-        return _Verdict("bad", "The data violate the contract", text)
+        is_tolerated = all(one.contract is None or one.contract.on_failure == "warn" for one in recordings)
+        return _Verdict("warn" if is_tolerated else "bad", "The data violate the contract", text)
     if incomplete:
         return _Verdict("warn", "Some messages are missing", text)
     if skipped == len(recordings):
@@ -116,7 +117,7 @@ def _totals(report: RunReport) -> dict[str, str]:
         "Recorded": bytes_text(source_bytes),
         "Stored": f"{bytes_text(stored_bytes)}{share}",
         "Working time": seconds_text(seconds),
-        "Messages per second": count_text(round(read / seconds)) if seconds else "",
+        "Messages / s": count_text(round(read / seconds)) if seconds else "",
     }
 
 

@@ -183,9 +183,13 @@ def _topic_view(topic: TopicInfo, statistics: TopicStatistics | None, axis: Axis
         rate_text(timing.rate_hz) if timing else "",
         interval_text(timeline.jitter_ns) if timeline else "",
         timeline.gap_count if timeline else 0,
-        draw_track(axis, topic.name, timeline) if axis is not None else None,
+        draw_track(axis, topic.name, timeline, span=_row_span(topic)) if axis is not None else None,
         tuple(map(_column, statistics.columns)) if statistics else (),
     )
+
+
+def _row_span(topic: TopicInfo) -> tuple[int, int] | None:
+    return None if topic.start_ns is None or topic.end_ns is None else (topic.start_ns, topic.end_ns)
 
 
 def _column(column: ColumnStatistics) -> _Column:

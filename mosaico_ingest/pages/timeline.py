@@ -96,14 +96,15 @@ def draw_track(
     name: str,
     timeline: TimelineReport | None,
     *,
+    span: Span | None = None,
     rejected: Sequence[Span] = (),
     unreadable: Sequence[Span] = (),
 ) -> Track:
-    """Return the drawing of one topic on the axis."""
+    """Return the drawing of one topic on the axis; `span` is the time of its first and last row, if it is known."""
     rows = gaps = ""
     words: list[str] = []
     if timeline is not None:
-        rows = _rows_path(_with_wider_bins(timeline), axis)
+        rows = _rows_path(_with_wider_bins(timeline), axis, span)
         gaps = _marks(
             axis, [(gap.start_ns, gap.end_ns) for gap in timeline.gaps], HEIGHT - GAP_HEIGHT, HEIGHT
         )
@@ -165,7 +166,7 @@ def _with_wider_bins(timeline: TimelineReport) -> TimelineReport:
     return timeline.model_copy(update={"step_ns": timeline.step_ns * factor, "counts": counts})
 
 
-def _rows_path(timeline: TimelineReport, axis: Axis) -> str:
+def _rows_path(timeline: TimelineReport, axis: Axis, span: Span | None) -> str:
     """Return the outline of all bars as one path; equal neighbors form one bar.
 
     A bin of a regular topic has one row more or less than the next one, and the first and the last bin are usually covered
@@ -181,7 +182,10 @@ def _rows_path(timeline: TimelineReport, axis: Axis) -> str:
     step = timeline.step_ns * axis.scale
     if bins * step < MIN_BAR:
         left, step = min(max(left, 0.0), WIDTH - MIN_BAR), MIN_BAR / bins
-    edges = [min(max(left + number * step, 0.0), WIDTH) for number in range(bins + 1)]
+    first, last = (0.0, float(WIDTH)) if span is None else (axis.position(span[0]), axis.position(span[1]))
+    if last - first < MIN_BAR:
+        first, last = 0.0, float(WIDTH)
+    edges = [min(max(left + number * step, first), last) for number in range(bins + 1)]
     highest = max(1, *counts)
     moves = [f"M{edges[0]:.5g} {HEIGHT}"]
     level = 0

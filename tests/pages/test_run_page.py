@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -248,3 +250,24 @@ def test_run_page_contract_results_are_counted_per_expectation_and_violations_ar
     assert "2023-11-14 22:13:20.000" in page
     # The list of all recordings repeats those that the page also has without scripts.
     assert unpacked(page).count("<h3>Contract</h3>") == 60 + MAX_OPEN
+
+
+@pytest.mark.slow
+def test_report_command_1000_recordings_need_less_than_200_mb_and_5_s_of_cpu(tmp_path: Path) -> None:
+    template = recording(1, topics=9)
+    copies = [template.replace(sequence=f"drive_{at:04}") for at in range(1000)]
+    report, page = tmp_path / "run.json", tmp_path / "run.html"
+    report.write_text(run(*copies).model_dump_json(indent=2) + "\n")
+    # The child of this process would start with the memory of the tests, so it starts a process itself and measures that.
+    program = (
+        "import os, resource, subprocess, sys\n"
+        "subprocess.run([sys.executable, '-m', 'mosaico_ingest', *sys.argv[1:]], check=True)\n"
+        "used = resource.getrusage(resource.RUSAGE_CHILDREN)\n"
+        "print(used.ru_maxrss, used.ru_utime + used.ru_stime)"
+    )
+    words = [sys.executable, "-c", program, "report", str(report), "--html", str(page)]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)  # noqa: S603 - a program of ours
+    peak_kib, cpu_s = map(float, done.stdout.split())
+    assert peak_kib < 200_000_000 / 1024
+    assert cpu_s < 5
+    assert page.stat().st_size < 1_000_000

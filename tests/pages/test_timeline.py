@@ -94,3 +94,9 @@ def test_track_of_any_counts_stays_on_the_axis(
     drawn = positions(draw_track(axis, "/a", timeline).rows)
     assert all(0 <= position <= WIDTH for position in drawn)
     assert drawn == sorted(drawn)
+
+
+def test_track_rows_end_at_the_last_row() -> None:
+    timeline = TimelineReport(start_ns=0, step_ns=S, counts=(5,) * 8, interval_ns=S // 5)
+    track = draw_track(TWENTY_SECONDS, "/a", timeline, span=(0, 7_600_000_000))
+    assert positions(track.rows)[-1] == WIDTH * 7.6 / 20
