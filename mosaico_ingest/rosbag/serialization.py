@@ -31,6 +31,7 @@ from mosaico_ingest.rosbag.definitions.model import (
     Definition,
     Field,
     MessageType,
+    Source,
 )
 from mosaico_ingest.rosbag.definitions.parser import BYTES
 
@@ -159,7 +160,7 @@ class Deserializer:
             return
         raise DecodeError(
             f"{left} bytes remain after the last field of {self._definition.root}, whose definition is from "
-            f"{_ORIGINS[self._definition.source.value]}",
+            f"{_ORIGINS[self._definition.source]}",
             rule="trailing-bytes",
         )
 
@@ -173,7 +174,12 @@ def _distro_readers(
 
 
 _OTHER_ENCODINGS = frozenset({"encapsulation", "pl-cdr", "xcdr2"})
-_ORIGINS = {"bag": "the recording", "custom": "a custom definition", "distro": "the distro's definitions"}
+_ORIGINS = {
+    Source.BAG: "the recording",
+    Source.CUSTOM: "a custom definition",
+    Source.DISTRO: "the distro's definitions",
+    Source.PACKAGE: "a public package",
+}
 
 
 def _byte_order(payload: bytes) -> str:

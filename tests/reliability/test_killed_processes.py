@@ -24,7 +24,7 @@ NAMES = ("one", "two", "three")
 TOPICS = tuple(f"/speed_{number}" for number in range(40))
 ROWS = 5000
 """Rows per topic; many topics make many events, each of which may meet a broken pipe."""
-VICTIMS = ("parent", "worker", "both")
+VICTIMS = ("parent", "worker", "parent", "both")
 
 
 def start(job: Path) -> subprocess.Popen[bytes]:
@@ -64,6 +64,14 @@ def wait_for_end(workers: list[int]) -> None:
             time.sleep(0.02)
         else:
             pytest.fail("a worker without a parent does not end")
+
+
+def wait_for_session(process: subprocess.Popen[bytes], store: Path) -> None:
+    """Wait until a worker has opened a session, before which a kill is harmless."""
+    staging = store / "staging"
+    before = set(staging.glob("*"))
+    while process.poll() is None and set(staging.glob("*")) <= before:
+        time.sleep(0.005)
 
 
 def content(store: Path) -> dict[str, float]:
@@ -106,15 +114,16 @@ def kill_and_look(write_bag: WriteBag, job: Path, store: Path, rounds: int) -> d
     before = content(store)
     for value in range(1, rounds + 1):
         victim = VICTIMS[value % len(VICTIMS)]
-        if value % 2:  # nothing is replaced, so `on_error.session` could keep a part
+        if moments.random() < 0.7:  # nothing is replaced, so `on_error.session` could keep a part
             for name in before:
                 Store.open(store).delete_sequence(name)
             before = {}
         write(value)
         process = start(job)
         workers: list[int] = []
+        wait_for_session(process, store)
         try:
-            process.wait(duration * moments.uniform(0.4, 1.0))
+            process.wait(duration * moments.uniform(0, 0.5))
         except subprocess.TimeoutExpired:
             workers = kill(process, victim)
         process.wait(120)
@@ -130,7 +139,7 @@ def kill_and_look(write_bag: WriteBag, job: Path, store: Path, rounds: int) -> d
 @pytest.fixture
 def job(write_job: WriteJob) -> Path:
     bag = {"path": "*.db3", "custom_msgs": [{"package": "own_msgs", "path": "definitions"}]}
-    return write_job(bag=bag, sequence={"name": "{stem}", "if_exists": "replace"})
+    return write_job(bag=bag, sequence={"name": "{stem}", "if_exists": "replace"}, run={"memory": "1MiB"})
 
 
 @pytest.mark.slow

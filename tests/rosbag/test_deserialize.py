@@ -22,6 +22,7 @@ from mosaico_ingest.rosbag.definitions.model import (
     Definition,
     Embedded,
     Field,
+    Source,
 )
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.serialization import Deserializer, Serializer, min_size
@@ -95,6 +96,14 @@ class TestTails:
     @pytest.mark.parametrize("tail", [b"", b"\1", b"\1\2", b"\1\2\3"])
     def test_cdr_three_trailing_bytes_are_accepted(self, tail: bytes) -> None:
         assert cdr("int8 a", b"\5" + tail) == {"a": 5}
+
+    @pytest.mark.parametrize("source", list(Source))
+    def test_deserializer_trailing_bytes_are_refused_for_every_source(self, source: Source) -> None:
+        types = definition("int8 a").types
+        reader = Deserializer(Definition(next(iter(types)), types, source), Encoding.CDR)
+        with pytest.raises(DecodeError) as raised:
+            reader.to_dict(LITTLE + bytes(8) + b"\1")
+        assert raised.value.rule == "trailing-bytes"
 
     @pytest.mark.promise("trailing-bytes")
     def test_cdr_four_to_seven_trailing_zeros_are_counted(self) -> None:
