@@ -6,8 +6,6 @@ from collections.abc import Collection, Iterable, Sequence
 from html import escape
 from itertools import islice
 
-__all__ = ["html_table"]
-
 MAX_ROWS = 100
 """Rows of a table; the last line states how many there are."""
 

@@ -17,20 +17,6 @@ from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 from mosaico_ingest.rosbag.definitions.model import Definition, Language
 from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS, encoding_of
 
-__all__ = [
-    "RESERVED_KEYS",
-    "ROS_METADATA_KEY",
-    "Adapted",
-    "Adapter",
-    "AdapterSpec",
-    "Envelope",
-    "RecordedSchema",
-    "UnmodeledSpec",
-    "recorded_schema",
-    "ros_metadata",
-    "source_metadata",
-]
-
 ROS_METADATA_KEY = "_ros_"
 """Reserved key: it takes precedence over the same key in the user's topic metadata."""
 MCAP_METADATA_KEY = "_mcap_"

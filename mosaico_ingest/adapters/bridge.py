@@ -42,18 +42,6 @@ if TYPE_CHECKING:
     from mosaico_ingest.ontology.header import Message
     from mosaico_ingest.rosbag.blocks import ROSMessage
 
-__all__ = [
-    "ENTRY_POINTS",
-    "AdapterFinder",
-    "ROSBridge",
-    "Reason",
-    "Resolution",
-    "adapter_spec",
-    "installed_adapters",
-    "load_adapter_reference",
-    "suggest_reference",
-]
-
 _MAPPING_SUFFIXES = frozenset({".yaml", ".yml"})
 _ADAPTER_KEY = re.compile(r"^adapter:\s*['\"]?(?P<name>\w+)['\"]?\s*(#|$)", re.MULTILINE)
 """The name of the adapter in an adapter file, found without parsing the file."""

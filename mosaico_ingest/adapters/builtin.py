@@ -19,17 +19,6 @@ from mosaico_ingest.adapters.adapter import Adapter
 from mosaico_ingest.adapters.mapping.loader import MappingSpec, adapter_from_model
 from mosaico_ingest.rosbag.definitions.model import Definition
 
-__all__ = [
-    "BUILTIN",
-    "BY_NAME",
-    "BY_TYPE",
-    "CATALOG",
-    "CATALOG_FILE",
-    "Builtin",
-    "builtins_of",
-    "find_builtin",
-]
-
 CATALOG = Path(__file__).parent / "catalog"
 CATALOG_FILE = CATALOG.with_suffix(".json")
 

@@ -11,8 +11,6 @@ from typing import Any
 from mosaico_ingest.adapters.builtin import CATALOG, CATALOG_FILE, Builtin, builtins_of, find_builtin
 from mosaico_ingest.adapters.mapping.loader import load_adapter
 
-__all__ = ["catalog_file", "read_catalog", "with_catalog"]
-
 _BEGIN, _END = "<!-- catalog: generated from its files -->\n", "<!-- end of catalog -->\n"
 
 

@@ -19,29 +19,13 @@ from mosaico_ingest.adapters.explain import unread_fields
 from mosaico_ingest.adapters.mapping.columns import DataType, pt
 from mosaico_ingest.adapters.mapping.conversion import check_fits
 from mosaico_ingest.adapters.mapping.loader import MappingAdapter, MappingSpec, load_adapter
-from mosaico_ingest.adapters.mapping.types import (
-    TypeMismatch,
-    expr_type_of,
-    format_type,
-    is_number,
-)
+from mosaico_ingest.adapters.mapping.types import TypeMismatch, expr_type_of, format_type, is_number
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.job.yaml_source import resolve_plain
 from mosaico_ingest.ontology.registry import ontology_type, tags
 from mosaico_ingest.rosbag.definitions.linking import TEXTS, ros_shape
 from mosaico_ingest.rosbag.definitions.model import Container, Definition, Field, Language
 from mosaico_ingest.rosbag.definitions.parser import BYTES
-
-__all__ = [
-    "ColumnDraft",
-    "RecordedExample",
-    "draft",
-    "draft_columns",
-    "draft_ontology_type",
-    "flow_style",
-    "quote_expression",
-    "quote_key",
-]
 
 
 def quote_key(name: str) -> str:

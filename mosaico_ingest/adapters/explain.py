@@ -38,13 +38,6 @@ from mosaico_ingest.adapters.standalone import mapping_of
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
 
-__all__ = [
-    "ColumnOrigin",
-    "Description",
-    "describe",
-    "unread_fields",
-]
-
 _FieldPath: TypeAlias = "tuple[str, ...]"
 
 

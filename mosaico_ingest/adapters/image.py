@@ -11,17 +11,10 @@ import numpy as np
 import pyarrow as pa
 from msgspec import Struct
 
-from mosaico_ingest.adapters.adapter import (
-    Adapted,
-    Adapter,
-    AdapterSpec,
-    Envelope,
-)
+from mosaico_ingest.adapters.adapter import Adapted, Adapter, AdapterSpec, Envelope
 from mosaico_ingest.errors import AdapterError, missing_library
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.rosbag.definitions.model import Definition
-
-__all__ = ["IMAGE_TAG", "PngImageSpec", "grayscale_pixels", "grayscale_png", "without_png"]
 
 IMAGE_TAG = "Image"
 """The tag of the ontology type whose rows can be stored as PNG."""

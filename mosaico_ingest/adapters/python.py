@@ -24,16 +24,6 @@ if TYPE_CHECKING:
     from mosaico_ingest.ontology.header import Header, Message
     from mosaico_ingest.ontology.model import Serializable
 
-__all__ = [
-    "PythonAdapterSpec",
-    "ROSAdapterBase",
-    "is_adapter_class",
-    "ontology_of",
-    "register_default_adapter",
-    "registered_adapters",
-    "ros_types_of",
-]
-
 T = TypeVar("T", bound="Serializable")
 A = TypeVar("A", bound=type[Any])
 
@@ -100,11 +90,7 @@ class ROSAdapterBase(ABC, Generic[T]):
     @classmethod
     def unpack_mosaico_msg(cls, mosaico_msg: Message | T) -> tuple[T, Header]:
         """Return the ontology object of a message and its header, which is empty if the object has none."""
-        from mosaico_ingest.ontology.header import (  # noqa: PLC0415 - the models are slow to import
-            Header,
-            Message,
-            Time,
-        )
+        from mosaico_ingest.ontology.header import Header, Message, Time  # noqa: PLC0415 - the models are slow to import
 
         data = cast("T", mosaico_msg.data if isinstance(mosaico_msg, Message) else mosaico_msg)
         header: Header | None = getattr(data, "header", None)

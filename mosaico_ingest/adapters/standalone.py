@@ -26,16 +26,6 @@ from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, normal
 from mosaico_ingest.rosbag.definitions.registry import CustomMessages, TypeResolver, store_of
 from mosaico_ingest.rosbag.typestore import definition_in, native_message
 
-__all__ = [
-    "CatalogAdapter",
-    "DefinitionFinder",
-    "adapt_dict",
-    "adapter_class",
-    "mapping_of",
-    "metadata_of",
-    "translate",
-]
-
 
 class DefinitionFinder:
     """Finds definitions by type name; implements `Resolver`."""

@@ -15,8 +15,6 @@ from mosaico_ingest.findings import RowFailure
 from mosaico_ingest.rosbag.blocks import Int64s, MessageBlock
 from mosaico_ingest.rosbag.encodings.table import MessageReader
 
-__all__ = ["Decoded", "Decoder", "DictDecoder", "merge_parts"]
-
 
 class Decoded(Struct, frozen=True):
     """The result of decoding a message block: rows, their positions in the block, and failures."""

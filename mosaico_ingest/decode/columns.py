@@ -38,13 +38,6 @@ from mosaico_ingest.decode.spans import (
 )
 from mosaico_ingest.rosbag.definitions.linking import NUMBERS
 
-__all__ = [
-    "build_columns",
-    "owners_of",
-    "utf8_texts",
-    "wide_texts",
-]
-
 _ASCII_END = 0x80
 _UTF8_STEPS = (0x80, 0x800, 0x10000)
 """Code points from which UTF-8 needs one more byte."""

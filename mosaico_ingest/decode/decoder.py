@@ -23,15 +23,6 @@ from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Language
 from mosaico_ingest.rosbag.serialization import Deserializer
 
-__all__ = [
-    "DECODERS",
-    "ColumnarDecoder",
-    "Decoded",
-    "Decoder",
-    "RowwiseDecoder",
-    "decoder_for",
-]
-
 
 class RowwiseDecoder:
     """Decodes each message to a dictionary, and the dictionaries to Arrow.

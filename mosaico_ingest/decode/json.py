@@ -25,8 +25,6 @@ from mosaico_ingest.rosbag.encodings.json_messages import JsonCodec
 from mosaico_ingest.rosbag.encodings.json_schema import confirming_type
 from mosaico_ingest.rosbag.encodings.json_types import JsonType
 
-__all__ = ["JsonDecoder"]
-
 _FEW = 4
 """Up to this many messages, row-wise decoding is faster."""
 

@@ -20,33 +20,7 @@ from msgspec.structs import replace
 
 from mosaico_ingest.rosbag.blocks import Encoding
 from mosaico_ingest.rosbag.definitions.linking import NUMBERS, TEXTS
-from mosaico_ingest.rosbag.definitions.model import (
-    Container,
-    Definition,
-    Field,
-    MessageType,
-)
-
-__all__ = [
-    "PADDING",
-    "WORD",
-    "ZEROS",
-    "Body",
-    "Column",
-    "FixedArrayColumn",
-    "FixedBlock",
-    "Layout",
-    "ListColumn",
-    "Loop",
-    "NumberColumn",
-    "Run",
-    "Step",
-    "StructColumn",
-    "Text",
-    "TextColumn",
-    "compile_layout",
-    "least_bytes",
-]
+from mosaico_ingest.rosbag.definitions.model import Container, Definition, Field, MessageType
 
 WORD = 4
 """Bytes of a length word."""

@@ -63,15 +63,8 @@ from mosaico_ingest.decode.spans import (
     expand_ranges,
     interleave,
 )
-from mosaico_ingest.decode.walk import (
-    MessageWalker,
-    OffsetRecorder,
-    locate_by_template,
-    locate_one_by_one,
-)
+from mosaico_ingest.decode.walk import MessageWalker, OffsetRecorder, locate_by_template, locate_one_by_one
 from mosaico_ingest.rosbag.blocks import Encoding
-
-__all__ = ["FEW", "locate", "locate_lockstep"]
 
 FEW = 16
 """Maximum number of messages for which walking one at a time is faster than lockstep."""

@@ -45,8 +45,6 @@ from mosaico_ingest.rosbag.encodings.protobuf import (
     requires_fields,
 )
 
-__all__ = ["ProtobufDecoder"]
-
 _FEW = 4
 """Up to this many messages, row-wise decoding is faster."""
 

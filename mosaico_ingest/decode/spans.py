@@ -13,23 +13,6 @@ from numpy.typing import NDArray
 from mosaico_ingest.rosbag.blocks import Bytes, Int64s
 from mosaico_ingest.rosbag.compression import allocate
 
-__all__ = [
-    "Array",
-    "BodyOffsets",
-    "Cells",
-    "Int64s",
-    "LocatedMessages",
-    "Payloads",
-    "StepOffsets",
-    "array_of",
-    "bytes_at",
-    "copy_slices",
-    "expand_ranges",
-    "fixed_cells",
-    "interleave",
-    "list_offsets",
-]
-
 _LARGE_BYTES = 4096
 """Average slice size above which individual copies are faster than `take`."""
 _FAR_BYTES = 1 << 28

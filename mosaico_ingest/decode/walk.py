@@ -28,8 +28,6 @@ from mosaico_ingest.decode.layout import (
 from mosaico_ingest.decode.spans import BodyOffsets, Int64s, LocatedMessages, Payloads, StepOffsets
 from mosaico_ingest.rosbag.blocks import Encoding
 
-__all__ = ["MessageWalker", "OffsetRecorder", "locate_by_template", "locate_one_by_one"]
-
 _MIN_GROUP = 4
 """Minimum number of messages per template."""
 _TEMPLATE_NS, _CHECK_NS = 120_000, 10

@@ -9,8 +9,6 @@ import pyarrow.compute as pc
 
 from mosaico_ingest.errors import SinkError
 
-__all__ = ["as_type", "comparable"]
-
 _PLAIN = {
     pa.string_view(): pa.string(),
     pa.large_string(): pa.string(),

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from mosaico_ingest.destinations.server.client import ServerClient
     from mosaico_ingest.destinations.store import Store
 
-__all__ = ["ServerSequence", "SourceSequence", "SourceTopic", "StoreSequence"]
-
 _TIME = "timestamp_ns"
 
 

@@ -12,8 +12,6 @@ from mosaico_ingest.job.fields import TopicGlob, marked_fields, values_at
 from mosaico_ingest.job.model import JobSettings, Manifest
 from mosaico_ingest.job.yaml_source import KeyPath, Source
 
-__all__ = ["PatternProblem", "pattern_problems"]
-
 _MISTAKES = (
     (
         re.compile(r"\.[*+]|\\|[$^()|]"),

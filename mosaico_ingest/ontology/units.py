@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-__all__ = ["UNITS", "column_unit"]
-
 _POSE = {"position": "m"}
 _VELOCITY = {"linear": "m/s", "angular": "rad/s"}
 _ACCELERATION = {"linear": "m/s²", "angular": "rad/s²"}

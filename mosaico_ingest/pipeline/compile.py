@@ -32,15 +32,6 @@ from mosaico_ingest.metadata.sources import source_spans, with_spans
 from mosaico_ingest.remote import AnyPath, RemotePath, without_options
 from mosaico_ingest.textfile import read_limited
 
-__all__ = [
-    "Recording",
-    "check_adapters",
-    "compile_manifest",
-    "compile_manifests",
-    "find_recordings",
-    "sequence_name",
-]
-
 _READ_LATER = {PathRole.WORKER_FILE, PathRole.DEFINITIONS, PathRole.SCHEMA}
 _REFUSED = re.compile(r"[^A-Za-z0-9_-]+")
 

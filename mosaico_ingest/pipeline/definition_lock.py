@@ -120,10 +120,7 @@ def lock_of(plan: Plan, connections: Sequence[Connection]) -> LockDocument:
         key = _definition_key(definitions, topic.msgtype, types)
         definitions[key] = types
         topics[name] = LockedTopic(
-            type=topic.msgtype,
-            definition=key,
-            ontology=topic.ontology.tag,
-            columns=_columns(topic.ontology),
+            type=topic.msgtype, definition=key, ontology=topic.ontology.tag, columns=_columns(topic.ontology)
         )
     return _sorted(topics, definitions)
 

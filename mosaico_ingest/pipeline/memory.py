@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from msgspec import Struct
 
-__all__ = ["DEFAULT_BYTES", "MemoryBudget"]
-
 DEFAULT_BYTES = 256 << 20
 _MIN_BYTES = 32 << 20
 _HOLDERS = 4

@@ -20,11 +20,7 @@ from mosaico_ingest.contracts.recording_monitor import ReadTopic
 from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.documents import Part, Unchecked
 from mosaico_ingest.findings import Finding, Span, escape_undecodable
-from mosaico_ingest.job.model import (
-    ErrorPolicy,
-    QuarantineSettings,
-    SequenceSettings,
-)
+from mosaico_ingest.job.model import ErrorPolicy, QuarantineSettings, SequenceSettings
 from mosaico_ingest.job.values import StampSource, Target, TopicLevelErrorPolicy
 from mosaico_ingest.notebook import html_table
 from mosaico_ingest.ontology.types import OntologyType
@@ -33,8 +29,6 @@ from mosaico_ingest.pipeline.task import Attempt
 from mosaico_ingest.remote import RemotePath
 from mosaico_ingest.report.units import count_text, counted
 from mosaico_ingest.rosbag.definitions.model import Resolver
-
-__all__ = ["ExcludedTopic", "Plan", "TopicPlan", "digest_of", "plan_headline"]
 
 
 class AdapterDocument(TypedDict):

@@ -21,20 +21,6 @@ from mosaico_ingest.report.contract import ContractResult
 from mosaico_ingest.report.units import count_text
 from mosaico_ingest.textfile import read_limited
 
-__all__ = [
-    "DestinationState",
-    "Difference",
-    "Note",
-    "PlanDocument",
-    "RecordingPlan",
-    "Sample",
-    "SampleRejection",
-    "differences",
-    "notes",
-    "plan_schema",
-    "read_plan",
-]
-
 Json: TypeAlias = Any
 
 

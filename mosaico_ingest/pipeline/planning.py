@@ -12,13 +12,7 @@ from mosaico_ingest.adapters.image import IMAGE_TAG
 from mosaico_ingest.contracts.clauses import Contract
 from mosaico_ingest.contracts.recording_monitor import check_expressions
 from mosaico_ingest.errors import AdapterError, BagError, IngestError, NothingMatched
-from mosaico_ingest.findings import (
-    Finding,
-    Severity,
-    Span,
-    escape_undecodable,
-    suggest_names,
-)
+from mosaico_ingest.findings import Finding, Severity, Span, escape_undecodable, suggest_names
 from mosaico_ingest.job.fields import TopicGlob, marked_fields, values_at
 from mosaico_ingest.job.model import Job, JobSettings
 from mosaico_ingest.job.patterns import Selection, first_match, select
@@ -39,8 +33,6 @@ from mosaico_ingest.rosbag.definitions.model import Definition, Language
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.encodings.table import refusal
 from mosaico_ingest.rosbag.recording import Recording, no_topics_error
-
-__all__ = ["merge", "plan_connection", "plan_recording"]
 
 
 def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resolver: TypeResolver) -> Plan:
@@ -225,11 +217,7 @@ def merge(topics: list[TopicPlan], addition: TopicPlan) -> Finding | None:
     """Add a connection's plan to the topic with the same name and columns, or else as another topic."""
     same_name = [plan for plan in topics if _bare(plan.target) == _bare(addition.target)]
     for position, plan in enumerate(topics):
-        same = (plan.topic, plan.target, plan.msgtype) == (
-            addition.topic,
-            addition.target,
-            addition.msgtype,
-        )
+        same = (plan.topic, plan.target, plan.msgtype) == (addition.topic, addition.target, addition.msgtype)
         if same and plan.ontology == addition.ontology:
             count = None if plan.count is None or addition.count is None else plan.count + addition.count
             topics[position] = plan.replace(

@@ -47,15 +47,6 @@ from mosaico_ingest.rosbag.blocks import MessageBlock
 from mosaico_ingest.rosbag.recording import Recording
 from mosaico_ingest.version import __version__
 
-__all__ = [
-    "ask_destination",
-    "decide",
-    "plan_document",
-    "preview",
-    "space_finding",
-    "try_messages",
-]
-
 
 def ask_destination(plan: Plan, samples: Iterable[Sample], *, connect: bool) -> DestinationState:
     """Return the state of the destination; a server is contacted only with `connect`."""

@@ -25,21 +25,6 @@ from mosaico_ingest.pipeline.quarantine import quarantine_file_name
 from mosaico_ingest.remote import AnyPath, RemotePath
 from mosaico_ingest.version import __version__
 
-__all__ = [
-    "Provenance",
-    "SequenceRequest",
-    "Source",
-    "StoredProvenance",
-    "add_doubtful_digests",
-    "check_provenance",
-    "content_digest",
-    "decide_skip",
-    "full_digest",
-    "is_repeatable",
-    "read_provenance",
-    "stored_provenance",
-]
-
 _READ_BYTES = 1 << 20
 _SAMPLES = 64
 """Number of blocks of `_READ_BYTES` that `content_digest` reads from a long file."""

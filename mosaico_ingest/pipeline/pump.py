@@ -37,8 +37,6 @@ from mosaico_ingest.report.timing import Step, Stopwatch
 from mosaico_ingest.rosbag.blocks import UnreadableRange
 from mosaico_ingest.rosbag.recording import Recording, damage_error
 
-__all__ = ["Written", "check_counts", "verify", "write_sequence"]
-
 _SHOWN_FIELDS = 8
 """Number of undeclared fields that a finding names."""
 
@@ -78,10 +76,7 @@ def write_sequence(
     quarantine = _open_quarantine(plan, request)
     buffer = WriteBuffer(max_bytes=plan.memory.queue_bytes)
     try:
-        with (
-            DeferredInterrupt() as interrupt,
-            _open_session(plan, request, sink) as session,
-        ):
+        with DeferredInterrupt() as interrupt, _open_session(plan, request, sink) as session:
             topics = _open_topics(
                 plan, recording, session, observe, quarantine=quarantine, stopwatch=stopwatch
             )
@@ -370,10 +365,7 @@ def _as_interrupt(error: BaseException) -> BaseException:
 
 
 def _discard(
-    topics: tuple[TopicPipeline, ...],
-    quarantine: Quarantine | None,
-    error: BaseException,
-    observe: Observer,
+    topics: tuple[TopicPipeline, ...], quarantine: Quarantine | None, error: BaseException, observe: Observer
 ) -> None:
     """Discard the quarantine and account for the rows of a session that was discarded."""
     if quarantine is not None:

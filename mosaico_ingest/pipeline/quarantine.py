@@ -23,16 +23,6 @@ from mosaico_ingest.rosbag.blocks import Connection, MessageBlock
 from mosaico_ingest.rosbag.definitions.model import Source
 from mosaico_ingest.rosbag.mcap.writer import McapWriter
 
-__all__ = [
-    "INDEX",
-    "MESSAGES",
-    "Quarantine",
-    "QuarantineFile",
-    "find_quarantine_files",
-    "quarantine_file_name",
-    "retire",
-]
-
 MESSAGES = ".mcap"
 INDEX = ".jsonl"
 _QOS = "offered_qos_profiles"

@@ -10,8 +10,6 @@ from mosaico_ingest.findings import Stage
 from mosaico_ingest.report.events import Event, Rejected, RunFinished
 from mosaico_ingest.report.units import counted, time_text
 
-__all__ = ["RejectionLog"]
-
 WARNING_INTERVAL_S = 10.0
 """Least seconds between two warnings about one topic and rule."""
 

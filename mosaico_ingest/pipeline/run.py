@@ -43,15 +43,6 @@ from mosaico_ingest.rosbag.compression import MAX_CHUNK_BYTES
 from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry, TypeResolver
 from mosaico_ingest.rosbag.recording import Recording, open_recording
 
-__all__ = [
-    "Outcome",
-    "failed_report",
-    "make_plan",
-    "open_job",
-    "preflight",
-    "run_recording",
-]
-
 _log = logging.getLogger(__name__)
 
 EXIT_WITH_ERRORS = 4

@@ -17,8 +17,6 @@ from mosaico_ingest.job.values import PROVENANCE_KEY, OnSchemaChange, Target
 from mosaico_ingest.pipeline.plan import Plan, TopicPlan
 from mosaico_ingest.protocol import check_topic_name
 
-__all__ = ["follow_schema_changes"]
-
 
 class _StoredDefinition(Struct, frozen=True):
     """A definition that a sequence of the family has for a topic."""

@@ -9,8 +9,6 @@ from msgspec import Struct, structs
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.report.contract import ExpectationResult
 
-__all__ = ["Attempt", "Task"]
-
 
 class Attempt(Struct, frozen=True):
     """An attempt to ingest a recording; a later attempt replaces what an earlier attempt of the same run committed."""

@@ -18,13 +18,7 @@ from mosaico_ingest.contracts.monitor import BlockObserver
 from mosaico_ingest.decode.base import Decoder
 from mosaico_ingest.decode.decoder import decoder_for
 from mosaico_ingest.destinations.base import ENVELOPE, Session, TopicWriter
-from mosaico_ingest.errors import (
-    AdapterError,
-    BagError,
-    DecodeError,
-    IngestError,
-    SinkError,
-)
+from mosaico_ingest.errors import AdapterError, BagError, DecodeError, IngestError, SinkError
 from mosaico_ingest.findings import RowFailure, Stage
 from mosaico_ingest.job.values import LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.ontology.types import OntologyType, RequiredFields
@@ -33,17 +27,10 @@ from mosaico_ingest.pipeline.plan import TopicPlan
 from mosaico_ingest.pipeline.quarantine import Quarantine
 from mosaico_ingest.pipeline.selection import RowSelector, row_times
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
-from mosaico_ingest.report.events import (
-    Observer,
-    Rejected,
-    TopicProgress,
-    TopicStatus,
-)
+from mosaico_ingest.report.events import Observer, Rejected, TopicProgress, TopicStatus
 from mosaico_ingest.report.timing import Step, Stopwatch, Timeline
 from mosaico_ingest.rosbag.blocks import Connection, MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
-
-__all__ = ["LATCHED_KEY", "TopicPipeline"]
 
 LATCHED_KEY = "_latched_"
 """Key of topic metadata: `before_ns` is the time before which rows are messages from before the time range."""

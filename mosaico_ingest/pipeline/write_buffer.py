@@ -12,8 +12,6 @@ from typing_extensions import Self
 
 from mosaico_ingest.destinations.base import TopicWriter
 
-__all__ = ["WriteBuffer"]
-
 _INTERRUPTED_S = 20.0
 """Seconds to wait for the writing thread after an interrupt: the destination may not respond."""
 _MIN_WAKE_BYTES = 1 << 20

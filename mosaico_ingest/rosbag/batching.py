@@ -22,16 +22,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from msgspec import Struct
 
-from mosaico_ingest.rosbag.blocks import (
-    EARLIEST_NS,
-    LATEST_NS,
-    MessageBlock,
-    ReadTask,
-    pack,
-    sort_by_time,
-)
-
-__all__ = ["BlockCoalescer", "MergedTask", "Prefetcher", "copy_if_small", "merge_by_time"]
+from mosaico_ingest.rosbag.blocks import EARLIEST_NS, LATEST_NS, MessageBlock, ReadTask, pack, sort_by_time
 
 T = TypeVar("T")
 _STOP_POLL_SECONDS = 0.1

@@ -20,35 +20,6 @@ from numpy.typing import NDArray
 from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
 
-__all__ = [
-    "EARLIEST_NS",
-    "FIRST_GROUP_BYTES",
-    "LATEST_NS",
-    "Bytes",
-    "ChunkChecksum",
-    "Connection",
-    "Encoding",
-    "HasMetadataRecords",
-    "Int64s",
-    "MessageBlock",
-    "ROSHeader",
-    "ROSMessage",
-    "ReadRequest",
-    "ReadResult",
-    "ReadTask",
-    "SplitConnection",
-    "SplitReader",
-    "UnreadableRange",
-    "add_selected",
-    "add_selected_rows",
-    "fixed_slices",
-    "group_by_bytes",
-    "pack",
-    "rows_by_connection",
-    "sort_by_time",
-    "undescribed_connections",
-]
-
 EARLIEST_NS, LATEST_NS = -(2**63), 2**63 - 1
 """The range of int64 nanosecond timestamps; the latest is in the year 2262."""
 FIRST_GROUP_BYTES, MAX_GROUP_LENGTH = 2 << 20, 64

@@ -22,22 +22,6 @@ from mosaico_ingest.containers import ZSTD
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.blocks import Bytes, MessageBlock, UnreadableRange, fixed_slices
 
-__all__ = [
-    "MAX_CHUNK_BYTES",
-    "CompressedChunk",
-    "DecompressedChunks",
-    "allocate",
-    "check_chunk_size",
-    "decompress",
-    "decompress_chunks",
-    "decompress_file",
-    "decompress_message",
-    "decompress_messages",
-    "decompress_partially",
-    "decompression_groups",
-    "is_plain",
-]
-
 MAX_CHUNK_BYTES = 256 << 20
 """Default limit for the decompressed size of a chunk."""
 _MAX_MESSAGE_BYTES = 256 << 20

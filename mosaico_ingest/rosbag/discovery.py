@@ -16,16 +16,6 @@ from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.rosbag.opening import is_recording
 from mosaico_ingest.textfile import read_limited
 
-__all__ = [
-    "FILE_NAME",
-    "Metadata",
-    "MetadataTopic",
-    "RecordingFiles",
-    "discover",
-    "parse_metadata",
-    "read_metadata",
-]
-
 FILE_NAME = "metadata.yaml"
 _TOP_KEY = "rosbag2_bagfile_information"
 _MAX_BYTES = 16 << 20

@@ -10,8 +10,6 @@ from msgspec.structs import replace
 from mosaico_ingest.rosbag.blocks import Connection, UnreadableRange
 from mosaico_ingest.rosbag.discovery import RecordingFiles
 
-__all__ = ["add_missing_messages", "listed_counts", "missing_after_reading"]
-
 
 def listed_counts(files: RecordingFiles) -> dict[str, int]:
     """Return the number of messages per topic in the metadata; empty if it does not describe exactly these files."""

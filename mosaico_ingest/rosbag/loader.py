@@ -33,8 +33,6 @@ from mosaico_ingest.rosbag.recording import (
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-__all__ = ["ROSLoader"]
-
 _LOG = logging.getLogger("mosaico_ingest.rosbag")
 
 
@@ -241,9 +239,7 @@ def _by_log_time(blocks: list[MessageBlock]) -> Iterator[tuple[int, int, bytes]]
         yield int(times[position]), block.connection, block.payload(row)
 
 
-def _definitions(
-    source: Typestore | Stores | str | None,
-) -> tuple[Stores | str | None, Mapping[str, str]]:
+def _definitions(source: Typestore | Stores | str | None) -> tuple[Stores | str | None, Mapping[str, str]]:
     """Return a distro, or the texts of the types in a typestore of rosbags."""
     if source is None or isinstance(source, (str, Enum)):
         return source, {}
@@ -253,9 +249,7 @@ def _definitions(
 
 
 def _open_with_rosbags(paths: Sequence[Path | RemotePath], resolver: TypeResolver) -> _Source:
-    from mosaico_ingest.rosbag.rosbags_reader import (  # noqa: PLC0415 - the native reader does not need it
-        RosbagsRecording,
-    )
+    from mosaico_ingest.rosbag.rosbags_reader import RosbagsRecording  # noqa: PLC0415 - the native reader does not need it
 
     local = [path for path in paths if isinstance(path, Path)]
     if len(local) < len(paths):

@@ -16,8 +16,6 @@ from mosaico_ingest.rosbag.blocks import SplitReader, UnreadableRange
 from mosaico_ingest.rosbag.compression import MAX_CHUNK_BYTES, decompress_file
 from mosaico_ingest.rosbag.source import FileSource, RemoteSource, download
 
-__all__ = ["is_recording", "open_split"]
-
 _HEAD_BYTES = 16
 
 

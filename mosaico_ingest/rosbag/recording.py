@@ -59,17 +59,6 @@ from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS, MessageEnco
 from mosaico_ingest.rosbag.listed_counts import add_missing_messages, listed_counts, missing_after_reading
 from mosaico_ingest.rosbag.opening import open_split
 
-__all__ = [
-    "ConnectionTable",
-    "Recording",
-    "damage_error",
-    "no_topics_error",
-    "open_recording",
-    "recording_findings",
-    "time_bounds",
-    "time_slices",
-]
-
 BlockObserver: TypeAlias = Callable[[int, int, MessageBlock], None]
 """Receives the number of a split, the id of a connection, and messages over the buffer that was read."""
 _SMALL_RECORDING_BYTES = 1 << 20
@@ -194,9 +183,7 @@ class Recording:
                 or definition.shape is not None
             ):
                 continue
-            from mosaico_ingest.rosbag.encodings.json_inference import (  # noqa: PLC0415 - rarely needed
-                infer_definition,
-            )
+            from mosaico_ingest.rosbag.encodings.json_inference import infer_definition  # noqa: PLC0415 - rarely needed
 
             inferred = infer_definition(definition, self.message_blocks([connection.id]))
             connections[connection.id] = replace(connection, definition=inferred)

@@ -14,8 +14,6 @@ from mosaico_ingest.rosbag.mcap import records as mcap_records
 from mosaico_ingest.rosbag.ros1 import records as ros1_records
 from mosaico_ingest.rosbag.source import Source, Window
 
-__all__ = ["find_mcap_chunk", "find_ros1_chunk", "find_ros1_message"]
-
 _STEP_BYTES = 1 << 20
 _OVERLAP_BYTES = 1 << 10
 """Overlap of two steps; more than any pattern spans."""

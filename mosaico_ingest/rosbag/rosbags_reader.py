@@ -21,8 +21,6 @@ from mosaico_ingest.rosbag.definitions.idl import message_type
 from mosaico_ingest.rosbag.definitions.model import Container, MessageType, normalize_msgtype
 from mosaico_ingest.rosbag.definitions.parser import BYTES
 
-__all__ = ["RosbagsRecording"]
-
 _ERRORS = (
     AnyReaderError,
     TypesysError,

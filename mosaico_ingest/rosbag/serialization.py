@@ -35,13 +35,6 @@ from mosaico_ingest.rosbag.definitions.model import (
 )
 from mosaico_ingest.rosbag.definitions.parser import BYTES
 
-__all__ = [
-    "FORMATS",
-    "Deserializer",
-    "Serializer",
-    "min_size",
-]
-
 FORMATS: Mapping[str, str] = {
     "bool": "B", "byte": "B", "char": "B", "uint8": "B", "int8": "b", "uint16": "H", "int16": "h",
     "uint32": "I", "int32": "i", "uint64": "Q", "int64": "q", "float32": "f", "float64": "d",

@@ -19,17 +19,6 @@ from mosaico_ingest.errors import BagError, Unreachable
 from mosaico_ingest.remote import AnyPath, RemotePath, translate_errors
 from mosaico_ingest.rosbag.compression import allocate
 
-__all__ = [
-    "Fields",
-    "FileSource",
-    "ReadBuffer",
-    "RemoteSource",
-    "Source",
-    "Window",
-    "check_inside",
-    "download",
-]
-
 _WINDOW_BYTES = 1 << 16
 
 

@@ -48,8 +48,6 @@ from mosaico_ingest.rosbag.blocks import (
 )
 from mosaico_ingest.rosbag.definitions.model import Embedded
 
-__all__ = ["DAMAGE", "Row", "RowScan", "SqliteReader"]
-
 DAMAGE = (sqlite3.Error, UnicodeDecodeError, MemoryError, OverflowError)
 """Exceptions that damage causes: damaged names in SQLite's messages, and damaged sizes, have no exception of their own."""
 

@@ -15,8 +15,6 @@ from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-__all__ = ["definition_in", "definition_texts", "native_message"]
-
 _HEADER = "std_msgs/msg/Header"
 
 

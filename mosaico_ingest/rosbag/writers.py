@@ -21,14 +21,6 @@ from mosaico_ingest.rosbag.definitions.hashes import md5sum, rihs01
 from mosaico_ingest.rosbag.definitions.model import Definition, Language
 from mosaico_ingest.rosbag.mcap.writer import McapWriter
 
-__all__ = [
-    "RecordingWriter",
-    "Ros1Writer",
-    "SqliteWriter",
-    "check_new_recording",
-    "open_writer",
-]
-
 
 class RecordingWriter(Protocol):
     """Writes messages in log-time order: ROS 1 messages in the ROS 1 encoding, others as little-endian CDR."""

@@ -14,8 +14,6 @@ from mosaico_ingest.errors import ViewError, missing_library
 from mosaico_ingest.report.units import seconds_text, time_text
 from mosaico_ingest.view.series import Series
 
-__all__ = ["ChartLine", "chart_lines", "write_chart"]
-
 _DOTS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.uint8)
 """The bit of each of the 4 x 2 dots of a Braille character."""
 _BRAILLE = 0x2800

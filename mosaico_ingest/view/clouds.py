@@ -15,8 +15,6 @@ from mosaico_ingest.errors import ViewError
 from mosaico_ingest.view.depth import colour_map
 from mosaico_ingest.view.encodings import Pixels, grey
 
-__all__ = ["Points", "from_above", "grid_pixels", "has_grid", "has_points", "row_points"]
-
 _NUMPY_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 """The types of point fields, from code 1 (INT8) to 8 (FLOAT64)."""
 _PERCENTILES = (0.5, 99.5)

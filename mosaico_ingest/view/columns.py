@@ -10,18 +10,6 @@ import pyarrow.compute as pc
 import pyarrow.types as pt
 from msgspec import Struct
 
-__all__ = [
-    "Column",
-    "flat_columns",
-    "is_binary",
-    "is_list",
-    "is_number",
-    "path_values",
-    "struct_paths",
-    "time_values",
-    "topic_columns",
-]
-
 _compute: Any = pc
 """`pyarrow.compute`, whose stubs do not accept arrays of any type."""
 _TIMES = ({"seconds", "nanoseconds"}, {"sec", "nanosec"}, {"secs", "nsecs"})

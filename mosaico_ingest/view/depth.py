@@ -10,8 +10,6 @@ import numpy.typing as npt
 
 from mosaico_ingest.errors import ViewError
 
-__all__ = ["colour_map", "depth_from_inverse", "depth_parameters", "depth_payload", "run_length_depth"]
-
 _TURBO = np.array(
     [
         *((48, 18, 59), (70, 98, 216), (53, 171, 248), (27, 229, 181), (116, 254, 93)),

@@ -13,8 +13,6 @@ from msgspec import Struct
 from mosaico_ingest.errors import ViewError
 from mosaico_ingest.view.depth import colour_map
 
-__all__ = ["ENCODINGS", "Pixels", "RawImage", "demosaic", "is_bayer", "raw_pixels"]
-
 Pixels: TypeAlias = npt.NDArray[np.uint8]
 """An RGB picture, of shape (height, width, 3)."""
 _Array: TypeAlias = npt.NDArray[Any]

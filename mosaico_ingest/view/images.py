@@ -25,17 +25,6 @@ from mosaico_ingest.view.encodings import Pixels, RawImage, demosaic, grey, is_b
 if TYPE_CHECKING:
     from PIL.Image import Image as Picture
 
-__all__ = [
-    "Pixels",
-    "contact_sheet",
-    "decode_image",
-    "fit_pixels",
-    "has_images",
-    "image_file_type",
-    "png_bytes",
-    "write_picture",
-]
-
 VIDEO = ("h264", "hevc", "h265", "vp9", "av1", "theora")
 """Formats whose frames depend on earlier frames."""
 _GAP = 4

@@ -14,8 +14,6 @@ from mosaico_ingest.view.clouds import from_above, grid_pixels, has_grid, has_po
 from mosaico_ingest.view.images import Pixels, decode_image, fit_pixels, has_images
 from mosaico_ingest.view.rows import rows_near
 
-__all__ = ["Thumbnail", "has_pictures", "row_picture", "thumbnails"]
-
 
 class Thumbnail(Struct, frozen=True):
     """A small picture of one row, or the reason why there is none."""

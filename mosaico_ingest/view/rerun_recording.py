@@ -19,8 +19,6 @@ from mosaico_ingest.view.logs import has_log, log_lines
 from mosaico_ingest.view.series import plot_fields, read_series
 from mosaico_ingest.view.tracks import has_track, read_track
 
-__all__ = ["ViewedTopic", "send_sequence"]
-
 TIMELINE = "log_time"
 MAX_POINTS = 100_000
 """Points per scalar series and track; extreme values are kept."""

@@ -19,8 +19,6 @@ from mosaico_ingest.destinations.store.model import SegmentInfo, TopicInfo
 from mosaico_ingest.destinations.store.segment import time_span
 from mosaico_ingest.destinations.store.store import Window, scan
 
-__all__ = ["first_rows", "last_rows", "nearest_row", "rows_near", "sampled_rows"]
-
 
 class _RowGroup(Struct, frozen=True):
     segment: SegmentInfo

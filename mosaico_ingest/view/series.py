@@ -20,8 +20,6 @@ from mosaico_ingest.ontology.units import column_unit
 from mosaico_ingest.view.columns import Column, is_list, is_number, topic_columns
 from mosaico_ingest.view.rows import first_rows
 
-__all__ = ["Series", "plot_fields", "read_series"]
-
 MAX_ITEMS = 8
 """Items of a list that are plotted if the field does not select one."""
 MAX_DEFAULT = 6

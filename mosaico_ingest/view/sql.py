@@ -17,8 +17,6 @@ from mosaico_ingest.remote import RemotePath
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
 
-__all__ = ["connect", "read_only", "run_query", "table_names"]
-
 MAX_SEQUENCES = 100
 """Number of sequences above which a query sees only the sequences that it names."""
 BATCH_ROWS = 10_000

@@ -21,14 +21,6 @@ from mosaico_ingest.ontology.units import column_unit
 from mosaico_ingest.report.timing import Timeline, TimelineReport
 from mosaico_ingest.view.columns import Column, is_binary, is_list, is_number, topic_columns
 
-__all__ = [
-    "ColumnStatistics",
-    "TopicStatistics",
-    "TopicTiming",
-    "describe_topic",
-    "topic_timing",
-]
-
 _compute: Any = pc
 """`pyarrow.compute`, whose stubs do not accept arrays of any type."""
 MAX_DISTINCT = 10_000

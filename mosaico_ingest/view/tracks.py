@@ -14,8 +14,6 @@ from mosaico_ingest.destinations.store.model import TopicInfo
 from mosaico_ingest.destinations.store.store import Window, scan
 from mosaico_ingest.view.columns import Column, is_number, topic_columns
 
-__all__ = ["Track", "has_track", "local_metres", "read_track"]
-
 _EARTH_M = 6_371_008.8
 """Mean radius of the Earth in m."""
 _NO_FIX = -1

@@ -14,8 +14,6 @@ import pyarrow as pa
 from mosaico_ingest.report.units import counted, time_text
 from mosaico_ingest.view.images import image_file_type
 
-__all__ = ["flat_text", "instant_text", "json_value", "scalar_text", "time_parts_ns", "value_text"]
-
 _SECOND = 1_000_000_000
 _FIRST_INSTANT_NS = 10**17
 """Times before March 1973 are durations, or times of a simulation, which starts at 0."""

@@ -13,8 +13,6 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorP
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
 from mosaico_ingest.rosbag.encodings import json_schema, protobuf
 
-__all__ = ["MESSAGES", "json_definition", "json_payload", "protobuf_definition", "protobuf_payload"]
-
 _POSE = {"position": {"x": 1.0, "y": 2.0, "z": 3.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
 _HEAD = {"timestamp": {"sec": 1_700_000_000, "nanosec": 5}, "frame_id": "map"}
 _TRANSFORM = {

@@ -16,8 +16,6 @@ from google.protobuf.descriptor_pb2 import (
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
 from mosaico_ingest.rosbag.encodings.protobuf import read_schema
 
-__all__ = ["SCALARS", "definition_of", "file_set", "message_class", "proto2_file", "proto3_file"]
-
 F = FieldDescriptorProto
 SCALARS = {
     name: getattr(F, f"TYPE_{name.upper()}")

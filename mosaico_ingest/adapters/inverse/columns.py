@@ -53,12 +53,6 @@ from mosaico_ingest.adapters.mapping.functions.ros import STAMP_TYPE
 from mosaico_ingest.adapters.mapping.loader import MappingAdapter
 from mosaico_ingest.adapters.mapping.types import is_number
 
-__all__ = [
-    "ONE_ARGUMENT",
-    "ColumnInverter",
-    "with_constant",
-]
-
 _SECOND_NS = 1_000_000_000
 
 

@@ -26,15 +26,6 @@ from mosaico_ingest.adapters.mapping.columns import (
 )
 from mosaico_ingest.adapters.mapping.types import is_list
 
-__all__ = [
-    "CLOUD_FUNCTIONS",
-    "EACH_ELEMENT",
-    "CloudField",
-    "FieldPath",
-    "MessageBuilder",
-    "pack_clouds",
-]
-
 CLOUD_FUNCTIONS: Mapping[str, tuple[str, int]] = {
     "points_float32": ("<f4", 7),
     "points_float64": ("<f8", 8),

@@ -33,13 +33,6 @@ from mosaico_ingest.adapters.mapping.loader import MappingAdapter
 from mosaico_ingest.adapters.mapping.types import is_list
 from mosaico_ingest.errors import AdapterError
 
-__all__ = [
-    "Inverse",
-    "Restored",
-    "differences",
-    "invert",
-]
-
 
 def differences(left: Array, right: Array) -> Mapping[str, Mask]:
     """Return where the fields of two columns of one struct differ, for the fields that differ at all."""

@@ -22,8 +22,6 @@ from mosaico_ingest.findings import Finding, Severity
 if TYPE_CHECKING:
     from mosaico_ingest.job.yaml_source import KeyPath, Source
 
-__all__ = ["Analyzer", "Target", "is_short_cast"]
-
 _Result = TypeVar("_Result")
 
 _SPECIAL_FORMS = {

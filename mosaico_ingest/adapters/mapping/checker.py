@@ -51,8 +51,6 @@ from mosaico_ingest.adapters.mapping.types import (
 )
 from mosaico_ingest.rosbag.definitions.model import MessageType
 
-__all__ = ["CAST_TYPES", "Checker", "Report", "Scope", "typed_constant"]
-
 CAST_TYPES = {
     "bool": arrays.bool_(),
     **{

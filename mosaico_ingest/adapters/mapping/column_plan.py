@@ -25,23 +25,9 @@ from mosaico_ingest.adapters.mapping.columns import (
 )
 from mosaico_ingest.adapters.mapping.conversion import convert, refuse_nulls
 from mosaico_ingest.adapters.mapping.evaluator import Evaluation, Rejection, RowsRejected
-from mosaico_ingest.adapters.mapping.expressions import (
-    TypedExpression,
-)
+from mosaico_ingest.adapters.mapping.expressions import TypedExpression
 from mosaico_ingest.adapters.mapping.functions.registry import RejectRows
 from mosaico_ingest.ontology.types import NullRows
-
-__all__ = [
-    "ColumnPlan",
-    "ColumnSource",
-    "ExpressionSource",
-    "MapLookup",
-    "NestedAdapter",
-    "NullColumn",
-    "StructSource",
-    "evaluate_column",
-    "evaluate_struct",
-]
 
 
 class NullColumn(Struct, frozen=True):

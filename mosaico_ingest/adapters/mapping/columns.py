@@ -11,28 +11,6 @@ import pyarrow.compute
 import pyarrow.types
 from numpy.typing import NDArray
 
-__all__ = [
-    "Array",
-    "Axis",
-    "Column",
-    "DataType",
-    "Mask",
-    "Scalar",
-    "arrays",
-    "field_of",
-    "fixed_list",
-    "null_mask",
-    "null_where",
-    "open_list",
-    "pc",
-    "promote",
-    "pt",
-    "repeat",
-    "struct_of",
-    "true_mask",
-    "variable_list",
-]
-
 Array: TypeAlias = Any
 """A `pyarrow.Array`; its type follows from the expression."""
 Scalar: TypeAlias = Any

@@ -44,8 +44,6 @@ from mosaico_ingest.ontology.types import NullRows, OntologyType
 from mosaico_ingest.protocol import check_metadata
 from mosaico_ingest.rosbag.definitions.model import Definition
 
-__all__ = ["AdapterLookup", "Compiler"]
-
 
 class AdapterLookup(Protocol):
     """Finds the adapters that `use` names. It must survive pickling."""

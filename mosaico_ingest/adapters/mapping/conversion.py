@@ -36,8 +36,6 @@ from mosaico_ingest.adapters.mapping.types import (
     within,
 )
 
-__all__ = ["check_fits", "convert", "element_type", "refuse_nulls", "to_number"]
-
 
 def element_type(target: DataType, axes: tuple[int | None, ...]) -> DataType:
     """Return the type that the elements of open lists must have for a column.

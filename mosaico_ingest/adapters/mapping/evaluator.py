@@ -41,9 +41,6 @@ from mosaico_ingest.adapters.mapping.expressions import (
 )
 from mosaico_ingest.adapters.mapping.functions.registry import RejectRows
 
-__all__ = ["Evaluation", "Rejection", "RowsRejected"]
-
-
 Rejection: TypeAlias = tuple[str, str]
 """The rule that a row violates, and the reason."""
 

@@ -14,21 +14,6 @@ from mosaico_ingest.adapters.mapping.types import ExprType
 if TYPE_CHECKING:
     from mosaico_ingest.job.yaml_source import KeyPath
 
-__all__ = [
-    "AnalyzedExpression",
-    "Cast",
-    "CloseList",
-    "Conditional",
-    "Constant",
-    "ElementAt",
-    "FieldAccess",
-    "FunctionCall",
-    "MakeList",
-    "MessageRef",
-    "OpenList",
-    "TypedExpression",
-]
-
 
 class Constant(ExpressionNode, frozen=True, eq=False):
     """A value that is the same for every row."""

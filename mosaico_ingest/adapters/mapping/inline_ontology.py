@@ -19,13 +19,7 @@ from mosaico_ingest.ontology.types import OntologyType
 if TYPE_CHECKING:
     from mosaico_ingest.job.yaml_source import KeyPath
 
-__all__ = ["inline_ontology_type"]
-
-_PLAIN_TYPES: dict[str, DataType] = {
-    **CAST_TYPES,
-    "string": arrays.string(),
-    "binary": arrays.binary(),
-}
+_PLAIN_TYPES: dict[str, DataType] = {**CAST_TYPES, "string": arrays.string(), "binary": arrays.binary()}
 _LIST = re.compile(r"list\[\s*(?P<element>.+?)\s*(,\s*(?P<size>\d+)\s*)?\]")
 _ENVELOPE_COLUMN = "timestamp_ns"
 _LIST_OF_STRUCTS = "list"

@@ -33,8 +33,6 @@ from mosaico_ingest.textfile import read_limited
 if TYPE_CHECKING:
     from mosaico_ingest.job.yaml_source import Source
 
-__all__ = ["MappingAdapter", "MappingSpec", "adapter_from_model", "load_adapter"]
-
 _BINDING: ContextVar[tuple[tuple[str, str], ...]] = ContextVar("binding", default=())
 """The adapters being bound with their message types, to detect adapters that use each other in a cycle."""
 _MAX_CACHED_BINDINGS = 64

@@ -12,19 +12,6 @@ from pydantic_core import PydanticCustomError
 from mosaico_ingest.documents import DIALECT, schema_of, tidy
 from mosaico_ingest.ontology.types import SerializationFormat
 
-__all__ = [
-    "AdapterTest",
-    "FieldDeclaration",
-    "FieldType",
-    "InlineType",
-    "MappingFile",
-    "RecordedMessage",
-    "Scalar",
-    "Value",
-    "ValueForm",
-    "adapter_schema",
-]
-
 
 def _plain(value: object) -> object:
     """Reject values that are not plain, with one error instead of one per type of the union."""

@@ -14,24 +14,6 @@ from typing import TypeAlias, cast
 
 from msgspec import Struct
 
-__all__ = [
-    "Attribute",
-    "Call",
-    "EachElement",
-    "ExpressionError",
-    "ExpressionNode",
-    "ListLiteral",
-    "Literal",
-    "LiteralValue",
-    "Name",
-    "Node",
-    "Subscript",
-    "Ternary",
-    "TextRange",
-    "children",
-    "parse",
-]
-
 MAX_CHARACTERS = 4000
 MAX_DEPTH = 60
 

@@ -20,8 +20,6 @@ from mosaico_ingest.errors import BagError, IngestError
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, Resolver, normalize_msgtype
 
-__all__ = ["CaseResult", "ReadRecorded", "message_row", "run_tests"]
-
 ReadRecorded: TypeAlias = Callable[[RecordedMessage], "tuple[Definition, pa.StructArray]"]
 """Reads one recorded message and returns its definition and a batch of one row in the ROS shape."""
 

@@ -8,23 +8,6 @@ from msgspec.structs import replace
 
 from mosaico_ingest.adapters.mapping.columns import DataType, arrays, pt
 
-__all__ = [
-    "INT64",
-    "ExprType",
-    "TypeMismatch",
-    "common_type",
-    "exact_float",
-    "expr_type_of",
-    "format_type",
-    "int_bounds",
-    "is_list",
-    "is_number",
-    "list_type",
-    "narrowest_int",
-    "widest_float",
-    "within",
-]
-
 Bounds = tuple[int, int]
 INT64 = (-(2**63), 2**63 - 1)
 _FLOATS = (pa.float16(), pa.float32(), pa.float64())

@@ -8,8 +8,6 @@ from pathlib import Path
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.job.values import DEFAULT_PORT, ServerTarget
 
-__all__ = ["server_at"]
-
 _SCHEMES = {"mosaico": False, "grpc": False, "mosaico+tls": True, "grpc+tls": True}
 """Whether each URL scheme uses TLS."""
 _ADDRESS = re.compile(

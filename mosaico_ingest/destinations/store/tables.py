@@ -17,8 +17,6 @@ from mosaico_ingest.job.units import parse_time
 if TYPE_CHECKING:
     from mosaico_ingest.destinations.store.model import TopicInfo
 
-__all__ = ["Moment", "bound_ns", "read_table", "topic_reader"]
-
 Moment: TypeAlias = "int | str | datetime"
 """A time: ns since the epoch, a text such as `2026-03-01T12:00:00Z`, `+10s` or `-5s`, or a `datetime` (UTC by default)."""
 

@@ -18,19 +18,6 @@ from mosaico_ingest.rosbag.definitions.linking import link
 from mosaico_ingest.rosbag.definitions.model import DURATION, TIME, Definition, Field, MessageType, Source
 from mosaico_ingest.rosbag.definitions.parser import flatten, parse_msg, read_types
 
-__all__ = [
-    "BEFORE_IRON",
-    "BUILTIN",
-    "FILE",
-    "ROS1",
-    "ROS2",
-    "agreed_type",
-    "distro_definitions",
-    "distro_type",
-    "package_type",
-    "ros_version",
-]
-
 FILE = Path(__file__).with_name("distros.json")
 _PARTS = (Field("sec", "int32"), Field("nanosec", "uint32"))
 BUILTIN: Mapping[str, MessageType] = {name: MessageType(name, _PARTS) for name in (TIME, DURATION)}

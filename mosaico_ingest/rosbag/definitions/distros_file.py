@@ -12,8 +12,6 @@ from mosaico_ingest.rosbag.definitions.distros import FILE
 from mosaico_ingest.rosbag.definitions.idl import message_type
 from mosaico_ingest.rosbag.definitions.parser import spell
 
-__all__ = ["distros_file"]
-
 
 def distros_file() -> str:
     """Return the content of the file: per type, its forms and the distros that have each form."""

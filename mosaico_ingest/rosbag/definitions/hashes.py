@@ -11,8 +11,6 @@ from mosaico_ingest.rosbag.definitions.model import Definition
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-__all__ = ["definition_difference", "md5sum", "rihs01"]
-
 _ANY = "*"
 """The MD5 sum that a ROS 1 subscriber writes to accept every form of a type."""
 
@@ -53,12 +51,7 @@ def definition_difference(definition: Definition, attributes: Mapping[str, str])
 
 
 def _store(definition: Definition) -> Typestore:
-    from rosbags.typesys import (  # noqa: PLC0415 - slow to import, and few recordings carry hashes and no definitions
-        Stores,
-        TypesysError,
-        get_types_from_msg,
-        get_typestore,
-    )
+    from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore  # noqa: PLC0415 - slow to import, and few recordings carry hashes and no definitions
 
     store = get_typestore(Stores.EMPTY)
     try:

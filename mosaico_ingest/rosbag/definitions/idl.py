@@ -11,8 +11,6 @@ from rosbags.typesys import TypesysError, get_types_from_idl
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.definitions.model import Constant, Container, Field, MessageType
 
-__all__ = ["message_type", "read_idl"]
-
 _NOT_CODE = re.compile(r"//[^\n]*|/\*.*?\*/|\"(?:\\.|[^\"\\])*\"", re.DOTALL)
 _PLACEHOLDER = "structure_needs_at_least_one_member"
 _CONTAINERS = {Nodetype.ARRAY: Container.ARRAY, Nodetype.SEQUENCE: Container.SEQUENCE}

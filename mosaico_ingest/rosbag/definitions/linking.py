@@ -19,13 +19,6 @@ from mosaico_ingest.rosbag.definitions.model import (
 )
 from mosaico_ingest.rosbag.definitions.parser import BYTES, PRIMITIVES
 
-__all__ = [
-    "NUMBERS",
-    "TEXTS",
-    "link",
-    "ros_shape",
-]
-
 _MAX_DEPTH = 64
 _MAX_LEAVES = 20_000
 

@@ -10,23 +10,6 @@ from typing import Protocol
 import pyarrow as pa
 from msgspec import Struct
 
-__all__ = [
-    "DURATION",
-    "HEADER",
-    "TIME",
-    "Constant",
-    "Container",
-    "Definition",
-    "Embedded",
-    "Field",
-    "Language",
-    "MessageType",
-    "Resolver",
-    "Source",
-    "normalize_msgtype",
-    "short_msgtype",
-]
-
 TIME = "builtin_interfaces/msg/Time"
 DURATION = "builtin_interfaces/msg/Duration"
 HEADER = "std_msgs/msg/Header"

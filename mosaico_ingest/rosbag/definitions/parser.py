@@ -21,18 +21,6 @@ from mosaico_ingest.rosbag.definitions.model import (
     short_msgtype,
 )
 
-__all__ = [
-    "BYTES",
-    "PRIMITIVES",
-    "SEPARATOR",
-    "Section",
-    "flatten",
-    "parse_msg",
-    "read_types",
-    "sections",
-    "spell",
-]
-
 SEPARATOR = "=" * 80
 
 PRIMITIVES = frozenset(

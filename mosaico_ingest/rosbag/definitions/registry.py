@@ -36,18 +36,6 @@ from mosaico_ingest.rosbag.definitions.model import (
 from mosaico_ingest.rosbag.definitions.parser import PRIMITIVES, RepeatedFieldError, flatten, read_types
 from mosaico_ingest.textfile import read_limited
 
-__all__ = [
-    "CustomMessages",
-    "ROSTypeRegistry",
-    "Registered",
-    "TypeResolver",
-    "definition_files",
-    "directory_types",
-    "register_source",
-    "store_of",
-    "suggest_type",
-]
-
 _SUFFIXES = (".msg", ".idl")
 
 
@@ -351,8 +339,7 @@ class TypeResolver:
     def _resolve(self, root: str, embedded: Embedded | None, version: int) -> Definition:
         sources = self._sources(root, embedded, version)
         entry = next(
-            ((message, candidate.source) for candidate in sources if (message := candidate.find(root))),
-            None,
+            ((message, candidate.source) for candidate in sources if (message := candidate.find(root))), None
         )
         hint = self._hint(sources, version)
         if not entry:

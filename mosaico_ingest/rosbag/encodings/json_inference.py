@@ -18,8 +18,6 @@ from mosaico_ingest.rosbag.blocks import MessageBlock
 from mosaico_ingest.rosbag.definitions.model import Definition
 from mosaico_ingest.rosbag.encodings.json_types import ANY, JsonType, list_of, message_types, struct_of
 
-__all__ = ["infer_definition"]
-
 _MAX_FIELDS = 1000
 """Number of fields beyond which an object is a map with arbitrary keys, and becomes JSON text."""
 _INT64_BITS = 63

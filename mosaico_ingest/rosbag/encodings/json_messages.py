@@ -15,8 +15,6 @@ from mosaico_ingest.rosbag.definitions.model import Definition
 from mosaico_ingest.rosbag.encodings.json_schema import json_type, validator_of
 from mosaico_ingest.rosbag.encodings.json_types import ANY, JsonType
 
-__all__ = ["JsonCodec", "columns_of"]
-
 _MAX_REASON = 200
 
 

@@ -40,8 +40,6 @@ from mosaico_ingest.rosbag.encodings.json_types import (
     struct_of,
 )
 
-__all__ = ["confirming_type", "json_type", "read_schema", "validator_of"]
-
 _UNNAMED = "json"
 """The type name of channels without a schema."""
 _MAX_COLUMNS = 20_000

@@ -14,8 +14,6 @@ from msgspec import Struct
 from mosaico_ingest.errors import DecodeError
 from mosaico_ingest.rosbag.definitions.model import Constant, Container, Field, MessageType
 
-__all__ = ["ANY", "BINARY", "SCALARS", "JsonType", "list_of", "message_types", "struct_of"]
-
 _INT64 = (-(2**63), 2**63 - 1)
 SCALARS = {
     "bool": pa.bool_(),

@@ -36,19 +36,6 @@ from mosaico_ingest.rosbag.definitions.model import (
     Source,
 )
 
-__all__ = [
-    "Form",
-    "ProtobufCodec",
-    "arrow_type",
-    "descriptor_of",
-    "form_of",
-    "json_text",
-    "message_class",
-    "message_type",
-    "read_schema",
-    "requires_fields",
-]
-
 _MAX_COLUMNS = 20_000
 _PACKAGE = "google.protobuf."
 _WRAPPERS = {

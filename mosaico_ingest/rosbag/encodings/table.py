@@ -11,15 +11,6 @@ from mosaico_ingest.rosbag.blocks import Encoding
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, Language
 from mosaico_ingest.rosbag.serialization import Deserializer, Serializer
 
-__all__ = [
-    "MESSAGE_ENCODINGS",
-    "MessageEncoding",
-    "MessageReader",
-    "MessageWriter",
-    "encoding_of",
-    "refusal",
-]
-
 
 class MessageReader(Protocol):
     """Converts payloads to dictionaries."""

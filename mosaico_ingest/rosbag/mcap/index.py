@@ -30,8 +30,6 @@ from mosaico_ingest.rosbag.mcap.records import (
 from mosaico_ingest.rosbag.recovery import find_mcap_chunk
 from mosaico_ingest.rosbag.source import Fields, Source, Window
 
-__all__ = ["Extent", "McapIndex", "read_extents", "read_index", "read_metadata"]
-
 _FOOTER_BYTES = RECORD.size + 20
 _INDEX_ENTRY_BYTES = 16
 _CHUNK_HEAD_BYTES = 1 << 12

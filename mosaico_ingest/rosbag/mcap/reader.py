@@ -47,17 +47,8 @@ from mosaico_ingest.rosbag.compression import (
 )
 from mosaico_ingest.rosbag.definitions.model import Embedded
 from mosaico_ingest.rosbag.mcap.index import Extent, McapIndex, read_extents, read_index, read_metadata
-from mosaico_ingest.rosbag.mcap.records import (
-    RECORD,
-    ChannelRecord,
-    ChunkHead,
-    Op,
-    SchemaRecord,
-    chunk_head,
-)
+from mosaico_ingest.rosbag.mcap.records import RECORD, ChannelRecord, ChunkHead, Op, SchemaRecord, chunk_head
 from mosaico_ingest.rosbag.source import ReadBuffer, Source
-
-__all__ = ["McapReader"]
 
 _ENCODINGS = {
     "cdr": Encoding.CDR,

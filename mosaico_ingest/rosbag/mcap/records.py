@@ -10,23 +10,6 @@ from msgspec import Struct
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.source import Fields
 
-__all__ = [
-    "RECORD",
-    "ChannelRecord",
-    "ChunkHead",
-    "MetadataRecord",
-    "Op",
-    "SchemaRecord",
-    "channel_of",
-    "chunk_head",
-    "metadata_of",
-    "record_bytes",
-    "records_in",
-    "schema_of",
-    "text_bytes",
-    "texts_bytes",
-]
-
 RECORD = struct.Struct("<BQ")
 """The head of every record: its kind, and the number of bytes that follow."""
 

@@ -14,16 +14,8 @@ from mosaico_ingest.containers import MCAP
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, short_msgtype
 from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS, encoding_of
-from mosaico_ingest.rosbag.mcap.records import (
-    RECORD,
-    Op,
-    record_bytes,
-    text_bytes,
-    texts_bytes,
-)
+from mosaico_ingest.rosbag.mcap.records import RECORD, Op, record_bytes, text_bytes, texts_bytes
 from mosaico_ingest.version import __version__
-
-__all__ = ["McapWriter"]
 
 _CHUNK_BYTES = 4 << 20
 _MESSAGE = struct.Struct("<HIQQ")

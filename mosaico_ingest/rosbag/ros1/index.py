@@ -28,8 +28,6 @@ from mosaico_ingest.rosbag.ros1.records import (
 )
 from mosaico_ingest.rosbag.source import Source, Window
 
-__all__ = ["Extent", "Ros1Index", "read_index"]
-
 _VERSION = b"#ROSBAG V2.0\n"
 _RUN_BYTES = 4 << 20
 """Maximum size of an extent of messages outside chunks."""

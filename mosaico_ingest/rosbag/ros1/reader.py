@@ -53,8 +53,6 @@ from mosaico_ingest.rosbag.ros1.records import (
 )
 from mosaico_ingest.rosbag.source import ReadBuffer, Source
 
-__all__ = ["Ros1Reader"]
-
 _MAX_LAYOUTS = 4
 """Maximum number of header layouts per connection; with more, chunks are scanned record by record."""
 _HEAD_BYTES = 1 << 12

@@ -12,25 +12,6 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.errors import BagError
 
-__all__ = [
-    "INDEX_ENTRY",
-    "ChunkHead",
-    "ConnectionRecord",
-    "Header",
-    "MessageRecord",
-    "Op",
-    "Record",
-    "chunk_head",
-    "connection_of",
-    "index_entries",
-    "messages_in",
-    "number",
-    "record_at",
-    "records_in",
-    "time_of",
-    "times_of",
-]
-
 _MAX_HEADER_BYTES = 1 << 20
 INDEX_ENTRY = np.dtype([("sec", "<u4"), ("nsec", "<u4"), ("offset", "<u4")])
 """One entry of an index record: log time, and offset in the chunk's data."""

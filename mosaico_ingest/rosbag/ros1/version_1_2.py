@@ -32,8 +32,6 @@ from mosaico_ingest.rosbag.recovery import find_ros1_message
 from mosaico_ingest.rosbag.ros1.records import Header, Record, number, record_at
 from mosaico_ingest.rosbag.source import Source, Window
 
-__all__ = ["RosrecordReader"]
-
 _DEFINITION, _MESSAGE, _FILE = 1, 2, 3
 _RUN_BYTES = 4 << 20
 """Bytes of the file per read."""

@@ -3,14 +3,7 @@
 Functions keep no state and must not depend on the adapter that calls them.
 """
 
-from mosaico_ingest.adapters.mapping.functions import (
-    lists,
-    numeric,
-    operators,
-    point_clouds,
-    ros,
-    text,
-)
+from mosaico_ingest.adapters.mapping.functions import lists, numeric, operators, point_clouds, ros, text
 from mosaico_ingest.adapters.mapping.functions.registry import (
     ANY,
     BINARY,

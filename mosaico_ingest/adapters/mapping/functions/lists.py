@@ -7,31 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mosaico_ingest.adapters.mapping.columns import (
-    Array,
-    Axis,
-    arrays,
-    field_of,
-    open_list,
-    pc,
-    pt,
-)
+from mosaico_ingest.adapters.mapping.columns import Array, Axis, arrays, field_of, open_list, pc, pt
 from mosaico_ingest.adapters.mapping.functions.operators import float_result, integer_result
-from mosaico_ingest.adapters.mapping.functions.registry import (
-    Parameter,
-    RejectRows,
-    function,
-    list_of,
-)
-from mosaico_ingest.adapters.mapping.types import (
-    INT64,
-    ExprType,
-    expr_type_of,
-    int_bounds,
-    is_number,
-)
-
-__all__ = ["BOOLEANS", "NUMBERS"]
+from mosaico_ingest.adapters.mapping.functions.registry import Parameter, RejectRows, function, list_of
+from mosaico_ingest.adapters.mapping.types import INT64, ExprType, expr_type_of, int_bounds, is_number
 
 NUMBERS = list_of("a list of numbers", is_number)
 BOOLEANS = list_of("a list of true and false", pt.is_boolean)

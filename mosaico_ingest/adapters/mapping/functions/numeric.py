@@ -23,13 +23,7 @@ from mosaico_ingest.adapters.mapping.functions.operators import (
     integer_result,
     numbers,
 )
-from mosaico_ingest.adapters.mapping.functions.registry import (
-    ANY,
-    FLOAT,
-    NUMBER,
-    RejectRows,
-    function,
-)
+from mosaico_ingest.adapters.mapping.functions.registry import ANY, FLOAT, NUMBER, RejectRows, function
 from mosaico_ingest.adapters.mapping.types import ExprType, TypeMismatch, common_type
 
 __all__: list[str] = []

@@ -27,8 +27,6 @@ from mosaico_ingest.adapters.mapping.types import (
     widest_float,
 )
 
-__all__ = ["comparable", "float_result", "integer_result"]
-
 _MOST_BITS = 64
 
 

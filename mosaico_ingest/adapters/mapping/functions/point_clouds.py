@@ -19,12 +19,7 @@ from mosaico_ingest.adapters.mapping.columns import (
     pt,
     variable_list,
 )
-from mosaico_ingest.adapters.mapping.functions.registry import (
-    TEXT_LITERAL,
-    RejectRows,
-    function,
-    struct_with,
-)
+from mosaico_ingest.adapters.mapping.functions.registry import TEXT_LITERAL, RejectRows, function, struct_with
 
 __all__: list[str] = []
 

@@ -8,8 +8,6 @@ from pathlib import Path
 
 from mosaico_ingest.adapters.mapping.functions import SUBJECTS, functions, operators
 
-__all__ = ["function_reference", "with_reference"]
-
 _BEGIN, _END = "<!-- functions: generated from their docstrings -->\n", "<!-- end of functions -->\n"
 _SPECIAL = (
     (

@@ -21,32 +21,6 @@ from mosaico_ingest.adapters.mapping.types import (
 )
 from mosaico_ingest.errors import AdapterError
 
-__all__ = [
-    "ANY",
-    "BINARY",
-    "BOOLEAN",
-    "FLOAT",
-    "INTEGER",
-    "LIST",
-    "NUMBER",
-    "STRUCT",
-    "TEXT",
-    "TEXT_LITERAL",
-    "Function",
-    "Parameter",
-    "RejectRows",
-    "ResultType",
-    "check_call",
-    "function",
-    "functions",
-    "list_of",
-    "lookup",
-    "set_null",
-    "struct_with",
-    "suggest",
-    "suggest_synonym",
-]
-
 
 class RejectRows(Protocol):
     """Rejects the rows of invalid elements; returns if none of them is needed, because its branch is not taken."""
@@ -296,8 +270,7 @@ def struct_with(description: str, *choices: Mapping[str, Callable[[DataType], bo
 def list_of(description: str, accepts: Callable[[DataType], bool]) -> Parameter:
     """Return a parameter for lists whose element type is accepted."""
     return Parameter(
-        description,
-        lambda expr_type: is_list(expr_type.arrow) and accepts(expr_type.arrow.value_type),
+        description, lambda expr_type: is_list(expr_type.arrow) and accepts(expr_type.arrow.value_type)
     )
 
 

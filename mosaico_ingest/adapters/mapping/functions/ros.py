@@ -35,17 +35,6 @@ from mosaico_ingest.adapters.mapping.functions.registry import (
 )
 from mosaico_ingest.adapters.mapping.types import ExprType, is_number
 
-__all__ = [
-    "HEADER",
-    "HEADER_TYPE",
-    "QUATERNION_TYPE",
-    "STAMP",
-    "STAMP_TYPE",
-    "as_header",
-    "as_stamp",
-    "stamp_parts",
-]
-
 SECOND_NS = 1_000_000_000
 STAMP_TYPE: DataType = arrays.struct(
     [

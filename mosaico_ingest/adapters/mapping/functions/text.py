@@ -7,14 +7,7 @@ import re
 import numpy as np
 from msgspec.structs import replace
 
-from mosaico_ingest.adapters.mapping.columns import (
-    Array,
-    arrays,
-    null_mask,
-    open_list,
-    pc,
-    pt,
-)
+from mosaico_ingest.adapters.mapping.columns import Array, arrays, null_mask, open_list, pc, pt
 from mosaico_ingest.adapters.mapping.functions.registry import (
     TEXT,
     TEXT_LITERAL,
