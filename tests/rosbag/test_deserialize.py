@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from rosbags.typesys import Stores as RosbagsStores
 from rosbags.typesys import get_typestore
 from rosbags.typesys.store import Typestore
@@ -99,8 +100,7 @@ class TestTails:
 
     @pytest.mark.parametrize("source", list(Source))
     def test_deserializer_trailing_bytes_are_refused_for_every_source(self, source: Source) -> None:
-        types = definition("int8 a").types
-        reader = Deserializer(Definition(next(iter(types)), types, source), Encoding.CDR)
+        reader = Deserializer(replace(definition("int8 a"), source=source), Encoding.CDR)
         with pytest.raises(DecodeError) as raised:
             reader.to_dict(LITTLE + bytes(8) + b"\1")
         assert raised.value.rule == "trailing-bytes"
