@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from foxglove_schemas import MESSAGES, json_definition, json_payload, protobuf_definition, protobuf_payload
+from protobuf_schemas import definition_of, message_class, proto3_file
 
 from mosaico_ingest import ROSInjectionConfig, ROSLoader
 from mosaico_ingest.api import inspect_recording, run
@@ -137,6 +138,29 @@ def test_export_restores_protobuf_and_json_recordings(tmp_path: Path, ingest: An
     ingest(tmp_path / "again.mcap", sequence_name="again")
     for topic, _, _ in topics:
         assert rows_of(tmp_path, topic, "again") == rows_of(tmp_path, topic)
+
+
+def test_export_keeps_absent_fields_absent(tmp_path: Path, ingest: Any) -> None:
+    kind = message_class(proto3_file(), "all.Message")
+    messages = [
+        kind(),
+        kind(maybe_int32=0, inner={}),
+        kind(int_choice=3, wrapped={"value": 1.5}, inners=[{}]),
+        kind(),
+    ]
+    source = write(
+        tmp_path / "r.mcap",
+        ("/pb", definition_of(proto3_file(), "all.Message"), [one.SerializeToString() for one in messages]),
+        ("/js", SPEED, [b'{"v":1.0}', b'{"v":1.0,"note":"a"}', b'{"v":2.0}']),
+        ("/free", FREE, [b'{"a":1}', b'{"a":2.5,"b":[1]}', b'{"c":{"d":null}}']),
+    )
+    ingest(source)
+    assert export_sequence(Store.open(tmp_path / "store"), "s", tmp_path / "again.mcap").faithful
+    before, after = (
+        sorted(repr((one.topic, one.timestamp_ns, one.data)) for one in ROSLoader(path))
+        for path in (source, tmp_path / "again.mcap")
+    )
+    assert before == after
 
 
 def test_export_of_protobuf_to_rosbag_is_refused(tmp_path: Path, ingest: Any) -> None:

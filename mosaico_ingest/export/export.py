@@ -232,7 +232,8 @@ def restorer_for(info: SourceTopic, definition: Definition, specs: Sequence[Adap
             mismatches.append(error.what)
             continue
         if _produces(adapter, info):
-            inverse = invert(adapter, shape, info.metadata)
+            nullable = definition.language is not Language.ROS
+            inverse = invert(adapter, shape, info.metadata, nullable=nullable)
             return Restorer(info, definition, spec.name, adapter.ontology, inverse)
     raise AdapterError(
         f"no known adapter converts {definition.root} to {info.ontology.tag}",

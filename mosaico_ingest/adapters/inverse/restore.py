@@ -104,14 +104,18 @@ class Inverse(Protocol):
         ...
 
 
-def invert(adapter: Adapter, shape: pa.StructType, metadata: Mapping[str, Any]) -> Inverse:
+def invert(
+    adapter: Adapter, shape: pa.StructType, metadata: Mapping[str, Any], *, nullable: bool = False
+) -> Inverse:
     """Return the inverse of a bound adapter; `metadata` is the topic's.
+
+    With `nullable`, the fields of messages can be absent, as in protobuf and JSON.
 
     Raises:
         AdapterError: The adapter is written in Python and has no inverse.
     """
     if isinstance(adapter, UnmodeledAdapter):
-        return _UnmodeledInverse(shape)
+        return _UnmodeledInverse(shape, nullable)
     if isinstance(adapter, MappingAdapter):
         return _MappingInverse(adapter, shape, _metadata_texts(adapter.metadata, metadata))
     raise AdapterError("an adapter written in Python has no way back")
@@ -121,10 +125,12 @@ class _UnmodeledInverse(Struct, frozen=True):
     """The exact inverse for messages stored in their ROS shape."""
 
     shape: pa.StructType
+    nullable: bool
 
     def restore(self, rows: pa.StructArray, envelope: Envelope) -> Restored:  # noqa: ARG002 - the protocol's signature
         columns = [
-            _in_shape(values, field.type) for values, field in zip(rows.flatten(), self.shape, strict=True)
+            _in_shape(values, field.type, nullable=self.nullable)
+            for values, field in zip(rows.flatten(), self.shape, strict=True)
         ]
         return Restored(struct_of(columns, self.shape, None, len(rows)))
 
@@ -168,20 +174,23 @@ def _metadata_texts(
     return texts
 
 
-def _in_shape(values: Array, kind: DataType) -> Array:
+def _in_shape(values: Array, kind: DataType, *, nullable: bool) -> Array:
     """Cast values to the message's own type, and drop the placeholder fields of empty messages."""
+    absent = null_mask(values) if nullable else None
     if values.type == kind and not values.null_count:
         return values
     if pt.is_struct(kind):
         names = [field.name for field in values.type]
-        children = [_in_shape(field_of(values, f.name), f.type) for f in kind if f.name in names]
-        return struct_of(children, kind, None, len(values))
+        children = [
+            _in_shape(field_of(values, f.name), f.type, nullable=nullable) for f in kind if f.name in names
+        ]
+        return struct_of(children, kind, absent, len(values))
     if is_list(kind):
         elements, axis = open_list(values)
-        elements = _in_shape(elements, kind.value_type)
+        elements = _in_shape(elements, kind.value_type, nullable=nullable)
         if pt.is_fixed_size_list(kind):
-            return fixed_list(elements, kind.list_size, None, len(values), kind)
-        return variable_list(elements, axis.offsets, None, kind)
-    if null_mask(values) is not None:
+            return fixed_list(elements, kind.list_size, absent, len(values), kind)
+        return variable_list(elements, axis.offsets, absent, kind)
+    if not nullable and null_mask(values) is not None:
         raise AdapterError(f"null where a {kind} is needed; the topic was not written by an ingestion")
     return values.cast(kind)

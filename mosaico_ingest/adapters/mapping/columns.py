@@ -152,7 +152,8 @@ def fixed_list(values: Array, size: int, null: Mask | None, rows: int, type_: Da
 def struct_of(children: list[Array], type_: DataType, null: Mask | None, rows: int) -> Array:
     """Build a struct column; `rows` is the length of a struct without fields."""
     if not children:
-        return arrays.array([{}] * rows, type_)
+        empty = [{}] * rows if null is None else [None if absent else {} for absent in null]
+        return arrays.array(empty, type_)
     mask = None if null is None or not null.any() else arrays.array(null)
     return arrays.StructArray.from_arrays(children, fields=list(type_), mask=mask)
 
