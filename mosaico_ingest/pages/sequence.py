@@ -142,7 +142,7 @@ class _Content:
         start_ns = self._info.start_ns or 0
         for topic in self._topics:
             statistics = described[topic.name]
-            if not topic.rows or statistics is None:
+            if not topic.rows or statistics is None or has_log(topic):
                 continue
             plots = self._attempt(topic, lambda info: topic_plots(info, start_ns))
             if plots is not None:

@@ -104,7 +104,7 @@ def draw_track(
     rows = gaps = ""
     words: list[str] = []
     if timeline is not None:
-        rows = _rows_path(_with_wider_bins(timeline), axis, span)
+        rows = _rows_path(_with_wider_bins(timeline, axis.scale), axis, span)
         gaps = _marks(
             axis, [(gap.start_ns, gap.end_ns) for gap in timeline.gaps], HEIGHT - GAP_HEIGHT, HEIGHT
         )
@@ -157,10 +157,12 @@ def _tick_text(seconds: float, step_s: float) -> str:
     return f"{seconds * 1e9:.0f} ns"
 
 
-def _with_wider_bins(timeline: TimelineReport) -> TimelineReport:
-    """Merge bins until each spans several intervals, so that only gaps leave bins empty."""
+def _with_wider_bins(timeline: TimelineReport, scale: float) -> TimelineReport:
+    """Merge bins until each is visible and spans several intervals, so that only gaps leave bins empty."""
     bins = len(timeline.counts)
     factor = math.ceil(INTERVALS_PER_BAR * (timeline.interval_ns or 0) / timeline.step_ns)
+    if scale:
+        factor = max(factor, math.ceil(MIN_BAR / (timeline.step_ns * scale)))
     factor = max(1, min(factor, bins))
     counts = tuple(sum(timeline.counts[at : at + factor]) for at in range(0, bins, factor))
     return timeline.model_copy(update={"step_ns": timeline.step_ns * factor, "counts": counts})

@@ -100,3 +100,10 @@ def test_track_rows_end_at_the_last_row() -> None:
     timeline = TimelineReport(start_ns=0, step_ns=S, counts=(5,) * 8, interval_ns=S // 5)
     track = draw_track(TWENTY_SECONDS, "/a", timeline, span=(0, 7_600_000_000))
     assert positions(track.rows)[-1] == WIDTH * 7.6 / 20
+
+
+def test_track_rows_close_together_are_a_visible_bar() -> None:
+    timeline = TimelineReport(start_ns=0, step_ns=2_000_000, counts=(9, *(0,) * 98, 1), interval_ns=1_000_000)
+    track = draw_track(TWENTY_SECONDS, "/a", timeline, span=(0, 200_000_000))
+    left, right, *_ = positions(track.rows)[1:]
+    assert right - left >= MIN_BAR - 0.1
