@@ -4,6 +4,7 @@ Start with these names:
 
     run("job.yaml")                  ingest the recordings of a manifest; returns the report
     plan("job.yaml")                 decide everything and try a few messages; writes nothing
+    check("job.yaml")                check recordings against a data contract; writes nothing
     inspect("drive.mcap")            list the topics of a recording
     Store.open("mosaico")            open a store; then .sequence("drive").topic("/imu").to_pandas()
     ROSInjectionConfig               a job in Python instead of a manifest
@@ -11,7 +12,6 @@ Start with these names:
     ROSLoader                        iterate over the messages of a recording
     ROSBridge                        the adapters of message types
     ROSAdapterBase                   the base class of your own adapters
-    register_default_adapter         register your own adapter
 
 Reports, plans, stores, sequences and topics are shown as tables in notebooks. The public names are imported on first
 access, so that `import mosaico_ingest` loads neither Arrow nor pydantic.
@@ -27,7 +27,7 @@ from mosaico_ingest.version import __version__
 if TYPE_CHECKING:
     from mosaico_ingest.adapters import ROSAdapterBase, register_default_adapter
     from mosaico_ingest.adapters.bridge import ROSBridge
-    from mosaico_ingest.api import RosbagInjector, run
+    from mosaico_ingest.api import RosbagInjector, check, run
     from mosaico_ingest.api import inspect_recording as inspect
     from mosaico_ingest.api import plan_job as plan
     from mosaico_ingest.destinations.store import Store
@@ -63,6 +63,7 @@ __all__ = [
     "Stores",
     "TopicLevelErrorPolicy",
     "__version__",
+    "check",
     "inspect",
     "plan",
     "register_default_adapter",
@@ -85,6 +86,7 @@ _MODULES = {
     "Store": "destinations.store",
     "Stores": "job.values",
     "TopicLevelErrorPolicy": "job.values",
+    "check": "api",
     "inspect": "api",
     "plan": "api",
     "register_default_adapter": "adapters",

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "RosbagInjector",
+    "check",
     "compare_jobs",
     "compile_job",
     "compile_plan",
@@ -182,6 +183,15 @@ def check_recordings(manifest: Path, *, jobs: Sequence[Job] | None = None) -> It
     from mosaico_ingest.services.check import check_jobs
 
     return check_jobs(jobs or compile_job(manifest))
+
+
+def check(manifest: Path | str) -> tuple[Checked, ...]:
+    """Return the result of the data contract for each recording of a manifest; write nothing.
+
+    Raises:
+        IngestError: The manifest cannot be compiled.
+    """
+    return tuple(check_recordings(Path(manifest)))
 
 
 def check_sequence(store: str, sequence: str, expect: Path) -> Checked:

@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup
 
+from mosaico_ingest.cli.completion import completer
 from mosaico_ingest.cli.process import defer_garbage_collection
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.findings import one_line
@@ -29,6 +30,8 @@ COMMANDS = {
 GROUPS = {"adapters": "adapters", "store": "store", "keys": "serve", "schema": "schema"}
 """The module in `cli` that defines each command group, as the Typer application `<name>_app`."""
 NAMES = (*COMMANDS, *GROUPS)
+COMPLETING = "_INGEST_COMPLETE" in os.environ
+"""Whether a shell asks for completions."""
 MANIFEST_SUFFIXES = (".yaml", ".yml")
 
 
@@ -116,6 +119,9 @@ def _without_types(parameters: Sequence[Any]) -> list[Any]:
             isinstance(parameter, TyperArgument) and parameter.metavar
         ):
             parameter.display_type_rich = _no_type
+        if COMPLETING and (complete := completer(parameter.metavar)) is not None:
+            # Typer has no public way to complete parameters that exist.
+            parameter._custom_shell_complete = complete  # noqa: SLF001 # pyright: ignore[reportPrivateUsage]
     return list(parameters)
 
 
@@ -141,7 +147,7 @@ def root(
 def _add_command(words: list[str]) -> list[str]:
     """Return the words with `run` before a manifest; exit with a hint if the first word is unknown."""
     first = next((word for word in words if not word.startswith("-")), None)
-    if first is None or first in NAMES:
+    if first is None or first in NAMES or words[0] in {"--show-completion", "--install-completion"}:
         return words
     is_option_value = first != words[0] and any(word.endswith(MANIFEST_SUFFIXES) for word in words)
     if first.endswith(MANIFEST_SUFFIXES) or is_option_value:

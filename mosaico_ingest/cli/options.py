@@ -12,6 +12,8 @@ from typer.models import OptionInfo
 from mosaico_ingest.job import values
 
 DEFAULT_STORE = str(values.DEFAULT_STORE)
+DISTROS = ", ".join(each.value for each in values.Stores if each.value.startswith("ros"))
+"""The distros with known definitions."""
 STANDARD_OUTPUT = Path("-")
 """The path that output options accept for standard output."""
 STORE = typer.Option(
@@ -38,7 +40,7 @@ DistroOption = Annotated[
     str | None,
     typer.Option(
         "--ros-distro",
-        help="Distro of recordings without definitions, such as ros2_humble.",
+        help=f"Distro of recordings without definitions: {DISTROS}.",
         metavar="DISTRO",
     ),
 ]
