@@ -10,7 +10,7 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from mosaico_ingest.cli.app import command_line
+from mosaico_ingest.cli.app import GROUP_HELP, command_line
 
 
 def _commands(command: Any, name: str = "ingest") -> Iterator[tuple[str, Any]]:
@@ -26,6 +26,11 @@ COMMANDS = dict(_commands(get_command(command_line())))
 def test_help_texts_contain_no_markup_brackets(name: str) -> None:
     for parameter in COMMANDS[name].params:
         assert "[" not in (getattr(parameter, "help", None) or ""), parameter.name
+
+
+def test_help_of_groups_is_the_same_without_their_commands() -> None:
+    commands = get_command(command_line()).commands  # type: ignore[attr-defined]
+    assert {name: commands[name].help for name in GROUP_HELP} == GROUP_HELP
 
 
 def test_short_options_have_one_meaning() -> None:
