@@ -23,6 +23,8 @@ _GRID = 52
 _MARGIN = 0.04
 """Share of the extent that is added on each side."""
 _MIN_EXTENT_M = 1.0
+_LARGE_PICTURE = 400
+_FEW_POINTS = 2_000
 _UNKNOWN = 128
 _LARGEST_PIXELS = 1 << 26
 
@@ -106,7 +108,8 @@ def from_above(points: Points, *, size: int = 800) -> Pixels:
     is_flat = float(np.ptp(heights)) == 0
     shades = np.ones(len(order)) if is_flat else heights[inside][order] - float(heights.min()) + 1
     colours = np.full((len(order), 3), 230, np.uint8) if is_flat else colour_map(shades[np.newaxis])[0]
-    radius = 1 if size >= 400 else 0  # noqa: PLR2004 - single pixels are hard to see in a large picture
+    radius = 1 if size >= _LARGE_PICTURE else 0  # single pixels are hard to see in a large picture
+    radius += 2 if len(order) < _FEW_POINTS else 0
     for offset_y in range(radius + 1):
         for offset_x in range(radius + 1):
             pixels[
