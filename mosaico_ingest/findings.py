@@ -150,3 +150,23 @@ def suggest_names(names: Iterable[str], wanted: Iterable[str] = ()) -> str:
     nearest = dict.fromkeys(name for match in matches for name in match)
     listing = f"there are {join_names(available)}" if available else "there are none"
     return f"the nearest is {join_names(nearest)}; {listing}" if nearest else listing
+
+
+def nearest(word: str, known: Iterable[str]) -> str | None:
+    """Return the known word that is closest to `word`: the same letters, a missing prefix, or a typo; None if none is close."""
+    words = list(known)
+    plain = {normalized_word(candidate): candidate for candidate in words}
+    if normalized_word(word) in plain:
+        return plain[normalized_word(word)]
+    tails = [
+        candidate for candidate in words if normalized_word(candidate).endswith(f"_{normalized_word(word)}")
+    ]
+    if len(tails) == 1:
+        return tails[0]
+    close = get_close_matches(normalized_word(word), plain, n=1, cutoff=0.6)
+    return plain[close[0]] if close else None
+
+
+def normalized_word(word: str) -> str:
+    """Return a word in lower case, with an underscore in place of hyphens and spaces."""
+    return re.sub(r"[-\s]+", "_", word.strip().lower())

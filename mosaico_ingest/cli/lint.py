@@ -104,7 +104,7 @@ def _summary(report: LintReport) -> str:
 
 
 def _explanation(name: str) -> str:
-    from mosaico_ingest.job.validation import nearest
+    from mosaico_ingest.findings import nearest
     from mosaico_ingest.lint.pages import page_of, rule_index
     from mosaico_ingest.rules import RULES, find_rule
 

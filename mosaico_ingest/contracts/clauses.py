@@ -19,12 +19,23 @@ from mosaico_ingest.job.expect import (
     TopicExpectations,
 )
 from mosaico_ingest.job.model import Job
+from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.report.contract import ExpectationResult, Location, Occurrence, Outcome
 
 KeyPath = tuple[str | int, ...]
 
 _LISTS = {"type": AllowedNames, "frame_id": AllowedNames}
 _LIMITS = frozenset({"rejected", "out_of_order", "unreadable"})
+
+
+class ReadTopic(Struct, frozen=True):
+    """A topic that is read: its connections, and the type of its rows."""
+
+    topic: str
+    """The name in the recording."""
+    connections: tuple[int, ...]
+    ontology: OntologyType | None = None
+    """The type of its rows; None if no expectation refers to them."""
 
 
 class Clause(Struct, frozen=True):

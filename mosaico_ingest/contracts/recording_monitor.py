@@ -6,9 +6,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from msgspec import Struct
-
-from mosaico_ingest.contracts.clauses import Clause, Contract
+from mosaico_ingest.contracts.clauses import Clause, Contract, ReadTopic
 from mosaico_ingest.contracts.evaluate import Facts, TopicFacts, evaluate, limit_result
 from mosaico_ingest.contracts.expressions import Rows
 from mosaico_ingest.contracts.monitor import (
@@ -30,16 +28,6 @@ from mosaico_ingest.rosbag.blocks import ChunkChecksum, Connection
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
 from mosaico_ingest.rosbag.recording import Recording
-
-
-class ReadTopic(Struct, frozen=True):
-    """A topic that is read: its connections, and the type of its rows."""
-
-    topic: str
-    """The name in the recording."""
-    connections: tuple[int, ...]
-    ontology: OntologyType | None = None
-    """The type of its rows; None if no expectation refers to them."""
 
 
 def check_expressions(

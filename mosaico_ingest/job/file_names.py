@@ -8,7 +8,7 @@ from datetime import datetime
 from functools import cached_property, partial
 from typing import TypeAlias
 
-from mosaico_ingest.job.validation import nearest
+from mosaico_ingest.findings import nearest
 
 FileNameValue: TypeAlias = "str | int | float"
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
-from difflib import get_close_matches
 from math import isfinite
 from typing import Any
 
@@ -13,7 +12,7 @@ from msgspec import Struct
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from mosaico_ingest.findings import Edit, Finding, Severity, Span
+from mosaico_ingest.findings import Edit, Finding, Severity, Span, nearest, normalized_word
 from mosaico_ingest.job.yaml_source import KeyPath, Source, Value, member
 
 _EXPECTED = {
@@ -94,19 +93,6 @@ def key_path_of(location: KeyPath, value: Value) -> KeyPath:
     return path
 
 
-def nearest(word: str, known: Iterable[str]) -> str | None:
-    """Return the known word that is closest to `word`: the same letters, a missing prefix, or a typo; None if none is close."""
-    words = list(known)
-    plain = {_plain(candidate): candidate for candidate in words}
-    if _plain(word) in plain:
-        return plain[_plain(word)]
-    tails = [candidate for candidate in words if _plain(candidate).endswith(f"_{_plain(word)}")]
-    if len(tails) == 1:
-        return tails[0]
-    close = get_close_matches(_plain(word), plain, n=1, cutoff=0.6)
-    return plain[close[0]] if close else None
-
-
 def keys_at(schema: dict[str, Any], path: KeyPath) -> list[str]:
     """Return the keys that a JSON Schema allows in the mapping at `path`; empty if every key is allowed."""
     return list(_resolved(_node_at(schema, path), schema, {"object"}).get("properties", {}))
@@ -123,10 +109,6 @@ def _node_at(schema: dict[str, Any], path: KeyPath) -> dict[str, Any]:
 def key_path_text(path: KeyPath) -> str:
     """Return a key path as text, such as `bag.custom_msgs[0].path`."""
     return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path).lstrip(".")
-
-
-def _plain(word: str) -> str:
-    return re.sub(r"[-\s]+", "_", word.strip().lower())
 
 
 def _problem(details: ErrorDetails, source: Source, schema: dict[str, Any]) -> _Problem:
@@ -187,7 +169,7 @@ def _unknown_key(problem: _Problem) -> Finding:
         remedy = _elsewhere(word, problem.schema)
     fix = (
         Edit(span, close)
-        if close and _plain(close).replace("_", "") == _plain(word).replace("_", "")
+        if close and normalized_word(close).replace("_", "") == normalized_word(word).replace("_", "")
         else None
     )
     message = f"unknown key {word!r} {section}"
@@ -287,7 +269,9 @@ def _not_a_choice(problem: _Problem) -> Finding:
     remedy = f"did you mean {close!r}? " if close else ""
     choices = ", ".join(words) or allowed
     exact = (
-        close is not None and isinstance(problem.value, str) and _plain(close).endswith(_plain(problem.value))
+        close is not None
+        and isinstance(problem.value, str)
+        and normalized_word(close).endswith(normalized_word(problem.value))
     )
     fix = Edit(problem.span, close) if close and exact else None
     return problem.finding(

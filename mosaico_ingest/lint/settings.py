@@ -14,9 +14,9 @@ from msgspec.structs import replace
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mosaico_ingest.errors import ManifestError
-from mosaico_ingest.findings import Finding, Severity, Span
+from mosaico_ingest.findings import Finding, Severity, Span, nearest
 from mosaico_ingest.job.manifest import read_text
-from mosaico_ingest.job.validation import explain, nearest
+from mosaico_ingest.job.validation import explain
 from mosaico_ingest.job.yaml_source import Source, Value, load_source
 from mosaico_ingest.rules import LINT_RULES
 

@@ -14,10 +14,9 @@ from msgspec.structs import replace
 
 from mosaico_ingest.containers import RECORDING_NAME
 from mosaico_ingest.errors import ManifestError
-from mosaico_ingest.findings import Finding, Severity, Span, join_names
+from mosaico_ingest.findings import Finding, Severity, Span, join_names, nearest
 from mosaico_ingest.job.file_names import FileNamePattern
 from mosaico_ingest.job.model import Job, Origin
-from mosaico_ingest.job.validation import nearest
 from mosaico_ingest.job.yaml_source import KeyPath, Source
 from mosaico_ingest.metadata.schema import read_json
 from mosaico_ingest.remote import AnyPath

@@ -8,8 +8,8 @@ from typing import Any, cast
 
 from msgspec import Struct
 
-from mosaico_ingest.findings import Edit, Finding, Severity, Span
-from mosaico_ingest.job.validation import key_path_text, nearest
+from mosaico_ingest.findings import Edit, Finding, Severity, Span, nearest
+from mosaico_ingest.job.validation import key_path_text
 from mosaico_ingest.job.yaml_source import KeyPath
 from mosaico_ingest.metadata.schema import MetadataSchema
 

@@ -42,10 +42,8 @@ class Conditions(Struct, frozen=True):
     on_change: tuple[FieldExpression, ...]
 
 
-def bind_conditions(plan: TopicPlan, definition: Definition) -> Conditions | None:
-    """Return the conditions of a plan that `check_conditions` accepted, or None if it has none."""
-    if plan.where is None and not plan.on_change:
-        return None
+def bind_conditions(plan: TopicPlan, definition: Definition) -> Conditions:
+    """Return the conditions of a plan that `check_conditions` accepted."""
     rows = message_rows(definition)
     where = None if plan.where is None else _bind(plan.where, rows)
     return Conditions(where, tuple(_bind(text, rows) for text in plan.on_change))

@@ -6,9 +6,9 @@ import numpy as np
 
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.bridge import ROSBridge
-from mosaico_ingest.contracts.clauses import Contract
+from mosaico_ingest.contracts.clauses import Contract, ReadTopic
 from mosaico_ingest.contracts.monitor import TIME_KEYS, BlockObserver
-from mosaico_ingest.contracts.recording_monitor import ReadTopic, RecordingMonitor
+from mosaico_ingest.contracts.recording_monitor import RecordingMonitor
 from mosaico_ingest.decode.decoder import decoder_for
 from mosaico_ingest.errors import AdapterError, ManifestError
 from mosaico_ingest.job.model import Job

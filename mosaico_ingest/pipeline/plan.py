@@ -15,8 +15,7 @@ from typing_extensions import TypedDict
 from mosaico_ingest.adapters.adapter import RESERVED_KEYS, AdapterSpec
 from mosaico_ingest.adapters.image import PngImageSpec
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
-from mosaico_ingest.contracts.clauses import Contract
-from mosaico_ingest.contracts.recording_monitor import ReadTopic
+from mosaico_ingest.contracts.clauses import Contract, ReadTopic
 from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.documents import Part, Unchecked
 from mosaico_ingest.findings import Finding, Span, escape_undecodable
@@ -153,6 +152,11 @@ class TopicPlan(Part):
     def as_read(self) -> ReadTopic:
         """The topic as a data contract observes it."""
         return ReadTopic(self.topic, self.connections, self.ontology)
+
+    @property
+    def has_conditions(self) -> bool:
+        """Whether `where` or `on_change` selects messages."""
+        return self.where is not None or bool(self.on_change)
 
     @property
     def has_log_times(self) -> bool:

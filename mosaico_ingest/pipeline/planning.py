@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from difflib import get_close_matches
 
 from mosaico_ingest.adapters.adapter import UnmodeledSpec, source_metadata
 from mosaico_ingest.adapters.bridge import Resolution, ROSBridge
 from mosaico_ingest.adapters.image import IMAGE_TAG
 from mosaico_ingest.contracts.clauses import Contract
-from mosaico_ingest.contracts.recording_monitor import check_expressions
 from mosaico_ingest.errors import AdapterError, BagError, IngestError, NothingMatched
 from mosaico_ingest.findings import Finding, Severity, Span, escape_undecodable, suggest_names
 from mosaico_ingest.job.fields import TopicGlob, marked_fields, values_at
@@ -18,10 +17,6 @@ from mosaico_ingest.job.model import Job, JobSettings
 from mosaico_ingest.job.patterns import Selection, first_match, select
 from mosaico_ingest.job.units import format_time
 from mosaico_ingest.job.values import LoaderErrorPolicy, StampSource, TimeBound, Unmodeled
-from mosaico_ingest.metadata.contract import check_metadata_contracts
-from mosaico_ingest.metadata.sources import fill_in_metadata
-from mosaico_ingest.pipeline.conditions import check_conditions
-from mosaico_ingest.pipeline.definition_lock import check_lock, lock_of
 from mosaico_ingest.pipeline.latched import is_static
 from mosaico_ingest.pipeline.memory import MemoryBudget
 from mosaico_ingest.pipeline.plan import ExcludedTopic, Plan, TopicPlan, digest_of
@@ -47,7 +42,7 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
         ManifestError: An expression of `where`, `on_change` or the data contract does not fit the messages of its topic.
         IngestError: The task is for another plan, or a definition has changed and `on_schema_change` is `fail`.
     """
-    job, metadata_findings = fill_in_metadata(task.job, recording)
+    job, metadata_findings = _with_metadata(task.job, recording)
     names = tuple(dict.fromkeys(connection.topic for connection in recording.connections))
     selection = select(job.topics, names)
     findings = [*_recording_findings(recording, resolver, selection), *_unmatched(job, selection, names)]
@@ -71,11 +66,9 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
         raise _misfit(job, misfits)
     if not topics:
         raise _nothing_selected(job, recording, excluded)
-    check_conditions(job, topics, recording.connections)
-    check_metadata_contracts(job, dict.fromkeys(topic.topic for topic in topics))
-    contract = Contract.of(job, task.group)
-    if contract is not None:
-        check_expressions(contract, recording.connections, [topic.as_read for topic in topics])
+    _check_conditions(job, topics, recording)
+    _check_metadata(job, topics)
+    contract = _contract(task, job, topics, recording)
     read_from_ns, read_until_ns = _time_range(
         job, recording, has_log_times=all(topic.has_log_times for topic in topics)
     )
@@ -104,11 +97,50 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
         contract=contract,
     )
     if job.lock is not None:
+        from mosaico_ingest.pipeline.definition_lock import check_lock, lock_of  # noqa: PLC0415 - only locked jobs need it
+
         check_lock(job.lock, lock_of(plan, recording.connections), recording=str(recording.files[0]))
     if job.on_schema_change is not None:
         plan = follow_schema_changes(plan, job.on_schema_change)
     _check_digest(plan, task)
     return plan
+
+
+def _with_metadata(job: Job, recording: Recording) -> tuple[Job, tuple[Finding, ...]]:
+    """Return the job with the metadata from `metadata_from`, and findings about it."""
+    if job.sequence.metadata_from is None:
+        return job, ()
+    from mosaico_ingest.metadata.sources import fill_in_metadata  # noqa: PLC0415 - it loads the YAML parser
+
+    return fill_in_metadata(job, recording)
+
+
+def _check_conditions(job: Job, topics: Sequence[TopicPlan], recording: Recording) -> None:
+    """Raise ManifestError if an expression of `where` or `on_change` does not fit its topic."""
+    if any(topic.has_conditions for topic in topics):
+        from mosaico_ingest.pipeline.conditions import check_conditions  # noqa: PLC0415 - only conditions need it
+
+        check_conditions(job, topics, recording.connections)
+
+
+def _contract(task: Task, job: Job, topics: Sequence[TopicPlan], recording: Recording) -> Contract | None:
+    """Return the data contract; raise ManifestError if an expression does not fit its topic."""
+    contract = Contract.of(job, task.group)
+    if contract is not None:
+        from mosaico_ingest.contracts.recording_monitor import check_expressions  # noqa: PLC0415 - only contracts need it
+
+        check_expressions(contract, recording.connections, [topic.as_read for topic in topics])
+    return contract
+
+
+def _check_metadata(job: Job, topics: Iterable[TopicPlan]) -> None:
+    """Raise ContractError if metadata violates its schema."""
+    settings = job.topic_settings.values()
+    if job.sequence.metadata_schema is None and all(entry.metadata_schema is None for entry in settings):
+        return
+    from mosaico_ingest.metadata.contract import check_metadata_contracts  # noqa: PLC0415 - it loads the YAML parser
+
+    check_metadata_contracts(job, dict.fromkeys(topic.topic for topic in topics))
 
 
 def plan_connection(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from msgspec import Struct
 
@@ -15,7 +15,6 @@ from mosaico_ingest.errors import IngestError, Interrupted, NothingMatched, Veri
 from mosaico_ingest.findings import Finding, Severity, Stage
 from mosaico_ingest.interrupts import Abandoned, DeferredInterrupt
 from mosaico_ingest.job.values import IfExists, OnFailure, SessionLevelErrorPolicy
-from mosaico_ingest.pipeline.contract import ContractRun
 from mosaico_ingest.pipeline.latched import latched_blocks
 from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.provenance import SequenceRequest
@@ -39,6 +38,9 @@ from mosaico_ingest.rosbag.recording import Recording, damage_error
 
 _SHOWN_FIELDS = 8
 """Number of undeclared fields that a finding names."""
+
+if TYPE_CHECKING:
+    from mosaico_ingest.pipeline.contract import ContractRun
 
 
 class Written(Struct, frozen=True):
@@ -80,7 +82,7 @@ def write_sequence(
             topics = _open_topics(
                 plan, recording, session, observe, quarantine=quarantine, stopwatch=stopwatch
             )
-            contract = ContractRun.start(plan, recording, topics)
+            contract = _start_contract(plan, recording, topics)
             reported = frozenset(recording.unreadable)
             try:
                 _pump(plan, recording, topics, buffer, stopwatch, contract=contract)
@@ -176,6 +178,16 @@ def check_counts(
         else:
             missing.append(f"{text} and no unreadable range explains the difference")
     return missing
+
+
+def _start_contract(
+    plan: Plan, recording: Recording, topics: tuple[TopicPipeline, ...]
+) -> ContractRun | None:
+    if plan.contract is None:
+        return None
+    from mosaico_ingest.pipeline.contract import ContractRun  # noqa: PLC0415 - only contracts need it
+
+    return ContractRun.start(plan, recording, topics)
 
 
 def _open_session(plan: Plan, request: SequenceRequest, sink: Sink) -> AbstractContextManager[Session]:

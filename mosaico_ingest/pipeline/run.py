@@ -16,7 +16,6 @@ from mosaico_ingest.errors import ContractError, IngestError, Interrupted
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import LoaderErrorPolicy
-from mosaico_ingest.pipeline.contract import check_group, contract_error
 from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.planning import plan_recording
 from mosaico_ingest.pipeline.provenance import check_provenance
@@ -70,7 +69,7 @@ def run_recording(task: Task, observe: Observer = ignore_events) -> Outcome:
             plan = _plan(task, recording, resolver)
             events.start(plan)
             if not task.dry_run:
-                check_group(plan)
+                _check_group(plan)
             request = None if task.dry_run else check_provenance(plan)
             if request is None:
                 return events.skip()
@@ -86,6 +85,14 @@ def run_recording(task: Task, observe: Observer = ignore_events) -> Outcome:
         _log.debug("unexpected", exc_info=True)
         return events.fail(_unexpected(job, error))
     return events.complete()
+
+
+def _check_group(plan: Plan) -> None:
+    """Raise ContractError if an expectation about the group of the recording failed, and nothing may be committed."""
+    if plan.contract is not None:
+        from mosaico_ingest.pipeline.contract import check_group  # noqa: PLC0415 - only contracts need it
+
+        check_group(plan)
 
 
 @contextmanager
@@ -147,6 +154,8 @@ def _open_sink(plan: Plan, events: _RunEvents) -> Sink:
 
 
 def _diverted(contract: ContractResult) -> str:
+    from mosaico_ingest.pipeline.contract import contract_error  # noqa: PLC0415 - only contracts need it
+
     error = contract_error(contract)
     return f"stored as {contract.stored_as}: {error.where}: {error.what}" if error.where else error.what
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
@@ -12,10 +13,11 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from mosaico_ingest.adapters.adapter import Envelope
-from mosaico_ingest.contracts.values import stamps_of
 from mosaico_ingest.job.values import StampSource
-from mosaico_ingest.pipeline.conditions import ConditionFilter, Conditions
 from mosaico_ingest.pipeline.plan import Plan, TopicPlan
+
+if TYPE_CHECKING:
+    from mosaico_ingest.pipeline.conditions import ConditionFilter, Conditions
 
 Int64s = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -43,6 +45,8 @@ def row_times(
     if plan.stamp is StampSource.PUBLISH and publish_times is not None:
         times = _or_log_times(publish_times, log_times)
     elif plan.stamp is StampSource.HEADER:
+        from mosaico_ingest.contracts.values import stamps_of  # noqa: PLC0415 - only header stamps need it
+
         times = _or_log_times(stamps_of(rows), log_times)
     if plan.time_offset_ns:
         return RowTimes(times.values + plan.time_offset_ns, times.fallback)
@@ -61,8 +65,7 @@ def row_selector(plan: Plan, topic: TopicPlan) -> RowSelector | None:
     """Return the selector of a topic, or None if it keeps all rows."""
     if plan.selects_after_reading:
         return RowSelector(topic, plan.read_from_ns, plan.read_until_ns)
-    drops = topic.rate is not None or topic.where is not None or bool(topic.on_change)
-    return RowSelector(topic) if drops else None
+    return RowSelector(topic) if topic.rate is not None or topic.has_conditions else None
 
 
 @dataclass(slots=True)
@@ -74,7 +77,7 @@ class RowSelector:
     """Earlier rows are dropped; None if the reader has applied the time range already."""
     end_ns: int | None = None
     """Rows of this time or later are dropped."""
-    _filter: ConditionFilter = field(default_factory=ConditionFilter)
+    _filter: ConditionFilter | None = None
     _origin_ns: int | None = None
     _last_interval: int = -1
 
@@ -93,6 +96,10 @@ class RowSelector:
             dropped["time_range"] = keep & ~inside
             keep &= inside
         if conditions is not None:
+            if self._filter is None:
+                from mosaico_ingest.pipeline.conditions import ConditionFilter  # noqa: PLC0415 - only conditions need it
+
+                self._filter = ConditionFilter()
             remaining = rows if keep.all() else rows.filter(pa.array(keep))
             where, on_change = (
                 _scattered(mask, keep)

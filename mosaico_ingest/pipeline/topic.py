@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.adapters.adapter import Adapted, Adapter, Envelope
 from mosaico_ingest.caching import cache_by_identity
-from mosaico_ingest.contracts.monitor import BlockObserver
 from mosaico_ingest.decode.base import Decoder
 from mosaico_ingest.decode.decoder import decoder_for
 from mosaico_ingest.destinations.base import ENVELOPE, Session, TopicWriter
@@ -22,7 +21,6 @@ from mosaico_ingest.errors import AdapterError, BagError, DecodeError, IngestErr
 from mosaico_ingest.findings import RowFailure, Stage
 from mosaico_ingest.job.values import LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.ontology.types import OntologyType, RequiredFields
-from mosaico_ingest.pipeline.conditions import Conditions, bind_conditions
 from mosaico_ingest.pipeline.plan import TopicPlan
 from mosaico_ingest.pipeline.quarantine import Quarantine
 from mosaico_ingest.pipeline.selection import RowSelector, row_times
@@ -31,6 +29,10 @@ from mosaico_ingest.report.events import Observer, Rejected, TopicProgress, Topi
 from mosaico_ingest.report.timing import Step, Stopwatch, Timeline
 from mosaico_ingest.rosbag.blocks import Connection, MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
+
+if TYPE_CHECKING:
+    from mosaico_ingest.contracts.monitor import BlockObserver
+    from mosaico_ingest.pipeline.conditions import Conditions
 
 LATCHED_KEY = "_latched_"
 """Key of topic metadata: `before_ns` is the time before which rows are messages from before the time range."""
@@ -82,7 +84,7 @@ class TopicPipeline:
     end_ns: int | None = None
     status: TopicStatus = TopicStatus.EMPTY
     error: str | None = None
-    observers: dict[int, BlockObserver] = field(default_factory=dict[int, BlockObserver])
+    observers: dict[int, BlockObserver] = field(default_factory=dict)
     """The observers of the data contract by connection."""
     quarantine: Quarantine | None = None
     """Keeps rejected messages; the error policies apply to messages beyond its limits."""
@@ -101,7 +103,7 @@ class TopicPipeline:
     _connections: dict[int, Connection] = field(default_factory=dict[int, Connection])
     _decoders: dict[int, Decoder] = field(default_factory=dict[int, Decoder])
     _adapters: dict[int, Adapter] = field(default_factory=dict[int, Adapter])
-    _conditions: dict[int, Conditions | None] = field(default_factory=dict[int, Conditions | None])
+    _conditions: dict[int, Conditions] = field(default_factory=dict)
     _writer: TopicWriter | None = None
     _adapter_metadata: dict[str, Any] | None = None
     """Topic metadata that the adapter derives from the first message."""
@@ -116,7 +118,10 @@ class TopicPipeline:
         if connection.definition is None:
             raise BagError(connection.problem or "no definition of the type is known", where=connection.topic)
         self._connections[connection.id] = connection
-        self._conditions[connection.id] = bind_conditions(self.plan, connection.definition)
+        if self.plan.has_conditions:
+            from mosaico_ingest.pipeline.conditions import bind_conditions  # noqa: PLC0415 - only conditions need it
+
+            self._conditions[connection.id] = bind_conditions(self.plan, connection.definition)
         self._decoders[connection.id] = decoder_for(connection)
         self._adapters[connection.id] = self.plan.adapter.bind(
             connection.definition, ros_shape(connection.definition)
@@ -181,7 +186,7 @@ class TopicPipeline:
         stamps = times.values
         if self.selector is not None and not latched:
             envelope = Envelope(self.plan.topic, self.plan.msgtype, block.log_times[index])
-            conditions = self._conditions[block.connection]
+            conditions = self._conditions.get(block.connection)
             keep, excluded = self.selector.select(stamps, rows, envelope, conditions)
             dropped |= {rule: index[mask] for rule, mask in excluded.items()}
             if keep is not None:

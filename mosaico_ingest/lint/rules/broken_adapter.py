@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from mosaico_ingest.job.validation import nearest
+from mosaico_ingest.findings import nearest
 from mosaico_ingest.lint.job import Job, adapter_references, find_module, python_reference, read_classes
 from mosaico_ingest.lint.rule import Check, Problem
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.job.validation import nearest
+from mosaico_ingest.findings import nearest
 from mosaico_ingest.job.values import DEFAULT_TOPIC
 from mosaico_ingest.lint.job import Job, topic_patterns
 from mosaico_ingest.lint.rule import Check, Problem

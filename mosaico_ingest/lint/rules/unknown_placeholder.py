@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from mosaico_ingest.findings import nearest
 from mosaico_ingest.job.compose import PLACEHOLDERS, placeholders_in
-from mosaico_ingest.job.validation import nearest
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.rule import Check, Problem
 
