@@ -25,8 +25,8 @@ DOCS = sorted((ROOT / "docs").glob("*.md"))
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 TEXT = {page: page.read_text(encoding="utf-8") for page in PAGES}
 INGEST: Any = get_command(command_line())
-NOT_RUN = ("--executor", "--otel", "--metrics", "serve", "browse", "replay", "lint .")
-"""Parts of commands that need a cluster, a collector, a system folder, a client or rejected messages, or that read all files."""
+NOT_RUN = ("--executor", "--from", "--otel", "--metrics", "serve", "browse", "replay", "lint .")
+"""Parts of commands that need a cluster, a server, a collector, a system folder, a client or rejected messages, or that read all files."""
 EXIT_CODES = {"ingest diff job.yaml other.yaml": 1}
 
 

@@ -129,9 +129,12 @@ def test_refused_requests_leak_no_memory_and_no_paths(
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
     text = refusal(client, call, MAX_REFUSED_SCHEMAS + 100)
-    before = resident_bytes()
-    text += refusal(client, call, 2000)
-    assert (resident_bytes() - before) / 2000 < 300
+    growth: list[float] = []  # a leak grows in every round, and the allocator in some
+    while len(growth) < 3 and min(growth, default=300) >= 300:
+        before = resident_bytes()
+        text += refusal(client, call, 2000)
+        growth.append((resident_bytes() - before) / 2000)
+    assert min(growth) < 300
     assert "Traceback" not in text
     assert "/" not in text.partition("gRPC")[0]
     capfd.readouterr()  # Arrow prints a warning for each exchange

@@ -119,6 +119,11 @@ def _is_vector(expr_type: ExprType) -> bool:
 )
 def norm(x: Array) -> Array:
     """Euclidean norm of a list or of the fields of a vector or quaternion; null if an element is null."""
+    with np.errstate(over="ignore"):  # a norm beyond the range of float64 is infinite
+        return _norm(x)
+
+
+def _norm(x: Array) -> Array:
     if pt.is_struct(x.type):
         members = [pc.cast(field_of(x, member.name), arrays.float64()) for member in x.type]
         absent = np.zeros(len(x), bool)
