@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
-import pty
 import re
 import struct
 import subprocess
 import sys
-import termios
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+# Only POSIX systems have pseudo terminals.
+fcntl: Any = pytest.importorskip("fcntl")
+pty: Any = pytest.importorskip("pty")
+termios: Any = pytest.importorskip("termios")
 
 ROOT = Path(__file__).resolve().parents[2]
 TOPICS = ("/camera/image_raw/compressed", "/joint_states", "/lidar/points")
