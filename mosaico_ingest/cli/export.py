@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mosaico_ingest.cli.options import (
     DEFAULT_STORE,
+    STANDARD_OUTPUT,
     STORE,
     ApiKeyOption,
     ForceOption,
@@ -33,7 +37,9 @@ def export(
     to: Annotated[
         Path,
         typer.Option(
-            "--to", help="The recording to write: .mcap, .db3 (ROS 2) or .bag (ROS 1).", metavar="FILE"
+            "--to",
+            help="The recording to write: .mcap, .db3 (ROS 2) or .bag (ROS 1); - writes MCAP to standard output.",
+            metavar="FILE",
         ),
     ],
     server: Annotated[
@@ -82,11 +88,11 @@ def export(
 
     if server is not None and store is not None:
         raise typer.BadParameter("excludes --from", param_hint="--store")
-    with _opened(sequence, server, api_key, tls_cert, store) as source:
+    with _opened(sequence, server, api_key, tls_cert, store) as source, _written(to) as path:
         report = export_sequence(
             source,
             sequence,
-            to,
+            path,
             topics=topics or (),
             start_ns=_instant_ns("--start", start, source),
             end_ns=_instant_ns("--end", end, source),
@@ -94,12 +100,29 @@ def export(
             ros_distro=ros_distro,
             replace=force,
         )
+    is_piped = to == STANDARD_OUTPUT
+    if is_piped:
+        report = report.model_copy(update={"path": str(to)})
     if as_json:
-        typer.echo(report.model_dump_json(indent=2))
+        typer.echo(report.model_dump_json(indent=2), err=is_piped)
     else:
-        _print_export(report)
+        _print_export(report, stderr=is_piped)
     if not report.faithful:
         raise typer.Exit(INCOMPLETE)
+
+
+@contextmanager
+def _written(to: Path) -> Generator[Path, None, None]:
+    """Yield the path to write; for standard output that of a temporary file, whose content follows at the end."""
+    if to != STANDARD_OUTPUT:
+        yield to
+        return
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "export.mcap"
+        yield path
+        with path.open("rb") as file:
+            shutil.copyfileobj(file, sys.stdout.buffer)
+        sys.stdout.buffer.flush()
 
 
 @contextmanager
@@ -136,7 +159,7 @@ def _instant_ns(option: str, text: str | None, source: SourceSequence) -> int | 
     return source.bounds[offset_ns < 0] + offset_ns
 
 
-def _print_export(report: ExportReport) -> None:
+def _print_export(report: ExportReport, *, stderr: bool) -> None:
     from mosaico_ingest.cli.console import PlainTable, Terminal, print_line
     from mosaico_ingest.report.units import bytes_text, count_text, counted
 
@@ -144,13 +167,13 @@ def _print_export(report: ExportReport) -> None:
     for topic in report.topics:
         if not topic.excluded:
             table.add_row(topic.topic, topic.msgtype, topic.adapter, count_text(topic.messages))
-    Terminal().print(table)
+    Terminal(stderr=stderr).print(table)
     for topic in report.topics:
         for difference in _differences(topic):
-            print_line(f"{topic.topic}: {difference}", style="yellow")
+            print_line(f"{topic.topic}: {difference}", style="yellow", stderr=stderr)
     warning = "" if report.faithful else "; some rows would differ if the file were ingested"
     line = f"{report.path}: {counted(report.messages, 'message')}, {bytes_text(report.bytes)}{warning}"
-    print_line(line, style="green" if report.faithful else "yellow")
+    print_line(line, style="green" if report.faithful else "yellow", stderr=stderr)
 
 
 def _differences(topic: TopicExport) -> list[str]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import json
 import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
@@ -16,6 +18,8 @@ from mosaico_ingest.cli.app import main
 from mosaico_ingest.destinations.server.address import server_at
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.protocol.messages import Permission
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.recording import open_recording
 from mosaico_ingest.serve import Keyring, serve
 
 DRIVE = Path(__file__).parents[2] / "configs" / "quickstart" / "drive.mcap"
@@ -64,6 +68,16 @@ def test_export_with_json_prints_report(folder: Path) -> None:
     account = json.loads(result.stdout)
     assert [topic["topic"] for topic in account["topics"]] == ["/imu"]
     assert account["topics"][0]["messages"] == 499
+
+
+def test_export_to_standard_output_writes_recording(folder: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "mosaico_ingest", "export", "drive", "--to", "-", "--topics", "/imu"]
+    finished = subprocess.run(command, cwd=folder, capture_output=True, check=True, timeout=60)  # noqa: S603 - our own
+    path = tmp_path / "piped.mcap"
+    path.write_bytes(finished.stdout)
+    with open_recording(path, resolve=TypeResolver()) as recording:
+        assert {one.topic: one.count for one in recording.connections} == {"/imu": 1000}
+    assert b"/imu" in finished.stderr
 
 
 def test_export_excluded_topic_exits_4(folder: Path) -> None:
