@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from rosbags.typesys import Stores as RosbagsStores
 from rosbags.typesys import get_typestore
 
+from mosaico_ingest.decode.base import Decoder, DictDecoder
 from mosaico_ingest.decode.decoder import Decoded, RowwiseDecoder, decoder_for
 from mosaico_ingest.errors import DecodeError, IngestError
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.blocks import Connection, Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.model import Container, Definition, Field
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.encodings.json_messages import JsonCodec
+from mosaico_ingest.rosbag.encodings.protobuf import ProtobufCodec
 from mosaico_ingest.rosbag.recording import open_recording
 from mosaico_ingest.rosbag.serialization import Serializer
 
@@ -85,9 +90,21 @@ def batches_of(corpus: Path) -> Iterator[tuple[Connection, MessageBlock]]:
             continue
 
 
+def reference_decoder(connection: Connection, shape: pa.StructType) -> Decoder:
+    """Return a decoder that decodes message by message."""
+    assert connection.definition is not None
+    match connection.encoding:
+        case Encoding.PROTOBUF:
+            return DictDecoder(shape, ProtobufCodec(connection.definition))
+        case Encoding.JSON:
+            return DictDecoder(shape, JsonCodec(connection.definition))
+        case encoding:
+            return RowwiseDecoder(connection.definition, encoding)
+
+
 @pytest.mark.slow
 def test_corpus_messages_decode_equally_columnar_and_rowwise(corpus: Path, assert_same: AssertSame) -> None:
-    messages = 0
+    messages: Counter[Encoding] = Counter()
     for connection, batch in batches_of(corpus):
         try:
             decoder = decoder_for(connection)
@@ -95,7 +112,8 @@ def test_corpus_messages_decode_equally_columnar_and_rowwise(corpus: Path, asser
             continue
         if connection.definition is None or batch.lengths.sum() > LARGEST_ROWWISE:
             continue
-        slow = RowwiseDecoder(connection.definition, connection.encoding).decode(batch)
-        assert_same(decoder.decode(batch), slow)
-        messages += len(batch)
-    assert messages > 100_000
+        assert_same(decoder.decode(batch), reference_decoder(connection, decoder.shape).decode(batch))
+        messages[connection.encoding] += len(batch)
+    assert messages.total() > 100_000
+    assert messages[Encoding.PROTOBUF] > 10
+    assert messages[Encoding.JSON] > 200
