@@ -269,8 +269,8 @@ def main() -> None:
             maxlen=3
         )  # as in a pipeline, memory is used again, not returned and asked for
         fast = count / seconds(lambda: recent.append(columnar.decode(batch)), 12)  # noqa: B023 - called immediately
-        peer = count / seconds(lambda: [store.deserialize_cdr(raw, name) for raw in payloads], 2)  # noqa: B023 - the same
-        slow = count / seconds(lambda: rowwise.decode(batch), 1)  # noqa: B023 - the same
+        peer = count / seconds(lambda: [store.deserialize_cdr(raw, name) for raw in payloads], 2)  # noqa: B023 - called immediately
+        slow = count / seconds(lambda: rowwise.decode(batch), 1)  # noqa: B023 - called immediately
         mark = "" if fast >= max(target * peer, slow) else "  MISSED"
         ratio = f"{fast / peer:.1f}x"
         print(

@@ -57,8 +57,8 @@ RosbagInjector(ROSInjectionConfig({recording!r}, "drive", store={store!r}{option
 
 def without_definitions(folder: Path) -> Path:
     """Return a `.db3` copy of standard topics of the recording, without definitions, as ROS 2 Humble writes them."""
-    from mosaico_ingest.destinations.store import Store  # noqa: PLC0415 - only this process needs them
-    from mosaico_ingest.export import export_sequence  # noqa: PLC0415 - as above
+    from mosaico_ingest.destinations.store import Store  # noqa: PLC0415 - only this process needs it
+    from mosaico_ingest.export import export_sequence  # noqa: PLC0415 - only this process needs it
 
     store = folder / "source"
     code = JOB.format(recording=str(RECORDING), store=str(store), options=', topics=["/imu", "/gps/fix"]')

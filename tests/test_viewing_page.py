@@ -50,7 +50,7 @@ def test_program_of_page_runs(project: Path) -> None:
 
 
 def test_page_names_every_command_and_option_of_rows() -> None:
-    store = get_command(command_line(["store"])).commands["store"]  # type: ignore[attr-defined]
+    store = get_command(command_line(["store"])).commands["store"]
     for name in ("head", "tail", "sample", "describe", "plot", "image", "sql"):
         assert f"ingest store {name} " in PAGE
     for option in (o for p in store.commands["head"].params for o in p.opts if o.startswith("--")):

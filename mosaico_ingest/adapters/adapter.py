@@ -211,7 +211,7 @@ class UnmodeledAdapter(Struct, frozen=True):
             rows = pa.StructArray.from_arrays(rows.flatten(), fields=columns)
         return Adapted(rows, np.arange(len(rows), dtype=np.int64), ())
 
-    def topic_metadata(self, first_row: pa.StructScalar | None) -> dict[str, Any]:  # noqa: ARG002 - as above
+    def topic_metadata(self, first_row: pa.StructScalar | None) -> dict[str, Any]:  # noqa: ARG002 - the protocol's signature
         """Return the renamed fields, if any."""
         return {"renamed_fields": dict(self.renamed)} if self.renamed else {}
 
@@ -227,7 +227,7 @@ def _free_of_the_envelope(shape: pa.StructType) -> dict[str, str]:
     return names
 
 
-def _storable(kind: Any) -> pa.DataType:  # noqa: ANN401 - the stubs hide what a nested type is made of
+def _storable(kind: Any) -> pa.DataType:  # noqa: ANN401 - the stubs hide the members of nested types
     """Return the type with a placeholder field in every struct without fields."""
     if pa.types.is_struct(kind):
         members = [field.with_type(_storable(field.type)) for field in kind]
@@ -239,7 +239,7 @@ def _storable(kind: Any) -> pa.DataType:  # noqa: ANN401 - the stubs hide what a
     return kind
 
 
-def _with_members(rows: Any, struct: pa.StructType) -> pa.StructArray:  # noqa: ANN401 - as above
+def _with_members(rows: Any, struct: pa.StructType) -> pa.StructArray:  # noqa: ANN401 - the stubs lack methods of struct arrays
     """Rebuild rows with null placeholder fields. It runs in Python, because such types are rare."""
     names = [field.name for field in struct]
     renamed = [dict(zip(names, row.values(), strict=True)) for row in rows.to_pylist()]

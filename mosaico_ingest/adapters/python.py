@@ -83,7 +83,7 @@ class ROSAdapterBase(ABC, Generic[T]):
         )
 
     @classmethod
-    def to_native(cls, mosaico_data: Message | T, **kwargs: Any) -> Any:  # noqa: ANN401 - as `to_ros`
+    def to_native(cls, mosaico_data: Message | T, **kwargs: Any) -> Any:  # noqa: ANN401 - a generated class
         """Return `to_ros` with keyword arguments, as generic code of the official SDK calls it."""
         return cls.to_ros(mosaico_data, **kwargs)
 

@@ -24,7 +24,7 @@ from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
 
 
 class TopicFacts:
-    """What is known about one topic of the recording."""
+    """The facts about one topic of the recording that expectations are compared with."""
 
     def __init__(
         self,
@@ -46,7 +46,7 @@ class TopicFacts:
 
 
 class Facts:
-    """What is known about a recording after it was read, or from its index."""
+    """The facts about a recording after it was read, or from its index."""
 
     def __init__(
         self,
@@ -298,7 +298,7 @@ def _rate(clause: Clause, monitor: TopicMonitor, facts: Facts) -> ExpectationRes
     limit = texts.bounds(
         *(None if hz is None else f"{texts.number(hz)} Hz" for hz in (expected.min, expected.max))
     )
-    if times.count < 2 or times.first_ns is None or times.last_ns is None:  # noqa: PLR2004 - as above
+    if times.count < 2 or times.first_ns is None or times.last_ns is None:  # noqa: PLR2004 - a rate needs an interval
         return _too_few(clause, times.count)
     if not times.span_ns:
         return clause.failed(f"all of {counted(times.count, 'message')} have one log time", limit=limit)

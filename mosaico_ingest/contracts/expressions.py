@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.mapping.analyzer import Analyzer
 from mosaico_ingest.adapters.mapping.checker import Scope
-from mosaico_ingest.adapters.mapping.columns import Array, arrays, null_mask, pt
+from mosaico_ingest.adapters.mapping.columns import Array, Axis, arrays, null_mask, pt
 from mosaico_ingest.adapters.mapping.evaluator import Evaluation, RowsRejected
 from mosaico_ingest.adapters.mapping.expressions import TypedExpression
 from mosaico_ingest.adapters.mapping.types import ExprType, format_type, is_list, is_number
@@ -208,10 +208,10 @@ def _values(evaluation: Evaluation, expression: FieldExpression) -> Values:
     return Values(data, null, _parents(column.axes))
 
 
-def _parents(axes: tuple[object, ...]) -> NDArray[np.int64] | None:
+def _parents(axes: tuple[Axis, ...]) -> NDArray[np.int64] | None:
     rows: NDArray[np.int64] | None = None
     for axis in reversed(axes):
-        parents: NDArray[np.int64] = axis.parents  # type: ignore[attr-defined]
+        parents = axis.parents
         rows = parents if rows is None else parents[rows]
     return rows
 
@@ -225,7 +225,7 @@ def _is_comparable(value: object, kind: object) -> bool:
 
 
 def _analyzer(locate: Locate) -> Analyzer:
-    return Analyzer(lambda: _Location(locate))  # type: ignore[arg-type, return-value]
+    return Analyzer(lambda: _Location(locate))  # type: ignore[arg-type, return-value] - has the part of `Source` that expressions use
 
 
 class _Location:

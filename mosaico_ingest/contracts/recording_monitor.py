@@ -252,7 +252,7 @@ class RecordingMonitor:
         )
 
     def _count_in_files(self, connection: Connection) -> int | None:
-        """Return the number of messages in the index, without those that only `metadata.yaml` promises."""
+        """Return the number of messages in the files' indexes; messages that only `metadata.yaml` promises do not count."""
         absent = sum(
             item.count or 0
             for item in self._recording.unreadable

@@ -36,6 +36,14 @@ class ExistingTopic(Struct, frozen=True):
     metadata: Mapping[str, Any]
 
 
+class FamilyTopic(Struct, frozen=True):
+    """A stored topic of a sequence family."""
+
+    sequence: str
+    name: str
+    metadata: Mapping[str, Any]
+
+
 class ExistingSequence(Struct, frozen=True):
     """The content of a sequence that a destination already has."""
 
@@ -105,8 +113,11 @@ class Destination(ABC):
         """Return warnings about a run, for example if it could not follow its session error policy; may connect."""
         return ()
 
-    def sequences(self) -> tuple[ExistingSequence, ...] | None:
-        """Return every stored sequence, or None if the destination cannot list topics with their metadata."""
+    def family_topics(self, family: str | None, names: Collection[str]) -> tuple[FamilyTopic, ...] | None:  # noqa: ARG002 - for subclasses
+        """Return the topics with these names that sessions of the family created, oldest session first.
+
+        None means that the destination cannot list topics with their metadata.
+        """
         return None
 
     def delete_sessions(self, sequence: str, sessions: Collection[str]) -> bool:  # noqa: ARG002 - for subclasses

@@ -31,8 +31,8 @@ class InProcess:
 
     def map(self, tasks: Sequence[Task], observe: BatchObserver) -> Iterator[Report]:
         """Yield the report of each task; see `Executor.map`."""
-        from mosaico_ingest.destinations.registry import keep_destinations_open  # noqa: PLC0415 - as the next line
-        from mosaico_ingest.pipeline.run import run_recording  # noqa: PLC0415 - it loads the pipeline
+        from mosaico_ingest.destinations.registry import keep_destinations_open  # noqa: PLC0415 - choosing an executor must not load it
+        from mosaico_ingest.pipeline.run import run_recording  # noqa: PLC0415 - choosing an executor must not load the pipeline
 
         with keep_destinations_open() as keep_open:
             for position, task in enumerate(tasks):

@@ -108,7 +108,7 @@ def _row(key: str, node: dict[str, Any], required: bool, schema: dict[str, Any])
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
 
 
-def _default(node: dict[str, Any], required: bool) -> str:  # noqa: FBT001 - as above
+def _default(node: dict[str, Any], required: bool) -> str:  # noqa: FBT001 - the key's state in the JSON Schema
     if required:
         return "required"
     default = node.get("default")

@@ -76,10 +76,10 @@ class _Loader:
 
     def load(self) -> Validator:
         """Return the validator of the schema after checking all files; raise ManifestError as `load_schema` does."""
-        from jsonschema import Draft202012Validator  # noqa: PLC0415 - slow to import, and few manifests have a schema
-        from jsonschema.validators import validator_for  # noqa: PLC0415 - as above
-        from jsonschema_specifications import REGISTRY  # noqa: PLC0415 - as above
-        from referencing import Registry  # noqa: PLC0415 - as above
+        from jsonschema import Draft202012Validator  # noqa: PLC0415 - only manifests with a schema need it
+        from jsonschema.validators import validator_for  # noqa: PLC0415 - only manifests with a schema need it
+        from jsonschema_specifications import REGISTRY  # noqa: PLC0415 - only manifests with a schema need it
+        from referencing import Registry  # noqa: PLC0415 - only manifests with a schema need it
 
         self._read(self._file)
         registry: Registry[Any] = Registry(retrieve=self._retrieve).combine(REGISTRY)
@@ -97,9 +97,9 @@ class _Loader:
 
     def _retrieve(self, uri: str) -> Resource[Any]:
         """Return the schema of a URI, which must be that of a local file."""
-        from referencing import Resource  # noqa: PLC0415 - as above
-        from referencing.exceptions import NoSuchResource  # noqa: PLC0415 - as above
-        from referencing.jsonschema import DRAFT202012  # noqa: PLC0415 - as above
+        from referencing import Resource  # noqa: PLC0415 - only manifests with a schema need it
+        from referencing.exceptions import NoSuchResource  # noqa: PLC0415 - only manifests with a schema need it
+        from referencing.jsonschema import DRAFT202012  # noqa: PLC0415 - only manifests with a schema need it
 
         file = self._local_file(uri)
         source = None if file is None else self.sources.get(file) or self._read(file)
@@ -133,9 +133,9 @@ class _Loader:
 
     def _check(self, file: Path, registry: Registry[Any]) -> None:
         """Add findings about the schema in a file and about references that lead nowhere."""
-        from jsonschema import Draft202012Validator  # noqa: PLC0415 - as above
-        from jsonschema.exceptions import best_match  # noqa: PLC0415 - as above
-        from jsonschema.validators import validator_for  # noqa: PLC0415 - as above
+        from jsonschema import Draft202012Validator  # noqa: PLC0415 - only manifests with a schema need it
+        from jsonschema.exceptions import best_match  # noqa: PLC0415 - only manifests with a schema need it
+        from jsonschema.validators import validator_for  # noqa: PLC0415 - only manifests with a schema need it
 
         source = self.sources[file]
         document: Any = source.value
@@ -151,7 +151,7 @@ class _Loader:
             self._check_reference(source.span(path), reference, base, registry)
 
     def _check_reference(self, span: Span, reference: str, base: str, registry: Registry[Any]) -> None:
-        from referencing.exceptions import Unresolvable  # noqa: PLC0415 - as above
+        from referencing.exceptions import Unresolvable  # noqa: PLC0415 - only manifests with a schema need it
 
         count = len(self._findings)
         try:
@@ -235,7 +235,7 @@ def _references(node: Any, path: KeyPath, base: str) -> Iterator[tuple[KeyPath, 
 @cache
 def _format_checker() -> FormatChecker:
     """Return a checker of `format`, with the formats that need no further library."""
-    from jsonschema import FormatChecker  # noqa: PLC0415 - as above
+    from jsonschema import FormatChecker  # noqa: PLC0415 - only manifests with a schema need it
 
     checker = FormatChecker()
     checker.checks("date-time", raises=ValueError)(_is_date_time)

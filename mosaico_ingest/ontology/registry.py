@@ -92,7 +92,7 @@ def encode_fields(struct: pa.StructType) -> dict[str, EncodedType]:
     return {field.name + "?" * field.nullable: _written(field.type) for field in struct}
 
 
-def _written(kind: Any) -> EncodedType:  # noqa: ANN401 - the stubs hide what a nested type is made of
+def _written(kind: Any) -> EncodedType:  # noqa: ANN401 - the stubs hide the members of nested types
     if pa.types.is_struct(kind):
         return encode_fields(kind)
     if pa.types.is_fixed_size_list(kind):

@@ -85,7 +85,7 @@ class NullRows:
         """Pickle without the cached rows."""
         return NullRows, (self._kind,)
 
-    def of(self, count: int) -> Any:  # noqa: ANN401 - an array of whatever type it is
+    def of(self, count: int) -> Any:  # noqa: ANN401 - an Arrow array
         """Return `count` null rows."""
         if self._kept is not None and count <= len(self._kept):
             return self._kept.slice(0, count)
@@ -96,7 +96,7 @@ class NullRows:
         return rows
 
 
-def _filling(kind: Any) -> _Fill | None:  # noqa: ANN401 - as above
+def _filling(kind: Any) -> _Fill | None:  # noqa: ANN401 - any Arrow type
     """Return a function that fills arrays of a type, None if nothing inside is required."""
     if pt.is_struct(kind):
         return _filling_struct(list(kind))
@@ -117,7 +117,7 @@ def _filling_struct(fields: list[pa.Field[Any]]) -> _Fill | None:
         if fill is not None or not field.nullable
     ]
 
-    def filled_struct(array: Any) -> Any:  # noqa: ANN401 - as above
+    def filled_struct(array: Any) -> Any:  # noqa: ANN401 - an Arrow array
         changed: dict[int, Any] = {}
         for position, fill, nullable in watched:
             child = array.field(position)
@@ -135,7 +135,7 @@ def _filling_struct(fields: list[pa.Field[Any]]) -> _Fill | None:
     return filled_struct if watched else None
 
 
-def _filled_fixed(array: Any, fill: _Fill) -> Any:  # noqa: ANN401 - as above
+def _filled_fixed(array: Any, fill: _Fill) -> Any:  # noqa: ANN401 - an Arrow array
     size = array.type.list_size
     values = array.values.slice(array.offset * size, len(array) * size)
     filled = fill(values)
@@ -145,7 +145,7 @@ def _filled_fixed(array: Any, fill: _Fill) -> Any:  # noqa: ANN401 - as above
     return _arrays.FixedSizeListArray.from_arrays(filled, type=array.type, mask=mask)
 
 
-def _filled_list(array: Any, fill: _Fill) -> Any:  # noqa: ANN401 - as above
+def _filled_list(array: Any, fill: _Fill) -> Any:  # noqa: ANN401 - an Arrow array
     values = array.values
     filled = fill(values)
     if filled is values:
@@ -156,7 +156,7 @@ def _filled_list(array: Any, fill: _Fill) -> Any:  # noqa: ANN401 - as above
     return pa.ListArray.from_arrays(offsets, filled, type=array.type)
 
 
-def _without_nulls(array: Any) -> Any:  # noqa: ANN401 - as above
+def _without_nulls(array: Any) -> Any:  # noqa: ANN401 - an Arrow array
     """Return the values without their null mask."""
     if pt.is_struct(array.type):
         children = [array.field(position) for position in range(array.type.num_fields)]

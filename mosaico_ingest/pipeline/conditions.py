@@ -171,7 +171,7 @@ def _value(values: Values, position: int) -> Any:  # noqa: ANN401 - a number, te
     return None if is_null else values.data[position]
 
 
-def _equal(one: Any, other: Any) -> bool:  # noqa: ANN401 - as above
+def _equal(one: Any, other: Any) -> bool:  # noqa: ANN401 - numbers, texts, booleans or None
     if one is None or other is None:
         return one is other
     return bool(one == other) or bool(one != one and other != other)  # noqa: PLR0124 - NaN differs from itself

@@ -30,7 +30,7 @@ Types = Mapping[str, tuple[str, ...]]
 
 
 class LockedTopic(Part):
-    """A topic: its message type and what it becomes."""
+    """The message type of a topic, and the ontology type and columns that it is stored as."""
 
     type: str
     required: bool = True

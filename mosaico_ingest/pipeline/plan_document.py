@@ -94,7 +94,7 @@ class RecordingPlan(Part):
     destination: DestinationState
     samples: tuple[Sample, ...]
     contract: ContractResult | None = None
-    """The expectations that the index of the recording decides, and those that the sample violates."""
+    """The results of the expectations that the index of the recording decides or that the sample violates."""
     notes: tuple[Note, ...]
 
     @property

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Mapping
 from difflib import unified_diff
-from typing import Any, cast
+from typing import Any
 
 from msgspec import Struct
 
@@ -13,7 +13,7 @@ from mosaico_ingest.adapters.adapter import recorded_schema
 from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.findings import Finding, Severity
-from mosaico_ingest.job.values import PROVENANCE_KEY, OnSchemaChange, Target
+from mosaico_ingest.job.values import OnSchemaChange
 from mosaico_ingest.pipeline.plan import Plan, TopicPlan
 from mosaico_ingest.protocol import check_topic_name
 
@@ -31,7 +31,7 @@ def follow_schema_changes(plan: Plan, action: OnSchemaChange) -> Plan:
     Raises:
         IngestError: A definition has changed and the action is `fail`; `findings` has every change.
     """
-    stored = _stored_definitions(plan.destination, plan.sequence.family)
+    stored = _stored_definitions(plan)
     if stored is None:
         unchecked = Finding(
             "schema-change-unchecked",
@@ -62,36 +62,23 @@ def follow_schema_changes(plan: Plan, action: OnSchemaChange) -> Plan:
     return plan.replace(topics=tuple(topics), findings=(*plan.findings, *findings))
 
 
-def _stored_definitions(target: Target, family: str | None) -> dict[str, list[_StoredDefinition]] | None:
+def _stored_definitions(plan: Plan) -> dict[str, list[_StoredDefinition]] | None:
     """Return the stored definitions by topic in the order of the family's sessions, or None if they cannot be listed."""
-    sequences = destination_of(target).sequences()
-    if sequences is None:
+    names = {check_topic_name(topic.target) for topic in plan.topics}
+    stored = destination_of(plan.destination).family_topics(plan.sequence.family, names)
+    if stored is None:
         return None
-    by_topic: dict[str, list[tuple[str, _StoredDefinition]]] = {}
-    for sequence in sequences:
-        sessions = {one.id for one in sequence.sessions if _family(one.metadata) == family}
-        for name, topic in sequence.topics.items():
-            text = _definition(topic.metadata)
-            if topic.session in sessions and text is not None:
-                entry = (topic.session, _StoredDefinition(sequence.name, text))
-                by_topic.setdefault(name, []).append(entry)
-    return {
-        name: [definition for _, definition in sorted(history, key=lambda entry: entry[0])]
-        for name, history in by_topic.items()
-    }
-
-
-def _family(metadata: Mapping[str, Any]) -> object:
-    return _member(metadata.get(PROVENANCE_KEY), "family")
+    by_topic: dict[str, list[_StoredDefinition]] = {}
+    for topic in stored:
+        text = _definition(topic.metadata)
+        if text is not None:
+            by_topic.setdefault(topic.name, []).append(_StoredDefinition(topic.sequence, text))
+    return by_topic
 
 
 def _definition(metadata: Mapping[str, Any]) -> str | None:
     schema = recorded_schema(metadata)
     return None if schema is None else schema.text
-
-
-def _member(value: object, key: str) -> object:
-    return cast("Mapping[str, object]", value).get(key) if isinstance(value, Mapping) else None
 
 
 def _versioned_name(target: str, text: str) -> str:

@@ -137,7 +137,7 @@ def _adapters(inspection: Inspection) -> Iterator[str]:
 
 
 def _merged(topics: Sequence[InspectedTopic]) -> list[InspectedTopic]:
-    """Return one entry per topic; of several connections, prefer one that can be ingested."""
+    """Return one entry per topic; prefer a connection that can be ingested."""
     best: dict[str, InspectedTopic] = {}
     for topic in topics:
         previous = best.get(topic.topic)

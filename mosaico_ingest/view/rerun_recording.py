@@ -54,7 +54,7 @@ class ViewedTopic:
 def send_sequence(
     info: SequenceInfo, *, save: Path | None, start_ns: int | None = None, end_ns: int | None = None
 ) -> list[ViewedTopic]:
-    """Open the viewer with a sequence, or write a `.rrd` file, and return what is shown of each topic.
+    """Open the viewer with a sequence, or write a `.rrd` file, and return how each topic is shown.
 
     Topics are read batch by batch, so memory does not depend on the size of the sequence.
 
@@ -223,7 +223,7 @@ class _Sender:
             if "plot" not in viewed.kinds:
                 viewed.kinds.append("plot")
 
-    def _times(self, times_ns: np.ndarray[Any, np.dtype[np.int64]]) -> Any:  # noqa: ANN401 - as above
+    def _times(self, times_ns: np.ndarray[Any, np.dtype[np.int64]]) -> Any:  # noqa: ANN401 - a class of the SDK, which has no stubs for it
         return self._rerun.TimeColumn(TIMELINE, timestamp=times_ns.astype("datetime64[ns]"))
 
 

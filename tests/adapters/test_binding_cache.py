@@ -32,5 +32,5 @@ def test_pickled_adapter_excludes_binding_cache() -> None:
     fresh = len(pickle.dumps(spec))
     spec.bind(IMU, ros_shape(IMU))
     assert len(pickle.dumps(spec)) == fresh
-    again = pickle.loads(pickle.dumps(spec))  # noqa: S301 - our own
+    again = pickle.loads(pickle.dumps(spec))  # noqa: S301 - pickled in this line
     assert again.bind(IMU, ros_shape(IMU)).ontology == spec.ontology

@@ -206,7 +206,7 @@ def test_mapping_uses_adapter_of_same_folder(tmp_path: Path, define: Callable[..
         "fields: {points: {use: FlatPointAdapter, of: 'points[]'}}\n"
     )
     choice = ROSBridge(loaded=["outline.yaml"], base_dir=tmp_path).resolve("/p", "geometry_msgs/msg/Polygon")
-    spec = pickle.loads(pickle.dumps(choice.spec))  # noqa: S301 - what was just pickled
+    spec = pickle.loads(pickle.dumps(choice.spec))  # noqa: S301 - pickled in this line
     definition = define("geometry_msgs/msg/Polygon")
     rows = pa.array([{"points": [{"x": 1.0, "y": 2.0, "z": 3.0}]}], ros_shape(definition))
     adapted = spec.bind(definition, rows.type).adapt(
@@ -303,4 +303,4 @@ def test_adapter_base_has_members_of_the_sdk() -> None:
 @pytest.mark.promise("adapter-abstract")
 def test_adapter_base_is_abstract() -> None:
     with pytest.raises(TypeError):
-        ROSAdapterBase()  # type: ignore[abstract]
+        ROSAdapterBase()

@@ -96,7 +96,7 @@ def test_catalog_adapter_passes_its_tests(builtin: Builtin) -> None:
 
 @EVERY
 def test_catalog_adapter_pickles(builtin: Builtin) -> None:
-    assert pickle.loads(pickle.dumps(builtin)) == builtin  # noqa: S301 - what was just pickled
+    assert pickle.loads(pickle.dumps(builtin)) == builtin  # noqa: S301 - pickled in this line
 
 
 def _definitions(define: Define, msgtype: str) -> list[Definition]:
@@ -197,7 +197,7 @@ def test_catalog_adapter_is_importable_class() -> None:
         assert adapter.__name__ == builtin.name
         assert adapter.ros_msgtype == builtin.ros_types
         assert adapter.__mosaico_ontology_type__.ontology_tag() == builtin.tag
-        assert pickle.loads(pickle.dumps(adapter)) is adapter  # noqa: S301 - what was just pickled
+        assert pickle.loads(pickle.dumps(adapter)) is adapter  # noqa: S301 - pickled in this line
     assert set(BY_NAME) <= set(dir(adapters))
     with pytest.raises(AttributeError, match="NoSuchAdapter"):
         _ = adapters.NoSuchAdapter

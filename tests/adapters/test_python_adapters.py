@@ -246,7 +246,7 @@ def test_file_reference_loads_and_pickles(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(_FILE.format(name="Doubling"))
     spec = load_adapter_reference("mine.py:Doubling", tmp_path)
     assert (spec.name, spec.ros_types, spec.default) == ("Doubling", ("std_msgs/msg/Float64",), True)
-    again = pickle.loads(pickle.dumps(spec))  # noqa: S301 - what was just pickled
+    again = pickle.loads(pickle.dumps(spec))  # noqa: S301 - pickled in this line
     assert again == spec
 
 

@@ -76,7 +76,7 @@ def test_unmodeled_empty_nested_message_gets_placeholder_member(
 
 def test_unmodeled_spec_pickles_with_format() -> None:
     spec = UnmodeledSpec(serialization_format=SerializationFormat.RAGGED)
-    assert pickle.loads(pickle.dumps(spec)) == spec  # noqa: S301 - what was just pickled
+    assert pickle.loads(pickle.dumps(spec)) == spec  # noqa: S301 - pickled in this line
     definition = _defined("int8 a\n")
     assert (
         spec.bind(definition, ros_shape(definition)).ontology.serialization_format

@@ -33,7 +33,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_bag_has_all_options_of_the_official_injector() -> None:
-    (command,) = [get_command(command_line(["bag", "run"])).commands["bag"]]  # pyright: ignore[reportAttributeAccessIssue]
+    (command,) = [get_command(command_line(["bag", "run"])).commands["bag"]]
     options = {option for parameter in command.params for option in parameter.opts}
     assert OFFICIAL_OPTIONS - {"--help", "-h"} <= options
     assert {"--help", "-h"} <= set(command.context_settings.get("help_option_names", ["--help", "-h"]))

@@ -29,7 +29,7 @@ def test_help_texts_contain_no_markup_brackets(name: str) -> None:
 
 
 def test_help_of_groups_is_the_same_without_their_commands() -> None:
-    commands = get_command(command_line()).commands  # type: ignore[attr-defined]
+    commands = get_command(command_line()).commands
     assert {name: commands[name].help for name in GROUP_HELP} == GROUP_HELP
 
 

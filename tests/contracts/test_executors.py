@@ -134,7 +134,7 @@ def on_ray(killed_once: Path) -> Iterator[Executor]:  # noqa: ARG001 - to be set
     from ray_cluster import connected, two_nodes  # noqa: PLC0415 - it imports Ray, where that is installed
 
     with two_nodes() as cluster, connected(cluster.address):
-        from mosaico_ingest.executors.ray import Ray  # noqa: PLC0415 - as above
+        from mosaico_ingest.executors.ray import Ray  # noqa: PLC0415 - it imports Ray, where that is installed
 
         yield Ray()
 

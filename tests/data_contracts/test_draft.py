@@ -1,4 +1,4 @@
-"""Contracts drafted from recordings: the recordings fulfill them, and the limits are what they are documented to be."""
+"""Contracts drafted from recordings: the recordings fulfill them, and the limits are the documented ones."""
 
 from __future__ import annotations
 

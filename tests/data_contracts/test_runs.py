@@ -1,4 +1,4 @@
-"""Contracts of complete runs: what is committed, which exit code results, and what check and plan report."""
+"""Contracts of complete runs: committed sequences, exit codes, and the reports of check and plan."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ _REFUSED = {"free", "tree", "wrapped", "wrapped_texts", "nothing"}
 
 
 def _plain_file() -> Any:
-    """Return the file of all features without those that the SDK cannot upload."""
+    """Return the file of all features except the fields that the SDK cannot upload."""
     file = proto3_file()
     message = next(one for one in file.message_type if one.name == "Message")
     kept = [field for field in message.field if field.name not in _REFUSED]

@@ -21,7 +21,7 @@ def findings_of(folder: Path, schema: object, text: str) -> list[tuple[str, int,
     spans = Spans(source.spans, source.key_spans)
     metadata = source.at(("metadata",))
     assert isinstance(metadata, dict)
-    actual = violations(load_schema(path), metadata, ("metadata",), spans)  # type: ignore[arg-type] # text keys
+    actual = violations(load_schema(path), metadata, ("metadata",), spans)
     assert {finding.rule for finding in actual} <= {"metadata-schema"}
     return [(f.message, f.span.line, f.span.column) for f in actual if f.span]
 

@@ -248,7 +248,7 @@ def test_run_page_contract_results_are_counted_per_expectation_and_violations_ar
     assert "3 Hz &lt;b&gt;" in page
     assert '<a href="#r3">drive_003</a>' in page
     assert "2023-11-14 22:13:20.000" in page
-    # The list of all recordings repeats those that the page also has without scripts.
+    # The list of all recordings repeats the open recordings, which the page shows without scripts.
     assert unpacked(page).count("<h3>Contract</h3>") == 60 + MAX_OPEN
 
 

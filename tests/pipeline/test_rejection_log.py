@@ -36,7 +36,7 @@ def rejected(count: int, stage: Stage = Stage.DECODE) -> Rejected:
 
 def run(recording: Path, tmp_path: Path, **options: object) -> None:
     store = tmp_path / "store"
-    report = RosbagInjector(ROSInjectionConfig(recording, "drive", store=store, **options)).run()  # pyright: ignore[reportArgumentType]
+    report = RosbagInjector(ROSInjectionConfig(recording, "drive", store=store, **options)).run()
     assert (report.totals.written, report.totals.rejected) == (1, 2)
 
 

@@ -50,7 +50,7 @@ def kill(process: subprocess.Popen[bytes], victim: str) -> list[int]:
 
 
 def wait_for_end(workers: list[int]) -> None:
-    """Wait for workers that lost their parent; a process that nobody waits for is a zombie or gone."""
+    """Wait for workers that lost their parent; a process without a waiting parent becomes a zombie or disappears."""
     end = time.monotonic() + 60
     for pid in workers:
         stat = Path(f"/proc/{pid}/stat")

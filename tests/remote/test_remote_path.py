@@ -23,7 +23,7 @@ def test_remote_path_has_the_parts_of_a_path() -> None:
     assert str(path.parent / "b" / "c.bag") == "s3://bucket/drives/b/c.bag"
     assert [str(one) for one in path.above] == ["s3://bucket/drives", "s3://bucket"]
     assert as_path(path.url) == path
-    assert pickle.loads(pickle.dumps(path)) == path  # noqa: S301 - our own
+    assert pickle.loads(pickle.dumps(path)) == path  # noqa: S301 - pickled in this line
 
 
 @pytest.mark.parametrize("given", ["s3://bucket", "s3://bucket/"])

@@ -223,7 +223,7 @@ class TestCustomMessages:
             resolver = TypeResolver(custom=[("mine", folder, None)])
         finally:
             ROSTypeRegistry.reset()
-        twin = pickle.loads(pickle.dumps(resolver))  # noqa: S301 - what was just dumped
+        twin = pickle.loads(pickle.dumps(resolver))  # noqa: S301 - pickled in this line
         assert resolve(twin, "mine/msg/Part") == resolve(resolver, "mine/msg/Part")
         assert resolve(twin, "mine/msg/Other").source is Source.CUSTOM
 

@@ -22,8 +22,8 @@ Rows = Callable[..., pa.RecordBatch]
 METADATA: dict[str, dict[str, Any]] = {
     "yard_1": {"vehicle": {"id": "v1"}, "run": 1},
     "yard_2": {"vehicle": {"id": "v2"}, "run": 2, "night": True},
-    "road_[a]": {"vehicle": "v1", "run": 1.5, "night": False},
-    "road-b": {"run": None, "tags": ["wet", "cold"]},
+    "road_[a]": {"vehicle": "v1", "run": 1.5, "night": False, "mosaico_ingest": {"family": "road"}},
+    "road-b": {"run": None, "tags": ["wet", "cold"], "mosaico_ingest": {"family": "road"}},
     "Yard_3": {},
 }
 
@@ -55,6 +55,23 @@ def test_listing_without_filter_equals_complete_entries(filled: Store) -> None:
     listing = filled.listing()
     assert listing.sequences == tuple(map(SequenceSummary.of, filled.sequences()))
     assert (listing.total, listing.next_after) == (len(METADATA), None)
+
+
+@pytest.mark.parametrize(
+    ("family", "names", "expected"),
+    [
+        ("road", {"/t0", "/t9"}, [("road_[a]", "/t0"), ("road-b", "/t0")]),
+        ("road", {"/t2"}, [("road-b", "/t2")]),
+        (None, {"/t0"}, [("yard_2", "/t0")]),
+        ("yard", {"/t0"}, []),
+    ],
+)
+def test_family_topics_selects_family_and_names_by_session(
+    filled: Store, family: str | None, names: set[str], expected: list[tuple[str, str]]
+) -> None:
+    topics = filled.catalog.family_topics(family, names)
+    assert [(topic.sequence, topic.name) for topic in topics] == expected
+    assert all(topic.metadata == filled.topic(topic.sequence, topic.name).metadata for topic in topics)
 
 
 @pytest.mark.parametrize("limit", [1, 2, 3, 5, 6])

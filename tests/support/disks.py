@@ -67,4 +67,4 @@ def _unmount(folder: Path) -> None:
     """Unmount a file system, also if a killed process still has files open."""
     umount = shutil.which("umount")
     assert umount is not None
-    subprocess.run([umount, "-l", str(folder)], check=True)  # noqa: S603 - as above
+    subprocess.run([umount, "-l", str(folder)], check=True)  # noqa: S603 - fixed arguments

@@ -136,7 +136,7 @@ class _Counting:
 
 def _serve() -> None:
     from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app  # noqa: PLC0415 - only the server process needs it
-    from werkzeug.serving import make_server  # noqa: PLC0415 - as above
+    from werkzeug.serving import make_server  # noqa: PLC0415 - only the server process needs it
 
     app = _Counting(DomainDispatcherApplication(create_backend_app))
     server = make_server("127.0.0.1", 0, app, threaded=True)

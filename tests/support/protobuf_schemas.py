@@ -33,7 +33,7 @@ def _field(message: DescriptorProto, name: str, kind: int | str, **options: Any)
         field.type = options.pop("type", F.TYPE_MESSAGE)
         field.type_name = kind
     else:
-        field.type = kind  # type: ignore[assignment]
+        field.type = kind
     if options.pop("optional", False):
         field.proto3_optional = True
         field.oneof_index = len(message.oneof_decl)

@@ -107,7 +107,7 @@ def message(msgtype: str, values: Mapping[str, Any]) -> Any:
 
 
 def write_recording(path: Path, plugin: StoragePlugin) -> Path:
-    """Write three messages per topic; SQLite files contain no definitions, as those that Humble writes."""
+    """Write three messages per topic; SQLite files contain no definitions, like the files that Humble writes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     folder = path.with_suffix("")
     with Writer(folder, version=8, storage_plugin=plugin) as writer:

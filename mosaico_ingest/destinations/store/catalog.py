@@ -19,9 +19,9 @@ from typing import Any
 
 import pyarrow as pa
 
-from mosaico_ingest.destinations.base import check_same_type, sequence_exists
+from mosaico_ingest.destinations.base import FamilyTopic, check_same_type, sequence_exists
 from mosaico_ingest.destinations.store.errors import NotInStore, sequence_changed, translate_errors
-from mosaico_ingest.destinations.store.listing import Listing, SequenceFilter, listing
+from mosaico_ingest.destinations.store.listing import Listing, SequenceFilter, family_topics, listing
 from mosaico_ingest.destinations.store.model import (
     Claim,
     NewNote,
@@ -188,6 +188,11 @@ class Catalog:
         """See `StoreCatalog.listing`."""
         with self.read() as db:
             return listing(db, selection, after=after, limit=limit)
+
+    def family_topics(self, family: str | None, names: Collection[str]) -> tuple[FamilyTopic, ...]:
+        """See `StoreCatalog.family_topics`."""
+        with self.read() as db:
+            return family_topics(db, family, names)
 
     def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
         """See `StoreCatalog.bounds`."""

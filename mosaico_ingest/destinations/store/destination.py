@@ -16,6 +16,7 @@ from mosaico_ingest.destinations.base import (
     ExistingSequence,
     ExistingSession,
     ExistingTopic,
+    FamilyTopic,
     Sink,
 )
 from mosaico_ingest.destinations.store.model import SequenceInfo
@@ -66,10 +67,10 @@ class StoreDestination(Destination):
         """Return a sink, after creating the store if necessary."""
         return StoreSink(Store.open(self.path), buffer_bytes)
 
-    def sequences(self) -> tuple[ExistingSequence, ...]:
-        """Return every stored sequence."""
+    def family_topics(self, family: str | None, names: Collection[str]) -> tuple[FamilyTopic, ...]:
+        """Return the topics with these names that sessions of the family created, oldest session first."""
         store = Store.find(self.path)
-        return tuple(map(_existing, store.sequences())) if store else ()
+        return store.catalog.family_topics(family, names) if store else ()
 
     def delete_sessions(self, sequence: str, sessions: Collection[str]) -> bool:
         """Delete sessions of a sequence."""

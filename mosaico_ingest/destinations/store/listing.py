@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from fnmatch import fnmatchcase
 from typing import Any
 
 from msgspec import Struct
 
+from mosaico_ingest.destinations.base import FamilyTopic
 from mosaico_ingest.destinations.store.model import Note, SequenceInfo, reason_incomplete
+from mosaico_ingest.job.values import PROVENANCE_KEY
 
 
 class SequenceFilter(Struct, frozen=True):
@@ -82,7 +84,7 @@ def listing(
     where, values = _conditions(selection)
     total = db.execute(f"SELECT count(*) FROM sequences WHERE {where}", values).fetchone()[0]  # noqa: S608 - `where` contains constants of this module and placeholders
     page = db.execute(
-        f"SELECT id, name, metadata FROM sequences WHERE {where} AND name > :after ORDER BY name LIMIT :limit",  # noqa: S608 - the same
+        f"SELECT id, name, metadata FROM sequences WHERE {where} AND name > :after ORDER BY name LIMIT :limit",  # noqa: S608 - `where` contains constants of this module and placeholders
         {**values, "after": after or "", "limit": -1 if limit is None else limit + 1},
     ).fetchall()
     more = limit is not None and len(page) > limit
@@ -90,6 +92,20 @@ def listing(
     return Listing(
         tuple(_summary(db, row) for row in rows), total, rows[-1]["name"] if more and rows else None
     )
+
+
+def family_topics(
+    db: sqlite3.Connection, family: str | None, names: Collection[str]
+) -> tuple[FamilyTopic, ...]:
+    """Return the topics with these names that sessions of the family created, oldest session first."""
+    rows = db.execute(
+        "SELECT sequences.name AS sequence, topics.name AS name, topics.metadata AS metadata FROM topics"
+        " JOIN sequences ON sequences.id = topics.sequence_id JOIN sessions ON sessions.id = topics.session_id"
+        " WHERE topics.name IN (SELECT value FROM json_each(:names))"
+        " AND json_extract(sessions.metadata, :path) IS :family ORDER BY topics.session_id",
+        {"names": json.dumps(list(names)), "path": f"$.{PROVENANCE_KEY}.family", "family": family},
+    )
+    return tuple(FamilyTopic(row["sequence"], row["name"], json.loads(row["metadata"])) for row in rows)
 
 
 def _conditions(selection: SequenceFilter) -> tuple[str, dict[str, str]]:

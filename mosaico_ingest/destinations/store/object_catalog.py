@@ -17,13 +17,14 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
 from io import BytesIO
+from operator import itemgetter
 from typing import Any
 from urllib.parse import unquote
 
 import pyarrow as pa
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from mosaico_ingest.destinations.base import check_same_type, sequence_exists
+from mosaico_ingest.destinations.base import FamilyTopic, check_same_type, sequence_exists
 from mosaico_ingest.destinations.store.errors import NotInStore, sequence_changed, translate_errors
 from mosaico_ingest.destinations.store.files import MARKER, ObjectFiles, encoded, new_session_id
 from mosaico_ingest.destinations.store.listing import Listing, SequenceFilter, SequenceSummary
@@ -40,7 +41,7 @@ from mosaico_ingest.destinations.store.model import (
 )
 from mosaico_ingest.destinations.store.segment import Segment
 from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
-from mosaico_ingest.job.values import IfExists
+from mosaico_ingest.job.values import PROVENANCE_KEY, IfExists
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 from mosaico_ingest.remote import AnyPath, RemotePath
 
@@ -378,6 +379,22 @@ class ObjectCatalog:
         page = rest[:limit]
         summaries = tuple(map(SequenceSummary.of, self._infos(page)))
         return Listing(summaries, len(names), page[-1] if page and len(page) < len(rest) else None)
+
+    def family_topics(self, family: str | None, names: Collection[str]) -> tuple[FamilyTopic, ...]:
+        """See `StoreCatalog.family_topics`."""
+        topics: list[tuple[str, FamilyTopic]] = []
+        for info in self.sequences():
+            sessions = {
+                one.id
+                for one in info.sessions
+                if (one.metadata.get(PROVENANCE_KEY) or {}).get("family") == family
+            }
+            topics += [
+                (topic.session, FamilyTopic(info.name, topic.name, topic.metadata))
+                for topic in info.topics
+                if topic.name in names and topic.session in sessions
+            ]
+        return tuple(topic for _, topic in sorted(topics, key=itemgetter(0)))
 
     def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
         """See `StoreCatalog.bounds`."""

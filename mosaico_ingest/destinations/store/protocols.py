@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any, Protocol
 
+from mosaico_ingest.destinations.base import FamilyTopic
 from mosaico_ingest.destinations.store.listing import Listing, SequenceFilter
 from mosaico_ingest.destinations.store.model import Claim, NewNote, NewSession, SequenceInfo, TopicInfo
 from mosaico_ingest.job.values import IfExists
@@ -134,6 +135,10 @@ class StoreCatalog(Protocol):
 
     def listing(self, selection: SequenceFilter, *, after: str | None, limit: int | None) -> Listing:
         """Return the selected sequences after the name `after`, at most `limit`, sorted by name."""
+        ...
+
+    def family_topics(self, family: str | None, names: Collection[str]) -> tuple[FamilyTopic, ...]:
+        """Return the topics with these names that sessions of the family created, oldest session first."""
         ...
 
     def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:

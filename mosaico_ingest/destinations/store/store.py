@@ -185,7 +185,7 @@ class Store(Struct, frozen=True):
         root = as_path(path)
         if isinstance(root, RemotePath):
             from mosaico_ingest.destinations.store.files import ObjectFiles  # noqa: PLC0415 - only stores behind URLs need it
-            from mosaico_ingest.destinations.store.object_catalog import ObjectCatalog  # noqa: PLC0415 - the same
+            from mosaico_ingest.destinations.store.object_catalog import ObjectCatalog  # noqa: PLC0415 - only stores behind URLs need it
 
             bucket = ObjectFiles(root)
             return cls(bucket, ObjectCatalog(bucket, create=create))

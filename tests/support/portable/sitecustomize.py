@@ -28,7 +28,7 @@ for module, name in REMOVED:
     if hasattr(module, name):
         delattr(module, name)
 for name in MODULES:
-    sys.modules[name] = None  # type: ignore[assignment]  # importing it raises ImportError
+    sys.modules[name] = None  # importing it raises ImportError
 
 
 class _LibraryWithoutMallopt(ctypes.CDLL):
@@ -40,4 +40,4 @@ class _LibraryWithoutMallopt(ctypes.CDLL):
         return super().__getattr__(name)
 
 
-ctypes.CDLL = _LibraryWithoutMallopt  # type: ignore[misc]
+ctypes.CDLL = _LibraryWithoutMallopt
