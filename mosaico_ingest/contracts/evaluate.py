@@ -19,6 +19,7 @@ from mosaico_ingest.contracts.row_results import field_result, header_result
 from mosaico_ingest.contracts.times import Gaps
 from mosaico_ingest.job.values import RECORDING, Limit
 from mosaico_ingest.report.contract import ContractResult, ExpectationResult
+from mosaico_ingest.report.timing import mean_rate_hz
 from mosaico_ingest.report.units import count_text, counted
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
 
@@ -300,16 +301,16 @@ def _rate(clause: Clause, monitor: TopicMonitor, facts: Facts) -> ExpectationRes
     )
     if times.count < 2 or times.first_ns is None or times.last_ns is None:  # noqa: PLR2004 - a rate needs an interval
         return _too_few(clause, times.count)
-    if not times.span_ns:
+    rate = mean_rate_hz(times.count, times.first_ns, times.last_ns)
+    if rate is None:
         return clause.failed(f"all of {counted(times.count, 'message')} have one log time", limit=limit)
-    rate = (times.count - 1) / (times.span_ns / 1e9)
     if _within(rate, expected.min, expected.max):
         text = f"the mean rate is {texts.number(rate)} Hz; expected {limit}"
         return clause.passed(text, measured=rate, unit="Hz", limit=limit)
     paused = covered_ns(times.first_ns, times.last_ns, facts.events.windows_of(monitor.name))
-    active = times.span_ns - paused
-    if paused and active > 0:
-        rate = (times.count - 1) / (active / 1e9)
+    active_rate = mean_rate_hz(times.count, times.first_ns, times.last_ns - paused)
+    if paused and active_rate is not None:
+        rate = active_rate
         note = f" without {texts.duration(paused)} in which the recorder was paused"
     else:
         note = ""

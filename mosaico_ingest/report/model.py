@@ -20,7 +20,7 @@ from mosaico_ingest.findings import Stage, one_line
 from mosaico_ingest.notebook import html_table
 from mosaico_ingest.report.contract import ContractResult
 from mosaico_ingest.report.events import RunStatus, TopicStatus
-from mosaico_ingest.report.timing import TimelineReport
+from mosaico_ingest.report.timing import TimelineReport, mean_rate_hz
 from mosaico_ingest.report.units import bytes_text, count_text, counted, written_text
 
 _GRAVEST_FIRST = (130, 5, 1, 2, 6, 3, 4)
@@ -133,10 +133,9 @@ class TopicReport(_Part):
     @computed_field
     @property
     def rate_hz(self) -> float | None:
-        """Rows per second between the topic's first and last row."""
-        if self.start_ns is None or self.end_ns is None or self.end_ns <= self.start_ns:
-            return None
-        return round((self.written - 1) / ((self.end_ns - self.start_ns) / 1e9), 6)
+        """Rows per second; see `mean_rate_hz`."""
+        rate = mean_rate_hz(self.written, self.start_ns, self.end_ns)
+        return None if rate is None else round(rate, 6)
 
 
 class Totals(_Part):

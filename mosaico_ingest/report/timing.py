@@ -60,6 +60,16 @@ class TimelineReport(Part):
     """The longest gaps, ordered by time."""
 
 
+def mean_rate_hz(count: int, start_ns: int | None, end_ns: int | None) -> float | None:
+    """Return the mean rate of a topic: its intervals per second between its own first and last time stamp.
+
+    None without an interval of positive length. Every rate that the package shows is computed by this function.
+    """
+    if start_ns is None or end_ns is None or end_ns <= start_ns:
+        return None
+    return (count - 1) / ((end_ns - start_ns) / 1e9)
+
+
 @dataclass(slots=True)
 class Timeline:
     """Counts of rows and of the intervals between them; times may come in any order."""

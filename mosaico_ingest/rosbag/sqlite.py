@@ -22,7 +22,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -109,7 +109,7 @@ class SqliteReader:
                 if any(self._missing_rows(request, rows_read).values()):
                     damage = "the index on the timestamp is damaged"
                 else:
-                    damage = _check(self._database, "integrity_check")
+                    damage = self._hidden_damage
                 if damage is None:
                     return
         yield from self._remaining_tasks(request, rows_read, damage, last_ns)
@@ -118,14 +118,22 @@ class SqliteReader:
         """Return the log times of some connections; None if the file is damaged."""
         if self._totals.damage is not None:
             return None
-        times: dict[int, list[Int64s]] = {}
         try:
-            for key in connections:
-                rows = self._database.execute("SELECT timestamp FROM messages WHERE topic_id = ?", (key,))
-                times[key] = [np.fromiter((time for (time,) in rows), np.int64)]
+            rows = np.fromiter(
+                self._database.execute(f"SELECT topic_id, timestamp FROM messages WHERE {_of(connections)}"),  # noqa: S608 - the keys are numbers
+                np.dtype([("topic", np.int64), ("time", np.int64)]),
+            )
         except (*DAMAGE, TypeError, ValueError):
             return None
+        times: dict[int, list[Int64s]] = {key: [] for key in connections}
+        for key, positions in rows_by_connection(rows["topic"]):
+            times[key] = [rows["time"][positions]]
         return times
+
+    @cached_property
+    def _hidden_damage(self) -> str | None:
+        """Damage that reading did not reveal, found by a complete check of the file; None without damage."""
+        return _check(self._database, "integrity_check")
 
     def check_unchanged(self) -> None:
         """Do nothing; see `FileSource.check_unchanged`."""
@@ -462,11 +470,15 @@ def _connection(
 
 
 def _query(request: ReadRequest) -> str:
-    keys = ",".join(str(int(key)) for key in request.connections)
     return (
         "SELECT rowid, topic_id, timestamp, data FROM messages "  # noqa: S608 - the keys are numbers
-        f"WHERE topic_id IN ({keys}) AND timestamp BETWEEN ? AND ? ORDER BY timestamp"
+        f"WHERE {_of(request.connections)} AND timestamp BETWEEN ? AND ? ORDER BY timestamp"
     )
+
+
+def _of(connections: Collection[int]) -> str:
+    """Return the condition that selects the messages of some connections."""
+    return f"topic_id IN ({','.join(str(int(key)) for key in connections)})"
 
 
 def _is_unlimited(request: ReadRequest) -> bool:

@@ -21,6 +21,7 @@ from mosaico_ingest.pipeline.run import open_job
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.report.contract import ContractResult, Outcome
+from mosaico_ingest.report.timing import mean_rate_hz
 from mosaico_ingest.report.units import counted
 
 DEFAULT_TOLERANCE = 20.0
@@ -174,11 +175,10 @@ def _measured_topic(topic: TopicMonitor, msgtype: str, result: ContractResult) -
     is_stamped = bool(lows) and bool(highs) and not any(one.unset for one in latencies)
     steps = [(name, one) for monitor in rows for name, one in monitor.steps.items() if one.count]
     broken = {name for name, one in steps if one.violations.count}
-    has_rate = times.count > 1 and times.span_ns > 0
     return MeasuredTopic(
         msgtype=msgtype,
         count=topic.read,
-        rate_hz=(times.count - 1) / (times.span_ns / 1e9) if has_rate else None,
+        rate_hz=mean_rate_hz(times.count, 0, times.span_ns),
         gap_ns=None if times.late or times.longest is None else times.longest.length_ns,
         latency_ns=(min(lows), max(highs)) if is_stamped else None,
         frames=frozenset(text for monitor in rows if monitor.frames for text in monitor.frames.seen),

@@ -12,8 +12,11 @@ from mosaico_ingest.notebook import html_table
 from mosaico_ingest.pipeline.plan import ExcludedTopic
 from mosaico_ingest.pipeline.planning import plan_connection
 from mosaico_ingest.pipeline.run import open_job
+from mosaico_ingest.remote import RemotePath
+from mosaico_ingest.report.timing import mean_rate_hz
 from mosaico_ingest.report.units import bytes_text, count_text, counted, rate_text
-from mosaico_ingest.rosbag.blocks import Connection
+from mosaico_ingest.rosbag.blocks import Connection, Int64s
+from mosaico_ingest.rosbag.recording import Recording
 
 
 class InspectedTopic(Part):
@@ -25,7 +28,7 @@ class InspectedTopic(Part):
     count: int | None
     """Number of messages in the index; None if it is unknown."""
     rate_hz: float | None
-    """Estimated messages per second; see `estimate_rate_hz`."""
+    """Messages per second; see `mean_rate_hz`, and `estimate_rate_hz` for recordings whose index has no times."""
     definition: str
     """The source of the definition: bag, custom, distro, package or none."""
     adapter: str
@@ -86,10 +89,8 @@ def inspect(job: Job) -> Inspection:
     """
     bridge = ROSBridge.for_job(job)
     with open_job(job) as (recording, _):
-        duration_ns = None
-        if recording.start_ns is not None and recording.end_ns is not None:
-            duration_ns = recording.end_ns - recording.start_ns
-        topics = [_topic(job, connection, bridge, duration_ns) for connection in recording.connections]
+        rates = _rates(recording)
+        topics = [_topic(job, one, bridge, rates[one.id]) for one in recording.connections]
         return Inspection(
             files=tuple(str(path) for path in recording.files),
             container=recording.container,
@@ -102,16 +103,13 @@ def inspect(job: Job) -> Inspection:
         )
 
 
-def _topic(job: Job, connection: Connection, bridge: ROSBridge, duration_ns: int | None) -> InspectedTopic:
+def _topic(job: Job, connection: Connection, bridge: ROSBridge, rate_hz: float | None) -> InspectedTopic:
     try:
         outcome = plan_connection(job, connection, select((), [connection.topic]), bridge, "")
     except AdapterError as error:
         outcome = ExcludedTopic(
             topic=connection.topic, msgtype=connection.msgtype, count=connection.count, why=str(error)
         )
-    rate = None
-    if connection.count and connection.count > 1 and duration_ns:
-        rate = estimate_rate_hz(connection.count, duration_ns)
     source = connection.definition.source.value if connection.definition else "none"
     is_excluded = isinstance(outcome, ExcludedTopic)
     return InspectedTopic(
@@ -119,7 +117,7 @@ def _topic(job: Job, connection: Connection, bridge: ROSBridge, duration_ns: int
         msgtype=connection.msgtype,
         encoding=connection.encoding.value,
         count=connection.count,
-        rate_hz=rate,
+        rate_hz=rate_hz,
         definition=source,
         adapter="" if is_excluded else outcome.adapter.name,
         ontology=None if is_excluded else outcome.ontology.tag,
@@ -127,11 +125,32 @@ def _topic(job: Job, connection: Connection, bridge: ROSBridge, duration_ns: int
     )
 
 
+def _rates(recording: Recording) -> dict[int, float | None]:
+    """Return the rate of each connection according to the index, without reading messages."""
+    connections = recording.connections
+    is_remote = any(isinstance(path, RemotePath) for path in recording.files)  # one request per chunk
+    times = None if is_remote else recording.index_times([one.id for one in connections])
+    if times is not None:
+        return {key: mean_rate_hz(len(one), *_ends(one)) for key, one in times.items()}
+    rates = dict[int, float | None].fromkeys(one.id for one in connections)
+    if recording.start_ns is not None and recording.end_ns is not None:
+        duration_ns = recording.end_ns - recording.start_ns
+        for one in connections:
+            if one.count is not None and one.count > 1 and duration_ns > 0:
+                rates[one.id] = estimate_rate_hz(one.count, duration_ns)
+    return rates
+
+
+def _ends(times: Int64s) -> tuple[int | None, int | None]:
+    return (int(times[0]), int(times[-1])) if len(times) else (None, None)
+
+
 def estimate_rate_hz(count: int, duration_ns: int) -> float:
     """Return the roundest rate with which `count` messages, at least two, fit the duration of the recording.
 
-    An index has no times per topic. A regular topic with n messages in d seconds has a rate between (n - 1) / d and
-    n / d, so only the digits that both bounds share are known.
+    The estimate is for recordings whose index has no times per topic, and assumes that the topic covers the complete
+    recording. A regular topic with n messages in d seconds has a rate between (n - 1) / d and n / d, so only the digits
+    that both bounds share are known.
     """
     low, high = (count - 1) * 1e9 / duration_ns, count * 1e9 / duration_ns
     middle = (low + high) / 2

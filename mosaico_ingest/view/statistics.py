@@ -18,7 +18,7 @@ from mosaico_ingest.destinations.store.files import opened
 from mosaico_ingest.destinations.store.model import TopicInfo
 from mosaico_ingest.destinations.store.store import Window, scan
 from mosaico_ingest.ontology.units import column_unit
-from mosaico_ingest.report.timing import Timeline, TimelineReport
+from mosaico_ingest.report.timing import Timeline, TimelineReport, mean_rate_hz
 from mosaico_ingest.view.columns import Column, is_binary, is_list, is_number, topic_columns
 
 _compute: Any = pc
@@ -65,7 +65,7 @@ class TopicTiming(Struct, frozen=True):
     start_ns: int | None
     end_ns: int | None
     rate_hz: float | None
-    """Rows per second between the first and the last row; None with fewer than two different times."""
+    """Rows per second; see `mean_rate_hz`."""
     jitter_s: float | None
     """Standard deviation of the intervals between consecutive rows."""
     timeline: TimelineReport | None
@@ -147,11 +147,10 @@ class _Clock:
 
     def timing(self) -> TopicTiming:
         """Return the timing of all rows added so far."""
-        rate = jitter = None
-        if self.first_ns is not None and self.last_ns is not None and self.last_ns > self.first_ns:
-            span_s, intervals = (self.last_ns - self.first_ns) / 1e9, self.rows - 1
-            rate = intervals / span_s
-            jitter = math.sqrt(max(0.0, self.squares / intervals - (span_s / intervals) ** 2))
+        jitter = None
+        rate = mean_rate_hz(self.rows, self.first_ns, self.last_ns)
+        if rate is not None:
+            jitter = math.sqrt(max(0.0, self.squares / (self.rows - 1) - rate**-2))
         return TopicTiming(self.rows, self.first_ns, self.last_ns, rate, jitter, self.timeline.report())
 
 

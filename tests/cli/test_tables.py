@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from made_recordings import define, record
 
 from mosaico_ingest import api
 from mosaico_ingest.cli import plan as plan_command
@@ -13,6 +14,7 @@ from mosaico_ingest.cli import store as store_command
 from mosaico_ingest.cli.report import rejection_lines
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.findings import Stage
+from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.ontology.registry import ontology_type
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.model import Rejection, Report, RunReport, TopicReport
@@ -146,6 +148,22 @@ def test_rates_of_inspect_init_and_run_agree(tmp_path: Path) -> None:
     assert stored == {topic: rate for topic, rate in inspected.items() if topic in stored}
     manifest = draft_manifest(inspection, DRIVE, folder=tmp_path)
     assert all(f" at {rate}" in manifest for rate in inspected.values())
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".db3", ".bag"])
+def test_rate_of_topic_in_part_of_recording_is_equal_in_inspect_and_run(tmp_path: Path, suffix: str) -> None:
+    number = define("std_msgs/msg/Float64", "float64 data", version=1 if suffix == ".bag" else 2)
+    start_ns = 1_700_000_000_000_000_000
+    always = [("/always", number, start_ns + step * 100_000_000, {"data": 1.0}) for step in range(101)]
+    briefly = [
+        ("/briefly", number, start_ns + 10**9 + step * 20_000_000, {"data": 1.0}) for step in range(51)
+    ]
+    recording = record(tmp_path / f"part{suffix}", sorted(always + briefly, key=lambda message: message[2]))
+    inspection = api.inspect_recording(recording)
+    rates = {topic.topic: topic.rate_hz for topic in inspection.topics}
+    assert rates == pytest.approx({"/always": 10.0, "/briefly": 50.0})
+    report = api.run([ROSInjectionConfig(recording, "part", store=str(tmp_path / "store"))])
+    assert {topic.topic: topic.rate_hz for topic in report.recordings[0].topics} == pytest.approx(rates)
 
 
 @pytest.mark.parametrize(

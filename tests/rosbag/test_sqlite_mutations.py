@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.rosbag import sqlite
 from mosaico_ingest.rosbag.recording import open_recording
 
 PAGE_BYTES = 4096
@@ -118,6 +119,25 @@ def run(tmp_path: Path, recordings: Any, intact: Intact, seeds: Iterable[int]) -
         path.write_bytes(content)
         check(path, recordings, f"seed {seed}: {fault}", intact.messages)
         check(path, recordings, f"seed {seed}: {fault}", selected, start_ns=start_ns, end_ns=end_ns)
+
+
+def test_sqlite_read_repeatedly_is_checked_once(
+    recordings: Any, intact: Intact, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checks: list[str] = []
+
+    def check(database: sqlite3.Connection, name: str) -> str | None:
+        checks.append(name)
+        return original(database, name)
+
+    original = sqlite._check
+    monkeypatch.setattr(sqlite, "_check", check)
+    path = tmp_path / "intact.db3"
+    path.write_bytes(intact.content)
+    with open_recording(path, resolve=recordings.blind) as recording:
+        counts = [sum(map(len, recording.message_blocks())) for _ in range(3)]
+    assert counts == [len(intact.messages)] * 3
+    assert checks == ["integrity_check"]
 
 
 def test_sqlite_one_fault_is_read_or_reported(tmp_path: Path, recordings: Any, intact: Intact) -> None:
