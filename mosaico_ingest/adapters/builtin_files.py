@@ -27,7 +27,7 @@ def read_catalog() -> dict[str, Any]:
 
 def catalog_file(catalog: dict[str, Any]) -> str:
     """Return the content of `catalog.json`: one line per adapter."""
-    lines = (f'"{stem}": {json.dumps(_with_text_keys(file))}' for stem, file in catalog.items())
+    lines = (f'"{stem}": {json.dumps(_as_json(file))}' for stem, file in catalog.items())
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
@@ -37,13 +37,13 @@ def with_catalog(text: str, catalog: dict[str, Any]) -> str:
     return f"{before}{_BEGIN}\n{_tables(builtins_of(catalog))}\n{_END}{rest.split(_END)[1]}"
 
 
-def _with_text_keys(value: Any) -> Any:  # noqa: ANN401 - any YAML value
+def _as_json(value: Any) -> Any:  # noqa: ANN401 - any YAML value
     """Return a value for JSON: a mapping with keys that are not text becomes a list of pairs."""
     if isinstance(value, list):
-        return [_with_text_keys(item) for item in value]
+        return [_as_json(item) for item in value]
     if not isinstance(value, dict):
         return value
-    pairs = [(key, _with_text_keys(item)) for key, item in value.items()]
+    pairs = [(key, _as_json(item)) for key, item in value.items()]
     return dict(pairs) if all(isinstance(key, str) for key in value) else {"": pairs}
 
 

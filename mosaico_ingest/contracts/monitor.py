@@ -127,7 +127,7 @@ class RowMonitor:
         """Add rows of a stored topic, whose header is that of the ontology or of the ROS shape."""
         if self.latency is not None or self.steps:
             stored = ontology_stamps_of(rows)
-            self._add_stamps(stamps_of(rows) if stored is None else np.where(stored[1], 0, stored[0]), batch)
+            self._add_stamps(stamps_of(rows) if stored is None else stored, batch)
         if self.frames is not None and (frames := frames_of(rows)) is not None:
             self.frames.add(batch, frames)
         self._add_values(rows, batch, envelope, is_ontology=True)

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from mosaico_ingest.adapters.mapping.columns import Array, arrays, field_of, pc, pt
+from mosaico_ingest.adapters.mapping.columns import Array, arrays, field_of, pc, pt, time_ns
 from mosaico_ingest.contracts.expressions import Values
 from mosaico_ingest.job.values import Limit
 
@@ -84,27 +84,13 @@ def plain_values(data: NDArray[Any]) -> Values:
 
 
 def stamps_of(rows: Array) -> NDArray[np.int64] | None:
-    """Return the header stamps in nanoseconds, shape (n,); None if the rows have no header with a stamp."""
-    stamp = _member(rows, "header", "stamp")
-    if stamp is None:
-        return None
-    seconds, nanoseconds = _member(stamp, "sec"), _member(stamp, "nanosec")
-    if seconds is None or nanoseconds is None:
-        return None
-    return _numbers(seconds).astype(np.int64) * 1_000_000_000 + _numbers(nanoseconds).astype(np.int64)
+    """Return the header stamps of messages in nanoseconds, shape (n,), 0 for null; None without a header stamp."""
+    return _times(_member(rows, "header", "stamp"), ("sec", "nanosec"))
 
 
-def ontology_stamps_of(rows: Array) -> tuple[NDArray[np.int64], Mask] | None:
-    """Return the stamps of stored rows in nanoseconds and where they are not set; None without a header."""
-    time = _member(rows, "header", "timestamp")
-    if time is None:
-        return None
-    seconds, nanoseconds = _member(time, "seconds"), _member(time, "nanoseconds")
-    unset = np.asarray(time.is_null())
-    return (
-        _numbers(seconds).astype(np.int64) * 1_000_000_000 + _numbers(nanoseconds).astype(np.int64),
-        unset,
-    )
+def ontology_stamps_of(rows: Array) -> NDArray[np.int64] | None:
+    """Return the header stamps of stored rows in nanoseconds, shape (n,), 0 for null; None without a header."""
+    return _times(_member(rows, "header", "timestamp"), ("seconds", "nanoseconds"))
 
 
 def frames_of(rows: Array) -> Array | None:
@@ -124,6 +110,12 @@ def _member(rows: Array, *names: str) -> Array | None:
             return None
         rows = field_of(rows, name)
     return rows
+
+
+def _times(times: Array | None, parts: tuple[str, str]) -> NDArray[np.int64] | None:
+    if times is None or any(_member(times, part) is None for part in parts):
+        return None
+    return _numbers(time_ns(times, parts))
 
 
 def _numbers(array: Array) -> NDArray[Any]:

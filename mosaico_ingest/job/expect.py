@@ -49,7 +49,7 @@ def _check_pair(value: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _form(value: Any) -> str:  # noqa: ANN401 - any YAML value
-    """Return the tag of a value that is a text, a list or a mapping."""
+    """Return the tag of a value in a union with a text, a list and a mapping."""
     if isinstance(value, list | tuple):
         return "list"
     return "mapping" if isinstance(value, dict | Section) else "one"
@@ -84,6 +84,8 @@ Scalar = Annotated[
     WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "number"}, {"type": "boolean"}]}),
 ]
 Amount = Annotated[int, Field(ge=0, le=_MAX_COUNT)]
+SpanOwner = Annotated[Text, TopicGlob(default=RECORDING)]
+"""The `recording`, or the name of the topic whose time span an expectation refers to."""
 
 
 class Expectation(Section):
@@ -190,7 +192,7 @@ class StampOrder(Expectation):
     """Properties of the header stamps."""
 
     order: StampProperties = Field(examples=["monotonic", ["monotonic", "unique"]])
-    """`monotonic`: no stamp is earlier than the one before. `unique`: no two consecutive stamps are equal."""
+    """`monotonic`: no stamp is earlier than the previous one. `unique`: no two consecutive stamps are equal."""
 
 
 class AllowedNames(Expectation):
@@ -201,7 +203,7 @@ class AllowedNames(Expectation):
 
 
 class SequenceNumbers(Expectation):
-    """The continuity of sequence numbers: those of MCAP messages, or else `header.seq` of ROS 1."""
+    """The continuity of the sequence numbers of MCAP messages, or else of `header.seq` of ROS 1."""
 
     missing: MessageLimit = Field(examples=[0, "0.1%"])
     """The largest number (or share of all numbers) of sequence numbers that no message has."""
@@ -214,20 +216,16 @@ class Coverage(Expectation):
     """The smallest share."""
     gap: IntervalLimit = Field(examples=["1s", "3 periods"])
     """The longest interval between consecutive messages that counts as covered, as in `gaps.over`."""
-    of: Annotated[Text, TopicGlob(default=RECORDING)] = Field(
-        default=RECORDING, examples=["recording", "/clock"]
-    )
-    """The interval: that of the `recording`, or of a topic by its name."""
+    of: SpanOwner = Field(default=RECORDING, examples=["recording", "/clock"])
+    """The interval: the time span of the `recording`, or of a topic by its name."""
 
 
 class Proximity(Expectation):
-    """The largest distance of the topic's first or last message from that of the recording or another topic."""
+    """The largest distance between the first or last messages of the topic and of the recording or another topic."""
 
     within: Duration = Field(examples=["1s"])
     """The largest distance."""
-    of: Annotated[Text, TopicGlob(default=RECORDING)] = Field(
-        default=RECORDING, examples=["recording", "/clock"]
-    )
+    of: SpanOwner = Field(default=RECORDING, examples=["recording", "/clock"])
     """The `recording`, or a topic by its name."""
 
 
@@ -248,7 +246,7 @@ class FieldExpectations(Expectation):
     max: Number | None = Field(default=None, examples=[100])
     """The largest number."""
     finite: bool | None = None
-    """Whether NaN and infinity are forbidden."""
+    """Whether NaN and infinity are violations."""
     nulls: MessageLimit | None = Field(default=None, examples=[0, "1%"])
     """The largest number (or share of the values) of nulls."""
     equals: Scalar | None = Field(default=None, examples=["imu_link"])
@@ -268,21 +266,33 @@ class FieldExpectations(Expectation):
     message."""
 
 
+Maximum = Annotated[
+    Annotated[MessageLimit, Tag("one")] | Annotated[Limit, Tag("several")], Discriminator(_short_form)
+]
+"""A maximum number or share, or `{max: …}`."""
+Names = Annotated[
+    Annotated[Text, Tag("one")]
+    | Annotated[tuple[Text, ...], Field(min_length=1), Tag("list")]
+    | Annotated[AllowedNames, Tag("mapping")],
+    Discriminator(_form),
+]
+"""An allowed text, a list of them, or `{one_of: […]}`."""
+Stamps = Annotated[
+    Annotated[StampProperty, Tag("one")]
+    | Annotated[tuple[StampProperty, ...], Field(min_length=1), Tag("list")]
+    | Annotated[StampOrder, Tag("mapping")],
+    Discriminator(_form),
+]
+"""A property of the stamps, a list of them, or `{order: …}`."""
+
+
 class TopicExpectations(Section):
     """Expectations of the topics that a name or glob matches."""
 
     severity: SeverityName | None = None
     """The severity of the expectations of this entry. Defaults to `expect.severity`."""
-    type: (
-        Annotated[
-            Annotated[Text, Tag("one")]
-            | Annotated[tuple[Text, ...], Field(min_length=1), Tag("list")]
-            | Annotated[AllowedNames, Tag("mapping")],
-            Discriminator(_form),
-        ]
-        | None
-    ) = Field(default=None, examples=["sensor_msgs/msg/Imu"])
-    """The message type, or a list of the allowed ones; short for `{one_of: […]}`."""
+    type: Names | None = Field(default=None, examples=["sensor_msgs/msg/Imu"])
+    """The message type, or a list of allowed types; short for `{one_of: […]}`."""
     rate: Rate | None = Field(default=None, examples=[{"min": "95 Hz", "max": "105 Hz"}])
     """The mean rate over the time between the first and the last message."""
     sliding_rate: SlidingRate | None = Field(default=None, examples=[{"window": "1s", "min": "90 Hz"}])
@@ -293,43 +303,17 @@ class TopicExpectations(Section):
     """The share of long intervals between consecutive messages."""
     messages: CountRange | None = Field(default=None, examples=[{"min": 1000}])
     """The number of messages."""
-    rejected: (
-        Annotated[
-            Annotated[MessageLimit, Tag("one")] | Annotated[Limit, Tag("several")], Discriminator(_short_form)
-        ]
-        | None
-    ) = Field(default=None, examples=[0, "0.1%"])
+    rejected: Maximum | None = Field(default=None, examples=[0, "0.1%"])
     """The largest number or share of rejected messages; short for `{max: …}`."""
     latency: Latency | None = Field(default=None, examples=[{"max": "200 ms"}])
     """The log time minus the header stamp."""
-    stamps: (
-        Annotated[
-            Annotated[StampProperty, Tag("one")]
-            | Annotated[tuple[StampProperty, ...], Field(min_length=1), Tag("list")]
-            | Annotated[StampOrder, Tag("mapping")],
-            Discriminator(_form),
-        ]
-        | None
-    ) = Field(default=None, examples=["monotonic", ["monotonic", "unique"]])
+    stamps: Stamps | None = Field(default=None, examples=["monotonic", ["monotonic", "unique"]])
     """The order of the header stamps: `monotonic`, `unique`, or both; short for `{order: …}`."""
-    frame_id: (
-        Annotated[
-            Annotated[Text, Tag("one")]
-            | Annotated[tuple[Text, ...], Field(min_length=1), Tag("list")]
-            | Annotated[AllowedNames, Tag("mapping")],
-            Discriminator(_form),
-        ]
-        | None
-    ) = Field(default=None, examples=["imu_link", ["imu_link", "imu"]])
+    frame_id: Names | None = Field(default=None, examples=["imu_link", ["imu_link", "imu"]])
     """The allowed values of `header.frame_id`; short for `{one_of: […]}`."""
     sequence_numbers: SequenceNumbers | None = Field(default=None, examples=[{"missing": 0}])
     """The continuity of the messages' sequence numbers."""
-    out_of_order: (
-        Annotated[
-            Annotated[MessageLimit, Tag("one")] | Annotated[Limit, Tag("several")], Discriminator(_short_form)
-        ]
-        | None
-    ) = Field(default=None, examples=[0])
+    out_of_order: Maximum | None = Field(default=None, examples=[0])
     """The largest number or share of messages with an earlier log time than the message before them in the file; short for
     `{max: …}`."""
     coverage: Coverage | None = Field(default=None, examples=[{"min": "99%", "gap": "1s"}])
@@ -374,12 +358,7 @@ class RecordingExpectations(Section):
     """The log time of the last message."""
     messages: CountRange | None = Field(default=None, examples=[{"min": 1000}])
     """The number of messages of all topics."""
-    unreadable: (
-        Annotated[
-            Annotated[MessageLimit, Tag("one")] | Annotated[Limit, Tag("several")], Discriminator(_short_form)
-        ]
-        | None
-    ) = Field(default=None, examples=[0, "0.1%"])
+    unreadable: Maximum | None = Field(default=None, examples=[0, "0.1%"])
     """The largest number or share of unreadable messages; short for `{max: …}`. An unreadable range with an unknown number
     of messages counts as one message."""
     chunk_crcs: ChunkCRCs | None = Field(default=None, examples=[{"present": True, "valid": True}])
@@ -402,7 +381,7 @@ class GroupExpectations(Section):
     ends: GroupDistance | None = Field(default=None, examples=[{"within": "5s"}])
     """The largest distance between the last messages of the recordings."""
     gap: GapLimit | None = Field(default=None, examples=[{"max": "1s"}])
-    """The longest interval between the end of a recording and the start of the next one that no other recording covers."""
+    """The longest time between two recordings that no recording of the group covers."""
 
 
 class GroupDistance(Expectation):
@@ -425,7 +404,7 @@ TopicItem = Annotated[
 
 
 class Expectations(Section):
-    """A data contract: what the recording must be like, and the action if it is not."""
+    """A data contract: expectations of a recording, and the action if one of them fails."""
 
     on_failure: OnFailure = OnFailure.FAIL
     """Action if an expectation with the severity `error` fails: fail (commit nothing, exit code 6), warn (commit), divert

@@ -125,7 +125,7 @@ def check_manifest(
         return None, source.findings or (_not_a_job(source),)
     filled = fill_in(source, env, cell)
     findings = [*source.findings, *filled.findings]
-    filled.value = _with_text_keys(filled.value, (), source, findings)
+    filled.value = _without_other_keys(filled.value, (), source, findings)
     manifest, mistakes = _validate(source, filled)
     reported = {finding.span for finding in findings}
     if any(finding.rule == "missing-base" for finding in findings):
@@ -207,10 +207,10 @@ def _not_a_job(source: Source) -> Finding:
     return Finding("not-a-mapping", Severity.ERROR, "a job is a mapping", span, "start with bag: {path: …}")
 
 
-def _with_text_keys(value: Value, path: KeyPath, source: Source, findings: list[Finding]) -> Value:
+def _without_other_keys(value: Value, path: KeyPath, source: Source, findings: list[Finding]) -> Value:
     """Report keys that are not text, and return the value without them."""
     if isinstance(value, list):
-        return [_with_text_keys(item, (*path, i), source, findings) for i, item in enumerate(value)]
+        return [_without_other_keys(item, (*path, i), source, findings) for i, item in enumerate(value)]
     if not isinstance(value, dict):
         return value
     for key in value:
@@ -219,7 +219,7 @@ def _with_text_keys(value: Value, path: KeyPath, source: Source, findings: list[
             message = f"the key {json.dumps(key)} is not text"
             findings.append(Finding("yaml-key", Severity.ERROR, message, span, "quote it"))
     return {
-        key: _with_text_keys(inner, (*path, key), source, findings)
+        key: _without_other_keys(inner, (*path, key), source, findings)
         for key, inner in value.items()
         if isinstance(key, str)
     }

@@ -432,7 +432,7 @@ class JobSettings(Section):
     expect: Expectations | None = None
     """The data contract: expectations of the recording, its topics and their values, and the action if one fails."""
     definitions: Literal["locked"] | None = None
-    """`locked` refuses recordings whose topics, message definitions or output columns differ from the lock file, which
+    """With `locked`, a recording must have the topics, message definitions and output columns of the lock file, which
     `ingest schema lock` writes next to the manifest (`job.lock.json` for `job.yaml`). If omitted, they are not compared."""
     quarantine: QuarantineSettings | None = None
     """Where rejected messages are kept; without this section, they are only counted."""

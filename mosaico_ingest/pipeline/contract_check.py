@@ -1,4 +1,4 @@
-"""Data contracts without a run: the complete check of a recording, and the part of it that the index reveals."""
+"""Data contracts without a run: the check of a complete recording, and the check of its index."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ _SAMPLE_KEYS = frozenset(
 def check_contract(job: Job, group: tuple[ExpectationResult, ...] = ()) -> ContractResult:
     """Return the results of a job's contract for its recording, without writing.
 
-    `group` has the results of the group that the recording belongs to. Only topics with expectations of their rows are decoded. If log times are all that is needed, the messages are not
-    read: the index has their times.
+    `group` has the results of the group that the recording belongs to. Only topics with expectations of their rows are
+    decoded. If the contract is only about log times, the index has them, and no message is read.
 
     Raises:
         ManifestError: The job has no contract, or an expression does not fit the messages of a topic.
@@ -200,7 +200,6 @@ class _Rows:
             if self._adapts and definition is not None
             else None
         )
-
         if self._adapts:
             monitor.reject(topic.topic, 0)
 

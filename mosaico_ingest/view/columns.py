@@ -10,11 +10,12 @@ import pyarrow.compute as pc
 import pyarrow.types as pt
 from msgspec import Struct
 
+from mosaico_ingest.adapters.mapping.columns import time_ns
+
 _compute: Any = pc
 """`pyarrow.compute`, whose stubs do not accept arrays of any type."""
 _TIMES = ({"seconds", "nanoseconds"}, {"sec", "nanosec"}, {"secs", "nsecs"})
 """Names of the parts of a time or duration in ontology types and in the messages of ROS 2 and ROS 1."""
-_SECOND = 1_000_000_000
 _TIMESTAMP = "timestamp_ns"
 
 
@@ -44,7 +45,7 @@ class Column(Struct, frozen=True):
         values: pa.Array[Any] = batch.column(self.name)
         for step in self.steps[1:]:
             values = _member(values, step)
-        return _nanoseconds(values) if self.is_time and pt.is_struct(values.type) else values
+        return time_ns(values) if self.is_time and pt.is_struct(values.type) else values
 
 
 def topic_columns(schema: pa.Schema) -> tuple[Column, ...]:
@@ -77,7 +78,7 @@ def flat_columns(path: str, values: pa.Array[Any]) -> Iterator[tuple[str, pa.Arr
 
 def time_values(values: pa.Array[Any]) -> pa.Array[Any]:
     """Return times in two parts in ns, and other values unchanged."""
-    return _nanoseconds(values) if _is_time(values.type) else values
+    return time_ns(values) if _is_time(values.type) else values
 
 
 def is_number(kind: pa.DataType) -> bool:
@@ -140,10 +141,3 @@ def _member(values: pa.Array[Any], name: str) -> pa.Array[Any]:
     while is_list(values.type):
         values = cast("pa.ListArray[Any]", values).flatten()
     return _compute.struct_field(values, name)
-
-
-def _nanoseconds(values: pa.Array[Any]) -> pa.Array[Any]:
-    seconds, rest = (
-        _compute.struct_field(values, [at]).cast(pa.int64()) for at in range(values.type.num_fields)
-    )
-    return _compute.add(_compute.multiply(seconds, pa.scalar(_SECOND, pa.int64())), rest)

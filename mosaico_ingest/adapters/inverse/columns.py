@@ -26,6 +26,7 @@ from mosaico_ingest.adapters.mapping.column_plan import (
     StructSource,
 )
 from mosaico_ingest.adapters.mapping.columns import (
+    SECOND_NS,
     Array,
     Axis,
     Mask,
@@ -35,6 +36,7 @@ from mosaico_ingest.adapters.mapping.columns import (
     open_list,
     pc,
     pt,
+    time_ns,
     true_mask,
 )
 from mosaico_ingest.adapters.mapping.expressions import (
@@ -53,8 +55,6 @@ from mosaico_ingest.adapters.mapping.functions.ros import STAMP_TYPE
 from mosaico_ingest.adapters.mapping.loader import MappingAdapter
 from mosaico_ingest.adapters.mapping.types import is_number
 
-_SECOND_NS = 1_000_000_000
-
 
 def _same(values: Array) -> Array:
     return values
@@ -70,19 +70,14 @@ def _yaw(quaternion: Array) -> Array:
 
 
 def _from_seconds(values: Array) -> Array:
-    return _from_ns(pc.round(pc.multiply(values, float(_SECOND_NS))))
+    return _from_ns(pc.round(pc.multiply(values, float(SECOND_NS))))
 
 
 def _from_ns(values: Array) -> Array:
     whole = np.asarray(filled_int(values))
-    seconds, rest = np.divmod(whole, _SECOND_NS)
+    seconds, rest = np.divmod(whole, SECOND_NS)
     children = [arrays.array(seconds.astype(np.int32)), arrays.array(rest.astype(np.uint32))]
     return arrays.StructArray.from_arrays(children, fields=list(STAMP_TYPE))
-
-
-def _to_ns(values: Array) -> Array:
-    seconds, rest = (pc.cast(field_of(values, name), arrays.int64()) for name in ("seconds", "nanoseconds"))
-    return pc.add(pc.multiply(seconds, _SECOND_NS), rest)
 
 
 def filled_int(values: Array) -> Array:
@@ -107,7 +102,7 @@ ONE_ARGUMENT: Mapping[str, Callable[[Array], Array]] = {
     "quaternion_from_yaw": _yaw,
     "seconds": _from_seconds,
     "nanoseconds": _from_ns,
-    "time_from_ns": _to_ns,
+    "time_from_ns": time_ns,
 }
 """Inverses of functions in their first argument, by name. Null stands for the field's own zero."""
 

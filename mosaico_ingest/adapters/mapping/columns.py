@@ -21,6 +21,7 @@ arrays: Any = pa
 """pyarrow without its stubs, which are narrower than the constructors."""
 
 Mask = NDArray[np.bool_]
+SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,6 +118,16 @@ def field_of(rows: Array, name: str) -> Array:
     """Return a field of every row, null where the row is null; shares memory unless a row is null."""
     position = rows.type.get_field_index(name)
     return pc.struct_field(rows, [position]) if rows.null_count else rows.field(position)
+
+
+def time_ns(times: Array, parts: tuple[str, str] | None = None) -> Array:
+    """Return times in nanoseconds, null where a part is null.
+
+    `parts` names the seconds and the nanoseconds; by default, these are the first and the second field.
+    """
+    names = parts or tuple(field.name for field in times.type)
+    seconds, rest = (pc.cast(field_of(times, name), arrays.int64()) for name in names)
+    return pc.add(pc.multiply(seconds, SECOND_NS), rest)
 
 
 def open_list(array: Array) -> tuple[Array, Axis]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mosaico_ingest.adapters.mapping.columns import (
+    SECOND_NS,
     Array,
     Axis,
     DataType,
@@ -35,7 +36,6 @@ from mosaico_ingest.adapters.mapping.functions.registry import (
 )
 from mosaico_ingest.adapters.mapping.types import ExprType, is_number
 
-SECOND_NS = 1_000_000_000
 STAMP_TYPE: DataType = arrays.struct(
     [
         arrays.field("seconds", arrays.int32(), nullable=False),
