@@ -73,7 +73,7 @@ class ROSAdapterBase(ABC, Generic[T]):
         typestore: Any,  # noqa: ANN401, ARG003 - rosbags' class, which only `rosbag` imports
         ros_msg_type: str | None = None,  # noqa: ARG003 - for overrides
     ) -> Any:  # noqa: ANN401 - a generated class
-        """Return the message object of a rosbags typestore for an ontology object. Override it to support this.
+        """Return the message object of a rosbags typestore for an ontology object. Override it to support exports.
 
         Raises:
             AdapterError: The adapter does not convert to ROS messages, or not to this type.
@@ -229,6 +229,21 @@ class PythonAdapter(Struct, frozen=True):
             return self._by_columns(rows)
         return self._by_messages(rows, envelope)
 
+    @property
+    def is_invertible(self) -> bool:
+        """Whether the class overrides `to_ros`."""
+        return _overrides(self.adapter, "to_ros")
+
+    def to_ros(self, row: dict[str, Any], log_ns: int, typestore: Any, msgtype: str) -> Any:  # noqa: ANN401 - rosbags' class, and a message object
+        """Return the message for one row of ontology columns; any exception of the class is passed on."""
+        from mosaico_ingest.ontology.header import Message  # noqa: PLC0415 - the models are slow to import
+
+        model = self.adapter.__mosaico_ontology_type__
+        # The SDK's models have no from_row.
+        data = model.from_row(row) if hasattr(model, "from_row") else model.model_validate(row)
+        message = _class_beside_base(self.adapter, "Message", Message)
+        return self.adapter.to_ros(message(timestamp_ns=log_ns, data=data), typestore, msgtype)
+
     def topic_metadata(self, first_row: pa.StructScalar | None) -> dict[str, Any]:
         """Return the result of `schema_metadata` for the first message; {} for adapters of the newer SDK.
 
@@ -324,7 +339,7 @@ class PythonAdapter(Struct, frozen=True):
     def _translate(
         self, ros_data: dict[str, Any], envelope: Envelope, row: int
     ) -> tuple[int, dict[str, Any]]:
-        message = _message_class(self.adapter)(
+        message = _class_beside_base(self.adapter, "ROSMessage", ROSMessage)(
             bag_timestamp_ns=int(envelope.log_times[row]),
             topic=envelope.topic,
             msg_type=envelope.msgtype,
@@ -400,10 +415,10 @@ def ontology_of(model: type[Any]) -> OntologyType:
     return OntologyType(model.ontology_tag(), struct, SerializationFormat(layout.value))
 
 
-def _message_class(adapter: type[Any]) -> Callable[..., Any]:
-    """Return the message class that belongs to the adapter's base class."""
+def _class_beside_base(adapter: type[Any], name: str, default: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a class of the module that defines the adapter's base class, which is the SDK's for its adapters."""
     base = next(base for base in adapter.__mro__ if base.__name__ == _BASE)
-    return getattr(sys.modules[base.__module__], "ROSMessage", ROSMessage)
+    return getattr(sys.modules[base.__module__], name, default)
 
 
 def _one_line(error: Exception) -> str:

@@ -23,15 +23,20 @@ from mosaico_ingest.ontology.registry import model
 from mosaico_ingest.rosbag.blocks import ROSMessage
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, normalize_msgtype
-from mosaico_ingest.rosbag.definitions.registry import CustomMessages, TypeResolver, store_of
+from mosaico_ingest.rosbag.definitions.registry import CustomMessages, ROSTypeRegistry, TypeResolver, store_of
 from mosaico_ingest.rosbag.typestore import definition_in, native_message
 
 
 class DefinitionFinder:
     """Finds definitions by type name; implements `Resolver`."""
 
-    def __init__(self, distro: Stores | str | None = None, custom: Iterable[CustomMessages] = ()) -> None:
-        """Look up types in `custom`, then in `distro`, by default in the newest ROS 2 and in ROS 1 Noetic.
+    def __init__(
+        self,
+        distro: Stores | str | None = None,
+        custom: Iterable[CustomMessages] = (),
+        registry: type[ROSTypeRegistry] = ROSTypeRegistry,
+    ) -> None:
+        """Look up types in `custom`, then in `registry`, then in `distro`, by default the newest ROS 2 and ROS 1 Noetic.
 
         Raises:
             BagError: A definition of `custom` cannot be read, or the distro does not exist.
@@ -39,8 +44,12 @@ class DefinitionFinder:
         store, definitions = store_of(distro), tuple(custom)
         is_ros1 = store is not None and store.value.startswith("ros1")
         self._resolvers = {
-            1: TypeResolver(store if store and is_ros1 else Stores.ROS1_NOETIC, definitions),
-            2: TypeResolver(store if store and not is_ros1 else Stores.LATEST, definitions),
+            1: TypeResolver(
+                store if store and is_ros1 else Stores.ROS1_NOETIC, definitions, registry=registry
+            ),
+            2: TypeResolver(
+                store if store and not is_ros1 else Stores.LATEST, definitions, registry=registry
+            ),
         }
         self._first, self._second = (1, 2) if is_ros1 else (2, 1)
 
@@ -220,10 +229,9 @@ class CatalogAdapter(ROSAdapterBase[Serializable]):
                 hint=f"it converts {cls.__mosaico_ontology_type__.__name__} to {', '.join(ros_types_of(cls))}",
             )
         definition = definition_in(typestore, msgtype)
-        shape = ros_shape(definition)
-        adapter = cls.__adapter_spec__.bind(definition, shape)
+        adapter = cls.__adapter_spec__.bind(definition, ros_shape(definition))
         row = cast("pa.StructArray", pa.array([data.to_row()], adapter.ontology.struct))
-        restored = invert(adapter, shape, {}).restore(row, Envelope("", msgtype, np.zeros(1, np.int64)))
+        restored = invert(adapter, definition, {}).restore(row, Envelope("", msgtype, np.zeros(1, np.int64)))
         return native_message(typestore, msgtype, cast("dict[str, Any]", restored.rows[0].as_py()))
 
 

@@ -30,7 +30,7 @@ from mosaico_ingest.errors import AdapterError, BagError
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.report.contract import ContractResult, ExpectationResult
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
-from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, Language
+from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 
 _OF_RECORDINGS = frozenset({"unreadable", "chunk_crcs", "metadata_counts"})
@@ -152,14 +152,10 @@ def _messages(topic: TopicInfo, bridge: ROSBridge) -> _Messages | None:
         definition = TypeResolver(Stores.EMPTY).resolve(
             _msgtype(topic), Embedded(f"ros{version}msg", text), ros_version=version
         )
-        shape = ros_shape(definition)
-        adapter = bridge.resolve(topic.name, definition.root).spec.bind(definition, shape)
+        adapter = bridge.resolve(topic.name, definition.root).spec.bind(definition, ros_shape(definition))
         if adapter.ontology != topic.ontology:
             return None
-        return _Messages(
-            definition,
-            invert(adapter, shape, topic.metadata, nullable=definition.language is not Language.ROS),
-        )
+        return _Messages(definition, invert(adapter, definition, topic.metadata))
     except (AdapterError, BagError):
         return None
 

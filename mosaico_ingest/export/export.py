@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import logging
 import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
@@ -32,9 +33,11 @@ from mosaico_ingest.job.values import Stores
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, Language, normalize_msgtype
-from mosaico_ingest.rosbag.definitions.registry import CustomMessages, TypeResolver, store_of
+from mosaico_ingest.rosbag.definitions.registry import CustomMessages, ROSTypeRegistry, TypeResolver, store_of
 from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS, encoding_of
 from mosaico_ingest.rosbag.writers import RecordingWriter, check_new_recording, open_writer
+
+_log = logging.getLogger(__name__)
 
 
 class _Record(BaseModel):
@@ -232,8 +235,7 @@ def restorer_for(info: SourceTopic, definition: Definition, specs: Sequence[Adap
             mismatches.append(error.what)
             continue
         if _produces(adapter, info):
-            nullable = definition.language is not Language.ROS
-            inverse = invert(adapter, shape, info.metadata, nullable=nullable)
+            inverse = invert(adapter, definition, info.metadata)
             return Restorer(info, definition, spec.name, adapter.ontology, inverse)
     raise AdapterError(
         f"no known adapter converts {definition.root} to {info.ontology.tag}",
@@ -282,7 +284,7 @@ def _assumed_restorer(
                 definition = known.finder.find(msgtype, spec)
                 adapter = spec.bind(definition, ros_shape(definition))
                 if definition.ros_version == version and _produces(adapter, info):
-                    inverse = invert(adapter, ros_shape(definition), info.metadata)
+                    inverse = invert(adapter, definition, info.metadata)
                     assumed = f"{definition.root} of {known.distro.value}"
                     restorers.append(
                         Restorer(info, definition, spec.name, adapter.ontology, inverse, assumed)
@@ -305,6 +307,7 @@ def export_sequence(
     adapters: Sequence[str] = (),
     ros_distro: Stores | str | None = None,
     custom_msgs: Sequence[CustomMessages] = (),
+    registry: type[ROSTypeRegistry] = ROSTypeRegistry,
     replace: bool = False,
     dry_run: bool = False,
 ) -> ExportReport:
@@ -313,7 +316,7 @@ def export_sequence(
     `source` is a store, or a sequence of another source, such as `sources.ServerSequence`. The suffix of the file selects the
     container: `.mcap`, `.db3` (ROS 2) or `.bag` (ROS 1). `start_ns` is inclusive, `end_ns` exclusive. `ros_distro` defines the
     message types of topics whose metadata has no definition; it defaults to the newest distro that the container can store, and
-    `custom_msgs` adds types. With `dry_run`, no message is read and no file is written.
+    `custom_msgs` and `registry` add types. With `dry_run`, no message is read and no file is written.
 
     Raises:
         NothingMatched: No topic or message is selected, or no topic can be exported.
@@ -326,7 +329,7 @@ def export_sequence(
     opened = StoreSequence(source, sequence) if isinstance(source, Store) else source
     default = Stores.LATEST if 2 in ROS_VERSIONS[path.suffix] else Stores.ROS1_NOETIC  # noqa: PLR2004 - ROS 2
     distro = store_of(ros_distro) or default
-    definitions = _Definitions(distro, DefinitionFinder(distro, custom_msgs))
+    definitions = _Definitions(distro, DefinitionFinder(distro, custom_msgs, registry))
     selected = _selected(opened, topics)
     specs = [adapter_spec(reference, Path()) for reference in adapters]
     candidates = [
@@ -335,7 +338,7 @@ def export_sequence(
     ]
     if dry_run:
         results = [one.result() if isinstance(one, Restorer) else one for one in candidates]
-        return ExportReport(sequence=sequence, path=str(path), bytes=0, topics=tuple(results))
+        return _logged(ExportReport(sequence=sequence, path=str(path), bytes=0, topics=tuple(results)))
     with open_writer(path, replace=replace) as writer:
         restorers: list[tuple[int, Restorer]] = []
         excluded: list[TopicExport] = []
@@ -362,7 +365,20 @@ def export_sequence(
             )
     results = [*(restorer.result() for _, restorer in restorers), *excluded]
     results.sort(key=lambda result: result.topic)
-    return ExportReport(sequence=sequence, path=str(path), bytes=path.stat().st_size, topics=tuple(results))
+    size = path.stat().st_size
+    return _logged(ExportReport(sequence=sequence, path=str(path), bytes=size, topics=tuple(results)))
+
+
+def _logged(report: ExportReport) -> ExportReport:
+    """Log the topics of a report, the unfaithful ones as warnings, and return the report."""
+    for topic in report.topics:
+        if topic.excluded:
+            _log.warning("%s of %s is not exported: %s", topic.topic, report.sequence, topic.excluded)
+            continue
+        for column, count in topic.changed.items():
+            _log.warning("%s of %s: %s differs in %s messages", topic.topic, report.sequence, column, count)
+        _log.info("%s of %s: exported %s messages", topic.topic, report.sequence, topic.messages)
+    return report
 
 
 def _selected(sequence: SourceSequence, patterns: Sequence[str]) -> tuple[SourceTopic, ...]:

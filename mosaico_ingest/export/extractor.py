@@ -12,7 +12,8 @@ from mosaico_ingest.errors import BagError
 from mosaico_ingest.export.export import ExportReport, export_sequence
 from mosaico_ingest.export.sources import ServerSequence
 from mosaico_ingest.job.values import DEFAULT_PORT, ServerTarget, Stores
-from mosaico_ingest.rosbag.definitions.registry import CustomMessages, store_of
+from mosaico_ingest.report.events import log_level
+from mosaico_ingest.rosbag.definitions.registry import CustomMessages, ROSTypeRegistry, store_of
 
 _SUFFIXES = {"mcap": ".mcap", "sqlite3": ".db3"}
 """Suffix of a ROS 2 recording by storage plugin."""
@@ -32,7 +33,7 @@ class ROSExtractorConfig:
     port: int = DEFAULT_PORT
     topics: Sequence[str] | str | None = None
     log_level: str = "INFO"
-    """Without effect: an export logs nothing."""
+    """The level of the logger `mosaico_ingest` during the export, which logs excluded topics and changed values as warnings."""
     mosaico_api_key: str | None = field(default=None, repr=False)
     tls_cert_path: Path | str | None = None
     enable_tls: bool = False
@@ -46,6 +47,8 @@ class ROSExtractorConfig:
     ros_distro: Stores | str | None = None
     storage_plugin: Enum | str = "mcap"
     custom_msgs: Sequence[CustomMessages] | None = None
+    registry: type[ROSTypeRegistry] | None = None
+    """The registry of message types; None selects the process-wide one."""
 
     @property
     def path(self) -> Path:
@@ -83,7 +86,7 @@ class ROSSequenceExtractor:
             tls_cert=Path(config.tls_cert_path) if config.tls_cert_path else None,
             tls=config.enable_tls,
         )
-        with connect(target) as client:
+        with log_level(config.log_level), connect(target) as client:
             source = ServerSequence(client, config.sequence_name)
             if not config.dry_run:
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -96,6 +99,7 @@ class ROSSequenceExtractor:
                 end_ns=config.end_timestamp_ns,
                 ros_distro=config.ros_distro,
                 custom_msgs=config.custom_msgs or (),
+                registry=config.registry or ROSTypeRegistry,
                 replace=config.overwrite,
                 dry_run=config.dry_run,
             )

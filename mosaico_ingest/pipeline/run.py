@@ -35,6 +35,7 @@ from mosaico_ingest.report.events import (
     Timed,
     Unreadable,
     ignore_events,
+    log_level,
 )
 from mosaico_ingest.report.model import Report
 from mosaico_ingest.report.timing import Step, Stopwatch
@@ -65,7 +66,7 @@ def run_recording(task: Task, observe: Observer = ignore_events) -> Outcome:
     events = _RunEvents(task, observe)
     stopwatch = events.stopwatch
     try:
-        with _log_level(job.run.log_level), open_job(job) as (recording, resolver):
+        with log_level(job.run.log_level), open_job(job) as (recording, resolver):
             plan = _plan(task, recording, resolver)
             events.start(plan)
             if not task.dry_run:
@@ -93,18 +94,6 @@ def _check_group(plan: Plan) -> None:
         from mosaico_ingest.pipeline.contract import check_group  # noqa: PLC0415 - only contracts need it
 
         check_group(plan)
-
-
-@contextmanager
-def _log_level(level: str) -> Generator[None]:
-    """Set the log level of the package during a run; handlers are those of the program."""
-    logger = logging.getLogger("mosaico_ingest")
-    previous = logger.level
-    logger.setLevel(level)
-    try:
-        yield
-    finally:
-        logger.setLevel(previous)
 
 
 @contextmanager

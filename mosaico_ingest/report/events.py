@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import logging
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
 from enum import Enum
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -194,3 +196,15 @@ def ignore_events(_event: Event) -> None:
 
 def ignore_batch(_position: int, _event: Event) -> None:
     """Ignore an event: the default observer of a batch."""
+
+
+@contextmanager
+def log_level(level: str) -> Generator[None]:
+    """Set the log level of the package inside a `with` block; the program configures the handlers."""
+    logger = logging.getLogger("mosaico_ingest")
+    previous = logger.level
+    logger.setLevel(level)
+    try:
+        yield
+    finally:
+        logger.setLevel(previous)

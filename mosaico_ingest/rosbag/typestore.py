@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow as pa
 from rosbags.interfaces import Nodetype
 
 from mosaico_ingest.errors import BagError
@@ -35,6 +36,49 @@ def definition_in(typestore: Typestore, msgtype: str) -> Definition:
         raise BagError(f"the typestore does not define {name}", hint="register the type in the typestore")
     text, _ = typestore.generate_msgdef(name, ros_version=version)
     return TypeResolver("empty").resolve(name, Embedded(f"ros{version}msg", text), ros_version=version)
+
+
+def typestore_of(definition: Definition) -> Typestore:
+    """Return a typestore with the types of one definition.
+
+    Raises:
+        BagError: rosbags cannot parse the definition.
+    """
+    from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore  # noqa: PLC0415 - slow to import, and only exports of adapters in Python need it
+
+    store = get_typestore(Stores.EMPTY)
+    try:
+        store.register(get_types_from_msg(definition.text, definition.root))
+    except (TypesysError, KeyError) as error:
+        raise BagError(f"rosbags cannot parse the definition: {error}", where=definition.root) from error
+    return store
+
+
+def message_values(message: Any, shape: pa.StructType) -> dict[str, Any]:  # noqa: ANN401 - a generated class, or a dict
+    """Return the fields of a message object, or of a dictionary with the same fields, for an array in the ROS shape.
+
+    Raises:
+        AttributeError, KeyError: The message lacks a field.
+    """
+    values: Mapping[str, Any] | None = message if isinstance(message, Mapping) else None
+    return {
+        field.name: _plain(
+            values[field.name] if values is not None else getattr(message, field.name), field.type
+        )
+        for field in shape
+    }
+
+
+def _plain(value: Any, kind: Any) -> Any:  # noqa: ANN401 - any field value and its type
+    if pa.types.is_struct(kind):
+        return message_values(value, kind)
+    if pa.types.is_binary(kind) or pa.types.is_fixed_size_binary(kind):
+        return bytes(value)
+    if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
+        if isinstance(value, np.ndarray):
+            return value.tolist()
+        return [_plain(item, kind.value_type) for item in value]
+    return value
 
 
 def native_message(typestore: Typestore, msgtype: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401 - a generated class

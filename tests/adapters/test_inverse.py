@@ -69,7 +69,7 @@ def restore(type_: str, value: str, message: dict[str, Any]) -> Restored:
     envelope = Envelope("/t", DEFINITION.root, np.zeros(1, np.int64))
     adapted = adapter.adapt(pa.array([message], shape), envelope)
     assert not adapted.failures
-    return invert(adapter, shape, {}).restore(adapted.rows, envelope)
+    return invert(adapter, DEFINITION, {}).restore(adapted.rows, envelope)
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_invert_element_columns_rebuild_list() -> None:
     messages = [MESSAGE, MESSAGE | {"cells": []}, MESSAGE]
     envelope = Envelope("/t", DEFINITION.root, np.zeros(3, np.int64))
     adapted = adapter.adapt(pa.array(messages, shape), envelope)
-    restored = invert(adapter, shape, {}).restore(adapted.rows, envelope)
+    restored = invert(adapter, DEFINITION, {}).restore(adapted.rows, envelope)
     assert restored.rows.field("cells").to_pylist() == [CELLS, [], CELLS]
 
 
@@ -146,7 +146,7 @@ def test_invert_field_of_two_columns_uses_non_null_one() -> None:
     adapter = load_adapter(text).bind(DEFINITION, shape)
     envelope = Envelope("/t", DEFINITION.root, np.zeros(2, np.int64))
     adapted = adapter.adapt(pa.array([MESSAGE, MESSAGE | {"d": 3.5}], shape), envelope)
-    restored = invert(adapter, shape, {}).restore(adapted.rows, envelope)
+    restored = invert(adapter, DEFINITION, {}).restore(adapted.rows, envelope)
     assert restored.rows.field("d").to_pylist() == [1.5, 3.5]
     assert not restored.changed
 

@@ -78,7 +78,7 @@ def there_and_back(spec: Builtin, definition: Definition, rows: pa.StructArray) 
     adapted = adapter.adapt(rows, Envelope("/t", definition.root, times))
     assert len(adapted.rows), adapted.failures[:1]
     envelope = Envelope("/t", definition.root, times[adapted.index])
-    restored = invert(adapter, shape, adapter.topic_metadata(rows[0])).restore(adapted.rows, envelope)
+    restored = invert(adapter, definition, adapter.topic_metadata(rows[0])).restore(adapted.rows, envelope)
     assert restored.rows.type == shape
     fields = set[str]()
     source = rows.take(pa.array(adapted.index))

@@ -14,7 +14,7 @@ from rosbags.highlevel import AnyReader
 
 from mosaico_ingest.api import run
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.errors import BagError, IngestError, NothingMatched
+from mosaico_ingest.errors import AdapterError, BagError, IngestError, NothingMatched
 from mosaico_ingest.export import export_sequence
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.values import TopicLevelErrorPolicy
@@ -288,3 +288,80 @@ def round_trip(path: Path, folder: Path) -> int:
         wrong = {field for field in wrong if not field.endswith(("header.seq", "covariance"))}
         assert not wrong or topic.topic in rejected, f"{path}: {topic.topic}: {wrong}"
     return len(report.topics)
+
+
+PACK = """
+float32 volts
+uint8[] serial
+acme_msgs/Cell[] cells
+int16[2] pair
+================================================================================
+MSG: acme_msgs/Cell
+float64 volts
+string[] tags
+"""
+PACK_ADAPTER = """
+from mosaico_ingest.adapters.python import ROSAdapterBase
+from mosaico_ingest.ontology import Serializable
+
+
+class Pack(Serializable):
+    volts: float
+    serial: bytes
+    cells: list[float]
+    pair: list[int]
+
+
+class OneWayAdapter(ROSAdapterBase[Pack]):
+    ros_msgtype = "acme_msgs/msg/Pack"
+    __mosaico_ontology_type__ = Pack
+
+    @classmethod
+    def from_dict(cls, ros_data):
+        return Pack(**{**ros_data, "cells": [cell["volts"] for cell in ros_data["cells"]]})
+
+
+class PackAdapter(OneWayAdapter):
+    @classmethod
+    def to_ros(cls, mosaico_data, typestore, ros_msg_type=None):
+        pack, _ = cls.unpack_mosaico_msg(mosaico_data)
+        if pack.volts < 0:
+            raise ValueError("negative")
+        cell = typestore.types["acme_msgs/msg/Cell"]
+        cells = [cell(volts=volts, tags=[]) for volts in pack.cells]
+        return typestore.types[ros_msg_type](volts=pack.volts, serial=pack.serial, cells=cells, pair=pack.pair)
+"""
+
+
+def record_packs(path: Path, volts: list[float], tags: list[str]) -> Path:
+    definition = define("acme_msgs/msg/Pack", PACK)
+    cells = [{"volts": 3.5, "tags": tags}, {"volts": 4.0, "tags": []}]
+    packs = [{"volts": value, "serial": b"\x00\xff", "cells": cells, "pair": [1, -2]} for value in volts]
+    return record(path, [("/pack", definition, at, pack) for at, pack in enumerate(packs)])
+
+
+def test_export_adapter_in_python_restores_messages_with_to_ros(ingested: Ingest, tmp_path: Path) -> None:
+    (tmp_path / "pack.py").write_text(PACK_ADAPTER)
+    adapter = f"{tmp_path / 'pack.py'}:PackAdapter"
+    source = record_packs(tmp_path / "in.mcap", [1.5, 2.5], [])
+    store = ingested(source, adapter_override={"/pack": adapter})
+    report = export_sequence(store, "s", tmp_path / "out.mcap", adapters=[adapter])
+    assert (report.faithful, report.messages, report.topics[0].adapter) == (True, 2, "PackAdapter")
+    assert differences(source, tmp_path / "out.mcap") == {}
+
+
+def test_export_adapter_in_python_that_fails_names_time_and_reason(ingested: Ingest, tmp_path: Path) -> None:
+    (tmp_path / "pack.py").write_text(PACK_ADAPTER)
+    adapter = f"{tmp_path / 'pack.py'}:PackAdapter"
+    store = ingested(record_packs(tmp_path / "in.mcap", [1.5, -1], []), adapter_override={"/pack": adapter})
+    with pytest.raises(AdapterError, match=r"PackAdapter\.to_ros failed at 1 ns: ValueError: negative"):
+        export_sequence(store, "s", tmp_path / "out.mcap", adapters=[adapter])
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_export_adapter_in_python_without_to_ros_excludes_its_topic(ingested: Ingest, tmp_path: Path) -> None:
+    (tmp_path / "pack.py").write_text(PACK_ADAPTER)
+    adapter = f"{tmp_path / 'pack.py'}:OneWayAdapter"
+    store = ingested(record_packs(tmp_path / "in.mcap", [1.5], []), adapter_override={"/pack": adapter})
+    report = export_sequence(store, "s", tmp_path / "out.mcap", adapters=[adapter], dry_run=True)
+    assert "override to_ros" in report.topics[0].excluded

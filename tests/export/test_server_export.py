@@ -308,6 +308,19 @@ def test_extractor_path_follows_distro_and_plugin() -> None:
         _ = ROSExtractorConfig("out", "s", storage_plugin="bag").path
 
 
+@pytest.mark.parametrize(("level", "logged"), [("WARNING", 1), ("ERROR", 0)])
+def test_extractor_log_level_selects_messages_of_the_log(
+    server: Server, tmp_path: Path, caplog: pytest.LogCaptureFixture, level: str, logged: int
+) -> None:
+    ingest(server.port, DRIVE, topics=["/imu", "/battery"])
+    with Store.open(tmp_path / "served").catalog.write() as db:
+        db.execute("UPDATE topics SET metadata = '{}' WHERE name = '/battery'")
+    config = ROSExtractorConfig(tmp_path / "out", "s", port=server.port, log_level=level, dry_run=True)
+    ROSSequenceExtractor(config).run()
+    messages = [record.args for record in caplog.records if record.name == "mosaico_ingest.export.export"]
+    assert [args[:2] for args in messages if args] == [("/battery", "s")] * logged
+
+
 def test_extractor_uses_custom_msgs_for_topics_without_definition(server: Server, tmp_path: Path) -> None:
     ingest(server.port, DRIVE, topics=["/imu"])
     store = Store.open(tmp_path / "served")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 import pyarrow as pa
@@ -31,7 +31,14 @@ from mosaico_ingest.adapters.mapping.columns import (
 from mosaico_ingest.adapters.mapping.expressions import FieldAccess, MessageRef, TypedExpression
 from mosaico_ingest.adapters.mapping.loader import MappingAdapter
 from mosaico_ingest.adapters.mapping.types import is_list
+from mosaico_ingest.adapters.python import PythonAdapter
 from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.model import Definition, Language
+from mosaico_ingest.rosbag.typestore import message_values, typestore_of
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 
 def differences(left: Array, right: Array) -> Mapping[str, Mask]:
@@ -104,21 +111,23 @@ class Inverse(Protocol):
         ...
 
 
-def invert(
-    adapter: Adapter, shape: pa.StructType, metadata: Mapping[str, Any], *, nullable: bool = False
-) -> Inverse:
-    """Return the inverse of a bound adapter; `metadata` is the topic's.
-
-    With `nullable`, the fields of messages can be absent, as in protobuf and JSON.
+def invert(adapter: Adapter, definition: Definition, metadata: Mapping[str, Any]) -> Inverse:
+    """Return the inverse of an adapter that is bound to a definition; `metadata` is the topic's.
 
     Raises:
-        AdapterError: The adapter is written in Python and has no inverse.
+        AdapterError: The adapter is written in Python and does not override `to_ros`, or the messages are not from ROS.
+        BagError: The message objects of an adapter in Python cannot be created.
     """
+    shape = ros_shape(definition)
     if isinstance(adapter, UnmodeledAdapter):
-        return _UnmodeledInverse(shape, nullable)
+        return _UnmodeledInverse(shape, definition.language is not Language.ROS)
     if isinstance(adapter, MappingAdapter):
         return _MappingInverse(adapter, shape, _metadata_texts(adapter.metadata, metadata))
-    raise AdapterError("an adapter written in Python has no way back")
+    if isinstance(adapter, PythonAdapter) and adapter.is_invertible:
+        if definition.language is not Language.ROS:
+            raise AdapterError(f"to_ros of {adapter.adapter.__name__} applies to ROS messages only")
+        return _PythonInverse(adapter, definition.root, shape, typestore_of(definition))
+    raise AdapterError("its adapter is written in Python", hint="override to_ros in the adapter")
 
 
 class _UnmodeledInverse(Struct, frozen=True):
@@ -149,14 +158,48 @@ class _MappingInverse(Struct, frozen=True):
         undo = ColumnInverter(builder, self.metadata_texts)
         undo.record(self.adapter.record, rows)
         messages = builder.build()
-        changed = self._changed(rows, messages, replace(envelope, msgtype=self.adapter.msgtype))
+        changed = _changed(self.adapter, rows, messages, replace(envelope, msgtype=self.adapter.msgtype))
         return Restored(messages, tuple(builder.defaulted), undo.not_invertible, changed)
 
-    def _changed(self, rows: Array, messages: Array, envelope: Envelope) -> Mapping[str, int]:
-        adapted = self.adapter.adapt(messages, envelope)
-        stored = rows if len(adapted.index) == len(rows) else rows.take(arrays.array(adapted.index))
-        changed = {name: int(wrong.sum()) for name, wrong in differences(stored, adapted.rows).items()}
-        return changed | ({"(refused)": len(adapted.failures)} if adapted.failures else {})
+
+class _PythonInverse(Struct, frozen=True):
+    """The inverse for messages that an adapter in Python converted: its `to_ros`, message by message."""
+
+    adapter: PythonAdapter
+    msgtype: str
+    shape: pa.StructType
+    typestore: Typestore
+
+    def restore(self, rows: pa.StructArray, envelope: Envelope) -> Restored:
+        stored: Any = rows  # the stubs lack to_pylist of struct arrays
+        times: list[int] = envelope.log_times.tolist()
+        messages = [self._message(row, time) for row, time in zip(stored.to_pylist(), times, strict=True)]
+        try:
+            restored = cast("pa.StructArray", arrays.array(messages, self.shape))
+        except (pa.ArrowException, TypeError, ValueError, OverflowError) as error:
+            raise AdapterError(f"a value that {self._method} returns does not fit: {error}") from error
+        return Restored(restored, changed=_changed(self.adapter, rows, restored, envelope))
+
+    def _message(self, row: dict[str, Any], time: int) -> dict[str, Any]:
+        try:
+            message = self.adapter.to_ros(row, time, self.typestore, self.msgtype)
+            return message_values(message, self.shape)
+        except Exception as error:  # user code may raise anything
+            raise AdapterError(
+                f"{self._method} failed at {time} ns: {type(error).__name__}: {error}"
+            ) from error
+
+    @property
+    def _method(self) -> str:
+        return f"{self.adapter.adapter.__name__}.to_ros"
+
+
+def _changed(adapter: Adapter, rows: Array, messages: Array, envelope: Envelope) -> Mapping[str, int]:
+    """Return the columns that differ after the messages are adapted again, with the number of rows."""
+    adapted = adapter.adapt(messages, envelope)
+    stored = rows if len(adapted.index) == len(rows) else rows.take(arrays.array(adapted.index))
+    changed = {name: int(wrong.sum()) for name, wrong in differences(stored, adapted.rows).items()}
+    return changed | ({"(refused)": len(adapted.failures)} if adapted.failures else {})
 
 
 def _metadata_texts(
