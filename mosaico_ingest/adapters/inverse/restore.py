@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import Any, Protocol, cast
 
 import numpy as np
 import pyarrow as pa
@@ -36,9 +36,6 @@ from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Language
 from mosaico_ingest.rosbag.typestore import message_values, typestore_of
-
-if TYPE_CHECKING:
-    from rosbags.typesys.store import Typestore
 
 
 def differences(left: Array, right: Array) -> Mapping[str, Mask]:
@@ -168,7 +165,8 @@ class _PythonInverse(Struct, frozen=True):
     adapter: PythonAdapter
     msgtype: str
     shape: pa.StructType
-    typestore: Typestore
+    typestore: Any
+    """A typestore of rosbags, which only `rosbag` imports."""
 
     def restore(self, rows: pa.StructArray, envelope: Envelope) -> Restored:
         stored: Any = rows  # the stubs lack to_pylist of struct arrays
