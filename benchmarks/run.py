@@ -5,6 +5,8 @@
     ./dev bench --long                        four to five times longer recordings, which need 3 GB more
     ./dev bench --peer ~/sdk/bin/python       also the official injector, uploading to a server that discards all rows;
                                               the Python of a virtual environment with mosaicolabs
+    ./dev bench --native RERUN                alternating with Rerun's converter and a plain copy; RERUN is the program
+                                              of rerun-sdk, for example ~/rerun/bin/rerun
     ./dev bench --recording drive.mcap        your own recording
 
 The floor reads and decompresses every chunk, then writes prepared tables of the same rows with the same settings.
@@ -26,6 +28,7 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 
+import native
 from measure import Sample, run, typical
 from workloads import BY_NAME, LONG, SHORT, WORKLOADS, Workload
 
@@ -129,6 +132,22 @@ def peer_speed(recording: Path, runs: int, python: Path, injector: str = "mosaic
     return rows / typical(samples).wall_s
 
 
+def peer_seconds(recording: Path, python: Path, injector: str) -> float:
+    """Return the time of the official injector for the complete recording, in one run."""
+    with discard_server() as (port, _):
+        command = [
+            python.parent / injector,
+            recording,
+            "--name",
+            "run",
+            "--host",
+            "127.0.0.1",
+            "--port",
+            port,
+        ]
+        return run([*command, "--log", "ERROR"]).wall_s
+
+
 @contextmanager
 def discard_server() -> Iterator[tuple[str, list[int]]]:
     """Run the server that discards rows; yield its port and a list to which the number of rows is added at the end."""
@@ -197,6 +216,29 @@ def start_up(folder: Path, runs: int) -> dict[str, float]:
     }
 
 
+def compare_native(arguments: argparse.Namespace, runs: int) -> None:
+    """Compare the selected MCAP recordings with Rerun's converter, which reads no other format."""
+    print(native.HEAD)
+    contests: list[native.Contest] = []
+    for case in cases(arguments):
+        if case.recording.suffix != ".mcap":
+            continue
+        contest = native.compare(
+            case.recording,
+            INGEST,
+            arguments.native,
+            runs=runs,
+            folder=HERE / "data",
+            floor_seconds=floor_seconds,
+        )
+        if arguments.peer:
+            contest.peer_s = peer_seconds(case.recording, arguments.peer, case.injector)
+        native.print_contest(contest)
+        contests.append(contest)
+    native.print_differences(contests)
+    native.write_contests(contests, arguments.json)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -209,6 +251,7 @@ def main() -> None:
     parser.add_argument(
         "--peer", type=Path, metavar="PYTHON", help="Python of a virtual environment with mosaicolabs"
     )
+    parser.add_argument("--native", type=Path, metavar="RERUN", help="the program `rerun` of rerun-sdk 0.41")
     parser.add_argument("--data", type=Path, default=HERE / "data", help="folder of the generated recordings")
     parser.add_argument(
         "--json", type=Path, default=HERE / "data" / "results.json", help="file for the figures"
@@ -217,6 +260,9 @@ def main() -> None:
     runs = arguments.runs or (1 if arguments.quick else 3)
     (HERE / "data").mkdir(exist_ok=True)
     run([*INGEST, "--help"])  # compile the sources before the first measured run
+    if arguments.native:
+        compare_native(arguments, runs)
+        return
     print(HEAD)
     results: list[Result] = []
     for case in cases(arguments):
