@@ -42,18 +42,12 @@ def job(**fields: Any) -> Job:
 
 
 @pytest.mark.promise("config-arguments")
-def test_config_reference_example_builds_job() -> None:
-    result = ROSInjectionConfig(
+def test_config_arguments_become_sections_of_a_job_that_can_be_pickled() -> None:
+    result = config(
         file_path=Path("data/session_01.db3"),
-        sequence_name="test_ros_sequence",
-        metadata={"driver_version": "v2.1", "weather": "sunny", "location": "test_track_A"},
         topics=["/cam*"],
-        ros_distro=Stores.ROS2_HUMBLE,
         custom_msgs=[("my_custom_pkg", Path("./definitions/my_pkg/"), Stores.ROS2_HUMBLE)],
         adapter_override={"/camera/depth/points": MyCustomRGBDAdapter},
-        log_level="WARNING",
-        on_error=SessionLevelErrorPolicy.Report,
-        topics_on_error=TopicLevelErrorPolicy.Raise,
     )
     assert result.job.paths == (Path("data/session_01.db3"),)
     assert result.job.topics == ("/cam*",)

@@ -45,10 +45,22 @@ def test_foxglove_message_becomes_the_same_row_in_every_form(
     assert row_of(name, text, JsonCodec(text).to_dict(json_payload(message))) == expected
 
 
-def test_foxglove_types_have_a_default_adapter_except_log() -> None:
-    names = [name for name in MESSAGES if name != "Log"]
+def test_foxglove_types_whose_fields_have_columns_have_a_default_adapter() -> None:
+    without_default = {"JointStates", "Log"}
+    names = MESSAGES.keys() - without_default
     assert all(f"foxglove.{name}" in BY_TYPE and f"foxglove_msgs/msg/{name}" in BY_TYPE for name in names)
-    assert "foxglove.Log" not in BY_TYPE
+    assert not [name for name in without_default if f"foxglove.{name}" in BY_TYPE]
+
+
+def test_foxglove_values_that_are_absent_are_nan() -> None:
+    message = {"joints": [{"name": "elbow", "position": 0.5}]}
+    row = row_of("JointStates", protobuf_definition("JointStates"), message)
+    assert row["positions"] == [0.5]
+    assert np.isnan([*row["velocities"], *row["efforts"]]).all()
+    message = {key: value for key, value in MESSAGES["Odometry"].items() if "velocity" not in key}
+    definition = json_definition("Odometry")
+    row = row_of("Odometry", definition, JsonCodec(definition).to_dict(json_payload(message)))
+    assert np.isnan([row["velocity"]["linear"][axis] for axis in "xyz"]).all()
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from protobuf_schemas import SCALARS, definition_of, file_set, message_class, proto2_file, proto3_file
+from protobuf_schemas import (
+    SCALARS,
+    definition_of,
+    editions_file,
+    file_set,
+    message_class,
+    proto2_file,
+    proto3_file,
+)
 
 from mosaico_ingest.decode.base import Decoded, DictDecoder
 from mosaico_ingest.decode.protobuf import ProtobufDecoder
@@ -153,6 +161,43 @@ def test_decoder_proto2_messages_equal_googles_parser(
     payloads = data.draw(st.lists(st.one_of(source, damaged(source)), min_size=5, max_size=8))
     slow = DictDecoder(definition.shape, ProtobufCodec(definition)).decode(block_of(payloads))
     check_same(ProtobufDecoder(definition).decode(block_of(payloads)), slow)
+
+
+NEW_FIELDS = st.fixed_dictionaries(
+    {},
+    optional={
+        **dict.fromkeys(("explicit", "implicit", "required"), INT[32]),
+        "unverified": TEXT,
+        **{name: st.lists(INT[32], max_size=3) for name in ("expanded", "packed")},
+        "open": st.integers(-1, 4),
+        "closed": st.integers(0, 1),
+        "closed_list": st.lists(st.integers(0, 1), max_size=3),
+        "inner": st.fixed_dictionaries({}, optional={"x": st.floats(allow_nan=False)}),
+    },
+)
+
+
+@pytest.mark.parametrize("delimited", [False, True])
+@given(data=st.data())
+def test_decoder_messages_of_editions_equal_googles_parser(data: st.DataObject, *, delimited: bool) -> None:
+    file = editions_file(delimited=delimited)
+    definition, kind = definition_of(file, "all.New"), message_class(file, "all.New")
+    source = NEW_FIELDS.map(lambda values: kind(**values).SerializePartialToString())
+    payloads = data.draw(st.lists(st.one_of(source, damaged(source)), min_size=5, max_size=8))
+    slow = DictDecoder(definition.shape, ProtobufCodec(definition)).decode(block_of(payloads))
+    check_same(ProtobufDecoder(definition).decode(block_of(payloads)), slow)
+
+
+def test_decoder_features_of_editions_decide_about_presence_text_and_enums() -> None:
+    definition = definition_of(editions_file(), "all.New")
+    # Field 3 is required, 4 an unverified string, 7 an open enum, and 8 a closed one.
+    payload = b"\x18\x05\x22\x01a\x38\x09\x40\x09"
+    row = ProtobufDecoder(definition).decode(block_of([payload] * 6)).rows[0].as_py()
+    assert (row["explicit"], row["implicit"], row["required"]) == (None, 0, 5)
+    assert (row["unverified"], row["open"], row["closed"]) == ("a", 9, None)
+    assert [failure.rule for failure in ProtobufDecoder(definition).decode(block_of([b""] * 6)).failures] == (
+        6 * ["protobuf"]
+    )
 
 
 def test_decoder_absent_fields_are_null_or_default() -> None:

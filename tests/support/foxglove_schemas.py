@@ -63,6 +63,20 @@ MESSAGES: dict[str, dict[str, Any]] = {
         "r": [float(number) for number in range(9)],
         "p": [float(number) for number in range(12)],
     },
+    "JointStates": {
+        "timestamp": _HEAD["timestamp"],
+        "joints": [{"name": "elbow", "position": 0.5, "velocity": 1.5, "acceleration": 2.5, "effort": 3.5}],
+    },
+    "Odometry": {
+        **_HEAD,
+        "body_frame_id": "base",
+        "pose": _POSE,
+        "linear_velocity": _POSE["position"],
+        "angular_velocity": _POSE["position"],
+        "pose_covariance": [1.0] + 35 * [0.0],
+        "velocity_covariance": [2.0] + 35 * [0.0],
+        "metadata": [{"key": "k", "value": "v"}],
+    },
     "Log": {
         "timestamp": _HEAD["timestamp"],
         "level": 2,
@@ -83,6 +97,10 @@ _NESTED = {
     "rotation": "Quaternion",
     "transforms": "FrameTransform",
     "fields": "PackedElementField",
+    "joints": "JointState",
+    "linear_velocity": "Vector3",
+    "angular_velocity": "Vector3",
+    "metadata": "KeyValuePair",
 }
 _ENUMS = {"type": "NumericType", "level": "Level", "position_covariance_type": "PositionCovarianceType"}
 _UPPER = {"d": "D", "k": "K", "r": "R", "p": "P"}

@@ -8,6 +8,7 @@ from typing import Any
 from google.protobuf import descriptor_pool, message_factory, struct_pb2, timestamp_pb2, wrappers_pb2
 from google.protobuf.descriptor_pb2 import (
     DescriptorProto,
+    FeatureSet,
     FieldDescriptorProto,
     FileDescriptorProto,
     FileDescriptorSet,
@@ -114,6 +115,36 @@ def proto2_file(*, group: bool = False) -> FileDescriptorProto:
         part = old.nested_type.add(name="Part")
         _field(part, "size", F.TYPE_INT32)
         _field(old, "part", ".all.Old.Part", type=F.TYPE_GROUP, label=F.LABEL_REPEATED)
+    return file
+
+
+def editions_file(*, delimited: bool = False) -> FileDescriptorProto:
+    """Return a file of edition 2023 whose message `all.New` sets the features that change how bytes are read."""
+    file = FileDescriptorProto(name="new.proto", package="all", syntax="editions", edition="EDITION_2023")
+    for name, kind in (("Open", FeatureSet.OPEN), ("Closed", FeatureSet.CLOSED)):
+        enum = file.enum_type.add(name=name)
+        enum.options.features.enum_type = kind
+        for number in range(2):
+            enum.value.add(name=f"{name.upper()}_{number}", number=number)
+    inner = file.message_type.add(name="Inner")
+    _field(inner, "x", F.TYPE_DOUBLE)
+    message = file.message_type.add(name="New")
+    _field(message, "explicit", F.TYPE_INT32)
+    implicit = _field(message, "implicit", F.TYPE_INT32)
+    implicit.options.features.field_presence = FeatureSet.IMPLICIT
+    required = _field(message, "required", F.TYPE_INT32)
+    required.options.features.field_presence = FeatureSet.LEGACY_REQUIRED
+    unverified = _field(message, "unverified", F.TYPE_STRING)
+    unverified.options.features.utf8_validation = FeatureSet.NONE
+    expanded = _field(message, "expanded", F.TYPE_INT32, label=F.LABEL_REPEATED)
+    expanded.options.features.repeated_field_encoding = FeatureSet.EXPANDED
+    _field(message, "packed", F.TYPE_INT32, label=F.LABEL_REPEATED)
+    _field(message, "open", ".all.Open", type=F.TYPE_ENUM)
+    _field(message, "closed", ".all.Closed", type=F.TYPE_ENUM)
+    _field(message, "closed_list", ".all.Closed", type=F.TYPE_ENUM, label=F.LABEL_REPEATED)
+    nested = _field(message, "inner", ".all.Inner")
+    if delimited:
+        nested.options.features.message_encoding = FeatureSet.DELIMITED
     return file
 
 
