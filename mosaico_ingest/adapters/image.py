@@ -60,7 +60,7 @@ def grayscale_pixels(png: bytes) -> bytes:
 
 def _unfiltered(png: bytes) -> bytes:
     try:
-        from PIL import Image  # noqa: PLC0415 - the extra `images`
+        from PIL import Image  # noqa: PLC0415 - an optional library
     except ImportError as error:
         raise missing_library("Pillow", "images") from error
     with Image.open(BytesIO(png), formats=["PNG"]) as picture:

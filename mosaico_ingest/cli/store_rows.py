@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -12,7 +12,15 @@ from rich.text import Text
 
 from mosaico_ingest.cli.console import PlainTable, Terminal, print_json, print_line
 from mosaico_ingest.cli.options import DEFAULT_STORE, JsonOption, StoreOption
-from mosaico_ingest.report.units import bytes_text, count_text, counted, rate_text, seconds_text, time_text
+from mosaico_ingest.report.units import (
+    bytes_text,
+    count_text,
+    counted,
+    interval_text,
+    rate_text,
+    seconds_text,
+    time_text,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -61,10 +69,9 @@ def head(
     """Print the first rows of a topic, or the first rows from a time on."""
     from mosaico_ingest.view.rows import first_rows
 
-    topic = open_topic(store, path)
-    start_ns = None if at is None else time_option(topic, at)
-    table = first_rows(topic, count, columns=_top_level(topic, columns), start_ns=start_ns)
-    _print_rows(topic, table, columns, flatten=flatten, as_json=as_json, as_csv=as_csv)
+    rows = _RowView(store, path, columns, flatten=flatten, as_json=as_json, as_csv=as_csv)
+    start_ns = None if at is None else time_option(rows.topic, at)
+    rows.print(first_rows(rows.topic, count, columns=rows.top_level, start_ns=start_ns))
 
 
 def tail(
@@ -84,10 +91,9 @@ def tail(
     """Print the last rows of a topic, or the last rows until a time."""
     from mosaico_ingest.view.rows import last_rows
 
-    topic = open_topic(store, path)
-    end_ns = None if at is None else time_option(topic, at)
-    table = last_rows(topic, count, columns=_top_level(topic, columns), end_ns=end_ns)
-    _print_rows(topic, table, columns, flatten=flatten, as_json=as_json, as_csv=as_csv)
+    rows = _RowView(store, path, columns, flatten=flatten, as_json=as_json, as_csv=as_csv)
+    end_ns = None if at is None else time_option(rows.topic, at)
+    rows.print(last_rows(rows.topic, count, columns=rows.top_level, end_ns=end_ns))
 
 
 def sample(
@@ -109,13 +115,12 @@ def sample(
     """Print rows at equal distances, or the rows nearest to some times."""
     from mosaico_ingest.view.rows import rows_near, sampled_rows
 
-    topic = open_topic(store, path)
-    names = _top_level(topic, columns)
+    rows = _RowView(store, path, columns, flatten=flatten, as_json=as_json, as_csv=as_csv)
     if at:
-        table = rows_near(topic, [time_option(topic, text) for text in at], columns=names)
+        times_ns = [time_option(rows.topic, text) for text in at]
+        rows.print(rows_near(rows.topic, times_ns, columns=rows.top_level))
     else:
-        table = sampled_rows(topic, count, columns=names)
-    _print_rows(topic, table, columns, flatten=flatten, as_json=as_json, as_csv=as_csv)
+        rows.print(sampled_rows(rows.topic, count, columns=rows.top_level))
 
 
 def describe(
@@ -190,13 +195,6 @@ def _opened(store: str) -> Store:
     return Store.open(store, create=False)
 
 
-def _top_level(topic: TopicInfo, columns: str | None) -> list[str] | None:
-    """Return the top-level columns that contain the selected ones; raises a usage error for an unknown one."""
-    if columns is None:
-        return None
-    return list(dict.fromkeys(column.partition(".")[0] for column in _selected(topic, columns)))
-
-
 def _selected(topic: TopicInfo, columns: str) -> list[str]:
     from mosaico_ingest.findings import suggest_names
     from mosaico_ingest.view.columns import struct_paths
@@ -210,45 +208,74 @@ def _selected(topic: TopicInfo, columns: str) -> list[str]:
     return names
 
 
-def _print_rows(
-    topic: TopicInfo,
-    table: pa.Table,
-    columns: str | None,
-    *,
-    flatten: bool,
-    as_json: bool,
-    as_csv: bool,
-) -> None:
-    from mosaico_ingest.view.columns import flat_columns, path_values, time_values
-    from mosaico_ingest.view.values import flat_text, json_value
+class _RowView:
+    """A topic, its selected columns, and the form in which its rows are printed."""
 
-    names = [table.schema.names[0], *(_selected(topic, columns) if columns else table.schema.names[1:])]
-    cells = {name: path_values(table, name) for name in dict.fromkeys(names)}
-    if flatten or as_csv:
-        cells = {path: values for name, array in cells.items() for path, values in flat_columns(name, array)}
-        cells = {path: time_values(values) for path, values in cells.items()} if as_csv else cells
-    if as_json:
-        lists = {name: values.to_pylist() for name, values in cells.items()}
-        print_json([json_value({name: lists[name][row] for name in lists}) for row in range(table.num_rows)])
-    elif as_csv:
-        writer = csv.writer(sys.stdout)
-        writer.writerow(cells)
-        writer.writerows(
-            zip(*([flat_text(each) for each in values.to_pylist()] for values in cells.values()), strict=True)
-        )
-    elif not table.num_rows:
-        print_line(f"{topic.sequence}{topic.name}: no rows here")
-    else:
-        empty = [name for name, values in cells.items() if values.null_count == len(values)]
-        texts = {
-            name: _cell_texts(values, is_time=at == 0)
-            for at, (name, values) in enumerate(cells.items())
-            if name not in empty
-        }
-        _print_texts(texts)
-        if empty:
-            noun = "column is" if len(empty) == 1 else "columns are"
-            print_line(f"{count_text(len(empty))} more {noun} null in these rows", style="dim")
+    def __init__(
+        self, store: str, path: str, columns: str | None, *, flatten: bool, as_json: bool, as_csv: bool
+    ) -> None:
+        """Open the topic.
+
+        Raises:
+            BadParameter: The path names no topic, or a column does not exist.
+        """
+        self.topic = open_topic(store, path)
+        self._paths = None if columns is None else _selected(self.topic, columns)
+        self._flatten, self._as_json, self._as_csv = flatten, as_json, as_csv
+
+    @property
+    def top_level(self) -> list[str] | None:
+        """The top-level columns that contain the selected ones; None for all columns."""
+        return self._paths and list(dict.fromkeys(path.partition(".")[0] for path in self._paths))
+
+    def print(self, table: pa.Table) -> None:
+        """Print rows of the topic as JSON, as CSV, or for people."""
+        from mosaico_ingest.view.columns import flat_columns, path_values, time_values
+
+        names = [table.schema.names[0], *(self._paths or table.schema.names[1:])]
+        cells = {name: path_values(table, name) for name in dict.fromkeys(names)}
+        if self._flatten or self._as_csv:
+            cells = {
+                path: values for name, array in cells.items() for path, values in flat_columns(name, array)
+            }
+        if self._as_json:
+            _print_json(cells, table.num_rows)
+        elif self._as_csv:
+            _print_csv({path: time_values(values) for path, values in cells.items()})
+        elif table.num_rows:
+            _print_columns(cells)
+        else:
+            print_line(f"{self.topic.sequence}{self.topic.name}: no rows here")
+
+
+def _print_json(cells: Mapping[str, pa.Array[Any]], rows: int) -> None:
+    from mosaico_ingest.view.values import json_value
+
+    lists = {name: values.to_pylist() for name, values in cells.items()}
+    print_json([json_value({name: lists[name][row] for name in lists}) for row in range(rows)])
+
+
+def _print_csv(cells: Mapping[str, pa.Array[Any]]) -> None:
+    from mosaico_ingest.view.values import flat_text
+
+    writer = csv.writer(sys.stdout)
+    writer.writerow(cells)
+    columns = ([flat_text(value) for value in values.to_pylist()] for values in cells.values())
+    writer.writerows(zip(*columns, strict=True))
+
+
+def _print_columns(cells: Mapping[str, pa.Array[Any]]) -> None:
+    """Print the columns with values; the first column is the time."""
+    empty = [name for name, values in cells.items() if values.null_count == len(values)]
+    texts = {
+        name: _cell_texts(values, is_time=at == 0)
+        for at, (name, values) in enumerate(cells.items())
+        if name not in empty
+    }
+    _print_texts(texts)
+    if empty:
+        noun = "column is" if len(empty) == 1 else "columns are"
+        print_line(f"{count_text(len(empty))} more {noun} null in these rows", style="dim")
 
 
 def _cell_texts(values: pa.Array[Any], *, is_time: bool) -> list[str]:
@@ -292,8 +319,8 @@ def _print_timings(info: SequenceInfo, timings: Sequence[tuple[TopicInfo, TopicT
             topic.ontology.tag,
             count_text(timing.rows),
             bytes_text(topic.stored_bytes),
-            _rate(timing.rate_hz),
-            _short_time(timing.jitter_s),
+            rate_text(timing.rate_hz),
+            _jitter(timing),
             count_text(timing.timeline.gap_count if timing.timeline else 0),
             "" if longest is None else seconds_text(longest / 1e9),
         )
@@ -306,7 +333,7 @@ def _print_topic_statistics(described: TopicStatistics, *, every: bool) -> None:
     span = f"{time_text(timing.start_ns)} .. {time_text(timing.end_ns)} UTC"
     facts = [described.ontology, counted(timing.rows, "row"), span]
     if timing.rate_hz is not None:
-        facts += [_rate(timing.rate_hz), f"jitter {_short_time(timing.jitter_s)}"]
+        facts += [rate_text(timing.rate_hz), f"jitter {_jitter(timing)}"]
     print_line(", ".join(facts))
     if timing.timeline is not None and timing.timeline.gap_count:
         _print_gaps(timing)
@@ -364,19 +391,8 @@ def _type_text(column: ColumnStatistics) -> str:
     return f"{item}[{shortest if shortest == longest else f'{shortest}..{longest}'}]"
 
 
-def _rate(rate_hz: float | None) -> str:
-    if rate_hz is None or rate_hz >= 1:
-        return rate_text(rate_hz)
-    return f"{rate_hz:.3g} Hz"
-
-
-def _short_time(seconds: float | None) -> str:
-    if seconds is None:
-        return ""
-    for factor, unit in ((1, "s"), (1e3, "ms")):
-        if seconds * factor >= 1:
-            return f"{seconds * factor:.3g} {unit}"
-    return f"{seconds * 1e6:.0f} µs"
+def _jitter(timing: TopicTiming) -> str:
+    return interval_text(timing.timeline.jitter_ns) if timing.timeline else ""
 
 
 def _builtin(value: Any) -> Any:  # noqa: ANN401 - msgspec's hook

@@ -49,23 +49,18 @@ def sql(
     A topic such as /gps/fix is the table SEQUENCE."gps/fix" or SEQUENCE.gps_fix.
     """
     from mosaico_ingest.destinations.store import Store
-    from mosaico_ingest.errors import ViewError
+    from mosaico_ingest.view.images import require_suffix
     from mosaico_ingest.view.sql import run_query
 
-    suffix = out.suffix.lower() if out is not None else ""
-    if out is not None and suffix not in {".parquet", ".csv", ".json"}:
-        raise ViewError(
-            f"{suffix or 'no suffix'} is no supported suffix",
-            where=str(out),
-            hint="use .parquet, .csv or .json",
-        )
+    if out is not None:
+        require_suffix(out, (".parquet", ".csv", ".json"))
     opened = Store.open(store, create=False)
     if query is None:
         _print_tables(opened, as_json=as_json)
         return
     reader = run_query(opened, query)
     if out is not None:
-        rows = _write(reader, out, suffix)
+        rows = _write(reader, out, out.suffix.lower())
         print_line(f"wrote {out}: {counted(rows, 'row')}", stderr=True)
     elif as_csv:
         _write_csv(reader, sys.stdout)

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import base64
-import io
 from collections.abc import Sequence
-from importlib import import_module
-from typing import Any
 
 import numpy as np
 from msgspec import Struct
@@ -15,7 +12,7 @@ from mosaico_ingest.destinations.store.model import TopicInfo
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.report.units import time_text
 from mosaico_ingest.view.clouds import grid_step
-from mosaico_ingest.view.images import Pixels, fit_pixels, has_images, png_bytes
+from mosaico_ingest.view.images import Pixels, fit_pixels, has_images, jpeg_bytes, png_bytes
 from mosaico_ingest.view.pictures import row_picture
 from mosaico_ingest.view.rows import sampled_rows
 from mosaico_ingest.view.tracks import Track, local_metres
@@ -150,11 +147,7 @@ def _meters(length: float) -> str:
 
 
 def _jpeg_url(pixels: Pixels) -> str:
-    buffer = io.BytesIO()
-    image: Any = import_module("PIL.Image")  # `fit_pixels` raises if it is not installed
-    thumbnail = fit_pixels(pixels, width=WIDTH, height=HEIGHT)
-    image.fromarray(thumbnail).save(buffer, "JPEG", quality=QUALITY)
-    return _url("jpeg", buffer.getvalue())
+    return _url("jpeg", jpeg_bytes(fit_pixels(pixels, width=WIDTH, height=HEIGHT), quality=QUALITY))
 
 
 def _png_url(pixels: Pixels) -> str:

@@ -123,7 +123,7 @@ def _violations(at: int, report: Report) -> Iterator[_Entry]:
             at=at,
             messages=0,
             title=lambda _, name=result.expectation: f"Expectation {name} failed",
-            reason=f"{result.topic}: {result.text}" if result.topic else result.text,
+            reason=result.line,
             advice=f"Correct the source of the data, or the expectation at {location} if the data are right.",
             is_error=True,
         )

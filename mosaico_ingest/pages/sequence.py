@@ -15,8 +15,15 @@ from mosaico_ingest.pages.design import render
 from mosaico_ingest.pages.pictures import Map, Strip, draw_map, picture_strip
 from mosaico_ingest.pages.plots import TopicPlots, topic_plots
 from mosaico_ingest.pages.snippets import sequence_snippets
-from mosaico_ingest.pages.timeline import Axis, Track, draw_track, interval_text, rate_text, time_axis
-from mosaico_ingest.report.units import bytes_text, count_text, seconds_text, time_text
+from mosaico_ingest.pages.timeline import Axis, Track, draw_track, optional_span, time_axis
+from mosaico_ingest.report.units import (
+    bytes_text,
+    count_text,
+    interval_text,
+    rate_text,
+    seconds_text,
+    time_text,
+)
 from mosaico_ingest.version import __version__
 from mosaico_ingest.view.images import has_images
 from mosaico_ingest.view.logs import LogExcerpt, has_log, read_excerpt
@@ -183,13 +190,11 @@ def _topic_view(topic: TopicInfo, statistics: TopicStatistics | None, axis: Axis
         rate_text(timing.rate_hz) if timing else "",
         interval_text(timeline.jitter_ns) if timeline else "",
         timeline.gap_count if timeline else 0,
-        draw_track(axis, topic.name, timeline, span=_row_span(topic)) if axis is not None else None,
+        draw_track(axis, topic.name, timeline, span=optional_span(topic.start_ns, topic.end_ns))
+        if axis is not None
+        else None,
         tuple(map(_column, statistics.columns)) if statistics else (),
     )
-
-
-def _row_span(topic: TopicInfo) -> tuple[int, int] | None:
-    return None if topic.start_ns is None or topic.end_ns is None else (topic.start_ns, topic.end_ns)
 
 
 def _column(column: ColumnStatistics) -> _Column:

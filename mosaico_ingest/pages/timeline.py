@@ -120,6 +120,11 @@ def draw_track(
     )
 
 
+def optional_span(start_ns: int | None, end_ns: int | None) -> Span | None:
+    """Return the span between two times; None if one of them is unknown."""
+    return None if start_ns is None or end_ns is None else (start_ns, end_ns)
+
+
 def gaps_text(timeline: TimelineReport) -> str:
     """Return the number of gaps and the length of the longest, such as `2 gaps, 1.20 s the longest`."""
     if not timeline.gap_count:
@@ -127,23 +132,6 @@ def gaps_text(timeline: TimelineReport) -> str:
     longest_ns = max((gap.end_ns - gap.start_ns for gap in timeline.gaps), default=0)
     text = counted(timeline.gap_count, "gap")
     return f"{text}, {seconds_text(longest_ns / 1e9)}" + ("" if timeline.gap_count == 1 else " the longest")
-
-
-def rate_text(rate_hz: float | None) -> str:
-    """Return a rate with four digits, such as `29.97 Hz`; empty if it is unknown."""
-    if rate_hz is None:
-        return ""
-    return f"{rate_hz:,.0f} Hz" if rate_hz >= 1000 else f"{rate_hz:.4g} Hz"  # noqa: PLR2004 - four digits
-
-
-def interval_text(interval_ns: float | None) -> str:
-    """Return a short interval, such as `2.5 ms`; empty if it is unknown."""
-    if interval_ns is None:
-        return ""
-    for unit, size in (("s", 1e9), ("ms", 1e6), ("µs", 1e3)):
-        if interval_ns >= size:
-            return f"{interval_ns / size:.3g} {unit}"
-    return f"{interval_ns:.0f} ns"
 
 
 def _tick_text(seconds: float, step_s: float) -> str:

@@ -11,7 +11,9 @@ from mosaico_ingest.documents import Part
 from mosaico_ingest.findings import Finding, Severity, Span
 
 
-class _Part(Part):
+class ReportPart(Part):
+    """The base of the parts of a report."""
+
     # Computed fields are written for other programs and ignored when a report is read.
     model_config = ConfigDict(extra="ignore", defer_build=True)
 
@@ -25,7 +27,7 @@ class Outcome(str, Enum):
     """The expectation was not evaluated; `text` has the reason."""
 
 
-class Location(_Part):
+class Location(ReportPart):
     """The location of an expectation in a manifest; lines and columns start at 1, and the end column is exclusive."""
 
     file: str
@@ -40,7 +42,7 @@ class Location(_Part):
         return Span(self.file, self.line, self.column, self.end_line, self.end_column)
 
 
-class Occurrence(_Part):
+class Occurrence(ReportPart):
     """One violation of an expectation."""
 
     log_time_ns: int | None = None
@@ -51,7 +53,7 @@ class Occurrence(_Part):
     """The value, in the unit of the result."""
 
 
-class ExpectationResult(_Part):
+class ExpectationResult(ReportPart):
     """The result of one expectation for the recording or one of its topics."""
 
     expectation: str
@@ -105,7 +107,7 @@ class ExpectationResult(_Part):
         return Finding("expectation-explained", Severity.INFO, text, span) if self.explained else None
 
 
-class ContractResult(_Part):
+class ContractResult(ReportPart):
     """The results of all expectations of one recording."""
 
     on_failure: Literal["fail", "warn", "divert"]

@@ -103,9 +103,8 @@ def _contract_lines(recordings: Sequence[Report]) -> list[str]:
 
 
 def _expectation_row(sequence: str, result: ExpectationResult) -> str:
-    text = f"{result.topic}: {result.text}" if result.topic else result.text
     location = "" if result.location is None else str(result.location.span)
-    cells = (sequence, result.severity.value, result.expectation, text, location)
+    cells = (sequence, result.severity.value, result.expectation, result.line, location)
     return f"| {' | '.join(map(_escape, cells))} |"
 
 

@@ -11,14 +11,13 @@ from typing import Any, TypeVar
 from urllib.parse import quote
 
 import msgspec
-from msgspec import Struct
-from pydantic import BaseModel, ConfigDict, Field, computed_field
+from pydantic import BaseModel, Field, computed_field
 
-from mosaico_ingest.documents import Part, document_schema, read_document
+from mosaico_ingest.documents import document_schema, read_document
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import Stage, one_line
 from mosaico_ingest.notebook import html_table
-from mosaico_ingest.report.contract import ContractResult
+from mosaico_ingest.report.contract import ContractResult, ReportPart
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.timing import TimelineReport, mean_rate_hz
 from mosaico_ingest.report.units import bytes_text, count_text, counted, written_text
@@ -26,15 +25,10 @@ from mosaico_ingest.report.units import bytes_text, count_text, counted, written
 _GRAVEST_FIRST = (130, 5, 1, 2, 6, 3, 4)
 
 
-class _Part(Part):
-    # Computed fields are written for other programs and ignored when a report is read.
-    model_config = ConfigDict(extra="ignore", defer_build=True)
-
-
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
-class Stretch(_Part):
+class Stretch(ReportPart):
     """A range of time, both ends inclusive."""
 
     start_ns: int
@@ -43,7 +37,7 @@ class Stretch(_Part):
     """Last log time, in ns since the epoch."""
 
 
-class Rejection(_Part):
+class Rejection(ReportPart):
     """Messages of one topic that were rejected for the same reason."""
 
     stage: Stage
@@ -62,7 +56,7 @@ class Rejection(_Part):
     """Ranges of log times in which messages were rejected, ordered by time; neighbors are merged beyond 50."""
 
 
-class UnreadableRange(_Part):
+class UnreadableRange(ReportPart):
     """A range of the recording from which messages could not be read."""
 
     topic: str | None
@@ -79,7 +73,7 @@ class UnreadableRange(_Part):
     """Last log time of the range according to the recording's index, inclusive; None if it is unknown."""
 
 
-class TopicReport(_Part):
+class TopicReport(ReportPart):
     """One topic: read = written + filtered + downsampled + rejected.
 
     If the recording was read completely, promised = read + unreadable.
@@ -138,7 +132,7 @@ class TopicReport(_Part):
         return None if rate is None else round(rate, 6)
 
 
-class Totals(_Part):
+class Totals(ReportPart):
     """Sums over the topics that were read."""
 
     promised: int | None
@@ -154,7 +148,7 @@ class Totals(_Part):
     stored_bytes: int
 
 
-class Steps(_Part):
+class Steps(ReportPart):
     """Seconds per step of a run; all steps but `write` add up to its duration."""
 
     prepare: float = 0
@@ -173,7 +167,7 @@ class Steps(_Part):
     """Time that the writing thread was busy, in parallel to the other steps."""
 
 
-class Report(_Part):
+class Report(ReportPart):
     """The result of one recording."""
 
     sequence: str
@@ -232,7 +226,7 @@ class Report(_Part):
         return round(self.totals.stored_bytes / self.source_bytes, 6) if self.source_bytes else None
 
 
-class UsedManifest(_Part):
+class UsedManifest(ReportPart):
     """A manifest of the run, as it was at the start."""
 
     path: str
@@ -240,7 +234,7 @@ class UsedManifest(_Part):
     """The manifest as YAML, with `extends` resolved and without secrets."""
 
 
-class RunReport(_Part):
+class RunReport(ReportPart):
     """The report of one run, with a part for each recording; `version` changes with the format."""
 
     version: int = Field(default=1, ge=1)
@@ -351,33 +345,29 @@ def read_report(path: Path) -> RunReport:
     )
 
 
-class _Raw(Struct, forbid_unknown_fields=True):
-    """The members of a report file whose parts are not parsed yet."""
-
-    version: int
-    tool: str
-    recordings: list[msgspec.Raw]
-    exit_code: int
-    manifests: list[msgspec.Raw] = []
-
-
 def _parse_by_recording(content: bytes) -> RunReport | None:
     """Return the report if the model writes each of its parts byte for byte the same, apart from white space; else None.
 
     Such a report satisfies the published schema, against which validation takes ten times as long. The recordings are
     parsed one by one, because the objects of a complete JSON document need several times the memory of its models.
     """
+    models = {"manifests": UsedManifest, "recordings": Report}
     try:
-        raw = msgspec.json.decode(content, type=_Raw)
-        report = RunReport(
-            version=raw.version,
-            tool=raw.tool,
-            manifests=tuple(_parse_part(part, UsedManifest) for part in raw.manifests),
-            recordings=tuple(_parse_part(part, Report) for part in raw.recordings),
-        )
+        members = msgspec.json.decode(content, type=dict[str, msgspec.Raw])
+        if not members.keys() <= {*RunReport.model_fields, *RunReport.model_computed_fields}:
+            return None
+        values = {
+            name: tuple(
+                _parse_part(part, models[name]) for part in msgspec.json.decode(raw, type=list[msgspec.Raw])
+            )
+            if name in models
+            else msgspec.json.decode(raw)
+            for name, raw in members.items()
+        }
+        report = RunReport.model_validate(values, strict=True)
     except ValueError:  # the base class of the errors of msgspec and pydantic
         return None
-    return report if report.exit_code == raw.exit_code else None
+    return report if report.exit_code == values.get("exit_code") else None
 
 
 def _parse_part(raw: msgspec.Raw, model: type[_Model]) -> _Model:

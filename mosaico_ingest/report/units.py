@@ -37,8 +37,25 @@ def percent_text(share: float) -> str:
 
 
 def rate_text(rate_hz: float | None) -> str:
-    """Return a rate, such as `100.0 Hz`; empty if the rate is unknown."""
-    return "" if rate_hz is None else f"{rate_hz:.1f} Hz"
+    """Return a rate with four digits, such as `29.97 Hz` or `100.0 Hz`; empty if it is unknown."""
+    if rate_hz is None:
+        return ""
+    text = f"{rate_hz:.4g}"
+    if rate_hz >= 1000:  # noqa: PLR2004 - four digits
+        text = f"{rate_hz:,.0f}"
+    elif "." not in text:
+        text = f"{text}.0"
+    return f"{text} Hz"
+
+
+def interval_text(interval_ns: float | None) -> str:
+    """Return a short interval, such as `2.5 ms`; empty if it is unknown."""
+    if interval_ns is None:
+        return ""
+    for unit, size in (("s", 1e9), ("ms", 1e6), ("µs", 1e3)):
+        if interval_ns >= size:
+            return f"{interval_ns / size:.3g} {unit}"
+    return f"{interval_ns:.0f} ns"
 
 
 def seconds_text(seconds: float) -> str:

@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from mosaico_ingest.errors import ViewError, missing_library
+from mosaico_ingest.errors import missing_library
 from mosaico_ingest.report.units import seconds_text, time_text
+from mosaico_ingest.view.images import require_suffix
 from mosaico_ingest.view.series import Series
 
 _DOTS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.uint8)
@@ -79,12 +80,7 @@ def write_chart(series: Sequence[Series], path: Path, *, title: str) -> None:
         ViewError: The suffix is unknown.
         IngestError: Matplotlib is not installed.
     """
-    if path.suffix.lower() not in _SUFFIXES:
-        raise ViewError(
-            f"{path.suffix or 'no suffix'} is no supported suffix",
-            where=str(path),
-            hint=f"use one of {', '.join(_SUFFIXES)}",
-        )
+    require_suffix(path, _SUFFIXES)
     try:
         from matplotlib.figure import Figure  # noqa: PLC0415 - an optional library
     except ImportError as error:

@@ -103,6 +103,17 @@ def png_bytes(pixels: Pixels) -> bytes:
     return buffer.getvalue()
 
 
+def jpeg_bytes(pixels: Pixels, *, quality: int) -> bytes:
+    """Return the picture as a JPEG file; `quality` is 1 to 95.
+
+    Raises:
+        IngestError: Pillow is not installed.
+    """
+    buffer = io.BytesIO()
+    _picture(pixels).save(buffer, "JPEG", quality=quality)
+    return buffer.getvalue()
+
+
 def write_picture(pixels: Pixels, path: Path) -> None:
     """Write the picture as PNG, JPEG or WebP, by the suffix of the file.
 
@@ -110,13 +121,22 @@ def write_picture(pixels: Pixels, path: Path) -> None:
         ViewError: The suffix is unknown.
         IngestError: Pillow is not installed.
     """
-    if path.suffix.lower() not in _SUFFIXES:
+    require_suffix(path, _SUFFIXES)
+    _picture(pixels).save(path)
+
+
+def require_suffix(path: Path, suffixes: Sequence[str]) -> None:
+    """Check that the name of a file has one of the suffixes, in upper or lower case.
+
+    Raises:
+        ViewError: It has not.
+    """
+    if path.suffix.lower() not in suffixes:
         raise ViewError(
             f"{path.suffix or 'no suffix'} is no supported suffix",
             where=str(path),
-            hint=f"use one of {', '.join(_SUFFIXES)}",
+            hint=f"use one of {', '.join(suffixes)}",
         )
-    _picture(pixels).save(path)
 
 
 def contact_sheet(pictures: Sequence[tuple[str, Pixels]], *, columns: int = 4, width: int = 320) -> Pixels:

@@ -33,7 +33,7 @@ _LEVELS = {"debug": "DEBUG", "warning": "WARN", "error": "ERROR", "stale": "WARN
 
 
 class ViewedTopic:
-    """What the viewer shows of one topic: the kinds of views, and rows that it cannot show."""
+    """One topic in the viewer: the kinds of its views, and the rows that the viewer cannot show."""
 
     def __init__(self, topic: TopicInfo) -> None:
         self.topic = topic

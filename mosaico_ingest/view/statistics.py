@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
@@ -66,10 +65,8 @@ class TopicTiming(Struct, frozen=True):
     end_ns: int | None
     rate_hz: float | None
     """Rows per second; see `mean_rate_hz`."""
-    jitter_s: float | None
-    """Standard deviation of the intervals between consecutive rows."""
     timeline: TimelineReport | None
-    """Rows over time, the median interval and the gaps; None without rows."""
+    """Rows over time, the median interval, the jitter and the gaps; None without rows."""
 
 
 class TopicStatistics(Struct, frozen=True):
@@ -124,14 +121,12 @@ def topic_timing(topic: TopicInfo) -> TopicTiming:
 
 @dataclass(slots=True)
 class _Clock:
-    """Intervals between rows, summed up batch by batch."""
+    """The times of rows, batch by batch."""
 
     timeline: Timeline = field(default_factory=Timeline)
     rows: int = 0
     first_ns: int | None = None
     last_ns: int | None = None
-    squares: float = 0.0
-    """Sum of the squared intervals in s²."""
 
     def add(self, times_ns: npt.NDArray[np.int64]) -> None:
         """Add rows in order of time."""
@@ -139,19 +134,13 @@ class _Clock:
             return
         self.timeline.add(times_ns)
         self.rows += len(times_ns)
-        previous = times_ns[:1] if self.last_ns is None else np.array([self.last_ns])
-        intervals = np.diff(times_ns, prepend=previous) / 1e9
-        self.squares += float(np.dot(intervals, intervals))
         self.first_ns = int(times_ns[0]) if self.first_ns is None else self.first_ns
         self.last_ns = int(times_ns[-1])
 
     def timing(self) -> TopicTiming:
         """Return the timing of all rows added so far."""
-        jitter = None
-        rate = mean_rate_hz(self.rows, self.first_ns, self.last_ns)
-        if rate is not None:
-            jitter = math.sqrt(max(0.0, self.squares / (self.rows - 1) - rate**-2))
-        return TopicTiming(self.rows, self.first_ns, self.last_ns, rate, jitter, self.timeline.report())
+        rate_hz = mean_rate_hz(self.rows, self.first_ns, self.last_ns)
+        return TopicTiming(self.rows, self.first_ns, self.last_ns, rate_hz, self.timeline.report())
 
 
 class _Tally:

@@ -29,7 +29,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture
 def output(store: str) -> Callable[..., str]:
-    """Return the function that runs a command of `ingest store` and returns what it prints."""
+    """Return the function that runs a command of `ingest store` and returns its output."""
 
     def run(*words: str, code: int = 0) -> str:
         result = CliRunner().invoke(command_line(["store"]), ["store", *words, "--store", store])

@@ -150,7 +150,7 @@ def open_browser() -> Iterator[Browser]:
         os.dup2(source, 3)
         os.dup2(sink, 4)
 
-    with tempfile.TemporaryDirectory() as profile:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:  # its children may still write
         process = subprocess.Popen(  # noqa: S603 - the browser
             [str(CHROMIUM), *OPTIONS, f"--user-data-dir={profile}"],
             stdout=subprocess.DEVNULL,
