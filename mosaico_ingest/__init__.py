@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     )
     from mosaico_ingest.ontology import Message, Serializable
     from mosaico_ingest.protocol.messages import Permission as APIKeyPermissionEnum
+    from mosaico_ingest.report.model import Report, RunReport
     from mosaico_ingest.rosbag.blocks import ROSMessage
     from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry
     from mosaico_ingest.rosbag.loader import ROSLoader
@@ -56,7 +57,9 @@ __all__ = [
     "ROSLoader",
     "ROSMessage",
     "ROSTypeRegistry",
+    "Report",
     "RosbagInjector",
+    "RunReport",
     "Serializable",
     "SessionLevelErrorPolicy",
     "Store",
@@ -80,7 +83,9 @@ _MODULES = {
     "ROSLoader": "rosbag.loader",
     "ROSMessage": "rosbag.blocks",
     "ROSTypeRegistry": "rosbag.definitions.registry",
+    "Report": "report.model",
     "RosbagInjector": "api",
+    "RunReport": "report.model",
     "Serializable": "ontology",
     "SessionLevelErrorPolicy": "job.values",
     "Store": "destinations.store",

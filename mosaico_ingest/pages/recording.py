@@ -9,8 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from msgspec import Struct
+from msgspec.structs import replace
 
-from mosaico_ingest.pages.timeline import Axis, Span, Track, draw_track, interval_text, rate_text, time_axis
+from mosaico_ingest.errors import IngestError
+from mosaico_ingest.job.values import LoaderErrorPolicy
+from mosaico_ingest.pages.timeline import Axis, Span, Track, draw_track, optional_span, time_axis
 from mosaico_ingest.report.collect import STEP_WORDS, longest_step, step_seconds
 from mosaico_ingest.report.contract import ExpectationResult, Outcome
 from mosaico_ingest.report.events import RunStatus, TopicStatus
@@ -19,11 +22,15 @@ from mosaico_ingest.report.units import (
     bytes_text,
     count_text,
     counted,
+    interval_text,
+    rate_text,
     stored_text,
     time_text,
     unreadable_text,
     written_text,
 )
+from mosaico_ingest.rosbag.loader import ROSLoader
+from mosaico_ingest.view.values import value_text
 
 FAILED = {RunStatus.FAILED, RunStatus.INTERRUPTED}
 STATUS_WORDS = {
@@ -48,6 +55,10 @@ MAX_EXAMPLES = 3
 """Quarantined messages that the page shows for each topic and rule."""
 MAX_INDEX_BYTES = 1 << 20
 """Bytes of a quarantine's index that are searched for examples."""
+MAX_DECODED_BYTES = 16 << 20
+"""Bytes of a quarantine file above which its messages are not decoded."""
+VALUE_WIDTH = 300
+"""Characters of the fields of a quarantined message."""
 MAX_SEARCH_TOPICS = 200
 """Topics by whose names a recording can be found."""
 
@@ -255,7 +266,7 @@ class RecordingView:
     @cached_property
     def examples(self) -> list[QuarantinedMessage]:
         """The first quarantined messages of each topic and rule, if the quarantine can be read."""
-        return list(_examples(self.report)) if self.quarantined else []
+        return _examples(self.report) if self.quarantined else []
 
 
 class TopicView:
@@ -278,7 +289,7 @@ class TopicView:
                 axis,
                 report.target,
                 timeline,
-                span=_row_span(report),
+                span=optional_span(report.start_ns, report.end_ns),
                 rejected=rejected,
                 unreadable=unreadable,
             )
@@ -287,15 +298,47 @@ class TopicView:
 class QuarantinedMessage(Struct, frozen=True):
     """A message in the quarantine."""
 
+    source: str
+    """The topic in the recording."""
+
     topic: str
     rule: str
     log_time_ns: int
     offset: int
     size: int
     reason: str
+    values: str = ""
+    """The decoded fields; empty if the message cannot be decoded."""
 
 
-def _examples(report: Report) -> Iterator[QuarantinedMessage]:
+def _examples(report: Report) -> list[QuarantinedMessage]:
+    """Return the first messages of each topic and rule, with their values as far as they can be decoded."""
+    messages = list(_indexed_messages(report))
+    if not messages or report.quarantine is None:
+        return messages
+    values = _decoded_values(Path(report.quarantine), {(each.source, each.log_time_ns) for each in messages})
+    return [replace(each, values=values.get((each.source, each.log_time_ns), "")) for each in messages]
+
+
+def _decoded_values(quarantine: Path, selected: set[tuple[str, int]]) -> dict[tuple[str, int], str]:
+    """Return the fields of messages by topic and log time; empty for a file that is too large or cannot be read."""
+    values: dict[tuple[str, int], str] = {}
+    try:
+        if quarantine.stat().st_size > MAX_DECODED_BYTES:
+            return {}
+        with ROSLoader(quarantine, error_policy=LoaderErrorPolicy.IGNORE) as messages:
+            for message in messages:
+                key = (message.topic, message.timestamp_ns)
+                if key in selected:
+                    values.setdefault(key, value_text(message.data, VALUE_WIDTH))
+                    if len(values) == len(selected):
+                        break
+    except (IngestError, OSError):
+        return values
+    return values
+
+
+def _indexed_messages(report: Report) -> Iterator[QuarantinedMessage]:
     """Yield the first messages of each topic and rule in the start of the quarantine's index."""
     if report.quarantine is None:
         return
@@ -309,6 +352,7 @@ def _examples(report: Report) -> Iterator[QuarantinedMessage]:
         try:
             entry: dict[str, Any] = json.loads(line)
             message = QuarantinedMessage(
+                str(entry["topic"]),
                 str(entry["target"]),
                 str(entry["rule"]),
                 int(entry["log_time_ns"]),
@@ -322,10 +366,6 @@ def _examples(report: Report) -> Iterator[QuarantinedMessage]:
         counts[key] = counts.get(key, 0) + 1
         if counts[key] <= MAX_EXAMPLES:
             yield message
-
-
-def _row_span(topic: TopicReport) -> Span | None:
-    return None if topic.start_ns is None or topic.end_ns is None else (topic.start_ns, topic.end_ns)
 
 
 def _times(report: Report) -> Iterator[int]:

@@ -36,10 +36,15 @@ LONG = {"inspect", "plan", "report", "show", "describe topic"}
 
 
 def in_terminal(words: list[str], width: int, folder: Path) -> list[str]:
-    """Return the lines that a command prints to a terminal of this width."""
+    """Return the lines that a command of `ingest` prints to a terminal of this width."""
+    return printed(["-m", "mosaico_ingest", *words], width, folder)
+
+
+def printed(arguments: list[str], width: int, folder: Path) -> list[str]:
+    """Return the lines that Python prints to a terminal of this width, including those that it overwrites."""
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 50, width, 0, 0))
-    command = [sys.executable, "-m", "mosaico_ingest", *words]
+    command = [sys.executable, *arguments]
     environment = {name: value for name, value in os.environ.items() if name not in {"COLUMNS", "LINES"}}
     with subprocess.Popen(  # noqa: S603 - our own code
         command, stdin=theirs, stdout=theirs, stderr=theirs, cwd=folder, env={**environment, "TERM": "xterm"}
@@ -114,3 +119,31 @@ def test_narrow_terminal_keeps_values_with_their_names(project: Path) -> None:
     at = lines.index("/joint_states")
     assert "rows: 500" in lines[at + 1]
     assert any("rate: 50.0 Hz" in line for line in lines[at + 1 : at + 4])
+
+
+PROGRESS = """
+from mosaico_ingest.cli import progress
+from mosaico_ingest.report.events import Expected, RunFinished, RunStarted, RunStatus, TopicProgress
+
+progress.time.monotonic = lambda: 5.0
+tally = progress.Tally([1] * 65, started=0.0)
+topic = Expected("/imu", "/imu", "sensor_msgs/msg/Imu", "IMUAdapter", "IMU", "", 3200)
+with progress.live_display(tally) as observe:
+    for at in range(44):
+        observe(at, RunStarted(f"drive_{at}", "store", (), 1, (topic,)))
+        observe(at, TopicProgress("/imu", read=3200 if at else 0, payload_bytes=20_000_000 if at else 0))
+        observe(at, RunFinished(RunStatus.COMPLETED if at else RunStatus.FAILED, 0 if at else 1))
+"""
+
+
+def test_progress_in_terminal_is_the_line_of_the_documentation(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "scale.md").read_text(encoding="utf-8")
+    (documented,) = re.findall(r"^44 of 65 recordings.*$", page, re.MULTILINE)
+    assert documented in printed(["-c", PROGRESS], 200, tmp_path)
+
+
+def test_progress_in_narrow_terminal_is_complete(tmp_path: Path) -> None:
+    lines = printed(["-c", PROGRESS], 60, tmp_path)
+    assert all(len(line) <= 60 for line in lines)
+    at = next(at for at, line in enumerate(lines) if line.startswith("44 of 65"))
+    assert "2.44 s left" in " ".join(lines[at : at + 3])

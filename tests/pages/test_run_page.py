@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,12 +15,17 @@ from typer.testing import CliRunner
 
 from mosaico_ingest.cli.app import command_line
 from mosaico_ingest.findings import Severity
+from mosaico_ingest.pages.recording import VALUE_WIDTH, RecordingView
 from mosaico_ingest.pages.run import MAX_OPEN, run_page
 from mosaico_ingest.report.compare import compare_reports
 from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Occurrence, Outcome
 from mosaico_ingest.report.events import RunStatus
 from mosaico_ingest.report.markdown import markdown_summary
-from mosaico_ingest.report.model import Steps, UnreadableRange
+from mosaico_ingest.report.model import Steps, UnreadableRange, read_report
+from mosaico_ingest.rosbag.loader import ROSLoader
+from mosaico_ingest.view.values import value_text
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.parametrize("name", RUNS)
@@ -189,7 +195,7 @@ def test_run_page_shows_changes_since_the_earlier_run() -> None:
 
 
 def test_run_page_shows_quarantined_examples(tmp_path: Path) -> None:
-    entry = '{"target": "/imu", "rule": "null", "log_time_ns": 5, "offset": 7, "bytes": 9, "reason": "no <b>x</b>"}'
+    entry = '{"topic": "/imu", "target": "/imu", "rule": "null", "log_time_ns": 5, "offset": 7, "bytes": 9, "reason": "no <b>x</b>"}'
     (tmp_path / "q.jsonl").write_text(f"{entry}\n" * 5 + "not JSON\n")
     report = recording(1, RunStatus.WITH_ERRORS).model_copy(update={"quarantine": str(tmp_path / "q.mcap")})
     page = run_page(run(report))
@@ -271,3 +277,20 @@ def test_report_command_1000_recordings_need_less_than_200_mb_and_5_s_of_cpu(tmp
     assert peak_kib < 200_000_000 / 1024
     assert cpu_s < 5
     assert page.stat().st_size < 1_000_000
+
+
+def test_run_page_quarantined_message_that_can_be_decoded_shows_its_values(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(ROOT / "configs", tmp_path / "configs")
+    monkeypatch.chdir(tmp_path)
+    words = ["run", "-q", "configs/examples/quarantine.yaml", "--report", "run.json"]
+    result = CliRunner().invoke(command_line(), words)
+    assert result.exit_code == 4, result.output
+    (one,) = read_report(Path("run.json")).recordings
+    rejected = next(topic for topic in one.topics if topic.quarantined)
+    with ROSLoader("configs/quickstart/drive.mcap", topics=rejected.topic) as messages:
+        values = {each.timestamp_ns: value_text(each.data, VALUE_WIDTH) for each in messages}
+    examples = RecordingView(0, run(one), tmp_path).examples
+    assert examples
+    assert [example.values for example in examples] == [values[example.log_time_ns] for example in examples]
