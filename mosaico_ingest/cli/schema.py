@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+
+from mosaico_ingest.cli.options import JunitOption, SarifOption
+from mosaico_ingest.errors import IngestError
 
 schema_app = typer.Typer()
 
@@ -78,20 +82,26 @@ def lock(
     check: Annotated[
         bool, typer.Option("--check", help="Compare the recordings with the lock file; write nothing.")
     ] = False,
+    junit: JunitOption = None,
+    sarif: SarifOption = None,
 ) -> None:
     """Write the types, fields and output columns of every selected topic to JOB.lock.json.
 
     With `definitions: locked` in the manifest, plans and runs refuse recordings that differ from this file. Without a
-    manifest, print the JSON Schema of lock files. Exit codes of --check: 0 equal, 6 different.
+    manifest, print the JSON Schema of lock files. Exit codes of --check: 0 equal, 6 different. --junit and --sarif write
+    the result of --check.
     """
     from mosaico_ingest import api
     from mosaico_ingest.cli.console import print_line
     from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas
     from mosaico_ingest.report.units import counted
 
+    ci_options = [name for name, value in (("--junit", junit), ("--sarif", sarif)) if value is not None]
+    if manifest is None and (check or ci_options):
+        raise typer.BadParameter("give a manifest", param_hint="JOB.yaml")
+    if ci_options and not check:
+        raise typer.BadParameter("add --check", param_hint=", ".join(ci_options))
     if manifest is None:
-        if check:
-            raise typer.BadParameter("give a manifest", param_hint="JOB.yaml")
         write_schemas([Document.LOCK], None, None)
         return
     from mosaico_ingest.services.lock import check_locked, write_lock
@@ -100,7 +110,8 @@ def lock(
     jobs = api.compile_job(manifest, locked=False)
     hide_pandas(jobs)
     if check:
-        count = check_locked(manifest, jobs)
+        with _ci_files(manifest, junit, sarif):
+            count = check_locked(manifest, jobs)
         print_line(f"{counted(count, 'recording')}: no differences", style="green")
         return
     written = write_lock(manifest, jobs)
@@ -109,6 +120,24 @@ def lock(
     topics = counted(len(written.lock.topics), "topic")
     state = "" if written.is_new else f", {counted(len(written.differences), 'difference')}"
     print_line(f"{written.path}: {topics}{state}", style="bold")
+
+
+@contextmanager
+def _ci_files(manifest: Path, junit: Path | None, sarif: Path | None) -> Generator[None]:
+    """Write the outcome of a check of the lock file as JUnit XML and SARIF, even if the check raises."""
+    error: IngestError | None = None
+    try:
+        yield
+    except IngestError as caught:
+        error = caught
+        raise
+    finally:
+        if junit is not None or sarif is not None:
+            from mosaico_ingest.cli.ci import CheckedRecording, write_ci_files
+
+            text, findings = (None, ()) if error is None else (str(error), error.findings)
+            outcome = CheckedRecording(f"schema lock {manifest}", error=text, findings=findings)
+            write_ci_files([outcome], junit=junit, sarif=sarif)
 
 
 def write_schemas(documents: Sequence[Document], write: Path | None, check: Path | None) -> None:

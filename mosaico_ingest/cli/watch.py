@@ -133,7 +133,7 @@ def watch(
     try:
         while True:
             complete = arrivals.settled(time.monotonic())
-            if complete and not _ingest(manifest, complete, jobs, None if once else arrivals, codes):
+            if complete and not _ingest(manifest, complete, jobs, arrivals, codes, once=once):
                 break
             if not complete and time.monotonic() > deadline:
                 break
@@ -150,25 +150,33 @@ def watch(
 
 
 def _ingest(
-    manifest: Path, paths: tuple[Path, ...], jobs: int, arrivals: Arrivals | None, codes: list[int]
+    manifest: Path, paths: tuple[Path, ...], jobs: int, arrivals: Arrivals, codes: list[int], *, once: bool
 ) -> bool:
     """Ingest recordings, print a line about each, and add its exit code to `codes`.
 
-    `arrivals` schedules another attempt of a recording that failed. Return False if the run was interrupted.
+    Unless the watch runs once, schedule another attempt of a recording that failed. A group consists of all complete
+    recordings of the folder. Return False if the run was interrupted.
     """
     from mosaico_ingest.executors.processes import Processes
+    from mosaico_ingest.pipeline.contract_group import add_group_results
     from mosaico_ingest.pipeline.task import Task
     from mosaico_ingest.report.events import RunStatus, ignore_batch
 
-    work = [(path, job) for path in paths for job in _jobs(manifest, path, arrivals, codes)]
+    def others() -> list[Job]:
+        present = (path for path in arrivals.complete() if path not in paths)
+        return [job for path in present for job in _jobs(manifest, path, None, [])]
+
+    retries = None if once else arrivals
+    work = [(path, job) for path in paths for job in _jobs(manifest, path, retries, codes)]
+    tasks = add_group_results([Task(job) for _, job in work], others)
     # Even a single recording runs in a worker process, so that a crash does not end the watch.
-    reports = Processes(jobs).map([Task(job) for _, job in work], ignore_batch)
+    reports = Processes(jobs).map(tasks, ignore_batch)
     interrupted = False
     for (path, _), report in zip(work, reports, strict=False):
         interrupted = interrupted or report.status is RunStatus.INTERRUPTED
         codes.append(report.exit_code)
         failed = report.exit_code not in {0, 4}
-        retry = _retry_text(arrivals, path) if failed and not interrupted else ""
+        retry = _retry_text(retries, path) if failed and not interrupted else ""
         _print(f"{path}: {_outcome_text(report)}{retry}")
     return not interrupted
 

@@ -197,9 +197,12 @@ class TopicMonitor:
         for rows in self.rows.values():
             rows.finish()
 
-    def observer(self, connection: int, msgtype: str) -> BlockObserver:
-        """Return the observer of the message blocks of a connection."""
-        return BlockObserver(self, connection, msgtype, self.rows.get(connection))
+    def observer(
+        self, connection: int, msgtype: str, *, start_ns: int | None = None, end_ns: int | None = None
+    ) -> BlockObserver:
+        """Return the observer of the message blocks of a connection, which ignores log times outside the range."""
+        rows = self.rows.get(connection)
+        return BlockObserver(self, connection, msgtype, rows, start_ns=start_ns, end_ns=end_ns)
 
 
 @dataclass(slots=True)
@@ -210,30 +213,42 @@ class BlockObserver:
     connection: int
     msgtype: str
     rows: RowMonitor | None
+    start_ns: int | None = None
+    """Start of the observed log times; None for all of them."""
+    end_ns: int | None = None
+    """End of the observed log times, exclusive."""
     _first: int = 0
-    """Position on the topic of the first message of the current block."""
+    """Position on the topic of the first observed message of the current block."""
+    _skipped: int = 0
+    """Number of messages of the current block before the range."""
     _log_times: Int64s = field(default_factory=lambda: np.zeros(0, np.int64))
+    """Log times of the observed messages of the current block."""
 
     def block(self, log_times: Int64s) -> None:
-        """Start with a block of messages."""
-        self._first = self.topic.add_block(self.connection, log_times)
-        self._log_times = log_times
+        """Start with a block of messages, whose log times are sorted."""
+        start = 0 if self.start_ns is None else int(np.searchsorted(log_times, self.start_ns))
+        end = None if self.end_ns is None else int(np.searchsorted(log_times, self.end_ns))
+        self._skipped, self._log_times = start, log_times[start:end]
+        self._first = self.topic.add_block(self.connection, self._log_times)
 
     def messages(self, rows: pa.StructArray, index: Int64s) -> None:
         """Add the decoded messages of the block; `index` is the position of each row in it."""
         if self.rows is not None and self.rows.needs_messages:
-            self.rows.add_messages(rows, self._batch(index), self._envelope(index))
+            self.rows.add_messages(*self._observed(rows, index))
 
     def ontology(self, rows: pa.StructArray, index: Int64s) -> None:
         """Add the ontology rows of the block; `index` is the position of each row in it."""
         if self.rows is not None and self.rows.needs_ontology:
-            self.rows.add_ontology(rows, self._batch(index), self._envelope(index))
+            self.rows.add_ontology(*self._observed(rows, index))
 
-    def _batch(self, index: Int64s) -> Batch:
-        return Batch(self._log_times[index], index + self._first)
-
-    def _envelope(self, index: Int64s) -> Envelope:
-        return Envelope(self.topic.name, self.msgtype, self._log_times[index])
+    def _observed(self, rows: pa.StructArray, index: Int64s) -> tuple[pa.StructArray, Batch, Envelope]:
+        """Return the rows inside the range, with their log times and positions on the topic."""
+        positions = index - self._skipped
+        inside = (positions >= 0) & (positions < len(self._log_times))
+        if not inside.all():
+            rows, positions = rows.filter(pa.array(inside)), positions[inside]
+        times = self._log_times[positions]
+        return rows, Batch(times, positions + self._first), Envelope(self.topic.name, self.msgtype, times)
 
 
 def topic_monitor(contract: Contract, name: str, references: Iterable[str] = ()) -> TopicMonitor | None:

@@ -103,9 +103,11 @@ class RecordingMonitor:
     def observer(self, connection: int) -> BlockObserver | None:
         """Return the observer of the blocks of a connection, None if nothing about its topic is expected."""
         monitor = self._monitors.get(self._connections[connection].topic)
-        return (
-            None if monitor is None else monitor.observer(connection, self._connections[connection].msgtype)
-        )
+        if monitor is None:
+            return None
+        start_ns, end_ns = self._range
+        msgtype = self._connections[connection].msgtype
+        return monitor.observer(connection, msgtype, start_ns=start_ns, end_ns=end_ns)
 
     @property
     def observed(self) -> Mapping[str, TopicMonitor]:

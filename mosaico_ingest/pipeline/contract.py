@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, cast
 
+import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
@@ -55,8 +56,17 @@ class ContractRun(Struct, frozen=True):
         return self.monitor.order
 
     def observe_order(self, split: int, connection: int, block: MessageBlock) -> None:
-        """Observe messages in the order of the files."""
-        if self.monitor.order is not None:
+        """Observe the messages of the time range in the order of the files."""
+        if self.monitor.order is None:
+            return
+        if self.plan.selects_after_reading:
+            inside = np.ones(len(block), bool)
+            if self.plan.read_from_ns is not None:
+                inside &= block.log_times >= self.plan.read_from_ns
+            if self.plan.read_until_ns is not None:
+                inside &= block.log_times < self.plan.read_until_ns
+            block = block.rows(inside)
+        if len(block):
             self.monitor.order.add(split, connection, block)
 
     def conclude(self, request: SequenceRequest, session: Session, observe: Observer) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pyarrow as pa
 
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.bridge import ROSBridge
@@ -13,14 +14,16 @@ from mosaico_ingest.decode.decoder import decoder_for
 from mosaico_ingest.errors import AdapterError, ManifestError
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import Unmodeled
+from mosaico_ingest.pipeline.conditions import bind_conditions
 from mosaico_ingest.pipeline.contract import monitor_of
 from mosaico_ingest.pipeline.plan import Plan, TopicPlan
 from mosaico_ingest.pipeline.planning import plan_recording
 from mosaico_ingest.pipeline.run import open_job
+from mosaico_ingest.pipeline.selection import row_selector, row_times
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.remote import RemotePath
 from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Outcome
-from mosaico_ingest.rosbag.blocks import Connection, MessageBlock
+from mosaico_ingest.rosbag.blocks import Connection, Int64s, MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.recording import Recording
 
@@ -154,7 +157,7 @@ def _observe(plan: Plan, contract: Contract, recording: Recording, monitor: Reco
         return
     connections = {connection.id: connection for connection in recording.connections}
     rows = {
-        key: _Rows(topics[key], connections[key], observer, monitor)
+        key: _Rows(plan, topics[key], connections[key], observer, monitor)
         for key in read
         if (observer := observers[key]) is not None
     }
@@ -183,7 +186,12 @@ class _Rows:
     """Decodes and adapts the blocks of one connection, as far as an expectation needs it."""
 
     def __init__(
-        self, topic: TopicPlan, connection: Connection, observer: BlockObserver, monitor: RecordingMonitor
+        self,
+        plan: Plan,
+        topic: TopicPlan,
+        connection: Connection,
+        observer: BlockObserver,
+        monitor: RecordingMonitor,
     ) -> None:
         self._topic = topic
         self._connection = connection
@@ -200,6 +208,10 @@ class _Rows:
             if self._adapts and definition is not None
             else None
         )
+        self._selector = row_selector(plan, topic)
+        self._conditions = (
+            bind_conditions(topic, definition) if topic.has_conditions and definition is not None else None
+        )
         if self._adapts:
             monitor.reject(topic.topic, 0)
 
@@ -212,16 +224,29 @@ class _Rows:
         if self._decoder is None:
             return
         decoded = self._decoder.decode(block if len(sample) == len(block) else block.rows(sample))
-        index = sample[decoded.index]
-        self._observer.messages(decoded.rows, index)
+        rows, index = self._selected(block, decoded.rows, sample[decoded.index])
+        self._observer.messages(rows, index)
         rejected = len(decoded.failures)
         if self._adapter is not None:
             envelope = Envelope(self._topic.topic, self._topic.msgtype, block.log_times[index])
             try:
-                adapted = self._adapter.adapt(decoded.rows, envelope)
+                adapted = self._adapter.adapt(rows, envelope)
             except AdapterError:
                 rejected += len(index)
             else:
                 self._observer.ontology(adapted.rows, index[adapted.index])
                 rejected += len(adapted.failures)
             self._monitor.reject(self._topic.topic, rejected)
+
+    def _selected(
+        self, block: MessageBlock, rows: pa.StructArray, index: Int64s
+    ) -> tuple[pa.StructArray, Int64s]:
+        """Return the rows that the settings of the topic keep, and their positions in the block."""
+        if self._selector is None:
+            return rows, index
+        log_times = block.log_times[index]
+        publish_times = None if block.publish_times is None else block.publish_times[index]
+        times = row_times(self._topic, rows, log_times, publish_times)
+        envelope = Envelope(self._topic.topic, self._topic.msgtype, log_times)
+        keep, _ = self._selector.select(times.values, rows, envelope, self._conditions)
+        return (rows, index) if keep is None else (rows.filter(pa.array(keep)), index[keep])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from msgspec import structs
 
@@ -17,9 +17,15 @@ from mosaico_ingest.report.contract import ExpectationResult
 from mosaico_ingest.rosbag.recording import time_bounds
 
 
-def add_group_results(tasks: Sequence[Task]) -> list[Task]:
-    """Return the tasks with the results of the expectations of their groups."""
-    results = results_by_job([task.job for task in tasks])
+def add_group_results(tasks: Sequence[Task], present: Callable[[], Sequence[Job]] = tuple) -> list[Task]:
+    """Return the tasks with the results of the expectations of their groups.
+
+    `present` returns the jobs of further recordings of the groups; it is only called if a group has expectations.
+    """
+    jobs = [task.job for task in tasks]
+    if any(job.expect is not None and job.expect.group is not None for job in jobs):
+        jobs += present()
+    results = results_by_job(jobs)
     return [
         structs.replace(task, group=results[position]) if position in results else task
         for position, task in enumerate(tasks)

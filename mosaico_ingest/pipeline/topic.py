@@ -178,8 +178,6 @@ class TopicPipeline:
             for failure in decoded.failures
         ]
         rows, index = decoded.rows, sample[decoded.index]
-        if observer is not None:
-            observer.messages(rows, index)
         publish_times = None if block.publish_times is None else block.publish_times[index]
         times = row_times(self.plan, rows, block.log_times[index], publish_times)
         fallbacks = index[:0] if times.fallback is None else index[times.fallback]
@@ -191,6 +189,8 @@ class TopicPipeline:
             dropped |= {rule: index[mask] for rule, mask in excluded.items()}
             if keep is not None:
                 rows, index, stamps = rows.filter(pa.array(keep)), index[keep], stamps[keep]
+        if observer is not None:
+            observer.messages(rows, index)
         envelope = Envelope(self.plan.topic, self.plan.msgtype, block.log_times[index])
         adapter = self._adapters[block.connection]
         try:

@@ -224,6 +224,10 @@ class SplitReader(Protocol):
         ...
 
 
+ROSBAG2_RECORD, ROSBAG2_ENTRY = "rosbag2", "serialized_metadata"
+"""The metadata record and its entry in which rosbag2 stores the text of `metadata.yaml`."""
+
+
 @runtime_checkable
 class HasMetadataRecords(Protocol):
     """A reader of a container that can contain metadata records."""

@@ -31,6 +31,8 @@ from mosaico_ingest.rosbag.batching import (
 from mosaico_ingest.rosbag.blocks import (
     EARLIEST_NS,
     LATEST_NS,
+    ROSBAG2_ENTRY,
+    ROSBAG2_RECORD,
     ChunkChecksum,
     Connection,
     Encoding,
@@ -67,8 +69,6 @@ _PREFETCH_CPUS = 3
 """Minimum number of CPUs for a prefetch thread: decoding and writing already use one thread each."""
 _BLOCKS_IN_MEMORY = 4
 """The memory limit divided by the size of one read, without prefetching; prefetching doubles it."""
-_ROSBAG2_RECORD, _ROSBAG2_ENTRY = "rosbag2", "serialized_metadata"
-"""The metadata record and its entry in which rosbag2 stores the text of `metadata.yaml`."""
 _MAX_ROWS = 1 << 16
 _MEMORY_BYTES = 64 << 20
 _SLICE_BYTES, _MAX_SLICE_BYTES, _MAX_SLICES = 32 << 20, 256 << 20, 10_000
@@ -219,7 +219,7 @@ class Recording:
         return tuple(self._unreadable)
 
     def metadata_records(self) -> dict[str, dict[str, str]]:
-        """Return the entries of the MCAP metadata records by name; later splits take precedence.
+        """Return the entries of the metadata records by name; later splits take precedence.
 
         Raises:
             BagError: The file cannot be read.
@@ -233,14 +233,14 @@ class Recording:
         return records
 
     def custom_data(self) -> dict[str, str]:
-        """Return the `custom_data` of rosbag2, from `metadata.yaml` or else from the copy that rosbag2 adds to MCAP files.
+        """Return the `custom_data` of rosbag2, from `metadata.yaml` or else from the copy in the files.
 
         Raises:
             BagError: The file cannot be read.
         """
         if self.metadata is not None:
             return dict(self.metadata.custom_data)
-        text = self.metadata_records().get(_ROSBAG2_RECORD, {}).get(_ROSBAG2_ENTRY)
+        text = self.metadata_records().get(ROSBAG2_RECORD, {}).get(ROSBAG2_ENTRY)
         if text is None:
             return {}
         with suppress(BagError):

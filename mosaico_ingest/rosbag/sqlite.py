@@ -34,6 +34,8 @@ from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.rosbag.blocks import (
     EARLIEST_NS,
     LATEST_NS,
+    ROSBAG2_ENTRY,
+    ROSBAG2_RECORD,
     Encoding,
     Int64s,
     MessageBlock,
@@ -134,6 +136,16 @@ class SqliteReader:
     def _hidden_damage(self) -> str | None:
         """Damage that reading did not reveal, found by a complete check of the file; None without damage."""
         return _check(self._database, "integrity_check")
+
+    def metadata_records(self) -> dict[str, dict[str, str]]:
+        """Return rosbag2's copy of `metadata.yaml` under the name of this record in MCAP files; empty without one."""
+        try:
+            row = self._database.execute("SELECT metadata FROM metadata ORDER BY id DESC").fetchone()
+        except DAMAGE:  # older files have no such table
+            return {}
+        if row is None or not isinstance(row[0], str):
+            return {}
+        return {ROSBAG2_RECORD: {ROSBAG2_ENTRY: row[0]}}
 
     def check_unchanged(self) -> None:
         """Do nothing; see `FileSource.check_unchanged`."""

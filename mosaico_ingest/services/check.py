@@ -11,8 +11,6 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from mosaico_ingest.contracts.clauses import Contract
-from mosaico_ingest.contracts.stored import check_stored
-from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import ContractError, IngestError, ManifestError
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.manifest import check_manifest, read_manifest, refusal
@@ -70,6 +68,9 @@ def check_sequence(
         ManifestError: The file has mistakes, or no section `expect`.
         SinkError: The store does not exist or has no such sequence.
     """
+    from mosaico_ingest.contracts.stored import check_stored  # noqa: PLC0415 - only stored sequences need the store
+    from mosaico_ingest.destinations.store import Store  # noqa: PLC0415 - as above
+
     contract = Contract.of(_contract_job(expect, env))
     if contract is None:
         raise ManifestError(

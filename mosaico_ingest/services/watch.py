@@ -55,6 +55,10 @@ class Arrivals:
         self._arrivals = {path: arrival for path, arrival in self._arrivals.items() if path in states}
         return tuple(path for path, files in sorted(states.items()) if self._has_settled(path, files, now))
 
+    def complete(self) -> tuple[Path, ...]:
+        """Return all recordings that are complete, including those of earlier calls of `settled`."""
+        return tuple(path for path, arrival in sorted(self._arrivals.items()) if arrival.settled)
+
     def unfinished(self) -> tuple[Path, ...]:
         """Return the recordings that are not settled because their end is missing."""
         return tuple(

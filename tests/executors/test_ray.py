@@ -59,6 +59,12 @@ class Slow(ROSAdapterBase[IMU]):
             cls.said = True
         return IMU(acceleration=Vector3d(x=FACTOR, y=0.0, z=0.0), angular_velocity=Vector3d(x=0.0, y=0.0, z=0.0))
 """
+CONTRACT = """
+expect:
+  on_failure: warn
+  group: {starts: {within: 1 s}}
+  topics: {/imu: {rate: {min: 150 Hz}, fields: {acceleration.x: {equals: 2.0}}}}
+"""
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +114,8 @@ def outcome(folder: Path) -> list[dict[str, Any]]:
 def test_ray_cluster_gives_the_same_result_as_one_machine(cluster: Any, tmp_path: Path) -> None:
     here, there = tmp_path / "here", tmp_path / "there"
     for folder in (here, there):
-        make_job(folder, "abcd")
+        with make_job(folder, "abcd").open("a") as manifest:
+            manifest.write(CONTRACT)
     code, output = ended(ingest(here))
     assert code == 0, output
     code, output = ended(
@@ -116,6 +123,8 @@ def test_ray_cluster_gives_the_same_result_as_one_machine(cluster: Any, tmp_path
     )
     assert code == 0, output
     assert outcome(there) == outcome(here)
+    results = [one["outcome"] for one in outcome(there)[0]["contract"]["results"]]
+    assert results == ["passed", "failed", "passed"]
     ours, theirs = Store.open(here / "store"), Store.open(there / "store")
     assert theirs.names() == ours.names() == tuple("abcd")
     for name in ours.names():

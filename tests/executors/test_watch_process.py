@@ -101,6 +101,17 @@ def test_watch_ingests_renamed_file_immediately_and_slow_copy_after_rest(watch: 
     assert set(watch.names()) == {"a", "slow"}
 
 
+def test_watch_evaluates_group_of_all_complete_recordings(watch: Watch) -> None:
+    with (watch.folder / "job.yaml").open("a") as manifest:
+        manifest.write('expect: {group: {files: ["a.mcap", "b.mcap"], starts: {within: 1 s}}}\n')
+    shutil.copy(DRIVE, watch.folder / "in" / "a.mcap")
+    watch.start()
+    watch.until(lambda: "in/a.mcap: failed" in watch.said())
+    assert "no file for 'b.mcap' among 1 recording" in watch.said()
+    shutil.copy(DRIVE, watch.folder / "in" / "b.mcap")
+    watch.until(lambda: "in/b.mcap: completed as b" in watch.said())
+
+
 def test_watch_stopped_by_signal_exits_0(watch: Watch) -> None:
     process = watch.start()
     process.send_signal(signal.SIGTERM)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 from metadata_files import write
 from msgspec.structs import replace
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 
 from mosaico_ingest import api
 from mosaico_ingest.errors import ContractError, IngestError, ManifestError
@@ -181,6 +185,27 @@ def test_custom_data_is_read_from_record_of_rosbag2(tmp_path: Path) -> None:
     text = "version: 5\nmessage_count: 2\ncustom_data: {vehicle: r1}\n"
     write(tmp_path / "r1_7.mcap", {"rosbag2": {"serialized_metadata": text}})
     job = manifest(tmp_path, "  metadata_from: {custom_data: true}\n")
+    assert plan_of(job).sequence.metadata == {"vehicle": "r1"}
+
+
+def test_custom_data_is_read_from_table_of_db3_file(tmp_path: Path) -> None:
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        types = get_typestore(Stores.ROS2_HUMBLE)
+        connection = writer.add_connection("/a", "std_msgs/msg/Int8", typestore=types)
+        message = types.types["std_msgs/msg/Int8"](data=1)
+        writer.write(connection, 1, types.serialize_cdr(message, "std_msgs/msg/Int8"))
+    (file,) = (tmp_path / "bag").glob("*.db3")
+    file.rename(tmp_path / "r1_7.db3")
+    texts = ["custom_data: {vehicle: old}", "custom_data: {vehicle: r1}"]
+    with closing(sqlite3.connect(tmp_path / "r1_7.db3")) as database:
+        database.execute("DROP TABLE IF EXISTS metadata")
+        database.execute(
+            "CREATE TABLE metadata(id INTEGER PRIMARY KEY, metadata_version INTEGER NOT NULL, metadata TEXT NOT NULL)"
+        )
+        rows = [(5, f"version: 5\nmessage_count: 1\n{text}\n") for text in texts]
+        database.executemany("INSERT INTO metadata(metadata_version, metadata) VALUES (?, ?)", rows)
+        database.commit()
+    job = manifest(tmp_path, "  metadata_from: {custom_data: true}\n", recording="r1_7.db3")
     assert plan_of(job).sequence.metadata == {"vehicle": "r1"}
 
 

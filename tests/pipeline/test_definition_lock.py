@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import pytest
 from hypothesis import given
@@ -201,6 +202,22 @@ def test_run_with_difference_writes_nothing_and_exits_6(tmp_path: Path) -> None:
     assert run_main("plan", str(manifest)) == 6
     assert run_main("schema", "lock", "--check", str(manifest)) == 6
     assert not (tmp_path / "store" / "segments").exists()
+
+
+def test_lock_check_writes_junit_and_sarif(tmp_path: Path) -> None:
+    changes(tmp_path, lambda path: make(path, number=1))
+    manifest, junit, sarif = (str(tmp_path / name) for name in ("job.yaml", "lock.xml", "lock.sarif"))
+    check = ("schema", "lock", manifest, "--junit", junit, "--sarif", sarif)
+    assert run_main(*check) == 2
+    assert run_main(*check, "--check") == 6
+    (case,) = ET.parse(junit).iterfind(".//testcase[failure]")  # noqa: S314 - our own file
+    assert str(case.get("name")).startswith("definition-difference: /number")
+    (result,) = json.loads(Path(sarif).read_text())["runs"][0]["results"]
+    assert result["ruleId"] == "definition-difference"
+    assert run_main("schema", "lock", manifest) == 0
+    assert run_main(*check, "--check") == 0
+    assert ET.parse(junit).find(".//failure") is None  # noqa: S314 - our own file
+    assert json.loads(Path(sarif).read_text())["runs"][0]["results"] == []
 
 
 def test_lock_topic_of_some_recordings_is_not_required(tmp_path: Path) -> None:
