@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from mosaico_ingest.rosbag.blocks import ROSMessage
     from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry
     from mosaico_ingest.rosbag.loader import ROSLoader
+    from mosaico_ingest.view.alignment import align
 
 __all__ = [
     "APIKeyPermissionEnum",
@@ -66,6 +67,7 @@ __all__ = [
     "Stores",
     "TopicLevelErrorPolicy",
     "__version__",
+    "align",
     "check",
     "inspect",
     "plan",
@@ -91,6 +93,7 @@ _MODULES = {
     "Store": "destinations.store",
     "Stores": "job.values",
     "TopicLevelErrorPolicy": "job.values",
+    "align": "view.alignment",
     "check": "api",
     "inspect": "api",
     "plan": "api",
