@@ -80,8 +80,13 @@ class RosbagInjector:
         The report of a dry run names the topics, counts no messages, and has the status `skipped`.
 
         Raises:
+            ManifestError: The configuration splits the recording into several sequences.
             IngestError: The run failed or was interrupted. The session policy decides which rows were kept.
         """
+        if self._config.job.split is not None:
+            raise ManifestError(
+                "split makes several sequences", where="manifest['split']", hint="use api.run([config])"
+            )
         outcome = run_recording(Task(self._config.job, dry_run=self._config.dry_run), self._observe)
         if outcome.error is not None:
             raise outcome.error
@@ -295,7 +300,7 @@ def run(
     if isinstance(jobs, str | Path):
         manifests = (*manifests, used_manifest(Path(jobs)))
         jobs = compile_job(Path(jobs))
-    tasks = [_task(job) for job in jobs]
+    tasks = [task for job in jobs for task in _tasks(job)]
     if any(task.job.expect is not None and task.job.expect.group is not None for task in tasks):
         from mosaico_ingest.pipeline.contract_group import add_group_results
 
@@ -308,10 +313,22 @@ def run(
     )
 
 
-def _task(job: Job | Task | ROSInjectionConfig) -> Task:
+def _tasks(job: Job | Task | ROSInjectionConfig) -> Iterator[Task]:
+    """Yield the task of a job, or one task for each part if a configuration splits its recording."""
     if isinstance(job, Task):
-        return job
-    return Task(job.job, dry_run=job.dry_run) if isinstance(job, ROSInjectionConfig) else Task(job)
+        yield job
+    elif isinstance(job, ROSInjectionConfig):
+        yield from (Task(part, dry_run=job.dry_run) for part in _parts(job.job))
+    else:
+        yield from map(Task, _parts(job))
+
+
+def _parts(job: Job) -> tuple[Job, ...]:
+    if job.split is None:
+        return (job,)
+    from mosaico_ingest.pipeline.split import split_job
+
+    return split_job(job)
 
 
 def used_manifest(path: Path) -> UsedManifest:

@@ -33,6 +33,7 @@ from mosaico_ingest.job.fields import AdapterRef, FilePath, Literally, Parsed, P
 from mosaico_ingest.job.file_names import FileNamePattern
 from mosaico_ingest.job.patterns import first_match, is_glob
 from mosaico_ingest.job.section import Count, MessageLimit, Section, Text, Time, Topic, shape_of
+from mosaico_ingest.job.split import SequencePart, SplitSettings
 from mosaico_ingest.job.units import parse_size
 from mosaico_ingest.job.values import (
     DEFAULT_MESSAGE_BYTES,
@@ -416,6 +417,8 @@ class JobSettings(Section):
     """The recording, and the options for reading it."""
     sequence: SequenceSettings = SequenceSettings()
     """The sequence that a recording becomes."""
+    split: SplitSettings | None = None
+    """One recording becomes several sequences: parts of equal length (`by`), or the intervals of a file (`events`)."""
     topics: tuple[Annotated[Text, TopicGlob(excludes=True)], ...] = Field(
         default=(), examples=[["/cam*", "!/cam/debug*"]]
     )
@@ -470,6 +473,8 @@ class Job(JobSettings):
     origin: SkipValidation[Origin] = Field(default=Origin(), repr=False)
     lock: SkipValidation[LockFile | None] = Field(default=None, repr=False)
     """The lock file, if `definitions` is `locked`."""
+    part: SkipValidation[SequencePart | None] = Field(default=None, repr=False)
+    """The part that the sequence consists of, if `split` divides the recording."""
     registry: SkipValidation[Any] = Field(default=None, repr=False)
     """The `ROSTypeRegistry` for definitions; None selects the process-wide registry."""
 

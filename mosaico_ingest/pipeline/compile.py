@@ -195,10 +195,17 @@ def compile_manifest(loaded: LoadedManifest, *, locked: bool = True) -> tuple[Jo
     )
     sections: dict[str, Any] = {key: getattr(shared, key) for key in JobSettings.model_fields}
     lock = None if shared.definitions is None or not locked else read_lock_file(loaded.path, loaded.origin)
-    return tuple(
+    jobs = tuple(
         _job({**sections, "sequence": sequence.replace(name=name), "lock": lock}, recording.paths, origin)
         for recording, name in zip(recordings, names, strict=True)
     )
+    if loaded.manifest.split is None:
+        return jobs
+    from mosaico_ingest.pipeline.split import split_job  # noqa: PLC0415 - only jobs with `split` need it
+
+    parts = tuple(part for job in jobs for part in split_job(job))
+    _refuse_duplicates(loaded, [part.sequence.name for part in parts])
+    return parts
 
 
 def _job(sections: dict[str, Any], paths: tuple[AnyPath, ...], origin: Origin) -> Job:

@@ -20,6 +20,7 @@ from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.documents import Part, Unchecked
 from mosaico_ingest.findings import Finding, Span, escape_undecodable
 from mosaico_ingest.job.model import ErrorPolicy, QuarantineSettings, SequenceSettings
+from mosaico_ingest.job.split import SequencePart
 from mosaico_ingest.job.values import StampSource, Target, TopicLevelErrorPolicy
 from mosaico_ingest.notebook import html_table
 from mosaico_ingest.ontology.types import OntologyType
@@ -53,6 +54,15 @@ class FileDocument(TypedDict):
     path: str
     """Relative to the manifest's folder."""
     size_bytes: int
+
+
+class PartDocument(TypedDict):
+    """A part of a recording in a plan document."""
+
+    recording: str
+    """The name of the sequence that the complete recording would become."""
+    number: int
+    event: str | None
 
 
 class PolicyDocument(TypedDict):
@@ -89,6 +99,12 @@ def _own_metadata(metadata: Mapping[str, Any]) -> dict[str, JsonValue]:
 
 def _describe_files(files: tuple[Path | RemotePath, ...], info: SerializationInfo) -> list[FileDocument]:
     return [{"path": _relative(path, info), "size_bytes": path.stat().st_size} for path in files]
+
+
+def _describe_part(part: SequencePart | None) -> PartDocument | None:
+    if part is None:
+        return None
+    return {"recording": part.recording, "number": part.number, "event": part.event}
 
 
 def _describe_quarantine(
@@ -193,6 +209,8 @@ class Plan(Part):
     """Earlier messages are not read; ns since the epoch."""
     read_until_ns: int | None = None
     """Messages of this log time or later are not read; ns since the epoch."""
+    part: Annotated[SequencePart | None, Unchecked(), PlainSerializer(_describe_part)] = None
+    """The part of the recording that becomes the sequence, if `split` divides the recording."""
     destination: Annotated[Target, Unchecked(), PlainSerializer(_describe_destination)]
     """The location of the store or server; a path is relative to the manifest's folder."""
     on_error: Annotated[ErrorPolicy, PlainSerializer(_describe_policy)]
@@ -218,6 +236,13 @@ class Plan(Part):
         """Whether the time range is applied to the rows, because the times of some rows are not the log times."""
         bounded = self.read_from_ns is not None or self.read_until_ns is not None
         return bounded and not all(topic.has_log_times for topic in self.topics)
+
+    @property
+    def log_range(self) -> tuple[int | None, int | None]:
+        """The range of log times to read: the start (inclusive) and the end (exclusive), ns since the epoch."""
+        if not self.selects_after_reading:
+            return self.read_from_ns, self.read_until_ns
+        return (None, None) if self.part is None else (self.part.read_from_ns, self.part.read_until_ns)
 
     def __repr__(self) -> str:
         """Return the counts of the plan, such as `<Plan yard: 9 topics, 2,110 messages, 31 excluded>`."""

@@ -69,9 +69,10 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
     _check_conditions(job, topics, recording)
     _check_metadata(job, topics)
     contract = _contract(task, job, topics, recording)
-    read_from_ns, read_until_ns = _time_range(
+    read_from_ns, read_until_ns = _part_range(
         job, recording, has_log_times=all(topic.has_log_times for topic in topics)
     )
+    findings += () if job.part is None else job.part.findings
     findings += _image_settings(job, topics)
     findings += _missing_publish_times(job, recording, topics)
     findings += _latched_before(job, topics, recording.start_ns, read_from_ns)
@@ -92,6 +93,7 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
         end_ns=recording.end_ns,
         read_from_ns=read_from_ns,
         read_until_ns=read_until_ns,
+        part=job.part,
         missing=recording.missing_files,
         attempt=task.attempt,
         contract=contract,
@@ -215,7 +217,7 @@ def _fitting(resolution: Resolution, definition: Definition) -> Resolution:
 def _is_latched(job: Job, connection: Connection) -> bool:
     """Return whether messages of a connection before the time range are included."""
     time = job.bag.time
-    if time.start is None or not time.include_latched:
+    if (time.start is None and job.part is None) or not time.include_latched:
         return False
     listed = first_match(time.latched, connection.topic) is not None
     return listed or connection.latched or is_static(connection.topic)
@@ -402,7 +404,19 @@ def _exclusion_hint(job: Job, excluded: list[ExcludedTopic]) -> str | None:
     return None
 
 
-def _time_range(job: Job, recording: Recording, *, has_log_times: bool) -> tuple[int | None, int | None]:
+def _part_range(job: Job, recording: Recording, *, has_log_times: bool) -> tuple[int | None, int | None]:
+    """Return the start and end of the part that the job ingests, or else of `bag.time`; see `time_range`."""
+    if job.part is not None:
+        return job.part.start_ns, job.part.end_ns
+    bounds = time_range(job, recording, has_log_times=has_log_times)
+    if job.split is not None:
+        hint = "correct the times, or remove split to ingest the complete recording"
+        where = job.where("split") or str(recording.files[0])
+        raise NothingMatched("no part of the recording has messages", where=where, hint=hint)
+    return bounds
+
+
+def time_range(job: Job, recording: Recording, *, has_log_times: bool) -> tuple[int | None, int | None]:
     """Return the start (inclusive) and the end (exclusive) of the time range, ns since the epoch.
 
     The range must overlap the recording if the times of all rows are log times.

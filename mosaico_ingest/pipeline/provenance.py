@@ -7,7 +7,7 @@ import json
 import os
 from collections.abc import Container, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from mosaico_ingest.destinations.base import ExistingSequence
 from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import BagError, SequenceExists
 from mosaico_ingest.findings import escape_undecodable
+from mosaico_ingest.job.split import SPLIT_KEY
 from mosaico_ingest.job.values import PROVENANCE_KEY, IfExists, Target
 from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.quarantine import quarantine_file_name
@@ -171,7 +172,11 @@ def check_provenance(plan: Plan) -> SequenceRequest | None:
     provenance = _add_full_digests(provenance, plan.files).model_copy(update={"quarantine": quarantine_file})
     return SequenceRequest(
         name=plan.sequence.name,
-        metadata={**plan.sequence.metadata, PROVENANCE_KEY: provenance.model_dump(mode="json")},
+        metadata={
+            **plan.sequence.metadata,
+            **({} if plan.part is None else {SPLIT_KEY: plan.part.metadata}),
+            PROVENANCE_KEY: provenance.model_dump(mode="json"),
+        },
         if_exists=if_exists,
         quarantine_file=quarantine_file,
         replaces_stored=stored is not None
@@ -185,7 +190,7 @@ def read_provenance(plan: Plan) -> Provenance:
     return Provenance(
         tool=__version__,
         job=_job_digest(plan),
-        sources=tuple(map(_source, plan.files)),
+        sources=tuple(map(_source if plan.part is None else _cached_source, plan.files)),
         family=plan.sequence.family,
         run=plan.attempt.run if plan.attempt else None,
     )
@@ -307,6 +312,18 @@ def _records(metadata: Iterable[Mapping[str, Any]]) -> tuple[Provenance, ...]:
             except ValidationError:
                 continue
     return tuple(records)
+
+
+def _cached_source(path: AnyPath) -> Source:
+    """Return the source of a file with its full digest; the file is read once for all parts of a recording."""
+    stat = path.stat()
+    return _read_source(path, stat.st_size, stat.st_mtime_ns)
+
+
+@lru_cache(maxsize=64)
+def _read_source(path: AnyPath, _size: int, _modified_ns: int) -> Source:
+    source = _source(path)
+    return source if isinstance(path, RemotePath) else source.model_copy(update={"whole": full_digest(path)})
 
 
 def _source(path: AnyPath) -> Source:

@@ -11,7 +11,7 @@ from msgspec import Struct
 
 from mosaico_ingest.destinations.base import AmendableSink, Session, Sink, StoredTopic
 from mosaico_ingest.destinations.registry import destination_of
-from mosaico_ingest.errors import IngestError, Interrupted, NothingMatched, VerificationError
+from mosaico_ingest.errors import EmptyPart, IngestError, Interrupted, NothingMatched, VerificationError
 from mosaico_ingest.findings import Finding, Severity, Stage
 from mosaico_ingest.interrupts import Abandoned, DeferredInterrupt
 from mosaico_ingest.job.values import IfExists, OnFailure, SessionLevelErrorPolicy
@@ -262,12 +262,12 @@ def _process(
 ) -> None:
     with buffer:
         stopwatch.lap(Step.PREPARE)
-        for block in latched_blocks(plan, recording):
+        for block in latched_blocks(plan, recording, lambda block: topics[block.connection].times_of(block)):
             topics[block.connection].process(block, buffer, latched=True)
         blocks = recording.message_blocks(
             tuple(topics),
-            start_ns=None if plan.selects_after_reading else plan.read_from_ns,
-            end_ns=None if plan.selects_after_reading else plan.read_until_ns,
+            start_ns=plan.log_range[0],
+            end_ns=plan.log_range[1],
             memory_bytes=plan.memory.read_bytes,
             observe=None if contract is None else contract.observe_order,
         )
@@ -344,12 +344,18 @@ def _check_not_empty(plan: Plan, recording: Recording, topics: tuple[TopicPipeli
             raise damage
         in_window = plan.read_from_ns is not None or plan.read_until_ns is not None
         scope = "in the time range" if in_window else "on the selected topics"
-        raise NothingMatched(f"there is no message {scope}", where=where, hint="nothing was written")
+        raise _nothing_matched(plan, f"there is no message {scope}")
     if read == sum(topic.dropped for topic in topics):
-        what = f"the settings of the topics and the time range drop all of {read} messages"
-        raise NothingMatched(what, where=where, hint="nothing was written")
+        raise _nothing_matched(
+            plan, f"the settings of the topics and the time range drop all of {read} messages"
+        )
     reason = next((topic.error for topic in topics if topic.error), "see the report for the reasons")
     raise IngestError(f"all of {read} messages were rejected", where=where, hint=reason)
+
+
+def _nothing_matched(plan: Plan, what: str) -> NothingMatched:
+    kind = NothingMatched if plan.part is None else EmptyPart
+    return kind(what, where=str(plan.files[0]), hint="nothing was written")
 
 
 def _keeps_partial(plan: Plan, request: SequenceRequest, failure: BaseException, *, rows: int) -> bool:

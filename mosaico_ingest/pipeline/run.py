@@ -12,8 +12,8 @@ from msgspec import Struct
 from mosaico_ingest.adapters.bridge import ROSBridge
 from mosaico_ingest.destinations.base import Sink
 from mosaico_ingest.destinations.registry import destination_of
-from mosaico_ingest.errors import ContractError, IngestError, Interrupted
-from mosaico_ingest.findings import Finding
+from mosaico_ingest.errors import ContractError, EmptyPart, IngestError, Interrupted
+from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import LoaderErrorPolicy
 from mosaico_ingest.pipeline.plan import Plan
@@ -78,6 +78,11 @@ def run_recording(task: Task, observe: Observer = ignore_events) -> Outcome:
             stopwatch.lap(Step.PREPARE)
             written = write_sequence(plan, request, recording, sink, observe=events, stopwatch=stopwatch)
             verify(written, events)
+    except EmptyPart as error:
+        events(
+            Noted(Finding("empty-part", Severity.INFO, f"{job.sequence.name} is not written: {error.what}"))
+        )
+        return events.skip()
     except IngestError as error:
         return events.fail(error)
     except KeyboardInterrupt:

@@ -13,8 +13,10 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from mosaico_ingest.adapters.adapter import Envelope
+from mosaico_ingest.decode.base import Decoder
 from mosaico_ingest.job.values import StampSource
 from mosaico_ingest.pipeline.plan import Plan, TopicPlan
+from mosaico_ingest.rosbag.blocks import MessageBlock
 
 if TYPE_CHECKING:
     from mosaico_ingest.pipeline.conditions import ConditionFilter, Conditions
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 Int64s = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
+_NO_ROWS = pa.StructArray.from_arrays([], names=[])
 _SECOND_NS = 1_000_000_000
 
 
@@ -35,21 +38,38 @@ class RowTimes(Struct, frozen=True):
 
 
 def row_times(
-    plan: TopicPlan, rows: pa.StructArray, log_times: Int64s, publish_times: Int64s | None
+    stamp: StampSource,
+    offset_ns: int,
+    rows: pa.StructArray,
+    log_times: Int64s,
+    publish_times: Int64s | None,
 ) -> RowTimes:
     """Return the times of decoded messages, according to `stamp` and `time_offset`.
 
     Without `publish_times`, publish times equal the log times.
     """
     times = RowTimes(log_times)
-    if plan.stamp is StampSource.PUBLISH and publish_times is not None:
+    if stamp is StampSource.PUBLISH and publish_times is not None:
         times = _or_log_times(publish_times, log_times)
-    elif plan.stamp is StampSource.HEADER:
+    elif stamp is StampSource.HEADER:
         from mosaico_ingest.contracts.values import stamps_of  # noqa: PLC0415 - only header stamps need it
 
         times = _or_log_times(stamps_of(rows), log_times)
-    if plan.time_offset_ns:
-        return RowTimes(times.values + plan.time_offset_ns, times.fallback)
+    if offset_ns:
+        return RowTimes(times.values + offset_ns, times.fallback)
+    return times
+
+
+def block_times(block: MessageBlock, decoder: Decoder, stamp: StampSource, offset_ns: int) -> Int64s:
+    """Return the time of every message of a block, shape (n,); a message that cannot be decoded has its log time."""
+    if stamp is StampSource.LOG:
+        return block.log_times + offset_ns
+    if stamp is StampSource.PUBLISH:
+        return row_times(stamp, offset_ns, _NO_ROWS, block.log_times, block.publish_times).values
+    decoded = decoder.decode(block)
+    times = block.log_times + offset_ns
+    index = decoded.index
+    times[index] = row_times(stamp, offset_ns, decoded.rows, block.log_times[index], None).values
     return times
 
 

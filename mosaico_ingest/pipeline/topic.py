@@ -23,7 +23,7 @@ from mosaico_ingest.job.values import LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.ontology.types import OntologyType, RequiredFields
 from mosaico_ingest.pipeline.plan import TopicPlan
 from mosaico_ingest.pipeline.quarantine import Quarantine
-from mosaico_ingest.pipeline.selection import RowSelector, row_times
+from mosaico_ingest.pipeline.selection import Int64s, RowSelector, block_times, row_times
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.report.events import Observer, Rejected, TopicProgress, TopicStatus
 from mosaico_ingest.report.timing import Step, Stopwatch, Timeline
@@ -127,6 +127,11 @@ class TopicPipeline:
             connection.definition, ros_shape(connection.definition)
         )
 
+    def times_of(self, block: MessageBlock) -> Int64s:
+        """Return the selected time of each message of a block, shape (n,)."""
+        decoder = self._decoders[block.connection]
+        return block_times(block, decoder, self.plan.stamp, self.plan.time_offset_ns)
+
     def process(self, block: MessageBlock, buffer: WriteBuffer, *, latched: bool = False) -> None:
         """Decode, adapt and write a message block, and account for every message of it.
 
@@ -179,7 +184,9 @@ class TopicPipeline:
         ]
         rows, index = decoded.rows, sample[decoded.index]
         publish_times = None if block.publish_times is None else block.publish_times[index]
-        times = row_times(self.plan, rows, block.log_times[index], publish_times)
+        times = row_times(
+            self.plan.stamp, self.plan.time_offset_ns, rows, block.log_times[index], publish_times
+        )
         fallbacks = index[:0] if times.fallback is None else index[times.fallback]
         stamps = times.values
         if self.selector is not None and not latched:

@@ -20,6 +20,13 @@ SCHEMA = """\
 {"required": ["vehicle"], "properties": {"vehicle": {"type": "string"}}, "additionalProperties": false}
 """
 
+EVENTS = {
+    "events": "name,start,end\nturn,+10s,+20s\nstop,+20s,+25s\n",
+    "no_end": "name,start\nturn,+10s\n",
+    "reversed": "name,start,end\nturn,+20s,+10s\n",
+    "overlapping": "name,start,end\nturn,+10s,+20s\nstop,+15s,+25s\n",
+}
+
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
@@ -29,6 +36,8 @@ def project(tmp_path: Path) -> Path:
     (tmp_path / "msgs" / "Cell.msg").write_text("float64 voltage\n")
     (tmp_path / "base.yaml").write_text("on_error: {topic: ignore}\n")
     (tmp_path / "metadata.json").write_text("{}")
+    for name, rows in EVENTS.items():
+        (tmp_path / f"{name}.csv").write_text(rows)
     (tmp_path / "vehicle.schema.json").write_text(SCHEMA)
     (tmp_path / "broken.schema.json").write_text('{"type": "strin"}')
     (tmp_path / "adapters" / "pack.yaml").write_text(ADAPTER)
