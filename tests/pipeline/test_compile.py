@@ -77,6 +77,7 @@ definitions: locked
 quarantine: {path: q, max: 0.1%, max_run: 100, systematic: 7}
 target: {host: h, port: 1, api_key: "${KEY}", tls_cert: ca.pem, tls: true, message_size: 4MB}
 run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
+split: {by: 10 min}
 """,
     )
     expected = ROSInjectionConfig(
@@ -102,6 +103,7 @@ run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
                 "time": TimeRange(start=TimeBound(10**10, relative=True), end=TimeBound(1772366400 * 10**9))
             },
             "sequence": {"family": "f", "if_exists": IfExists.APPEND},
+            "split": {"by": 600 * 10**9},
             "topic_settings": {
                 "/imu": {"rename": "/sensors/imu"},
                 "/camera/*": {"every": 3, "image": "png"},
