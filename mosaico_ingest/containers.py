@@ -33,6 +33,8 @@ class Container(Struct, frozen=True):
 MCAP = b"\x89MCAP0\r\n"
 ROSRECORD = b"#ROSRECORD V1.2"
 ZSTD = b"\x28\xb5\x2f\xfd"
+ACTIVE_SUFFIX = ".active"
+"""Suffix of files that a recorder is writing, or was writing when it crashed."""
 ZSTD_SUFFIX = ".zstd"
 """Suffix of files that rosbag2 compressed as a whole; every container may be compressed."""
 
@@ -57,9 +59,9 @@ ROS_VERSIONS = {container.suffix: container.ros_versions for container in CONTAI
 SUFFIX_LIST = f"{', '.join(SUFFIXES[:-1])} and {SUFFIXES[-1]}"
 """The suffixes as they appear in messages."""
 RECORDING_NAME = re.compile(
-    rf"({'|'.join(map(re.escape, SUFFIXES))})(\.(zstd|zst|lz4|gz|bz2))?$", re.IGNORECASE
+    rf"({'|'.join(map(re.escape, SUFFIXES))})(\.(zstd|zst|lz4|gz|bz2))?(\.active)?$", re.IGNORECASE
 )
-"""Matches the end of a recording's file name, compressed or not."""
+"""Matches the end of a recording's file name, compressed or not, finished or not."""
 
 
 def container_of(head: bytes) -> Container | None:

@@ -167,6 +167,8 @@ _TABLE = (
     Rule(
         "ING513", "undeclared-fields", _WARNING, "fields of JSON messages that their schema does not declare"
     ),
+    Rule("ING520", "split-gap", _WARNING, "a missing number among the splits of a recording"),
+    Rule("ING521", "grouped-splits", _INFO, "files that are read as the splits of one recording"),
     Rule("ING601", "unmatched-pattern", _WARNING, "a topic pattern that matches no topic of the recording"),
     Rule("ING602", "skipped-topic", _INFO, "a topic that is not ingested"),
     Rule("ING603", "adapter-override", _INFO, "a topic whose adapter the manifest chooses"),

@@ -99,6 +99,17 @@ def _check_sidecar(text: str) -> str:
     return text
 
 
+def _grouping(text: str) -> str | FileNamePattern:
+    if text in {"auto", "none"}:
+        return text
+    pattern = FileNamePattern(text)
+    if "split" not in pattern.names or "{split:int}" not in text:
+        raise ValueError(
+            f"{text!r} has no number of the split; write auto, none or a pattern with {{split:int}}"
+        )
+    return pattern
+
+
 VariableName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 VariableValue = Annotated[
     Any, AfterValidator(_check_variable), WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "integer"}]})
@@ -114,6 +125,7 @@ Matrix = Annotated[
     AfterValidator(_check_matrix),
 ]
 Bytes = Annotated[int, Parsed(_bytes, r"^[0-9.]+ ?[kKMGT]?i?B$", to_json=int)]
+Grouping = Annotated[str | FileNamePattern, Parsed(_grouping, r"^(auto|none)$|\{split:int\}")]
 AdapterReference = Annotated[Any, AdapterRef()]
 """An adapter: in manifests a text, in Python also a class or an `AdapterSpec`."""
 RecordingPath = Annotated[Text, FilePath(PathRole.RECORDING)]
@@ -160,6 +172,10 @@ class BagSource(Section):
     ] = Field(examples=["data/session_01.db3", ["part_0.mcap", "part_1.mcap"], "data/*.mcap"])
     """A file, a rosbag2 directory or a URL. A list names the splits of one recording. A glob makes one sequence for each
     match that is not hidden."""
+    group: Grouping = Field(default="auto", examples=["none", "{stem}_{split:int}"])
+    """Which matches of a glob are the splits of one recording. auto: files whose names differ only in the number after the last
+    `_`, starting at 0. none: every match is a recording. A pattern of the file name with the field {split:int}: files whose
+    other fields are the same."""
     ros_distro: Stores | None = Field(default=None, examples=["ros2_humble"])
     """The distro whose definitions are used if the recording does not contain its own."""
     custom_msgs: tuple[CustomMessages, ...] = ()

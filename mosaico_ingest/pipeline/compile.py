@@ -22,6 +22,7 @@ from mosaico_ingest.errors import AdapterError, ManifestError, NothingMatched
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.compose import PLACEHOLDERS, Placeholder, placeholders_in
 from mosaico_ingest.job.fields import FilePath, PathRole, marked_fields, replace_values
+from mosaico_ingest.job.file_names import FileNamePattern
 from mosaico_ingest.job.impossible_patterns import pattern_problems
 from mosaico_ingest.job.manifest import LoadedManifest, refusal
 from mosaico_ingest.job.model import Job, JobSettings, Manifest, Origin, SequenceSettings
@@ -30,6 +31,8 @@ from mosaico_ingest.job.yaml_source import Source
 from mosaico_ingest.metadata.schema import read_json
 from mosaico_ingest.metadata.sources import source_spans, with_spans
 from mosaico_ingest.remote import AnyPath, RemotePath, without_options
+from mosaico_ingest.rosbag.discovery import recording_files
+from mosaico_ingest.rosbag.grouping import SplitGroup, group_splits
 from mosaico_ingest.textfile import read_limited
 
 _READ_LATER = {PathRole.WORKER_FILE, PathRole.DEFINITIONS, PathRole.SCHEMA}
@@ -41,6 +44,8 @@ class Recording(Struct, frozen=True):
 
     paths: tuple[AnyPath, ...]
     index: int
+    group: str | None = None
+    """The name of the recording without number and suffix, if `bag.group` found its splits."""
 
     @property
     def main(self) -> AnyPath:
@@ -57,10 +62,23 @@ def find_recordings(loaded: LoadedManifest) -> tuple[Recording, ...]:
     """
     path = loaded.manifest.bag.path
     if isinstance(path, str):
-        matches = _matches(loaded, path, ("bag", "path"))
-        return tuple(Recording((match,), index) for index, match in enumerate(matches, 1))
+        return tuple(
+            Recording(group.files, index, group.stem)
+            for index, group in enumerate(_grouped(loaded, _matches(loaded, path, ("bag", "path"))), 1)
+        )
     parts = [part for i, item in enumerate(path) for part in _matches(loaded, item, ("bag", "path", i))]
     return (Recording(tuple(dict.fromkeys(parts)), 1),)
+
+
+def _grouped(loaded: LoadedManifest, matches: list[AnyPath]) -> tuple[SplitGroup, ...]:
+    """Return the recordings that the matches of `bag.path` belong to, according to `bag.group`."""
+    group = loaded.manifest.bag.group
+    if isinstance(group, FileNamePattern):
+        files = [file for match in matches for file in recording_files(match)]
+        return group_splits(files, group.match)
+    if group == "none" or len(matches) == 1:
+        return tuple(SplitGroup((match,)) for match in matches)
+    return group_splits(matches)
 
 
 def sequence_name(loaded: LoadedManifest, recording: Recording) -> str:
@@ -92,7 +110,7 @@ def _fill(placeholder: Placeholder, recording: Recording) -> str:
     if main.name in {"", ".."}:  # such as `bag.path: ..`
         main = main.resolve()
     texts = {
-        "stem": RECORDING_NAME.sub("", main.name),
+        "stem": recording.group or RECORDING_NAME.sub("", main.name),
         "name": main.name,
         "parent": main.resolve().parent.name,
     }

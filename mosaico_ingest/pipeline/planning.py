@@ -13,6 +13,7 @@ from mosaico_ingest.contracts.clauses import Contract
 from mosaico_ingest.errors import AdapterError, BagError, IngestError, NothingMatched
 from mosaico_ingest.findings import Finding, Severity, Span, escape_undecodable, suggest_names
 from mosaico_ingest.job.fields import TopicGlob, marked_fields, values_at
+from mosaico_ingest.job.file_names import FileNamePattern
 from mosaico_ingest.job.model import Job, JobSettings
 from mosaico_ingest.job.patterns import Selection, first_match, select
 from mosaico_ingest.job.units import format_time
@@ -27,6 +28,7 @@ from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Language
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.encodings.table import refusal
+from mosaico_ingest.rosbag.grouping import numbering_gaps
 from mosaico_ingest.rosbag.recording import Recording, no_topics_error
 
 
@@ -47,6 +49,7 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
     selection = select(job.topics, names)
     findings = [*_recording_findings(recording, resolver, selection), *_unmatched(job, selection, names)]
     findings += metadata_findings
+    findings += _group_findings(job, recording)
     topics: list[TopicPlan] = []
     excluded: list[ExcludedTopic] = []
     misfits: list[tuple[str, AdapterError]] = []
@@ -106,6 +109,24 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
         plan = follow_schema_changes(plan, job.on_schema_change)
     _check_digest(plan, task)
     return plan
+
+
+def _group_findings(job: Job, recording: Recording) -> Iterator[Finding]:
+    """Yield findings about the files of a recording that no `metadata.yaml` lists: their group, and missing numbers."""
+    if recording.metadata is not None or len(recording.files) == 1:
+        return
+    group = job.bag.group
+    number_of = group.match if isinstance(group, FileNamePattern) else None
+    if isinstance(job.bag.path, str) and len(job.paths) > 1:
+        first, last = recording.files[0].name, recording.files[-1].name
+        yield Finding(
+            "grouped-splits",
+            Severity.INFO,
+            f"{len(recording.files)} files are read as the splits of one recording: {first} to {last}",
+            job.span("bag", "group") or job.span("bag", "path"),
+            "set bag.group: none if every file is a recording",
+        )
+    yield from numbering_gaps(recording.files, number_of, from_zero=len(job.paths) == 1)
 
 
 def _with_metadata(job: Job, recording: Recording) -> tuple[Job, tuple[Finding, ...]]:

@@ -138,6 +138,13 @@ def discover(paths: Sequence[AnyPath]) -> RecordingFiles:
     return RecordingFiles(files, parts[0].metadata if len(parts) == 1 else None, findings, missing)
 
 
+def recording_files(path: AnyPath) -> list[AnyPath]:
+    """Return the recordings in a folder without a `metadata.yaml`; for any other path, the path itself."""
+    if not path.is_dir() or (path / FILE_NAME).is_file():
+        return [path]
+    return _recordings(path) or [path]
+
+
 def _discover_path(path: AnyPath) -> RecordingFiles:
     if not path.exists():
         raise BagError("does not exist", where=str(path), hint="check the path")

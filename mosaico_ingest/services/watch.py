@@ -13,7 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
 
-from mosaico_ingest.containers import MCAP, RECORDING_NAME
+from mosaico_ingest.containers import ACTIVE_SUFFIX, MCAP, RECORDING_NAME
 
 _METADATA = "metadata.yaml"
 _FIRST_RETRY_S, _LAST_RETRY_S = 60.0, 3600.0
@@ -158,6 +158,8 @@ def _recordings(folder: Path, parents: frozenset[Path] = frozenset()) -> Iterato
     for entry in entries:
         if entry.is_dir():
             yield from _recordings(entry, parents | {resolved})
+        elif entry.name.endswith(ACTIVE_SUFFIX):
+            continue  # the recorder renames the file when it is complete
         elif RECORDING_NAME.search(entry.name) and not _is_split(entry):
             yield entry
 
