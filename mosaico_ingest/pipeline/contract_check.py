@@ -246,7 +246,8 @@ class _Rows:
             return rows, index
         log_times = block.log_times[index]
         publish_times = None if block.publish_times is None else block.publish_times[index]
-        times = row_times(self._topic, rows, log_times, publish_times)
+        topic = self._topic
+        times = row_times(topic.stamp, topic.time_offset_ns, rows, log_times, publish_times)
         envelope = Envelope(self._topic.topic, self._topic.msgtype, log_times)
         keep, _ = self._selector.select(times.values, rows, envelope, self._conditions)
         return (rows, index) if keep is None else (rows.filter(pa.array(keep)), index[keep])
