@@ -230,6 +230,7 @@ _TABLE = (
     Rule("ING729", "nanosec", _WARNING, "a time with 1,000,000,000 or more nanoseconds"),
     Rule("ING730", "unmapped", _WARNING, "a value that a `map` does not list"),
     Rule("ING731", "point-cloud", _WARNING, "a point cloud whose layout contradicts its data"),
+    Rule("ING732", "image-encoding", _WARNING, "an image that the selected image format cannot store"),
     Rule("ING741", "not-written", _WARNING, "a row that did not reach the destination"),
     Rule("ING742", "topic-closed", _WARNING, "a row of a topic that had already failed"),
     Rule("ING743", "topic-refused", _WARNING, "a row that the destination refuses"),

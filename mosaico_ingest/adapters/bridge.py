@@ -23,7 +23,7 @@ from msgspec.structs import replace
 
 from mosaico_ingest.adapters.adapter import AdapterSpec, UnmodeledSpec
 from mosaico_ingest.adapters.builtin import BY_NAME, BY_TYPE, Builtin
-from mosaico_ingest.adapters.image import PngImageSpec
+from mosaico_ingest.adapters.image import EncodedImageSpec
 from mosaico_ingest.adapters.mapping.loader import load_adapter
 from mosaico_ingest.adapters.python import (
     PythonAdapterSpec,
@@ -32,6 +32,7 @@ from mosaico_ingest.adapters.python import (
     registered_adapters,
 )
 from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.job.image import ImageFormat, ImageSettings, image_settings
 from mosaico_ingest.job.patterns import first_match
 from mosaico_ingest.ontology.types import SerializationFormat
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
@@ -257,7 +258,7 @@ class ROSBridge:
         overrides: Mapping[str, object] | None = None,
         loaded: Iterable[object] = (),
         base_dir: Path | None = None,
-        images: Mapping[str, str] | None = None,
+        images: Mapping[str, ImageSettings | ImageFormat] | None = None,
         formats: Mapping[str, str] | None = None,
     ) -> None:
         """Load all adapters; `base_dir` is the folder for relative paths.
@@ -278,7 +279,7 @@ class ROSBridge:
             else adapter_spec(reference, folder)
             for pattern, reference in (overrides or {}).items()
         }
-        self._images = dict(images or {})
+        self._images = {pattern: image_settings(value) for pattern, value in (images or {}).items()}
         self._formats = {normalize_msgtype(name): _layout(value) for name, value in (formats or {}).items()}
 
     @classmethod
@@ -308,9 +309,9 @@ class ROSBridge:
         """
         resolution = self._resolve(topic, normalize_msgtype(msgtype))
         pattern = first_match(self._images, topic)
-        if pattern is None or self._images[pattern] == "raw":
+        if pattern is None or self._images[pattern].format == "raw":
             return resolution
-        return replace(resolution, spec=PngImageSpec(resolution.spec))
+        return replace(resolution, spec=EncodedImageSpec(resolution.spec, self._images[pattern]))
 
     def _resolve(self, topic: str, msgtype: str) -> Resolution:
         pattern = first_match(self._overrides, topic)

@@ -1,96 +1,26 @@
-"""Lossless PNG storage of raw images: the buffer's bytes as an 8-bit grayscale picture."""
+"""The setting `image`: raw images as image files, and back to raw images."""
 
 from __future__ import annotations
 
-import struct
-import zlib
-from io import BytesIO
-from typing import Any
-
-import numpy as np
 import pyarrow as pa
 from msgspec import Struct
 
-from mosaico_ingest.adapters.adapter import Adapted, Adapter, AdapterSpec, Envelope
-from mosaico_ingest.errors import AdapterError, missing_library
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.adapters.adapter import Adapter, AdapterSpec
+from mosaico_ingest.errors import AdapterError, ViewError
+from mosaico_ingest.job.image import ImageSettings
 from mosaico_ingest.rosbag.definitions.model import Definition
 
 IMAGE_TAG = "Image"
-"""The tag of the ontology type whose rows can be stored as PNG."""
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_GRAYSCALE_8_BIT = bytes((8, 0, 0, 0, 0))
-_FASTEST = 1
+"""The tag of the ontology type whose rows can be stored as image files."""
+_FILES = frozenset({"png", "jpeg", "jpg", "tiff"})
+"""Formats whose `data` is an image file."""
 
 
-def grayscale_png(data: bytes | memoryview, *, width: int, height: int) -> bytes:
-    """Return `data`, which contains `height` rows of `width` bytes, as a PNG; both are positive."""
-    scanlines = np.empty((height, width + 1), np.uint8)
-    scanlines[:, 0] = 0  # the filter type "none"
-    scanlines[:, 1:] = np.frombuffer(data, np.uint8).reshape(height, width)
-    header = struct.pack(">II", width, height) + _GRAYSCALE_8_BIT
-    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(scanlines.data, _FASTEST)), (b"IEND", b""))
-    return _SIGNATURE + b"".join(_chunk(kind, body) for kind, body in chunks)
-
-
-def grayscale_pixels(png: bytes) -> bytes:
-    """Return the bytes of an 8-bit grayscale PNG. Pillow reads PNGs with filtered lines, as the official SDK writes.
-
-    Raises:
-        AdapterError: The picture is not an 8-bit grayscale PNG.
-        IngestError: Pillow is not installed.
-    """
-    offset, compressed = len(_SIGNATURE), b""
-    width = height = 0
-    try:
-        while offset < len(png):
-            (size,) = struct.unpack_from(">I", png, offset)
-            kind, body = png[offset + 4 : offset + 8], png[offset + 8 : offset + 8 + size]
-            offset += size + 12
-            if kind == b"IHDR":
-                width, height = struct.unpack(">II", body[:8])
-                if body[8:] != _GRAYSCALE_8_BIT:
-                    raise AdapterError("the picture is not an 8-bit grayscale PNG")
-            compressed += body if kind == b"IDAT" else b""
-        scanlines = np.frombuffer(zlib.decompress(compressed), np.uint8).reshape(height, width + 1)
-    except (struct.error, zlib.error, ValueError) as error:
-        raise AdapterError(f"the picture is not a PNG: {error}") from error
-    return _unfiltered(png) if scanlines[:, 0].any() else scanlines[:, 1:].tobytes()
-
-
-def _unfiltered(png: bytes) -> bytes:
-    try:
-        from PIL import Image  # noqa: PLC0415 - an optional library
-    except ImportError as error:
-        raise missing_library("Pillow", "images") from error
-    with Image.open(BytesIO(png), formats=["PNG"]) as picture:
-        return picture.tobytes()
-
-
-def without_png(rows: pa.StructArray) -> pa.StructArray:
-    """Return images with their raw buffers; images that are stored as PNG are decoded."""
-    columns = {field.name: rows.field(field.name) for field in rows.type}
-    formats = columns["format"].to_pylist()
-    if "png" not in formats:
-        return rows
-    data: list[bytes | memoryview] = [
-        grayscale_pixels(raw.as_py()) if formats[row] == "png" else memoryview(raw.as_buffer())
-        for row, raw in enumerate(columns["data"])
-    ]
-    columns["data"] = pa.array(data, rows.type.field("data").type)
-    columns["format"] = pa.array(["raw" if name == "png" else name for name in formats], pa.string())
-    return pa.StructArray.from_arrays(list(columns.values()), fields=list(rows.type))
-
-
-def _chunk(kind: bytes, body: bytes) -> bytes:
-    checksum = zlib.crc32(body, zlib.crc32(kind))
-    return b"".join((struct.pack(">I", len(body)), kind, body, struct.pack(">I", checksum)))
-
-
-class PngImageSpec(Struct, frozen=True):
-    """Stores the raw images of an adapter as PNG; adapters of other ontology types are unchanged."""
+class EncodedImageSpec(Struct, frozen=True):
+    """Stores the raw images of an adapter as image files; adapters of other ontology types are unchanged."""
 
     inner: AdapterSpec
+    settings: ImageSettings
 
     @property
     def name(self) -> str:
@@ -108,39 +38,45 @@ class PngImageSpec(Struct, frozen=True):
         return self.inner.default
 
     def bind(self, definition: Definition, shape: pa.StructType) -> Adapter:
-        """Bind the inner adapter."""
+        """Bind the inner adapter.
+
+        Raises:
+            AdapterError: As in the inner adapter.
+            IngestError: The format requires Pillow, which is not installed.
+        """
         adapter = self.inner.bind(definition, shape)
-        return _PngImages(adapter) if adapter.ontology.tag == IMAGE_TAG else adapter
+        if adapter.ontology.tag != IMAGE_TAG:
+            return adapter
+        from mosaico_ingest.adapters.encoded_images import encoded_images  # noqa: PLC0415 - only this setting needs it
+
+        return encoded_images(adapter, self.settings)
 
 
-class _PngImages(Struct, frozen=True):
-    inner: Adapter
+def without_files(rows: pa.StructArray) -> pa.StructArray:
+    """Return images as raw buffers; images that are stored as image files are decoded.
 
-    @property
-    def ontology(self) -> OntologyType:
-        return self.inner.ontology
-
-    def topic_metadata(self, first_row: pa.StructScalar | None) -> dict[str, Any]:
-        return self.inner.topic_metadata(first_row)
-
-    def adapt(self, rows: pa.StructArray, envelope: Envelope) -> Adapted:
-        adapted = self.inner.adapt(rows, envelope)
-        return Adapted(_as_png(adapted.rows), adapted.index, adapted.failures)
-
-
-def _as_png(rows: pa.StructArray) -> pa.StructArray:
-    """Encode each image whose buffer has height x stride bytes as PNG; other images stay raw."""
+    Raises:
+        AdapterError: A file is damaged.
+        IngestError: Pillow is not installed.
+    """
     columns = {field.name: rows.field(field.name) for field in rows.type}
-    heights, strides = columns["height"].to_numpy(), columns["stride"].to_numpy()
     formats = columns["format"].to_pylist()
-    data: list[bytes | memoryview] = []
-    for row, raw in enumerate(columns["data"]):
-        buffer, height, width = raw.as_buffer(), int(heights[row]), int(strides[row])
-        if formats[row] == "raw" and height > 0 and width > 0 and buffer.size == height * width:
-            data.append(grayscale_png(memoryview(buffer), width=width, height=height))
-            formats[row] = "png"
-        else:
-            data.append(memoryview(buffer))
+    if not _FILES.intersection(formats):
+        return rows
+    data = [
+        _decoded(value.as_py()) if formats[row] in _FILES else memoryview(value.as_buffer())
+        for row, value in enumerate(columns["data"])
+    ]
+    names = ["raw" if name in _FILES else name for name in formats]
     columns["data"] = pa.array(data, rows.type.field("data").type)
-    columns["format"] = pa.array(formats, rows.type.field("format").type)
+    columns["format"] = pa.array(names, rows.type.field("format").type)
     return pa.StructArray.from_arrays(list(columns.values()), fields=list(rows.type))
+
+
+def _decoded(file: bytes) -> bytes:
+    from mosaico_ingest.images.encode import decoded_buffer  # noqa: PLC0415 - only image files need it
+
+    try:
+        return decoded_buffer(file)
+    except ViewError as error:
+        raise AdapterError(error.what) from error

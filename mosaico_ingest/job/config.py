@@ -24,6 +24,8 @@ from mosaico_ingest.remote import AnyPath, RemotePath, as_path
 
 _KEY = "key"
 _TOPIC = "*"
+_TAGS = ("one", "several", "axes", "combinations")
+"""The tags of unions in locations of errors."""
 
 
 def _key(path: str) -> dict[str, tuple[str, ...]]:
@@ -168,7 +170,7 @@ class ROSInjectionConfig:
                 ]
                 name = argument.name + "".join(f"[{key!r}]" for key in inner)
                 return ManifestError(f"{name} is {error['input']!r:.80}", hint=hint)
-        name = "manifest" + "".join(f"[{key!r}]" for key in location)
+        name = "manifest" + "".join(f"[{key!r}]" for key in location if key not in _TAGS)
         return ManifestError(f"{name} is {error['input']!r:.80}", hint=hint)
 
 

@@ -31,6 +31,7 @@ from mosaico_ingest.findings import Span
 from mosaico_ingest.job.expect import Expectations, Frequency, SignedDuration
 from mosaico_ingest.job.fields import AdapterRef, FilePath, Literally, Parsed, PathRole, Secret, TopicGlob
 from mosaico_ingest.job.file_names import FileNamePattern
+from mosaico_ingest.job.image import ImageFormat, ImageSettings
 from mosaico_ingest.job.patterns import first_match, is_glob
 from mosaico_ingest.job.section import Count, MessageLimit, Section, Text, Time, Topic, shape_of
 from mosaico_ingest.job.split import SequencePart, SplitSettings
@@ -254,8 +255,10 @@ class TopicSettings(Section):
     rate: Frequency | None = Field(default=None, examples=["10 Hz"])
     """Keep the first message of each interval of this frequency; the first interval starts at the topic's first message.
     The rules apply in the order `every`, `where`, `on_change`, `rate`."""
-    image: Literal["raw", "png"] = "raw"
-    """The encoding of raw images: as recorded, or PNG."""
+    image: Annotated[
+        Annotated[ImageFormat, Tag("one")] | Annotated[ImageSettings, Tag("several")], Discriminator(shape_of)
+    ] = Field(default="raw", examples=["png", {"format": "jpeg", "quality": 90, "max_width": 1280}])
+    """How raw images are stored: a format (`raw`, `png`, `jpeg`, `buffer_png`), or a format with its settings."""
 
 
 def combined_settings(settings: Mapping[str, TopicSettings], topic: str) -> TopicSettings:

@@ -119,6 +119,7 @@ def _kind(node: dict[str, Any], schema: dict[str, Any]) -> str:
     """Return the type of a value, or its allowed words."""
     branches = cast("list[dict[str, Any]]", node.get("anyOf") or node.get("oneOf") or [])
     if branches:
+        branches = [branch for branch in branches if branch.get("type") != "null"]
         kinds = (_kind(branch, schema) for branch in branches if branch.get("$ref") != "#/$defs/Variable")
         return " or ".join(dict.fromkeys(kinds))
     node = _resolved(node, schema)
@@ -135,7 +136,13 @@ def _kind(node: dict[str, Any], schema: dict[str, Any]) -> str:
     )
 
 
-_WORDS = {"string": "text", "integer": "number", "boolean": "true or false", "object": "mapping"}
+_WORDS = {
+    "string": "text",
+    "integer": "number",
+    "number": "number",
+    "boolean": "true or false",
+    "object": "mapping",
+}
 
 
 def _resolved(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:

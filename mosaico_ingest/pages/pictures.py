@@ -10,9 +10,10 @@ from msgspec import Struct
 
 from mosaico_ingest.destinations.store.model import TopicInfo
 from mosaico_ingest.errors import IngestError
+from mosaico_ingest.images.files import jpeg_file
 from mosaico_ingest.report.units import time_text
 from mosaico_ingest.view.clouds import grid_step
-from mosaico_ingest.view.images import Pixels, fit_pixels, has_images, jpeg_bytes, png_bytes
+from mosaico_ingest.view.images import Pixels, fit_pixels, has_images, png_bytes
 from mosaico_ingest.view.pictures import row_picture
 from mosaico_ingest.view.rows import sampled_rows
 from mosaico_ingest.view.tracks import Track, local_metres
@@ -147,7 +148,7 @@ def _meters(length: float) -> str:
 
 
 def _jpeg_url(pixels: Pixels) -> str:
-    return _url("jpeg", jpeg_bytes(fit_pixels(pixels, width=WIDTH, height=HEIGHT), quality=QUALITY))
+    return _url("jpeg", jpeg_file(fit_pixels(pixels, width=WIDTH, height=HEIGHT), quality=QUALITY))
 
 
 def _png_url(pixels: Pixels) -> str:

@@ -13,7 +13,7 @@ from pydantic import Field, JsonValue, PlainSerializer, SerializationInfo
 from typing_extensions import TypedDict
 
 from mosaico_ingest.adapters.adapter import RESERVED_KEYS, AdapterSpec
-from mosaico_ingest.adapters.image import PngImageSpec
+from mosaico_ingest.adapters.image import EncodedImageSpec
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.contracts.clauses import Contract, ReadTopic
 from mosaico_ingest.destinations.registry import destination_of
@@ -77,11 +77,11 @@ def _describe_policy(policy: ErrorPolicy) -> PolicyDocument:
 
 
 def _describe_adapter(spec: AdapterSpec) -> AdapterDocument:
-    inner = spec.inner if isinstance(spec, PngImageSpec) else spec
+    inner = spec.inner if isinstance(spec, EncodedImageSpec) else spec
     digest = None
     if isinstance(inner, MappingSpec):
         digest = hashlib.sha256(inner.model.model_dump_json().encode()).hexdigest()[:16]
-    name = f"{spec.name}, then PNG" if isinstance(spec, PngImageSpec) else spec.name
+    name = f"{spec.name}, then {spec.settings.format}" if isinstance(spec, EncodedImageSpec) else spec.name
     return {"name": name, "digest": digest}
 
 

@@ -14,6 +14,7 @@ from mosaico_ingest.errors import AdapterError, BagError, IngestError, NothingMa
 from mosaico_ingest.findings import Finding, Severity, Span, escape_undecodable, suggest_names
 from mosaico_ingest.job.fields import TopicGlob, marked_fields, values_at
 from mosaico_ingest.job.file_names import FileNamePattern
+from mosaico_ingest.job.image import image_settings
 from mosaico_ingest.job.model import Job, JobSettings
 from mosaico_ingest.job.patterns import Selection, first_match, select
 from mosaico_ingest.job.units import format_time
@@ -341,16 +342,16 @@ def _unmatched(job: Job, selection: Selection, topics: tuple[str, ...]) -> Itera
 
 
 def _image_settings(job: Job, topics: Iterable[TopicPlan]) -> Iterator[Finding]:
-    """Yield a finding for each `image: png` whose pattern applies only to topics that do not become images."""
+    """Yield a finding for each `image` setting whose pattern applies only to topics that do not become images."""
     images = {
-        pattern: settings.image
+        pattern: image_settings(settings.image).format
         for pattern, settings in job.topic_settings.items()
         if "image" in settings.model_fields_set
     }
     tags: dict[str, dict[str, str]] = {}
     for topic in topics:
         pattern = first_match(images, topic.topic)
-        if pattern is not None and images[pattern] == "png":
+        if pattern is not None and images[pattern] != "raw":
             tags.setdefault(pattern, {})[topic.topic] = topic.ontology.tag
     for pattern, by_topic in tags.items():
         if IMAGE_TAG not in by_topic.values():
@@ -358,7 +359,7 @@ def _image_settings(job: Job, topics: Iterable[TopicPlan]) -> Iterator[Finding]:
             yield Finding(
                 "image-setting",
                 Severity.WARNING,
-                f"image: png has no effect, because {topic} becomes {tag}, not {IMAGE_TAG}",
+                f"image: {images[pattern]} has no effect, because {topic} becomes {tag}, not {IMAGE_TAG}",
                 job.span("topic_settings", pattern, "image"),
                 "remove the setting",
             )

@@ -12,8 +12,8 @@ import pyarrow as pa
 from msgspec import Struct
 
 from mosaico_ingest.errors import ViewError
-from mosaico_ingest.view.depth import colour_map
-from mosaico_ingest.view.encodings import Pixels, grey
+from mosaico_ingest.images.depth import colour_map
+from mosaico_ingest.images.encodings import Pixels, grey
 
 _NUMPY_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 """The types of point fields, from code 1 (INT8) to 8 (FLOAT64)."""

@@ -4,26 +4,23 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from mosaico_ingest.errors import ViewError, missing_library
-from mosaico_ingest.view.depth import (
+from mosaico_ingest.errors import ViewError
+from mosaico_ingest.images.depth import (
     colour_map,
     depth_from_inverse,
     depth_parameters,
     depth_payload,
     run_length_depth,
 )
-from mosaico_ingest.view.encodings import Pixels, RawImage, demosaic, grey, is_bayer, raw_pixels
-
-if TYPE_CHECKING:
-    from PIL.Image import Image as Picture
+from mosaico_ingest.images.encodings import Pixels, RawImage, demosaic, eight_bits, grey, is_bayer, raw_pixels
+from mosaico_ingest.images.files import file_samples, image_file_type, picture_of, pillow
 
 VIDEO = ("h264", "hevc", "h265", "vp9", "av1", "theora")
 """Formats whose frames depend on earlier frames."""
@@ -32,14 +29,6 @@ _GAP = 4
 _BACKGROUND = 32
 """Grey value between the pictures of a contact sheet."""
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
-_SIGNATURES = {
-    b"\x89PNG": "png",
-    b"\xff\xd8\xff": "jpeg",
-    b"RIFF": "webp",
-    b"II*\0": "tiff",
-    b"MM\0*": "tiff",
-    b"BM": "bmp",
-}
 
 
 def has_images(schema: pa.Schema) -> bool:
@@ -49,12 +38,6 @@ def has_images(schema: pa.Schema) -> bool:
     if "encoding" in schema.names:
         return {"width", "height"} <= set(schema.names)
     return "format" in schema.names
-
-
-def image_file_type(data: bytes | memoryview) -> str | None:
-    """Return the type of an image file, such as `png`, or None if the bytes are no image file."""
-    start = bytes(data[:4])
-    return next((name for signature, name in _SIGNATURES.items() if start.startswith(signature)), None)
 
 
 def decode_image(row: Mapping[str, Any], *, ros_format: str = "") -> Pixels:
@@ -75,7 +58,7 @@ def decode_image(row: Mapping[str, Any], *, ros_format: str = "") -> Pixels:
         return _compressed_pixels(bytes(data), str(row.get("format") or ""), ros_format)
     if row.get("format") in {None, "", "raw"}:
         return raw_pixels(_raw_image(row, data))
-    samples = _file_samples(bytes(data))
+    samples = file_samples(bytes(data))
     if samples.ndim == 2 and samples.dtype == np.uint8:  # noqa: PLR2004 - the buffer, stored as a grayscale picture
         return raw_pixels(_raw_image(row, samples.tobytes()))
     return _sample_pixels(samples, str(encoding))
@@ -87,7 +70,7 @@ def fit_pixels(pixels: Pixels, *, width: int, height: int) -> Pixels:
     Raises:
         IngestError: Pillow is not installed.
     """
-    picture = _picture(pixels)
+    picture = picture_of(pixels)
     picture.thumbnail((max(1, width), max(1, height)))
     return np.asarray(picture)
 
@@ -99,18 +82,7 @@ def png_bytes(pixels: Pixels) -> bytes:
         IngestError: Pillow is not installed.
     """
     buffer = io.BytesIO()
-    _picture(pixels).save(buffer, "PNG")
-    return buffer.getvalue()
-
-
-def jpeg_bytes(pixels: Pixels, *, quality: int) -> bytes:
-    """Return the picture as a JPEG file; `quality` is 1 to 95.
-
-    Raises:
-        IngestError: Pillow is not installed.
-    """
-    buffer = io.BytesIO()
-    _picture(pixels).save(buffer, "JPEG", quality=quality)
+    picture_of(pixels).save(buffer, "PNG")
     return buffer.getvalue()
 
 
@@ -122,7 +94,7 @@ def write_picture(pixels: Pixels, path: Path) -> None:
         IngestError: Pillow is not installed.
     """
     require_suffix(path, _SUFFIXES)
-    _picture(pixels).save(path)
+    picture_of(pixels).save(path)
 
 
 def require_suffix(path: Path, suffixes: Sequence[str]) -> None:
@@ -145,8 +117,8 @@ def contact_sheet(pictures: Sequence[tuple[str, Pixels]], *, columns: int = 4, w
     Raises:
         IngestError: Pillow is not installed.
     """
-    image, draw = _pillow("Image"), _pillow("ImageDraw")
-    font = _pillow("ImageFont").load_default(size=14)
+    image, draw = pillow("Image"), pillow("ImageDraw")
+    font = pillow("ImageFont").load_default(size=14)
     thumbnails = [fit_pixels(pixels, width=width, height=width) for _, pixels in pictures]
     label_height = 20
     cell_height = max((each.shape[0] for each in thumbnails), default=0) + label_height + _GAP
@@ -191,15 +163,15 @@ def _compressed_pixels(data: bytes, codec: str, ros_format: str) -> Pixels:
         raise ViewError(
             f"{video} is a video stream, whose frames depend on earlier frames", hint="use `ingest view`"
         )
-    return _sample_pixels(_file_samples(data), encoding)
+    return _sample_pixels(file_samples(data), encoding)
 
 
 def _compressed_depth(data: bytes, encoding: str, ros_format: str) -> npt.NDArray[Any]:
     payload = depth_payload(data)
     if payload is not None:
-        values = _file_samples(payload)
+        values = file_samples(payload)
     elif image_file_type(data) is not None:
-        return _file_samples(data)
+        return file_samples(data)
     elif "rvl" in ros_format.lower():
         values = run_length_depth(data)
     else:
@@ -213,46 +185,7 @@ def _sample_pixels(samples: npt.NDArray[Any], encoding: str) -> Pixels:
         return np.ascontiguousarray(samples[..., :3])
     pattern = is_bayer(encoding)
     if pattern is not None:
-        return demosaic(_eight_bits(samples), pattern)
+        return demosaic(eight_bits(samples), pattern)
     if samples.dtype == np.uint8:
         return grey(samples)
-    return grey(_eight_bits(samples)) if encoding == "mono16" else colour_map(samples)
-
-
-def _eight_bits(samples: npt.NDArray[Any]) -> Pixels:
-    return samples if samples.dtype == np.uint8 else (samples >> 8).astype(np.uint8)
-
-
-def _file_samples(data: bytes) -> npt.NDArray[Any]:
-    """Return the samples of an image file: 8-bit RGB, or one channel with the depth of the file."""
-    picture = _opened(data)
-    try:
-        if picture.mode in {"L", "F", "I"} or picture.mode.startswith("I;16"):
-            samples = np.asarray(picture)
-            return samples.astype(np.uint16) if picture.mode.startswith("I;16") else samples
-        return np.asarray(picture.convert("RGB"))
-    except (OSError, ValueError, SyntaxError) as error:
-        raise ViewError(f"the image file is damaged: {error}") from error
-
-
-def _opened(data: bytes) -> Picture:
-    image = _pillow("Image")
-    try:
-        return image.open(io.BytesIO(data))
-    except (OSError, ValueError, SyntaxError, image.DecompressionBombError) as error:
-        start = data[:8].hex(" ")
-        raise ViewError(
-            f"the bytes are no image file that Pillow can read; they start with {start}"
-        ) from error
-
-
-def _picture(pixels: Pixels) -> Picture:
-    return _pillow("Image").fromarray(pixels)
-
-
-def _pillow(module: str) -> Any:  # noqa: ANN401 - a module
-    """Return a module of Pillow, which only images need."""
-    try:
-        return import_module(f"PIL.{module}")
-    except ImportError as error:
-        raise missing_library("Pillow", "images") from error
+    return grey(eight_bits(samples)) if encoding == "mono16" else colour_map(samples)

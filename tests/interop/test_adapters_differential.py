@@ -24,9 +24,10 @@ from mosaico_ingest.adapters.builtin import (
     BY_TYPE,
     Builtin,
 )
-from mosaico_ingest.adapters.image import PngImageSpec
+from mosaico_ingest.adapters.image import EncodedImageSpec
 from mosaico_ingest.adapters.python import ontology_of
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.job.image import ImageSettings
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
@@ -136,7 +137,11 @@ def test_stored_images_equal_those_of_the_sdk() -> None:
             "is_bigendian": random.choice((0, 1)), "data": random.randbytes(height * step + random.choice((0, 0, 1))),
         }  # fmt: skip
         theirs, _ = _theirs(adapter, message, BY_NAME["ImageAdapter"].mapping.ontology.struct)
-        (ours,) = _ours(PngImageSpec(BY_NAME["ImageAdapter"]), definition, [message]).rows.to_pylist()
+        (ours,) = _ours(
+            EncodedImageSpec(BY_NAME["ImageAdapter"], ImageSettings(format="buffer_png")),
+            definition,
+            [message],
+        ).rows.to_pylist()
         assert _with_pixels(ours) == _with_pixels(theirs)
 
 

@@ -11,7 +11,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from mosaico_ingest.adapters.adapter import Adapter, Envelope, UnmodeledAdapter
-from mosaico_ingest.adapters.image import without_png
+from mosaico_ingest.adapters.image import without_files
 from mosaico_ingest.adapters.inverse.columns import ColumnInverter
 from mosaico_ingest.adapters.inverse.message_builder import FieldPath, MessageBuilder
 from mosaico_ingest.adapters.mapping.columns import (
@@ -150,7 +150,7 @@ class _MappingInverse(Struct, frozen=True):
 
     def restore(self, rows: pa.StructArray, envelope: Envelope) -> Restored:
         if self.adapter.ontology.tag == _IMAGE:
-            rows = without_png(rows)
+            rows = without_files(rows)
         builder = MessageBuilder(self.shape, len(rows))
         undo = ColumnInverter(builder, self.metadata_texts)
         undo.record(self.adapter.record, rows)

@@ -6,13 +6,14 @@ from collections.abc import Iterator
 
 from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.adapters.image import IMAGE_TAG
+from mosaico_ingest.job.image import image_settings
 from mosaico_ingest.job.patterns import first_match, is_glob
 from mosaico_ingest.lint.job import Job
 from mosaico_ingest.lint.rule import Check, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:
-    """Report `image: png` for topics whose built-in adapter in `override` does not produce images.
+    """Report `image` settings for topics whose built-in adapter in `override` does not produce images.
 
     The types of other topics are known only to plan and run, which report the same rule.
     """
@@ -20,8 +21,9 @@ def check(job: Job) -> Iterator[Problem]:
     for topic, setting in job.manifest.topic_settings.items():
         pattern = topic if is_glob(topic) else first_match(overrides, topic)
         adapter = BY_NAME.get(overrides.get(pattern or "", ""))
-        if setting.image == "png" and adapter is not None and adapter.tag != IMAGE_TAG:
-            message = f"image: png has no effect, because {topic} becomes {adapter.tag}, not {IMAGE_TAG}"
+        image = image_settings(setting.image).format
+        if image != "raw" and adapter is not None and adapter.tag != IMAGE_TAG:
+            message = f"image: {image} has no effect, because {topic} becomes {adapter.tag}, not {IMAGE_TAG}"
             yield Problem(message, job.key_span("topic_settings", topic, "image"), "remove the setting")
 
 

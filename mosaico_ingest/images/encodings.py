@@ -1,4 +1,4 @@
-"""Raw pixel encodings of ROS images, converted to RGB."""
+"""Raw pixel encodings of ROS images: the samples of a buffer, and their colors as RGB."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from msgspec import Struct
 
 from mosaico_ingest.errors import ViewError
-from mosaico_ingest.view.depth import colour_map
+from mosaico_ingest.images.depth import colour_map
 
 Pixels: TypeAlias = npt.NDArray[np.uint8]
 """An RGB picture, of shape (height, width, 3)."""
@@ -23,7 +23,10 @@ _BAYER = re.compile(r"bayer_(rggb|bggr|gbrg|grbg)(8|16)")
 _COLOURS = {
     f"{order}{bits}": (order, f"u{bits // 8}") for order in ("rgb", "bgr", "rgba", "bgra") for bits in (8, 16)
 }
+_OPENCV_ORDER = "bgra"
 _EIGHT_BITS = 8
+_COLOUR_AXES = 3
+"""Height, width and channels."""
 
 
 class RawImage(Struct, frozen=True):
@@ -38,8 +41,17 @@ class RawImage(Struct, frozen=True):
     is_bigendian: bool = False
 
 
-def raw_pixels(image: RawImage) -> Pixels:
-    """Return the pixels of a raw image as RGB; depth and other measurements are colour-mapped.
+class Samples(Struct, frozen=True):
+    """The samples of a raw image: a picture, or measurements such as depth."""
+
+    values: _Array
+    """Grey values or measurements of shape (height, width), or colours of shape (height, width, n): RGB, RGBA, or two
+    measurements per pixel."""
+    is_measured: bool = False
+
+
+def raw_samples(image: RawImage) -> Samples:
+    """Return the samples of a raw image in their recorded depth; mosaics and YUV are converted to RGB.
 
     Raises:
         ViewError: The encoding is unknown, or the buffer is too short.
@@ -49,21 +61,39 @@ def raw_pixels(image: RawImage) -> Pixels:
         raise ViewError(f"the image has {image.width} x {image.height} pixels")
     if encoding in _COLOURS:
         order, kind = _COLOURS[encoding]
-        return _ordered(_eight_bits(_samples(image, kind, len(order))), order)
+        return Samples(_ordered(_samples(image, kind, len(order)), order))
     if encoding in {"mono8", "mono16", "8UC1", "8UC", "8UC01"}:
-        kind = "u2" if encoding == "mono16" else "u1"
-        return grey(_eight_bits(_samples(image, kind, 1)[..., 0]))
+        return Samples(_samples(image, "u2" if encoding == "mono16" else "u1", 1)[..., 0])
     bayer = _BAYER.fullmatch(encoding)
     if bayer is not None:
-        return demosaic(_eight_bits(_samples(image, f"u{int(bayer[2]) // 8}", 1)[..., 0]), bayer[1])
+        return Samples(demosaic(_samples(image, f"u{int(bayer[2]) // 8}", 1)[..., 0], bayer[1]))
     if encoding in _YUV:
-        return _YUV[encoding](image)
+        return Samples(_YUV[encoding](image))
     opencv = _OPENCV.fullmatch(encoding)
-    if opencv is not None:
-        return _opencv_pixels(image, opencv[1], int(opencv[2] or 1))
+    if opencv is not None and 1 <= int(opencv[2] or 1) <= len(_OPENCV_ORDER):
+        return _opencv_samples(image, opencv[1], int(opencv[2] or 1))
     raise ViewError(
         f"the encoding {image.encoding!r} is not supported", hint=f"use one of {', '.join(ENCODINGS)}"
     )
+
+
+def raw_pixels(image: RawImage) -> Pixels:
+    """Return the pixels of a raw image as RGB; depth and other measurements are colour-mapped.
+
+    Raises:
+        ViewError: The encoding is unknown, or the buffer is too short.
+    """
+    samples = raw_samples(image)
+    values = samples.values
+    if samples.is_measured:
+        return colour_map(np.hypot(values[..., 0], values[..., 1]) if values.ndim == _COLOUR_AXES else values)
+    pixels = eight_bits(values)
+    return grey(pixels) if pixels.ndim < _COLOUR_AXES else np.ascontiguousarray(pixels[..., :3])
+
+
+def eight_bits(values: _Array) -> Pixels:
+    """Return samples as bytes: the high byte of 16-bit samples, and other numbers stretched to the range of a byte."""
+    return _eight_bits(values) if values.dtype.kind == "u" else _stretched(values)
 
 
 def is_bayer(encoding: str) -> str | None:
@@ -77,13 +107,13 @@ def grey(values: Pixels) -> Pixels:
     return np.repeat(values[..., np.newaxis], 3, axis=2)
 
 
-def demosaic(mosaic: Pixels, pattern: str) -> Pixels:
-    """Return the colours of a Bayer mosaic of shape (height, width), interpolated from neighbouring pixels.
+def demosaic(mosaic: _Array, pattern: str) -> _Array:
+    """Return the colours of a Bayer mosaic of shape (height, width) with its sample type, interpolated from neighbouring pixels.
 
     `pattern` has the colours of the first two rows, such as `rggb`.
     """
     height, width = mosaic.shape
-    pixels = np.empty((height, width, 3), np.uint8)
+    pixels = np.empty((height, width, 3), mosaic.dtype)
     for channel, colour in enumerate("rgb"):
         mask = np.zeros((height, width), np.float32)
         for at, letter in enumerate(pattern):
@@ -102,15 +132,16 @@ def _blur(values: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.floating[Any]
 
 
 def _samples(image: RawImage, kind: str, channels: int) -> _Array:
-    """Return the samples of shape (height, width, channels)."""
+    """Return the samples of shape (height, width, channels), in the byte order of this machine."""
     item = np.dtype(kind).newbyteorder(">" if image.is_bigendian else "<")
     rows = _rows(image, image.width * channels * item.itemsize, image.height)
-    return np.ascontiguousarray(rows).view(item).reshape(image.height, image.width, channels)
+    samples = np.ascontiguousarray(rows).view(item).reshape(image.height, image.width, channels)
+    return samples.astype(item.newbyteorder("="), copy=False)
 
 
 def _rows(image: RawImage, used: int, height: int) -> npt.NDArray[np.uint8]:
     """Return the first `used` bytes of each row, of shape (height, used)."""
-    stride = max(image.stride, used) if image.stride else used
+    stride = image.stride if image.stride and height > 1 else used
     if image.stride and image.stride < used:
         raise ViewError(
             f"a row of {image.width} pixels in {image.encoding} has {used} bytes, but the stride is {image.stride}"
@@ -131,17 +162,20 @@ def _eight_bits(samples: _Array) -> Pixels:
     return samples if samples.dtype.itemsize == 1 else (samples >> _EIGHT_BITS).astype(np.uint8)
 
 
-def _ordered(samples: Pixels, order: str) -> Pixels:
-    return np.ascontiguousarray(samples[..., [order.index(colour) for colour in "rgb"]])
+def _ordered(samples: _Array, order: str) -> _Array:
+    """Return the channels as RGB or RGBA."""
+    colours = "rgba"[: len(order)]
+    if order == colours:
+        return samples
+    return np.ascontiguousarray(samples[..., [order.index(colour) for colour in colours]])
 
 
-def _opencv_pixels(image: RawImage, depth: str, channels: int) -> Pixels:
-    """Return the pixels of an OpenCV matrix: bytes in three or four channels are colours in OpenCV's order."""
+def _opencv_samples(image: RawImage, depth: str, channels: int) -> Samples:
+    """Return the samples of an OpenCV matrix: three or four channels are colours in OpenCV's order."""
     samples = _samples(image, _OPENCV_TYPES[depth], channels)
-    if channels in {3, 4}:
-        return _ordered(_eight_bits(samples) if depth in {"8U", "16U"} else _stretched(samples), "bgra")
-    values = samples[..., 0] if channels == 1 else np.hypot(samples[..., 0], samples[..., 1])
-    return colour_map(values)
+    if channels > 2:  # noqa: PLR2004 - fewer channels are measurements
+        return Samples(_ordered(samples, _OPENCV_ORDER[:channels]))
+    return Samples(samples[..., 0] if channels == 1 else samples, is_measured=True)
 
 
 def _stretched(samples: _Array) -> Pixels:
