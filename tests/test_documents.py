@@ -15,9 +15,11 @@ from typing import Any
 
 import pytest
 import yaml
+from documentation_site import CODE, LINK, build, navigation, readme_with_page_list, write_sources
 from typer.main import get_command
 
 from mosaico_ingest.cli.app import command_line
+from mosaico_ingest.cli.reference import cli_reference
 from mosaico_ingest.job.config import ROSInjectionConfig
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -27,7 +29,10 @@ TEXT = {page: page.read_text(encoding="utf-8") for page in PAGES}
 INGEST: Any = get_command(command_line())
 NOT_RUN = ("--executor", "--from", "--otel", "--metrics", "serve", "browse", "replay", "lint .")
 """Parts of commands that need a cluster, a server, a collector, a system folder, a client or rejected messages, or that read all files."""
-EXIT_CODES = {"ingest diff job.yaml other.yaml": 1}
+EXIT_CODES = {
+    "ingest diff job.yaml other.yaml": 1,
+    "ingest bag damaged.mcap --name recovered --report run.json": 4,
+}
 
 
 def label(page: Path) -> str:
@@ -78,9 +83,54 @@ def test_link_leads_to_existing_file_and_heading(page: Path) -> None:
         assert not anchor or anchor in anchors(goal.read_text(encoding="utf-8")), f"{target}#{anchor}"
 
 
-def test_docs_readme_lists_every_page() -> None:
-    listed = set(re.findall(r"\]\(([\w-]+\.md)", TEXT[ROOT / "docs" / "README.md"]))
-    assert listed == {page.name for page in DOCS} - {"README.md"}
+def test_navigation_contains_every_page_once() -> None:
+    pages = [path for section in navigation().values() for path in section.values()]
+    assert len(pages) == len(set(pages))
+    assert {*DOCS, ROOT / "docs" / "rules" / "README.md"} <= set(pages)
+    assert [page for page in pages if not page.is_file()] == []
+
+
+def test_docs_readme_has_the_page_list_of_the_navigation() -> None:
+    assert TEXT[ROOT / "docs" / "README.md"] == readme_with_page_list(), "run ./dev docs"
+
+
+def test_command_line_page_equals_the_command_line() -> None:
+    assert TEXT[ROOT / "docs" / "cli.md"] == cli_reference(), "run ./dev docs"
+
+
+def test_site_sources_contain_every_linked_file(tmp_path: Path) -> None:
+    write_sources(tmp_path)
+    for page in (tmp_path / "docs").rglob("*.md"):
+        for link in LINK.finditer(CODE.sub("", page.read_text(encoding="utf-8"))):
+            assert (page.parent / link[2]).is_file(), f"{page}: {link[2]}"
+
+
+@pytest.mark.slow
+def test_site_builds_in_strict_mode_and_loads_nothing_from_other_servers(tmp_path: Path) -> None:
+    pytest.importorskip("zensical", reason="the extra docs is not installed")
+    build(tmp_path / "sources", tmp_path / "site")
+    pages = list((tmp_path / "site").rglob("*.html"))
+    assert len(pages) > len(DOCS)
+    for page in pages:
+        text = page.read_text(encoding="utf-8")
+        loaded = re.findall(r"<(?:script|img|iframe|source)[^>]*\ssrc=\"?([^\" >]+)", text)
+        loaded += re.findall(
+            r"<link[^>]*rel=\"?(?:stylesheet|preload|preconnect|icon)[^>]*href=\"?([^\" >]+)", text
+        )
+        assert [url for url in loaded if url.startswith(("http:", "https:", "//"))] == []
+    signatures = (tmp_path / "site" / "python" / "index.html").read_text(encoding="utf-8")
+    assert 'id="mosaico_ingest.ROSLoader"' in signatures
+
+
+@pytest.mark.slow
+def test_terminal_pictures_show_the_current_output(tmp_path: Path) -> None:
+    pytest.importorskip("pty", reason="only POSIX systems have pseudo terminals")
+    from terminal import picture_text  # noqa: PLC0415 - it imports pty
+    from terminal_pictures import take_pictures  # noqa: PLC0415 - as above
+
+    for name, picture in take_pictures(tmp_path):
+        stored = (ROOT / "docs" / "images" / f"{name}.svg").read_text(encoding="utf-8")
+        assert picture_text(stored) == picture_text(picture), f"{name}: run ./dev screenshots"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=label)
@@ -117,6 +167,10 @@ def run(*arguments: str, cwd: Path, code: int = 0) -> str:
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in DOCS if console_commands(page)], ids=label)
 def test_commands_of_page_succeed_in_order(project: Path, page: Path) -> None:
+    if page.name == "start.md":
+        shutil.rmtree(project / "mosaico")  # its first command ingests the quickstart
+    content = (project / "drive.mcap").read_bytes()
+    (project / "damaged.mcap").write_bytes(content[: len(content) // 2])
     job = "version: 1\nbag: {path: drive.mcap}\nsequence: {name: drive, if_exists: replace}\n"
     (project / "job.yaml").write_text(job)
     (project / "other.yaml").write_text(f"{job}topics: [/imu]\n")

@@ -30,7 +30,7 @@ def rule_index() -> str:
         for group, rules in groupby(RULES.values(), key=lambda rule: rule.group)
     ]
     return (
-        "# Rules\n\nLook up a finding of lint, plan or run, or the reason of a rejected row. "
+        "# Rules\n\nAfter reading this page, you can look up a finding of lint, plan or run, or the reason of a rejected row. "
         "`ingest lint --explain RULE` prints the same page.\n" + "".join(tables)
     )
 

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import re
-import struct
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-# Only POSIX systems have pseudo terminals.
-fcntl: Any = pytest.importorskip("fcntl")
-pty: Any = pytest.importorskip("pty")
-termios: Any = pytest.importorskip("termios")
+pytest.importorskip("pty", reason="only POSIX systems have pseudo terminals")
+from terminal import in_terminal, printed_lines
 
 ROOT = Path(__file__).resolve().parents[2]
 TOPICS = ("/camera/image_raw/compressed", "/joint_states", "/lidar/points")
@@ -33,36 +28,6 @@ COMMANDS = {
 }
 LONG = {"inspect", "plan", "report", "show", "describe topic"}
 """Commands that also print sentences, which the terminal wraps."""
-
-
-def in_terminal(words: list[str], width: int, folder: Path) -> list[str]:
-    """Return the lines that a command of `ingest` prints to a terminal of this width."""
-    return printed(["-m", "mosaico_ingest", *words], width, folder)
-
-
-def printed(arguments: list[str], width: int, folder: Path) -> list[str]:
-    """Return the lines that Python prints to a terminal of this width, including those that it overwrites."""
-    ours, theirs = pty.openpty()
-    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 50, width, 0, 0))
-    command = [sys.executable, *arguments]
-    environment = {name: value for name, value in os.environ.items() if name not in {"COLUMNS", "LINES"}}
-    with subprocess.Popen(  # noqa: S603 - our own code
-        command, stdin=theirs, stdout=theirs, stderr=theirs, cwd=folder, env={**environment, "TERM": "xterm"}
-    ) as process:
-        os.close(theirs)
-        output = b""
-        while True:
-            try:
-                part = os.read(ours, 1 << 16)
-            except OSError:  # Linux reports the end of a terminal as an error
-                break
-            if not part:
-                break
-            output += part
-    os.close(ours)
-    assert process.returncode in {0, 1}, output.decode()
-    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", output.decode())
-    return [line.rstrip() for line in text.replace("\r\n", "\n").splitlines()]
 
 
 @pytest.fixture(scope="module")
@@ -139,11 +104,11 @@ with progress.live_display(tally) as observe:
 def test_progress_in_terminal_is_the_line_of_the_documentation(tmp_path: Path) -> None:
     page = (ROOT / "docs" / "scale.md").read_text(encoding="utf-8")
     (documented,) = re.findall(r"^44 of 65 recordings.*$", page, re.MULTILINE)
-    assert documented in printed(["-c", PROGRESS], 200, tmp_path)
+    assert documented in printed_lines(["-c", PROGRESS], 200, tmp_path)
 
 
 def test_progress_in_narrow_terminal_is_complete(tmp_path: Path) -> None:
-    lines = printed(["-c", PROGRESS], 60, tmp_path)
+    lines = printed_lines(["-c", PROGRESS], 60, tmp_path)
     assert all(len(line) <= 60 for line in lines)
     at = next(at for at, line in enumerate(lines) if line.startswith("44 of 65"))
     assert "2.44 s left" in " ".join(lines[at : at + 3])
