@@ -25,6 +25,7 @@ from mosaico_ingest.adapters.adapter import AdapterSpec, UnmodeledSpec
 from mosaico_ingest.adapters.builtin import BY_NAME, BY_TYPE, Builtin
 from mosaico_ingest.adapters.image import EncodedImageSpec
 from mosaico_ingest.adapters.mapping.loader import load_adapter
+from mosaico_ingest.adapters.permission import is_python_allowed, python_refusal
 from mosaico_ingest.adapters.python import (
     PythonAdapterSpec,
     ROSAdapterBase,
@@ -48,18 +49,19 @@ _ADAPTER_KEY = re.compile(r"^adapter:\s*['\"]?(?P<name>\w+)['\"]?\s*(#|$)", re.M
 """The name of the adapter in an adapter file, found without parsing the file."""
 
 
-def adapter_spec(adapter: object, base_dir: Path) -> AdapterSpec:
+def adapter_spec(adapter: object, base_dir: Path, *, python: bool = True) -> AdapterSpec:
     """Return the spec for a spec, an adapter class, or a reference as text or path.
 
     Raises:
-        AdapterError: The object is not an adapter.
+        AdapterError: The object is not an adapter, or is one in Python although `python` is false.
     """
     if isinstance(adapter, (str, Path)):
-        return load_adapter_reference(str(adapter), base_dir)
+        return load_adapter_reference(str(adapter), base_dir, python=python)
     if isinstance(adapter, type):
         if "__adapter_spec__" in vars(adapter):  # the class of a built-in adapter, but not a subclass
             return vars(adapter)["__adapter_spec__"]
         if is_adapter_class(adapter):
+            _check_permission(adapter.__qualname__, allowed=python)
             return PythonAdapterSpec(adapter)
     elif hasattr(adapter, "bind") and hasattr(adapter, "ros_types"):
         return cast("AdapterSpec", adapter)  # it implements the protocol
@@ -69,13 +71,14 @@ def adapter_spec(adapter: object, base_dir: Path) -> AdapterSpec:
     )
 
 
-def load_adapter_reference(ref: str, base_dir: Path) -> AdapterSpec:
+def load_adapter_reference(ref: str, base_dir: Path, *, python: bool = True) -> AdapterSpec:
     """Load the adapter that a reference names: `LidarAdapter`, `adapters/pack.yaml`, `pkg.module:Class` or `file.py:Class`.
 
     Paths are relative to `base_dir`. Modules are imported from Python's search path, then from `base_dir`.
 
     Raises:
-        AdapterError: There is no such adapter, or its file has a mistake; the error has file and line.
+        AdapterError: There is no such adapter, its file has a mistake (the error has file and line), or it is written in
+            Python although `python` is false.
     """
     if ref in BY_NAME:
         return BY_NAME[ref]
@@ -86,6 +89,7 @@ def load_adapter_reference(ref: str, base_dir: Path) -> AdapterSpec:
     module_path, colon, qualname = ref.rpartition(":")
     if not colon or not module_path or not qualname:
         raise AdapterError(f"there is no adapter {ref!r}", hint=suggest_reference(ref, BY_NAME))
+    _check_permission(ref, allowed=python)
     module = (
         _load_file(base_dir / module_path)
         if module_path.endswith(".py")
@@ -96,6 +100,12 @@ def load_adapter_reference(ref: str, base_dir: Path) -> AdapterSpec:
     if isinstance(spec, PythonAdapterSpec):
         return PythonAdapterSpec(spec.adapter, origin=(load_adapter_reference, (ref, base_dir)))
     return spec
+
+
+def _check_permission(reference: str, *, allowed: bool) -> None:
+    if not (allowed and is_python_allowed()):
+        message, hint = python_refusal(reference)
+        raise AdapterError(message, hint=hint)
 
 
 def suggest_reference(ref: str, names: Iterable[str] = ()) -> str:
@@ -260,23 +270,27 @@ class ROSBridge:
         base_dir: Path | None = None,
         images: Mapping[str, ImageSettings | ImageFormat] | None = None,
         formats: Mapping[str, str] | None = None,
+        python: bool = True,
     ) -> None:
         """Load all adapters; `base_dir` is the folder for relative paths.
 
-        `overrides` and `images` are by topic name or glob, `formats` (of types without an adapter) by type.
+        `overrides` and `images` are by topic name or glob, `formats` (of types without an adapter) by type. Without
+        `python`, adapters in Python are refused, and those of installed packages and of the program are not used.
 
         Raises:
             AdapterError: An adapter is missing or has a mistake, or two are loaded for one type.
         """
         folder = base_dir or Path()
-        specs = [(str(reference), adapter_spec(reference, folder)) for reference in loaded]
+        specs = [(str(reference), adapter_spec(reference, folder, python=python)) for reference in loaded]
+        installed = installed_adapters() if python else ()
         self._loaded = _by_type((f"loaded from {origin}", spec) for origin, spec in specs)
-        self._installed = _by_type(installed_adapters())
-        names = {spec.name: spec for _, spec in (*installed_adapters(), *specs)}
+        self._installed = _by_type(installed)
+        self._registered = _registered() if python else {}
+        names = {spec.name: spec for _, spec in (*installed, *specs)}
         self._overrides = {
-            pattern: names.get(reference) or adapter_spec(reference, folder)
+            pattern: names.get(reference) or adapter_spec(reference, folder, python=python)
             if isinstance(reference, str)
-            else adapter_spec(reference, folder)
+            else adapter_spec(reference, folder, python=python)
             for pattern, reference in (overrides or {}).items()
         }
         self._images = {pattern: image_settings(value) for pattern, value in (images or {}).items()}
@@ -299,6 +313,7 @@ class ROSBridge:
                 if "image" in settings.model_fields_set
             },
             formats=job.adapters.serialization_formats,
+            python=job.adapters.python,
         )
 
     def resolve(self, topic: str, msgtype: str) -> Resolution:
@@ -319,7 +334,7 @@ class ROSBridge:
             return self._override(pattern, topic, msgtype)
         sources: tuple[tuple[Reason, Mapping[str, tuple[str, AdapterSpec]]], ...] = (
             ("loaded", self._loaded),
-            ("registered", _registered()),
+            ("registered", self._registered),
             ("entry point", self._installed),
         )
         for reason, by_type in sources:
@@ -408,19 +423,25 @@ def _by_type(specs: Iterable[tuple[str, AdapterSpec]]) -> dict[str, tuple[str, A
 
 
 def _registered() -> dict[str, tuple[str, AdapterSpec]]:
+    if not is_python_allowed():
+        return {}
     return {
         msgtype: (f"registered by {adapter.__module__}", PythonAdapterSpec(adapter))
         for msgtype, adapter in registered_adapters().items()
     }
 
 
-@cache
 def installed_adapters() -> tuple[tuple[str, AdapterSpec], ...]:
-    """Return the adapters of installed packages, each with the name of its entry point.
+    """Return the adapters of installed packages, each with the name of its entry point; none if Python is refused.
 
     Raises:
         AdapterError: An entry point cannot be imported or is not an adapter; the error names the package.
     """
+    return _entry_point_adapters() if is_python_allowed() else ()
+
+
+@cache
+def _entry_point_adapters() -> tuple[tuple[str, AdapterSpec], ...]:
     adapters: list[tuple[str, AdapterSpec]] = []
     for entry in entry_points(group=ENTRY_POINTS):
         package = entry.dist.name if entry.dist else "an installed package"

@@ -35,6 +35,8 @@ GROUP_HELP = {
     "keys": "Create and list the API keys of `ingest serve`.",
 }
 """The help of groups whose commands `ingest --help` need not import."""
+NO_PYTHON = "MOSAICO_NO_PYTHON"
+"""As `adapters.permission.NO_PYTHON`, which takes longer to import."""
 NAMES = (*COMMANDS, *GROUPS)
 COMPLETING = "_INGEST_COMPLETE" in os.environ
 """Whether a shell asks for completions."""
@@ -45,13 +47,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit with the documented code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
+    if "--no-python" in words:
+        os.environ[NO_PYTHON] = "1"
     defer_garbage_collection()
     # OpenBLAS, which NumPy loads, starts a thread for each core. They take 40 ms of CPU, and no code here uses them.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # file names need not be valid text
     try:
-        _invoke(_add_command([word for word in words if word != "--debug"]))
+        _invoke(_add_command([word for word in words if word not in {"--debug", "--no-python"}]))
     except IngestError as error:
         if debug:
             raise
@@ -153,6 +157,10 @@ def root(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Print the traceback of an error.")] = False,
+    no_python: Annotated[
+        bool,
+        typer.Option("--no-python", envvar=NO_PYTHON, show_envvar=True, help="Refuse adapters in Python."),
+    ] = False,
 ) -> None:
     """Turn ROS recordings into typed, queryable sequences. `ingest job.yaml` runs a job."""
 

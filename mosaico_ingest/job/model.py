@@ -283,6 +283,9 @@ class AdapterSettings(Section):
     override: dict[Topic, AdapterReference] = Field(default={}, examples=[{"/lidar/*": "LidarAdapter"}])
     """The adapter for a topic name or glob, written as in `load` or as the name of a built-in adapter. The exact topic name
     takes precedence, followed by the first matching glob."""
+    python: bool = True
+    """Whether adapters in Python may run. With `false`, a reference to one is an error, and those of installed packages are not
+    used. `ingest --no-python` does the same for every job."""
     unmodeled: Unmodeled = Unmodeled.KEEP
     """Action for a type without an adapter: keep its ROS shape, skip its topics, fail."""
     serialization_formats: dict[Text, Literal["default", "ragged", "image"]] = Field(

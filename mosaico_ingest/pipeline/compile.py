@@ -17,6 +17,7 @@ from msgspec import Struct
 from mosaico_ingest.adapters.adapter import AdapterSpec
 from mosaico_ingest.adapters.bridge import adapter_spec, installed_adapters, suggest_reference
 from mosaico_ingest.adapters.builtin import BY_NAME
+from mosaico_ingest.adapters.permission import is_python_allowed, is_python_reference, python_refusal
 from mosaico_ingest.containers import RECORDING_NAME
 from mosaico_ingest.errors import AdapterError, ManifestError, NothingMatched
 from mosaico_ingest.findings import Finding, Severity
@@ -332,7 +333,8 @@ def check_adapters(job: Job) -> None:
         AdapterError: An adapter file has mistakes.
     """
     findings: list[Finding] = []
-    names: dict[str, AdapterSpec] = {spec.name: spec for _, spec in installed_adapters()}
+    installed = installed_adapters() if job.adapters.python else ()
+    names: dict[str, AdapterSpec] = {spec.name: spec for _, spec in installed}
     owners: dict[str, tuple[str, AdapterSpec]] = {}
     for position, reference in enumerate(job.adapters.load):
         spec = _load_adapter(job, ("adapters", "load", position), reference, names, findings)
@@ -363,6 +365,10 @@ def _load_adapter(
     findings: list[Finding],
 ) -> AdapterSpec | None:
     """Return an adapter, or None with a finding about its reference."""
+    if not (job.adapters.python and is_python_allowed()) and is_python_reference(reference):
+        message, hint = python_refusal(str(reference))
+        findings.append(Finding("python-refused", Severity.ERROR, message, job.value_span(*path), hint))
+        return None
     try:
         return adapter_spec(reference, job.folder)
     except AdapterError as error:

@@ -63,7 +63,7 @@ def _nothing_stays_registered() -> Iterator[None]:
     yield
     base._registered.clear()
     base._registered.update(before)
-    bridge_module.installed_adapters.cache_clear()
+    bridge_module._entry_point_adapters.cache_clear()
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     def offer(value: str) -> None:
         entry = EntryPoint("mine", value, bridge_module.ENTRY_POINTS)
         monkeypatch.setattr(bridge_module, "entry_points", lambda group: [entry] if group else [])
-        bridge_module.installed_adapters.cache_clear()
+        bridge_module._entry_point_adapters.cache_clear()
 
     return offer
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from mosaico_ingest.adapters.bridge import installed_adapters
+from mosaico_ingest.adapters.bridge import _entry_point_adapters
 from mosaico_ingest.adapters.builtin import BUILTIN, BY_NAME
 from mosaico_ingest.adapters.standalone import DefinitionFinder
 from mosaico_ingest.cli.app import main
@@ -192,10 +192,10 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     (info / "entry_points.txt").write_text("[mosaico_ingest.adapters]\nimu = acme_pkg_for_tests:OFFERED\n")
     (info.parent / "acme_pkg_for_tests.py").write_text(PACKAGE)
     monkeypatch.syspath_prepend(info.parent)
-    installed_adapters.cache_clear()
+    _entry_point_adapters.cache_clear()
     yield info
     sys.modules.pop("acme_pkg_for_tests", None)
-    installed_adapters.cache_clear()
+    _entry_point_adapters.cache_clear()
 
 
 @pytest.mark.usefixtures("package")
