@@ -287,11 +287,13 @@ def run(
     executor: Executor | None = None,
     observe: BatchObserver = ignore_batch,
     manifests: Sequence[UsedManifest] = (),
+    verify: bool = False,
 ) -> RunReport:
     """Run a manifest, or every job of a list, and return the report; a failed recording is part of the report.
 
     The default executor runs as many recordings at a time as `run.jobs` of the first job. `manifests` are added to
-    the report for its readers; a manifest that is run is added by itself.
+    the report for its readers; a manifest that is run is added by itself. With `if_exists: skip`, stored recordings whose
+    files and job have not changed are not opened; `verify` opens them and compares their content.
 
     Raises:
         ManifestError: The manifest has mistakes.
@@ -305,11 +307,13 @@ def run(
         from mosaico_ingest.pipeline.contract_group import add_group_results
 
         tasks = add_group_results(tasks)
+    from mosaico_ingest.pipeline.known import mark_known
+
     chosen = executor or choose_executor(tasks)
     return RunReport(
         tool=f"mosaico-ingest {__version__}",
         manifests=tuple(manifests),
-        recordings=tuple(chosen.map(tasks, observe)),
+        recordings=tuple(chosen.map(tasks if verify else mark_known(tasks), observe)),
     )
 
 
@@ -342,15 +346,17 @@ def used_manifest(path: Path) -> UsedManifest:
     return UsedManifest(path=str(path), text=manifest_text(path))
 
 
-def job_status(manifest: Path) -> tuple[RecordingStatus, ...]:
+def job_status(manifest: Path, *, verify: bool = False) -> tuple[RecordingStatus, ...]:
     """Return which recordings of a manifest are done, new, changed, failed or unreadable; write nothing.
+
+    Stored recordings whose files and job have not changed are not opened; `verify` opens them and compares their content.
 
     Raises:
         IngestError: The manifest cannot be compiled.
     """
     from mosaico_ingest.services.status import recording_statuses
 
-    return tuple(recording_statuses(compile_job(manifest)))
+    return tuple(recording_statuses(compile_job(manifest), verify=verify))
 
 
 def _read_topic_metadata(argument: str | None) -> dict[str, dict[str, Any]]:

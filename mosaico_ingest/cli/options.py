@@ -72,6 +72,13 @@ ForceOption = Annotated[bool, typer.Option("--force", "-f", help="Replace an exi
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 LogOption = Annotated[str | None, log_level("run.log_level")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
+VerifyOption = Annotated[
+    bool,
+    typer.Option(
+        "--verify",
+        help="Open stored recordings and compare their content, even if their files have not changed.",
+    ),
+]
 ReportOption = Annotated[
     Path | None,
     typer.Option("--report", metavar="FILE", help="Write the report as JSON; - writes it to stdout."),

@@ -27,6 +27,7 @@ from mosaico_ingest.cli.options import (
     SarifOption,
     TlsCertOption,
     TopicsOption,
+    VerifyOption,
     log_level,
     write_output,
 )
@@ -152,6 +153,7 @@ def run(
     otel: Annotated[
         bool, typer.Option("--otel", help="Send metrics and traces, as configured by the OTEL_... variables.")
     ] = False,
+    verify: VerifyOption = False,
     quiet: QuietOption = False,
     log: LogOption = None,
     log_format: Annotated[
@@ -199,6 +201,7 @@ def run(
             manifests=used_manifests,
             observe=files.observing(telemetry),
             on_finish=files.write,
+            verify=verify,
         )
 
 
@@ -346,6 +349,7 @@ def run_tasks(
     manifests: Sequence[UsedManifest] = (),
     observe: BatchObserver = ignore_batch,
     on_finish: Callable[[RunReport], None] = lambda _report: None,
+    verify: bool = False,
 ) -> None:
     """Run the tasks with a progress display, write reports, print the result, and exit with its code.
 
@@ -382,7 +386,7 @@ def run_tasks(
             show(position, event)
 
         chosen = executor or choose_executor(tasks, simultaneous=jobs, prepare=prepare)
-        result = api.run(tasks, executor=chosen, observe=observe_all, manifests=manifests)
+        result = api.run(tasks, executor=chosen, observe=observe_all, manifests=manifests, verify=verify)
     write_errors = list(_write_results(result, report_files, on_finish))
     if not quiet and not as_json:
         from mosaico_ingest.cli.report import print_report

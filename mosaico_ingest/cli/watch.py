@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mosaico_ingest.cli.options import JsonOption, log_level
+from mosaico_ingest.cli.options import JsonOption, VerifyOption, log_level
 
 if TYPE_CHECKING:
     from mosaico_ingest.job.model import Job
@@ -29,6 +29,7 @@ def status(
     check: Annotated[
         bool, typer.Option("--check", help="Exit with 1 unless every recording is done.")
     ] = False,
+    verify: VerifyOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Show the status of each recording: done, new, changed, failed or unreadable. Read-only."""
@@ -37,7 +38,9 @@ def status(
     from mosaico_ingest import api
     from mosaico_ingest.cli.console import print_json
 
-    recordings = [recording for manifest in manifests for recording in api.job_status(manifest)]
+    recordings = [
+        recording for manifest in manifests for recording in api.job_status(manifest, verify=verify)
+    ]
     if as_json:
         print_json([to_builtins(recording) for recording in recordings])
     else:

@@ -101,6 +101,15 @@ class Destination(ABC):
             SinkError: The destination cannot be read.
         """
 
+    def find_all(self, sequences: Collection[str]) -> dict[str, ExistingSequence]:
+        """Return the stored sequences with these names; `topics` may be empty.
+
+        Raises:
+            SinkError: The destination cannot be read.
+        """
+        existing = ((name, self.find(name)) for name in sequences)
+        return {name: sequence for name, sequence in existing if sequence is not None}
+
     @abstractmethod
     def open_sink(self, *, buffer_bytes: int) -> Sink:
         """Return the sink for this destination; one session buffers at most about `buffer_bytes`.

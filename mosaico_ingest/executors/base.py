@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Protocol
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 class Executor(Protocol):
     """Runs the recordings of a batch."""
 
-    def map(self, tasks: Sequence[Task], observe: BatchObserver) -> Iterator[Report]:
+    def map(self, tasks: Iterable[Task], observe: BatchObserver) -> Iterator[Report]:
         """Yield the report of each task, in the order of the tasks; a failed recording does not stop the others.
 
         An interrupt ends the running recordings as their session policies demand. Recordings that were not started have
@@ -29,19 +29,21 @@ class Executor(Protocol):
 class InProcess:
     """The executor that runs recordings one after the other in this process."""
 
-    def map(self, tasks: Sequence[Task], observe: BatchObserver) -> Iterator[Report]:
+    def map(self, tasks: Iterable[Task], observe: BatchObserver) -> Iterator[Report]:
         """Yield the report of each task; see `Executor.map`."""
         from mosaico_ingest.destinations.registry import keep_destinations_open  # noqa: PLC0415 - choosing an executor must not load it
         from mosaico_ingest.pipeline.run import run_recording  # noqa: PLC0415 - choosing an executor must not load the pipeline
 
         with keep_destinations_open() as keep_open:
+            previous: Task | None = None
             for position, task in enumerate(tasks):
+                if previous is not None:
+                    keep_open(previous.job.destination)
                 report = run_recording(task, partial(observe, position)).report
                 yield report
                 if report.status is RunStatus.INTERRUPTED:
                     return
-                if position + 1 < len(tasks):
-                    keep_open(task.job.destination)
+                previous = previous if task.known else task
 
 
 def do_nothing() -> None:

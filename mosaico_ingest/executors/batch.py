@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import uuid
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import islice
 from typing import Any
 
 from msgspec import Struct
@@ -14,29 +15,68 @@ from msgspec import Struct
 from mosaico_ingest.adapters.python import register_default_adapter, registered_adapters
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.job.values import Stores
-from mosaico_ingest.pipeline.run import failed_report
+from mosaico_ingest.pipeline.run import failed_report, run_recording
 from mosaico_ingest.pipeline.task import Attempt, Task
 from mosaico_ingest.report.events import BatchObserver, Event
 from mosaico_ingest.report.model import Report
 from mosaico_ingest.rosbag.definitions.registry import Registered, ROSTypeRegistry
 
+_MAX_SKIPPED = 256
+"""Number of recordings that are skipped before their reports are yielded."""
+
 
 @dataclass(slots=True)
 class Batch:
-    """The recordings of a batch by position; every started recording gets exactly one report."""
+    """The recordings of a batch by position; every started recording gets exactly one report.
 
-    tasks: Sequence[Task]
+    Recordings are taken from `source` one by one, so a batch may be of any size. Only recordings whose report has not been
+    yielded are kept in memory.
+    """
+
+    source: Iterator[Task]
     observe: BatchObserver
     run: str = field(default_factory=lambda: uuid.uuid4().hex)
     """The id of the run, by which a later attempt recognizes what an earlier one committed."""
-    waiting: deque[int] = field(default_factory=deque[int])
+    tasks: dict[int, Task] = field(default_factory=dict[int, Task])
+    """The recordings that were taken and have no report yet."""
     attempts: dict[int, int] = field(default_factory=dict[int, int])
-    """The number of attempts per recording."""
+    """The number of attempts of each of them."""
+    exhausted: bool = False
+    """Whether no recording is left to take."""
+    _retries: deque[int] = field(default_factory=deque[int])
     _reports: dict[int, Report] = field(default_factory=dict[int, Report])
+    _taken: int = 0
     _next: int = 0
 
-    def __post_init__(self) -> None:
-        self.waiting.extend(range(len(self.tasks)))
+    def take(self) -> int | None:
+        """Return the position of a recording to start, None if there is none now.
+
+        Recordings that are known to be stored are skipped here, so that no worker is needed for them.
+        """
+        if self._retries:
+            return self._retries.popleft()
+        if self.exhausted:
+            return None
+        for task in islice(self.source, _MAX_SKIPPED):
+            position, self._taken = self._taken, self._taken + 1
+            self.tasks[position] = task
+            if not task.known:
+                return position
+            self.finish(position, run_recording(task, partial(self.observe, position)).report)
+            if self._taken - self._next >= _MAX_SKIPPED:
+                return None
+        self.exhausted = True
+        return None
+
+    def stop(self) -> None:
+        """Take no more recordings."""
+        self.exhausted = True
+        self._retries.clear()
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether recordings are left to take."""
+        return bool(self._retries) or not self.exhausted
 
     def start(self, position: int) -> Attempt:
         """Count and return a new attempt."""
@@ -50,14 +90,16 @@ class Batch:
     def finish(self, position: int, report: Report) -> None:
         """Store the report of a recording."""
         self._reports[position] = report
+        del self.tasks[position]
+        self.attempts.pop(position, None)
 
     def fail(self, position: int, error: IngestError) -> None:
         """Store the report of a recording that could not run."""
         self.finish(position, failed_report(self.tasks[position], error, partial(self.observe, position)))
 
     def retry(self, position: int) -> None:
-        """Put a recording at the front of the queue."""
-        self.waiting.appendleft(position)
+        """Start a recording again, before others."""
+        self._retries.appendleft(position)
 
     def reports(self) -> Iterator[Report]:
         """Yield the next reports in order, up to the first recording that is not finished."""

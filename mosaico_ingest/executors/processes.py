@@ -6,10 +6,11 @@ import multiprocessing
 import os
 import pickle
 import signal
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain, islice
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from multiprocessing.reduction import ForkingPickler
@@ -52,10 +53,14 @@ class Processes(Struct, frozen=True):
     attempts: int = ATTEMPTS
     prepare: Callable[[], None] = do_nothing
 
-    def map(self, tasks: Sequence[Task], observe: BatchObserver) -> Iterator[Report]:
+    def map(self, tasks: Iterable[Task], observe: BatchObserver) -> Iterator[Report]:
         """Yield the report of each task; see `Executor.map`."""
-        processes = max(1, min(self.processes, len(tasks)))
-        split = [structs.replace(task, job=_split_memory(task.job, processes)) for task in tasks]
+        remaining = iter(tasks)
+        first = list(islice(remaining, self.processes))  # fewer tasks need fewer processes
+        processes = max(1, len(first))
+        split = (
+            structs.replace(task, job=_split_memory(task.job, processes)) for task in chain(first, remaining)
+        )
         spawn = partial(_spawn_worker, self.prepare, processes)
         pool = _Pool(Batch(split, observe), processes, self.attempts, spawn)
         with count_interrupts() as interrupts:
@@ -86,7 +91,7 @@ class _Pool:
 
     def reports(self, interrupts: list[int]) -> Iterator[Report]:
         """Yield reports in order, each as soon as the ones before it are finished."""
-        while self.batch.waiting or any(worker.task is not None for worker in self.workers):
+        while self.batch.is_waiting or any(worker.task is not None for worker in self.workers):
             self._assign()
             self._poll()
             if len(interrupts) > self.interrupts:
@@ -107,14 +112,15 @@ class _Pool:
                 worker.process.join()
 
     def _assign(self) -> None:
-        while self.batch.waiting:
+        while self._has_capacity() and (task := self.batch.take()) is not None:
             worker = next((worker for worker in self.workers if worker.task is None), None)
             if worker is None:
-                if len(self.workers) == self.size:
-                    return
                 worker = self.spawn()
                 self.workers.append(worker)
-            self._send(worker, self.batch.waiting.popleft())
+            self._send(worker, task)
+
+    def _has_capacity(self) -> bool:
+        return len(self.workers) < self.size or any(worker.task is None for worker in self.workers)
 
     def _send(self, worker: _Worker, task: int) -> None:
         try:
@@ -130,7 +136,8 @@ class _Pool:
 
     def _poll(self) -> None:
         busy = [worker.pipe for worker in self.workers if worker.task is not None]
-        ready = set(wait(busy, _POLL_S)) if busy else set[object]()
+        skips = self._has_capacity() and not self.batch.exhausted  # and has more recordings to skip
+        ready = set(wait(busy, 0 if skips else _POLL_S)) if busy else set[object]()
         for worker in self.workers[:]:
             if worker.task is not None and worker.pipe in ready:
                 self._receive(worker, worker.task)
@@ -164,7 +171,7 @@ class _Pool:
 
     def _interrupt(self) -> None:
         """Start no more recordings and interrupt the running ones; a second interrupt kills them."""
-        self.batch.waiting.clear()
+        self.batch.stop()
         for worker in self.workers:
             if worker.task is not None:
                 if self.interrupts:

@@ -6,7 +6,7 @@ import logging
 import socket
 import tempfile
 from collections import Counter
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from os.path import relpath
@@ -66,15 +66,16 @@ class Ray(Struct, frozen=True):
     simultaneous: int | None = None
     attempts: int = ATTEMPTS
 
-    def map(self, tasks: Sequence[Task], observe: BatchObserver) -> Iterator[Report]:
-        """Yield the report of each task; see `Executor.map`.
+    def map(self, tasks: Iterable[Task], observe: BatchObserver) -> Iterator[Report]:
+        """Yield the report of each task; see `Executor.map`. All tasks are sent to the cluster before the first one starts.
 
         Raises:
             IngestError: There is no Ray cluster at the address, or it ends during the run.
         """
+        tasks = list(tasks)
         if not tasks:
             return
-        batch = Batch(tasks, observe)
+        batch = Batch(iter(tasks), observe)
         with ExitStack() as stack:
             sent = [absolute(task) for task in tasks]
             if not ray.is_initialized():
@@ -113,9 +114,9 @@ class _Run:
     def reports(self, interrupts: list[int]) -> Iterator[Report]:
         """Yield reports in order, each as soon as the ones before it are finished."""
         largest_bytes = max((node["Resources"].get("memory", 0) for node in ray.nodes()), default=0)
-        while self.batch.waiting or self.tasks:
-            while self.batch.waiting and len(self.tasks) < self.max_tasks:
-                self._start(self.batch.waiting.popleft(), int(largest_bytes))
+        while self.batch.is_waiting or self.tasks:
+            while len(self.tasks) < self.max_tasks and (position := self.batch.take()) is not None:
+                self._start(position, int(largest_bytes))
             done, _ = ray.wait(list(self.tasks), timeout=_POLL_S) if self.tasks else ([], [])
             self._receive()  # a task posts its events before it ends
             for task in done:
@@ -159,7 +160,7 @@ class _Run:
         for position, attempt, message in ray.get(self.mailbox.fetch.remote()):
             if isinstance(message, logging.LogRecord):
                 logging.getLogger(message.name).handle(message)
-            elif attempt == self.batch.attempts[position]:
+            elif attempt == self.batch.attempts.get(position):
                 self.started.add(position)
                 self.batch.tell(position, self._with_job_paths(position, message))
 
@@ -197,7 +198,7 @@ class _Run:
 
     def _interrupt(self) -> None:
         """Start no more recordings and cancel the running ones; a second interrupt kills them."""
-        self.batch.waiting.clear()
+        self.batch.stop()
         self._cancel(force=self.interrupted > 0)
         self.interrupted += 1
 

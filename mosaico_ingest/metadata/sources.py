@@ -127,8 +127,9 @@ def _additions(job: Job, recording: Recording) -> Iterator[_Addition]:
         yield _custom_data(job, recording)
     if sources.file_name is not None:
         yield _file_name(job, sources.file_name, path)
-    if sources.sidecar is not None:
-        yield _sidecar(job, sources.sidecar, path)
+    sidecar = sidecar_path(job)
+    if sidecar is not None:
+        yield _sidecar(job, sidecar)
 
 
 def _span(job: Job, *path: str | int) -> Span | None:
@@ -195,10 +196,18 @@ def _file_name(job: Job, pattern: FileNamePattern, path: AnyPath) -> _Addition:
     )
 
 
-def _sidecar(job: Job, template: str, path: AnyPath) -> _Addition:
-    """Return the content of the side-car file; a file that is not a JSON object ends the plan."""
+def sidecar_path(job: Job) -> AnyPath | None:
+    """Return the path of the recording's side-car file, which need not exist; None if the job has no such source."""
+    sources = job.sequence.metadata_from
+    if sources is None or sources.sidecar is None:
+        return None
+    path = _main_path(job)
     texts = {"stem": RECORDING_NAME.sub("", path.name), "name": path.name, "parent": path.parent.name}
-    file = path.parent / re.sub(r"\{(\w+)\}", lambda match: texts[match[1]], template)
+    return path.parent / re.sub(r"\{(\w+)\}", lambda match: texts[match[1]], sources.sidecar)
+
+
+def _sidecar(job: Job, file: AnyPath) -> _Addition:
+    """Return the content of the side-car file; a file that is not a JSON object ends the plan."""
     span = _span(job, "sidecar")
     if not file.is_file():
         problem = f"the side-car file {file} does not exist"

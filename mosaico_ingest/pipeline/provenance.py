@@ -67,6 +67,8 @@ class Provenance(_Part):
     """The family of sequences whose message definitions are compared."""
     run: str | None = None
     """The id of the run, if its executor may start a recording more than once."""
+    fingerprint: str | None = None
+    """The fingerprint of the recording and the job before the run; see `fingerprint`."""
     quarantine: str | None = None
     """The name of the quarantine file for rejected messages, if the job has a quarantine."""
 
@@ -142,8 +144,10 @@ def full_digest(path: Path) -> str | None:
         return xxh3_128("".join(digests).encode()).hexdigest()
 
 
-def check_provenance(plan: Plan) -> SequenceRequest | None:
+def check_provenance(plan: Plan, fingerprint: str | None = None) -> SequenceRequest | None:
     """Compare the recording with the stored sequence; return how to open the sequence, None to skip it.
+
+    The `fingerprint` becomes part of the provenance record.
 
     A sequence that an interrupted run of the same job left incomplete is replaced, so that running the same command
     again completes it. Sessions that an earlier attempt of the same run committed before its process died are removed.
@@ -169,7 +173,8 @@ def check_provenance(plan: Plan) -> SequenceRequest | None:
     elif stored is not None and if_exists is IfExists.FAIL and is_repeatable(provenance, stored):
         if_exists = IfExists.REPLACE
     quarantine_file = quarantine_file_name(plan.sequence.name) if plan.quarantine else None
-    provenance = _add_full_digests(provenance, plan.files).model_copy(update={"quarantine": quarantine_file})
+    added = {"quarantine": quarantine_file, "fingerprint": fingerprint}
+    provenance = _add_full_digests(provenance, plan.files).model_copy(update=added)
     return SequenceRequest(
         name=plan.sequence.name,
         metadata={

@@ -16,6 +16,7 @@ from mosaico_ingest.errors import ContractError, EmptyPart, IngestError, Interru
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import LoaderErrorPolicy
+from mosaico_ingest.pipeline.fingerprint import fingerprint, is_fingerprinted
 from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.planning import plan_recording
 from mosaico_ingest.pipeline.provenance import check_provenance
@@ -66,12 +67,15 @@ def run_recording(task: Task, observe: Observer = ignore_events) -> Outcome:
     events = _RunEvents(task, observe)
     stopwatch = events.stopwatch
     try:
+        if task.known:
+            return events.skip_known()
+        before = None if task.dry_run else fingerprint(job)
         with log_level(job.run.log_level), open_job(job) as (recording, resolver):
             plan = _plan(task, recording, resolver)
             events.start(plan)
             if not task.dry_run:
                 _check_group(plan)
-            request = None if task.dry_run else check_provenance(plan)
+            request = None if task.dry_run else check_provenance(plan, _covering(before, plan, job))
             if request is None:
                 return events.skip()
             sink = _open_sink(plan, events)
@@ -91,6 +95,11 @@ def run_recording(task: Task, observe: Observer = ignore_events) -> Outcome:
         _log.debug("unexpected", exc_info=True)
         return events.fail(_unexpected(job, error))
     return events.complete()
+
+
+def _covering(before: str | None, plan: Plan, job: Job) -> str | None:
+    """Return the fingerprint that was taken before the run, if it covers all files of the recording."""
+    return before if before is not None and is_fingerprinted(job, plan.files) else None
 
 
 def _check_group(plan: Plan) -> None:
@@ -199,6 +208,12 @@ class _RunEvents:
         """End a run that has nothing to write."""
         self(RunFinished(RunStatus.SKIPPED, 0))
         return Outcome(self._collector.report())
+
+    def skip_known(self) -> Outcome:
+        """End the run of a recording that was recognized without opening it; its report has no topics."""
+        self._started = True
+        self(_not_planned(self._task.job))
+        return self.skip()
 
     def complete(self) -> Outcome:
         """End a run that was committed and verified."""

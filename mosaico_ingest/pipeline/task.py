@@ -25,6 +25,8 @@ class Task(Struct, frozen=True):
     plan_digest: str | None = None
     """The digest of the only plan that may run; None for any plan."""
     attempt: Attempt | None = None
+    known: bool = False
+    """Whether the same content is stored already, ingested by the same job: the run skips it without opening it."""
     dry_run: bool = False
     """Whether to plan only, and write nothing."""
     group: tuple[ExpectationResult, ...] = ()

@@ -10,6 +10,7 @@ from msgspec import Struct
 from mosaico_ingest.errors import IngestError, SequenceExists
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import IfExists
+from mosaico_ingest.pipeline.known import with_known
 from mosaico_ingest.pipeline.provenance import (
     add_doubtful_digests,
     decide_skip,
@@ -45,10 +46,14 @@ class RecordingStatus(Struct, frozen=True):
     """The reason of a status other than `done` or `new`."""
 
 
-def recording_statuses(jobs: Iterable[Job]) -> Iterator[RecordingStatus]:
-    """Yield the status of each recording; read-only."""
-    for job in jobs:
-        status, reason = _status(job)
+def recording_statuses(jobs: Iterable[Job], *, verify: bool = False) -> Iterator[RecordingStatus]:
+    """Yield the status of each recording; read-only.
+
+    Stored recordings whose files and job have not changed are recognized by their fingerprints; with `verify`, every
+    recording is opened and its content is compared.
+    """
+    for job, is_known in ((job, False) for job in jobs) if verify else with_known(jobs):
+        status, reason = (Status.DONE, "") if is_known else _status(job)
         yield RecordingStatus(job.sequence.name, tuple(map(str, job.paths)), status, reason)
 
 

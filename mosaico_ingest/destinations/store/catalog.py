@@ -178,6 +178,11 @@ class Catalog:
         with self.read() as db:
             return _find_sequence(db, name, self.root)
 
+    def headers(self, names: Collection[str]) -> tuple[SequenceInfo, ...]:
+        """See `StoreCatalog.headers`."""
+        with self.read() as db:
+            return _headers(db, names)
+
     def sequences(self) -> tuple[SequenceInfo, ...]:
         """See `StoreCatalog.sequences`."""
         with self.read() as db:
@@ -375,6 +380,31 @@ def _find_sequence(db: sqlite3.Connection, name: str, root: Path) -> SequenceInf
     )
 
 
+def _headers(db: sqlite3.Connection, names: Collection[str]) -> tuple[SequenceInfo, ...]:
+    """Return the sequences with these names, without their topics."""
+    # One parameter with all names: SQLite limits the number of parameters.
+    among = "IN (SELECT value FROM json_each(?))"
+    rows = db.execute(f"SELECT * FROM sequences WHERE name {among}", (json.dumps(list(names)),)).fetchall()  # noqa: S608 - `among` is a constant
+    ids = json.dumps([row["id"] for row in rows])
+    sessions: dict[int, list[SessionInfo]] = defaultdict(list)
+    for row in db.execute(f"SELECT * FROM sessions WHERE sequence_id {among} ORDER BY id", (ids,)):  # noqa: S608 - as above
+        sessions[row["sequence_id"]].append(_session_info(row))
+    notes: dict[int, list[Note]] = defaultdict(list)
+    for row in db.execute(f"SELECT * FROM notes WHERE sequence_id {among} ORDER BY id", (ids,)):  # noqa: S608 - as above
+        notes[row["sequence_id"]].append(_note_of(row))
+    return tuple(
+        SequenceInfo(
+            name=row["name"],
+            metadata=json.loads(row["metadata"]),
+            created_ns=row["created_ns"],
+            sessions=tuple(sessions[row["id"]]),
+            topics=(),
+            notes=tuple(notes[row["id"]]),
+        )
+        for row in rows
+    )
+
+
 def _bounds(
     db: sqlite3.Connection, topic: TopicInfo, columns: Collection[str], root: Path
 ) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
@@ -394,10 +424,11 @@ def _bounds(
 
 def _session_infos(db: sqlite3.Connection, sequence_id: int) -> tuple[SessionInfo, ...]:
     rows = db.execute("SELECT * FROM sessions WHERE sequence_id = ? ORDER BY id", (sequence_id,))
-    return tuple(
-        SessionInfo(row["id"], json.loads(row["metadata"]), row["created_ns"], row["completed_ns"])
-        for row in rows
-    )
+    return tuple(map(_session_info, rows))
+
+
+def _session_info(row: sqlite3.Row) -> SessionInfo:
+    return SessionInfo(row["id"], json.loads(row["metadata"]), row["created_ns"], row["completed_ns"])
 
 
 def _topics(db: sqlite3.Connection, sequence_id: int, name: str, root: Path) -> tuple[TopicInfo, ...]:
@@ -442,7 +473,11 @@ def _segments(db: sqlite3.Connection, sequence_id: int, root: Path) -> dict[int,
 
 def _notes(db: sqlite3.Connection, sequence_id: int) -> tuple[Note, ...]:
     rows = db.execute("SELECT * FROM notes WHERE sequence_id = ? ORDER BY id", (sequence_id,))
-    return tuple(Note(row["topic"], row["message"], row["created_ns"]) for row in rows)
+    return tuple(map(_note_of, rows))
+
+
+def _note_of(row: sqlite3.Row) -> Note:
+    return Note(row["topic"], row["message"], row["created_ns"])
 
 
 def _claim(

@@ -63,6 +63,18 @@ class StoreDestination(Destination):
         info = store.find_sequence(sequence) if store else None
         return _existing(info) if info else None
 
+    def find_all(self, sequences: Collection[str]) -> dict[str, ExistingSequence]:
+        """Return the stored sequences with these names, without their topics."""
+        store = Store.find(self.path)
+        return {
+            info.name: ExistingSequence(
+                name=info.name,
+                complete=info.incomplete is None,
+                sessions=tuple(ExistingSession(session.id, session.metadata) for session in info.sessions),
+            )
+            for info in (store.catalog.headers(sequences) if store else ())
+        }
+
     def open_sink(self, *, buffer_bytes: int) -> Sink:
         """Return a sink, after creating the store if necessary."""
         return StoreSink(Store.open(self.path), buffer_bytes)

@@ -364,6 +364,10 @@ class ObjectCatalog:
         document = self._load(name)
         return None if document is None else document.info(self._root)
 
+    def headers(self, names: Collection[str]) -> tuple[SequenceInfo, ...]:
+        """See `StoreCatalog.headers`; reads one document per sequence."""
+        return tuple(self._infos(list(names)))
+
     def sequences(self) -> tuple[SequenceInfo, ...]:
         """See `StoreCatalog.sequences`; the sequences are not read at the same moment."""
         return tuple(one.info(self._root) for one in self._all())

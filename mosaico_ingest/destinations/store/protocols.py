@@ -129,6 +129,10 @@ class StoreCatalog(Protocol):
         """Return a sequence, or None."""
         ...
 
+    def headers(self, names: Collection[str]) -> tuple[SequenceInfo, ...]:
+        """Return the sequences with these names, without their topics, in any order."""
+        ...
+
     def sequences(self) -> tuple[SequenceInfo, ...]:
         """Return every sequence by name, in one consistent state if the catalog supports it."""
         ...

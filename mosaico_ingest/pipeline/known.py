@@ -1,0 +1,80 @@
+"""Recordings that are stored already: recognized by their fingerprints, with one catalog query for many recordings."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import TypeVar
+
+from msgspec import structs
+
+from mosaico_ingest.destinations.base import ExistingSequence
+from mosaico_ingest.destinations.registry import destination_of
+from mosaico_ingest.job.model import Job
+from mosaico_ingest.job.values import IfExists
+from mosaico_ingest.pipeline.fingerprint import fingerprint
+from mosaico_ingest.pipeline.provenance import StoredProvenance
+from mosaico_ingest.pipeline.task import Task
+
+_FIRST_BATCH, _MAX_BATCH = 8, 256
+"""Number of recordings of the first and of later catalog queries: the first recording of a run starts early."""
+_T = TypeVar("_T")
+
+
+def mark_known(tasks: Iterable[Task]) -> Iterator[Task]:
+    """Yield the tasks; those with `if_exists: skip` whose recording is stored, complete and unchanged, are marked as known."""
+    for batch in _batches(tasks):
+        candidates = [task for task in batch if _may_be_skipped(task)]
+        known = iter(known_recordings([task.job for task in candidates]))
+        for task in batch:
+            is_known = _may_be_skipped(task) and next(known)
+            yield structs.replace(task, known=True) if is_known else task
+
+
+def with_known(jobs: Iterable[Job]) -> Iterator[tuple[Job, bool]]:
+    """Yield each job, and whether its recording is stored, complete and unchanged."""
+    for batch in _batches(jobs):
+        yield from zip(batch, known_recordings(batch), strict=True)
+
+
+def known_recordings(jobs: Sequence[Job]) -> list[bool]:
+    """Return for each job whether its recording is stored, complete and unchanged, according to its fingerprint.
+
+    False means that the recording has to be opened and compared. Errors are not raised here, but when it is opened.
+    """
+    positions: dict[tuple[int, Path], list[int]] = defaultdict(list)
+    for position, job in enumerate(jobs):
+        positions[id(job.target), job.folder].append(
+            position
+        )  # targets are not hashable, and jobs share them
+    known = [False] * len(jobs)
+    for group in positions.values():
+        stored = _stored([jobs[position] for position in group])
+        for position in group:
+            existing = stored.get(jobs[position].sequence.name)
+            if existing is not None and existing.complete:
+                prints = {record.fingerprint for record in StoredProvenance.of(existing).records} - {None}
+                known[position] = bool(prints) and fingerprint(jobs[position]) in prints
+    return known
+
+
+def _stored(jobs: Sequence[Job]) -> dict[str, ExistingSequence]:
+    """Return the stored sequences of jobs with one destination; empty if it cannot be read."""
+    try:
+        return destination_of(jobs[0].destination).find_all([job.sequence.name for job in jobs])
+    except Exception:  # noqa: BLE001 - destinations may be of other packages, and the run of the recording reports it
+        return {}
+
+
+def _may_be_skipped(task: Task) -> bool:
+    return task.job.sequence.if_exists is IfExists.SKIP and task.plan_digest is None and not task.dry_run
+
+
+def _batches(items: Iterable[_T]) -> Iterator[list[_T]]:
+    iterator = iter(items)
+    size = _FIRST_BATCH
+    while batch := list(islice(iterator, size)):
+        yield batch
+        size = min(2 * size, _MAX_BATCH)
