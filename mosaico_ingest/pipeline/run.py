@@ -65,28 +65,13 @@ def run_recording(task: Task, observe: Observer = ignore_events) -> Outcome:
     """
     job = task.job
     events = _RunEvents(task, observe)
-    stopwatch = events.stopwatch
+    is_written = False
     try:
-        if task.known:
-            return events.skip_known()
-        before = None if task.dry_run else fingerprint(job)
-        with log_level(job.run.log_level), open_job(job) as (recording, resolver):
-            plan = _plan(task, recording, resolver)
-            events.start(plan)
-            if not task.dry_run:
-                _check_group(plan)
-            request = None if task.dry_run else check_provenance(plan, _covering(before, plan, job))
-            if request is None:
-                return events.skip()
-            sink = _open_sink(plan, events)
-            stopwatch.lap(Step.PREPARE)
-            written = write_sequence(plan, request, recording, sink, observe=events, stopwatch=stopwatch)
-            verify(written, events)
+        is_written = _ingest(task, events)
     except EmptyPart as error:
         events(
             Noted(Finding("empty-part", Severity.INFO, f"{job.sequence.name} is not written: {error.what}"))
         )
-        return events.skip()
     except IngestError as error:
         return events.fail(error)
     except KeyboardInterrupt:
@@ -94,12 +79,30 @@ def run_recording(task: Task, observe: Observer = ignore_events) -> Outcome:
     except Exception as error:  # noqa: BLE001 - one recording must not end the run of the others
         _log.debug("unexpected", exc_info=True)
         return events.fail(_unexpected(job, error))
-    return events.complete()
+    return events.complete() if is_written else events.skip()
 
 
-def _covering(before: str | None, plan: Plan, job: Job) -> str | None:
-    """Return the fingerprint that was taken before the run, if it covers all files of the recording."""
-    return before if before is not None and is_fingerprinted(job, plan.files) else None
+def _ingest(task: Task, events: _RunEvents) -> bool:
+    """Run a task; return False if there is nothing to write."""
+    job = task.job
+    if task.known:
+        events.start_unopened()
+        return False
+    before = None if task.dry_run else fingerprint(job)
+    with log_level(job.run.log_level), open_job(job) as (recording, resolver):
+        plan = _plan(task, recording, resolver)
+        events.start(plan)
+        if task.dry_run:
+            return False
+        _check_group(plan)
+        request = check_provenance(plan, before if is_fingerprinted(job, plan.files) else None)
+        if request is None:
+            return False
+        sink = _open_sink(plan, events)
+        events.stopwatch.lap(Step.PREPARE)
+        written = write_sequence(plan, request, recording, sink, observe=events, stopwatch=events.stopwatch)
+        verify(written, events)
+    return True
 
 
 def _check_group(plan: Plan) -> None:
@@ -209,11 +212,10 @@ class _RunEvents:
         self(RunFinished(RunStatus.SKIPPED, 0))
         return Outcome(self._collector.report())
 
-    def skip_known(self) -> Outcome:
-        """End the run of a recording that was recognized without opening it; its report has no topics."""
+    def start_unopened(self) -> None:
+        """Report the start of a recording that is not opened, so that its report has no topics."""
         self._started = True
         self(_not_planned(self._task.job))
-        return self.skip()
 
     def complete(self) -> Outcome:
         """End a run that was committed and verified."""

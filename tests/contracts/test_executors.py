@@ -297,7 +297,7 @@ def test_executor_divides_memory_among_processes(tmp_path: Path, monkeypatch: py
     jobs = tasks(tmp_path, "abcd", manifest={"run": {"memory": 400 << 20}})
     monkeypatch.setattr(
         "mosaico_ingest.executors.processes._Pool.reports",
-        lambda self, _: iter(seen.extend(job.job.run.memory for job in self.batch.tasks) or ()),
+        lambda self, _: iter(seen.extend(job.job.run.memory for job in self.batch.source) or ()),
     )
     assert list(Processes(4).map(jobs, ignore_batch)) == []
     assert seen == [100 << 20] * 4
