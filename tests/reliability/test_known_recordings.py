@@ -220,7 +220,11 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @given(
-    changes=st.lists(st.tuples(st.sampled_from(sorted(CHANGES)), st.sampled_from(NAMES)), max_size=4),
+    changes=st.lists(
+        st.tuples(st.sampled_from(sorted(CHANGES)), st.sampled_from(NAMES)),
+        max_size=4,
+        unique_by=lambda one: one[0],
+    ),
 )
 @settings(max_examples=25, deadline=None)
 def test_status_after_any_changes_equals_that_of_opening_every_recording(
