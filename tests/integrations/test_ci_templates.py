@@ -77,8 +77,8 @@ def test_action_lint_fails_from_the_chosen_severity(project: Path, fail_on: str,
 @pytest.mark.slow
 def test_action_plan_check_and_run_pass_for_good_and_fail_for_violated_recordings(project: Path) -> None:
     assert bash(f"ingest plan {MANIFEST} --out plan.json", project, {}).returncode == 0
-    assert step("plan", project, plans=f"{MANIFEST} plan.json\n") == 0
-    assert step("plan", project, plans=f"{VIOLATED} plan.json\n") == 1
+    assert step("plan", project, plans=f"{MANIFEST}=plan.json\n") == 0
+    assert step("plan", project, plans=f"{VIOLATED}=plan.json\n") == 1
     assert step("check", project, check=f"{VIOLATED}\n{MANIFEST}\n") == 6
     assert step("run", project, run=MANIFEST) == 0
     assert "contract" in (project / "out/summary.md").read_text()
@@ -102,7 +102,7 @@ def gitlab(name: str, project: Path, **inputs: str) -> int:
 def test_gitlab_jobs_report_results_and_fail_for_violated_recordings(project: Path) -> None:
     (project / "bad.yaml").write_text("version: 1\nbag: {path: a.mcap}\nsequence: {nam: a}\n")
     assert gitlab("ingest-lint", project, lint="bad.yaml") == 12
-    assert gitlab("ingest-plan", project, plans=f"{MANIFEST} bad.yaml") == 1
+    assert gitlab("ingest-plan", project, plans=f"{MANIFEST}=bad.yaml") == 1
     assert gitlab("ingest-check", project, check=VIOLATED) == 6
     assert gitlab("ingest-run", project, run=MANIFEST) == 0
     names = {"ingest-lint.xml", "ingest-check-1.xml", "ingest-run.xml", "run.html", "run.json", "run.md"}
