@@ -15,6 +15,8 @@ from mosaico_ingest.errors import ManifestError
 
 DEFAULT_KEY_FILE = Path("api_keys.json")
 LOOPBACK = {"127.0.0.1", "::1", "[::1]", "localhost"}
+WILDCARDS = {"0.0.0.0": "127.0.0.1", "::": "[::1]", "[::]": "[::1]"}  # noqa: S104 - not bound here
+"""The addresses at which this machine reaches a server that listens on all addresses."""
 GRACE_S = 0.5
 """Seconds that open calls get to finish at shutdown."""
 
@@ -69,6 +71,42 @@ def serve(
             help="Discard sessions that are idle for this long.",
         ),
     ] = 60,
+    audit_log: Annotated[
+        Path | None,
+        typer.Option(
+            "--audit-log", metavar="FILE", help="Append a JSON line about each call: who read or wrote what."
+        ),
+    ] = None,
+    requests_per_second: Annotated[
+        float | None,
+        typer.Option(
+            "--requests-per-second",
+            min=0.01,
+            metavar="N",
+            help="Mean number of calls of one key, or without keys of one address. If omitted, there is no limit.",
+        ),
+    ] = None,
+    max_request: Annotated[
+        str,
+        typer.Option(
+            "--max-request", metavar="SIZE", help="Largest request, and largest message of an upload."
+        ),
+    ] = "256MiB",
+    max_upload: Annotated[
+        str | None,
+        typer.Option(
+            "--max-upload",
+            metavar="SIZE",
+            help="Largest upload of one topic, in memory. If omitted, there is no limit.",
+        ),
+    ] = None,
+    health_check: Annotated[
+        bool,
+        typer.Option(
+            "--health-check",
+            help="Start no server; exit with 0 if one responds at this host and port, else 1.",
+        ),
+    ] = False,
 ) -> None:
     """Serve the store to Mosaico clients until interrupted. Clients can list, read, query and write."""
     from mosaico_ingest.cli.process import (
@@ -77,9 +115,17 @@ def serve(
         interrupt_on_sigterm,
         limit_heaps,
     )
-    from mosaico_ingest.serve import Keyring, Tls
+    from mosaico_ingest.serve import Keyring, Limits, Tls, responds
     from mosaico_ingest.serve import serve as start_server
 
+    if health_check:
+        scheme = "grpc" if tls_cert is None else "grpc+tls"
+        raise typer.Exit(0 if responds(f"{scheme}://{WILDCARDS.get(host, host)}:{port}") else 1)
+    limits = Limits(
+        requests_per_s=requests_per_second,
+        request_bytes=_size(max_request, "--max-request"),
+        upload_bytes=None if max_upload is None else _size(max_upload, "--max-upload"),
+    )
     if (tls_cert is None) != (tls_key is None):
         raise ManifestError("--tls-cert and --tls-key need each other", hint="give both, or neither")
     if api_keys is not None:
@@ -89,7 +135,9 @@ def serve(
     interrupt_on_sigterm()
     collect_garbage_as_usual()
     limit_heaps()
-    server = start_server(store, host, port, keys=keyring, tls=tls, idle_s=idle_minutes * 60)
+    server = start_server(
+        store, host, port, keys=keyring, tls=tls, idle_s=idle_minutes * 60, limits=limits, audit_log=audit_log
+    )
     try:
         typer.echo(f"serving {store} at {server.location}")
         if keyring is None:
@@ -151,6 +199,15 @@ def list_keys(api_keys: KeyFileOption = DEFAULT_KEY_FILE) -> None:
         verb = "expired" if key.expires and key.expires <= now else "expires"
         line = f"{key.sha256[:12]}  {key.permission.value:6}  {verb} {expiry}  {key.description}"
         print_line(line.rstrip())
+
+
+def _size(text: str, option: str) -> int:
+    from mosaico_ingest.job.units import parse_size
+
+    try:
+        return parse_size(text)
+    except ValueError as error:
+        raise ManifestError(f"{option}: {error}", hint="write a size such as 64MiB") from error
 
 
 def check_key_file(file: Path) -> None:

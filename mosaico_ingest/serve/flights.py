@@ -86,9 +86,8 @@ class Flights:
         for name in self._store.names():
             yield fl.FlightInfo(pa.schema([]), fl.FlightDescriptor.for_path(name), [], -1, -1)
 
-    def info(self, descriptor: fl.FlightDescriptor) -> fl.FlightInfo:
+    def info(self, question: messages.GetInfo, descriptor: fl.FlightDescriptor) -> fl.FlightInfo:
         """Return a sequence with one endpoint per topic, or a topic with its endpoint."""
-        question = _question(descriptor)
         name, topic = split_locator(question.resource_locator)
         if topic is not None:
             info = self._store.topic(name, topic)
@@ -109,13 +108,12 @@ class Flights:
         schema = sequence_schema(sequence)
         return fl.FlightInfo(schema, descriptor, endpoints, -1, -1, app_metadata=metadata)
 
-    def schema(self, descriptor: fl.FlightDescriptor) -> pa.Schema:
+    def schema(self, question: messages.GetInfo) -> pa.Schema:
         """Return the schema of a topic, without its metadata."""
-        return self._topic(_question(descriptor)).schema
+        return self._topic(question).schema
 
-    def rows(self, ticket: fl.Ticket) -> tuple[pa.Schema, Iterator[pa.RecordBatch]]:
+    def rows(self, question: messages.GetInfo) -> tuple[pa.Schema, Iterator[pa.RecordBatch]]:
         """Return the schema of a topic, and its rows in time order as batches of about `_MESSAGE_BYTES` or less."""
-        question = JSON.decode(messages.GetInfo, ticket.ticket)
         topic = self._topic(question)
         rows = scan(topic.segments, topic.schema, _window(question))
         return topic_schema(topic), _slices(rows)
@@ -155,7 +153,13 @@ class Flights:
         )
 
 
-def _question(descriptor: fl.FlightDescriptor) -> messages.GetInfo:
+def question_of(descriptor: fl.FlightDescriptor) -> messages.GetInfo:
+    """Return the question in the command of a descriptor.
+
+    Raises:
+        Refusal: The descriptor has no command.
+        Malformed: The command is not a question.
+    """
     if descriptor.descriptor_type is not fl.DescriptorType.CMD:
         raise Refusal(Condition.INVALID, "the descriptor has no command; send a command descriptor")
     question = JSON.decode(messages.GetInfo, descriptor.command or b"")

@@ -10,7 +10,7 @@ import os
 import tempfile
 import time
 from collections import defaultdict, deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
 from threading import Lock
@@ -169,10 +169,11 @@ def _hash(key: str) -> str:
 
 
 class _Granted(fl.ServerMiddleware):
-    """The permission of the caller, and the times at which GetSchema calls of its key were refused."""
+    """The caller: its key and permission, and the times at which GetSchema calls of its key were refused."""
 
-    def __init__(self, permission: Permission, refused_schemas: deque[float]) -> None:
+    def __init__(self, key: str, permission: Permission, refused_schemas: deque[float]) -> None:
         super().__init__()
+        self.fingerprint = key_fingerprint(key) if key else ""
         self.permission = permission
         self.refused_schemas = refused_schemas
 
@@ -189,9 +190,11 @@ class KeyCheck(fl.ServerMiddlewareFactory):
     memory.
     """
 
-    def __init__(self, keyring: Keyring | None) -> None:
+    def __init__(self, keyring: Keyring | None, refused: Callable[[str, fl.FlightError], None]) -> None:
+        """Create the check; `refused` receives the name of each refused call and the error."""
         super().__init__()
         self._keyring = keyring
+        self._refused = refused
         self._refused_schemas: defaultdict[str, deque[float]] = defaultdict(
             lambda: deque[float](maxlen=MAX_REFUSED_SCHEMAS)
         )
@@ -200,6 +203,13 @@ class KeyCheck(fl.ServerMiddlewareFactory):
         self, info: fl.CallInfo, headers: Mapping[str, list[str | bytes]]
     ) -> _Granted:
         """Return the permission of the key in the headers, or refuse the call."""
+        try:
+            return self._granted(info, headers)
+        except fl.FlightError as error:
+            self._refused(info.method.name.lower(), error)
+            raise
+
+    def _granted(self, info: fl.CallInfo, headers: Mapping[str, list[str | bytes]]) -> _Granted:
         key = self._key_of(headers)
         permission = Permission.MANAGE if self._keyring is None else self._permission_of(self._keyring, key)
         refused = self._refused_schemas[key]
@@ -208,7 +218,7 @@ class KeyCheck(fl.ServerMiddlewareFactory):
             raise as_flight_error(
                 Condition.UNAVAILABLE, f"{len(refused)} calls of GetSchema were refused within an hour"
             )
-        return _Granted(permission, refused)
+        return _Granted(key, permission, refused)
 
     def _key_of(self, headers: Mapping[str, list[str | bytes]]) -> str:
         """Return the key in the headers, or an empty text if the server has no keys."""
@@ -226,6 +236,12 @@ class KeyCheck(fl.ServerMiddlewareFactory):
             raise as_flight_error(Condition.UNAUTHENTICATED, str(err)) from None
         except SinkError as err:
             raise as_flight_error(Condition.UNAVAILABLE, err.what) from None
+
+
+def fingerprint_of(context: fl.ServerCallContext) -> str:
+    """Return the part of the caller's key that identifies it, or an empty text if the server has no keys."""
+    granted = context.get_middleware(MIDDLEWARE)
+    return granted.fingerprint if isinstance(granted, _Granted) else ""
 
 
 def count_refused_schema(context: fl.ServerCallContext) -> None:

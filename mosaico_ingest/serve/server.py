@@ -20,7 +20,8 @@ from mosaico_ingest.protocol.messages import ACTIONS, JSON, Body, Permission
 from mosaico_ingest.remote import RemotePath, as_path
 from mosaico_ingest.serve.actions import HANDLERS, Backend
 from mosaico_ingest.serve.errors import Refusal, translate_errors
-from mosaico_ingest.serve.flights import Flights
+from mosaico_ingest.serve.flights import Flights, question_of
+from mosaico_ingest.serve.guard import AuditLog, Call, Guard, Limits
 from mosaico_ingest.serve.keys import MIDDLEWARE, KeyCheck, Keyring, count_refused_schema, require
 from mosaico_ingest.serve.uploads import Uploads
 
@@ -30,6 +31,8 @@ IDLE_S = 3600.0
 """Idle time after which an open session is discarded, in seconds."""
 REQUEST_S = 60.0
 """Time limit of a query, in seconds."""
+NO_LIMITS = Limits()
+"""The default limits: no limit of the rate."""
 _GRACE_S = 10.0
 """Time for calls in progress to finish during a shutdown, in seconds."""
 _CLEANUP_INTERVAL_S = 30.0
@@ -56,11 +59,13 @@ class Service(fl.FlightServerBase):
         keyring: Keyring | None,
         certificates: list[tuple[bytes, bytes]] | None,
         request_s: float,
+        guard: Guard,
     ) -> None:
+        self._guard = guard
         self._uploads = Uploads(store)
         self._flights = Flights(store, self._uploads)
         self._backend = Backend(store, self._uploads, keyring, request_s)
-        middleware = {MIDDLEWARE: KeyCheck(keyring)}
+        middleware = {MIDDLEWARE: KeyCheck(keyring, guard.refused)}
         super().__init__(location, tls_certificates=certificates, middleware=middleware)  # pyright: ignore[reportArgumentType] - PEM is bytes
 
     def discard_idle(self, idle_s: float) -> None:
@@ -75,7 +80,7 @@ class Service(fl.FlightServerBase):
         self, context: fl.ServerCallContext, criteria: bytes
     ) -> Iterator[fl.FlightInfo]:
         """List the sequences."""
-        with translate_errors():
+        with self._guard.call(context, "list_flights"):
             require(context, Permission.READ)
             if criteria not in {b"", b"/"}:
                 raise Refusal(
@@ -88,9 +93,11 @@ class Service(fl.FlightServerBase):
         self, context: fl.ServerCallContext, descriptor: fl.FlightDescriptor
     ) -> fl.FlightInfo:
         """Describe a sequence or a topic."""
-        with translate_errors():
+        with self._guard.call(context, "get_flight_info") as call:
             require(context, Permission.READ)
-            return self._flights.info(descriptor)
+            question = question_of(descriptor)
+            call.target = question.resource_locator
+            return self._flights.info(question, descriptor)
 
     def get_schema(  # pyright: ignore[reportIncompatibleMethodOverride] - Flight requires a SchemaResult
         self, context: fl.ServerCallContext, descriptor: fl.FlightDescriptor
@@ -100,19 +107,23 @@ class Service(fl.FlightServerBase):
         Flight has no statuses for this call: it sends the exception with its traceback, and never frees it.
         """
         try:
-            with translate_errors():
+            with self._guard.call(context, "get_schema") as call:
                 require(context, Permission.READ)
-                return fl.SchemaResult(self._flights.schema(descriptor))
+                question = question_of(descriptor)
+                call.target = question.resource_locator
+                return fl.SchemaResult(self._flights.schema(question))
         except fl.FlightError as error:
             count_refused_schema(context)
             refusal = error.with_traceback(None)
         raise refusal
 
     def do_get(self, context: fl.ServerCallContext, ticket: fl.Ticket) -> fl.FlightDataStream:
-        """Stream the rows of a topic."""
-        with translate_errors():
+        """Stream the rows of a topic; the call is recorded when it is accepted."""
+        with self._guard.call(context, "get") as call:
             require(context, Permission.READ)
-            schema, batches = self._flights.rows(ticket)
+            question = JSON.decode(messages.GetInfo, ticket.ticket)
+            call.target = question.resource_locator
+            schema, batches = self._flights.rows(question)
             return fl.GeneratorStream(schema, _with_translated_errors(batches))
 
     def do_put(
@@ -123,25 +134,35 @@ class Service(fl.FlightServerBase):
         writer: fl.FlightMetadataWriter,  # noqa: ARG002 - no metadata is sent during an upload
     ) -> None:
         """Receive the rows of a topic."""
-        with translate_errors():
+        with self._guard.call(context, "put") as call:
             require(context, Permission.WRITE)
             if descriptor.descriptor_type is not fl.DescriptorType.CMD:
                 raise Refusal(Condition.INVALID, "the descriptor has no command; send a command descriptor")
             put = JSON.decode(messages.Put, descriptor.command or b"")
-            self._uploads.receive(put, reader.schema, _batches(reader))
+            call.target = put.resource_locator
+            self._uploads.receive(put, reader.schema, self._batches(reader, call))
 
     def do_action(self, context: fl.ServerCallContext, action: fl.Action) -> Iterator[bytes]:
         """Execute an action."""
-        with translate_errors():
+        with self._guard.call(context, action.type) as call:
             definition = ACTIONS.get(action.type)
             if definition is None or definition not in HANDLERS:
                 raise Refusal(Condition.UNIMPLEMENTED, f"action {action.type!r} is not implemented")
             require(context, definition.permission)
+            self._guard.check_size(len(action.body), "the request")
             question = JSON.decode(definition.question, action.body.to_pybytes() or b"{}")
+            call.target = _target_of(question)
             response = HANDLERS[definition](self._backend, question)
             if isinstance(response, Body):
                 return iter([JSON.encode_answer(definition, response)])
             return iter([JSON.encode_answer(definition, body) + b"\n" for body in response])
+
+    def _batches(self, reader: fl.MetadataRecordBatchReader, call: Call) -> Iterator[pa.RecordBatch]:
+        for chunk in reader:
+            if chunk.data is None:
+                raise Refusal(Condition.INVALID, "the upload contains a message without rows")
+            self._guard.add_upload(call, chunk.data.num_rows, chunk.data.get_total_buffer_size())
+            yield chunk.data
 
     def list_actions(self, context: fl.ServerCallContext) -> Iterable[fl.Action]:  # noqa: ARG002 - Flight's signature
         """Refuse the call, as the platform's server does; Flight's own refusal sends a traceback and leaks."""
@@ -217,14 +238,17 @@ def serve(
     tls: Tls | None = None,
     idle_s: float = IDLE_S,
     request_s: float = REQUEST_S,
+    limits: Limits = NO_LIMITS,
+    audit_log: Path | None = None,
 ) -> Server:
     """Serve the store in a folder, which is created if necessary; port 0 selects a free port.
 
     Without `keys`, every caller has every permission. A session that is idle for `idle_s` is discarded, and a query
-    that takes longer than `request_s` is refused.
+    that takes longer than `request_s` is refused. `audit_log` names the file that records every call.
 
     Raises:
-        SinkError: The store cannot be opened, the certificate cannot be read, or the port is in use.
+        SinkError: The store cannot be opened, the certificate cannot be read, the audit log cannot be written, or the port
+            is in use.
     """
     path = as_path(store_path)
     if isinstance(path, RemotePath):
@@ -238,7 +262,12 @@ def serve(
     certificates = None if tls is None else [(_read(tls.certificate), _read(tls.key))]
     try:
         service = Service(
-            store, f"{scheme}://{host}:{port}", keyring=keys, certificates=certificates, request_s=request_s
+            store,
+            f"{scheme}://{host}:{port}",
+            keyring=keys,
+            certificates=certificates,
+            request_s=request_s,
+            guard=Guard(limits, AuditLog(audit_log)),
         )
     except (OSError, pa.ArrowException) as err:
         text = str(err).splitlines()[0]
@@ -262,8 +291,7 @@ def _with_translated_errors(batches: Iterator[pa.RecordBatch]) -> Generator[pa.R
         yield from batches
 
 
-def _batches(reader: fl.MetadataRecordBatchReader) -> Iterator[pa.RecordBatch]:
-    for chunk in reader:
-        if chunk.data is None:
-            raise Refusal(Condition.INVALID, "the upload contains a message without rows")
-        yield chunk.data
+def _target_of(question: Body) -> str:
+    """Return the locator in the question of an action, or its other reference to an object."""
+    names = ("locator", "resource_locator", "session_uuid", "api_key_fingerprint")
+    return next((str(value) for name in names if (value := getattr(question, name, None))), "")
