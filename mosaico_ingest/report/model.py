@@ -7,11 +7,11 @@ import shlex
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 from urllib.parse import quote
 
 import msgspec
-from pydantic import BaseModel, Field, computed_field
+from pydantic import BaseModel, computed_field
 
 from mosaico_ingest.documents import document_schema, read_document
 from mosaico_ingest.errors import ManifestError
@@ -237,7 +237,7 @@ class UsedManifest(ReportPart):
 class RunReport(ReportPart):
     """The report of one run, with a part for each recording; `version` changes with the format."""
 
-    version: int = Field(default=1, ge=1)
+    version: Literal[1] = 1
     tool: str
     """Name and version of the program that wrote the report."""
     manifests: tuple[UsedManifest, ...] = ()

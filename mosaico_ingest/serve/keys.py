@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
 from threading import Lock
+from typing import Literal
 
 import pyarrow.flight as fl
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -46,7 +47,7 @@ class StoredKey(BaseModel):
 class _KeyFile(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    version: int = 1
+    version: Literal[1] = 1
     keys: tuple[StoredKey, ...] = ()
 
 
@@ -149,7 +150,9 @@ class Keyring:
             return _KeyFile.model_validate_json(text)
         except ValidationError as err:
             first = err.errors(include_url=False, include_input=False)[0]
-            raise SinkError(f"the file is not a key file: {first['msg']}", where=str(self.path)) from err
+            key = ".".join(map(str, first["loc"]))
+            problem = f"{key}: {first['msg']}" if key else first["msg"]
+            raise SinkError(f"the file is not a key file: {problem}", where=str(self.path)) from err
 
     def _save(self, keys: tuple[StoredKey, ...]) -> None:
         content = _KeyFile(keys=keys).model_dump_json(indent=2)
