@@ -45,7 +45,7 @@ class Batch:
     """Whether no recording is left to take."""
     _retries: deque[int] = field(default_factory=deque[int])
     _reports: dict[int, Report] = field(default_factory=dict[int, Report])
-    _taken: int = 0
+    _started: int = 0
     _next: int = 0
 
     def take(self) -> int | None:
@@ -58,12 +58,12 @@ class Batch:
         if self.exhausted:
             return None
         for task in islice(self.source, _MAX_SKIPPED):
-            position, self._taken = self._taken, self._taken + 1
+            position, self._started = self._started, self._started + 1
             self.tasks[position] = task
             if not task.known:
                 return position
             self.finish(position, run_recording(task, partial(self.observe, position)).report)
-            if self._taken - self._next >= _MAX_SKIPPED:
+            if self._started - self._next >= _MAX_SKIPPED:
                 return None
         self.exhausted = True
         return None
