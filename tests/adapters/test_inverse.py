@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pytest
+from foxglove_schemas import protobuf_definition
 from hypothesis import given
 from hypothesis import strategies as st
 from made_recordings import define
 
 from mosaico_ingest.adapters.adapter import Envelope
+from mosaico_ingest.adapters.builtin import BY_TYPE
 from mosaico_ingest.adapters.inverse import Restored, invert
 from mosaico_ingest.adapters.inverse.restore import differences
 from mosaico_ingest.adapters.mapping.loader import load_adapter
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.model import Embedded
+from mosaico_ingest.rosbag.encodings import json_schema
+from mosaico_ingest.rosbag.encodings.json_messages import JsonCodec
+from mosaico_ingest.rosbag.encodings.protobuf import ProtobufCodec
 
 DEFINITION = define(
     "acme_msgs/msg/T",
@@ -172,3 +179,86 @@ def test_differences_returns_rows_with_different_text(left: list[Any], right: li
 
 def spell(value: Any) -> str:
     return str(value).replace("-0.0", "0.0") if isinstance(value, (float, list)) else str(value)
+
+
+JSON_SCHEMA = {
+    "type": "object",
+    "required": ["header", "speed"],
+    "properties": {
+        "header": {
+            "type": "object",
+            "properties": {
+                "stamp": {
+                    "type": "object",
+                    "properties": {"sec": {"type": "integer"}, "nanosec": {"type": "integer"}},
+                },
+                "frame_id": {"type": "string"},
+            },
+        },
+        "when": {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}},
+        "speed": {"type": "number"},
+        "limit": {"type": "number"},
+        "names": {"type": "array", "items": {"type": "string"}},
+        "axis": {"type": "object", "properties": {"x": {"type": "number"}, "y": {"type": "number"}}},
+        "unused": {"type": "object", "properties": {"x": {"type": "number"}}},
+    },
+}
+JSON_MAPPING = """
+version: 1
+adapter: TAdapter
+ros_type: acme.T
+ontology:
+  tag: T
+  fields:
+    header: Header
+    when: Time
+    speed: float64
+    limit: float64
+    fast: float64
+    names: list[string]
+    axis: {fields: {x: float64, y: float64}}
+fields:
+  header: header
+  when: ros_time(when)
+  speed: speed
+  limit: limit
+  fast: {value: speed, when: speed > 5}
+  names: names
+  axis: {fields: {x: axis.x, y: axis.y}}
+"""
+EMPTY = {"header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}, "speed": 1.5, "unused": {"x": 0.0}}
+
+
+def test_invert_absent_fields_of_json_messages_stay_absent() -> None:
+    definition = json_schema.read_schema("acme.T", Embedded("jsonschema", json.dumps(JSON_SCHEMA)))
+    codec, shape = JsonCodec(definition), ros_shape(definition)
+    full = {"when": {"sec": 1, "nsec": 2}, "limit": 0.0, "names": ["a"], "axis": {"x": 1.0, "y": 2.0}}
+    messages = [EMPTY, {**EMPTY, **full}, {**EMPTY, "names": [], "axis": {"y": 0.0}}]
+    rows = pa.array([codec.to_dict(json.dumps(message).encode()) for message in messages], shape)
+    adapter = load_adapter(JSON_MAPPING).bind(definition, shape)
+    envelope = Envelope("/t", definition.root, np.zeros(3, np.int64))
+    adapted = adapter.adapt(rows, envelope)
+    assert not adapted.failures
+    restored = invert(adapter, definition, {}).restore(adapted.rows, envelope)
+    assert [json.loads(codec.from_dict(row)) for row in restored.rows.to_pylist()] == messages
+    assert restored.changed == {}
+
+
+def test_invert_absent_messages_of_protobuf_stay_absent() -> None:
+    definition = protobuf_definition("PoseInFrame")
+    shape = ros_shape(definition)
+    adapter = BY_TYPE["foxglove.PoseInFrame"].bind(definition, shape)
+    pose = {
+        "position": {"x": 0.0, "y": 0.0, "z": 1.0},
+        "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+    }
+    messages = [
+        {"timestamp": None, "frame_id": "map", "pose": pose},
+        {"timestamp": {"seconds": 0, "nanos": 0}, "frame_id": "", "pose": pose},
+    ]
+    envelope = Envelope("/t", definition.root, np.zeros(2, np.int64))
+    adapted = adapter.adapt(pa.array(messages, shape), envelope)
+    restored = invert(adapter, definition, {}).restore(adapted.rows, envelope)
+    assert (restored.rows.to_pylist(), restored.changed) == (messages, {})
+    payloads = [ProtobufCodec(definition).from_dict(message) for message in messages]
+    assert [ProtobufCodec(definition).to_dict(payload) for payload in payloads] == messages

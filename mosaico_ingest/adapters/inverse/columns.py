@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 
 from mosaico_ingest.adapters.inverse.message_builder import (
     CLOUD_FUNCTIONS,
@@ -51,7 +52,7 @@ from mosaico_ingest.adapters.mapping.expressions import (
     OpenList,
     TypedExpression,
 )
-from mosaico_ingest.adapters.mapping.functions.ros import STAMP_TYPE
+from mosaico_ingest.adapters.mapping.functions.ros import HEADER_TYPE, STAMP_TYPE
 from mosaico_ingest.adapters.mapping.loader import MappingAdapter
 from mosaico_ingest.adapters.mapping.types import is_number
 
@@ -139,6 +140,8 @@ class _Scope(Struct, frozen=True):
 
     path: FieldPath = ()
     axes: tuple[Axis, ...] = ()
+    keeps_null: bool = True
+    """Whether a null column means an absent field; a condition (`when`) also makes columns null."""
 
 
 class ColumnInverter:
@@ -165,8 +168,10 @@ class ColumnInverter:
     def _column(self, field: ColumnPlan, values: Array, scope: _Scope) -> None:
         self._target = field.path
         absent = null_mask(values)
-        if field.when is not None and absent is not None:
-            self._make_false(field.when, absent, scope)
+        if field.when is not None:
+            scope = replace(scope, keeps_null=False)
+            if absent is not None:
+                self._make_false(field.when, absent, scope)
         for replaced in field.overrides:
             self._column(replaced, field_of(values, replaced.name), scope)
         self._target = field.path
@@ -205,7 +210,7 @@ class ColumnInverter:
             self._report_not_invertible(of.text)
             return None
         values, axes = _opened(of, values)
-        return values, _Scope(path, (*scope.axes, *axes))
+        return values, _Scope(path, (*scope.axes, *axes), scope.keeps_null)
 
     def _map_lookup(self, source: MapLookup, values: Array, scope: _Scope) -> None:
         values, axes = _opened(source.operand, values)
@@ -215,11 +220,13 @@ class ColumnInverter:
             originals = pc.cast(originals, values.type)
         if source.otherwise == source.operand:
             originals = pc.coalesce(originals, values)
-        self._assign(source.operand, originals, _Scope(scope.path, (*scope.axes, *axes)))
+        self._assign(source.operand, originals, _Scope(scope.path, (*scope.axes, *axes), keeps_null=False))
 
     def _expression(self, typed: TypedExpression, values: Array, scope: _Scope) -> None:
         values, axes = _opened(typed, values)
-        self._assign(typed, values, _Scope(scope.path, (*scope.axes, *axes)))
+        # An empty header is stored as null, too.
+        keeps_null = scope.keeps_null and _field_path(typed, scope) is not None and values.type != HEADER_TYPE
+        self._assign(typed, values, _Scope(scope.path, (*scope.axes, *axes), keeps_null))
 
     def _assign(self, typed: TypedExpression, values: Array, scope: _Scope) -> None:
         """Assign the values of an expression to the fields it reads; one value per element of all open lists."""
@@ -228,7 +235,7 @@ class ColumnInverter:
             if path.count(EACH_ELEMENT) != len(scope.axes):
                 self._report_not_invertible(typed.text)
             else:
-                self._builder.assign(path, values, scope.axes)
+                self._builder.assign(path, values, scope.axes, keeps_null=scope.keeps_null)
             return
         match typed:
             case Constant():

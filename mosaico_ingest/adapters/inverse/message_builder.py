@@ -138,31 +138,41 @@ class _Constraint(Struct, frozen=True):
 
 
 class MessageBuilder:
-    """Builds a batch of messages from field values; the first non-null value of a field is kept."""
+    """Builds a batch of messages from field values; the first non-null value of a field is kept.
 
-    def __init__(self, shape: DataType, rows: int) -> None:
+    With `nullable`, the fields of messages can be absent, as in protobuf and JSON: fields that are assigned with
+    `keeps_null` keep their nulls, and a nested message is absent where all its values are null.
+    """
+
+    def __init__(self, shape: DataType, rows: int, *, nullable: bool = False) -> None:
         self._shape = shape
         self._rows = rows
+        self._nullable = nullable
+        self._keep_null: set[FieldPath] = set()
         self._values: dict[FieldPath, Array] = {}
         self._axes: dict[FieldPath, Axis] = {}
         self._constraints: dict[FieldPath, list[_Constraint]] = defaultdict(list)
         self.defaulted: list[str] = []
         """The fields that `build` filled with defaults, such as `header.seq`."""
 
-    def assign(self, path: FieldPath, values: Array, axes: tuple[Axis, ...] = ()) -> None:
+    def assign(
+        self, path: FieldPath, values: Array, axes: tuple[Axis, ...] = (), *, keeps_null: bool = False
+    ) -> None:
         """Set a field: one value per row, or one per element of the lists around it."""
         type_ = self.type_at(path)
         if pt.is_struct(type_):
-            self._put_fields(path, type_, values, axes)
+            self._put_fields(path, type_, values, axes, keeps_null=keeps_null)
         elif is_list(type_) and pt.is_struct(type_.value_type):
             elements, axis = open_list(values)
-            self.assign((*path, EACH_ELEMENT), elements, (*axes, axis))
+            self.assign((*path, EACH_ELEMENT), elements, (*axes, axis), keeps_null=keeps_null)
         else:
             lists = [at for at, name in enumerate(path) if name == EACH_ELEMENT]
             for at, axis in zip(lists, axes, strict=True):
                 self._axes.setdefault(path[:at], axis)
             current = self._values.get(path)
             self._values[path] = values if current is None else _coalesce(current, values)
+            if keeps_null and self._nullable:
+                self._keep_null.add(path)
 
     def constrain(self, path: FieldPath, index: int | None, where: Mask, value: Any) -> None:  # noqa: ANN401 - a field's value
         """Record the value that a field, or one of its elements, must have in some rows if nothing else is known."""
@@ -180,16 +190,37 @@ class MessageBuilder:
         self.defaulted.clear()
         return self._struct(self._shape, (), self._rows)
 
-    def _put_fields(self, path: FieldPath, type_: DataType, values: Array, axes: tuple[Axis, ...]) -> None:
+    def _put_fields(
+        self,
+        path: FieldPath,
+        type_: DataType,
+        values: Array,
+        axes: tuple[Axis, ...],
+        *,
+        keeps_null: bool,
+    ) -> None:
         present = {field.name for field in values.type}
         for field in type_:
             source_name = field.name if field.name in present else _ONTOLOGY_NAMES.get(field.name)
             if source_name in present:
-                self.assign((*path, field.name), field_of(values, str(source_name)), axes)
+                self.assign(
+                    (*path, field.name), field_of(values, str(source_name)), axes, keeps_null=keeps_null
+                )
 
     def _struct(self, type_: DataType, path: FieldPath, rows: int) -> Array:
         children = [self._field(field.type, (*path, field.name), rows) for field in type_]
-        return struct_of(children, type_, None, rows)
+        return struct_of(children, type_, self._absent(path), rows)
+
+    def _absent(self, path: FieldPath) -> Mask | None:
+        """Return where a nested message is absent: all its assigned values are null, and one of them keeps nulls."""
+        below = [each for each in self._values if each[: len(path)] == path and each != path]
+        if not path or path[-1] == EACH_ELEMENT or self._keep_null.isdisjoint(below):
+            return None
+        if any(EACH_ELEMENT in each[len(path) :] for each in below):  # a list of messages is never absent
+            return None
+        masks = [null_mask(self._values[each]) for each in below]
+        present = [mask for mask in masks if mask is not None]
+        return np.logical_and.reduce(present) if len(present) == len(masks) else None
 
     def _field(self, type_: DataType, path: FieldPath, rows: int) -> Array:
         if pt.is_struct(type_):
@@ -200,6 +231,8 @@ class MessageBuilder:
             variable = variable_list(elements, axis.offsets, None, arrays.list_(type_.value_field))
             return _of_size(variable, type_) if pt.is_fixed_size_list(type_) else variable
         values = self._values.get(path)
+        if values is not None and path in self._keep_null and path not in self._constraints:
+            return _with_nulls(values, type_)
         if values is None and path not in self._constraints:
             self.defaulted.append(".".join(path).replace(f".{EACH_ELEMENT}", EACH_ELEMENT))
         array = zeros(type_, rows) if values is None else fill_nulls(values, type_)
@@ -247,6 +280,13 @@ def fill_nulls(values: Array, type_: DataType) -> Array:
             values = pc.round(values)
         values = pc.cast(values, type_, safe=False)
     return pc.fill_null(values, _zero(type_)) if values.null_count else values
+
+
+def _with_nulls(values: Array, type_: DataType) -> Array:
+    """Cast values to the type of a field; nulls stay null."""
+    array = fill_nulls(values, type_)
+    absent = null_mask(values)
+    return array if absent is None else pc.if_else(arrays.array(absent), arrays.scalar(None, type_), array)
 
 
 def _coalesce(current: Array, more: Array) -> Array:

@@ -119,7 +119,8 @@ def invert(adapter: Adapter, definition: Definition, metadata: Mapping[str, Any]
     if isinstance(adapter, UnmodeledAdapter):
         return _UnmodeledInverse(shape, definition.language is not Language.ROS)
     if isinstance(adapter, MappingAdapter):
-        return _MappingInverse(adapter, shape, _metadata_texts(adapter.metadata, metadata))
+        texts = _metadata_texts(adapter.metadata, metadata)
+        return _MappingInverse(adapter, shape, texts, definition.language is not Language.ROS)
     if isinstance(adapter, PythonAdapter) and adapter.is_invertible:
         if definition.language is not Language.ROS:
             raise AdapterError(f"to_ros of {adapter.adapter.__name__} applies to ROS messages only")
@@ -147,11 +148,12 @@ class _MappingInverse(Struct, frozen=True):
     adapter: MappingAdapter
     shape: pa.StructType
     metadata_texts: Mapping[FieldPath, str]
+    nullable: bool
 
     def restore(self, rows: pa.StructArray, envelope: Envelope) -> Restored:
         if self.adapter.ontology.tag == _IMAGE:
             rows = without_files(rows)
-        builder = MessageBuilder(self.shape, len(rows))
+        builder = MessageBuilder(self.shape, len(rows), nullable=self.nullable)
         undo = ColumnInverter(builder, self.metadata_texts)
         undo.record(self.adapter.record, rows)
         messages = builder.build()
