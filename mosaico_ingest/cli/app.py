@@ -24,7 +24,7 @@ from mosaico_ingest.version import __version__
 COMMANDS = {
     "run": "run", "bag": "run", "inspect": "report", "plan": "plan", "check": "check", "diff": "plan", "init": "plan",
     "expand": "plan", "view": "view", "verify": "store", "replay": "run", "export": "export", "lint": "lint", "serve": "serve", "browse": "pages", "watch": "watch",
-    "status": "watch", "report": "report",
+    "status": "watch", "report": "report", "quickstart": "quickstart",
 }  # fmt: skip
 """The module in `cli` that defines each command, in the order of `--help`."""
 GROUPS = {"adapters": "adapters", "store": "store", "keys": "serve", "schema": "schema"}
@@ -76,7 +76,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(IngestError.exit_code)
 
 
+def _suggest() -> bool:
+    """Print commands for the recordings and manifests of the current folder; return whether there are any."""
+    from mosaico_ingest.cli.quickstart import suggestions
+
+    lines = suggestions(Path())
+    if lines:
+        typer.echo("\n".join(["This folder contains", *lines, "All commands: ingest --help"]))
+    return bool(lines)
+
+
 def _invoke(words: list[str]) -> None:
+    if not words and not COMPLETING and _suggest():
+        sys.exit(2)
     try:
         lists_only = not COMPLETING and words in ([], ["--help"], ["-h"])
         names = words[:1] if words and words[0] in NAMES else NAMES
