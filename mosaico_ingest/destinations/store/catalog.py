@@ -1,7 +1,7 @@
 """The SQLite catalog of a store: tables, queries, sessions and removal.
 
-Every call opens its own connection. Threads and forked processes therefore share no connection, and a catalog that was
-deleted is detected instead of written to.
+Every call has a connection for itself, so threads and forked processes share none. A catalog that was deleted is
+detected instead of written to.
 """
 
 from __future__ import annotations
@@ -14,12 +14,21 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Collection, Generator, Mapping
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 
 from mosaico_ingest.destinations.base import FamilyTopic, check_same_type, sequence_exists
+from mosaico_ingest.destinations.store.connections import (
+    BUSY_S,
+    Handle,
+    connect,
+    connection,
+    find_open,
+    keep_open,
+)
 from mosaico_ingest.destinations.store.errors import NotInStore, sequence_changed, translate_errors
 from mosaico_ingest.destinations.store.listing import Listing, SequenceFilter, family_topics, listing
 from mosaico_ingest.destinations.store.model import (
@@ -43,8 +52,6 @@ FORMAT = 1
 """The version of the tables; it increases if earlier releases cannot read them."""
 
 _APPLICATION = 0x6D6F7361  # "mosa", which `file catalog.sqlite` shows
-
-_BUSY_S = 30.0
 
 _STAMPS = ("user_version", "application_id")
 
@@ -136,10 +143,10 @@ class Catalog:
         with self._task("BEGIN IMMEDIATE", mode="rw", lasting=lasting) as db:
             yield db
 
-    def keep_open(self) -> sqlite3.Connection:
-        """Return an idle connection, since only closing the last connection costs a checkpoint."""
+    def keep_open(self) -> Handle:
+        """See `StoreCatalog.keep_open`; calls reuse the connections of an open catalog."""
         with translate_errors(self.path):
-            return self._connect("rw")
+            return keep_open(self.path)
 
     def claim(
         self, session: str, sequence: str, if_exists: IfExists, *, is_live: Callable[[str], bool]
@@ -233,10 +240,9 @@ class Catalog:
     def _task(
         self, begin: str, *, mode: str, lasting: bool = True
     ) -> Generator[sqlite3.Connection, None, None]:
-        with translate_errors(self.path), closing(self._connect(mode)) as db:
-            if not lasting:
-                # The WAL stays consistent, but its last transactions may be missing after a power cut.
-                db.execute("PRAGMA synchronous = NORMAL")
+        with translate_errors(self.path), connection(self.path, partial(self._connect, mode)) as db:
+            # Without FULL, the WAL stays consistent, but its last transactions may be missing after a power cut.
+            db.execute(f"PRAGMA synchronous = {'FULL' if lasting else 'NORMAL'}")
             db.execute(begin)
             try:
                 yield db
@@ -247,15 +253,18 @@ class Catalog:
 
     def _connect(self, mode: str) -> sqlite3.Connection:
         try:
-            return _connect(self.path, f"mode={mode}")
+            return connect(self.path, f"mode={mode}")
         except sqlite3.OperationalError:
             if mode != "ro" or not self.path.is_file() or os.access(self.path.parent, os.W_OK):
                 raise
-            return _connect(self.path, "immutable=1")  # a read-only medium cannot hold the files of the WAL
+            return connect(self.path, "immutable=1")  # a read-only medium cannot hold the files of the WAL
 
     def _prepare(self, *, create: bool) -> None:
         if create and not self.path.exists():
             self._create_atomically()
+        catalog = find_open(self.path)
+        if catalog is not None and (catalog.is_current or not create):
+            return
         with closing(self._connect("rw" if create else "ro")) as db:
             if create:
                 _initialize(db, self.path)
@@ -270,12 +279,14 @@ class Catalog:
             )
         if version == 0:
             raise SinkError("there is no store here", where=str(self.path.parent), hint="check the path")
+        if catalog is not None:
+            catalog.is_current = create
 
     def _create_atomically(self) -> None:
         """Create the catalog under its name only when it is initialized, so that no process sees half of it."""
         draft = self.path.with_name(f".{self.path.name}-{secrets.token_hex(8)}")
         try:
-            with closing(_connect(draft, "mode=rwc")) as db:
+            with closing(connect(draft, "mode=rwc")) as db:
                 _initialize(db, draft)
             try:
                 os.link(draft, self.path)
@@ -287,20 +298,6 @@ class Catalog:
         finally:
             for file in self.path.parent.glob(f"{draft.name}*"):
                 file.unlink(missing_ok=True)
-
-
-def _connect(path: Path, query: str) -> sqlite3.Connection:
-    uri = f"{path.absolute().as_uri()}?{query}"
-    db = sqlite3.connect(uri, uri=True, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
-    try:
-        db.row_factory = sqlite3.Row
-        db.execute("PRAGMA foreign_keys = ON")
-        db.execute("PRAGMA synchronous = FULL")
-        db.execute("SELECT count(*) FROM sqlite_master")
-    except sqlite3.Error:
-        db.close()
-        raise
-    return db
 
 
 def _format(db: sqlite3.Connection, path: Path) -> int:
@@ -331,7 +328,7 @@ def _initialize(db: sqlite3.Connection, path: Path) -> None:
 
 
 def _use_wal(db: sqlite3.Connection) -> None:
-    deadline = time.monotonic() + _BUSY_S
+    deadline = time.monotonic() + BUSY_S
     while not _switched_to_wal(db) and time.monotonic() < deadline:
         time.sleep(0.01)
 
