@@ -62,7 +62,7 @@ def keep_destinations_open() -> Generator[KeepOpen]:
 def _store(target: StoreTarget) -> Destination:
     from mosaico_ingest.destinations.store.destination import StoreDestination  # noqa: PLC0415 - Parquet is slow to import
 
-    return StoreDestination(target.path)
+    return StoreDestination(target.path, target.compression)
 
 
 def _server(target: ServerTarget) -> Destination:

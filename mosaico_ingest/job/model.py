@@ -42,6 +42,7 @@ from mosaico_ingest.job.values import (
     DEFAULT_STORE,
     DEFAULT_TOPIC,
     PROVENANCE_KEY,
+    Compression,
     IfExists,
     LoaderErrorPolicy,
     LockFile,
@@ -345,6 +346,8 @@ class DestinationSettings(Section):
 
     store: Annotated[Text, FilePath(PathRole.STORE)] | None = Field(default=None, examples=["./mosaico"])
     """The directory of the embedded store, or a URL (`s3://bucket/prefix`, `gs://bucket/prefix`)."""
+    compression: Compression = Compression.FAST
+    """The compression of the store: fast, or small (fewer bytes, more CPU time; only the size of the files differs)."""
     host: Text | None = Field(default=None, examples=["mosaico.example.org"])
     """The server's name or address."""
     port: Annotated[int, Field(ge=1, le=65535)] = DEFAULT_PORT
@@ -371,7 +374,11 @@ class DestinationSettings(Section):
             raise _conflict(f"{kinds[0]} and {kinds[1]} are two destinations", kinds[1])
         if self.options and self.type is None:
             raise _conflict("options are set, but type is not", "options")
-        server_only = sorted(self.model_fields_set - {"store", "host", "type", "options"})
+        if "compression" in self.model_fields_set and kinds and "store" not in kinds:
+            raise _conflict(
+                f"compression is an option of store, and {kinds[0]} is another destination", "compression"
+            )
+        server_only = sorted(self.model_fields_set - {"store", "compression", "host", "type", "options"})
         if self.host is None and server_only:
             raise _conflict(f"{server_only[0]} requires host, which is not set", server_only[0])
         return self
@@ -381,7 +388,8 @@ class DestinationSettings(Section):
         if self.type is not None:
             return PluginTarget(self.type, self.options, folder)
         if self.host is None:
-            return StoreTarget(DEFAULT_STORE if self.store is None else as_path(self.store))
+            path = DEFAULT_STORE if self.store is None else as_path(self.store)
+            return StoreTarget(path, self.compression)
         key = None if self.api_key is None else self.api_key.get_secret_value()
         certificate = None if self.tls_cert is None else Path(self.tls_cert)
         return ServerTarget(

@@ -166,11 +166,21 @@ class Interval(Struct, frozen=True):
         return f"{self.periods:g} periods" if self.ns is None else f"{self.ns} ns"
 
 
+class Compression(str, Enum):
+    """How much time compressing a stored sequence may take."""
+
+    FAST = "fast"
+    """Encodings by type and the lowest level of zstd."""
+    SMALL = "small"
+    """For each column the smallest encoding of a sample, and a higher level of zstd."""
+
+
 class StoreTarget(Struct, frozen=True):
     """The embedded store in a directory, or behind a URL."""
 
     kind: ClassVar[str] = "store"
     path: AnyPath
+    compression: Compression = Compression.FAST
 
 
 @dataclass(frozen=True, slots=True)

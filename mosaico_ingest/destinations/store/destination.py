@@ -23,6 +23,7 @@ from mosaico_ingest.destinations.store.model import SequenceInfo
 from mosaico_ingest.destinations.store.session import StoreSink
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import SinkError, Unreachable
+from mosaico_ingest.job.values import Compression
 from mosaico_ingest.remote import AnyPath, RemotePath
 
 
@@ -32,8 +33,9 @@ class StoreDestination(Destination):
     kind: ClassVar[str] = "store"
     can_amend: ClassVar[bool] = True
 
-    def __init__(self, path: AnyPath) -> None:
+    def __init__(self, path: AnyPath, compression: Compression = Compression.FAST) -> None:
         self.path = path
+        self.compression = compression
 
     def describe(self, *, folder: Path | None = None) -> str:
         """Return the path or URL."""
@@ -77,7 +79,7 @@ class StoreDestination(Destination):
 
     def open_sink(self, *, buffer_bytes: int) -> Sink:
         """Return a sink, after creating the store if necessary."""
-        return StoreSink(Store.open(self.path), buffer_bytes)
+        return StoreSink(Store.open(self.path), buffer_bytes, self.compression)
 
     def family_topics(self, family: str | None, names: Collection[str]) -> tuple[FamilyTopic, ...]:
         """Return the topics with these names that sessions of the family created, oldest session first."""

@@ -38,7 +38,7 @@ from mosaico_ingest.destinations.store.segment import (
 )
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import IngestError, SinkError
-from mosaico_ingest.job.values import IfExists
+from mosaico_ingest.job.values import Compression, IfExists
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.protocol.batches import has_nested_lists, with_offsets
 from mosaico_ingest.remote import AnyPath, RemotePath
@@ -55,8 +55,16 @@ _SEGMENT_BYTES = 512 << 20
 class Staging:
     """The topics of a session, the paths of their staged segments, and their shared buffer."""
 
-    def __init__(self, where: AnyPath, staged: Callable[[str, int], AnyPath], *, buffer_bytes: int) -> None:
+    def __init__(
+        self,
+        where: AnyPath,
+        staged: Callable[[str, int], AnyPath],
+        *,
+        buffer_bytes: int,
+        compression: Compression = Compression.FAST,
+    ) -> None:
         self.where = where
+        self.compression = compression
         self._staged = staged
         self.topics: dict[str, StoreTopic] = {}
         self._buffer_bytes = buffer_bytes
@@ -174,7 +182,9 @@ class StoreTopic:
         if self._writer is not None and rows.column(0)[0].as_py() < self._writer.end_ns:
             self._finish_segment()  # a segment is sorted from its first row to its last
         if self._writer is None:
-            self._writer = SegmentWriter(self._staging.next_path(self.name), self._columns, rows)
+            self._writer = SegmentWriter(
+                self._staging.next_path(self.name), self._columns, rows, self._staging.compression
+            )
         self._writer.append(rows)
         if self._writer.written_bytes >= _SEGMENT_BYTES:
             self._finish_segment()
@@ -206,6 +216,7 @@ class StoreSession:
         *,
         if_exists: IfExists,
         buffer_bytes: int,
+        compression: Compression = Compression.FAST,
         keep_catalog_open: bool = True,
     ) -> None:
         self.id = new_session_id()
@@ -216,7 +227,10 @@ class StoreSession:
         self._topics: dict[str, StoreTopic] = {}
         self._notes: list[NewNote] = []
         self._staging = Staging(
-            layout.root, partial(layout.staged, self.id, sequence), buffer_bytes=buffer_bytes
+            layout.root,
+            partial(layout.staged, self.id, sequence),
+            buffer_bytes=buffer_bytes,
+            compression=compression,
         )
         self._lease = layout.begin(self.id)
         self._open_catalog = ExitStack()
@@ -376,6 +390,7 @@ class StoreSink(Struct, frozen=True):
 
     store: Store
     buffer_bytes: int = _BUFFER_BYTES
+    compression: Compression = Compression.FAST
 
     @contextmanager
     def open(
@@ -394,6 +409,7 @@ class StoreSink(Struct, frozen=True):
             protocol.check_metadata(metadata, where=sequence),
             if_exists=if_exists,
             buffer_bytes=self.buffer_bytes,
+            compression=self.compression,
         )
         try:
             yield session
