@@ -26,10 +26,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from mosaico_ingest.destinations.store import SequenceInfo, Store, TopicInfo
-    from mosaico_ingest.view.statistics import ColumnStatistics, TopicStatistics, TopicTiming
+    from mosaico_ingest.view.statistics import TopicStatistics, TopicTiming
 
-CELL_WIDTH = 40
-"""Characters of a value in a table of rows."""
 RECORD_WIDTH = 90
 """Characters of a value where each column of a row has its own line."""
 MAX_GAPS = 5
@@ -328,6 +326,10 @@ def _print_timings(info: SequenceInfo, timings: Sequence[tuple[TopicInfo, TopicT
 
 
 def _print_topic_statistics(described: TopicStatistics, *, every: bool) -> None:
+    from msgspec.structs import astuple
+
+    from mosaico_ingest.view.values import column_texts
+
     timing = described.timing
     print_line(f"{described.sequence}{described.topic}", style="bold")
     span = f"{time_text(timing.start_ns)} .. {time_text(timing.end_ns)} UTC"
@@ -341,7 +343,8 @@ def _print_topic_statistics(described: TopicStatistics, *, every: bool) -> None:
     names = ("column", "type", "unit", "nulls", "min", "max", "mean", "distinct")
     table = PlainTable(*names, numbers={"nulls", "min", "max", "mean", "distinct"})
     for column in columns:
-        table.add_row(*_statistics_cells(column))
+        texts = column_texts(column)
+        table.add_row(Text(texts.path, style="cyan"), *astuple(texts)[1:])
     Terminal().print(table)
     hidden = len(described.columns) - len(columns)
     if hidden:
@@ -358,37 +361,6 @@ def _print_gaps(timing: TopicTiming) -> None:
     for gap in sorted(gaps, key=lambda gap: gap.start_ns):
         length = seconds_text((gap.end_ns - gap.start_ns) / 1e9)
         print_line(f"  {length} from {time_text(gap.start_ns)} to {time_text(gap.end_ns)}", style="yellow")
-
-
-def _statistics_cells(column: ColumnStatistics) -> tuple[str | Text, ...]:
-    from mosaico_ingest.view.values import instant_text, value_text
-
-    is_size = "binary" in column.type
-    low, high = (
-        "-" if bound is None
-        else instant_text(bound) if column.is_time
-        else bytes_text(bound) if is_size
-        else value_text(bound, CELL_WIDTH // 2)
-        for bound in (column.minimum, column.maximum)
-    )  # fmt: skip
-    mean = "-" if column.mean is None else bytes_text(column.mean) if is_size else f"{column.mean:.6g}"
-    kind = "time" if column.is_time else _type_text(column)
-    nulls = "?" if column.nulls is None else count_text(column.nulls)
-    nulls += f" +{count_text(column.nan)} NaN" if column.nan else ""
-    if column.distinct is not None:
-        distinct = count_text(column.distinct)
-    else:
-        distinct = "?" if column.rows is None else "> 10,000" if column.rows else "-"
-    return Text(column.path, style="cyan"), kind, column.unit, nulls, low, high, mean, distinct
-
-
-def _type_text(column: ColumnStatistics) -> str:
-    """Return the type; of lists with the lengths, as in `double[9]` or `float[0..64]`."""
-    if column.lengths is None:
-        return column.type
-    shortest, longest = column.lengths
-    item = column.type.partition("item: ")[2].partition(">")[0].removesuffix(" not null") or column.type
-    return f"{item}[{shortest if shortest == longest else f'{shortest}..{longest}'}]"
 
 
 def _jitter(timing: TopicTiming) -> str:

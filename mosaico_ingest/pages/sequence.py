@@ -28,17 +28,16 @@ from mosaico_ingest.version import __version__
 from mosaico_ingest.view.images import has_images
 from mosaico_ingest.view.logs import LogExcerpt, has_log, read_excerpt
 from mosaico_ingest.view.pictures import has_pictures
-from mosaico_ingest.view.statistics import ColumnStatistics, TopicStatistics, describe_topic
+from mosaico_ingest.view.statistics import TopicStatistics, describe_topic
 from mosaico_ingest.view.tracks import Track as Positions
 from mosaico_ingest.view.tracks import has_track, read_track
 from mosaico_ingest.view.transforms import frame_trees, read_edges
+from mosaico_ingest.view.values import ColumnTexts, column_texts
 
 MAX_STRIPS = 24
 """Topics with pictures that a page shows."""
 MAX_TOPICS = 300
 """Topics whose values a page describes."""
-EPOCH_NS = 10**17
-"""Smaller times, before 1973, are shown as durations."""
 _Value = TypeVar("_Value")
 
 
@@ -61,20 +60,7 @@ class _TopicView(Struct, frozen=True):
     jitter: str
     gap_count: int
     track: Track | None
-    columns: tuple[_Column, ...]
-
-
-class _Column(Struct, frozen=True):
-    """The row of one column in the table of a topic's schema."""
-
-    path: str
-    type: str
-    unit: str
-    nulls: str
-    minimum: str
-    maximum: str
-    mean: str
-    distinct: str
+    columns: tuple[ColumnTexts, ...]
 
 
 class _Content:
@@ -193,35 +179,8 @@ def _topic_view(topic: TopicInfo, statistics: TopicStatistics | None, axis: Axis
         draw_track(axis, topic.name, timeline, span=optional_span(topic.start_ns, topic.end_ns))
         if axis is not None
         else None,
-        tuple(map(_column, statistics.columns)) if statistics else (),
+        tuple(map(column_texts, statistics.columns)) if statistics else (),
     )
-
-
-def _column(column: ColumnStatistics) -> _Column:
-    nulls = "" if column.rows is None or column.nulls is None else count_text(column.nulls)
-    return _Column(
-        column.path,
-        column.type,
-        column.unit,
-        nulls,
-        _value(column.minimum, is_time=column.is_time),
-        _value(column.maximum, is_time=column.is_time),
-        _value(column.mean, is_time=False),
-        "" if column.distinct is None else count_text(column.distinct),
-    )
-
-
-def _value(value: object, *, is_time: bool) -> str:
-    if value is None:
-        return ""
-    if is_time and isinstance(value, int):
-        return time_text(value) if abs(value) >= EPOCH_NS else interval_text(value)
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    text = str(value)
-    return text if len(text) <= 40 else f"{text[:40]}…"  # noqa: PLR2004 - the width of a cell
 
 
 def _flatten(metadata: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:

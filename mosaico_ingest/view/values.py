@@ -6,14 +6,20 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
+from msgspec import Struct
 
-from mosaico_ingest.report.units import counted, time_text
+from mosaico_ingest.report.units import bytes_text, count_text, counted, time_text
 from mosaico_ingest.view.images import image_file_type
 
+if TYPE_CHECKING:
+    from mosaico_ingest.view.statistics import ColumnStatistics
+
+BOUND_WIDTH = 20
+"""Characters of the smallest and the largest value of a column."""
 _SECOND = 1_000_000_000
 _FIRST_INSTANT_NS = 10**17
 """Times before March 1973 are durations, or times of a simulation, which starts at 0."""
@@ -93,6 +99,49 @@ def time_parts_ns(value: Mapping[str, Any]) -> int | None:
         if set(value) == {seconds, rest} and isinstance(value[seconds], int) and isinstance(value[rest], int):
             return value[seconds] * _SECOND + value[rest]
     return None
+
+
+class ColumnTexts(Struct, frozen=True):
+    """The statistics of a column as text, in the order of a table."""
+
+    path: str
+    type: str
+    unit: str
+    nulls: str
+    minimum: str
+    maximum: str
+    mean: str
+    distinct: str
+
+
+def column_texts(column: ColumnStatistics) -> ColumnTexts:
+    """Return the statistics of a column as text: `-` without a value, `?` if it is unknown."""
+    is_size = "binary" in column.type
+    low, high = (
+        "-" if bound is None
+        else instant_text(bound) if column.is_time
+        else bytes_text(bound) if is_size
+        else value_text(bound, BOUND_WIDTH)
+        for bound in (column.minimum, column.maximum)
+    )  # fmt: skip
+    mean = "-" if column.mean is None else bytes_text(column.mean) if is_size else f"{column.mean:.6g}"
+    nulls = "?" if column.nulls is None else count_text(column.nulls)
+    nulls += f" +{count_text(column.nan)} NaN" if column.nan else ""
+    if column.distinct is not None:
+        distinct = count_text(column.distinct)
+    else:
+        distinct = "?" if column.rows is None else "> 10,000" if column.rows else "-"
+    kind = "time" if column.is_time else _type_text(column)
+    return ColumnTexts(column.path, kind, column.unit, nulls, low, high, mean, distinct)
+
+
+def _type_text(column: ColumnStatistics) -> str:
+    """Return the type; of lists with the lengths, as in `double[9]` or `float[0..64]`."""
+    if column.lengths is None:
+        return column.type
+    shortest, longest = column.lengths
+    item = column.type.partition("item: ")[2].partition(">")[0].removesuffix(" not null") or column.type
+    return f"{item}[{shortest if shortest == longest else f'{shortest}..{longest}'}]"
 
 
 def json_value(value: object) -> Any:  # noqa: ANN401 - any JSON value
