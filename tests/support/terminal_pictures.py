@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 IMAGES = ROOT / "docs" / "images"
 WIDTH = 104
 PICTURES = {
-    "terminal-run": "ingest configs/quickstart.yaml",
+    "terminal-run": "ingest quickstart/quickstart.yaml",
     "terminal-show": "ingest store show quickstart_drive",
     "terminal-plot": "ingest store plot quickstart_drive/odom pose.position",
     "terminal-lint": "ingest lint job.yaml",
@@ -30,7 +30,7 @@ topic_settings: {"/cam*": {every: two}}
 
 def take_pictures(folder: Path) -> Iterator[tuple[str, str]]:
     """Run the commands in a folder with the quickstart, and yield the name and the SVG of each picture."""
-    shutil.copytree(ROOT / "configs", folder / "configs")
+    captured(["-m", "mosaico_ingest", "quickstart"], WIDTH, folder)
     shutil.copy(ROOT / "configs" / "quickstart" / "drive.mcap", folder)
     (folder / "job.yaml").write_text(MISTAKE)
     for name, command in PICTURES.items():
