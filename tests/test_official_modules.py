@@ -15,6 +15,7 @@ import pytest
         ("ros_bridge", "ROSHeader"),
         ("bridges.ros", "ROSExtractorConfig"),
         ("bridges.ros", "ROSSequenceExtractor"),
+        ("bridges.ros", "MosaicoToROSLoader"),
         ("ros_bridge.adapters", "IMUAdapter"),
         ("ros_bridge.adapters.sensor_msgs", "IMUAdapter"),
         ("ros_bridge.adapters.override_msgs", "LidarAdapter"),

@@ -35,8 +35,9 @@ class DefinitionFinder:
         distro: Stores | str | None = None,
         custom: Iterable[CustomMessages] = (),
         registry: type[ROSTypeRegistry] = ROSTypeRegistry,
+        types: Mapping[str, str] | None = None,
     ) -> None:
-        """Look up types in `custom`, then in `registry`, then in `distro`, by default the newest ROS 2 and ROS 1 Noetic.
+        """Look up types in `custom` and `types`, then in `registry`, then in `distro`, by default the newest ROS 2 and ROS 1 Noetic.
 
         Raises:
             BagError: A definition of `custom` cannot be read, or the distro does not exist.
@@ -45,10 +46,13 @@ class DefinitionFinder:
         is_ros1 = store is not None and store.value.startswith("ros1")
         self._resolvers = {
             1: TypeResolver(
-                store if store and is_ros1 else Stores.ROS1_NOETIC, definitions, registry=registry
+                store if store and is_ros1 else Stores.ROS1_NOETIC,
+                definitions,
+                types=types,
+                registry=registry,
             ),
             2: TypeResolver(
-                store if store and not is_ros1 else Stores.LATEST, definitions, registry=registry
+                store if store and not is_ros1 else Stores.LATEST, definitions, types=types, registry=registry
             ),
         }
         self._first, self._second = (1, 2) if is_ros1 else (2, 1)

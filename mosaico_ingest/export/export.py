@@ -172,6 +172,11 @@ class Restorer:
             BagError: A value does not fit its message field.
         """
         serializer = MESSAGE_ENCODINGS[encoding_of(self.definition)].writer(self.definition)
+        for log_ns, values in self.read_values(batches):
+            yield log_ns, serializer.from_dict(values)
+
+    def read_values(self, batches: Iterator[pa.RecordBatch]) -> Iterator[tuple[int, dict[str, Any]]]:
+        """Yield the log time and the fields of each message of the topic in the order of the rows."""
         for batch in batches:
             all_times: Any = batch.column("timestamp_ns").to_numpy()
             all_rows = self._rows(batch)
@@ -180,8 +185,7 @@ class Restorer:
                 restored = self._restore(all_rows.slice(start, _ROWS), times)
                 self._count(restored)
                 array: Any = restored.rows  # the stubs lack to_pylist of struct arrays
-                values = array.to_pylist()
-                yield from zip(times.tolist(), map(serializer.from_dict, values), strict=True)
+                yield from zip(times.tolist(), array.to_pylist(), strict=True)
 
     def result(self) -> TopicExport:
         """Return the result so far."""
@@ -262,7 +266,7 @@ def _produces(adapter: Adapter, info: SourceTopic) -> bool:
     )
 
 
-class _Definitions(Struct, frozen=True):
+class Definitions(Struct, frozen=True):
     """The definitions of topics that were stored without one."""
 
     distro: Stores
@@ -270,7 +274,7 @@ class _Definitions(Struct, frozen=True):
 
 
 def _assumed_restorer(
-    source: SourceSequence, info: SourceTopic, specs: Sequence[AdapterSpec], known: _Definitions
+    source: SourceSequence, info: SourceTopic, specs: Sequence[AdapterSpec], known: Definitions
 ) -> Restorer | None:
     """Return the restorer of a topic whose metadata has no definition, or None if no adapter produces its columns.
 
@@ -329,13 +333,9 @@ def export_sequence(
     opened = StoreSequence(source, sequence) if isinstance(source, Store) else source
     default = Stores.LATEST if 2 in ROS_VERSIONS[path.suffix] else Stores.ROS1_NOETIC  # noqa: PLR2004 - ROS 2
     distro = store_of(ros_distro) or default
-    definitions = _Definitions(distro, DefinitionFinder(distro, custom_msgs, registry))
-    selected = _selected(opened, topics)
+    definitions = Definitions(distro, DefinitionFinder(distro, custom_msgs, registry))
     specs = [adapter_spec(reference, Path()) for reference in adapters]
-    candidates = [
-        _restorer(opened, info, selected, specs, suffix=path.suffix, definitions=definitions)
-        for info in selected
-    ]
+    candidates = restorers_of(opened, topics, definitions, specs=specs, versions=ROS_VERSIONS[path.suffix])
     if dry_run:
         results = [one.result() if isinstance(one, Restorer) else one for one in candidates]
         return _logged(ExportReport(sequence=sequence, path=str(path), bytes=0, topics=tuple(results)))
@@ -394,14 +394,36 @@ def _selected(sequence: SourceSequence, patterns: Sequence[str]) -> tuple[Source
     return tuple(topic for topic in sequence.topics if topic.name in selection.selected)
 
 
+def restorers_of(
+    source: SourceSequence,
+    patterns: Sequence[str],
+    definitions: Definitions,
+    *,
+    specs: Sequence[AdapterSpec] = (),
+    versions: Collection[int] = (1, 2),
+) -> list[Restorer | TopicExport]:
+    """Return the restorer of each selected topic, or the reason why the topic cannot be restored.
+
+    `versions` are the possible versions of ROS of the messages.
+
+    Raises:
+        NothingMatched: No topic is selected.
+    """
+    selected = _selected(source, patterns)
+    return [
+        _restorer(source, info, selected, specs, versions=versions, definitions=definitions)
+        for info in selected
+    ]
+
+
 def _restorer(
     source: SourceSequence,
     info: SourceTopic,
     selected: Sequence[SourceTopic],
     specs: Sequence[AdapterSpec],
     *,
-    suffix: str,
-    definitions: _Definitions,
+    versions: Collection[int],
+    definitions: Definitions,
 ) -> Restorer | TopicExport:
     """Return the restorer of a topic, or the reason why the topic cannot be exported."""
     if info.problem:
@@ -412,7 +434,7 @@ def _restorer(
         reason = "its metadata does not describe the original messages"
         return restorer or _excluded(info, "", f"{reason}, and no adapter produces {info.ontology.tag}")
     others = [other for topic in selected if (other := origin_of(topic)) is not None]
-    version = version_of(origin, others, ROS_VERSIONS[suffix])
+    version = version_of(origin, others, versions)
     try:
         return restorer_for(info, origin.definition(version), specs)
     except (AdapterError, BagError) as error:

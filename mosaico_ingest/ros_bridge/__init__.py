@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         register_default_adapter,
     )
     from mosaico_ingest.export.extractor import ROSExtractorConfig, ROSSequenceExtractor
+    from mosaico_ingest.export.loader import MosaicoToROSLoader
     from mosaico_ingest.ontology import BatteryState, FrameTransform, PointCloud2, PointField
     from mosaico_ingest.rosbag.blocks import ROSHeader
 
@@ -33,6 +34,7 @@ __all__ = [
     "BatteryState",
     "FrameTransform",
     "LoaderErrorPolicy",
+    "MosaicoToROSLoader",
     "PointCloud2",
     "PointField",
     "ROSAdapterBase",
@@ -50,6 +52,7 @@ __all__ = [
 ]
 
 _MODULES = {
+    "MosaicoToROSLoader": "mosaico_ingest.export.loader",
     "ROSExtractorConfig": "mosaico_ingest.export.extractor",
     "ROSHeader": "mosaico_ingest.rosbag.blocks",
     "ROSSequenceExtractor": "mosaico_ingest.export.extractor",

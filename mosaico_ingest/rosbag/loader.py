@@ -78,7 +78,7 @@ class ROSLoader:
             NothingMatched: The patterns select no topic.
         """
         self._policy = LoaderErrorPolicy(error_policy)
-        distro, types = _definitions(typestore_or_distro)
+        distro, types = distro_and_types(typestore_or_distro)
         self._resolver = TypeResolver(distro, custom_msgs, types={**types, **(custom_types or {})})
         paths = [as_path(path) for path in ([file_path] if isinstance(file_path, (str, Path)) else file_path)]
         self._recording: Recording | None = None
@@ -239,7 +239,9 @@ def _by_log_time(blocks: list[MessageBlock]) -> Iterator[tuple[int, int, bytes]]
         yield int(times[position]), block.connection, block.payload(row)
 
 
-def _definitions(source: Typestore | Stores | str | None) -> tuple[Stores | str | None, Mapping[str, str]]:
+def distro_and_types(
+    source: Typestore | Stores | str | None,
+) -> tuple[Stores | str | None, Mapping[str, str]]:
     """Return a distro, or the texts of the types in a typestore of rosbags."""
     if source is None or isinstance(source, (str, Enum)):
         return source, {}

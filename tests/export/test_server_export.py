@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from mosaicod import Mosaicod, Topic, running
 from random_messages import random_rows
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores as RosbagsStores
+from rosbags.typesys import get_typestore
 
 from mosaico_ingest.adapters.builtin import BUILTIN, Builtin
 from mosaico_ingest.adapters.standalone import DefinitionFinder
@@ -27,16 +28,19 @@ from mosaico_ingest.api import run
 from mosaico_ingest.destinations.base import topic_schema
 from mosaico_ingest.destinations.server.client import connect
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.errors import BagError, SinkError
+from mosaico_ingest.errors import BagError, NothingMatched, SinkError
 from mosaico_ingest.export import ExportReport, export_sequence
 from mosaico_ingest.export.columns import as_type, comparable
 from mosaico_ingest.export.extractor import ROSExtractorConfig, ROSSequenceExtractor
+from mosaico_ingest.export.loader import MosaicoToROSLoader
 from mosaico_ingest.export.sources import ServerSequence
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.values import ServerTarget, Stores
 from mosaico_ingest.ontology import Integer64
+from mosaico_ingest.rosbag.blocks import ROSMessage
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
+from mosaico_ingest.rosbag.loader import ROSLoader
 from mosaico_ingest.rosbag.writers import open_writer
 from mosaico_ingest.serve import Server, serve
 
@@ -339,3 +343,45 @@ def test_extractor_uses_custom_msgs_for_topics_without_definition(server: Server
     (topic,) = ROSSequenceExtractor(config).run().topics
     assert topic.assumed.startswith("sensor_msgs/msg/Imu of ")
     assert topic.defaulted == ("own",)
+
+
+def by_topic(messages: Iterable[ROSMessage]) -> list[tuple[str, int, str, str]]:
+    """Return messages by topic and time, which are comparable if a value is NaN."""
+    return sorted(
+        (message.topic, message.bag_timestamp_ns, message.msg_type, repr(message.data))
+        for message in messages
+    )
+
+
+def test_loader_of_a_server_yields_the_messages_of_the_recording(server: Server) -> None:
+    topics = ["/imu", "/tf", "/battery", "/lidar/points"]
+    ingest(server.port, DRIVE, topics=[*topics, "/odom"])
+    with connect(ServerTarget("127.0.0.1", server.port)) as client:
+        loader = MosaicoToROSLoader(client, None, "s", topics)
+        restored = list(loader)
+        counts = loader.msg_count(), loader.msg_count("/imu")
+        with pytest.raises(NothingMatched, match="/odom"):
+            loader.msg_count("/odom")
+    with ROSLoader(DRIVE, topics=topics) as recording:
+        assert by_topic(restored) == by_topic(recording)
+        assert (loader.topics, loader.duration > 0) == (recording.topics, True)
+    assert counts == (len(restored), 1000)
+    times = [message.bag_timestamp_ns for message in restored]
+    assert times == sorted(times)
+    assert (loader.filtered_topics, loader.rejected_topics) == (["/odom"], {})
+    assert loader.resolve_native_msg_type("/imu") == "sensor_msgs/msg/Imu"
+
+
+def test_loader_of_a_store_applies_the_time_range_and_names_topics_it_cannot_restore(
+    server: Server, tmp_path: Path
+) -> None:
+    ingest(server.port, DRIVE, topics=["/imu", "/battery"])
+    store = Store.open(tmp_path / "served")
+    with store.catalog.write() as db:
+        db.execute("UPDATE topics SET metadata = '{}'")
+    start = store.sequence("s").start_ns or 0
+    typestore = get_typestore(RosbagsStores.ROS2_HUMBLE)
+    loader = MosaicoToROSLoader(store, typestore, "s", None, start, start + 10**9)
+    assert {message.msg_type for message in loader} == {"sensor_msgs/msg/Imu"}
+    assert loader.msg_count() == len(list(loader)) == 100
+    assert list(loader.rejected_topics) == ["/battery"]

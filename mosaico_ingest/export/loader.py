@@ -1,0 +1,123 @@
+"""`MosaicoToROSLoader`: the messages of a stored sequence, with the signature of the official bridge."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from typing import TYPE_CHECKING
+
+from mosaico_ingest.adapters.standalone import DefinitionFinder
+from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.errors import NothingMatched
+from mosaico_ingest.export.export import Definitions, Restorer, restorers_of
+from mosaico_ingest.export.sources import ServerSequence, StoreSequence
+from mosaico_ingest.findings import suggest_names
+from mosaico_ingest.job.values import Stores
+from mosaico_ingest.rosbag.blocks import ROSMessage
+from mosaico_ingest.rosbag.definitions.registry import store_of
+from mosaico_ingest.rosbag.loader import distro_and_types
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+    from mosaico_ingest.destinations.server.client import ServerClient
+
+
+class MosaicoToROSLoader:
+    """The messages of a sequence in their original types, ordered by log time. Iterate it once or several times.
+
+    Messages are restored as `export_sequence` restores them: see docs/export.md for the fields that can differ.
+    """
+
+    def __init__(  # noqa: PLR0917 - the positional parameters of the official SDK
+        self,
+        m_client: ServerClient | Store,
+        typestore_or_distro: Typestore | Stores | str | None,
+        sequence_name: str,
+        topics: str | Sequence[str] | None = None,
+        start_timestamp_ns: int | None = None,
+        end_timestamp_ns: int | None = None,
+    ) -> None:
+        """Look up a sequence of a store, or of the server of a client.
+
+        `typestore_or_distro` defines the types of topics that were stored without a definition. `topics` are topic globs.
+        The start is inclusive, the end exclusive.
+
+        Raises:
+            SinkError: The sequence does not exist.
+            NothingMatched: The patterns select no topic.
+        """
+        distro, types = distro_and_types(typestore_or_distro)
+        store = store_of(distro) or Stores.LATEST
+        finder = DefinitionFinder(None if store is Stores.EMPTY else store, types=types)
+        self._source = (
+            StoreSequence(m_client, sequence_name)
+            if isinstance(m_client, Store)
+            else ServerSequence(m_client, sequence_name)
+        )
+        patterns = [topics] if isinstance(topics, str) else list(topics or ())
+        candidates = restorers_of(self._source, patterns, Definitions(store, finder))
+        self._restorers = {one.info.name: one for one in candidates if isinstance(one, Restorer)}
+        self.rejected_topics: dict[str, str] = {
+            one.topic: one.excluded for one in candidates if not isinstance(one, Restorer)
+        }
+        """The reason for each selected topic whose messages cannot be restored."""
+        self._window = (start_timestamp_ns, end_timestamp_ns)
+
+    @property
+    def topics(self) -> list[str]:
+        """The topics whose messages are yielded, sorted."""
+        return sorted(self._restorers)
+
+    @property
+    def filtered_topics(self) -> list[str]:
+        """The topics that the patterns do not select, sorted."""
+        return sorted({topic.name for topic in self._source.topics} - {*self.topics, *self.rejected_topics})
+
+    @property
+    def msg_types(self) -> list[str]:
+        """The message types of the topics, sorted."""
+        return sorted({one.definition.root for one in self._restorers.values()})
+
+    @property
+    def duration(self) -> int:
+        """The time between the first and the last row of the sequence in ns."""
+        start_ns, end_ns = self._source.bounds
+        return end_ns - start_ns
+
+    def resolve_native_msg_type(self, topic_name: str) -> str | None:
+        """Return the message type of a topic; None if its messages cannot be restored."""
+        restorer = self._restorers.get(topic_name)
+        return None if restorer is None else restorer.definition.root
+
+    def msg_count(self, topic: str | None = None) -> int:
+        """Return the number of messages of a topic, or of all, in the time range; reads the times of the rows.
+
+        Raises:
+            NothingMatched: The topic has no messages to restore.
+        """
+        if topic is not None and topic not in self._restorers:
+            hint = suggest_names(self.topics, [topic])
+            raise NothingMatched(f"the topic {topic!r} is not selected", where=self._source.name, hint=hint)
+        names = self.topics if topic is None else [topic]
+        batches = (self._source.rows(self._restorers[name].info, *self._window) for name in names)
+        return sum(batch.num_rows for rows in batches for batch in rows)
+
+    def __iter__(self) -> Iterator[ROSMessage]:
+        """Yield the messages by log time.
+
+        Raises:
+            SinkError: The sequence cannot be read.
+            AdapterError: An adapter in Python fails.
+        """
+        messages = [self._messages(one) for one in self._restorers.values()]
+        yield from heapq.merge(*messages, key=lambda message: message.bag_timestamp_ns)
+
+    def _messages(self, restorer: Restorer) -> Iterator[ROSMessage]:
+        with closing(self._source.rows(restorer.info, *self._window)) as batches:
+            for log_ns, values in restorer.read_values(batches):
+                yield ROSMessage(log_ns, restorer.info.name, restorer.definition.root, values)
+
+    def close(self) -> None:
+        """Do nothing: the client or the store belongs to the caller."""
