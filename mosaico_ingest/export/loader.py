@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mosaico_ingest.adapters.standalone import DefinitionFinder
 from mosaico_ingest.destinations.store import Store
@@ -19,8 +19,6 @@ from mosaico_ingest.rosbag.definitions.registry import store_of
 from mosaico_ingest.rosbag.loader import distro_and_types
 
 if TYPE_CHECKING:
-    from rosbags.typesys.store import Typestore
-
     from mosaico_ingest.destinations.server.client import ServerClient
 
 
@@ -33,7 +31,7 @@ class MosaicoToROSLoader:
     def __init__(  # noqa: PLR0917 - the positional parameters of the official SDK
         self,
         m_client: ServerClient | Store,
-        typestore_or_distro: Typestore | Stores | str | None,
+        typestore_or_distro: Any,  # noqa: ANN401 - also a typestore of rosbags, which only `rosbag` imports
         sequence_name: str,
         topics: str | Sequence[str] | None = None,
         start_timestamp_ns: int | None = None,
@@ -41,7 +39,8 @@ class MosaicoToROSLoader:
     ) -> None:
         """Look up a sequence of a store, or of the server of a client.
 
-        `typestore_or_distro` defines the types of topics that were stored without a definition. `topics` are topic globs.
+        `typestore_or_distro`, a typestore of rosbags, a distro or None, defines the types of topics that were stored
+        without a definition. `topics` are topic globs.
         The start is inclusive, the end exclusive.
 
         Raises:
