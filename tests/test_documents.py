@@ -98,6 +98,26 @@ def test_command_line_page_equals_the_command_line() -> None:
     assert TEXT[ROOT / "docs" / "cli.md"] == cli_reference(), "run ./dev docs"
 
 
+def all_leaf_commands(group: Any, path: str) -> Iterator[tuple[str, Any]]:
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from all_leaf_commands(command, f"{path} {name}")
+        else:
+            yield f"{path} {name}", command
+
+
+def test_command_line_page_names_every_option_of_every_command() -> None:
+    sections = dict(
+        section.split("\n", 1) for section in f"\n{TEXT[ROOT / 'docs' / 'cli.md']}".split("\n## ")[1:]
+    )
+    commands = dict(all_leaf_commands(INGEST, "ingest"))
+    assert sections.keys() == commands.keys()
+    for path, command in commands.items():
+        for option in command.params:
+            for name in option.opts if option.param_type_name == "option" else ():
+                assert name == "--help" or re.search(rf"`{name}[ `]", sections[path]), f"{path} {name}"
+
+
 def test_site_sources_contain_every_linked_file(tmp_path: Path) -> None:
     write_sources(tmp_path)
     for page in (tmp_path / "docs").rglob("*.md"):
