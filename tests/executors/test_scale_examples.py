@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -16,7 +17,9 @@ import pytest
 import yaml
 
 from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.protocol.messages import Permission
 from mosaico_ingest.report.model import RunReport
+from mosaico_ingest.serve import Keyring
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -155,9 +158,56 @@ def test_kubernetes_example_defines_its_volume_and_names_the_image_of_the_docker
     assert f"docker build -t {image} -f configs/scale/Dockerfile ." in (SCALE / "Dockerfile").read_text()
 
 
+def instructions(name: str) -> list[str]:
+    """Return the arguments of the instructions with a name in the last stage of the Dockerfile."""
+    stage = (SCALE / "Dockerfile").read_text().rpartition("\nFROM ")[2]
+    return [line.partition(" ")[2] for line in stage.splitlines() if line.startswith(f"{name} ")]
+
+
+def test_dockerfile_example_runs_as_another_user_than_root() -> None:
+    (user,) = instructions("USER")
+    uid = int(user.partition(":")[0])
+    assert uid != 0
+    assert any(f"useradd --uid {uid} " in line for line in instructions("RUN"))
+    assert kubernetes_job()["template"]["spec"]["securityContext"] == {"fsGroup": uid, "runAsNonRoot": True}
+
+
+def test_dockerfile_example_serves_and_reports_its_health(tmp_path: Path) -> None:
+    (entry,), (default,), (health,) = map(instructions, ("ENTRYPOINT", "CMD", "HEALTHCHECK"))
+    program, arguments = json.loads(entry)[0], json.loads(default)
+    check = json.loads(health.partition("CMD ")[2])
+    assert (program, check[0]) == ("ingest", "ingest")
+    python = [sys.executable, "-m", "mosaico_ingest"]
+    local = [argument.replace("/data", str(tmp_path)) for argument in arguments]
+    local[local.index("--host") + 1] = "127.0.0.1"
+    result = subprocess.run([*python, *local], capture_output=True, text=True, check=False)  # noqa: S603 - our own command
+    assert result.returncode == 2  # it refuses to serve without keys
+    assert "ingest keys new" in result.stderr
+    Keyring(tmp_path / "api_keys.json").add(Permission.READ)
+    server = subprocess.Popen([*python, *local, "--port", "0"], stdout=subprocess.PIPE, text=True)  # noqa: S603 - our own command
+    try:
+        assert server.stdout is not None
+        port = server.stdout.readline().rpartition(":")[2].strip()
+        for port_of_check, code in ((port, 0), ("1", 1)):
+            command = [*python, *check[1:], "--port", port_of_check]
+            assert subprocess.run(command, check=False).returncode == code  # noqa: S603 - our own command
+    finally:
+        server.terminate()
+        server.communicate(timeout=20)
+
+
+def test_dockerignore_keeps_all_files_that_the_image_copies() -> None:
+    text = (SCALE / "Dockerfile").read_text()
+    copies = [
+        line.split()[1:-1] for line in text.splitlines() if line.startswith("COPY ") and "--from" not in line
+    ]
+    kept = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
+    assert {source for sources in copies for source in sources} == kept
+
+
 def test_dockerfile_example_copies_existing_files_and_all_that_the_build_needs() -> None:
     lines = (SCALE / "Dockerfile").read_text().splitlines()
-    copies = [line.split()[1:] for line in lines if line.startswith("COPY ")]
+    copies = [line.split()[1:] for line in lines if line.startswith("COPY ") and "--from" not in line]
     sources = {source for *names, _ in copies for source in names}
     assert all((ROOT / source).exists() for source in sources)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import random
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -11,18 +12,6 @@ from types import ModuleType
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-IDL = b"module pkg { module msg { struct Fuzzed { int32 a; sequence<double, 3> b; string<4> c; long d[3]; }; }; };"
-MSG = (
-    b"int32 a\nstring b\nfloat64[3] c\nuint8[] d\nOther[] o\n"
-    + b"=" * 80
-    + b"\nMSG: pkg/Other\nstring<=5 s\n"
-)
-BODY = b'{"locator": "a/b", "session_uuid": "x", "user_metadata": {"a": {"b": 1}}, "timestamp_ns_start": 3}'
-METADATA = b"rosbag2_bagfile_information: {version: 5, relative_file_paths: [a.db3], message_count: 3}\n"
-_FIELDS = (
-    b"\4\0\0\0op=\2\7\0\0\0topic=a\6\0\0\0type=a\5\0\0\0md5=a\x08\0\0\0sec=\1\0\0\0\x09\0\0\0nsec=\2\0\0\0"
-)
-ROSRECORD = b"#ROSRECORD V1.2\n" + (bytes([len(_FIELDS)]) + b"\0\0\0" + _FIELDS + b"\2\0\0\0hi") * 20
 NASTY = (
     b"\xff" * 4,
     b"\0" * 8,
@@ -36,8 +25,8 @@ NASTY = (
 )
 
 
-def _targets() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("fuzz_targets", ROOT / "fuzz" / "targets.py")
+def _module(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"fuzz_{name}", ROOT / "fuzz" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -45,29 +34,10 @@ def _targets() -> ModuleType:
     return module
 
 
-TARGETS: dict[str, Callable[[bytes], None]] = _targets().TARGETS
-
-
-def _seeds() -> dict[str, list[bytes]]:
-    configs = ROOT / "configs"
-    bag = (configs / "quickstart" / "drive.mcap").read_bytes()
-    return {
-        "recording": [
-            bag[:20_000] + bag[-4_000:],
-            b"#ROSBAG V2.0\n" + bytes(200),
-            b"SQLite format 3\0" + bytes(4080),
-            ROSRECORD,
-        ],
-        "definition": [
-            b"\1" + MSG + b"\0\0\0\0\0\1\0\0" + b"\1\0\0\0" * 20,
-            b"\2" + IDL,
-            b"\0Header header\ntime t\n",
-        ],
-        "manifest": [path.read_bytes() for path in configs.glob("*.yaml")],
-        "adapter": [path.read_bytes() for path in configs.glob("*/adapters/*.yaml")],
-        "metadata": [METADATA],
-        "wire": [BODY, b'{"action": "query", "response": {"items": []}}'],
-    }
+TARGETS: dict[str, Callable[[bytes], None]] = _module("targets").TARGETS
+SEEDS: dict[str, list[bytes]] = _module("seeds").seeds()
+SECONDS = 2.0
+"""Duration of the longer run of each target."""
 
 
 def _mutated(seed: bytes, rng: random.Random) -> bytes:
@@ -81,7 +51,7 @@ def _mutated(seed: bytes, rng: random.Random) -> bytes:
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_fuzz_target_mutated_seed_is_accepted_or_refused(name: str) -> None:
-    seeds = _seeds()[name]
+    seeds = SEEDS[name]
     assert seeds
     rng = random.Random(name)  # noqa: S311 - test data
     TARGETS[name](b"")
@@ -89,3 +59,14 @@ def test_fuzz_target_mutated_seed_is_accepted_or_refused(name: str) -> None:
         TARGETS[name](seed)
     for _ in range(120):
         TARGETS[name](_mutated(rng.choice(seeds), rng))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TARGETS)
+def test_fuzz_target_repeatedly_mutated_seed_is_accepted_or_refused(name: str) -> None:
+    rng = random.Random(f"long {name}")  # noqa: S311 - test data
+    end_s = time.process_time() + SECONDS
+    data = rng.choice(SEEDS[name])
+    while time.process_time() < end_s:
+        data = _mutated(data, rng) if rng.random() < 0.8 and len(data) < 100_000 else rng.choice(SEEDS[name])
+        TARGETS[name](data)
