@@ -29,8 +29,6 @@ from mosaico_ingest.report.units import (
     unreadable_text,
     written_text,
 )
-from mosaico_ingest.rosbag.loader import ROSLoader
-from mosaico_ingest.view.values import value_text
 
 FAILED = {RunStatus.FAILED, RunStatus.INTERRUPTED}
 STATUS_WORDS = {
@@ -322,6 +320,10 @@ def _examples(report: Report) -> list[QuarantinedMessage]:
 
 def _decoded_values(quarantine: Path, selected: set[tuple[str, int]]) -> dict[tuple[str, int], str]:
     """Return the fields of messages by topic and log time; empty for a file that is too large or cannot be read."""
+    # Only pages with quarantined messages need Arrow.
+    from mosaico_ingest.rosbag.loader import ROSLoader  # noqa: PLC0415 - as above
+    from mosaico_ingest.view.values import value_text  # noqa: PLC0415 - as above
+
     values: dict[tuple[str, int], str] = {}
     try:
         if quarantine.stat().st_size > MAX_DECODED_BYTES:
