@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from mosaico_ingest.cli.app import command_line
 from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.destinations.store.catalog import FORMAT
 from mosaico_ingest.errors import IngestError, ManifestError, SinkError
 from mosaico_ingest.pipeline.definition_lock import LockFile, read_lock
 from mosaico_ingest.pipeline.plan_document import read_plan
@@ -68,10 +69,12 @@ def test_manifest_and_adapter_of_a_newer_version_are_refused(documents: Path) ->
 def test_store_of_a_newer_format_is_refused_and_unchanged(documents: Path) -> None:
     catalog = documents / "mosaico" / "catalog.sqlite"
     with closing(sqlite3.connect(catalog)) as database:
-        database.execute("PRAGMA user_version = 2")
+        database.execute(f"PRAGMA user_version = {FORMAT + 1}")
         database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     content = catalog.read_bytes()
     for create in (False, True):
-        with pytest.raises(IngestError, match="the store has format 2, this version supports up to 1"):
+        with pytest.raises(
+            IngestError, match=f"the store has format {FORMAT + 1}, this version supports up to {FORMAT}"
+        ):
             Store.open("mosaico", create=create)
     assert catalog.read_bytes() == content

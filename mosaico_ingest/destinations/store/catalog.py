@@ -21,6 +21,7 @@ from typing import Any
 import pyarrow as pa
 
 from mosaico_ingest.destinations.base import FamilyTopic, check_same_type, sequence_exists
+from mosaico_ingest.destinations.store import schemas
 from mosaico_ingest.destinations.store.connections import (
     BUSY_S,
     Handle,
@@ -48,7 +49,7 @@ from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 from mosaico_ingest.remote import AnyPath
 
-FORMAT = 1
+FORMAT = 2
 """The version of the tables; it increases if earlier releases cannot read them."""
 
 _APPLICATION = 0x6D6F7361  # "mosa", which `file catalog.sqlite` shows
@@ -78,7 +79,7 @@ CREATE TABLE topics (
     ontology_tag TEXT NOT NULL,
     serialization_format TEXT NOT NULL,
     fingerprint TEXT NOT NULL,
-    arrow_schema BLOB NOT NULL,
+    schema_digest TEXT NOT NULL REFERENCES schemas,
     metadata TEXT NOT NULL,
     created_ns INTEGER NOT NULL,
     UNIQUE (sequence_id, name)
@@ -269,8 +270,8 @@ class Catalog:
             if create:
                 _initialize(db, self.path)
             version = _format(db, self.path)
-            if create and version == FORMAT:  # a catalog of a newer format must not be changed
-                _add_missing_columns(db)
+            if create and version <= FORMAT:  # a catalog of a newer format must not be changed
+                version = _convert(db)
         if version > FORMAT:
             raise SinkError(
                 f"the store has format {version}, this version supports up to {FORMAT}",
@@ -320,7 +321,7 @@ def _initialize(db: sqlite3.Connection, path: Path) -> None:
     _use_wal(db)
     db.execute("BEGIN IMMEDIATE")
     if _format(db, path) == 0:  # another process may have been faster
-        for statement in _TABLES.split(";"):
+        for statement in (_TABLES + schemas.TABLE).split(";"):
             db.execute(statement)
         db.execute(f"PRAGMA application_id = {_APPLICATION}")
         db.execute(f"PRAGMA user_version = {FORMAT}")
@@ -343,13 +344,22 @@ def _switched_to_wal(db: sqlite3.Connection) -> bool:
     return True
 
 
-def _add_missing_columns(db: sqlite3.Connection) -> None:
-    """Add the columns that earlier catalogs of the same format lack."""
-    if not _has_checksums(db):
-        db.execute("BEGIN IMMEDIATE")
-        if not _has_checksums(db):  # another process may have been faster
+def _convert(db: sqlite3.Connection) -> int:
+    """Convert a catalog of an earlier format or version, and return its format."""
+    if _version(db) == FORMAT:
+        return FORMAT
+    db.execute("BEGIN IMMEDIATE")
+    if _version(db) == 1:  # another process may have been faster
+        if not _has_checksums(db):
             db.execute("ALTER TABLE segments ADD COLUMN checksum TEXT")
-        db.execute("COMMIT")
+        schemas.convert(db)
+        db.execute(f"PRAGMA user_version = {FORMAT}")
+    db.execute("COMMIT")
+    return _version(db)
+
+
+def _version(db: sqlite3.Connection) -> int:
+    return int(db.execute("PRAGMA user_version").fetchone()[0])
 
 
 def _has_checksums(db: sqlite3.Connection) -> bool:
@@ -436,8 +446,8 @@ def _topics(db: sqlite3.Connection, sequence_id: int, name: str, root: Path) -> 
             sequence=name,
             name=row["name"],
             session=row["session_id"],
-            ontology=_ontology_of(row),
-            schema=pa.ipc.read_schema(pa.py_buffer(row["arrow_schema"])),
+            ontology=_ontology_of(db, row),
+            schema=schemas.schema_of(db, row),
             metadata=json.loads(row["metadata"]),
             created_ns=row["created_ns"],
             segments=tuple(segments[row["id"]]),
@@ -584,7 +594,7 @@ def _sequence(db: sqlite3.Connection, claimed: Claim, new: NewSession) -> int:
 def _topic(db: sqlite3.Connection, sequence_id: int, session: str, topic: NewTopic) -> int:
     db.execute(
         "INSERT INTO topics (sequence_id, session_id, name, ontology_tag, serialization_format, fingerprint,"
-        " arrow_schema, metadata, created_ns) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
+        " schema_digest, metadata, created_ns) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
         " ON CONFLICT (sequence_id, name) DO NOTHING",
         (
             sequence_id,
@@ -593,7 +603,7 @@ def _topic(db: sqlite3.Connection, sequence_id: int, session: str, topic: NewTop
             topic.ontology.tag,
             topic.ontology.serialization_format.value,
             topic.ontology.fingerprint,
-            topic.schema.serialize().to_pybytes(),
+            schemas.store_schema(db, topic.schema),
             topic.metadata,
             topic.created_ns,
         ),
@@ -633,12 +643,12 @@ def _session_ids(db: sqlite3.Connection, sequence_id: int) -> tuple[str, ...]:
 
 def _types(db: sqlite3.Connection, sequence_id: int) -> dict[str, OntologyType]:
     rows = db.execute("SELECT * FROM topics WHERE sequence_id = ?", (sequence_id,))
-    return {row["name"]: _ontology_of(row) for row in rows}
+    return {row["name"]: _ontology_of(db, row) for row in rows}
 
 
-def _ontology_of(row: sqlite3.Row) -> OntologyType:
+def _ontology_of(db: sqlite3.Connection, row: sqlite3.Row) -> OntologyType:
     """Return the ontology type of a row of `topics`."""
-    columns = list(pa.ipc.read_schema(pa.py_buffer(row["arrow_schema"])))[1:]
+    columns = list(schemas.schema_of(db, row))[1:]
     return OntologyType(
         row["ontology_tag"], pa.struct(columns), SerializationFormat(row["serialization_format"])
     )
@@ -687,6 +697,7 @@ def _forget(db: sqlite3.Connection, live: Collection[str]) -> set[str]:
     for row in db.execute("SELECT session_id FROM reservations").fetchall():
         if row["session_id"] not in live:
             db.execute("DELETE FROM reservations WHERE session_id = ?", (row["session_id"],))
+    schemas.remove_unused(db)
     return set(_paths(db, "?", 1))
 
 
