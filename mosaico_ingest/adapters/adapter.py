@@ -106,6 +106,20 @@ class Envelope(Struct, frozen=True):
     msgtype: str
     log_times: NDArray[np.int64]
     """Log times in ns since the epoch, shape (n,)."""
+    publish_times: NDArray[np.int64] | None = None
+    """Publish times in ns since the epoch, shape (n,); None if they equal the log times."""
+    sequences: NDArray[np.int64] | None = None
+    """Sequence numbers, shape (n,); None if all are 0."""
+
+    def take(self, rows: NDArray[Any]) -> Envelope:
+        """Return the envelope of some rows, given by a mask or by positions."""
+        return Envelope(
+            self.topic,
+            self.msgtype,
+            self.log_times[rows],
+            None if self.publish_times is None else self.publish_times[rows],
+            None if self.sequences is None else self.sequences[rows],
+        )
 
 
 class Adapted(Struct, frozen=True):
@@ -114,10 +128,24 @@ class Adapted(Struct, frozen=True):
     rows: pa.StructArray
     """The adapted rows; their type is the ontology's struct."""
     index: NDArray[np.int64]
-    """Positions of the adapted rows in the batch, ascending, shape (len(rows),)."""
+    """Positions of the rows' messages in the batch, ascending, shape (len(rows),); several rows can have one message."""
     failures: tuple[RowFailure, ...]
+    """The rejected messages; no output has a row of them."""
     log_times: NDArray[np.int64] | None = None
     """Times to store instead of the log times, shape (len(rows),); only a `translate` in Python changes them."""
+    dropped: Mapping[str, NDArray[np.int64]] = {}
+    """Positions of the messages that have no row in any output, by the rule that drops them."""
+    others: tuple[Adapted, ...] = ()
+    """The rows of the other outputs of the adapter; their failures and dropped messages are the same."""
+
+    @property
+    def messages(self) -> NDArray[np.int64]:
+        """Positions of the messages that have a row in any output, ascending."""
+        if self.others:
+            return np.unique(np.concatenate([self.index, *(one.index for one in self.others)]))
+        first = np.ones(len(self.index), bool)
+        first[1:] = self.index[1:] != self.index[:-1]
+        return self.index if first.all() else self.index[first]
 
 
 class Adapter(Protocol):

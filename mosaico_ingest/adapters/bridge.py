@@ -24,7 +24,7 @@ from msgspec.structs import replace
 from mosaico_ingest.adapters.adapter import AdapterSpec, UnmodeledSpec
 from mosaico_ingest.adapters.builtin import BY_NAME, BY_TYPE, Builtin
 from mosaico_ingest.adapters.image import EncodedImageSpec
-from mosaico_ingest.adapters.mapping.loader import load_adapter
+from mosaico_ingest.adapters.mapping.loader import MappingSpec, load_adapter
 from mosaico_ingest.adapters.permission import is_python_allowed, python_refusal
 from mosaico_ingest.adapters.python import (
     PythonAdapterSpec,
@@ -33,6 +33,7 @@ from mosaico_ingest.adapters.python import (
     registered_adapters,
 )
 from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.job.adapter_reference import ParameterizedAdapter
 from mosaico_ingest.job.image import ImageFormat, ImageSettings, image_settings
 from mosaico_ingest.job.patterns import first_match
 from mosaico_ingest.ontology.types import SerializationFormat
@@ -57,6 +58,11 @@ def adapter_spec(adapter: object, base_dir: Path, *, python: bool = True) -> Ada
     """
     if isinstance(adapter, (str, Path)):
         return load_adapter_reference(str(adapter), base_dir, python=python)
+    if isinstance(adapter, ParameterizedAdapter):
+        spec = adapter_spec(adapter.file, base_dir, python=python)
+        if not isinstance(spec, MappingSpec):
+            raise AdapterError(f"{spec.name} has no parameters", hint="give the path of an adapter file")
+        return spec.with_parameters(adapter.values)
     if isinstance(adapter, type):
         if "__adapter_spec__" in vars(adapter):  # the class of a built-in adapter, but not a subclass
             return vars(adapter)["__adapter_spec__"]
@@ -69,6 +75,12 @@ def adapter_spec(adapter: object, base_dir: Path, *, python: bool = True) -> Ada
         f"{_spell(adapter)} is not an adapter",
         hint="give a subclass of ROSAdapterBase, or a reference to one",
     )
+
+
+def outputs_of(spec: AdapterSpec) -> tuple[MappingSpec, ...]:
+    """Return the adapter of each output of a file with `outputs`; () for any other adapter."""
+    inner = spec.inner if isinstance(spec, EncodedImageSpec) else spec
+    return inner.outputs if isinstance(inner, MappingSpec) else ()
 
 
 def load_adapter_reference(ref: str, base_dir: Path, *, python: bool = True) -> AdapterSpec:

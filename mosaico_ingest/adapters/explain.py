@@ -23,15 +23,17 @@ from mosaico_ingest.adapters.mapping.expressions import (
     Conditional,
     Constant,
     ElementAt,
+    EnvelopeField,
     FieldAccess,
     FunctionCall,
     MakeList,
     MessageRef,
     OpenList,
+    OuterValue,
     TypedExpression,
 )
 from mosaico_ingest.adapters.mapping.loader import MappingAdapter, MappingSpec
-from mosaico_ingest.adapters.mapping.model import Scalar, Value, ValueForm
+from mosaico_ingest.adapters.mapping.model import Scalar, Value, ValueForm, records_of
 from mosaico_ingest.adapters.mapping.types import format_type, is_list
 from mosaico_ingest.adapters.python import PythonAdapterSpec, ontology_of
 from mosaico_ingest.adapters.standalone import mapping_of
@@ -39,6 +41,8 @@ from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
 
 _FieldPath: TypeAlias = "tuple[str, ...]"
+_ScopePaths: TypeAlias = "tuple[_FieldPath, ...]"
+"""The path of the message in which names are looked up, after those of the messages around it."""
 
 
 def unread_fields(adapter: Adapter, shape: pa.StructType) -> tuple[str, ...]:
@@ -67,12 +71,13 @@ def _outside(shape: DataType, at: _FieldPath, read: set[_FieldPath]) -> Iterator
 
 
 def _of_adapter(adapter: MappingAdapter, at: _FieldPath) -> Iterator[_FieldPath]:
-    yield from _of_field(adapter.record, at)
-    for typed in adapter.metadata.values():
-        yield from _of_value(typed, at)
+    for output in (adapter, *adapter.others):
+        yield from _of_field(output.record, (at,))
+        for typed in (*output.drops, *output.metadata.values()):
+            yield from _of_value(typed, (at,))
 
 
-def _of_field(field: ColumnPlan, at: _FieldPath) -> Iterator[_FieldPath]:
+def _of_field(field: ColumnPlan, at: _ScopePaths) -> Iterator[_FieldPath]:
     """Yield the fields that a column reads, as paths from the message; `at` is the scope of its names."""
     source = field.source
     match source:
@@ -87,7 +92,9 @@ def _of_field(field: ColumnPlan, at: _FieldPath) -> Iterator[_FieldPath]:
             path = _path_of(source.operand, at)
             yield from _of_adapter(inner, path) if isinstance(inner, MappingAdapter) else (path,)
         case StructSource():
-            inside = at if source.operand is None else _path_of(source.operand, at)
+            inside = at if source.operand is None else (*at, _path_of(source.operand, at))
+            if source.operand is not None:
+                yield from _computed_inside(source.operand, at)
             for column in source.fields:
                 yield from _of_field(column, inside)
         case _:
@@ -98,9 +105,12 @@ def _of_field(field: ColumnPlan, at: _FieldPath) -> Iterator[_FieldPath]:
         yield from _of_value(field.when, at)
 
 
-def _of_value(typed: TypedExpression, at: _FieldPath) -> Iterator[_FieldPath]:
+def _of_value(typed: TypedExpression, at: _ScopePaths) -> Iterator[_FieldPath]:
     match typed:
-        case Constant():
+        case Constant() | EnvelopeField():
+            return
+        case OuterValue():
+            yield from _of_value(typed.operand, at[: -typed.levels])
             return
         case FunctionCall(arguments=parts) | MakeList(items=parts):
             pass
@@ -110,17 +120,14 @@ def _of_value(typed: TypedExpression, at: _FieldPath) -> Iterator[_FieldPath]:
             parts = (typed.operand,)
         case _:
             yield _path_of(typed, at)
-            if not isinstance(typed, MessageRef):
-                yield from _computed_inside(typed, at)
+            yield from _computed_inside(typed, at)
             return
     for part in parts:
         yield from _of_value(part, at)
 
 
-def _computed_inside(
-    typed: FieldAccess | OpenList | CloseList | ElementAt, at: _FieldPath
-) -> Iterator[_FieldPath]:
-    """Yield the fields below a computed list, as in `sorted(a)[0]`."""
+def _computed_inside(typed: TypedExpression, at: _ScopePaths) -> Iterator[_FieldPath]:
+    """Yield the fields below a computed list, as in `sort(a)[0]`."""
     inner: Any = typed
     while isinstance(inner, (FieldAccess, OpenList, CloseList, ElementAt)):
         inner = inner.operand
@@ -128,7 +135,7 @@ def _computed_inside(
         yield from _of_value(inner, at)
 
 
-def _path_of(typed: TypedExpression, at: _FieldPath) -> _FieldPath:
+def _path_of(typed: TypedExpression, at: _ScopePaths) -> _FieldPath:
     """Return the path of the field that an expression reads; computed values have the path of no field."""
     match typed:
         case FieldAccess():
@@ -136,7 +143,9 @@ def _path_of(typed: TypedExpression, at: _FieldPath) -> _FieldPath:
         case OpenList() | CloseList() | ElementAt():
             return _path_of(typed.operand, at)
         case MessageRef():
-            return at
+            return at[-1]
+        case OuterValue():
+            return _path_of(typed.operand, at[: -typed.levels])
         case _:
             return ("",)  # no field has an empty name
 
@@ -184,15 +193,21 @@ def describe(spec: AdapterSpec, msgtype: str | None = None) -> Description:
 def _of_mapping(spec: MappingSpec, msgtype: str | None) -> Description:
     variants = {normalize_msgtype(name): wrap for name, wrap in (spec.model.variants or {}).items()}
     wrap = variants.get(msgtype or spec.ros_types[0], {})
-    values = {**spec.model.fields, **{name: value for name, value in wrap.items() if name != "of"}}
+    takes = {name: _text(variants.get(name, {}).get("of", "")) for name in spec.ros_types}
+    outputs = spec.outputs or (spec,)
+    columns: list[ColumnOrigin] = []
+    for output, record in zip(outputs, records_of(spec.model).values(), strict=False):
+        values = {**record.fields, **{name: value for name, value in wrap.items() if name != "of"}}
+        prefix = f"{output.output}: " if output.output else ""
+        columns += _columns(output.ontology.struct, values, prefix)
     return Description(
         spec.name,
         spec.model.description or "",
         spec.default,
-        spec.ontology.tag,
+        ", ".join(output.ontology.tag for output in outputs),
         spec.ontology.serialization_format.value,
-        {name: _text(variants.get(name, {}).get("of", "")) for name in spec.ros_types},
-        tuple(_columns(spec.ontology.struct, values, "")),
+        takes,
+        tuple(columns),
     )
 
 

@@ -67,19 +67,24 @@ class RecordingTally:
     payload_bytes: int = 0
 
     @property
+    def counted(self) -> list[TopicTally]:
+        """The topics without those that share their messages with another topic."""
+        return [topic for topic in self.topics.values() if not topic.expected.shares_messages]
+
+    @property
     def promised(self) -> int:
         """Messages that the recording's index promises; 0 if it has no index."""
-        return sum(topic.expected.count or 0 for topic in self.topics.values())
+        return sum(topic.expected.count or 0 for topic in self.counted)
 
     @property
     def read(self) -> int:
         """Messages read."""
-        return sum(topic.read for topic in self.topics.values())
+        return sum(topic.read for topic in self.counted)
 
     @property
     def rejected(self) -> int:
         """Messages rejected."""
-        return sum(topic.rejected for topic in self.topics.values())
+        return sum(topic.rejected for topic in self.counted)
 
     @property
     def share(self) -> float:
@@ -115,7 +120,8 @@ class Tally:
                 recording = self.active[position]
                 recording.topics[event.target].read += event.read
                 recording.topics[event.target].written += event.written
-                recording.payload_bytes += event.payload_bytes
+                if not recording.topics[event.target].expected.shares_messages:
+                    recording.payload_bytes += event.payload_bytes
             case Rejected():
                 self.active[position].topics[event.target].rejected += event.count
             case RunFinished():

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from mosaico_ingest.cli.console import PlainTable, Terminal, print_line
 from mosaico_ingest.cli.options import DistroOption, JsonOption, RecordingArgument, write_output
-from mosaico_ingest.findings import join_names
+from mosaico_ingest.findings import Stage, join_names
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.units import (
     bytes_text,
@@ -21,6 +21,7 @@ from mosaico_ingest.report.units import (
     seconds_text,
     stored_text,
     time_text,
+    written_cell,
     written_text,
 )
 
@@ -226,7 +227,7 @@ def _topic_cells(topic: TopicReport) -> dict[str, str | Text]:
         "topic": topic.target,
         "ontology": topic.ontology,
         "read": count_text(topic.read),
-        "written": count_text(topic.written),
+        "written": written_cell(topic.written, topic.rows),
         "rejected": Text(count_text(topic.rejected), style="red" if topic.rejected else "dim"),
         "rate": rate_text(topic.rate_hz),
         "payload": bytes_text(topic.payload_bytes),
@@ -251,6 +252,8 @@ def rejection_lines(report: Report) -> Iterator[str]:
     counts: dict[tuple[str, str], dict[str, int]] = {}
     for topic in report.topics:
         for rejection in topic.rejections:
+            if topic.shares_messages and rejection.stage is not Stage.WRITE:
+                continue  # the other topic counts the same message
             by_topic = counts.setdefault((rejection.rule, rejection.reason), {})
             by_topic[topic.target] = by_topic.get(topic.target, 0) + rejection.count
     for (rule, reason), by_topic in counts.items():
@@ -270,8 +273,9 @@ def _totals(report: Report) -> Iterator[str]:
         yield f"{count_text(totals.downsampled)} downsampled"
     if totals.stored_bytes:
         # Only a complete recording can be compared with the size of its files.
-        selected = [topic for topic in report.topics if topic.status is not TopicStatus.EXCLUDED]
-        is_part = len(selected) < len(report.topics) or totals.read < sum(t.promised or 0 for t in selected)
+        is_part = any(topic.status is TopicStatus.EXCLUDED for topic in report.topics) or totals.read < sum(
+            topic.promised or 0 for topic in report.counted_topics
+        )
         size = totals.payload_bytes if is_part else report.source_bytes
         yield stored_text(size, totals.stored_bytes, of=" of messages" if is_part else "")
     rate = totals.read / report.duration_s if report.duration_s else 0

@@ -17,7 +17,7 @@ from msgspec import Struct
 from pydantic import BaseModel, ConfigDict
 
 from mosaico_ingest.adapters.adapter import Adapter, AdapterSpec, Envelope, UnmodeledSpec, recorded_schema
-from mosaico_ingest.adapters.bridge import ROSBridge, adapter_spec
+from mosaico_ingest.adapters.bridge import ROSBridge, adapter_spec, outputs_of
 from mosaico_ingest.adapters.builtin import BUILTIN
 from mosaico_ingest.adapters.inverse import Inverse, Restored, invert
 from mosaico_ingest.adapters.mapping.columns import struct_of
@@ -232,7 +232,8 @@ def restorer_for(info: SourceTopic, definition: Definition, specs: Sequence[Adap
     """
     shape = ros_shape(definition)
     mismatches: list[str] = []
-    for spec in _candidates(info, definition, specs):
+    candidates = _candidates(info, definition, specs)
+    for spec in (one for candidate in candidates for one in outputs_of(candidate) or (candidate,)):
         try:
             adapter = spec.bind(definition, shape)
         except AdapterError as error:

@@ -28,8 +28,9 @@ from typing_extensions import Self
 
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.findings import Span
+from mosaico_ingest.job.adapter_reference import AdapterReference, LoadedAdapter
 from mosaico_ingest.job.expect import Expectations, Frequency, SignedDuration
-from mosaico_ingest.job.fields import AdapterRef, FilePath, Literally, Parsed, PathRole, Secret, TopicGlob
+from mosaico_ingest.job.fields import FilePath, Literally, Parsed, PathRole, Secret, TopicGlob
 from mosaico_ingest.job.file_names import FileNamePattern
 from mosaico_ingest.job.image import ImageFormat, ImageSettings
 from mosaico_ingest.job.patterns import first_match, is_glob
@@ -128,8 +129,6 @@ Matrix = Annotated[
 ]
 Bytes = Annotated[int, Parsed(_bytes, r"^[0-9.]+ ?[kKMGT]?i?B$", to_json=int)]
 Grouping = Annotated[str | FileNamePattern, Parsed(_grouping, r"^(auto|none)$|\{split:int\}")]
-AdapterReference = Annotated[Any, AdapterRef()]
-"""An adapter: in manifests a text, in Python also a class or an `AdapterSpec`."""
 RecordingPath = Annotated[Text, FilePath(PathRole.RECORDING)]
 BasePath = Annotated[Text, FilePath(PathRole.BASE)]
 InputPath = Annotated[Text, FilePath(PathRole.INPUT)]
@@ -277,10 +276,15 @@ def combined_settings(settings: Mapping[str, TopicSettings], topic: str) -> Topi
 class AdapterSettings(Section):
     """The adapters that turn messages into ontology records in place of the built-in ones."""
 
-    load: tuple[AdapterReference, ...] = Field(
-        default=(), examples=[["adapters/battery_pack.yaml", "my_pkg.adapters:WheelAdapter"]]
+    load: tuple[LoadedAdapter, ...] = Field(
+        default=(),
+        examples=[
+            ["adapters/battery_pack.yaml", "my_pkg.adapters:WheelAdapter"],
+            [{"file": "adapters/battery_pack.yaml", "with": {"cells": 12}}],
+        ],
     )
-    """Adapters for every topic of their types: YAML files, `module:Class` or `file.py:Class`."""
+    """Adapters for every topic of their types: YAML files, `module:Class` or `file.py:Class`. `{file: …, with: {…}}` sets
+    parameters of a YAML file."""
     override: dict[Topic, AdapterReference] = Field(default={}, examples=[{"/lidar/*": "LidarAdapter"}])
     """The adapter for a topic name or glob, written as in `load` or as the name of a built-in adapter. The exact topic name
     takes precedence, followed by the first matching glob."""

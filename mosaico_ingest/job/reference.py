@@ -79,7 +79,7 @@ def _models(
     for key, node in properties.items():
         name, inner = key, _mapping_form(_resolved(node, schema), schema)
         if "items" in inner:
-            name, inner = f"{key}[]", _resolved(inner["items"], schema)
+            name, inner = f"{key}[]", _mapping_form(_resolved(inner["items"], schema), schema)
         elif isinstance(inner.get("additionalProperties"), dict):
             name, inner = f"{key}.*", _resolved(inner["additionalProperties"], schema)
         if "properties" in inner:

@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from mosaico_ingest.findings import Finding, Span
+from mosaico_ingest.job.adapter_reference import reference_of
 from mosaico_ingest.job.compose import combinations, fill_in
 from mosaico_ingest.job.fields import AdapterRef, FilePath, PathRole, TopicGlob, marked_fields, values_at
 from mosaico_ingest.job.manifest import check_manifest
@@ -212,7 +213,8 @@ class PythonReference(Struct, frozen=True):
 def adapter_references(job: Job) -> Iterator[tuple[KeyPath, str]]:
     """Yield the key path and the text of every adapter reference."""
     for field in marked_fields(JobSettings, AdapterRef):
-        yield from values_at(job.manifest, field.path)
+        values = values_at(job.manifest, field.path)
+        yield from ((path, value) for path, value in values if isinstance(value, str))
 
 
 def is_mapping_file(reference: str) -> bool:
@@ -229,7 +231,7 @@ def python_reference(reference: str) -> PythonReference | None:
 def loaded_names(job: Job) -> set[str] | None:
     """Return the names of the adapters in `adapters.load`, or None if one of them cannot be read."""
     names: set[str] = set()
-    for reference in job.manifest.adapters.load:
+    for reference in map(reference_of, job.manifest.adapters.load):
         python = python_reference(reference)
         if python is not None:
             names.add(python.name.rpartition(".")[2])

@@ -17,10 +17,12 @@ from msgspec import Struct
 from mosaico_ingest.adapters.adapter import AdapterSpec
 from mosaico_ingest.adapters.bridge import adapter_spec, installed_adapters, suggest_reference
 from mosaico_ingest.adapters.builtin import BY_NAME
+from mosaico_ingest.adapters.mapping.loader import MappingSpec, parameter_problem
 from mosaico_ingest.adapters.permission import is_python_allowed, is_python_reference, python_refusal
 from mosaico_ingest.containers import RECORDING_NAME
 from mosaico_ingest.errors import AdapterError, ManifestError, NothingMatched
 from mosaico_ingest.findings import Finding, Severity
+from mosaico_ingest.job.adapter_reference import ParameterizedAdapter, reference_of
 from mosaico_ingest.job.compose import PLACEHOLDERS, Placeholder, placeholders_in
 from mosaico_ingest.job.fields import FilePath, PathRole, marked_fields, replace_values
 from mosaico_ingest.job.file_names import FileNamePattern
@@ -365,12 +367,14 @@ def _load_adapter(
     findings: list[Finding],
 ) -> AdapterSpec | None:
     """Return an adapter, or None with a finding about its reference."""
-    if not (job.adapters.python and is_python_allowed()) and is_python_reference(reference):
+    if not (job.adapters.python and is_python_allowed()) and is_python_reference(reference_of(reference)):
         message, hint = python_refusal(str(reference))
         findings.append(Finding("python-refused", Severity.ERROR, message, job.value_span(*path), hint))
         return None
+    wrong = tuple(_parameter_findings(job, path, reference))
+    findings += wrong
     try:
-        return adapter_spec(reference, job.folder)
+        return adapter_spec(reference_of(reference) if wrong else reference, job.folder)
     except AdapterError as error:
         if error.findings:
             raise
@@ -383,6 +387,22 @@ def _load_adapter(
             message, hint = _missing_adapter(str(reference), job.folder)
         findings.append(Finding(rule, Severity.ERROR, message, job.value_span(*path), hint))
         return None
+
+
+def _parameter_findings(job: Job, path: tuple[str | int, ...], reference: object) -> Iterator[Finding]:
+    """Yield a finding for each value in `with` that the adapter does not accept."""
+    if not isinstance(reference, ParameterizedAdapter):
+        return
+    try:
+        spec = adapter_spec(reference.file, job.folder)
+    except AdapterError:
+        return  # the caller reports it
+    defaults = spec.model.parameters if isinstance(spec, MappingSpec) else {}
+    for name, value in reference.values.items():
+        problem, hint = parameter_problem(defaults, name, value)
+        if problem is not None:
+            span = job.value_span(*path, "with", name)
+            yield Finding("adapter-parameter", Severity.ERROR, f"{reference}: {problem}", span, hint)
 
 
 def _missing_adapter(reference: str, folder: Path) -> tuple[str, str]:

@@ -18,7 +18,7 @@ from mosaico_ingest.findings import Severity
 from mosaico_ingest.job.values import PROVENANCE_KEY, OnFailure
 from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.provenance import SequenceRequest
-from mosaico_ingest.pipeline.topic import TopicPipeline
+from mosaico_ingest.pipeline.topic import TopicPipeline, pipelines_by_connection
 from mosaico_ingest.report.contract import ContractResult
 from mosaico_ingest.report.events import ContractEvaluated, Noted, Observer
 from mosaico_ingest.rosbag.blocks import MessageBlock
@@ -43,12 +43,12 @@ class ContractRun(Struct, frozen=True):
         monitor = monitor_of(plan, recording)
         if monitor is None:
             return None
-        for topic in topics:
-            for connection in topic.plan.connections:
-                observer = monitor.observer(connection)
-                if observer is not None:
-                    topic.observers[connection] = observer
-        return cls(plan, monitor, tuple(topics))
+        read = pipelines_by_connection(topics)
+        for connection, topic in read.items():
+            observer = monitor.observer(connection)
+            if observer is not None:
+                topic.observers[connection] = observer
+        return cls(plan, monitor, tuple(topic for topic in topics if not topic.plan.shares_messages))
 
     @property
     def order(self) -> FileOrder | None:
@@ -76,7 +76,7 @@ class ContractRun(Struct, frozen=True):
             ContractError: The contract is violated, and nothing may be committed.
         """
         for topic in self.topics:
-            self.monitor.reject(topic.plan.topic, topic.read - topic.rows - topic.dropped)
+            self.monitor.reject(topic.plan.topic, topic.read - topic.written - topic.dropped)
         result = self.monitor.finish()
         action = self.monitor.on_failure
         diverts = action is OnFailure.DIVERT and not result.passed
@@ -100,7 +100,7 @@ def monitor_of(plan: Plan, recording: Recording) -> RecordingMonitor | None:
     return RecordingMonitor(
         plan.contract,
         recording,
-        [topic.as_read for topic in plan.topics],
+        [topic.as_read for topic in plan.read_topics],
         excluded={topic.topic: topic.why for topic in plan.excluded},
         start_ns=plan.read_from_ns,
         end_ns=plan.read_until_ns,

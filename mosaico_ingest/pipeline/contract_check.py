@@ -103,7 +103,7 @@ def index_results(plan: Plan, recording: Recording) -> list[ExpectationResult]:
     monitor = monitor_of(plan, recording)
     if monitor is None:
         return []
-    topics = tuple(key for topic in plan.topics for key in topic.connections)
+    topics = tuple(key for topic in plan.read_topics for key in topic.connections)
     observed = [key for key in topics if monitor.observer(key) is not None]
     times = None
     if not any(
@@ -139,7 +139,7 @@ def _is_known(result: ExpectationResult, *, has_times: bool) -> bool:
 
 def _observe(plan: Plan, contract: Contract, recording: Recording, monitor: RecordingMonitor) -> None:
     """Observe every message for which something is expected, through the index where that is enough."""
-    topics = {key: topic for topic in plan.topics for key in topic.connections}
+    topics = {key: topic for topic in plan.read_topics for key in topic.connections}
     observers = {key: monitor.observer(key) for key in topics}
     reads_all = any(clause.key in _WHOLE_FILE_KEYS for clause in contract.recording_clauses())
     if not reads_all:
@@ -228,7 +228,10 @@ class _Rows:
         self._observer.messages(rows, index)
         rejected = len(decoded.failures)
         if self._adapter is not None:
-            envelope = Envelope(self._topic.topic, self._topic.msgtype, block.log_times[index])
+            topic = self._topic
+            envelope = Envelope(
+                topic.topic, topic.msgtype, block.log_times, block.publish_times, block.sequences
+            ).take(index)
             try:
                 adapted = self._adapter.adapt(rows, envelope)
             except AdapterError:

@@ -21,6 +21,7 @@ from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.adapters.python import PythonAdapterSpec, ontology_of, registered_adapters
 from mosaico_ingest.caching import cache_by_identity
 from mosaico_ingest.errors import IngestError
+from mosaico_ingest.job.adapter_reference import reference_of
 from mosaico_ingest.job.model import Job, JobSettings
 from mosaico_ingest.metadata.sources import sidecar_path
 from mosaico_ingest.remote import AnyPath, RemotePath
@@ -162,7 +163,7 @@ def _job_parts(job: Job) -> Iterator[bytes]:
 
 def _adapter_parts(job: Job) -> Iterator[bytes]:
     """Yield the adapters outside of the manifest: files with their neighbors, classes, registered and installed ones."""
-    for reference in (*job.adapters.load, *job.adapters.override.values()):
+    for reference in (*map(reference_of, job.adapters.load), *job.adapters.override.values()):
         if not isinstance(reference, str):
             raise TypeError("an adapter is an object")
         if reference.endswith((".yaml", ".yml")):  # a mapping may use other mappings in its folder

@@ -163,6 +163,8 @@ class TopicPlan(Part):
     """True if messages before the time range are included, see `bag.time.latched`."""
     on_error: TopicLevelErrorPolicy
     metadata: Annotated[Mapping[str, Any], Unchecked(), PlainSerializer(_own_metadata)]
+    shares_messages: bool = False
+    """True if another topic counts the same messages, because the adapter has several outputs."""
 
     @property
     def as_read(self) -> ReadTopic:
@@ -232,6 +234,11 @@ class Plan(Part):
     """The attempt of an executor that may start a recording more than once."""
 
     @property
+    def read_topics(self) -> tuple[TopicPlan, ...]:
+        """The topics without those that share their messages with another topic."""
+        return tuple(topic for topic in self.topics if not topic.shares_messages)
+
+    @property
     def selects_after_reading(self) -> bool:
         """Whether the time range is applied to the rows, because the times of some rows are not the log times."""
         bounded = self.read_from_ns is not None or self.read_until_ns is not None
@@ -246,7 +253,7 @@ class Plan(Part):
 
     def __repr__(self) -> str:
         """Return the counts of the plan, such as `<Plan yard: 9 topics, 2,110 messages, 31 excluded>`."""
-        return f"<Plan {plan_headline(self.sequence.name, [topic.count for topic in self.topics], len(self.excluded))}>"
+        return f"<Plan {plan_headline(self.sequence.name, [topic.count for topic in self.read_topics], len(self.excluded))}>"
 
     def _repr_html_(self) -> str:
         """Return a table of the topics for a notebook."""

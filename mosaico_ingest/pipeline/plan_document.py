@@ -154,7 +154,7 @@ class PlanDocument(Part):
     @staticmethod
     def _headline(recording: RecordingPlan) -> str:
         plan = recording.plan
-        counts = [topic["count"] for topic in plan["topics"]]
+        counts = [topic["count"] for topic in plan["topics"] if not topic["shares_messages"]]
         return plan_headline(plan["sequence"]["name"], counts, len(plan["excluded"]))
 
     @property

@@ -7,8 +7,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from difflib import get_close_matches
 
 from mosaico_ingest.adapters.adapter import UnmodeledSpec, source_metadata
-from mosaico_ingest.adapters.bridge import Resolution, ROSBridge
+from mosaico_ingest.adapters.bridge import Resolution, ROSBridge, outputs_of
 from mosaico_ingest.adapters.image import IMAGE_TAG
+from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.contracts.clauses import Contract
 from mosaico_ingest.errors import AdapterError, BagError, IngestError, NothingMatched
 from mosaico_ingest.findings import Finding, Severity, Span, escape_undecodable, suggest_names
@@ -64,8 +65,9 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
             continue
         if isinstance(outcome, ExcludedTopic):
             excluded.append(outcome)
-        elif (finding := merge(topics, outcome)) is not None:
-            findings.append(finding)
+        else:
+            merged = (merge(topics, topic) for topic in outcome)
+            findings += [finding for finding in merged if finding is not None]
     if misfits:
         raise _misfit(job, misfits)
     if not topics:
@@ -153,7 +155,8 @@ def _contract(task: Task, job: Job, topics: Sequence[TopicPlan], recording: Reco
     if contract is not None:
         from mosaico_ingest.contracts.recording_monitor import check_expressions  # noqa: PLC0415 - only contracts need it
 
-        check_expressions(contract, recording.connections, [topic.as_read for topic in topics])
+        read = [topic.as_read for topic in topics if not topic.shares_messages]
+        check_expressions(contract, recording.connections, read)
     return contract
 
 
@@ -169,8 +172,8 @@ def _check_metadata(job: Job, topics: Iterable[TopicPlan]) -> None:
 
 def plan_connection(
     job: Job, connection: Connection, selection: Selection, bridge: ROSBridge, source_file: str
-) -> TopicPlan | ExcludedTopic:
-    """Return the plan of one connection, or the reason why it is excluded.
+) -> tuple[TopicPlan, ...] | ExcludedTopic:
+    """Return the plan of each output of one connection, or the reason why it is excluded.
 
     Raises:
         AdapterError: An override does not fit, or the type has no adapter and `adapters.unmodeled` is `fail`.
@@ -194,21 +197,17 @@ def plan_connection(
             )
         why = f"no adapter takes {connection.msgtype}, and adapters.unmodeled is skip"
         return _excluded(connection, why, job.span("adapters", "unmodeled"))
-    bound = resolution.spec.bind(connection.definition, ros_shape(connection.definition))
-    settings = job.settings_of(connection.topic)
-    return TopicPlan(
+    definition, settings = connection.definition, job.settings_of(connection.topic)
+    first = TopicPlan(
         topic=connection.topic,
         target=settings.rename or connection.topic,
         msgtype=connection.msgtype,
         connections=(connection.id,),
         adapter=resolution.spec,
         why=resolution.why,
-        ontology=bound.ontology,
+        ontology=resolution.spec.bind(definition, ros_shape(definition)).ontology,
         count=connection.count,
-        metadata={
-            **settings.metadata,
-            **source_metadata(connection.definition, source_file, topic=connection.topic),
-        },
+        metadata={**settings.metadata, **source_metadata(definition, source_file, topic=connection.topic)},
         on_error=job.on_error.for_topic(connection.topic),
         every=settings.every,
         where=settings.where,
@@ -217,8 +216,23 @@ def plan_connection(
         stamp=settings.stamp,
         time_offset_ns=settings.time_offset,
         latched=_is_latched(job, connection),
-        definitions=(_describe_definition(connection.definition),),
+        definitions=(_describe_definition(definition),),
     )
+    outputs = outputs_of(resolution.spec)
+    return tuple(_plan_outputs(first, outputs, definition)) or (first,)
+
+
+def _plan_outputs(
+    first: TopicPlan, outputs: Sequence[MappingSpec], definition: Definition
+) -> Iterator[TopicPlan]:
+    """Yield the plan of each output of an adapter, named below the topic; only the first one counts its messages."""
+    for position, output in enumerate(outputs):
+        yield first.replace(
+            target=f"{first.target}/{output.output}",
+            adapter=output,
+            ontology=output.bind(definition, ros_shape(definition)).ontology,
+            shares_messages=position > 0,
+        )
 
 
 def _fitting(resolution: Resolution, definition: Definition) -> Resolution:

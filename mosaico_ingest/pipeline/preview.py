@@ -38,7 +38,7 @@ from mosaico_ingest.pipeline.planning import plan_recording
 from mosaico_ingest.pipeline.provenance import StoredProvenance, is_repeatable, read_provenance
 from mosaico_ingest.pipeline.run import open_job, preflight
 from mosaico_ingest.pipeline.task import Task
-from mosaico_ingest.pipeline.topic import TopicPipeline
+from mosaico_ingest.pipeline.topic import TopicPipeline, link_outputs
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.protocol import check_topic_name
 from mosaico_ingest.report.contract import ContractResult, ExpectationResult
@@ -132,7 +132,13 @@ def try_messages(
     """Decode and adapt the first messages of every topic of the plan, without writing; `monitor` observes them."""
     with MemorySink().open(plan.sequence.name, plan.sequence.metadata) as session:
         trials = tuple(_trial(topic, recording, session) for topic in plan.topics)
-        by_connection = {connection: trial for trial in trials for connection in trial.topic.plan.connections}
+        link_outputs([trial.topic for trial in trials])
+        by_connection = {
+            connection: trial
+            for trial in trials
+            if not trial.topic.plan.shares_messages
+            for connection in trial.topic.plan.connections
+        }
         if monitor is not None:
             for connection, trial in by_connection.items():
                 observer = monitor.observer(connection)
@@ -172,7 +178,7 @@ class _Trial(Struct, frozen=True):
             target=self.topic.plan.target,
             read=self.topic.read,
             rejected=sum(rejection.count for rejection in rejections),
-            row_bytes=-(-stored.stored_bytes // stored.rows) if stored and stored.rows else None,
+            row_bytes=-(-stored.stored_bytes // self.topic.written) if stored and stored.rows else None,
             rejections=rejections,
         )
 

@@ -20,7 +20,7 @@ from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.provenance import SequenceRequest
 from mosaico_ingest.pipeline.quarantine import Quarantine
 from mosaico_ingest.pipeline.selection import row_selector
-from mosaico_ingest.pipeline.topic import TopicPipeline
+from mosaico_ingest.pipeline.topic import TopicPipeline, link_outputs, pipelines_by_connection
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.report.events import (
     CommitStarted,
@@ -128,8 +128,12 @@ def verify(written: Written, observe: Observer) -> None:
         content = stored.get(topic.plan.target)
         if written.failure is not None:
             # Rows that were still in the write buffer are not stored; that is no difference to report.
-            rows = topic.rows - (content.rows if content else 0)
-            _subtract(topic, rows, f"not written before the run ended: {written.failure}", observe)
+            _subtract(
+                topic,
+                content.rows if content else 0,
+                f"not written before the run ended: {written.failure}",
+                observe,
+            )
         else:
             problems += _difference(topic, content)
         observe(
@@ -166,6 +170,8 @@ def check_counts(
     any_unknown = any(item.connection is None or item.count is None for item in recording.unreadable)
     missing: list[str] = []
     for topic in topics:
+        if topic.plan.shares_messages:
+            continue
         target, promised = topic.plan.target, topic.plan.count
         accounted = topic.read + sum(unreadable[connection] for connection in topic.plan.connections)
         if promised is None or promised == accounted:
@@ -200,7 +206,7 @@ def _open_session(plan: Plan, request: SequenceRequest, sink: Sink) -> AbstractC
 def _open_quarantine(plan: Plan, request: SequenceRequest) -> Quarantine | None:
     if plan.quarantine is None:
         return None
-    counts = [topic.count for topic in plan.topics]
+    counts = [topic.count for topic in plan.read_topics]
     promised = None if None in counts else sum(count or 0 for count in counts)
     return Quarantine(plan.quarantine, plan.sequence.name, promised, name=request.quarantine_file)
 
@@ -230,6 +236,7 @@ def _open_topics(
         for connection in topic_plan.connections:
             topic.bind(connections[connection])
         topics.append(topic)
+    link_outputs(topics)
     return tuple(topics)
 
 
@@ -243,7 +250,7 @@ def _pump(
     contract: ContractRun | None,
 ) -> None:
     """Move every message block of the recording through its topic; a thread of the buffer writes the rows."""
-    by_connection = {connection: topic for topic in topics for connection in topic.plan.connections}
+    by_connection = pipelines_by_connection(topics)
     try:
         _process(plan, recording, by_connection, buffer, stopwatch, contract=contract)
     finally:
@@ -294,7 +301,7 @@ def _report_reading(
             observe(Noted(_padded(topic)))
         if topic.undeclared:
             observe(Noted(_undeclared(topic)))
-    targets = {connection: topic.plan.target for topic in topics for connection in topic.plan.connections}
+    targets = {key: topic.plan.target for key, topic in pipelines_by_connection(topics).items()}
     for item in recording.unreadable:
         if item.connection is not None and item.connection not in targets:
             continue  # the topic is not selected
@@ -392,7 +399,7 @@ def _discard(
         return
     cause = error.what if isinstance(error, IngestError) else str(error)
     for topic in topics:
-        _subtract(topic, topic.rows, f"the session was discarded: {cause}", observe)
+        _subtract(topic, 0, f"the session was discarded: {cause}", observe)
         observe(TopicClosed(topic.plan.target, topic.status, 0, error=topic.error))
 
 
@@ -422,16 +429,19 @@ def _difference(topic: TopicPipeline, content: StoredTopic | None) -> Iterator[s
         )
 
 
-def _subtract(topic: TopicPipeline, rows: int, reason: str, observe: Observer) -> None:
-    """Count rows that were handed to the sink but are not stored as rejected."""
-    if rows > 0:
-        observe(TopicProgress(topic.plan.target, written=-rows))
+def _subtract(topic: TopicPipeline, stored_rows: int, reason: str, observe: Observer) -> None:
+    """Count messages whose rows were handed to the sink but are not stored as rejected."""
+    rows = topic.rows - stored_rows
+    messages = topic.written - topic.messages_in(stored_rows)
+    if rows > 0 or messages > 0:
+        observe(TopicProgress(topic.plan.target, written=-messages, rows=-rows))
+    if messages > 0:
         observe(
             Rejected(
                 topic.plan.target,
                 Stage.WRITE,
                 "not-written",
-                rows,
+                messages,
                 reason,
                 topic.start_ns or 0,
                 -1,

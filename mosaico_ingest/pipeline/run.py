@@ -246,7 +246,16 @@ class _RunEvents:
 
 def _run_started(plan: Plan) -> RunStarted:
     selected = (
-        Expected(t.topic, t.target, t.msgtype, t.adapter.name, t.ontology.tag, t.why, t.count)
+        Expected(
+            t.topic,
+            t.target,
+            t.msgtype,
+            t.adapter.name,
+            t.ontology.tag,
+            t.why,
+            t.count,
+            shares_messages=t.shares_messages,
+        )
         for t in plan.topics
     )
     excluded = (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -45,13 +45,22 @@ class _Rejection(Struct, frozen=True):
     failure: RowFailure
 
 
-class _Converted(Struct, frozen=True):
-    """The rows of one message block and the messages that did not become rows, by position in the block."""
+class _OutputRows(Struct, frozen=True):
+    """The rows that one message block has in one topic of the sequence."""
 
     rows: pa.StructArray
     log_times: NDArray[np.int64]
     index: NDArray[np.int64]
-    """The position of each row's message."""
+    """The position of each row's message in the block."""
+
+
+class _Converted(Struct, frozen=True):
+    """The rows of one message block and the messages that did not become rows, by position in the block."""
+
+    outputs: tuple[_OutputRows, ...]
+    """The rows of the topic, and of the other outputs of its adapter."""
+    written: NDArray[np.int64]
+    """The messages with a row in any output, ascending."""
     rejections: tuple[_Rejection, ...]
     """In the order of the messages."""
     dropped: Mapping[str, NDArray[np.int64]]
@@ -65,7 +74,8 @@ class TopicPipeline:
     """Decodes, adapts and writes the messages of one topic, and counts them.
 
     A message that breaks a policy of `raise` or `finalize` ends the topic at this message: the rows before it are
-    written, whatever the size of the blocks.
+    written, whatever the size of the blocks. If the adapter has several outputs, the pipeline of the first one processes
+    the messages, and `outputs` are the pipelines of the others; each message is written, dropped or rejected in all.
     """
 
     plan: TopicPlan
@@ -76,6 +86,10 @@ class TopicPipeline:
     """Number of messages read so far."""
     rows: int = 0
     """Number of rows handed to the destination so far."""
+    written: int = 0
+    """Number of messages that became rows so far."""
+    outputs: list[TopicPipeline] = field(default_factory=list["TopicPipeline"])
+    """The pipelines of the other outputs of the adapter."""
     padded: int = 0
     """Number of messages that end in zero bytes their definition does not explain."""
     undeclared: set[str] = field(default_factory=set[str])
@@ -104,6 +118,8 @@ class TopicPipeline:
     _decoders: dict[int, Decoder] = field(default_factory=dict[int, Decoder])
     _adapters: dict[int, Adapter] = field(default_factory=dict[int, Adapter])
     _conditions: dict[int, Conditions] = field(default_factory=dict)
+    _batches: list[tuple[int, int]] = field(default_factory=list[tuple[int, int]])
+    """Numbers of rows and messages of each batch; empty as long as every message has one row."""
     _writer: TopicWriter | None = None
     _adapter_metadata: dict[str, Any] | None = None
     """Topic metadata that the adapter derives from the first message."""
@@ -118,14 +134,16 @@ class TopicPipeline:
         if connection.definition is None:
             raise BagError(connection.problem or "no definition of the type is known", where=connection.topic)
         self._connections[connection.id] = connection
+        self._adapters[connection.id] = self.plan.adapter.bind(
+            connection.definition, ros_shape(connection.definition)
+        )
+        if self.plan.shares_messages:
+            return
         if self.plan.has_conditions:
             from mosaico_ingest.pipeline.conditions import bind_conditions  # noqa: PLC0415 - only conditions need it
 
             self._conditions[connection.id] = bind_conditions(self.plan, connection.definition)
         self._decoders[connection.id] = decoder_for(connection)
-        self._adapters[connection.id] = self.plan.adapter.bind(
-            connection.definition, ros_shape(connection.definition)
-        )
 
     def times_of(self, block: MessageBlock) -> Int64s:
         """Return the selected time of each message of a block, shape (n,)."""
@@ -143,26 +161,47 @@ class TopicPipeline:
         observer = None if latched else self.observers.get(block.connection)
         if observer is not None:
             observer.block(block.log_times)
-        if self.status in {TopicStatus.FINALIZED, TopicStatus.FAILED}:
-            self.read += len(block)
-            self._count(block, len(block))
-            self._reject_from(block, 0)
+        topics = (self, *self.outputs)
+        if self.has_ended:
+            for topic in topics:
+                topic.skip(block)
             return
         converted = self._convert(block, observer, latched=latched)
         fatal, quarantined = self._apply_policies(block, converted)
         end = len(block) if fatal is None else fatal.failure.row + 1
-        self._count(block, end, converted, latched=latched)
-        self._report_rejections(
-            block, (one for one in converted.rejections if one.failure.row < end), quarantined
-        )
-        accepted = int(np.searchsorted(converted.index, end))
-        if accepted:
-            rows = _columns(self.plan.ontology).batch(
-                converted.log_times[:accepted], converted.rows[:accepted]
+        for topic, output in zip(topics, converted.outputs, strict=True):
+            if topic.has_ended:
+                topic.skip(block)
+                continue
+            topic.count(block, end, converted, latched=latched)
+            topic.report_rejections(
+                block, (one for one in converted.rejections if one.failure.row < end), quarantined
             )
-            self._write(rows, block, converted.index, buffer)
+            topic.write(block, output, end, int(np.searchsorted(converted.written, end)), buffer)
         if fatal is not None:
             self._stop(fatal, block, end)
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether no more rows can be written."""
+        return self.status in {TopicStatus.FINALIZED, TopicStatus.FAILED}
+
+    def messages_in(self, rows: int) -> int:
+        """Return the number of messages in the first rows handed to the destination, which end with a batch."""
+        if rows >= self.rows:
+            return self.written
+        messages = 0
+        for batch_rows, batch_messages in self._batches:
+            rows -= batch_rows
+            if rows < 0:
+                return messages
+            messages += batch_messages
+        return messages + rows
+
+    def skip(self, block: MessageBlock) -> None:
+        """Account for messages after the end of the topic."""
+        self.count(block, len(block))
+        self._reject_from(block, 0)
 
     def _convert(self, block: MessageBlock, observer: BlockObserver | None, *, latched: bool) -> _Converted:
         """Decode, select and adapt the messages of a block."""
@@ -170,8 +209,6 @@ class TopicPipeline:
         selected = (positions + self.read - self._latched) % self.plan.every == 0
         if latched:
             selected[:] = True
-            self._latched += len(block)
-        self.read += len(block)
         dropped = {} if selected.all() else {"every": positions[~selected]}
         sample = positions[selected]
         decoded = self._decoders[block.connection].decode(block if selected.all() else block.rows(sample))
@@ -190,7 +227,7 @@ class TopicPipeline:
         fallbacks = index[:0] if times.fallback is None else index[times.fallback]
         stamps = times.values
         if self.selector is not None and not latched:
-            envelope = Envelope(self.plan.topic, self.plan.msgtype, block.log_times[index])
+            envelope = self._envelope(block, index)
             conditions = self._conditions.get(block.connection)
             keep, excluded = self.selector.select(stamps, rows, envelope, conditions)
             dropped |= {rule: index[mask] for rule, mask in excluded.items()}
@@ -198,15 +235,7 @@ class TopicPipeline:
                 rows, index, stamps = rows.filter(pa.array(keep)), index[keep], stamps[keep]
         if observer is not None:
             observer.messages(rows, index)
-        envelope = Envelope(self.plan.topic, self.plan.msgtype, block.log_times[index])
-        adapter = self._adapters[block.connection]
-        try:
-            if self._adapter_metadata is None and len(rows):
-                self._adapter_metadata = adapter.topic_metadata(rows[0])
-            adapted = adapter.adapt(rows, envelope)
-        except AdapterError as error:
-            failures = tuple(RowFailure(row, "adapter-error", str(error)) for row in range(len(index)))
-            adapted = Adapted(rows[:0], index[:0], failures)
+        adapted = self._adapt(rows, self._envelope(block, index), block.connection)
         rejections += [
             _Rejection(Stage.ADAPT, replace(failure, row=int(index[failure.row])))
             for failure in adapted.failures
@@ -215,23 +244,51 @@ class TopicPipeline:
             observer.ontology(adapted.rows, index[adapted.index])
         rejections.sort(key=lambda rejection: rejection.failure.row)
         return _Converted(
-            adapted.rows,
-            stamps[adapted.index] if adapted.log_times is None else adapted.log_times,
-            index[adapted.index],
+            tuple(
+                _OutputRows(
+                    one.rows,
+                    stamps[one.index] if one.log_times is None else one.log_times,
+                    index[one.index],
+                )
+                for one in (adapted, *adapted.others)
+            ),
+            index[adapted.messages],
             tuple(rejections),
-            dropped,
+            dropped | {rule: index[positions] for rule, positions in adapted.dropped.items()},
             fallbacks,
         )
+
+    def _envelope(self, block: MessageBlock, index: NDArray[np.int64]) -> Envelope:
+        """Return the envelope of some messages of a block."""
+        return Envelope(
+            self.plan.topic, self.plan.msgtype, block.log_times, block.publish_times, block.sequences
+        ).take(index)
+
+    def _adapt(self, rows: pa.StructArray, envelope: Envelope, connection: int) -> Adapted:
+        """Adapt messages; if the adapter itself fails, all of them fail."""
+        try:
+            for topic in (self, *self.outputs) if len(rows) else ():
+                topic.note_first_message(connection, rows[0])
+            return self._adapters[connection].adapt(rows, envelope)
+        except AdapterError as error:
+            failures = tuple(RowFailure(row, "adapter-error", str(error)) for row in range(len(rows)))
+            nothing = Adapted(rows[:0], np.zeros(0, np.int64), failures)
+            return replace(nothing, others=(nothing,) * len(self.outputs))
+
+    def note_first_message(self, connection: int, row: pa.StructScalar) -> None:
+        """Derive topic metadata from the first message."""
+        if self._adapter_metadata is None:
+            self._adapter_metadata = self._adapters[connection].topic_metadata(row)
 
     def _apply_policies(
         self, block: MessageBlock, converted: _Converted
     ) -> tuple[_Rejection | None, set[int]]:
         """Quarantine rejected messages in order; return the rejection that ends the topic, and the quarantined positions."""
         quarantined: set[int] = set()
-        first_row = int(converted.index[0]) if len(converted.index) else len(block)
+        first_row = int(converted.written[0]) if len(converted.written) else len(block)
         for rejection in converted.rejections:
             position = rejection.failure.row
-            self._leading_failures += self.rows == 0 and position < first_row
+            self._leading_failures += self.written == 0 and position < first_row
             if self._try_quarantine(block, rejection):
                 quarantined.add(position)
             elif self._ends_topic(rejection):
@@ -251,7 +308,7 @@ class TopicPipeline:
             stage=rejection.stage,
             target=self.plan.target,
             promised=self.plan.count,
-            read=self.read,
+            read=self.read + len(block),
         )
 
     def _ends_topic(self, rejection: _Rejection) -> bool:
@@ -272,13 +329,22 @@ class TopicPipeline:
         kind = DecodeError if fatal.stage is Stage.DECODE else AdapterError
         offset = int(block.offsets[fatal.failure.row])
         error = kind(fatal.failure.reason, where=f"{self.plan.topic} at offset {offset}")
-        self.error = str(error)
-        self.session.note_error(self.error, topic=self.plan.target)
+        topics = (self, *self.outputs)
+        for topic in topics:
+            topic.error = str(error)
+            self.session.note_error(topic.error, topic=topic.plan.target)
         if self._ends_run(fatal.stage):
             raise error
+        for topic in topics:
+            if topic.status is not TopicStatus.FAILED:
+                topic.finalize(block, end)
+
+    def finalize(self, block: MessageBlock, end: int) -> None:
+        """Close the topic, and account for the messages of a block from a position on."""
         self.status = TopicStatus.FINALIZED
         remaining = block.lengths[end:]
         if len(remaining):
+            self.read += len(remaining)
             self.observe(
                 TopicProgress(self.plan.target, read=len(remaining), payload_bytes=int(remaining.sum()))
             )
@@ -299,35 +365,47 @@ class TopicPipeline:
             )
         )
 
-    def _write(
-        self, rows: pa.RecordBatch, block: MessageBlock, index: NDArray[np.int64], buffer: WriteBuffer
+    def write(
+        self, block: MessageBlock, output: _OutputRows, end: int, written: int, buffer: WriteBuffer
     ) -> None:
-        """Queue rows for the sink; open the topic in the sink with its first rows."""
-        if self._writer is None:
+        """Queue the rows of messages before a position for the sink; open the topic in the sink with its first rows.
+
+        `written` is the number of these messages that have a row in any output.
+        """
+        accepted = int(np.searchsorted(output.index, end))
+        rows = _columns(self.plan.ontology).batch(output.log_times[:accepted], output.rows[:accepted])
+        if self._writer is None and accepted:
             try:
                 metadata = {**(self._adapter_metadata or {}), **self.plan.metadata}
                 if self._latched:
                     metadata[LATCHED_KEY] = {"before_ns": self.range_start_ns}
                 self._writer = self.session.topic(self.plan.target, self.plan.ontology, metadata)
             except SinkError as error:
-                self._fail(error, rows, block, index)
+                self._fail(error, written, block, output.index)
                 return
+        if accepted != written or self._batches:
+            self._batches = self._batches or [(self.rows, self.written)]
+            self._batches.append((accepted, written))
+        self.rows += accepted
+        self.written += written
+        if self._writer is None or not accepted:
+            self.observe(TopicProgress(self.plan.target, written=written))
+            return
         times = rows.column(0).to_numpy()
         first, last = int(times.min()), int(times.max())
         self.timeline.add(times)
-        self.rows += rows.num_rows
         self.start_ns = first if self.start_ns is None else min(self.start_ns, first)
         self.end_ns = last if self.end_ns is None else max(self.end_ns, last)
         self.status = TopicStatus.WRITTEN
         # `put` may end the run, so rows are counted before; rows that are not stored are subtracted afterwards.
-        self.observe(TopicProgress(self.plan.target, written=rows.num_rows, start_ns=first, end_ns=last))
+        self.observe(
+            TopicProgress(self.plan.target, written=written, rows=accepted, start_ns=first, end_ns=last)
+        )
         self.stopwatch.lap(Step.ADAPT)
         buffer.put(self._writer, rows)
         self.stopwatch.lap(Step.WAIT)
 
-    def _fail(
-        self, error: IngestError, rows: pa.RecordBatch, block: MessageBlock, index: NDArray[np.int64]
-    ) -> None:
+    def _fail(self, error: IngestError, written: int, block: MessageBlock, index: NDArray[np.int64]) -> None:
         """Mark the topic as failed; raise if its error policy ends the run."""
         self.status, self.error = TopicStatus.FAILED, str(error)
         first = int(index[0])
@@ -336,7 +414,7 @@ class TopicPipeline:
                 self.plan.target,
                 Stage.WRITE,
                 "topic-refused",
-                rows.num_rows,
+                written,
                 self.error,
                 int(block.log_times[first]),
                 int(block.offsets[first]),
@@ -346,9 +424,12 @@ class TopicPipeline:
         if self.plan.on_error is TopicLevelErrorPolicy.Raise:
             raise error
 
-    def _count(
+    def count(
         self, block: MessageBlock, end: int, converted: _Converted | None = None, *, latched: bool = False
     ) -> None:
+        """Count the messages of a block before a position."""
+        self.read += end
+        self._latched += end if latched else 0
         dropped = {
             rule: int((positions < end).sum())
             for rule, positions in (converted.dropped.items() if converted else ())
@@ -365,7 +446,7 @@ class TopicPipeline:
             )
         )
 
-    def _report_rejections(
+    def report_rejections(
         self, block: MessageBlock, rejections: Iterable[_Rejection], quarantined: set[int]
     ) -> None:
         """Emit one event per stage and rule, with the first message as the example."""
@@ -387,6 +468,24 @@ class TopicPipeline:
                     int(block.log_times[failures[-1].row]),
                 )
             )
+
+
+def link_outputs(pipelines: Sequence[TopicPipeline]) -> None:
+    """Let the pipeline that processes messages also write to the other topics that share them."""
+    readers = pipelines_by_connection(pipelines)
+    for pipeline in pipelines:
+        if pipeline.plan.shares_messages:
+            readers[pipeline.plan.connections[0]].outputs.append(pipeline)
+
+
+def pipelines_by_connection(pipelines: Iterable[TopicPipeline]) -> dict[int, TopicPipeline]:
+    """Return the pipeline that processes the messages of each connection."""
+    return {
+        connection: pipeline
+        for pipeline in pipelines
+        if not pipeline.plan.shares_messages
+        for connection in pipeline.plan.connections
+    }
 
 
 @cache_by_identity

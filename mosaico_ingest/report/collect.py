@@ -74,6 +74,7 @@ class _Sum:
     quarantined: int = 0
     read: int = 0
     written: int = 0
+    rows: int = 0
     dropped: Counter[str] = field(default_factory=Counter[str])
     latched: int = 0
     stamp_fallbacks: int = 0
@@ -95,6 +96,7 @@ class _Sum:
     def _add(self, more: TopicProgress) -> None:
         self.read += more.read
         self.written += more.written
+        self.rows += more.rows
         self.dropped.update(more.dropped)
         self.latched += more.latched
         self.stamp_fallbacks += more.stamp_fallbacks
@@ -212,6 +214,16 @@ class Collector:
         counts = (item.count or 0 for item in self._unreadable if item.topic == expected.topic)
         return _Sum(unreadable=sum(counts))
 
+    def _unreadable_in(self, expected: Expected) -> int:
+        """Return the number of unreadable messages of a topic; ranges are reported for one of the topics that share them."""
+        targets = (
+            other.target
+            for other in self._start.topics
+            if (other.topic, other.msgtype) == (expected.topic, expected.msgtype)
+            and not (other.excluded or other.shares_messages)
+        )
+        return self._sums[next(targets, expected.target)].unreadable
+
     def _topic(self, expected: Expected) -> TopicReport:
         total = self._sums[expected.target] if not expected.excluded else self._unread(expected)
         rejections = tuple(
@@ -227,9 +239,11 @@ class Collector:
             why=expected.why,
             status=_status(expected, total),
             promised=expected.count,
-            unreadable=total.unreadable,
+            shares_messages=expected.shares_messages,
+            unreadable=self._unreadable_in(expected) if expected.shares_messages else total.unreadable,
             read=total.read,
             written=total.written,
+            rows=total.rows,
             filtered=sum(count for rule, count in total.dropped.items() if rule not in DOWNSAMPLING),
             downsampled=sum(total.dropped[rule] for rule in DOWNSAMPLING),
             dropped={rule: count for rule, count in total.dropped.items() if count},
@@ -238,13 +252,13 @@ class Collector:
             rejected=sum(rejection.count for rejection in rejections),
             quarantined=total.quarantined,
             rejections=rejections,
-            start_ns=total.start_ns if total.written else None,
-            end_ns=total.end_ns if total.written else None,
+            start_ns=total.start_ns if total.rows else None,
+            end_ns=total.end_ns if total.rows else None,
             payload_bytes=total.payload_bytes,
             stored_bytes=(total.closed.stored_bytes or 0) if total.closed else 0,
             checksum=total.closed.checksum if total.closed else None,
             error=total.closed.error if total.closed else None,
-            timeline=total.closed.timeline if total.closed and total.written else None,
+            timeline=total.closed.timeline if total.closed and total.rows else None,
         )
 
 
@@ -266,4 +280,4 @@ def _status(expected: Expected, total: _Sum) -> TopicStatus:
         return TopicStatus.EXCLUDED
     if total.closed is not None:
         return total.closed.status
-    return TopicStatus.WRITTEN if total.written else TopicStatus.EMPTY
+    return TopicStatus.WRITTEN if total.rows else TopicStatus.EMPTY

@@ -138,12 +138,12 @@ def _sums(reports: Sequence[Report]) -> dict[str, _Sum]:
 
 
 def _add(total: _Sum, topic: TopicReport) -> None:
-    total.rows += topic.written
+    total.rows += topic.rows
     total.stored_bytes += topic.stored_bytes
     total.rejected += topic.rejected
     total.ontology = topic.ontology
     if topic.start_ns is not None and topic.end_ns is not None and topic.end_ns > topic.start_ns:
-        total.intervals += topic.written - 1
+        total.intervals += topic.rows - 1
         total.span_ns += topic.end_ns - topic.start_ns
 
 

@@ -61,6 +61,8 @@ class Expected(Struct, frozen=True):
     count: int | None
     """Number of messages in the index of the recording; None if it is unknown."""
     excluded: bool = False
+    shares_messages: bool = False
+    """True if another topic counts the same messages, because the adapter has several outputs."""
 
 
 class RunStarted(Struct, frozen=True):
@@ -79,8 +81,12 @@ class TopicProgress(Struct, frozen=True):
     target: str
     read: int = 0
     written: int = 0
+    """Number of messages that became rows, in this topic or another output of the adapter."""
+    rows: int = 0
+    """Number of rows; it differs from `written` if messages have any number of rows."""
     dropped: Mapping[str, int] = {}
-    """Number of messages by the rule that drops them: `every`, `rate`, `where`, `on_change` or `time_range`."""
+    """Number of messages by the rule that drops them: `every`, `rate`, `where`, `on_change`, `time_range`, `drop_when` or
+    `rows`."""
     latched: int = 0
     """Number of messages from before the time range."""
     stamp_fallbacks: int = 0

@@ -20,7 +20,7 @@ from mosaico_ingest.notebook import html_table
 from mosaico_ingest.report.contract import ContractResult, ReportPart
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.timing import TimelineReport, mean_rate_hz
-from mosaico_ingest.report.units import bytes_text, count_text, counted, written_text
+from mosaico_ingest.report.units import bytes_text, count_text, counted, written_cell, written_text
 
 _GRAVEST_FIRST = (130, 5, 1, 2, 6, 3, 4)
 
@@ -96,12 +96,18 @@ class TopicReport(ReportPart):
     """Number of messages that could not be read, as far as it is known; see `unreadable_ranges`."""
     read: int = 0
     written: int = 0
+    """Number of messages that became rows, in this topic or another output of its adapter."""
+    rows: int = 0
+    """Number of rows; it differs from `written` if the adapter has `rows` or several outputs."""
+    shares_messages: bool = False
+    """True if another topic counts the same messages, because the adapter has several outputs; totals count them once."""
     filtered: int = 0
-    """Number of messages that `where`, `on_change` or the time range dropped after they were read."""
+    """Number of messages that `where`, `on_change`, the time range or the adapter dropped after they were read."""
     downsampled: int = 0
     """Number of messages that `every` or `rate` dropped."""
     dropped: Mapping[str, int] = {}
-    """Number of filtered and downsampled messages by rule: `every`, `rate`, `where`, `on_change`, `time_range`."""
+    """Number of filtered and downsampled messages by rule: `every`, `rate`, `where`, `on_change`, `time_range`, and of the
+    adapter `drop_when` and `rows` (an empty list)."""
     latched: int = 0
     """Number of messages from before the time range, see `bag.time.include_latched`."""
     stamp_fallbacks: int = 0
@@ -128,7 +134,7 @@ class TopicReport(ReportPart):
     @property
     def rate_hz(self) -> float | None:
         """Rows per second; see `mean_rate_hz`."""
-        rate = mean_rate_hz(self.written, self.start_ns, self.end_ns)
+        rate = mean_rate_hz(self.rows, self.start_ns, self.end_ns)
         return None if rate is None else round(rate, 6)
 
 
@@ -141,6 +147,8 @@ class Totals(ReportPart):
     """Number of messages in unreadable ranges; None if the number is unknown for a range."""
     read: int
     written: int
+    rows: int
+    """Number of rows in all topics."""
     filtered: int
     downsampled: int
     rejected: int
@@ -195,7 +203,7 @@ class Report(ReportPart):
     @property
     def totals(self) -> Totals:
         """Sums over the topics that were read."""
-        topics = [topic for topic in self.topics if topic.status is not TopicStatus.EXCLUDED]
+        topics = self.counted_topics
         promised = [topic.promised for topic in topics]
         unreadable = [item.count for item in self.unreadable_ranges]
         return Totals(
@@ -203,12 +211,22 @@ class Report(ReportPart):
             unreadable=None if None in unreadable else sum(count or 0 for count in unreadable),
             read=sum(t.read for t in topics),
             written=sum(t.written for t in topics),
+            rows=sum(t.rows for t in self.topics),
             filtered=sum(t.filtered for t in topics),
             downsampled=sum(t.downsampled for t in topics),
             rejected=sum(t.rejected for t in topics),
             payload_bytes=sum(t.payload_bytes for t in topics),
-            stored_bytes=sum(t.stored_bytes for t in topics),
+            stored_bytes=sum(t.stored_bytes for t in self.topics),
         )
+
+    @property
+    def counted_topics(self) -> list[TopicReport]:
+        """The topics that were read, without those that share their messages with another topic."""
+        return [
+            topic
+            for topic in self.topics
+            if topic.status is not TopicStatus.EXCLUDED and not topic.shares_messages
+        ]
 
     def __repr__(self) -> str:
         """Return the outcome, such as `<Report yard: completed, 2,110 of 2,110 messages written>`."""
@@ -293,7 +311,9 @@ def _topic_table(report: Report) -> str:
         (
             topic.target,
             topic.ontology,
-            *(count_text(count) for count in (topic.read, topic.written, topic.rejected)),
+            count_text(topic.read),
+            written_cell(topic.written, topic.rows),
+            count_text(topic.rejected),
             bytes_text(topic.stored_bytes),
         )
         for topic in topics

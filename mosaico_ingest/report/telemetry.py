@@ -52,6 +52,8 @@ class _Recording:
     rejected: int = 0
     contract: ContractResult | None = None
     written: dict[str, int] = field(default_factory=lambda: defaultdict[str, int](int))
+    sharing: frozenset[str] = frozenset()
+    """The topics that share their messages with another topic."""
 
 
 class Telemetry:
@@ -120,10 +122,14 @@ class Telemetry:
         self._tracers.shutdown()
 
     def _begin(self, position: int, event: RunStarted) -> None:
-        self._recordings[position] = _Recording(event.sequence, event.destination, event.source_bytes)
+        recording = _Recording(event.sequence, event.destination, event.source_bytes)
+        recording.sharing = frozenset(topic.target for topic in event.topics if topic.shares_messages)
+        self._recordings[position] = recording
         self._bytes.add(event.source_bytes, {"kind": "source"})
 
     def _progress(self, recording: _Recording, event: TopicProgress) -> None:
+        if event.target in recording.sharing:
+            return
         recording.read += event.read
         recording.written[event.target] += event.written
         self._count(event.target, "read", event.read)

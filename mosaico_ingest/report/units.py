@@ -94,10 +94,16 @@ def stored_text(source_bytes: int, stored_bytes: int, *, of: str = "") -> str:
 def written_text(report: Report) -> str:
     """Return the number of written messages, out of the messages read or, if the run stopped early, of the recording."""
     written, read = report.totals.written, report.totals.read
-    promised = sum(topic.promised or 0 for topic in report.topics if topic.status.value != "excluded")
+    promised = sum(topic.promised or 0 for topic in report.counted_topics)
     if report.status.value in {"failed", "interrupted"} and promised > read:
         return f"{counted(written, 'message')} written before the run stopped, of {count_text(promised)}"
-    return f"{count_text(written)} of {counted(read, 'message')} written"
+    rows = "" if report.totals.rows == written else f" as {counted(report.totals.rows, 'row')}"
+    return f"{count_text(written)} of {counted(read, 'message')} written{rows}"
+
+
+def written_cell(messages: int, rows: int) -> str:
+    """Return the number of written messages, with the number of rows if it differs, such as `12 (34 rows)`."""
+    return count_text(messages) if messages == rows else f"{count_text(messages)} ({counted(rows, 'row')})"
 
 
 def unreadable_text(reports: Iterable[Report]) -> str:

@@ -263,4 +263,12 @@ def _join(blocks: Sequence[MessageBlock]) -> MessageBlock:
         )
         if has_publish_times
         else None,
+        np.concatenate(
+            [
+                np.zeros(len(block), np.int64) if block.sequences is None else block.sequences
+                for block in blocks
+            ]
+        )
+        if any(block.sequences is not None for block in blocks)
+        else None,
     )

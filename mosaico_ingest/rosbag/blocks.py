@@ -116,6 +116,8 @@ class MessageBlock(Struct, frozen=True):
     """Position in the source, for diagnostics: file offset of the record or chunk, or row id; shape (n,)."""
     publish_times: Int64s | None = None
     """Nanoseconds since the epoch, shape (n,); None if they equal the log times, or if the container has none."""
+    sequences: Int64s | None = None
+    """Sequence numbers, shape (n,); None if all are 0, or if the container has none."""
     payload_bytes: int = -1
     """Sum of the lengths."""
 
@@ -138,6 +140,7 @@ class MessageBlock(Struct, frozen=True):
             self.lengths[selection],
             self.offsets[selection],
             None if self.publish_times is None else self.publish_times[selection],
+            None if self.sequences is None else self.sequences[selection],
         )
 
     def payload(self, row: int) -> bytes:
@@ -418,7 +421,8 @@ def pack(block: MessageBlock) -> MessageBlock:
 def _with_data(block: MessageBlock, data: Bytes, starts: Int64s) -> MessageBlock:
     times, lengths, offsets = map(_without_base, (block.log_times, block.lengths, block.offsets))
     publish_times = None if block.publish_times is None else _without_base(block.publish_times)
-    return MessageBlock(block.connection, times, data, starts, lengths, offsets, publish_times)
+    sequences = None if block.sequences is None else _without_base(block.sequences)
+    return MessageBlock(block.connection, times, data, starts, lengths, offsets, publish_times, sequences)
 
 
 def _without_base(values: Int64s) -> Int64s:

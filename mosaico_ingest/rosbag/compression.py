@@ -227,6 +227,7 @@ def decompress_messages(block: MessageBlock, unreadable: list[UnreadableRange]) 
         lengths,
         rows.offsets,
         rows.publish_times,
+        rows.sequences,
     )
 
 

@@ -13,7 +13,7 @@ import pyarrow as pa
 from msgspec import Struct
 from msgspec.structs import replace
 
-from mosaico_ingest.adapters.adapter import AdapterSpec
+from mosaico_ingest.adapters.adapter import AdapterSpec, Envelope
 from mosaico_ingest.adapters.bridge import ROSBridge, installed_adapters, load_adapter_reference
 from mosaico_ingest.adapters.builtin import BUILTIN, BY_NAME, Builtin
 from mosaico_ingest.adapters.draft import RecordedExample, draft
@@ -58,8 +58,8 @@ def definition_in(path: Path, msgtype: str, *, resolve: Resolver) -> Definition:
 
 def message_in(
     path: Path, topic: str, index: int = 0, *, resolve: Resolver
-) -> tuple[Definition, pa.StructArray]:
-    """Return the definition of a topic's message, and the message as a single row in its ROS shape.
+) -> tuple[Definition, pa.StructArray, Envelope]:
+    """Return the definition of a topic's message, the message as a single row in its ROS shape, and its envelope.
 
     Raises:
         BagError: The recording cannot be opened, has fewer messages, or the message cannot be decoded.
@@ -72,7 +72,11 @@ def message_in(
         for batch in recording.message_blocks(ids, max_rows=_ROWS):
             if index < before + len(batch):
                 connection = recording.connections[batch.connection]
-                return _definition(connection), _row(connection, batch, index - before)
+                one = batch.rows(np.array([index - before]))
+                envelope = Envelope(
+                    topic, connection.msgtype, one.log_times, one.publish_times, one.sequences
+                )
+                return _definition(connection), _row(connection, one), envelope
             before += len(batch)
     raise BagError(
         f"{topic} has {before} messages, there is none at index {index}",
@@ -107,9 +111,8 @@ def _definition(connection: Connection) -> Definition:
     return connection.definition
 
 
-def _row(connection: Connection, batch: MessageBlock, row: int) -> pa.StructArray:
-    alone = batch.rows(np.array([row]))
-    decoded = decoder_for(connection).decode(alone)
+def _row(connection: Connection, message: MessageBlock) -> pa.StructArray:
+    decoded = decoder_for(connection).decode(message)
     if decoded.failures:
         failure = decoded.failures[0]
         raise DecodeError(failure.reason, rule=failure.rule, where=connection.topic)
@@ -295,7 +298,7 @@ def run_adapter_tests(spec: AdapterSpec, types: DefinitionFinder) -> TestResult:
         )
     folder = Path(mapping.source.file).parent
 
-    def recorded(message: RecordedMessage) -> tuple[Definition, pa.StructArray]:
+    def recorded(message: RecordedMessage) -> tuple[Definition, pa.StructArray, Envelope]:
         return message_in(folder / message.bag, message.topic, message.index, resolve=types)
 
     findings: dict[Finding, None] = {}
@@ -337,7 +340,7 @@ def draft_adapter(
     if record is None:
         definition, example = definition_in(bag, name, resolve=types), None
     else:
-        definition, row = message_in(bag, record, resolve=types)
+        definition, row, _ = message_in(bag, record, resolve=types)
         reference = {"bag": relpath(bag, folder), "topic": record, "index": 0}
         example = RecordedExample(row, reference)
         if definition.root != name:

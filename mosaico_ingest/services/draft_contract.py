@@ -104,7 +104,9 @@ def measure_recording(path: AnyPath, *, ros_distro: Stores | str | None = None) 
         if monitor is None:
             raise AssertionError("the probe has expectations")
         connections = [
-            recording.connections[connection] for topic in plan.topics for connection in topic.connections
+            recording.connections[connection]
+            for topic in plan.read_topics
+            for connection in topic.connections
         ]
         order = monitor.order
         blocks = recording.message_blocks(

@@ -111,7 +111,6 @@ def _topic(job: Job, connection: Connection, bridge: ROSBridge, rate_hz: float |
             topic=connection.topic, msgtype=connection.msgtype, count=connection.count, why=str(error)
         )
     source = connection.definition.source.value if connection.definition else "none"
-    is_excluded = isinstance(outcome, ExcludedTopic)
     return InspectedTopic(
         topic=connection.topic,
         msgtype=connection.msgtype,
@@ -119,9 +118,11 @@ def _topic(job: Job, connection: Connection, bridge: ROSBridge, rate_hz: float |
         count=connection.count,
         rate_hz=rate_hz,
         definition=source,
-        adapter="" if is_excluded else outcome.adapter.name,
-        ontology=None if is_excluded else outcome.ontology.tag,
-        problem=outcome.why if is_excluded else None,
+        adapter="" if isinstance(outcome, ExcludedTopic) else ", ".join(one.adapter.name for one in outcome),
+        ontology=None
+        if isinstance(outcome, ExcludedTopic)
+        else ", ".join(one.ontology.tag for one in outcome),
+        problem=outcome.why if isinstance(outcome, ExcludedTopic) else None,
     )
 
 

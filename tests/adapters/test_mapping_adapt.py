@@ -410,7 +410,10 @@ def test_run_tests_reads_recorded_message() -> None:
         "acme_msgs/msg/Pack", Embedded("ros2msg", spec.model.definition or ""), ros_version=2
     )
     rows: Any = pa.array([{"volts": 5.0, "any_length": []}], ros_shape(pack))
+    envelope = Envelope("/a", pack.root, np.zeros(1, np.int64))
     seen: list[Any] = []
-    [outcome] = run_tests(spec, TypeResolver(), recorded=lambda what: (seen.append(what), (pack, rows))[1])
+    [outcome] = run_tests(
+        spec, TypeResolver(), recorded=lambda what: (seen.append(what), (pack, rows, envelope))[1]
+    )
     assert outcome.passed
     assert (seen[0].bag, seen[0].topic, seen[0].index) == ("x.mcap", "/a", 2)

@@ -43,6 +43,8 @@ def column(text: str, values: list[Any], type_: pa.DataType, other: list[Any] | 
 
 
 def near(left: Any, right: Any) -> bool:
+    if isinstance(left, list) and isinstance(right, list):
+        return len(left) == len(right) and all(map(near, left, right))
     if isinstance(left, dict):
         return left.keys() == right.keys() and all(near(left[key], right[key]) for key in left)
     if isinstance(left, float) and isinstance(right, int | float):
@@ -51,6 +53,8 @@ def near(left: Any, right: Any) -> bool:
 
 
 F8, I4, U1, TEXT, BOOL = pa.float64(), pa.int32(), pa.uint8(), pa.string(), pa.bool_()
+
+PAIRS = pa.list_(pa.struct([("k", TEXT), ("v", I4)]))
 
 CASES = [
     ("is_null(x)", F8, [1.0, None], [False, True]),
@@ -109,6 +113,22 @@ CASES = [
     ("norm(x)", pa.struct([("a", F8), ("b", I4)]), [{"a": 3.0, "b": 4}, {"a": 1.0, "b": None}, None], [5.0, None, None]),
     ("any(x)", pa.list_(BOOL), [[], [False, True], [None]], [False, True, None]),
     ("all(x[] > 0)", pa.list_(I4), [[], [1, 0], [1]], [True, False, True]),
+    ("x[y[0]]", pa.list_(I4), [[1, 7], [2, 0], [0], [], None], [7, None, 0, None, None]),
+    ("element(x, -1)", pa.list_(I4), [[1, 2], [], None], [2, None, None]),
+    ("x[1:]", pa.list_(I4, 3), [[1, 2, 3], None], [[2, 3], None]),
+    ("x[-2:-1]", pa.list_(TEXT), [["a", "b", "c"], ["a"], []], [["b"], [], []]),
+    ("slice(x, 0, 1)", pa.list_(I4), [[1, 2], []], [[1], []]),
+    ("filter(x, self > 1)", pa.list_(I4), [[1, 2, None, 3], [], None], [[2, 3], [], None]),
+    ("filter(x, v > 1)", PAIRS, [[{"k": "a", "v": 1}, {"k": "b", "v": 2}]], [[{"k": "b", "v": 2}]]),
+    ("lookup(x, k, 'b', v)", PAIRS, [[{"k": "a", "v": 1}, {"k": "b", "v": 2}, {"k": "b", "v": 3}], []], [2, None]),
+    ("sort(x)", pa.list_(F8), [[2.0, NAN, None, 1.0], []], [[1.0, 2.0, NAN, None], []]),
+    ("sort(x, -v)[].v", PAIRS, [[{"k": "a", "v": 1}, {"k": "b", "v": 2}]], [[2, 1]]),
+    ("reverse(x)", pa.list_(I4, 2), [[1, 2], None], [[2, 1], None]),
+    ("unique(x)", pa.list_(F8), [[1.0, NAN, 1.0, None, NAN, None]], [[1.0, NAN, None]]),
+    ("flatten(x)", pa.list_(pa.list_(I4)), [[[1], [], None, [2, 3]], [], None], [[1, 2, 3], [], None]),
+    ("zip(x, y)[].x", pa.list_(I4), [[1, 2], [], None], [[1, 2], [], None]),
+    ("argmin(x)", pa.list_(I4), [[2, 1, 1], [], [None, 1], None], [1, None, None, None]),
+    ("argmax(x)", pa.list_(F8), [[1.0, 3.0, 3.0], [1.0, NAN]], [1, 1]),
     ("lower(x)", TEXT, ["ŻÓ"], ["żó"]),
     ("upper(x)", TEXT, ["a"], ["A"]),
     ("strip(x)", TEXT, [" a\t"], ["a"]),

@@ -143,6 +143,8 @@ def test_check_manifest_wrong_value_is_one_located_finding(path: KeyPath, writte
     span = SOURCE.span(path)
     text = replaced((span.line, span.column), (span.end_line, span.end_column), written)
     actual = findings_of(text)
+    if written.startswith("{"):  # a mapping with another key also lacks the required ones
+        actual = [finding for finding in actual if finding[0] != "missing-key"]
     assert len(actual) == 1
     rule, line, column, remedy = actual[0]
     assert rule in {"wrong-type", "wrong-value", "newer-version", "unknown-key"}

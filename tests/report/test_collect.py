@@ -46,7 +46,11 @@ def rejected(rule: str, count: int) -> Rejected:
 def test_collector_sums_every_increment(steps: list[tuple[int, int, str]]) -> None:
     collector = started()
     for written, lost, rule in steps:
-        collector(TopicProgress(IMU.target, read=written + lost, written=written, payload_bytes=written))
+        collector(
+            TopicProgress(
+                IMU.target, read=written + lost, written=written, rows=written, payload_bytes=written
+            )
+        )
         if lost:
             collector(rejected(rule, lost))
     topic = collector.report().topics[0]
@@ -96,7 +100,7 @@ def test_collector_excluded_topic_is_not_in_totals() -> None:
 
 def test_report_computes_rate_and_compression() -> None:
     collector = started()
-    collector(TopicProgress(IMU.target, read=11, written=11, start_ns=0, end_ns=1_000_000_000))
+    collector(TopicProgress(IMU.target, read=11, written=11, rows=11, start_ns=0, end_ns=1_000_000_000))
     collector(TopicClosed(IMU.target, TopicStatus.WRITTEN, stored_bytes=250))
     report = collector.report()
     assert report.topics[0].rate_hz == 10.0
@@ -105,8 +109,8 @@ def test_report_computes_rate_and_compression() -> None:
 
 def test_collector_discarded_rows_have_no_time_range() -> None:
     collector = started()
-    collector(TopicProgress(IMU.target, read=1, written=1, start_ns=5, end_ns=5))
-    collector(TopicProgress(IMU.target, written=-1))
+    collector(TopicProgress(IMU.target, read=1, written=1, rows=1, start_ns=5, end_ns=5))
+    collector(TopicProgress(IMU.target, written=-1, rows=-1))
     topic = collector.report().topics[0]
     assert (topic.written, topic.start_ns, topic.end_ns) == (0, None, None)
 

@@ -52,6 +52,7 @@ def topic(name: str, *, rejected: int = 0, counts: tuple[int, ...] = (50,) * 20)
         promised=sum(counts) + rejected,
         read=sum(counts) + rejected,
         written=sum(counts),
+        rows=sum(counts),
         rejected=rejected,
         quarantined=rejected,
         rejections=rejections if rejected else (),

@@ -45,6 +45,7 @@ from mosaico_ingest.adapters.mapping.expressions import (
     Conditional,
     Constant,
     ElementAt,
+    EnvelopeField,
     FieldAccess,
     FunctionCall,
     MakeList,
@@ -238,7 +239,7 @@ class ColumnInverter:
                 self._builder.assign(path, values, scope.axes, keeps_null=scope.keeps_null)
             return
         match typed:
-            case Constant():
+            case Constant() | EnvelopeField():
                 pass
             case Cast(operand=of):
                 self._assign(of, values, scope)

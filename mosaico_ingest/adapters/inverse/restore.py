@@ -119,6 +119,9 @@ def invert(adapter: Adapter, definition: Definition, metadata: Mapping[str, Any]
     if isinstance(adapter, UnmodeledAdapter):
         return _UnmodeledInverse(shape, definition.language is not Language.ROS)
     if isinstance(adapter, MappingAdapter):
+        if adapter.levels or adapter.others:
+            cause = "several rows" if adapter.levels else "several topics"
+            raise AdapterError(f"the adapter converts each message to {cause}, so it has no inverse")
         texts = _metadata_texts(adapter.metadata, metadata)
         return _MappingInverse(adapter, shape, texts, definition.language is not Language.ROS)
     if isinstance(adapter, PythonAdapter) and adapter.is_invertible:
@@ -199,7 +202,9 @@ def _changed(adapter: Adapter, rows: Array, messages: Array, envelope: Envelope)
     adapted = adapter.adapt(messages, envelope)
     stored = rows if len(adapted.index) == len(rows) else rows.take(arrays.array(adapted.index))
     changed = {name: int(wrong.sum()) for name, wrong in differences(stored, adapted.rows).items()}
-    return changed | ({"(refused)": len(adapted.failures)} if adapted.failures else {})
+    dropped = sum(len(positions) for positions in adapted.dropped.values())
+    counts = {"(refused)": len(adapted.failures), "(dropped)": dropped}
+    return changed | {name: count for name, count in counts.items() if count}
 
 
 def _metadata_texts(

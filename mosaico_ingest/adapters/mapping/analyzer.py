@@ -158,7 +158,7 @@ class Analyzer:
             return None
         element = of.typed.type.element
         if pt.is_struct(element.arrow):
-            return replace(scope, message=element)
+            return scope.nested(element)
         hint = f"write {of.typed.text}[]" if is_list(element.arrow) else None
         message = f"`{of.typed.text}` is {format_type(element)}, not a message"
         self.report_inside(of.path, of.node.span, "operand-type", message, hint)

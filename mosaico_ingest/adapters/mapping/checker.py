@@ -16,15 +16,17 @@ from mosaico_ingest.adapters.mapping.expressions import (
     Conditional,
     Constant,
     ElementAt,
+    EnvelopeField,
     FieldAccess,
     FunctionCall,
     MakeList,
     MessageRef,
     OpenList,
+    OuterValue,
     TypedExpression,
 )
 from mosaico_ingest.adapters.mapping.functions import lookup
-from mosaico_ingest.adapters.mapping.functions.registry import Parameter, check_call, suggest
+from mosaico_ingest.adapters.mapping.functions.registry import Function, Parameter, check_call, suggest
 from mosaico_ingest.adapters.mapping.parser import (
     Attribute,
     Call,
@@ -66,6 +68,25 @@ _NUMBERS = {"nan": math.nan, "inf": math.inf, "pi": math.pi}
 Report = Callable[[str, str, TextRange, "str | None"], None]
 """Receives a mistake: rule id, message, text range in the expression, hint."""
 _UNKNOWN_FIELD, _OPERAND_TYPE = "unknown-field", "operand-type"
+ENVELOPE_NAME = "message"
+"""The name before the properties of a message besides its content."""
+ENVELOPE_FIELDS = {
+    "log_time": expr_type_of(arrays.int64()),
+    "publish_time": expr_type_of(arrays.int64()),
+    "topic": expr_type_of(arrays.string()),
+    "sequence": expr_type_of(arrays.uint32()),
+}
+"""The properties of a message besides its content, by name; times are in ns since the epoch."""
+RESERVED_NAMES = frozenset({"self", ENVELOPE_NAME, *_NUMBERS})
+"""Names that bindings cannot have."""
+
+
+class Binding(Struct, frozen=True):
+    """A named value of an adapter file: a parameter, or a binding of `let`."""
+
+    typed: TypedExpression
+    depth: int
+    """The number of scopes around the one in which the value is computed."""
 
 
 class Scope(Struct, frozen=True):
@@ -73,10 +94,37 @@ class Scope(Struct, frozen=True):
 
     message: ExprType
     types: Mapping[str, MessageType]
+    bindings: Mapping[str, Binding] = {}
+    depth: int = 0
+    """The number of messages around this one, whose values are `OuterValue`s here."""
+    has_envelope: bool = False
+    """Whether expressions can use the properties of messages besides their content."""
+    subject: TypedExpression | None = None
+    """The elements in which names are looked up first, if the scope is that of an element."""
+    enclosing: Scope | None = None
+    """The scope in which names are looked up next, if the scope is that of an element."""
+
+    def nested(self, message: ExprType) -> Scope:
+        """Return the scope of a nested message."""
+        return replace(self, message=message, depth=self.depth + 1)
+
+    def of_elements(self, elements: TypedExpression) -> Scope:
+        """Return the scope of the elements of a list, in which names of the enclosing scope are visible."""
+        return replace(self, message=elements.type, subject=elements, enclosing=self)
+
+    def bound(self, name: str) -> TypedExpression | None:
+        """Return the value of a binding, None if there is none of this name."""
+        binding = self.bindings.get(name)
+        if binding is None:
+            return None
+        levels = self.depth - binding.depth
+        if levels == 0 or isinstance(binding.typed, Constant):
+            return replace(binding.typed, text=name)
+        return OuterValue(binding.typed, levels, binding.typed.type.close_all(), name)
 
     def field(self, message: ExprType, name: str) -> ExprType | None:
         """Return the type of a field of a message, None if it has no such field."""
-        position = message.arrow.get_field_index(name)
+        position = message.arrow.get_field_index(name) if pt.is_struct(message.arrow) else -1
         if position < 0:
             return None
         definition = self.types.get(message.msgtype or "")
@@ -93,7 +141,7 @@ class Scope(Struct, frozen=True):
 
     def suggest_name(self, message: ExprType, name: str) -> str:
         """Return the hint for a name that is neither a field nor a constant of a message."""
-        fields = [field.name for field in message.arrow]
+        fields = [field.name for field in message.arrow] if pt.is_struct(message.arrow) else []
         nearest = suggest(name, [*fields, *self.constants(message)])
         listing = f"it has {', '.join(fields)}" if fields else "it has no fields"
         return f"{nearest} {listing}" if nearest else listing
@@ -160,19 +208,32 @@ class Checker:
 
     def _name(self, node: Name) -> TypedExpression | None:
         scope = self._scope
-        field = scope.field(scope.message, node.name)
-        if field is not None:
-            return FieldAccess(MessageRef(scope.message), node.name, field, node.name)
-        if node.name == "self":
-            return MessageRef(scope.message)
-        value = scope.constants(scope.message).get(node.name, _NUMBERS.get(node.name))
-        if value is not None:
-            return typed_constant(value, node.name)
-        message = f"no field {node.name!r} in {format_type(scope.message)}"
-        self._fail(message, node.span, scope.suggest_name(scope.message, node.name), rule=_UNKNOWN_FIELD)
+        typed = _resolve(scope, node.name)
+        if typed is not None:
+            return typed
+        element = scope.message.element
+        message = f"no field {node.name!r} in {format_type(element)}"
+        hint = suggest(node.name, scope.bindings) or scope.suggest_name(element, node.name)
+        if node.name == ENVELOPE_NAME and scope.has_envelope:
+            hint = f"write {', '.join(f'{ENVELOPE_NAME}.{name}' for name in ENVELOPE_FIELDS)}"
+        self._fail(message, node.span, hint, rule=_UNKNOWN_FIELD)
         return None
 
+    def _envelope_field(self, node: Attribute) -> TypedExpression | None:
+        """Return a property such as `message.log_time`, None if the name means a field of the message."""
+        is_message = isinstance(node.base, Name) and node.base.name == ENVELOPE_NAME
+        if not (is_message and self._scope.has_envelope):
+            return None
+        expr_type = ENVELOPE_FIELDS.get(node.name)
+        field = _resolve(self._scope, ENVELOPE_NAME)
+        if expr_type is None or (field is not None and self._scope.field(field.type, node.name) is not None):
+            return None
+        return EnvelopeField(node.name, expr_type, self._source(node))
+
     def _attribute(self, node: Attribute) -> TypedExpression | None:
+        envelope_field = self._envelope_field(node)
+        if envelope_field is not None:
+            return envelope_field
         base = self.infer(node.base)
         if base is None:
             return None
@@ -203,10 +264,7 @@ class Checker:
         base = self._infer_list(node)
         if base is None:
             return None
-        arrow = base.type.arrow
-        size = arrow.list_size if pt.is_fixed_size_list(arrow) else None
-        element = expr_type_of(arrow.value_type, msgtype=base.type.msgtype)
-        return OpenList(base, replace(element, axes=(*base.type.axes, size)), self._source(node))
+        return open_elements(base, self._source(node))
 
     def _subscript(self, node: Subscript) -> TypedExpression | None:
         base = self._infer_list(node)
@@ -264,17 +322,14 @@ class Checker:
         if special_form is not None:
             return special_form(node)
         function = lookup(node.name)
-        arguments = self._infer_all(node.arguments)
+        arguments = self._arguments(node, function) if function is not None else None
         if function is None or arguments is None:
             return None  # `Analyzer` reports unknown functions before expressions are typed.
-        arguments = tuple(
-            _close_for(function.parameter(index), argument) for index, argument in enumerate(arguments)
-        )
-        for position, argument in enumerate(arguments):
-            problem = _literal_problem(function.parameter(position), argument)
-            if problem is not None:
-                self._fail(f"{node.name} {problem}", node.arguments[position].span)
-                return None
+        names = self._argument_names(node) if function.named else ()
+        if self._has_literal_problem(node, function, arguments) or names is None:
+            return None
+        if function.named:
+            function = function.with_names(names)
         try:
             expr_type = check_call(function, [argument.type.element for argument in arguments])
         except TypeMismatch as mismatch:
@@ -284,7 +339,84 @@ class Checker:
         if pt.is_null(expr_type.arrow):
             return typed_constant(None, self._source(node))
         expr_type = replace(expr_type, axes=_deepest_axes(arguments))
-        return FunctionCall(node.name, function, arguments, expr_type, self._source(node))
+        return FunctionCall(node.name, function, arguments, expr_type, self._source(node), names)
+
+    def _has_literal_problem(
+        self, node: Call, function: Function, arguments: tuple[TypedExpression, ...]
+    ) -> bool:
+        """Report an argument that must be a literal and is not, or is not a valid one."""
+        for position, argument in enumerate(arguments):
+            problem = _literal_problem(function.parameter(position), argument)
+            if problem is not None:
+                self._fail(f"{node.name} {problem}", node.arguments[position].span)
+                return True
+        if function.check_literals is not None:
+            literals = [argument.value if isinstance(argument, Constant) else None for argument in arguments]
+            problem = function.check_literals(*literals)
+            if problem is not None:
+                self._fail(f"{node.name}: {problem}", node.span)
+                return True
+        return False
+
+    def _arguments(self, node: Call, function: Function) -> tuple[TypedExpression, ...] | None:
+        """Infer the arguments of a call, with lists closed as the function takes them; None after a report."""
+        if any(parameter.of_elements for parameter in function.parameter_types):
+            arguments = self._infer_with_elements(node, function)
+        else:
+            arguments = self._infer_all(node.arguments)
+        if arguments is None:
+            return None
+        return tuple(_close_for(function.parameter(i), argument) for i, argument in enumerate(arguments))
+
+    def _infer_with_elements(self, node: Call, function: Function) -> tuple[TypedExpression, ...] | None:
+        """Infer the arguments of a function some of whose parameters apply to each element of the first argument."""
+        first = self.infer(node.arguments[0])
+        if first is None:
+            return None
+        first = _close_for(function.parameter(0), first)
+        arrow = first.type.arrow
+        if not is_list(arrow):
+            message = f"{node.name} takes {function.parameter(0).description} here, not {format_type(first.type.element)}"
+            self._fail(message, node.arguments[0].span)
+            return None
+        elements = open_elements(first, f"{first.text}[]")
+        inner = Checker(self._scope.of_elements(elements), self._report, self._text)
+        arguments: list[TypedExpression | None] = [first]
+        for position, argument in enumerate(node.arguments[1:], 1):
+            if not function.parameter(position).of_elements:
+                arguments.append(self.infer(argument))
+                continue
+            typed = inner.infer(argument)
+            arguments.append(typed)
+            if typed is not None and len(typed.type.axes) != len(elements.type.axes):
+                fewer = len(typed.type.axes) < len(elements.type.axes)
+                problem = "does not refer to the elements" if fewer else "has several values for each element"
+                hint = (
+                    "name a field of the elements; `self` is the element"
+                    if fewer
+                    else "reduce it to one value"
+                )
+                self._fail(f"`{typed.text}` {problem} of `{first.text}`", argument.span, hint)
+                return None
+        valid = tuple(value for value in arguments if value is not None)
+        return valid if len(valid) == len(arguments) else None
+
+    def _argument_names(self, node: Call) -> tuple[str, ...] | None:
+        """Return the name of each argument, such as `y` for `x.y[]`; None after a report."""
+        names: list[str] = []
+        for argument in node.arguments:
+            base: Node = argument
+            while isinstance(base, (EachElement, Subscript)):
+                base = base.base
+            if not isinstance(base, (Name, Attribute)) or base.name in names:
+                problem = (
+                    "has no name" if not isinstance(base, (Name, Attribute)) else f"is another {base.name!r}"
+                )
+                message = f"{node.name} names its fields after its arguments, and `{self._source(argument)}` {problem}"
+                self._fail(message, argument.span, "bind the argument to a name with `let`")
+                return None
+            names.append(base.name)
+        return tuple(names)
 
     def _cast(self, node: Call) -> TypedExpression | None:
         if len(node.arguments) != 2:  # noqa: PLR2004 - value and type
@@ -311,6 +443,34 @@ class Checker:
             if set(rules) != {_UNKNOWN_FIELD}:
                 return self.infer(argument)  # for the report
         return self.infer(node.arguments[-1])
+
+
+def open_elements(operand: TypedExpression, text: str) -> OpenList:
+    """Return the elements of an expression that is a list."""
+    arrow = operand.type.arrow
+    size = arrow.list_size if pt.is_fixed_size_list(arrow) else None
+    element = expr_type_of(arrow.value_type, msgtype=operand.type.msgtype)
+    return OpenList(operand, replace(element, axes=(*operand.type.axes, size)), text)
+
+
+def _resolve(scope: Scope, name: str) -> TypedExpression | None:
+    """Return the value of a name: of a binding, a field, a constant, or else in the enclosing scope."""
+    bound = scope.bound(name)
+    if bound is not None:
+        return bound
+    subject = scope.subject or MessageRef(scope.message)
+    field = scope.field(scope.message, name)
+    if field is not None:
+        return FieldAccess(subject, name, field, name)
+    if name == "self":
+        return subject
+    value = scope.constants(scope.message).get(name)
+    if value is not None:
+        return typed_constant(value, name)
+    if scope.enclosing is not None:
+        return _resolve(scope.enclosing, name)
+    number = _NUMBERS.get(name)
+    return None if number is None else typed_constant(number, name)
 
 
 def _collect_rules(rules: list[str]) -> Report:

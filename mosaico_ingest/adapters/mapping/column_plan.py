@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from mosaico_ingest.adapters.adapter import Adapter, Envelope
+from mosaico_ingest.adapters.adapter import Adapter
 from mosaico_ingest.adapters.mapping.columns import (
     Array,
     Axis,
@@ -24,7 +24,7 @@ from mosaico_ingest.adapters.mapping.columns import (
     struct_of,
 )
 from mosaico_ingest.adapters.mapping.conversion import convert, refuse_nulls
-from mosaico_ingest.adapters.mapping.evaluator import Evaluation, Rejection, RowsRejected
+from mosaico_ingest.adapters.mapping.evaluator import Evaluation, RowsRejected, reject_by_rule
 from mosaico_ingest.adapters.mapping.expressions import TypedExpression
 from mosaico_ingest.adapters.mapping.functions.registry import RejectRows
 from mosaico_ingest.ontology.types import NullRows
@@ -151,7 +151,9 @@ def _evaluate_source(evaluation: Evaluation, plan: ColumnPlan) -> Column:
             element = _nested_types(plan.type, column.axes)[-1]
 
             def evaluate_fields(rows: Array, positions: Mask) -> Array:
-                inner = Evaluation(rows, _envelope_of(evaluation.envelope, column.axes, positions))
+                parents = row_of(column.axes, positions)
+                envelope = evaluation.envelope.take(parents)
+                inner = Evaluation(rows, envelope, outer=evaluation, parents=parents)
                 return evaluate_struct(inner, source.fields, element)
 
             return _nested(evaluation, column, plan.type, evaluate_fields, None)
@@ -198,7 +200,7 @@ def _nested(
             break
         except RowsRejected as error:
             rejections = {int(positions[row]): rejection for row, rejection in error.rejections.items()}
-            _reject_by_rule(rejections, len(messages), refuse)
+            reject_by_rule(rejections, len(messages), refuse)
             selected[list(rejections)] = False
     result = convert(result, _nested_types(target, column.axes)[-1], refuse)
     if not selected.all():
@@ -210,7 +212,7 @@ def _nested(
 
 def _adapt(evaluation: Evaluation, source: NestedAdapter, column: Column) -> Callable[[Array, Any], Array]:
     def run(rows: Array, positions: Mask) -> Array:
-        envelope = _envelope_of(evaluation.envelope, column.axes, positions)
+        envelope = evaluation.envelope.take(row_of(column.axes, positions))
         adapted = source.adapter.adapt(rows, replace(envelope, msgtype=source.msgtype))
         if adapted.failures:
             raise RowsRejected({f.row: (f.rule, f"{source.name}: {f.reason}") for f in adapted.failures})
@@ -219,19 +221,11 @@ def _adapt(evaluation: Evaluation, source: NestedAdapter, column: Column) -> Cal
     return run
 
 
-def _envelope_of(envelope: Envelope, axes: tuple[Axis, ...], positions: Any) -> Envelope:  # noqa: ANN401 - a numpy array
-    """Return the envelope of elements: each has the log time of its row."""
+def row_of(axes: tuple[Axis, ...], positions: Any) -> Any:  # noqa: ANN401 - arrays of numpy
+    """Return the row of each element at some positions below open lists."""
     for axis in reversed(axes):
         positions = axis.parents[positions]
-    return replace(envelope, log_times=envelope.log_times[positions])
-
-
-def _reject_by_rule(rejections: dict[int, Rejection], count: int, refuse: RejectRows) -> None:
-    """Reject elements, with one call per rule."""
-    for rule in dict.fromkeys(rule for rule, _ in rejections.values()):
-        bad = np.zeros(count, bool)
-        bad[[row for row, (own, _) in rejections.items() if own == rule]] = True
-        refuse(bad, rule, lambda i: rejections[i][1])
+    return positions
 
 
 def _look_up(evaluation: Evaluation, source: MapLookup) -> Column:

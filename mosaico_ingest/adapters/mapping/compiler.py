@@ -6,11 +6,12 @@ from collections.abc import Iterable, Mapping
 from collections.abc import Set as AbstractSet
 from typing import Protocol
 
+from msgspec import Struct
 from msgspec.structs import replace
 
 from mosaico_ingest.adapters.adapter import Adapter, AdapterSpec
 from mosaico_ingest.adapters.mapping.analyzer import Analyzer, Target, is_short_cast
-from mosaico_ingest.adapters.mapping.checker import Scope, typed_constant
+from mosaico_ingest.adapters.mapping.checker import Binding, Scope, typed_constant
 from mosaico_ingest.adapters.mapping.column_plan import (
     ColumnPlan,
     ColumnSource,
@@ -29,7 +30,7 @@ from mosaico_ingest.adapters.mapping.expressions import (
     TypedExpression,
 )
 from mosaico_ingest.adapters.mapping.functions.registry import suggest
-from mosaico_ingest.adapters.mapping.model import MappingFile, Scalar, Value, ValueForm
+from mosaico_ingest.adapters.mapping.model import MappingFile, RecordModel, Scalar, Value, ValueForm
 from mosaico_ingest.adapters.mapping.types import (
     ExprType,
     TypeMismatch,
@@ -57,6 +58,17 @@ class AdapterLookup(Protocol):
         ...
 
 
+class CompiledRecord(Struct, frozen=True):
+    """The compiled content of one output of an adapter file."""
+
+    plan: ColumnPlan
+    """The record, or a list of records for each message."""
+    drops: tuple[TypedExpression, ...] = ()
+    """Conditions of which one is enough to drop a message."""
+    levels: int = 0
+    """The number of lists around the records of a message; 0 for one record per message."""
+
+
 class Compiler:
     """Compiles one adapter file.
 
@@ -72,28 +84,33 @@ class Compiler:
         self._adapters = adapters
 
     def record(
-        self, model: MappingFile, ontology: OntologyType, scope: Scope | None, variant: str | None
-    ) -> ColumnPlan | None:
-        """Compile the complete record; None after a finding or without a scope."""
+        self,
+        model: MappingFile,
+        record: RecordModel,
+        ontology: OntologyType,
+        scope: Scope | None,
+        variant: str | None,
+    ) -> CompiledRecord | None:
+        """Compile one output of a file; None after a finding or without a scope."""
         target = Target("", ontology.struct, (), scope, f"ontology {ontology.tag}")
         if model.variants is None:
-            return self._record(model, target, {})
+            return self._record(model, record, target, {})
         if variant is not None:
-            return self._record(model, target.at("variants", variant), dict(model.variants[variant]))
+            return self._record(model, record, target.at("variants", variant), dict(model.variants[variant]))
         for name, wrapper in model.variants.items():
             count = len(self._analyzer.findings)
-            self._record(model, target.at("variants", name), dict(wrapper))
+            self._record(model, record, target.at("variants", name), dict(wrapper))
             if (
                 len(self._analyzer.findings) > count
             ):  # The variants share `fields` and would repeat its findings.
                 break
         return None
 
-    def metadata(self, values: Mapping[str, Value], scope: Scope | None) -> dict[str, TypedExpression]:
+    def metadata(self, record: RecordModel, scope: Scope | None) -> dict[str, TypedExpression]:
         """Compile the expressions of `schema_metadata` that have no finding."""
         compiled: dict[str, TypedExpression] = {}
-        for key, value in values.items():
-            path = ("schema_metadata", key)
+        for key, value in record.schema_metadata.items():
+            path = (*record.path, "schema_metadata", key)
             try:
                 check_metadata({key: None}, where="")
             except SinkError as refused:
@@ -110,22 +127,82 @@ class Compiler:
                 compiled[key] = typed
         return compiled
 
-    def _record(self, model: MappingFile, target: Target, wrapper: dict[str, Value]) -> ColumnPlan | None:
+    def _record(
+        self, model: MappingFile, record: RecordModel, target: Target, wrapper: dict[str, Value]
+    ) -> CompiledRecord | None:
         of_text = wrapper.pop("of", None)
         of = self._of(target.at("of"), of_text)
         overrides = self._columns(wrapper, target)
-        inner = replace(target, path=("fields",), scope=self._analyzer.nested_scope(of, target.scope))
-        fields = self._columns(model.fields, inner, skip=wrapper.keys())
-        self._check_required(inner, {*model.fields, *wrapper})
+        payload = self._analyzer.nested_scope(of, target.scope)
+        flat = target.scope
+        if flat is not None and of is not None:
+            of_typed = of.typed
+            flat = None if of_typed is None else replace(flat, message=of_typed.type, subject=of_typed)
+        flat = self._bind(model.let, flat)
+        conditions = ((("drop_when",), model.drop_when), ((*record.path, "drop_when"), record.drop_when))
+        drops = [
+            self._condition(text, replace(target, path=path, scope=flat)) for path, text in conditions if text
+        ]
+        rows = self._rows(record, flat)
+        if record.rows is not None:
+            inner_scope = None if flat is None or rows is None else flat.nested(rows.type.element)
+        else:
+            inner_scope = flat if of is None else self._bind(model.let, payload)
+        inner = replace(target, path=(*record.path, "fields"), scope=inner_scope)
+        fields = self._columns(record.fields, inner, skip=wrapper.keys())
+        self._check_required(inner, {*record.fields, *wrapper})
         if (
-            target.scope is None
+            inner_scope is None
             or fields is None
             or overrides is None
+            or None in drops
             or (of_text is not None and of is None)
         ):
             return None
-        source = StructSource(of.typed if of else None, _all_fields(fields, target))
-        return ColumnPlan(target.title, "", target.type, nullable=False, source=source, overrides=overrides)
+        operand = rows or (of.typed if of else None)
+        source = StructSource(operand, _all_fields(fields, target))
+        type_, levels = target.type, 0 if rows is None else len(rows.type.axes)
+        for _ in range(levels):
+            type_ = arrays.list_(type_)
+        plan = ColumnPlan(target.title, "", type_, nullable=levels > 0, source=source, overrides=overrides)
+        return CompiledRecord(plan, tuple(drop for drop in drops if drop is not None), levels)
+
+    def _bind(self, values: Mapping[str, Scalar], scope: Scope | None) -> Scope | None:
+        """Return the scope with the bindings of `let`; None after a finding, so that no name is reported as unknown."""
+        complete = True
+        for name, value in values.items():
+            analyzed = self._analyzer.scalar(("let", name), value, scope)
+            if isinstance(analyzed, AnalyzedExpression) and is_short_cast(analyzed.node):
+                self._analyzer.report_inside(
+                    analyzed.path,
+                    analyzed.node.span,
+                    "function-arguments",
+                    "a binding has no column, so cast(x, 'type') needs the type",
+                    "write the type, or cast the value where it is used",
+                )
+                analyzed = None
+            typed = _typed(analyzed)
+            if scope is None or typed is None:
+                complete = False
+            elif complete:
+                scope = replace(scope, bindings={**scope.bindings, name: Binding(typed, scope.depth)})
+        return scope if complete else None
+
+    def _rows(self, record: RecordModel, scope: Scope | None) -> TypedExpression | None:
+        """Compile `rows`; None without it, or after a finding."""
+        if record.rows is None:
+            return None
+        path = (*record.path, "rows")
+        analyzed = self._analyzer.expression(path, record.rows, scope)
+        if analyzed is None or analyzed.typed is None:
+            return None
+        if not analyzed.typed.type.axes:
+            closed = analyzed.typed.type
+            hint = f"write {record.rows}[]" if is_list(closed.arrow) else "name a list, as in transforms[]"
+            message = f"`rows` takes the elements of a list, not {format_type(closed)}"
+            self._analyzer.report_inside(path, analyzed.node.span, "operand-type", message, hint)
+            return None
+        return analyzed.typed
 
     def _of(self, target: Target, text: Value) -> AnalyzedExpression | None:
         if text is None:
@@ -225,7 +302,8 @@ class Compiler:
         if condition is None or condition.typed is None:
             return None
         if condition.typed.type.axes or not pt.is_boolean(condition.typed.type.arrow):
-            message = f"`when` takes one boolean per row, not {format_type(condition.typed.type)}"
+            key = target.path[-1]
+            message = f"`{key}` takes one boolean per row, not {format_type(condition.typed.type)}"
             hint = "compare a number with x != 0, or reduce a list with any(…)"
             self._analyzer.report_inside(target.path, condition.node.span, "operand-type", message, hint)
             return None
@@ -306,11 +384,17 @@ class Compiler:
             self._analyzer.report_value(path, text, hint, rule="type-mismatch")
             return None
         try:
-            return spec.bind(replace(definition, root=message.msgtype), message.arrow)
+            adapter = spec.bind(replace(definition, root=message.msgtype), message.arrow)
         except AdapterError as error:
             text = f"{spec.name} does not fit the message: {error.what}"
             self._analyzer.report_value(path, text, error.hint, rule="type-mismatch")
             return None
+        if getattr(adapter, "is_plain", True):
+            return adapter
+        text = f"{spec.name} does not make exactly one row of each message"
+        hint = "use an adapter without drop_when, rows and outputs"
+        self._analyzer.report_value(path, text, hint, rule="type-mismatch")
+        return None
 
     def _map_lookup(
         self, form: ValueForm, entries: Mapping[Scalar, Scalar], target: Target

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from typing import TypeAlias
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.mapping.columns import (
@@ -32,11 +33,13 @@ from mosaico_ingest.adapters.mapping.expressions import (
     Conditional,
     Constant,
     ElementAt,
+    EnvelopeField,
     FieldAccess,
     FunctionCall,
     MakeList,
     MessageRef,
     OpenList,
+    OuterValue,
     TypedExpression,
 )
 from mosaico_ingest.adapters.mapping.functions.registry import RejectRows
@@ -56,9 +59,19 @@ class RowsRejected(Exception):  # noqa: N818 - control flow: the caller retries 
 class Evaluation:
     """The values of expressions over one batch; equal expressions are computed once."""
 
-    def __init__(self, rows: Array, envelope: Envelope) -> None:
+    def __init__(
+        self,
+        rows: Array,
+        envelope: Envelope,
+        *,
+        outer: Evaluation | None = None,
+        parents: NDArray[np.int64] | None = None,
+    ) -> None:
+        """Prepare the evaluation of a batch; `parents` is the row of `outer` to which each nested message belongs."""
         self.rows = rows
         self.envelope = envelope
+        self._outer = outer
+        self._parents = np.arange(len(rows)) if parents is None else parents
         self.target = ""
         """The path of the column being evaluated, for messages."""
         self._cache: dict[TypedExpression, Column] = {}
@@ -83,6 +96,22 @@ class Evaluation:
             ):  # Inside a branch, rows that do not take it may have invalid values.
                 self._cache[typed] = column
         return column
+
+    def enclosing(self, levels: int) -> tuple[Evaluation, NDArray[np.int64]]:
+        """Return an enclosing evaluation, and the row in it to which each row belongs."""
+        if levels == 0 or self._outer is None:
+            return self, np.arange(len(self))
+        outer, parents = self._outer.enclosing(levels - 1)
+        return outer, parents[self._parents]
+
+    def subset(self, accepted: Mask) -> Evaluation:
+        """Return the evaluation of some rows."""
+        return Evaluation(
+            self.rows.filter(arrays.array(accepted)),
+            self.envelope.take(accepted),
+            outer=self._outer,
+            parents=self._parents[accepted],
+        )
 
     def count(self, axes: tuple[Axis, ...]) -> int:
         """Return the number of values below some axes; without axes, the number of rows."""
@@ -137,10 +166,10 @@ class Evaluation:
 
     def _compute(self, typed: TypedExpression) -> Column:
         match typed:
-            case MessageRef():
-                return Column(self.rows)
-            case Constant():
-                return Column(_scalar(typed))
+            case MessageRef() | Constant() | EnvelopeField():
+                return self._leaf(typed)
+            case OuterValue():
+                return self._outer_value(typed)
             case FunctionCall():
                 return self._call(typed)
             case MakeList():
@@ -167,6 +196,49 @@ class Evaluation:
                     operand,
                     to_number(_as_array(operand), typed.target, self.rejecter(operand.axes, typed.text)),
                 )
+
+    def _leaf(self, typed: MessageRef | Constant | EnvelopeField) -> Column:
+        """Evaluate a node without operands."""
+        match typed:
+            case MessageRef():
+                return Column(self.rows)
+            case Constant():
+                return Column(_scalar(typed))
+            case EnvelopeField(name="topic"):
+                return Column(arrays.scalar(self.envelope.topic, arrays.string()))
+            case EnvelopeField(name="sequence"):
+                numbers = self.envelope.sequences
+                numbers = np.zeros(len(self), np.int64) if numbers is None else numbers
+                return Column(arrays.array(numbers.astype(np.uint32)))
+            case EnvelopeField():
+                published = self.envelope.publish_times if typed.name == "publish_time" else None
+                return Column(arrays.array(self.envelope.log_times if published is None else published))
+
+    def _outer_value(self, typed: OuterValue) -> Column:
+        """Return a value of an enclosing evaluation for each row; rows are rejected like those they belong to."""
+        outer, parents = self.enclosing(typed.levels)
+        accepted = np.ones(len(outer), bool)
+        rejections: dict[int, Rejection] = {}
+        while True:
+            index = np.flatnonzero(accepted)
+            part = outer if accepted.all() else outer.subset(accepted)
+            try:
+                values = part.evaluate(typed.operand).close_all(len(part))
+                break
+            except RowsRejected as error:
+                rejected = {int(index[row]): rejection for row, rejection in error.rejections.items()}
+                rejections |= rejected
+                accepted[list(rejected)] = False
+        if not rejections:
+            return Column(values.take(arrays.array(parents)))
+        of_rows = {
+            row: rejections[parent] for row, parent in enumerate(parents.tolist()) if parent in rejections
+        }
+        reject_by_rule(of_rows, len(self), self.rejecter((), None))
+        positions = np.full(len(outer), -1, np.int64)
+        positions[index] = np.arange(len(index))
+        positions = positions[parents]
+        return Column(values.take(arrays.array(np.maximum(positions, 0), mask=positions < 0)))
 
     def _aligned(self, columns: list[Column], text: str) -> tuple[list[Column], tuple[Axis, ...]]:
         """Broadcast columns to the same axes; rows whose lists differ in length are rejected."""
@@ -235,6 +307,14 @@ class Evaluation:
             if isinstance(only, pa.Array):
                 return Column(only, axes)
         return Column(pc.if_else(chosen, *branches), axes)
+
+
+def reject_by_rule(rejections: Mapping[int, Rejection], count: int, refuse: RejectRows) -> None:
+    """Reject elements, with one call per rule."""
+    for rule in dict.fromkeys(rule for rule, _ in rejections.values()):
+        bad = np.zeros(count, bool)
+        bad[[row for row, (own, _) in rejections.items() if own == rule]] = True
+        refuse(bad, rule, lambda i: rejections[i][1])
 
 
 def _scalar(typed: Constant) -> Array:

@@ -30,6 +30,24 @@ class MessageRef(ExpressionNode, frozen=True, eq=False):
     text: str = "self"
 
 
+class EnvelopeField(ExpressionNode, frozen=True, eq=False):
+    """A property of the message besides its content, such as `message.log_time`."""
+
+    name: str
+    type: ExprType
+    text: str = ""
+
+
+class OuterValue(ExpressionNode, frozen=True, eq=False):
+    """A value of an enclosing scope, repeated for the nested messages of each of its rows."""
+
+    operand: TypedExpression
+    levels: int
+    """The number of scopes between the expression and the operand."""
+    type: ExprType
+    text: str = ""
+
+
 class FieldAccess(ExpressionNode, frozen=True, eq=False):
     """A field of a message."""
 
@@ -89,6 +107,8 @@ class FunctionCall(ExpressionNode, frozen=True, eq=False):
     arguments: tuple[TypedExpression, ...]
     type: ExprType
     text: str = ""
+    names: tuple[str, ...] = ()
+    """The names of the arguments, for a function whose result depends on them."""
 
 
 class Conditional(ExpressionNode, frozen=True, eq=False):
@@ -111,4 +131,4 @@ class AnalyzedExpression(Struct, frozen=True):
     typed: TypedExpression | None
 
 
-TypedExpression: TypeAlias = "Constant | MessageRef | FieldAccess | OpenList | CloseList | ElementAt | MakeList | Cast | FunctionCall | Conditional"
+TypedExpression: TypeAlias = "Constant | MessageRef | EnvelopeField | OuterValue | FieldAccess | OpenList | CloseList | ElementAt | MakeList | Cast | FunctionCall | Conditional"

@@ -25,16 +25,16 @@ _ENVELOPE_COLUMN = "timestamp_ns"
 _LIST_OF_STRUCTS = "list"
 
 
-def inline_ontology_type(inline: InlineType, analyzer: Analyzer) -> OntologyType:
-    """Return the declared ontology type; fields with a finding are omitted."""
-    path: KeyPath = ("ontology", "fields")
+def inline_ontology_type(inline: InlineType, analyzer: Analyzer, base: KeyPath = ()) -> OntologyType:
+    """Return the ontology type declared below the key path `base`; fields with a finding are omitted."""
+    path: KeyPath = (*base, "ontology", "fields")
     if _ENVELOPE_COLUMN in inline.fields:
         message = f"{_ENVELOPE_COLUMN} is the column of the log time"
         analyzer.report((*path, _ENVELOPE_COLUMN), message, "rename the field")
     if inline.tag in MODULES:
         message = f"{inline.tag!r} is a built-in tag with its own columns"
         hint = f"write ontology: {inline.tag}, or choose another tag"
-        analyzer.report_value(("ontology", "tag"), message, hint)
+        analyzer.report_value((*base, "ontology", "tag"), message, hint)
     return OntologyType(inline.tag, pa.struct(_fields(inline.fields, path, analyzer)), inline.format)
 
 

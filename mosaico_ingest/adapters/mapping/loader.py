@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import keyword
+from collections.abc import Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,17 +13,20 @@ import numpy as np
 import pyarrow as pa
 from msgspec import Struct
 from msgspec.structs import replace
+from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from mosaico_ingest.adapters.adapter import Adapted, Envelope
 from mosaico_ingest.adapters.mapping.analyzer import Analyzer
-from mosaico_ingest.adapters.mapping.checker import Scope
+from mosaico_ingest.adapters.mapping.checker import RESERVED_NAMES, Binding, Scope, typed_constant
 from mosaico_ingest.adapters.mapping.column_plan import ColumnPlan, evaluate_column
+from mosaico_ingest.adapters.mapping.columns import open_list
 from mosaico_ingest.adapters.mapping.compiler import AdapterLookup, Compiler
 from mosaico_ingest.adapters.mapping.evaluator import Evaluation, Rejection, RowsRejected
 from mosaico_ingest.adapters.mapping.expressions import TypedExpression
+from mosaico_ingest.adapters.mapping.functions.registry import suggest
 from mosaico_ingest.adapters.mapping.inline_ontology import inline_ontology_type
-from mosaico_ingest.adapters.mapping.model import InlineType, MappingFile
+from mosaico_ingest.adapters.mapping.model import InlineType, MappingFile, RecordModel, Scalar, records_of
 from mosaico_ingest.adapters.mapping.types import ExprType
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.findings import Finding, RowFailure, Severity
@@ -40,6 +45,17 @@ _BindingKey: TypeAlias = tuple[str, int, tuple[MessageType, ...], pa.StructType]
 """What the compiled mapping depends on: root type, ROS version, message types, type of the rows."""
 
 
+class _OutputRows(Struct, frozen=True):
+    """The rows that one output has of a batch."""
+
+    rows: Any
+    """A struct array."""
+    messages: NDArray[np.int64]
+    """The position of each row's message in the batch."""
+    dropped: NDArray[np.bool_]
+    """Where `drop_when` is true."""
+
+
 class MappingAdapter(Struct, frozen=True):
     """A mapping bound to one message definition; implements `Adapter`."""
 
@@ -47,9 +63,22 @@ class MappingAdapter(Struct, frozen=True):
     record: ColumnPlan
     metadata: dict[str, TypedExpression]
     msgtype: str
+    drops: tuple[TypedExpression, ...] = ()
+    """Conditions of which one is enough to drop a message."""
+    levels: int = 0
+    """The number of lists around the records of a message; 0 for one record per message."""
+    others: tuple[MappingAdapter, ...] = ()
+    """The other outputs of the adapter file."""
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether each message that is not rejected becomes exactly one row."""
+        return not (self.drops or self.levels or self.others)
 
     def adapt(self, rows: pa.StructArray, envelope: Envelope) -> Adapted:
         """Adapt a batch; rows that do not fit become failures."""
+        if not self.is_plain:
+            return self._adapt_outputs(rows, envelope)
         try:
             adapted = evaluate_column(Evaluation(rows, envelope), self.record)
         except RowsRejected as error:
@@ -60,13 +89,62 @@ class MappingAdapter(Struct, frozen=True):
         """Adapt the rows that were not rejected; recursion ends because each round rejects at least one row."""
         accepted = np.ones(len(rows), bool)
         accepted[list(rejections)] = False
-        others = replace(envelope, log_times=envelope.log_times[accepted])
-        adapted = self.adapt(rows.filter(pa.array(accepted)), others)
+        adapted = self.adapt(rows.filter(pa.array(accepted)), envelope.take(accepted))
         index = np.flatnonzero(accepted).astype(np.int64)
         failures = [RowFailure(row, rule, reason) for row, (rule, reason) in rejections.items()]
         failures += [replace(failure, row=int(index[failure.row])) for failure in adapted.failures]
         failures.sort(key=lambda failure: failure.row)
         return Adapted(adapted.rows, index[adapted.index], tuple(failures))
+
+    def _adapt_outputs(self, rows: Any, envelope: Envelope) -> Adapted:  # noqa: ANN401 - an Arrow array
+        """Adapt a batch to any number of rows per message; a message that one output rejects has no row in any."""
+        accepted = np.ones(len(rows), bool)
+        rejections: dict[int, Rejection] = {}
+        while True:
+            index = np.flatnonzero(accepted).astype(np.int64)
+            part = rows if accepted.all() else rows.filter(pa.array(accepted))
+            parts: list[_OutputRows] = []
+            rejected: dict[int, Rejection] = {}
+            for output in (self, *self.others):
+                try:
+                    parts.append(output._rows_of(part, envelope.take(accepted)))  # noqa: SLF001 - the same class
+                except RowsRejected as error:  # noqa: PERF203 - one per output
+                    rejected = {**error.rejections, **rejected}
+            if not rejected:
+                break
+            rejections |= {int(index[row]): rejection for row, rejection in rejected.items()}
+            accepted[list(rejections)] = False
+        failures = tuple(RowFailure(row, *rejections[row]) for row in sorted(rejections))
+        dropped = _dropped(parts, index)
+        first, *others = [Adapted(one.rows, index[one.messages], failures, dropped=dropped) for one in parts]
+        return replace(first, others=tuple(others))
+
+    def _rows_of(self, rows: Any, envelope: Envelope) -> _OutputRows:  # noqa: ANN401 - an Arrow array
+        """Return the rows of this output.
+
+        Raises:
+            RowsRejected: Some messages do not fit.
+        """
+        evaluation = Evaluation(rows, envelope)
+        dropped = np.zeros(len(rows), bool)
+        for condition in self.drops:
+            dropped |= evaluation.mask(condition)
+        messages = np.flatnonzero(~dropped)
+        try:
+            values = evaluate_column(
+                evaluation.subset(~dropped) if dropped.any() else evaluation, self.record
+            )
+        except RowsRejected as error:
+            raise RowsRejected(
+                {int(messages[row]): rejection for row, rejection in error.rejections.items()}
+            ) from None
+        for _ in range(self.levels):
+            values, axis = open_list(values)
+            messages = messages[axis.parents]
+        if values.null_count:  # a null element of a list has no row
+            present = values.is_valid()
+            values, messages = values.filter(present), messages[np.asarray(present)]
+        return _OutputRows(values, messages, dropped)
 
     def topic_metadata(self, first_row: pa.StructScalar | None) -> dict[str, Any]:
         """Return the values of `schema_metadata` for a row; {} without a row, or if the row does not fit."""
@@ -83,6 +161,17 @@ class MappingAdapter(Struct, frozen=True):
             return {}
 
 
+def _dropped(parts: Sequence[_OutputRows], index: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
+    """Return the messages without a row in any output, by rule: `drop_when` of an output, or only empty lists."""
+    empty = np.ones(len(index), bool)
+    by_condition = np.zeros(len(index), bool)
+    for part in parts:
+        empty[part.messages] = False
+        by_condition |= part.dropped
+    masks = {"drop_when": empty & by_condition, "rows": empty & ~by_condition}
+    return {rule: index[mask] for rule, mask in masks.items() if mask.any()}
+
+
 @dataclass(frozen=True, slots=True)
 class MappingSpec:
     """A valid adapter file; implements `AdapterSpec`. It can be pickled if its adapter lookup can."""
@@ -93,6 +182,8 @@ class MappingSpec:
     ontology: OntologyType
     adapters: AdapterLookup | None = None
     """Finds the adapters that `use` names."""
+    output: str = ""
+    """The name of the output that the adapter makes; empty for the file as a whole, which binds to its first output."""
     _bindings: dict[_BindingKey, MappingAdapter] = field(
         default_factory=dict["_BindingKey", "MappingAdapter"], compare=False, repr=False
     )
@@ -105,8 +196,31 @@ class MappingSpec:
 
     @property
     def name(self) -> str:
-        """The adapter's name, such as `IMUAdapter`."""
-        return self.model.adapter
+        """The adapter's name, such as `IMUAdapter`, with the name of the output if it stands for one of several."""
+        return f"{self.model.adapter}.{self.output}" if self.output else self.model.adapter
+
+    @property
+    def outputs(self) -> tuple[MappingSpec, ...]:
+        """One spec for each output of the file; () if the file has no `outputs`."""
+        if self.output or self.model.outputs is None:
+            return ()
+        return tuple(
+            MappingSpec(self.model, self.origin, _known_ontology(record), self.adapters, name)
+            for name, record in records_of(self.model).items()
+        )
+
+    def with_parameters(self, values: Mapping[str, Scalar]) -> MappingSpec:
+        """Return the adapter with other values of its parameters.
+
+        Raises:
+            AdapterError: There is no such parameter, or a value has another type than the default.
+        """
+        for name, value in values.items():
+            problem, hint = parameter_problem(self.model.parameters, name, value)
+            if problem is not None:
+                raise AdapterError(f"{self.model.adapter}: {problem}", hint=hint)
+        model = self.model.model_copy(update={"parameters": {**self.model.parameters, **values}})
+        return MappingSpec(model, self.origin, self.ontology, self.adapters, self.output)
 
     @property
     def ros_types(self) -> tuple[str, ...]:
@@ -144,7 +258,7 @@ class MappingSpec:
 
     def __reduce__(self) -> tuple[type[MappingSpec], tuple[object, ...]]:
         """Pickle without the cache: compiled mappings are large and quickly rebuilt."""
-        return MappingSpec, (self.model, self.origin, self.ontology, self.adapters)
+        return MappingSpec, (self.model, self.origin, self.ontology, self.adapters, self.output)
 
     def _compile(
         self, definition: Definition, shape: pa.StructType
@@ -174,12 +288,55 @@ class MappingSpec:
     ) -> tuple[MappingAdapter | None, tuple[Finding, ...]]:
         analyzer = Analyzer(lambda: self.source)
         compiler = Compiler(analyzer, definition, self.adapters)
-        scope = Scope(ExprType(shape, msgtype=definition.root), definition.types)
-        record = compiler.record(self.model, self.ontology, scope, variant)
-        metadata = compiler.metadata(self.model.schema_metadata, scope)
-        if record is None:
+        parameters = {
+            name: Binding(typed_constant(value, name), 0) for name, value in self.model.parameters.items()
+        }
+        scope = Scope(
+            ExprType(shape, msgtype=definition.root), definition.types, parameters, has_envelope=True
+        )
+        adapters: dict[str, MappingAdapter] = {}
+        records = records_of(self.model)
+        own_name = self.output or next(iter(records))
+        for name, record in records.items():
+            ontology = self.ontology if name == own_name else _known_ontology(record)
+            compiled = compiler.record(self.model, record, ontology, scope, variant)
+            metadata = compiler.metadata(record, replace(scope, has_envelope=False))
+            if compiled is not None:
+                adapters[name] = MappingAdapter(
+                    ontology, compiled.plan, metadata, definition.root, compiled.drops, compiled.levels
+                )
+        own = adapters.pop(own_name, None)
+        if own is None or analyzer.findings:
             return None, tuple(analyzer.findings)
-        return MappingAdapter(self.ontology, record, metadata, definition.root), tuple(analyzer.findings)
+        return replace(own, others=tuple(adapters.values())), ()
+
+
+def parameter_problem(
+    defaults: Mapping[str, object], name: str, value: object
+) -> tuple[str | None, str | None]:
+    """Return the problem of a value for one of an adapter's parameters with its hint; None if it is valid."""
+    if name not in defaults:
+        hint = suggest(name, defaults) or f"its parameters are: {', '.join(defaults) or 'none'}"
+        return f"there is no parameter {name!r}", hint
+    default = defaults[name]
+    fits = default is None or type(value) is type(default)
+    if fits or (isinstance(default, float) and type(value) is int):
+        return None, None
+    return (
+        f"the parameter {name!r} is {value!r}, its default is {default!r}",
+        "write a value of the same type",
+    )
+
+
+def _known_ontology(record: RecordModel) -> OntologyType:
+    """Return the ontology type of an output that was checked when its file was loaded."""
+    if isinstance(record.ontology, InlineType):
+        return inline_ontology_type(record.ontology, Analyzer(_no_source), record.path)
+    return ontology_type(str(record.ontology))
+
+
+def _no_source() -> Source:
+    raise AssertionError
 
 
 def load_adapter(
@@ -231,22 +388,64 @@ def _load(source: Source, adapters: AdapterLookup | None) -> tuple[MappingSpec |
     if (model.ros_type is None) == (model.variants is None):
         message = "an adapter needs exactly one of ros_type and variants"
         analyzer.report(("adapter",), message, "give one of them")
-    ontology = _ontology(model, analyzer)
-    if ontology is None:
-        return None, tuple(analyzer.findings)
+    _check_keys(model, analyzer)
+    records = records_of(model)
+    ontologies = {name: _ontology(record, analyzer) for name, record in records.items()}
     compiler = Compiler(analyzer, None, adapters)
-    compiler.record(model, ontology, None, None)
-    compiler.metadata(model.schema_metadata, None)
+    for name, record in records.items():
+        ontology = ontologies[name]
+        if ontology is not None:
+            compiler.record(model, record, ontology, None, None)
+            compiler.metadata(record, None)
+    ontology = next(iter(ontologies.values()))
+    if ontology is None or None in ontologies.values():
+        return None, tuple(analyzer.findings)
     return MappingSpec(model, source, ontology, adapters), tuple(analyzer.findings)
 
 
-def _ontology(model: MappingFile, analyzer: Analyzer) -> OntologyType | None:
-    if isinstance(model.ontology, InlineType):
-        return inline_ontology_type(model.ontology, analyzer)
+def _check_keys(model: MappingFile, analyzer: Analyzer) -> None:
+    """Report keys that are missing or exclude each other, and names that cannot be bound."""
+    given = model.model_fields_set
+    single = ("ontology", "fields", "rows", "schema_metadata")
+    if model.outputs is None:
+        for key in ("ontology", "fields"):
+            if key not in given:
+                message = f"the adapter needs the key {key!r}"
+                analyzer.report(("adapter",), message, f"add {key}:, or outputs:", rule="missing-key")
+        return _check_names(model, analyzer)
+    for key in single:
+        if key in given:
+            message = f"{key!r} and 'outputs' exclude each other"
+            analyzer.report((key,), message, f"move {key} into each output", rule="conflicting-keys")
+    for name, wrapper in (model.variants or {}).items():
+        for key in wrapper.keys() - {"of"}:
+            message = "the variants of an adapter with outputs can only have the key 'of'"
+            analyzer.report(
+                ("variants", name, key), message, "move the column into an output", rule="field-form"
+            )
+    return _check_names(model, analyzer)
+
+
+def _check_names(model: MappingFile, analyzer: Analyzer) -> None:
+    for section, names in (("parameters", model.parameters), ("let", model.let)):
+        for name in names:
+            if name in RESERVED_NAMES or keyword.iskeyword(name):
+                message = f"{name!r} has another meaning in expressions"
+                analyzer.report((section, name), message, "choose another name")
+            elif section == "let" and name in model.parameters:
+                analyzer.report((section, name), f"{name!r} is a parameter", "choose another name")
+
+
+def _ontology(record: RecordModel, analyzer: Analyzer) -> OntologyType | None:
+    if record.ontology is None:
+        return None
+    if isinstance(record.ontology, InlineType):
+        return inline_ontology_type(record.ontology, analyzer, record.path)
     try:
-        return ontology_type(model.ontology)
+        return ontology_type(record.ontology)
     except UnknownTag as error:
-        analyzer.report_value(("ontology",), error.what, error.hint, rule="unknown-ontology")
+        path = (*record.path, "ontology")
+        analyzer.report_value(path, error.what, error.hint, rule="unknown-ontology")
         return None
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Annotated, Any, Literal, TypeAlias
 
+from msgspec import Struct
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag
 from pydantic_core import PydanticCustomError
 
@@ -29,6 +30,8 @@ TypeName: TypeAlias = Annotated[
     ),
 ]
 _NAME = r"^[A-Za-z_]\w*$"
+Identifier: TypeAlias = Annotated[str, Field(pattern=_NAME)]
+OutputName: TypeAlias = Annotated[str, Field(pattern=r"^[A-Za-z_]\w*(/[A-Za-z_]\w*)*$", examples=["battery"])]
 
 
 class _Strict(BaseModel):
@@ -120,6 +123,25 @@ class RecordedMessage(_Strict):
     """The position of the message within its topic, from 0."""
 
 
+class MessageProperties(_Strict):
+    """The properties of a message besides its content."""
+
+    log_time: int = 0
+    """Log time in ns since the epoch."""
+    publish_time: int | None = None
+    """Publish time in ns since the epoch; by default the log time."""
+    topic: str = ""
+    """The topic."""
+    sequence: Annotated[int, Field(ge=0)] = 0
+    """The sequence number."""
+
+
+Expected: TypeAlias = Annotated[
+    Annotated[Mapping[str, Any], Tag("one")] | Annotated[Sequence[Mapping[str, Any]], Tag("many")],
+    Discriminator(_one_or_many),
+]
+
+
 class AdapterTest(_Strict):
     """A test: a message, and the record or rejection to expect."""
 
@@ -129,16 +151,44 @@ class AdapterTest(_Strict):
     """The message type; by default the adapter's first."""
     given: Mapping[str, Any]
     """Fields of the message (all others are zero, empty or false), or `{bag, topic, index}`."""
-    expect: Mapping[str, Any] | None = None
-    """The expected record; fields that are not listed are not compared."""
+    message: MessageProperties | None = None
+    """The properties of the message besides its content; those of a recorded message are its own."""
+    parameters: Mapping[str, Scalar] = Field(default_factory=dict)
+    """Values of parameters; the others have their defaults."""
+    expect: Expected | None = None
+    """The expected record, a list of them for an adapter with `rows`, or either by output; fields that are not listed
+    are not compared."""
     rejects: str | None = None
-    """The row must be rejected with a reason that contains this text."""
+    """The message must be rejected with a reason that contains this text."""
+    drops: Literal[True] | None = None
+    """The message must have no row, because `drop_when` is true or the list of `rows` is empty."""
 
 
 TypeNames: TypeAlias = Annotated[
     Annotated[TypeName, Tag("one")] | Annotated[Sequence[TypeName], Field(min_length=1), Tag("many")],
     Discriminator(_one_or_many),
 ]
+
+
+OntologyReference: TypeAlias = Annotated[
+    Annotated[str, Tag("text")] | Annotated[InlineType, Tag("inline")], Discriminator(_type_or_text)
+]
+"""A known ontology tag, or the declaration of a type."""
+
+
+class Output(_Strict):
+    """One of several topics to which an adapter converts a message."""
+
+    ontology: OntologyReference
+    """The ontology type: a known tag, or a declaration."""
+    fields: Mapping[str, Value]
+    """Column → value."""
+    rows: str | None = None
+    """A list, as in `transforms[]`: each element becomes a row, and names in `fields` are looked up in the element."""
+    drop_when: str | None = None
+    """A condition; the output has no row of messages for which it is true."""
+    schema_metadata: Mapping[str, Value] = Field(default_factory=dict)
+    """Topic metadata, computed from the topic's first row."""
 
 
 class MappingFile(_Strict):
@@ -154,14 +204,23 @@ class MappingFile(_Strict):
     """The message type, or a list of types that all have the fields used."""
     variants: Annotated[Mapping[TypeName, Mapping[str, Value]], Field(min_length=1)] | None = None
     """Instead of `ros_type`: types that wrap the same payload. `of` selects the payload; other keys are columns."""
-    ontology: Annotated[
-        Annotated[str, Tag("text")] | Annotated[InlineType, Tag("inline")], Discriminator(_type_or_text)
-    ]
+    ontology: OntologyReference | None = None
     """The ontology type: a known tag, or a declaration."""
     default: bool = True
     """Whether the adapter applies to its types without an override."""
-    fields: Mapping[str, Value]
+    parameters: Mapping[Identifier, Scalar] = Field(default_factory=dict)
+    """Parameter → default value, for use by this name in expressions; a manifest sets parameters with
+    `load: [{file: …, with: {…}}]`."""
+    let: Mapping[Identifier, Scalar] = Field(default_factory=dict)
+    """Name → expression, for use by this name in later bindings, `drop_when`, `rows` and `fields`."""
+    drop_when: str | None = None
+    """A condition; messages for which it is true have no row and count as filtered."""
+    rows: str | None = None
+    """A list, as in `transforms[]`: each element becomes a row, and names in `fields` are looked up in the element."""
+    fields: Mapping[str, Value] | None = None
     """Column → value."""
+    outputs: Annotated[Mapping[OutputName, Output], Field(min_length=1)] | None = None
+    """Instead of `ontology` and `fields`: name below the topic → what the messages become there."""
     schema_metadata: Mapping[str, Value] = Field(default_factory=dict)
     """Topic metadata, computed from the topic's first row."""
     definition: str | None = None
@@ -179,9 +238,37 @@ class MappingFile(_Strict):
         return (self.ros_type,) if isinstance(self.ros_type, str) else tuple(self.ros_type)
 
 
+class RecordModel(Struct, frozen=True):
+    """What one output of an adapter file contains."""
+
+    path: tuple[str, ...]
+    """The key path of the output; () if the file has no `outputs`."""
+    ontology: str | InlineType | None
+    fields: Mapping[str, Value]
+    rows: str | None
+    drop_when: str | None
+    """The condition of the output besides that of the file."""
+    schema_metadata: Mapping[str, Value]
+
+
+def records_of(model: MappingFile) -> Mapping[str, RecordModel]:
+    """Return the outputs of an adapter file by name; an empty name stands for the only one of a file without `outputs`."""
+    if model.outputs is None:
+        return {
+            "": RecordModel((), model.ontology, model.fields or {}, model.rows, None, model.schema_metadata)
+        }
+    return {
+        name: RecordModel(
+            ("outputs", name), one.ontology, one.fields, one.rows, one.drop_when, one.schema_metadata
+        )
+        for name, one in model.outputs.items()
+    }
+
+
 @cache
 def adapter_schema() -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of adapter files, for validation and for completion in editors."""
     schema = tidy(schema_of(MappingFile))
-    takes = [{"required": ["ros_type"]}, {"required": ["variants"]}]
-    return {"$schema": DIALECT, "title": "mosaico-ingest adapter", **schema, "oneOf": takes}
+    takes = {"oneOf": [{"required": ["ros_type"]}, {"required": ["variants"]}]}
+    gives = {"oneOf": [{"required": ["ontology", "fields"]}, {"required": ["outputs"]}]}
+    return {"$schema": DIALECT, "title": "mosaico-ingest adapter", **schema, "allOf": [takes, gives]}

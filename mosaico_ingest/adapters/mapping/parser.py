@@ -321,12 +321,22 @@ class _Parser:
                 return Subscript(base, index, span)
             case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() as index)):
                 return Subscript(base, -index, span)
-            case _:
-                raise ExpressionError(
-                    "an index must be a number",
-                    self._span(node.slice),
-                    "write a[] for each element, a[0] for the first, a[-1] for the last",
+            case ast.Slice(step=None):
+                start = (
+                    Literal(0, span) if node.slice.lower is None else self.translate(node.slice.lower, depth)
                 )
+                stop = () if node.slice.upper is None else (self.translate(node.slice.upper, depth),)
+                return Call("slice", (base, start, *stop), span, span)
+            case ast.Slice():
+                raise ExpressionError(
+                    "a slice has no step",
+                    self._span(node.slice),
+                    "write a[1:3] for a part of a list, reverse(a) for the opposite order",
+                )
+            case ast.Tuple():
+                raise ExpressionError("a list has one index", self._span(node.slice), "write a[0][1]")
+            case _:
+                return Call("element", (base, self.translate(node.slice, depth)), span, span)
 
     def _list(self, node: ast.List, depth: int) -> Node:
         return ListLiteral(tuple(self.translate(item, depth) for item in node.elts), self._span(node))

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 import pyarrow as pa
 from msgspec import Struct
 from pydantic import ValidationError
 
-from mosaico_ingest.adapters.adapter import Envelope
-from mosaico_ingest.adapters.mapping.columns import Array, DataType, pt
+from mosaico_ingest.adapters.adapter import Adapted, Envelope
+from mosaico_ingest.adapters.mapping.columns import DataType, pt
 from mosaico_ingest.adapters.mapping.functions.registry import suggest
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
-from mosaico_ingest.adapters.mapping.model import AdapterTest, RecordedMessage
+from mosaico_ingest.adapters.mapping.model import AdapterTest, MessageProperties, RecordedMessage, records_of
 from mosaico_ingest.errors import BagError, IngestError
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, Resolver, normalize_msgtype
 
-ReadRecorded: TypeAlias = Callable[[RecordedMessage], "tuple[Definition, pa.StructArray]"]
-"""Reads one recorded message and returns its definition and a batch of one row in the ROS shape."""
+ReadRecorded: TypeAlias = Callable[[RecordedMessage], "tuple[Definition, pa.StructArray, Envelope]"]
+"""Reads one recorded message and returns its definition, a batch of one row in the ROS shape, and its envelope."""
 
 _RELATIVE, _ABSOLUTE = 1e-6, 1e-9
 """Tolerances for numbers: float32 columns keep about seven digits."""
@@ -65,13 +65,14 @@ def message_row(given: Mapping[str, Any], shape: DataType) -> tuple[dict[str, An
 def _run(
     spec: MappingSpec, case: AdapterTest, resolver: Resolver, recorded: ReadRecorded | None
 ) -> list[str]:
-    if case.expect is None and case.rejects is None:
-        return ["the test has neither expect nor rejects"]
+    if case.expect is None and case.rejects is None and not case.drops:
+        return ["the test has neither expect nor rejects nor drops"]
+    spec = spec.with_parameters(case.parameters) if case.parameters else spec
     if {"bag", "topic"} <= case.given.keys():
         if recorded is None:
             return ["recorded messages cannot be read here"]
         try:
-            definition, rows = recorded(RecordedMessage.model_validate(case.given))
+            definition, rows, envelope = recorded(RecordedMessage.model_validate(case.given))
         except ValidationError as error:
             return [f"given: {detail['loc'][-1]}: {detail['msg']}" for detail in error.errors()]
     else:
@@ -84,7 +85,17 @@ def _run(
             rows = pa.array([row], shape)
         except (pa.ArrowException, OverflowError, TypeError, ValueError) as error:
             return [f"given does not fit {definition.root}: {error}"]
-    return _compare(spec, case, definition, rows)
+        envelope = _envelope(case.message or MessageProperties(), definition)
+    adapted = spec.bind(definition, rows.type).adapt(cast("pa.StructArray", rows), envelope)
+    return _outcome_problems(case, adapted) or _compare(spec, case, adapted)
+
+
+def _envelope(message: MessageProperties, definition: Definition) -> Envelope:
+    published = message.log_time if message.publish_time is None else message.publish_time
+    log_times, publish_times, sequences = (
+        np.array([value], np.int64) for value in (message.log_time, published, message.sequence)
+    )
+    return Envelope(message.topic, definition.root, log_times, publish_times, sequences)
 
 
 def _definition(spec: MappingSpec, case: AdapterTest, resolver: Resolver) -> Definition:
@@ -101,23 +112,53 @@ def _definition(spec: MappingSpec, case: AdapterTest, resolver: Resolver) -> Def
             raise BagError(unknown.what, where=unknown.where, hint=hint) from unknown
 
 
-def _compare(spec: MappingSpec, case: AdapterTest, definition: Definition, rows: Array) -> list[str]:
-    adapter = spec.bind(definition, rows.type)
-    adapted = adapter.adapt(rows, Envelope("", definition.root, np.zeros(len(rows), np.int64)))
-    if adapted.failures:
-        reason = adapted.failures[0].reason
-        if case.rejects is None:
-            return [f"the row is rejected: {reason}"]
-        return (
-            []
-            if case.rejects in reason
-            else [f"rejected, but the reason does not contain {case.rejects!r}: {reason}"]
-        )
-    if case.rejects is not None:
-        return [f"the row is accepted; expected a rejection with {case.rejects!r}"]
+def _outcome_problems(case: AdapterTest, adapted: Adapted) -> list[str]:
+    """Return why the message is not accepted, rejected or dropped as expected."""
+    reason = adapted.failures[0].reason if adapted.failures else None
+    if reason is not None and case.rejects is None:
+        return [f"the row is rejected: {reason}"]
+    if case.rejects is not None and case.rejects not in (reason or ""):
+        if reason is None:
+            return [f"the row is accepted; expected a rejection with {case.rejects!r}"]
+        return [f"rejected, but the reason does not contain {case.rejects!r}: {reason}"]
+    if bool(adapted.dropped) != bool(case.drops):
+        rule = next(iter(adapted.dropped), None)
+        return [f"the message is dropped by `{rule}`" if rule else "the message is not dropped"]
+    return []
+
+
+def _compare(spec: MappingSpec, case: AdapterTest, adapted: Adapted) -> list[str]:
+    """Return the differences between the rows of a message and the expected ones."""
     problems: list[str] = []
-    _differences(case.expect, adapted.rows[0].as_py(), adapted.rows.type, "", problems)
+    if case.rejects is not None or case.drops:
+        return problems
+    outputs = [output.output for output in spec.outputs]
+    if not outputs:
+        _compare_rows(case.expect, adapted, has_list=spec.model.rows is not None, path="", problems=problems)
+        return problems
+    if not isinstance(case.expect, Mapping):
+        return [f"expect must be a mapping with the outputs {', '.join(outputs)}"]
+    problems += [
+        f"expect: unknown output {name}; {suggest(name, outputs) or 'there are ' + ', '.join(outputs)}"
+        for name in case.expect.keys() - set(outputs)
+    ]
+    records = records_of(spec.model)
+    for name, rows in zip(outputs, (adapted, *adapted.others), strict=True):
+        if name in case.expect:
+            has_list = records[name].rows is not None
+            _compare_rows(case.expect[name], rows, has_list=has_list, path=name, problems=problems)
     return problems
+
+
+def _compare_rows(expected: Any, adapted: Adapted, *, has_list: bool, path: str, problems: list[str]) -> None:  # noqa: ANN401 - values of a test
+    """Compare the rows of one output with the expected record, or with the expected list of records."""
+    rows: Any = adapted.rows
+    if has_list or expected is None or isinstance(expected, list):
+        _differences(expected or [], rows.to_pylist(), pa.list_(rows.type), path, problems)
+    elif len(rows):
+        _differences(expected, rows[0].as_py(), rows.type, path, problems)
+    else:
+        problems.append(f"{path}: expected a row, but there is none")
 
 
 def _with_defaults(

@@ -6,6 +6,7 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
+from mosaico_ingest.job.adapter_reference import reference_of
 from mosaico_ingest.lint.job import Job, find_module, load_mapping_source, python_reference
 from mosaico_ingest.lint.rule import Check, Problem
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
@@ -15,9 +16,9 @@ from mosaico_ingest.textfile import read_limited
 def check(job: Job) -> Iterator[Problem]:
     """Report each adapter in `load` for a message type that an earlier adapter takes by default."""
     owners: dict[str, tuple[str, int]] = {}
-    references = dict.fromkeys(filter(job.is_expanded, job.manifest.adapters.load))
-    for reference in references:
-        span = job.span("adapters", "load", job.manifest.adapters.load.index(reference))
+    loaded = list(map(reference_of, job.manifest.adapters.load))
+    for reference in dict.fromkeys(filter(job.is_expanded, loaded)):
+        span = job.span("adapters", "load", loaded.index(reference))
         types = dict.fromkeys(map(normalize_msgtype, _default_types(job, reference)))
         for msgtype in types:
             if msgtype in owners:

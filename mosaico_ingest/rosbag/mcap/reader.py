@@ -413,4 +413,7 @@ def _block(records: Bytes, heads: NDArray[np.void], starts: Int64s, offsets: Int
     times = np.ascontiguousarray(heads["time"])
     published = heads["published"]
     publish_times = None if np.array_equal(published, times) else np.ascontiguousarray(published)
-    return MessageBlock(-1, times, records, starts + _MESSAGE_HEAD.itemsize, lengths, offsets, publish_times)
+    numbers = heads["sequence"]
+    sequences = numbers.astype(np.int64) if numbers.any() else None
+    starts = starts + _MESSAGE_HEAD.itemsize
+    return MessageBlock(-1, times, records, starts, lengths, offsets, publish_times, sequences)

@@ -50,7 +50,7 @@ def _total(expr_type: ExprType) -> ExprType:
     return integer_result() if int_bounds(element.arrow) else float_result(element)
 
 
-def _fold(values: NDArray[Any], axis: Axis, run: np.ufunc, empty: Any) -> NDArray[Any]:  # noqa: ANN401 - a number
+def fold(values: NDArray[Any], axis: Axis, run: np.ufunc, empty: Any) -> NDArray[Any]:  # noqa: ANN401 - a number
     """Reduce the elements of each row; `empty` is the result for an empty row."""
     filled = axis.lengths > 0
     result = np.full(len(filled), empty, values.dtype)
@@ -60,7 +60,7 @@ def _fold(values: NDArray[Any], axis: Axis, run: np.ufunc, empty: Any) -> NDArra
     return result
 
 
-def _absent(elements: Array, axis: Axis) -> NDArray[np.bool_]:
+def absent_rows(elements: Array, axis: Axis) -> NDArray[np.bool_]:
     """Return which rows are null or contain a null."""
     absent = np.zeros(len(axis.lengths), bool) if axis.null is None else axis.null.copy()
     if elements.null_count:
@@ -85,24 +85,24 @@ def sum_(refuse: RejectRows, x: Array) -> Array:
     """Sum of the elements; 0 for an empty list."""
     elements, axis = open_list(x)
     values = _plain(elements)
-    total = _fold(values, axis, np.add, 0)
+    total = fold(values, axis, np.add, 0)
     if values.dtype != np.float64:
-        near = np.abs(_fold(values.astype(np.float64), axis, np.add, 0)) > _NEAR_OVERFLOW
+        near = np.abs(fold(values.astype(np.float64), axis, np.add, 0)) > _NEAR_OVERFLOW
         for row in np.flatnonzero(near):
             exact = sum(values[axis.offsets[row] : axis.offsets[row + 1]].tolist())
             near[row] = not INT64[0] <= exact <= INT64[1]
         if near.any():
             refuse(near, "overflow", lambda _: "the sum has more than 64 bits")
         total = total.astype(np.int64)
-    return arrays.array(total, mask=_absent(elements, axis))
+    return arrays.array(total, mask=absent_rows(elements, axis))
 
 
 @function(NUMBERS, returns=_mean_type)
 def mean(x: Array) -> Array:
     """Mean of the elements; null for an empty list."""
     elements, axis = open_list(x)
-    total = _fold(_plain(elements).astype(np.float64), axis, np.add, 0)
-    mask = _absent(elements, axis) | (axis.lengths == 0)
+    total = fold(_plain(elements).astype(np.float64), axis, np.add, 0)
+    mask = absent_rows(elements, axis) | (axis.lengths == 0)
     return arrays.array(total / np.maximum(axis.lengths, 1), mask=mask)
 
 
@@ -133,15 +133,15 @@ def _norm(x: Array) -> Array:
             total += np.square(np.asarray(pc.fill_null(member, 0.0)))
         return arrays.array(np.sqrt(total), mask=absent)
     elements, axis = open_list(x)
-    total = _fold(np.square(_plain(elements).astype(np.float64)), axis, np.add, 0.0)
-    return arrays.array(np.sqrt(total), mask=_absent(elements, axis))
+    total = fold(np.square(_plain(elements).astype(np.float64)), axis, np.add, 0.0)
+    return arrays.array(np.sqrt(total), mask=absent_rows(elements, axis))
 
 
 def _extreme(x: Array, run: np.ufunc) -> Array:
     elements, axis = open_list(x)
     values = np.asarray(pc.fill_null(elements, 0))
-    mask = _absent(elements, axis) | (axis.lengths == 0)
-    return arrays.array(_fold(values, axis, run, 0), mask=mask)
+    mask = absent_rows(elements, axis) | (axis.lengths == 0)
+    return arrays.array(fold(values, axis, run, 0), mask=mask)
 
 
 @function(NUMBERS, returns=_element)
@@ -159,7 +159,7 @@ def greatest(x: Array) -> Array:
 def _logic(x: Array, run: np.ufunc, empty: bool) -> Array:  # noqa: FBT001 - the neutral element, not a switch
     elements, axis = open_list(x)
     values = np.asarray(pc.fill_null(elements, empty)).astype(bool)
-    return arrays.array(_fold(values, axis, run, empty), mask=_absent(elements, axis))
+    return arrays.array(fold(values, axis, run, empty), mask=absent_rows(elements, axis))
 
 
 @function(BOOLEANS, returns=arrays.bool_(), name="any")

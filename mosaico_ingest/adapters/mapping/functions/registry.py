@@ -5,10 +5,12 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from difflib import get_close_matches
+from functools import partial
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 
 from mosaico_ingest.adapters.mapping.columns import Array, DataType, Mask, arrays, pc, pt
 from mosaico_ingest.adapters.mapping.types import (
@@ -41,6 +43,8 @@ class Parameter(Struct, frozen=True):
     """The argument must be a literal in the expression; the function receives it as a Python value."""
     check_literal: Callable[[str], str | None] | None = None
     """Returns the problem of a literal text, None if it is valid."""
+    of_elements: bool = False
+    """The argument is evaluated for each element of the first argument, and names refer to that element."""
 
     def takes(self, expr_type: ExprType) -> bool:
         """Return whether an argument of a type is accepted; null always is."""
@@ -68,6 +72,10 @@ class Function(Struct, frozen=True):
     """Whether a literal null reaches `apply`; otherwise it makes the result null."""
     refuses: bool = False
     """Whether `apply` takes a `RejectRows` as its first argument."""
+    named: bool = False
+    """Whether `result_type` and `apply` take the names of the arguments as the keyword `names`."""
+    check_literals: Callable[..., str | None] | None = None
+    """Returns the problem of the literals of a call together, None if they are valid."""
     parameters: tuple[str, ...] = ()
     summary: str = ""
 
@@ -86,6 +94,15 @@ class Function(Struct, frozen=True):
     def parameter(self, position: int) -> Parameter:
         """Return the parameter of an argument."""
         return self.parameter_types[min(position, len(self.parameter_types) - 1)]
+
+    def with_names(self, names: tuple[str, ...]) -> Function:
+        """Return the function for arguments of these names."""
+        return replace(
+            self,
+            result_type=partial(self.result_type, names=names),
+            apply=partial(self.apply, names=names),
+            named=False,
+        )
 
     def _arity(self) -> str:
         maximum = len(self.parameter_types)
@@ -107,6 +124,8 @@ def function(
     variadic: bool = False,
     scalars: bool = False,
     sees_null: bool = False,
+    named: bool = False,
+    check_literals: Callable[..., str | None] | None = None,
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Add a function to the language; the first line of its docstring is its documentation.
 
@@ -119,7 +138,9 @@ def function(
 
     def register(apply: Callable[..., Any]) -> Callable[..., Any]:
         signature = inspect.signature(apply).parameters
-        names = tuple(name for name, p in signature.items() if p.kind is not p.VAR_POSITIONAL)
+        names = tuple(
+            name for name, p in signature.items() if p.kind not in {p.VAR_POSITIONAL, p.KEYWORD_ONLY}
+        )
         refuses = names[:1] == ("refuse",)
         function_name = name or apply.__name__.rstrip("_")
         other = _FUNCTIONS.get(function_name)
@@ -139,6 +160,8 @@ def function(
             scalars=scalars,
             sees_null=sees_null,
             refuses=refuses,
+            named=named,
+            check_literals=check_literals,
             parameters=names[refuses:],
             summary=(apply.__doc__ or "").strip().split("\n", maxsplit=1)[0],
         )
