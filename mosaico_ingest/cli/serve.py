@@ -207,7 +207,7 @@ def _size(text: str, option: str) -> int:
     try:
         return parse_size(text)
     except ValueError as error:
-        raise ManifestError(f"{option}: {error}", hint="write a size such as 64MiB") from error
+        raise ManifestError(f"{option}: {error}") from error
 
 
 def check_key_file(file: Path) -> None:

@@ -59,8 +59,9 @@ class Service(fl.FlightServerBase):
         keyring: Keyring | None,
         certificates: list[tuple[bytes, bytes]] | None,
         request_s: float,
-        guard: Guard,
+        guard: Guard | None = None,
     ) -> None:
+        guard = guard or Guard(NO_LIMITS, AuditLog(None))
         self._guard = guard
         self._uploads = Uploads(store)
         self._flights = Flights(store, self._uploads)
