@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -63,12 +64,16 @@ class DictDecoder:
 
     def decode(self, block: MessageBlock) -> Decoded:
         """Decode all messages of the block."""
+        return self.decode_payloads(block.payload(row) for row in range(len(block)))
+
+    def decode_payloads(self, payloads: Iterable[bytes]) -> Decoded:
+        """Decode messages that are not in a block."""
         values: list[dict[str, Any]] = []
         index: list[int] = []
         failures: list[RowFailure] = []
-        for row in range(len(block)):
+        for row, payload in enumerate(payloads):
             try:
-                values.append(self._reader.to_dict(block.payload(row)))
+                values.append(self._reader.to_dict(payload))
                 index.append(row)
             except DecodeError as error:  # noqa: PERF203 - each message may fail
                 failures.append(RowFailure(row, error.rule, str(error)))

@@ -7,17 +7,17 @@ confirmed ones. `JsonCodec`, which asks jsonschema, decodes all other messages.
 from __future__ import annotations
 
 import io
-from typing import Any, cast
+from collections.abc import Callable, Iterable
+from typing import Any, TypeAlias
 
 import msgspec
 import numpy as np
 import pyarrow as pa
+from msgspec.structs import replace
 from numpy.typing import NDArray
 from pyarrow.json import ParseOptions, ReadOptions, read_json
 
 from mosaico_ingest.decode.base import Decoded, DictDecoder, merge_parts
-from mosaico_ingest.errors import DecodeError
-from mosaico_ingest.findings import RowFailure
 from mosaico_ingest.rosbag.blocks import MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
@@ -64,9 +64,12 @@ class JsonDecoder:
         return merge_parts(parts)
 
     def _by_rows(self, block: MessageBlock) -> Decoded:
-        self._codec.undeclared.clear()
-        decoded = DictDecoder(self._shape, self._codec).decode(block)
-        return msgspec.structs.replace(decoded, undeclared=frozenset(self._codec.undeclared))
+        return self._with_reader(self._codec.read, (block.payload(row) for row in range(len(block))))
+
+    def _with_reader(self, read: _Read, payloads: Iterable[bytes]) -> Decoded:
+        reader = _Reader(read, set())
+        decoded = DictDecoder(self._shape, reader).decode_payloads(payloads)
+        return replace(decoded, undeclared=frozenset(reader.undeclared))
 
     def _confirmed(self, payloads: list[bytes]) -> NDArray[np.bool_]:
         """Return which messages are certainly valid JSON objects that satisfy the schema."""
@@ -112,26 +115,29 @@ class JsonDecoder:
             shaped = _shaped(rows, self._columns, self._shape, "$", undeclared)
         except ValueError:
             return None
-        return _complete(shaped, len(payloads), undeclared)
+        index = np.arange(len(payloads), dtype=np.int64)
+        return Decoded(shaped, index, (), undeclared=frozenset(undeclared))
 
     def _by_values(self, payloads: list[bytes]) -> Decoded:
         """Decode confirmed messages to Python objects, and these to columns."""
-        undeclared: set[str] = set()
-        values: list[dict[str, Any]] = []
-        index: list[int] = []
-        failures: list[RowFailure] = []
-        for row, payload in enumerate(payloads):
-            try:
-                values.append(self._columns.to_column(msgspec.json.decode(payload), "$", undeclared))
-                index.append(row)
-            except DecodeError as error:  # noqa: PERF203 - each message may fail
-                failures.append(RowFailure(row, error.rule, str(error)))
-        rows = cast("pa.StructArray", pa.array(values, type=self._shape))
-        return Decoded(rows, np.array(index, np.int64), tuple(failures), undeclared=frozenset(undeclared))
+        return self._with_reader(self._read_confirmed, payloads)
+
+    def _read_confirmed(self, payload: bytes, undeclared: set[str]) -> dict[str, Any]:
+        return self._columns.to_column(msgspec.json.decode(payload), "$", undeclared)
 
 
-def _complete(rows: Any, count: int, undeclared: set[str]) -> Decoded:  # noqa: ANN401 - a struct array
-    return Decoded(rows, np.arange(count, dtype=np.int64), (), undeclared=frozenset(undeclared))
+_Read: TypeAlias = Callable[[bytes, set[str]], "dict[str, Any]"]
+"""Returns the fields of a message, and adds the fields without a column to a set."""
+
+
+class _Reader(msgspec.Struct, frozen=True):
+    """A `MessageReader` that collects the fields without a column; one per block, because decoders have no state."""
+
+    read: _Read
+    undeclared: set[str]
+
+    def to_dict(self, payload: bytes) -> dict[str, Any]:
+        return self.read(payload, self.undeclared)
 
 
 def _parsed_schema(columns: JsonType) -> pa.Schema:

@@ -31,8 +31,6 @@ class JsonCodec:
         self.columns = columns_of(definition)
         text = definition.text
         self._validator = validator_of(text, definition.root) if text.strip() else None
-        self.undeclared: set[str] = set()
-        """The fields without a column that the messages contained so far."""
 
     def to_dict(self, payload: bytes) -> dict[str, Any]:
         """Return the message's fields by name.
@@ -40,6 +38,10 @@ class JsonCodec:
         Raises:
             DecodeError: The payload is not a JSON object, violates the schema, or has a value that fits no column.
         """
+        return self.read(payload, set())
+
+    def read(self, payload: bytes, undeclared: set[str]) -> dict[str, Any]:
+        """Return the message's fields by name, as `to_dict`; add the fields without a column to `undeclared`."""
         try:
             value = json.loads(payload)
         except (ValueError, RecursionError) as error:
@@ -47,15 +49,7 @@ class JsonCodec:
         if not isinstance(value, dict):
             raise DecodeError(f"the message is not an object: {json.dumps(value)[:80]}", rule="json-syntax")
         self._validate(value)
-        return self.to_columns(value)
-
-    def to_columns(self, value: object) -> dict[str, Any]:
-        """Return the fields of a valid message.
-
-        Raises:
-            DecodeError: A value fits no column.
-        """
-        return self.columns.to_column(value, "$", self.undeclared)
+        return self.columns.to_column(value, "$", undeclared)
 
     def from_dict(self, values: Mapping[str, Any]) -> bytes:
         """Return the payload of a message in the form that `to_dict` returns.

@@ -16,7 +16,7 @@ from functools import lru_cache
 from typing import Annotated, Any, Literal, cast
 
 import msgspec
-from jsonschema import validators
+from jsonschema import Draft202012Validator, validators
 from jsonschema.exceptions import SchemaError
 from jsonschema.protocols import Validator
 from msgspec import UNSET, Meta, UnsetType
@@ -87,20 +87,18 @@ def json_type(text: str, name: str) -> JsonType:
 def validator_of(text: str, name: str) -> Validator:
     """Return the validator of a JSON Schema, in the draft that it names; the default is 2020-12."""
     schema = _parse(text, name)
-    kind = validators.validator_for(schema, default=validators.validator_for({"$schema": _LATEST}))
-    return kind(schema, registry=Registry())  # this registry never downloads schemas
+    return _draft_of(schema)(schema, registry=Registry())  # this registry never downloads schemas
 
 
-_LATEST = "https://json-schema.org/draft/2020-12/schema"
+def _draft_of(schema: Any) -> type[Validator]:  # noqa: ANN401 - an object or a boolean
+    return validators.validator_for(schema, default=Draft202012Validator)
 
 
 @lru_cache(maxsize=64)
 def _parse(text: str, name: str) -> Any:  # noqa: ANN401 - an object or a boolean
     try:
         schema = json.loads(text)
-        validators.validator_for(schema, default=validators.validator_for({"$schema": _LATEST})).check_schema(
-            schema
-        )
+        _draft_of(schema).check_schema(schema)
     except (ValueError, RecursionError) as error:
         raise BagError(f"the schema is not JSON: {error}", where=name) from error
     except SchemaError as error:

@@ -188,12 +188,9 @@ def _add_types(struct: JsonType, name: str, types: dict[str, MessageType]) -> No
 
 def _free_name(struct: JsonType, path: str, types: dict[str, MessageType]) -> str:
     """Return the title of a struct, or its path if another struct has the same title."""
-    known = types.get(struct.name)
-    if not struct.name or (
-        known is not None and tuple(_names(struct)) != tuple(one.name for one in known.fields)
-    ):
-        return path
-    return struct.name
+    other = types.get(struct.name)
+    is_taken = other is not None and list(_names(struct)) != [field.name for field in other.fields]
+    return path if is_taken or not struct.name else struct.name
 
 
 def _names(struct: JsonType) -> Iterator[str]:

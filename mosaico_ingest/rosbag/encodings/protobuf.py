@@ -75,8 +75,8 @@ def read_schema(name: str, embedded: Embedded | None) -> Definition:
         BagError: There is no schema, it is not a FileDescriptorSet with this type, or it has too many fields.
     """
     if embedded is None or embedded.encoding != "protobuf":
-        found = "no schema" if embedded is None else f"a schema in {embedded.encoding!r}"
-        raise BagError(f"the protobuf channel has {found}; it needs a FileDescriptorSet", where=name or None)
+        schema = "no schema" if embedded is None else f"a schema in {embedded.encoding!r}"
+        raise BagError(f"the protobuf channel has {schema}; it needs a FileDescriptorSet", where=name or None)
     descriptor = _descriptor(name, embedded.text)
     types: dict[str, MessageType] = {}
     _add_types(descriptor, types)
@@ -176,16 +176,7 @@ def _owner(field: FieldDescriptor) -> Descriptor:
 
 def _reaches(start: Descriptor, goal: Descriptor) -> bool:
     """Return whether a message contains messages of another type, at any depth; a type contains itself."""
-    visited: set[str] = set()
-    waiting = [start]
-    while waiting:
-        message = waiting.pop()
-        if message.full_name == goal.full_name:
-            return True
-        if message.full_name not in visited:
-            visited.add(message.full_name)
-            waiting += [field.message_type for field in message.fields if field.message_type is not None]
-    return False
+    return any(message.full_name == goal.full_name for message in _messages_in(start))
 
 
 class _Budget:
@@ -264,14 +255,19 @@ def _constants(message: Descriptor) -> Iterator[Constant]:
 
 def requires_fields(message: Descriptor) -> bool:
     """Return whether a message or a message in it has required fields, which only proto2 has."""
-    visited: dict[str, Descriptor] = {}
+    return any(field.is_required for each in _messages_in(message) for field in each.fields)
+
+
+def _messages_in(message: Descriptor) -> Iterator[Descriptor]:
+    """Yield a message type and the types of all messages in it, at any depth."""
+    visited: set[str] = set()
     waiting = [message]
     while waiting:
-        one = waiting.pop()
-        if one.full_name not in visited:
-            visited[one.full_name] = one
-            waiting += [field.message_type for field in one.fields if field.message_type is not None]
-    return any(field.is_required for one in visited.values() for field in one.fields)
+        each = waiting.pop()
+        if each.full_name not in visited:
+            visited.add(each.full_name)
+            yield each
+            waiting += [field.message_type for field in each.fields if field.message_type is not None]
 
 
 class ProtobufCodec:
