@@ -547,14 +547,23 @@ class Job(JobSettings):
         """Return the settings of a topic, each from the topic's name or else from the first glob that defines the setting."""
         return combined_settings(self.topic_settings, topic)
 
+    def check_name(self) -> Self:
+        """Return the job if the platform accepts its name.
+
+        Raises:
+            ManifestError: The platform refuses the name.
+        """
+        with _located(self, "sequence", "name"):
+            check_sequence_name(self.sequence.name)
+        return self
+
     def check(self) -> Self:
         """Return the job if the platform accepts its names and metadata.
 
         Raises:
             ManifestError: The platform refuses a name or metadata, or a run uses the metadata key itself.
         """
-        with _located(self, "sequence", "name"):
-            check_sequence_name(self.sequence.name)
+        self.check_name()
         with _located(self, "sequence", "metadata"):
             check_metadata(self.sequence.metadata, where="")
         if PROVENANCE_KEY in self.sequence.metadata:

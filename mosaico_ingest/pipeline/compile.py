@@ -112,12 +112,13 @@ def _fill(placeholder: Placeholder, recording: Recording) -> str:
         return f"{changed:%Y-%m-%d}"
     if main.name in {"", ".."}:  # such as `bag.path: ..`
         main = main.resolve()
-    texts = {
-        "stem": recording.group or RECORDING_NAME.sub("", main.name),
-        "name": main.name,
-        "parent": main.resolve().parent.name,
-    }
-    return _REFUSED.sub("_", texts[placeholder.name]).strip("_")
+    if placeholder.name == "parent":
+        text = main.resolve().parent.name  # a request to the file system, like the date
+    else:
+        text = (
+            main.name if placeholder.name == "name" else recording.group or RECORDING_NAME.sub("", main.name)
+        )
+    return _REFUSED.sub("_", text).strip("_")
 
 
 def _matches(loaded: LoadedManifest, pattern: str, key_path: tuple[str | int, ...]) -> list[AnyPath]:
@@ -128,12 +129,17 @@ def _matches(loaded: LoadedManifest, pattern: str, key_path: tuple[str | int, ..
     where = loaded.where(*key_path)
     if not has_magic(without_options(pattern)):
         raise NothingMatched(f"no such file or directory: {path}", where=where, hint=_nearby(path))
-    found: list[AnyPath] = sorted(_glob(path))
+    found: list[AnyPath] = sorted(_glob(path), key=_order)
     recordings = [match for match in found if _is_recording(match)]
     if not recordings:
         only = f"; it matches {len(found)} other files" if found else ""
         raise NothingMatched(f"no recording matches {path}{only}", where=where, hint=_nearby(path))
     return recordings
+
+
+def _order(path: AnyPath) -> tuple[str, ...]:
+    """Return the sort key of a path; comparing paths themselves takes several times as long."""
+    return (path.root, path.key) if isinstance(path, RemotePath) else path.parts
 
 
 def _glob(path: AnyPath) -> Iterator[AnyPath]:
@@ -150,7 +156,8 @@ def _glob(path: AnyPath) -> Iterator[AnyPath]:
             part if part == "**" else re.sub(r"\*+", "*", part) for part in path.relative_to(fixed).parts
         )
         pattern = "/".join(parts)
-        found = ((match, match.relative_to(fixed).as_posix()) for match in fixed.glob(pattern))
+        depth = len(fixed.parts)
+        found = ((match, "/".join(match.parts[depth:])) for match in fixed.glob(pattern))
     yield from (match for match, below in found if _is_hidden(pattern) or not _is_hidden(below))
 
 
@@ -216,10 +223,22 @@ def compile_manifest(loaded: LoadedManifest, *, locked: bool = True) -> tuple[Jo
     )
     sections: dict[str, Any] = {key: getattr(shared, key) for key in JobSettings.model_fields}
     lock = None if shared.definitions is None or not locked else read_lock_file(loaded.path, loaded.origin)
+    keys = {
+        *sections,
+        "lock",
+        "paths",
+        "origin",
+    }  # one set for all jobs, since it takes half of a job's memory
     jobs = tuple(
-        _job({**sections, "sequence": sequence.replace(name=name), "lock": lock}, recording.paths, origin)
+        Job.model_construct(
+            keys,
+            **{**sections, "sequence": sequence.replace(name=name), "lock": lock},
+            paths=recording.paths,
+            origin=origin,
+        ).check_name()
         for recording, name in zip(recordings, names, strict=True)
     )
+    jobs[0].check()  # the jobs differ only in their names
     if loaded.manifest.split is None:
         return jobs
     from mosaico_ingest.pipeline.split import split_job  # noqa: PLC0415 - only jobs with `split` need it
@@ -227,10 +246,6 @@ def compile_manifest(loaded: LoadedManifest, *, locked: bool = True) -> tuple[Jo
     parts = tuple(part for job in jobs for part in split_job(job))
     _refuse_duplicates(loaded, [part.sequence.name for part in parts])
     return parts
-
-
-def _job(sections: dict[str, Any], paths: tuple[AnyPath, ...], origin: Origin) -> Job:
-    return Job.model_construct(None, **sections, paths=paths, origin=origin).check()
 
 
 def _check_patterns(loaded: LoadedManifest) -> None:
