@@ -1,9 +1,9 @@
-"""Merge the read tasks of several splits by time, prefetch them, and coalesce small message blocks.
+"""Merge the read tasks of several splits by time, run them ahead, and coalesce small message blocks.
 
 The steps between the container readers and `Recording.message_blocks`:
 
 1. `merge_by_time` orders the tasks of all splits by their start time.
-2. `Prefetcher` runs the tasks in a background thread.
+2. `results_in_order` runs the tasks in threads, ahead of the consumer.
 3. `BlockCoalescer` joins the small blocks of each connection until they are worth decoding, sorted by log time.
 """
 
@@ -13,7 +13,8 @@ import heapq
 import queue
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import closing, suppress
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from types import TracebackType
@@ -68,6 +69,36 @@ def merge_by_time(
 
 def _deferred(tasks: Callable[[], Iterator[ReadTask]]) -> Iterator[ReadTask]:
     yield from tasks()
+
+
+@contextmanager
+def results_in_order(
+    calls: Generator[Callable[[], T], None, None], *, threads: int
+) -> Generator[Iterator[T], None, None]:
+    """Return an iterator over the results of `calls`, in their order, while threads make the next calls.
+
+    Another thread runs the generator. At most `max(threads, 2) + 1` results exist at a time. An exception of a call or
+    of the generator is raised in place of a result. Without threads, each call is made when its result is requested.
+    All threads have ended when the context is left.
+    """
+    if not threads:
+        with closing(calls):
+            yield (call() for call in calls)
+        return
+    pool = ThreadPoolExecutor(threads, thread_name_prefix="mosaico-read")
+    try:
+        with Prefetcher(_submitted(calls, pool), ahead=max(threads - 1, 1)) as futures:
+            yield (future.result() for future in futures)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _submitted(
+    calls: Generator[Callable[[], T], None, None], pool: ThreadPoolExecutor
+) -> Generator[Future[T], None, None]:
+    with closing(calls):
+        for call in calls:
+            yield pool.submit(call)
 
 
 class _End(Struct, frozen=True):

@@ -6,7 +6,7 @@ import re
 import weakref
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Generator, Iterator, Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -24,9 +24,9 @@ from mosaico_ingest.remote import AnyPath, RemotePath
 from mosaico_ingest.rosbag.batching import (
     BlockCoalescer,
     MergedTask,
-    Prefetcher,
     copy_if_small,
     merge_by_time,
+    results_in_order,
 )
 from mosaico_ingest.rosbag.blocks import (
     EARLIEST_NS,
@@ -65,10 +65,11 @@ BlockObserver: TypeAlias = Callable[[int, int, MessageBlock], None]
 """Receives the number of a split, the id of a connection, and messages over the buffer that was read."""
 _SMALL_RECORDING_BYTES = 1 << 20
 """Up to this size, reading the recording takes less time than starting a prefetch thread."""
-_PREFETCH_CPUS = 3
-"""Minimum number of CPUs for a prefetch thread: decoding and writing already use one thread each."""
-_BLOCKS_IN_MEMORY = 4
-"""The memory limit divided by the size of one read, without prefetching; prefetching doubles it."""
+_MAX_READERS = 3
+"""Maximum number of threads that read and decompress; decoding and writing use one thread each."""
+_BLOCKS_IN_MEMORY = _MAX_READERS + 1
+"""The memory limit divided by the size of one read; it must not depend on the number of threads, because the size of
+reads determines the row groups in the store."""
 _MAX_ROWS = 1 << 16
 _MEMORY_BYTES = 64 << 20
 _SLICE_BYTES, _MAX_SLICE_BYTES, _MAX_SLICES = 32 << 20, 256 << 20, 10_000
@@ -266,17 +267,15 @@ class Recording:
         ids = frozenset(range(len(self.connections))) if connection_ids is None else frozenset(connection_ids)
         first = EARLIEST_NS if start_ns is None else start_ns
         end = LATEST_NS + 1 if end_ns is None else end_ns
-        prefetch = self.size_bytes > _SMALL_RECORDING_BYTES and pa.cpu_count() >= _PREFETCH_CPUS
-        block_bytes = memory_bytes // (2 * _BLOCKS_IN_MEMORY if prefetch else _BLOCKS_IN_MEMORY)
         requests = {
-            number: ReadRequest(keys, first, end, block_bytes)
+            number: ReadRequest(keys, first, end, memory_bytes // _BLOCKS_IN_MEMORY)
             for number in range(len(self._splits))
             if (keys := self._table.split_connections(number, ids))
         }
         coalescer = BlockCoalescer(max_rows=max_rows, memory_bytes=memory_bytes)
         is_unlimited = first <= EARLIEST_NS and end > LATEST_NS
         read = dict.fromkeys(ids, 0) if is_unlimited else None
-        iterator = self._coalesced(requests, coalescer, observe, read, prefetch=prefetch)
+        iterator = self._coalesced(requests, coalescer, observe, read)
         self._iterators.add(iterator)
         return iterator
 
@@ -306,12 +305,9 @@ class Recording:
         coalescer: BlockCoalescer,
         observe: BlockObserver | None,
         read: dict[int, int] | None,
-        *,
-        prefetch: bool,
     ) -> Generator[MessageBlock, None, None]:
         """Yield blocks; count their messages in `read`, which is None if the request is limited in time."""
-        source = self._loaded(requests, observe)
-        with Prefetcher(source) if prefetch else closing(source) as loaded_tasks:
+        with results_in_order(self._loads(requests, observe), threads=self._reader_threads()) as loaded_tasks:
             for loaded in loaded_tasks:
                 self._report(loaded.split, loaded.unreadable)
                 for block in loaded.blocks:
@@ -319,6 +315,8 @@ class Recording:
                         read[block.connection] += len(block)
                     yield from coalescer.add(block, loaded.start_ns)
                 yield from coalescer.flush_ready(loaded.next_ns)
+            for number in requests:
+                self._splits[number].check_unchanged()
             yield from coalescer.flush_all()
         if read is not None and self._listed:
             missing = missing_after_reading(
@@ -326,19 +324,25 @@ class Recording:
             )
             self._unreadable |= dict.fromkeys(missing)
 
-    def _loaded(
+    def _reader_threads(self) -> int:
+        """Return the number of threads that read ahead; ranges of a remote file are fetched in order, so it has one."""
+        if self.size_bytes <= _SMALL_RECORDING_BYTES or pa.cpu_count() == 1:
+            return 0
+        if any(isinstance(file, RemotePath) for file in self.files):
+            return 1
+        return min(pa.cpu_count() - 1, _MAX_READERS)
+
+    def _loads(
         self, requests: dict[int, ReadRequest], observe: BlockObserver | None
-    ) -> Generator[_LoadedTask, None, None]:
-        """Load task after task; runs in the prefetch thread if there is one."""
+    ) -> Generator[Callable[[], _LoadedTask], None, None]:
+        """Yield a function for each task, which reads and decompresses its messages."""
         numbers = list(requests)
         tasks = [
             (self._splits[number].start_ns, partial(_read_tasks, self._splits[number], request))
             for number, request in requests.items()
         ]
         for merged in merge_by_time(tasks):
-            yield self._load(numbers[merged.split], merged, observe)
-        for number in numbers:
-            self._splits[number].check_unchanged()
+            yield partial(self._load, numbers[merged.split], merged, observe)
 
     def _load(self, split: int, merged: MergedTask, observe: BlockObserver | None) -> _LoadedTask:
         try:

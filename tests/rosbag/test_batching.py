@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Generator, Iterator
+from functools import partial
 from itertools import pairwise
 from random import Random
 
@@ -12,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mosaico_ingest.rosbag.batching import BlockCoalescer, Prefetcher, merge_by_time
+from mosaico_ingest.rosbag.batching import BlockCoalescer, Prefetcher, merge_by_time, results_in_order
 from mosaico_ingest.rosbag.blocks import (
     FIRST_GROUP_BYTES,
     LATEST_NS,
@@ -173,6 +175,33 @@ def test_prefetcher_context_exit_stops_thread() -> None:
     assert threading.active_count() == before
     assert len(result) <= 6
     assert result[-1] == 0
+
+
+@pytest.mark.parametrize("threads", [0, 1, 3])
+def test_results_in_order_slow_calls_keep_their_order_and_errors(threads: int) -> None:
+    def call(number: int) -> int:
+        time.sleep(0.002 if number % 3 else 0.005)
+        if number == 8:
+            raise ValueError("here")
+        return number
+
+    before = threading.active_count()
+    actual: list[int] = []
+    calls = (partial(call, number) for number in range(20))
+    with pytest.raises(ValueError, match="here"), results_in_order(calls, threads=threads) as results:
+        actual.extend(results)
+    assert actual == list(range(8))
+    assert threading.active_count() == before
+
+
+@pytest.mark.parametrize(("threads", "most"), [(0, 0), (1, 3), (3, 4)])
+def test_results_in_order_limits_the_results_that_wait(threads: int, most: int) -> None:
+    started: list[int] = []
+    calls = (partial(started.append, number) for number in range(50))
+    with results_in_order(calls, threads=threads) as results:
+        for taken, _ in enumerate(results, 1):
+            time.sleep(0.001)
+            assert len(started) - taken <= most
 
 
 def test_group_by_bytes_failing_iterator_yields_doubling_groups_then_raises() -> None:

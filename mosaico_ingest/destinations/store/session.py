@@ -27,6 +27,7 @@ from mosaico_ingest.destinations.store import files
 from mosaico_ingest.destinations.store.checksum import combined
 from mosaico_ingest.destinations.store.errors import translate_errors
 from mosaico_ingest.destinations.store.files import new_session_id
+from mosaico_ingest.destinations.store.group_writers import Group, GroupWriters
 from mosaico_ingest.destinations.store.model import NewNote, NewSession, NewTopic
 from mosaico_ingest.destinations.store.protocols import Files, StoreCatalog
 from mosaico_ingest.destinations.store.segment import (
@@ -50,6 +51,8 @@ _BIG_GROUP_BYTES = 8 << 20
 _BIG_ROW_BYTES = 16 << 10
 """Rows that are larger on average gain nothing from larger row groups."""
 _SEGMENT_BYTES = 512 << 20
+_MAX_WRITERS = 4
+"""Maximum number of threads that write row groups; one core is left to the threads that read and convert."""
 
 
 class Staging:
@@ -62,9 +65,12 @@ class Staging:
         *,
         buffer_bytes: int,
         compression: Compression = Compression.FAST,
+        writers: GroupWriters | None = None,
     ) -> None:
         self.where = where
         self.compression = compression
+        self.writers = writers
+        """None if the caller's thread writes the row groups."""
         self._staged = staged
         self.topics: dict[str, StoreTopic] = {}
         self._buffer_bytes = buffer_bytes
@@ -104,6 +110,8 @@ class StoreTopic:
         self._rows = 0
         self._group_bytes = _FIRST_GROUP_BYTES
         self._broken = False
+        self._group: Group | None = None
+        """The row group that was last handed to the writers of the session."""
         self._writer: SegmentWriter | None = None
         self._lock = threading.Lock()
 
@@ -114,6 +122,8 @@ class StoreTopic:
             return
         if self._has_nested_lists:
             batch = with_offsets(batch)
+        if self._staging.writers is not None:
+            self._staging.writers.check()
         with self._lock:
             self._check_usable()
             self._batches.append(batch)
@@ -133,12 +143,22 @@ class StoreTopic:
         )
 
     def flush(self) -> None:
-        """Write the buffered rows as one row group."""
-        with self._writing():
-            self._flush()
+        """Write the buffered rows as one row group, or hand them to the writers of the session."""
+        writers = self._staging.writers
+        if writers is None:
+            with self._writing():
+                self._flush()
+            return
+        with self._lock:
+            self._check_usable()
+            batches = self._take_batches()
+        if batches:
+            self._group = writers.submit(self._group, partial(self._write_later, batches))
 
     def close(self) -> None:
         """Write the buffered rows and finish the last segment."""
+        if self._group is not None:
+            self._group.result()
         with self._writing():
             self._flush()
             self._finish_segment()
@@ -160,23 +180,42 @@ class StoreTopic:
 
     @contextmanager
     def _writing(self) -> Generator[None, None, None]:
-        """Hold the lock; after an error inside, the file is incomplete and the topic cannot be committed."""
-        with self._lock, translate_errors(self._staging.where):
+        """Hold the lock; after an error inside, the topic cannot be committed."""
+        with self._lock:
             self._check_usable()
+            with self._breaking():
+                yield
+
+    @contextmanager
+    def _breaking(self) -> Generator[None, None, None]:
+        """After an error inside, the file is incomplete."""
+        try:
+            with translate_errors(self._staging.where):
+                yield
+        except BaseException:
             self._broken = True
-            yield
-            self._broken = False
+            raise
 
     def _check_usable(self) -> None:
         if self._broken:
             raise SinkError("an earlier write of the topic failed", where=self.name)
 
     def _flush(self) -> None:
+        batches = self._take_batches()
+        if batches:
+            self._write_group(sorted_rows(batches, self.schema))
+
+    def _write_later(self, batches: Sequence[pa.RecordBatch]) -> None:
+        """Write a row group on a thread of the session; the lock stays free for the next batches."""
+        with self._breaking():
+            self._write_group(sorted_rows(batches, self.schema))
+
+    def _take_batches(self) -> list[pa.RecordBatch]:
         batches, self._batches = self._batches, []
         self._rows = self.buffered_bytes = 0
         if batches:
             self._group_bytes = min(2 * self._group_bytes, _GROUP_BYTES)
-            self._write_group(sorted_rows(batches, self.schema))
+        return batches
 
     def _write_group(self, rows: pa.Table) -> None:
         if self._writer is not None and rows.column(0)[0].as_py() < self._writer.end_ns:
@@ -218,6 +257,7 @@ class StoreSession:
         buffer_bytes: int,
         compression: Compression = Compression.FAST,
         keep_catalog_open: bool = True,
+        writer_threads: int = 1,
     ) -> None:
         self.id = new_session_id()
         self.created_ns = time.time_ns()
@@ -231,6 +271,7 @@ class StoreSession:
             partial(layout.staged, self.id, sequence),
             buffer_bytes=buffer_bytes,
             compression=compression,
+            writers=GroupWriters(writer_threads) if writer_threads > 1 else None,
         )
         self._lease = layout.begin(self.id)
         self._open_catalog = ExitStack()
@@ -319,6 +360,8 @@ class StoreSession:
 
     def discard(self) -> None:
         """Delete everything the session wrote."""
+        if self._staging.writers is not None:
+            self._staging.writers.close()
         with ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="segment") as pool:
             list(pool.map(StoreTopic.abandon, self._staging.topics.values()))
         try:
@@ -361,6 +404,8 @@ class StoreSession:
         )
 
     def _leave(self) -> None:
+        if self._staging.writers is not None:
+            self._staging.writers.close()
         self._open_catalog.close()
         self._lease.release()
         self._layout.discard(self.id)
@@ -410,6 +455,8 @@ class StoreSink(Struct, frozen=True):
             if_exists=if_exists,
             buffer_bytes=self.buffer_bytes,
             compression=self.compression,
+            # The groups of all threads together need no more memory than the buffer.
+            writer_threads=min(pa.cpu_count() - 1, _MAX_WRITERS, self.buffer_bytes // _GROUP_BYTES),
         )
         try:
             yield session
