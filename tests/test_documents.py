@@ -138,6 +138,8 @@ def test_site_builds_in_strict_mode_and_loads_nothing_from_other_servers(tmp_pat
             r"<link[^>]*rel=\"?(?:stylesheet|preload|preconnect|icon)[^>]*href=\"?([^\" >]+)", text
         )
         assert [url for url in loaded if url.startswith(("http:", "https:", "//"))] == []
+    options = (tmp_path / "site" / "cli" / "index.html").read_text(encoding="utf-8")
+    assert "<code>--executor local|ray</code>" in options
     signatures = (tmp_path / "site" / "python" / "index.html").read_text(encoding="utf-8")
     assert 'id="mosaico_ingest.ROSLoader"' in signatures
 

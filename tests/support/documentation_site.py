@@ -120,7 +120,7 @@ def linked_file(page: Path, link: str) -> Path:
 
 
 def with_site_links(page: Path, text: str) -> str:
-    """Return a page with the links that it has on the site, outside of code."""
+    """Return a page with the links and the code that it has on the site."""
     here = site_path(page).parent
 
     def replaced(match: re.Match[str]) -> str:
@@ -131,7 +131,12 @@ def with_site_links(page: Path, text: str) -> str:
         return f"{match[1]}{link}{match[3] or ''}{match[4]}"
 
     parts = CODE.split(text)
-    return "".join(part if at % 2 else LINK.sub(replaced, part) for at, part in enumerate(parts))
+    return "".join(_site_code(part) if at % 2 else LINK.sub(replaced, part) for at, part in enumerate(parts))
+
+
+def _site_code(code: str) -> str:
+    """Return code with plain `|`, which GitHub needs escaped in tables and the site must not escape."""
+    return code if code.startswith("```") else code.replace("\\|", "|")
 
 
 def build(folder: Path, site: Path) -> None:
