@@ -189,8 +189,8 @@ def _add_types(struct: JsonType, name: str, types: dict[str, MessageType]) -> No
 def _free_name(struct: JsonType, path: str, types: dict[str, MessageType]) -> str:
     """Return the title of a struct, or its path if another struct has the same title."""
     other = types.get(struct.name)
-    is_taken = other is not None and list(_names(struct)) != [field.name for field in other.fields]
-    return path if is_taken or not struct.name else struct.name
+    is_used = other is not None and list(_names(struct)) != [field.name for field in other.fields]
+    return path if is_used or not struct.name else struct.name
 
 
 def _names(struct: JsonType) -> Iterator[str]:
