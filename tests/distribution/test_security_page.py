@@ -42,6 +42,7 @@ INTERNAL = {
     "metadata.validation._MAX_CHOICES": "length of a text",
     "metadata.validation._MAX_MESSAGE": "length of a text",
     "adapters.mapping.loader._MAX_CACHED_BINDINGS": "size of a cache",
+    "rosbag.recording._MAX_READERS": "number of threads",
 }
 """Constants that do not limit what input may cost, with the reason."""
 
