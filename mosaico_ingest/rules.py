@@ -201,6 +201,8 @@ _TABLE = (
     Rule("ING640", "event-outside", _WARNING, "an event without messages in the recording"),
     Rule("ING641", "too-many-parts", _ERROR, "a `split` that makes too many sequences"),
     Rule("ING642", "empty-part", _INFO, "a part of a recording without rows"),
+    Rule("ING643", "attachments-not-stored", _WARNING, "attachments that the destination cannot store"),
+    Rule("ING644", "damaged-attachment", _WARNING, "an attachment that differs from its checksum"),
     Rule("ING701", "decode", _WARNING, "bytes that do not fit their message type"),
     Rule("ING702", "definition", _WARNING, "a message type without a usable definition"),
     Rule("ING703", "encoding", _WARNING, "a message in an encoding that cannot be decoded"),

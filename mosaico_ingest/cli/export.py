@@ -171,7 +171,9 @@ def _print_export(report: ExportReport, *, stderr: bool) -> None:
     for topic in report.topics:
         for difference in _differences(topic):
             print_line(f"{topic.topic}: {difference}", style="yellow", stderr=stderr)
-    warning = "" if report.faithful else "; some rows would differ if the file were ingested"
+    for line in report.omitted:
+        print_line(f"not in the file: {line}", style="yellow", stderr=stderr)
+    warning = "" if report.faithful else "; some content would be missing or differ if the file were ingested"
     line = f"{report.path}: {counted(report.messages, 'message')}, {bytes_text(report.bytes)}{warning}"
     print_line(line, style="green" if report.faithful else "yellow", stderr=stderr)
 

@@ -14,13 +14,14 @@ from mosaico_ingest.cli.pages import page
 from mosaico_ingest.cli.store_pictures import image, plot
 from mosaico_ingest.cli.store_rows import describe, head, sample, tail
 from mosaico_ingest.cli.store_sql import sql
-from mosaico_ingest.job.values import PROVENANCE_KEY
+from mosaico_ingest.job.values import ATTACHMENTS_KEY, PROVENANCE_KEY
 from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text, time_text
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from mosaico_ingest.destinations.store import Listing, SequenceInfo, SequenceSummary, TopicInfo
+    from mosaico_ingest.destinations.store.model import AttachmentInfo
 
 DEFAULT_ROWS = 100
 """Number of sequences that `ingest store ls` prints by default."""
@@ -46,6 +47,7 @@ def verify(
     from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas
     from mosaico_ingest.destinations.store import Store
     from mosaico_ingest.destinations.store.store import verify as verify_sequence
+    from mosaico_ingest.destinations.store.store import verify_attachments
     from mosaico_ingest.errors import VerificationError
 
     collect_garbage_as_usual()
@@ -58,6 +60,12 @@ def verify(
         for name, checked in results.items()
         for result in checked
         if result.problem is not None
+    ]
+    problems += [
+        {"sequence": info.name, "topic": "", "file": str(each.attachment.path), "problem": each.problem}
+        for info in infos
+        for each in verify_attachments(info)
+        if each.problem is not None
     ]
     incomplete = {info.name: info.incomplete for info in infos if info.incomplete is not None}
     rows = sum(result.segment.rows for checked in results.values() for result in checked)
@@ -159,6 +167,7 @@ def show(
                 {
                     **_summary_json(SequenceSummary.of(info)),
                     "topics": [_topic_json(topic) for topic in info.topics],
+                    "attachments": [_attachment_json(each) for each in info.attachments],
                 }
             )
         else:
@@ -262,6 +271,12 @@ def print_sequence(info: SequenceInfo) -> None:
             _duration_text(topic),
         )
     Terminal().print(table)
+    if info.attachments:
+        files = PlainTable("attachment", "media type", "size", "time", "file", numbers={"size"})
+        for each in info.attachments:
+            size, file = bytes_text(each.stored_bytes), str(each.path)
+            files.add_row(each.name, each.media_type, size, time_text(each.log_ns), file)
+        Terminal().print(files)
     for note in info.notes:
         topic_name = f"{note.topic}: " if note.topic else ""
         print_line(f"{time_text(note.created_ns)} {topic_name}{note.message}", style="yellow")
@@ -313,6 +328,8 @@ def _print_metadata(metadata: Mapping[str, Any]) -> None:
 def _metadata_lines(metadata: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """Yield names and values; the provenance, which is for programs, is reduced to tool and files."""
     for key, value in metadata.items():
+        if key == ATTACHMENTS_KEY:
+            continue
         if not isinstance(value, dict) or not value:
             yield key, value
         elif key == PROVENANCE_KEY and "sources" in value:
@@ -339,6 +356,18 @@ def _summary_json(summary: SequenceSummary) -> dict[str, Any]:
         "end_ns": summary.end_ns,
         "incomplete": summary.incomplete,
         "notes": [{"topic": note.topic, "message": note.message} for note in summary.notes],
+    }
+
+
+def _attachment_json(info: AttachmentInfo) -> dict[str, Any]:
+    return {
+        "name": info.name,
+        "media_type": info.media_type,
+        "log_ns": info.log_ns,
+        "create_ns": info.create_ns,
+        "stored_bytes": info.stored_bytes,
+        "checksum": info.checksum,
+        "file": str(info.path),
     }
 
 

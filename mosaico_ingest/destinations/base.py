@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -71,6 +71,17 @@ class DestinationStatus(Struct, frozen=True):
     free_bytes: int | None = None
 
 
+class Attached(Struct, frozen=True):
+    """A file that belongs to a sequence."""
+
+    name: str
+    media_type: str
+    log_ns: int
+    """The time at which the recorder received it, ns since the epoch."""
+    create_ns: int
+    """The time at which it was created, ns since the epoch; 0 if unknown."""
+
+
 class Destination(ABC):
     """A store, a server or another system that sequences are written to.
 
@@ -80,6 +91,8 @@ class Destination(ABC):
 
     kind: ClassVar[str]
     """The name of this type of destination in plans."""
+    can_attach: ClassVar[bool] = False
+    """True if its sessions are `AttachableSession`s, which store files of the sequence."""
     can_amend: ClassVar[bool] = False
     """True if its sinks accept `amendable=True` and then open an `AmendableSession`."""
     replaces_atomically: ClassVar[bool] = True
@@ -182,6 +195,18 @@ class Session(Protocol):
 
     def stored(self) -> tuple[StoredTopic, ...]:
         """Return the stored content, read from the destination again; only after a commit."""
+        ...
+
+
+class AttachableSession(Session, Protocol):
+    """A session that stores files of the sequence next to its topics."""
+
+    def attach(self, file: Attached, chunks: Iterable[bytes]) -> None:
+        """Store a file; an exception of `chunks` leaves no file behind.
+
+        Raises:
+            SinkError: The file cannot be written.
+        """
         ...
 
 

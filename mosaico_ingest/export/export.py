@@ -26,6 +26,7 @@ from mosaico_ingest.containers import ROS_VERSIONS
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import AdapterError, BagError, IngestError, NothingMatched
 from mosaico_ingest.export.columns import as_type, comparable
+from mosaico_ingest.export.kept import write_kept
 from mosaico_ingest.export.sources import SourceSequence, SourceTopic, StoreSequence
 from mosaico_ingest.findings import suggest_names
 from mosaico_ingest.job.patterns import select
@@ -78,6 +79,8 @@ class ExportReport(_Record):
     path: str
     bytes: int
     topics: tuple[TopicExport, ...]
+    omitted: tuple[str, ...] = ()
+    """Attachments, metadata records and `custom_data` that the container cannot store, one line for each kind."""
 
     @property
     def messages(self) -> int:
@@ -86,8 +89,8 @@ class ExportReport(_Record):
 
     @property
     def faithful(self) -> bool:
-        """Whether the file contains every topic and gives the same rows."""
-        return all(topic.faithful for topic in self.topics)
+        """Whether the file contains every topic and all else that the sequence keeps, and gives the same rows."""
+        return not self.omitted and all(topic.faithful for topic in self.topics)
 
 
 _TIME_1 = re.compile(r"^(?:time|duration)(?:\[\d*\])?\s", re.MULTILINE)
@@ -355,6 +358,7 @@ def export_sequence(
                 where=sequence,
                 hint=_first_reason(excluded),
             )
+        omitted = write_kept(opened, writer)
         messages = [
             _messages(opened, connection, restorer, start_ns, end_ns) for connection, restorer in restorers
         ]
@@ -367,11 +371,15 @@ def export_sequence(
     results = [*(restorer.result() for _, restorer in restorers), *excluded]
     results.sort(key=lambda result: result.topic)
     size = path.stat().st_size
-    return _logged(ExportReport(sequence=sequence, path=str(path), bytes=size, topics=tuple(results)))
+    return _logged(
+        ExportReport(sequence=sequence, path=str(path), bytes=size, topics=tuple(results), omitted=omitted)
+    )
 
 
 def _logged(report: ExportReport) -> ExportReport:
     """Log the topics of a report, the unfaithful ones as warnings, and return the report."""
+    for line in report.omitted:
+        _log.warning("%s: the file cannot contain %s", report.sequence, line)
     for topic in report.topics:
         if topic.excluded:
             _log.warning("%s of %s is not exported: %s", topic.topic, report.sequence, topic.excluded)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import pyarrow as pa
 from msgspec import Struct
 
+from mosaico_ingest.destinations.store.model import AttachmentInfo
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.export.columns import comparable
 from mosaico_ingest.findings import suggest_names
@@ -48,6 +49,16 @@ class SourceSequence(Protocol):
         ...
 
     @property
+    def metadata(self) -> Mapping[str, Any]:
+        """The metadata of the sequence."""
+        ...
+
+    @property
+    def attachments(self) -> Sequence[AttachmentInfo]:
+        """The files of the sequence."""
+        ...
+
+    @property
     def bounds(self) -> tuple[int, int]:
         """The first and the last timestamp, nanoseconds; zeros without rows."""
         ...
@@ -71,6 +82,8 @@ class StoreSequence:
         info = store.sequence(name)
         self._store = store
         self.name = info.name
+        self.metadata = info.metadata
+        self.attachments = info.attachments
         self.topics = tuple(SourceTopic(one.name, one.ontology, one.metadata) for one in info.topics)
         self.bounds = info.start_ns or 0, info.end_ns or 0
 
@@ -93,9 +106,12 @@ class ServerSequence:
         """
         self._client = client
         self.name = name
-        if client.find(name) is None:
+        found = client.find(name)
+        if found is None:
             hint = suggest_names(client.sequence_names(), [name])
             raise SinkError(f"there is no sequence {name!r}", where=str(client.address), hint=hint)
+        self.metadata: Mapping[str, Any] = found.user_metadata or {}
+        self.attachments: tuple[AttachmentInfo, ...] = ()
         self._infos = {topic_name(info.resource_locator): info for info in client.topic_infos(name)}
         self.topics = tuple(self._topic(name, info) for name, info in sorted(self._infos.items()))
 

@@ -210,6 +210,17 @@ class MetadataSources(Section):
     and with the suffix, `{parent}` is the name of its folder."""
 
 
+class KeepSettings(Section):
+    """What a sequence keeps of its recording besides messages; exports write it again."""
+
+    records: tuple[Text, ...] = Field(default=("*",), examples=[["vehicle", "drive_*"], []])
+    """Names or globs of MCAP metadata records, which become the metadata `_records_`."""
+    custom_data: bool = True
+    """Whether the `custom_data` of rosbag2 becomes the metadata `_custom_data_`."""
+    attachments: tuple[Text, ...] = Field(default=("*",), examples=[["*.yaml"], []])
+    """Names or globs of MCAP attachments, which become files of the sequence."""
+
+
 class SequenceSettings(Section):
     """The sequence that a recording becomes."""
 
@@ -228,6 +239,8 @@ class SequenceSettings(Section):
     """Sources of metadata that each recording fills on its own: its name, its metadata records, a file next to it."""
     metadata_schema: SchemaPath | None = Field(default=None, examples=["fleet/vehicle.schema.json"])
     """A JSON Schema (draft 2020-12) for the final metadata. It may refer to other files (`$ref`), but not to URLs."""
+    keep: KeepSettings = KeepSettings()
+    """What the sequence keeps of the recording besides messages."""
     if_exists: IfExists = IfExists.FAIL
     """Action if the sequence exists: fail, skip (if its content is the same), append, replace."""
 

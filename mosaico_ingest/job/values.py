@@ -20,6 +20,8 @@ DEFAULT_TOPIC = "default"
 """The key of `on_error.topic` for topics that no other key matches."""
 PROVENANCE_KEY = "mosaico_ingest"
 """The metadata key of a sequence, and of each of its sessions, for its provenance."""
+ATTACHMENTS_KEY = "_attachments_"
+"""The metadata key of a session in a store that lists the attachments that the session stored."""
 
 
 RECORDING = "recording"

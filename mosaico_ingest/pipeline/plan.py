@@ -28,6 +28,7 @@ from mosaico_ingest.pipeline.memory import MemoryBudget
 from mosaico_ingest.pipeline.task import Attempt
 from mosaico_ingest.remote import RemotePath
 from mosaico_ingest.report.units import count_text, counted
+from mosaico_ingest.rosbag.attachments import Attachment
 from mosaico_ingest.rosbag.definitions.model import Resolver
 
 
@@ -53,6 +54,14 @@ class FileDocument(TypedDict):
 
     path: str
     """Relative to the manifest's folder."""
+    size_bytes: int
+
+
+class AttachmentDocument(TypedDict):
+    """An attachment in a plan document."""
+
+    name: str
+    media_type: str
     size_bytes: int
 
 
@@ -99,6 +108,13 @@ def _own_metadata(metadata: Mapping[str, Any]) -> dict[str, JsonValue]:
 
 def _describe_files(files: tuple[Path | RemotePath, ...], info: SerializationInfo) -> list[FileDocument]:
     return [{"path": _relative(path, info), "size_bytes": path.stat().st_size} for path in files]
+
+
+def _describe_attachments(attachments: tuple[Attachment, ...]) -> list[AttachmentDocument]:
+    return [
+        {"name": each.name, "media_type": each.media_type, "size_bytes": each.size_bytes}
+        for each in attachments
+    ]
 
 
 def _describe_part(part: SequencePart | None) -> PartDocument | None:
@@ -219,9 +235,13 @@ class Plan(Part):
     """The policies for the session and for messages that cannot be decoded; each topic has its own policy."""
     quarantine: Annotated[QuarantineSettings | None, PlainSerializer(_describe_quarantine)] = None
     """Where rejected messages are kept; the path is relative to the manifest's folder."""
+    attachments: Annotated[tuple[Attachment, ...], Unchecked(), PlainSerializer(_describe_attachments)] = ()
+    """The attachments that become files of the sequence."""
     topics: tuple[TopicPlan, ...]
     excluded: tuple[ExcludedTopic, ...] = ()
 
+    kept_metadata: Annotated[Mapping[str, Any], Unchecked()] = Field(default={}, exclude=True)
+    """Metadata of the recording that the sequence keeps under reserved keys."""
     memory: Annotated[MemoryBudget, Unchecked()] = Field(default=MemoryBudget(), exclude=True)
     source_bytes: int = Field(exclude=True)
     resolver: Annotated[Resolver, Unchecked()] = Field(exclude=True)

@@ -179,6 +179,7 @@ def check_provenance(plan: Plan, fingerprint: str | None = None) -> SequenceRequ
         name=plan.sequence.name,
         metadata={
             **plan.sequence.metadata,
+            **plan.kept_metadata,
             **({} if plan.part is None else {SPLIT_KEY: plan.part.metadata}),
             PROVENANCE_KEY: provenance.model_dump(mode="json"),
         },

@@ -15,6 +15,7 @@ from mosaico_ingest.errors import EmptyPart, IngestError, Interrupted, NothingMa
 from mosaico_ingest.findings import Finding, Severity, Stage
 from mosaico_ingest.interrupts import Abandoned, DeferredInterrupt
 from mosaico_ingest.job.values import IfExists, OnFailure, SessionLevelErrorPolicy
+from mosaico_ingest.pipeline.attachments import attach_files
 from mosaico_ingest.pipeline.latched import latched_blocks
 from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.provenance import SequenceRequest
@@ -85,6 +86,7 @@ def write_sequence(
             contract = _start_contract(plan, recording, topics)
             reported = frozenset(recording.unreadable)
             try:
+                attach_files(plan, recording, session, observe)
                 _pump(plan, recording, topics, buffer, stopwatch, contract=contract)
                 _report_reading(recording, topics, observe, reported=reported)
                 missing = check_counts(plan, recording, topics, observe)

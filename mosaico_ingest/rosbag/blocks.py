@@ -18,6 +18,7 @@ from msgspec.structs import force_setattr
 from numpy.typing import NDArray
 
 from mosaico_ingest.remote import AnyPath
+from mosaico_ingest.rosbag.attachments import Attachment
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
 
 EARLIEST_NS, LATEST_NS = -(2**63), 2**63 - 1
@@ -237,6 +238,23 @@ class HasMetadataRecords(Protocol):
 
     def metadata_records(self) -> dict[str, dict[str, str]]:
         """Return the entries of the metadata records by name."""
+        ...
+
+
+@runtime_checkable
+class HasAttachments(Protocol):
+    """A reader of a container that can contain attachments."""
+
+    def attachments(self) -> list[Attachment]:
+        """Return the attachments without their content."""
+        ...
+
+    def attachment_chunks(self, attachment: Attachment) -> Iterator[bytes]:
+        """Yield the content of an attachment.
+
+        Raises:
+            BagError: The content cannot be read, or differs from its checksum; raised after the last chunk.
+        """
         ...
 
 

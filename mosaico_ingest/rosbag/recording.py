@@ -21,6 +21,7 @@ from typing_extensions import Self
 from mosaico_ingest.errors import BagError, NothingMatched
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.remote import AnyPath, RemotePath
+from mosaico_ingest.rosbag.attachments import Attachment
 from mosaico_ingest.rosbag.batching import (
     BlockCoalescer,
     MergedTask,
@@ -36,6 +37,7 @@ from mosaico_ingest.rosbag.blocks import (
     ChunkChecksum,
     Connection,
     Encoding,
+    HasAttachments,
     HasMetadataRecords,
     Int64s,
     MessageBlock,
@@ -232,6 +234,24 @@ class Recording:
             ):
                 records.setdefault(name, {}).update(entries)
         return records
+
+    def attachments(self) -> tuple[Attachment, ...]:
+        """Return the attachments of all splits, without their content."""
+        return tuple(
+            replace(attachment, split=number)
+            for number, split in enumerate(self._splits)
+            for attachment in (split.attachments() if isinstance(split, HasAttachments) else ())
+        )
+
+    def attachment_chunks(self, attachment: Attachment) -> Iterator[bytes]:
+        """Yield the content of an attachment.
+
+        Raises:
+            BagError: The content cannot be read, or differs from its checksum; raised after the last chunk.
+        """
+        split = self._splits[attachment.split]
+        if isinstance(split, HasAttachments):
+            yield from split.attachment_chunks(attachment)
 
     def custom_data(self) -> dict[str, str]:
         """Return the `custom_data` of rosbag2, from `metadata.yaml` or else from the copy in the files.

@@ -5,10 +5,10 @@ from __future__ import annotations
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from rosbags.interfaces import Connection as RosbagsConnection
 from rosbags.rosbag1 import Writer as Rosbag1
@@ -17,6 +17,7 @@ from rosbags.rosbag2 import Writer as Rosbag2
 
 from mosaico_ingest.containers import SUFFIX_LIST
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.rosbag.attachments import Attachment
 from mosaico_ingest.rosbag.definitions.hashes import md5sum, rihs01
 from mosaico_ingest.rosbag.definitions.model import Definition, Language
 from mosaico_ingest.rosbag.mcap.writer import McapWriter
@@ -37,12 +38,37 @@ class RecordingWriter(Protocol):
         """Append a message."""
         ...
 
+    def set_custom_data(self, custom_data: Mapping[str, str]) -> None:
+        """Set the `custom_data` of rosbag2.
+
+        Raises:
+            BagError: The container cannot store it.
+        """
+        ...
+
     def finish(self) -> None:
         """Write the index and close the file."""
         ...
 
     def abandon(self) -> None:
         """Close the unfinished file."""
+        ...
+
+
+@runtime_checkable
+class AttachmentWriter(Protocol):
+    """A writer whose container stores attachments and metadata records."""
+
+    def add_metadata(self, name: str, entries: Iterable[tuple[str, str]]) -> None:
+        """Write a metadata record."""
+        ...
+
+    def add_attachment(self, attachment: Attachment, chunks: Iterable[bytes]) -> None:
+        """Write an attachment with its checksum.
+
+        Raises:
+            BagError: The chunks do not have the size of the attachment.
+        """
         ...
 
 
@@ -78,6 +104,11 @@ class SqliteWriter:
     def write(self, channel: int, log_ns: int, payload: bytes) -> None:
         """Append a message."""
         self._bag.write(self._connections[channel], log_ns, payload)
+
+    def set_custom_data(self, custom_data: Mapping[str, str]) -> None:
+        """Set the `custom_data` of rosbag2, which the copy of `metadata.yaml` in the database contains."""
+        for key, value in custom_data.items():
+            self._bag.set_custom_data(key, value)
 
     def finish(self) -> None:
         """Close the database and move it out of its folder."""
@@ -115,6 +146,10 @@ class Ros1Writer:
     def write(self, channel: int, log_ns: int, payload: bytes) -> None:
         """Append a message."""
         self._bag.write(self._connections[channel], log_ns, payload)
+
+    def set_custom_data(self, custom_data: Mapping[str, str]) -> None:
+        """Raise BagError: a bag has no `custom_data`."""
+        raise BagError(f"a bag has no custom_data: {', '.join(custom_data)}", hint="write .mcap or .db3")
 
     def finish(self) -> None:
         """Write the index."""

@@ -42,6 +42,7 @@ from mosaico_ingest.destinations.store.model import (
     SequenceInfo,
     SessionInfo,
     TopicInfo,
+    attachments_of,
 )
 from mosaico_ingest.destinations.store.segment import Segment
 from mosaico_ingest.errors import SequenceExists, SinkError
@@ -377,11 +378,13 @@ def _find_sequence(db: sqlite3.Connection, name: str, root: Path) -> SequenceInf
     row = db.execute("SELECT * FROM sequences WHERE name = ?", (name,)).fetchone()
     if row is None:
         return None
+    sessions = _session_infos(db, row["id"])
     return SequenceInfo(
         name=name,
         metadata=json.loads(row["metadata"]),
         created_ns=row["created_ns"],
-        sessions=_session_infos(db, row["id"]),
+        sessions=sessions,
+        attachments=attachments_of(sessions, root),
         topics=_topics(db, row["id"], name, root),
         notes=_notes(db, row["id"]),
     )

@@ -31,6 +31,7 @@ class StoreDestination(Destination):
     """The store in a folder or behind a URL; a run creates it if it does not exist."""
 
     kind: ClassVar[str] = "store"
+    can_attach: ClassVar[bool] = True
     can_amend: ClassVar[bool] = True
 
     def __init__(self, path: AnyPath, compression: Compression = Compression.FAST) -> None:

@@ -4,6 +4,7 @@ On a disk:
 
     catalog.sqlite
     segments/<sequence>/<topic…>/<session>-<number>.parquet
+    attachments/<sequence>/<session>-<number>-<name>
     staging/<session>/                       the unpublished segments of an open session, and its lock
 
 Behind a URL:
@@ -11,6 +12,7 @@ Behind a URL:
     store.json                               the format of the store
     catalog/<sequence>.json                  the catalog entry of a sequence
     segments/<sequence>/<topic…>/<session>-<number>.parquet
+    attachments/<sequence>/<session>-<number>-<name>
     claims/<sequence>/<session>              the claim of a session on a sequence
     sessions/<session>                       rewritten regularly while the session's writer is alive
 
@@ -110,6 +112,8 @@ def footer(path: AnyPath) -> pq.FileMetaData:
         return file.metadata
 
 
+ATTACHMENTS = "attachments"
+"""The folder of the files of sequences."""
 _UNSAFE = re.compile(rb"[^A-Za-z0-9_-]")
 _LONGEST = 200
 _ATTEMPTS = 5
@@ -153,6 +157,14 @@ class LocalFiles(Struct, frozen=True):
         """Return where a session writes a segment before it is published."""
         return Path(self.root, "staging", session, f"{session}-{number:04}.parquet")
 
+    def attachment(self, sequence: str, name: str) -> Path:
+        """Return the path of an attachment after the commit."""
+        return Path(self.root, ATTACHMENTS, encoded(sequence), name)
+
+    def staged_attachment(self, session: str, sequence: str, name: str) -> Path:  # noqa: ARG002 - the file is moved later
+        """Return where a session writes an attachment before it is published."""
+        return self.session(session) / name
+
     def relative(self, path: AnyPath) -> str:
         """Return a segment's path relative to the store, as in the catalog."""
         return Path(str(path)).relative_to(self.root).as_posix()
@@ -178,9 +190,10 @@ class LocalFiles(Struct, frozen=True):
         return sorted(entry.name for entry in self.staging.iterdir()) if self.staging.is_dir() else []
 
     def segment_files(self) -> Iterator[AnyPath]:
-        """Yield every file below the folder of segments."""
-        for folder, _, files in os.walk(self.segments):
-            yield from (Path(folder, name) for name in files)
+        """Yield every file below the folders of segments and attachments."""
+        for top in (self.segments, self.root / ATTACHMENTS):
+            for folder, _, files in os.walk(top):
+                yield from (Path(folder, name) for name in files)
 
     def publish(self, moves: Mapping[AnyPath, AnyPath]) -> None:
         """Move finished files to their final paths, so that they survive a power cut."""
@@ -201,13 +214,13 @@ class LocalFiles(Struct, frozen=True):
                 self._prune(path.parent)
 
     def _prune(self, folder: Path) -> None:
-        while folder != self.segments:
+        while folder not in {self.segments, self.root / ATTACHMENTS, self.root}:
             folder.rmdir()
             folder = folder.parent
 
     def staged_files(self, session: str) -> list[AnyPath]:
         """Return the segments that a session started and did not publish."""
-        return [path for path in self.session(session).rglob("*.parquet") if path.is_file()]
+        return [path for path in self.session(session).rglob(f"{session}-*") if path.is_file()]
 
     def discard(self, session: str) -> None:
         """Remove the staged files of a session."""
@@ -290,6 +303,16 @@ class ObjectFiles:
         self._unpublished[session].append(path)
         return path
 
+    def attachment(self, sequence: str, name: str) -> RemotePath:
+        """Return the path of an attachment."""
+        return self.root / f"{ATTACHMENTS}/{encoded(sequence)}/{name}"
+
+    def staged_attachment(self, session: str, sequence: str, name: str) -> RemotePath:
+        """Return the final path of an attachment, which is not in the catalog yet."""
+        path = self.attachment(sequence, name)
+        self._unpublished[session].append(path)
+        return path
+
     def relative(self, path: AnyPath) -> str:
         """Return a segment's path relative to the store, as in the catalog."""
         return str(path).removeprefix(f"{self.root}/")
@@ -358,9 +381,10 @@ class ObjectFiles:
         return []
 
     def segment_files(self) -> Iterator[AnyPath]:
-        """Yield every file below the folder of segments."""
-        below = (self.root / "segments").listing(recursive=True)
-        return (path for path in below if path.is_file())
+        """Yield every file below the folders of segments and attachments."""
+        for folder in ("segments", ATTACHMENTS):
+            below = (self.root / folder).listing(recursive=True)
+            yield from (path for path in below if path.is_file())
 
     def _session(self, session: str) -> RemotePath:
         return self.root / f"sessions/{session}"

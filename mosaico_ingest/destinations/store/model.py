@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
@@ -13,7 +14,7 @@ from mosaico_ingest.destinations.store.errors import NotInStore
 from mosaico_ingest.destinations.store.segment import Segment
 from mosaico_ingest.errors import missing_library
 from mosaico_ingest.findings import suggest_names
-from mosaico_ingest.job.values import IfExists
+from mosaico_ingest.job.values import ATTACHMENTS_KEY, IfExists
 from mosaico_ingest.notebook import html_table
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote import AnyPath
@@ -204,6 +205,43 @@ class Note(Struct, frozen=True):
     created_ns: int
 
 
+class AttachmentInfo(Struct, frozen=True):
+    """A file of a sequence."""
+
+    path: AnyPath
+    session: str
+    name: str
+    """The name in the recording."""
+    media_type: str
+    log_ns: int
+    create_ns: int
+    stored_bytes: int
+    checksum: str
+    """XXH3 (128 bits) of the content."""
+
+
+def attachments_of(sessions: Iterable[SessionInfo], root: AnyPath) -> tuple[AttachmentInfo, ...]:
+    """Return the attachments that the metadata of sessions lists; entries in another form are ignored."""
+    attachments: list[AttachmentInfo] = []
+    for session in sessions:
+        entries = session.metadata.get(ATTACHMENTS_KEY)
+        for entry in entries if isinstance(entries, list) else ():
+            with suppress(KeyError, TypeError):
+                attachments.append(
+                    AttachmentInfo(
+                        root / str(entry["path"]),
+                        session.id,
+                        str(entry["name"]),
+                        str(entry["media_type"]),
+                        int(entry["log_ns"]),
+                        int(entry["create_ns"]),
+                        int(entry["bytes"]),
+                        str(entry["checksum"]),
+                    )
+                )
+    return tuple(attachments)
+
+
 class SequenceInfo(Struct, frozen=True):
     """One sequence with its sessions, topics and notes."""
 
@@ -214,6 +252,7 @@ class SequenceInfo(Struct, frozen=True):
     topics: tuple[TopicInfo, ...]
     """Sorted by name."""
     notes: tuple[Note, ...]
+    attachments: tuple[AttachmentInfo, ...] = ()
 
     @property
     def incomplete(self) -> str | None:
@@ -227,7 +266,7 @@ class SequenceInfo(Struct, frozen=True):
 
     @property
     def stored_bytes(self) -> int:
-        """Size of its files in bytes."""
+        """Size of the files of its topics in bytes."""
         return sum(topic.stored_bytes for topic in self.topics)
 
     @property

@@ -38,6 +38,7 @@ from mosaico_ingest.destinations.store.model import (
     SequenceInfo,
     SessionInfo,
     TopicInfo,
+    attachments_of,
 )
 from mosaico_ingest.destinations.store.segment import Segment
 from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
@@ -136,14 +137,16 @@ class SequenceDocument(_Part):
 
     def info(self, root: RemotePath) -> SequenceInfo:
         """Return the sequence as the model of the catalog."""
+        sessions = tuple(
+            SessionInfo(one.id, one.metadata, one.created_ns, one.completed_ns)
+            for one in sorted(self.sessions, key=lambda one: one.id)
+        )
         return SequenceInfo(
             name=self.name,
             metadata=self.metadata,
             created_ns=self.created_ns,
-            sessions=tuple(
-                SessionInfo(one.id, one.metadata, one.created_ns, one.completed_ns)
-                for one in sorted(self.sessions, key=lambda one: one.id)
-            ),
+            sessions=sessions,
+            attachments=attachments_of(sessions, root),
             topics=tuple(
                 self._topic(topic, root) for topic in sorted(self.topics, key=lambda topic: topic.name)
             ),

@@ -44,6 +44,14 @@ class Files(Protocol):
         """Return the path at which a session writes a segment before the commit."""
         ...
 
+    def attachment(self, sequence: str, name: str) -> AnyPath:
+        """Return the path of an attachment after the commit."""
+        ...
+
+    def staged_attachment(self, session: str, sequence: str, name: str) -> AnyPath:
+        """Return the path at which a session writes an attachment before the commit."""
+        ...
+
     def relative(self, path: AnyPath) -> str:
         """Return a segment's path relative to the store, as in the catalog."""
         ...

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
+import re
 import threading
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from typing import Any
 
 import pyarrow as pa
 from msgspec import Struct
+from xxhash import xxh3_128
 
 from mosaico_ingest import protocol
 from mosaico_ingest.destinations.base import (
+    Attached,
     Session,
     StoredTopic,
     check_batch,
@@ -39,7 +43,7 @@ from mosaico_ingest.destinations.store.segment import (
 )
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import IngestError, SinkError
-from mosaico_ingest.job.values import Compression, IfExists
+from mosaico_ingest.job.values import ATTACHMENTS_KEY, Compression, IfExists
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.protocol.batches import has_nested_lists, with_offsets
 from mosaico_ingest.remote import AnyPath, RemotePath
@@ -53,6 +57,9 @@ _BIG_ROW_BYTES = 16 << 10
 _SEGMENT_BYTES = 512 << 20
 _MAX_WRITERS = 4
 """Maximum number of threads that write row groups; one core is left to the threads that read and convert."""
+_REFUSED = re.compile(r"[^A-Za-z0-9._-]")
+_MAX_NAME = 100
+"""Maximum length of the part of a file's name that comes from the recording."""
 
 
 class Staging:
@@ -243,6 +250,22 @@ _WAITING = 2
 """Number of additional threads, since threads that wait for the disk do not use a core."""
 
 
+class _Attachment(Struct, frozen=True):
+    """A staged file of the sequence."""
+
+    name: str
+    """The name of the file in the store."""
+    staged: AnyPath
+    file: Attached
+    size_bytes: int
+    checksum: str
+
+
+def _file_name(name: str) -> str:
+    """Return the part of an attachment's name that the name of its file contains."""
+    return _REFUSED.sub("_", name.rpartition("/")[2])[-_MAX_NAME:]
+
+
 class StoreSession:
     """One writing session; `commit` or `discard` ends it."""
 
@@ -266,6 +289,7 @@ class StoreSession:
         self._metadata = metadata
         self._topics: dict[str, StoreTopic] = {}
         self._notes: list[NewNote] = []
+        self._attachments: list[_Attachment] = []
         self._staging = Staging(
             layout.root,
             partial(layout.staged, self.id, sequence),
@@ -297,6 +321,25 @@ class StoreSession:
             topic = StoreTopic(self._staging, path, ontology, described, folder=folder)
         self._staging.topics[path] = self._topics[name] = topic
         return topic
+
+    def attach(self, file: Attached, chunks: Iterable[bytes]) -> None:
+        """Store a file of the sequence; see `AttachableSession.attach`."""
+        name = f"{self.id}-{len(self._attachments):04}-{_file_name(file.name)}"
+        staged = self._layout.staged_attachment(self.id, self._claim.sequence, name)
+        digest, size = xxh3_128(), 0
+        try:
+            with translate_errors(file.name), files.create(staged) as target:
+                for chunk in chunks:
+                    target.write(chunk)
+                    digest.update(chunk)
+                    size += len(chunk)
+            with translate_errors(file.name):
+                files.sync(staged)
+        except BaseException:
+            with suppress(IngestError, OSError):
+                staged.unlink()
+            raise
+        self._attachments.append(_Attachment(name, staged, file, size, digest.hexdigest()))
 
     def note_error(self, message: str, *, topic: str | None = None) -> None:
         """Attach an error; see `Session.note_error`."""
@@ -331,8 +374,11 @@ class StoreSession:
             for topic in self._staging.topics.values()
             for segment in topic.segments
         }
+        moves |= {each.staged: self._final(each) for each in self._attachments}
         topics = tuple(map(self._placed, self._staging.topics.values()))
-        new = NewSession(self.id, self._metadata, self.created_ns, topics, tuple(self._notes))
+        metadata = self._metadata_with_attachments()
+        new = NewSession(self.id, metadata, self.created_ns, topics, tuple(self._notes))
+        replaced_attachments = self._replaced_attachments()
         try:
             with translate_errors(self._layout.root):
                 self._layout.publish(moves)
@@ -342,7 +388,36 @@ class StoreSession:
                 self._layout.remove(moves.values())
             raise
         self._leave()
-        self._layout.remove(self._layout.root / path for path in replaced)
+        self._layout.remove([*(self._layout.root / path for path in replaced), *replaced_attachments])
+
+    def _final(self, attachment: _Attachment) -> AnyPath:
+        return self._layout.attachment(self._claim.sequence, attachment.name)
+
+    def _metadata_with_attachments(self) -> str:
+        """Return the metadata of the session with the list of its attachments."""
+        if not self._attachments:
+            return self._metadata
+        entries = [
+            {
+                "path": self._layout.relative(self._final(each)),
+                "name": each.file.name,
+                "media_type": each.file.media_type,
+                "log_ns": each.file.log_ns,
+                "create_ns": each.file.create_ns,
+                "bytes": each.size_bytes,
+                "checksum": each.checksum,
+            }
+            for each in self._attachments
+        ]
+        metadata = {**json.loads(self._metadata), ATTACHMENTS_KEY: entries}
+        return protocol.check_metadata(metadata, where=self._claim.sequence)
+
+    def _replaced_attachments(self) -> list[AnyPath]:
+        """Return the attachments of the stored sequence that the commit replaces."""
+        if self._claim.if_exists is not IfExists.REPLACE or self._claim.sequence_id is None:
+            return []
+        info = self._catalog.sequence(self._claim.sequence)
+        return [] if info is None else [each.path for each in info.attachments]
 
     def _close_topics(self) -> None:
         """Close large topics on threads, and small topics on this thread meanwhile."""

@@ -10,14 +10,22 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from msgspec import Struct
+from xxhash import xxh3_128
 
 from mosaico_ingest import protocol
 from mosaico_ingest.destinations.store.catalog import Catalog
 from mosaico_ingest.destinations.store.checksum import ContentHash, column_makers
 from mosaico_ingest.destinations.store.errors import NotInStore, translate_errors
-from mosaico_ingest.destinations.store.files import LocalFiles, opened
+from mosaico_ingest.destinations.store.files import ATTACHMENTS, LocalFiles, opened
 from mosaico_ingest.destinations.store.listing import Listing, SequenceFilter
-from mosaico_ingest.destinations.store.model import Collected, NewNote, SegmentInfo, SequenceInfo, TopicInfo
+from mosaico_ingest.destinations.store.model import (
+    AttachmentInfo,
+    Collected,
+    NewNote,
+    SegmentInfo,
+    SequenceInfo,
+    TopicInfo,
+)
 from mosaico_ingest.destinations.store.protocols import Files, StoreCatalog
 from mosaico_ingest.destinations.store.segment import sorted_rows, time_span
 from mosaico_ingest.errors import SinkError
@@ -35,11 +43,45 @@ class Checked(Struct, frozen=True):
     problem: str | None
 
 
+class CheckedAttachment(Struct, frozen=True):
+    """An attachment that was read completely, and its problem, if any."""
+
+    attachment: AttachmentInfo
+    problem: str | None
+
+
+_READ_BYTES = 1 << 20
+
+
 def verify(info: SequenceInfo) -> Iterator[Checked]:
     """Read every segment of a sequence and compare pages, rows and checksums with the catalog."""
     for topic in info.topics:
         for segment in topic.segments:
             yield Checked(topic.name, segment, _problem(topic, segment))
+
+
+def verify_attachments(info: SequenceInfo) -> Iterator[CheckedAttachment]:
+    """Read every attachment of a sequence and compare its size and checksum with the catalog."""
+    for attachment in info.attachments:
+        yield CheckedAttachment(attachment, _attachment_problem(attachment))
+
+
+def _attachment_problem(attachment: AttachmentInfo) -> str | None:
+    digest, size = xxh3_128(), 0
+    try:
+        with attachment.path.open("rb") as file:
+            while chunk := file.read(_READ_BYTES):
+                digest.update(chunk)
+                size += len(chunk)
+    except FileNotFoundError:
+        return "the file does not exist"
+    except OSError as error:
+        return str(error).partition("\n")[0]
+    if (size, digest.hexdigest()) == (attachment.stored_bytes, attachment.checksum):
+        return None
+    form = "{} bytes and the checksum {}"
+    expected = form.format(attachment.stored_bytes, attachment.checksum)
+    return f"the catalog has {expected}, the file has {form.format(size, digest.hexdigest())}"
 
 
 def _problem(topic: TopicInfo, segment: SegmentInfo) -> str | None:
@@ -334,7 +376,9 @@ class Store(Struct, frozen=True):
 
     def delete_sequence(self, sequence: str) -> None:
         """Remove a sequence; raises SinkError if it does not exist."""
-        self._remove(self.catalog.delete_sequence(sequence))
+        info = self.catalog.sequence(sequence)
+        paths = self.catalog.delete_sequence(sequence)
+        self.layout.remove([*(self.path / path for path in paths), *_attachment_paths(info)])
 
     def delete_topic(self, sequence: str, topic: str) -> None:
         """Remove a topic; raises SinkError if it does not exist."""
@@ -342,7 +386,9 @@ class Store(Struct, frozen=True):
 
     def delete_session(self, sequence: str, session: str) -> None:
         """Remove the content of a session; raises SinkError if it does not exist."""
-        self._remove(self.catalog.delete_session(sequence, session))
+        info = self.catalog.sequence(sequence)
+        paths = self.catalog.delete_session(sequence, session)
+        self.layout.remove([*(self.path / path for path in paths), *_attachment_paths(info, session)])
 
     def collect_garbage(self, *, grace_s: float = _GRACE_S) -> Collected:
         """Remove files that crashed writers and interrupted deletions left behind.
@@ -354,6 +400,9 @@ class Store(Struct, frozen=True):
             sessions = self.layout.open_sessions()
             live = {session for session in sessions if self.layout.in_use(session, grace_s)}
             paths = self.catalog.forget(live)
+            if any(self.layout.relative(file).startswith(f"{ATTACHMENTS}/") for file in files):
+                kept = (path for info in self.catalog.sequences() for path in _attachment_paths(info))
+                paths |= {self.layout.relative(path) for path in kept}
             orphans = [file for file in files if self._is_orphan(file, paths, live)]
             dead = sorted(set(sessions) - live)
             staged = [file for session in dead for file in self.layout.staged_files(session)]
@@ -368,6 +417,12 @@ class Store(Struct, frozen=True):
 
     def _is_orphan(self, file: AnyPath, known: set[str], live: set[str]) -> bool:
         return self.layout.relative(file) not in known and file.name.partition("-")[0] not in live
+
+
+def _attachment_paths(info: SequenceInfo | None, session: str | None = None) -> list[AnyPath]:
+    """Return the paths of a sequence's attachments, or of those that one session stored."""
+    attachments = () if info is None else info.attachments
+    return [each.path for each in attachments if session in {None, each.session}]
 
 
 def _chosen(schema: pa.Schema, columns: Sequence[str], *, where: str) -> pa.Schema:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -13,6 +13,7 @@ from msgspec.structs import replace
 
 from mosaico_ingest.containers import MCAP
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.rosbag.attachments import Attachment
 from mosaico_ingest.rosbag.blocks import LATEST_NS, UnreadableRange
 from mosaico_ingest.rosbag.compression import MAX_CHUNK_BYTES, decompress_partially
 from mosaico_ingest.rosbag.mcap.records import (
@@ -36,6 +37,10 @@ _CHUNK_HEAD_BYTES = 1 << 12
 """Bytes to read for the fields of a chunk record before its data; more than they can take."""
 _RUN_BYTES = 4 << 20
 """Maximum size of an extent of messages outside chunks."""
+_ATTACHMENT_HEAD_BYTES = 1 << 16
+"""Bytes to read for the fields of an attachment before its data."""
+_ATTACHMENT_BYTES = 4 << 20
+"""Bytes of an attachment that are read at a time."""
 _MESSAGE = struct.Struct("<HIQ")
 
 
@@ -81,6 +86,10 @@ class McapIndex:
     """Start and end of the content of each metadata record."""
     lists_metadata: bool = True
     """Whether `metadata` is complete; the summary may omit the index of metadata records."""
+    attachments: list[tuple[int, int]] = field(default_factory=list[tuple[int, int]])
+    """Start and end of the content of each attachment record."""
+    lists_attachments: bool = True
+    """Whether `attachments` is complete; the summary may omit the index of attachments."""
     is_walked: bool = False
     """Whether the index comes from a walk over all records rather than from the summary."""
 
@@ -128,14 +137,61 @@ def read_metadata(
     """Return the metadata records; damaged ones are skipped. Walks over the records if the summary does not list them."""
     ranges = index.metadata
     if not index.lists_metadata:
-        walked = McapIndex()
-        _Walk(source, walked, max_chunk_bytes).over(len(MCAP), index.data_end)
-        ranges = walked.metadata
+        ranges = _walked(source, index, max_chunk_bytes).metadata
     records: list[MetadataRecord] = []
     for start, end in ranges:
         with suppress(BagError):
             records.append(metadata_of(Fields(source.read(start, end - start))))
     return records
+
+
+def read_attachments(
+    source: Source, index: McapIndex, max_chunk_bytes: int = MAX_CHUNK_BYTES
+) -> list[Attachment]:
+    """Return the attachments; damaged ones are skipped. Walks over the records if the summary does not list them."""
+    ranges = index.attachments
+    if not index.lists_attachments:
+        ranges = _walked(source, index, max_chunk_bytes).attachments
+    attachments: list[Attachment] = []
+    for start, end in ranges:
+        with suppress(BagError):
+            attachments.append(_attachment(source, start, end))
+    return attachments
+
+
+def attachment_chunks(source: Source, attachment: Attachment) -> Iterator[bytes]:
+    """Yield the content of an attachment.
+
+    Raises:
+        BagError: The content cannot be read, or differs from its checksum; raised after the last chunk.
+    """
+    end = attachment.data_offset + attachment.size_bytes
+    crc = zlib.crc32(source.read(attachment.offset, attachment.data_offset - attachment.offset))
+    for position in range(attachment.data_offset, end, _ATTACHMENT_BYTES):
+        chunk = source.read(position, min(_ATTACHMENT_BYTES, end - position))
+        crc = zlib.crc32(chunk, crc)
+        yield chunk
+    expected = int.from_bytes(source.read(end, 4), "little")
+    if expected and crc != expected:
+        raise BagError(f"the checksum of the attachment {attachment.name!r} differs from that in the file")
+
+
+def _attachment(source: Source, start: int, end: int) -> Attachment:
+    head = source.read(start, min(end - start, _ATTACHMENT_HEAD_BYTES))
+    fields = Fields(head)
+    log_ns, create_ns, name, media_type = fields.u64(), fields.u64(), fields.text(), fields.text()
+    size = fields.u64()
+    data = start + len(head) - fields.left
+    if data + size + 4 != end:
+        raise BagError(f"the attachment {name!r} has {size} bytes, which do not fit its record")
+    has_crc = source.read(end - 4, 4) != bytes(4)
+    return Attachment(name, media_type, log_ns, create_ns, size, has_crc, offset=start, data_offset=data)
+
+
+def _walked(source: Source, index: McapIndex, max_chunk_bytes: int) -> McapIndex:
+    walked = McapIndex()
+    _Walk(source, walked, max_chunk_bytes).over(len(MCAP), index.data_end)
+    return walked
 
 
 def _read_summary(source: Source) -> McapIndex | None:
@@ -160,7 +216,7 @@ def _parse_summary(data: bytes, data_end: int) -> McapIndex | None:
     """Return the content of the summary, or None if records that the reader needs are missing."""
     index = McapIndex(data_end=data_end)
     chunk_count: int | None = None
-    metadata_count = 0
+    metadata_count = attachment_count = 0
     for op, start, end in records_in(data):
         fields = Fields(data, start, end)
         if op == Op.CHUNK_INDEX:
@@ -169,13 +225,17 @@ def _parse_summary(data: bytes, data_end: int) -> McapIndex | None:
             offset, length = fields.u64(), fields.u64()
             index.metadata.append((offset + RECORD.size, offset + length))
         elif op == Op.STATISTICS:
-            chunk_count, metadata_count = _add_statistics(fields, index)
+            chunk_count, metadata_count, attachment_count = _add_statistics(fields, index)
+        elif op == Op.ATTACHMENT_INDEX:
+            offset, length = fields.u64(), fields.u64()
+            index.attachments.append((offset + RECORD.size, offset + length))
         else:
             _add_description(op, fields, index)
     counts = index.counts
     if counts is None or chunk_count != len(index.extents) or not index.channels.keys() >= counts.keys():
         return None
     index.lists_metadata = metadata_count == len(index.metadata)
+    index.lists_attachments = attachment_count == len(index.attachments)
     return index
 
 
@@ -199,11 +259,11 @@ def _indexed_chunk(fields: Fields, data_end: int) -> Extent:
     return Extent(offset, stop, start_ns, end_ns, indexes, fields.u64())
 
 
-def _add_statistics(fields: Fields, index: McapIndex) -> tuple[int, int]:
-    """Add counts and times to the index; return the number of chunks and of metadata records."""
+def _add_statistics(fields: Fields, index: McapIndex) -> tuple[int, int, int]:
+    """Add counts and times to the index; return the number of chunks, of metadata records and of attachments."""
     total = fields.u64()
-    fields.take(2 + 4 + 4)
-    metadata, chunks = fields.u32(), fields.u32()
+    fields.take(2 + 4)
+    attachments, metadata, chunks = fields.u32(), fields.u32(), fields.u32()
     start_ns, end_ns = fields.u64(), fields.u64()
     index.counts = {channel: count for channel, count in fields.pairs("<HQ") if count}
     if max(start_ns, end_ns) > LATEST_NS:
@@ -212,7 +272,7 @@ def _add_statistics(fields: Fields, index: McapIndex) -> tuple[int, int]:
         raise BagError(f"{total} messages in total, {sum(index.counts.values())} by channel")
     if total:
         index.start_ns, index.end_ns = start_ns, end_ns
-    return chunks, metadata
+    return chunks, metadata, attachments
 
 
 class _Walk:
@@ -263,6 +323,8 @@ class _Walk:
             self._add_chunk(start, end)
         elif op == Op.MESSAGE_INDEX:
             self._add_message_index(start, end)
+        elif op == Op.ATTACHMENT:
+            self._index.attachments.append((start + RECORD.size, end))
         elif op == Op.METADATA:
             self._index.metadata.append((start + RECORD.size, end))
         elif op in (Op.SCHEMA, Op.CHANNEL):

@@ -19,6 +19,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.rosbag.attachments import Attachment
 from mosaico_ingest.rosbag.blocks import (
     EARLIEST_NS,
     LATEST_NS,
@@ -46,7 +47,15 @@ from mosaico_ingest.rosbag.compression import (
     decompression_groups,
 )
 from mosaico_ingest.rosbag.definitions.model import Embedded
-from mosaico_ingest.rosbag.mcap.index import Extent, McapIndex, read_extents, read_index, read_metadata
+from mosaico_ingest.rosbag.mcap.index import (
+    Extent,
+    McapIndex,
+    attachment_chunks,
+    read_attachments,
+    read_extents,
+    read_index,
+    read_metadata,
+)
 from mosaico_ingest.rosbag.mcap.records import RECORD, ChannelRecord, ChunkHead, Op, SchemaRecord, chunk_head
 from mosaico_ingest.rosbag.source import ReadBuffer, Source
 
@@ -138,6 +147,14 @@ class McapReader:
         for record in read_metadata(self._source, self._index, self._max_chunk_bytes):
             records.setdefault(record.name, {}).update(record.entries)
         return records
+
+    def attachments(self) -> list[Attachment]:
+        """Return the attachments without their content."""
+        return read_attachments(self._source, self._index, self._max_chunk_bytes)
+
+    def attachment_chunks(self, attachment: Attachment) -> Iterator[bytes]:
+        """Yield the content of an attachment; see `index.attachment_chunks`."""
+        return attachment_chunks(self._source, attachment)
 
     def index_times(self, connections: Collection[int]) -> dict[int, list[Int64s]] | None:
         """Return the log times of some connections according to the message indexes; None if a chunk has none."""

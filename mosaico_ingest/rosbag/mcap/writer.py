@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import zstandard
 
 from mosaico_ingest.containers import MCAP
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.rosbag.attachments import Attachment
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, short_msgtype
 from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS, encoding_of
 from mosaico_ingest.rosbag.mcap.records import RECORD, Op, record_bytes, text_bytes, texts_bytes
@@ -52,6 +54,11 @@ class McapWriter:
         self._end_ns = 0
         self._file.write(MCAP)
         self._has_header = False
+        self._topics: list[tuple[str, str, str]] = []
+        """Topic, type and encoding of each channel."""
+        self._custom_data: dict[str, str] = {}
+        self._metadata_indexes: list[bytes] = []
+        self._attachment_indexes: list[bytes] = []
 
     def add_connection(
         self,
@@ -71,7 +78,46 @@ class McapWriter:
         content = struct.pack("<HH", number, schema) + text_bytes(topic) + text_bytes(encoding)
         self._add(Op.CHANNEL, content + texts_bytes(dict(metadata or {})))
         self._counts[number] = 0
+        self._topics.append((topic, definition.root, encoding))
         return number
+
+    def add_metadata(self, name: str, entries: Iterable[tuple[str, str]]) -> None:
+        """Write a metadata record."""
+        self._write_pending()
+        content = text_bytes(name) + texts_bytes(dict(entries))
+        at = self._put(Op.METADATA, content)
+        entry = struct.pack("<QQ", at, self._file.tell() - at) + text_bytes(name)
+        self._metadata_indexes.append(record_bytes(Op.METADATA_INDEX, entry))
+
+    def add_attachment(self, attachment: Attachment, chunks: Iterable[bytes]) -> None:
+        """Write an attachment with its checksum.
+
+        Raises:
+            BagError: The chunks do not have the size of the attachment.
+        """
+        self._write_pending()
+        head = struct.pack("<QQ", attachment.log_ns, attachment.create_ns)
+        head += text_bytes(attachment.name) + text_bytes(attachment.media_type)
+        head += struct.pack("<Q", attachment.size_bytes)
+        at = self._file.tell()
+        self._file.write(RECORD.pack(Op.ATTACHMENT, len(head) + attachment.size_bytes + 4) + head)
+        crc, size = zlib.crc32(head), 0
+        for chunk in chunks:
+            self._file.write(chunk)
+            crc = zlib.crc32(chunk, crc)
+            size += len(chunk)
+        if size != attachment.size_bytes:
+            what = f"the attachment {attachment.name!r} has {size} bytes instead of {attachment.size_bytes}"
+            raise BagError(what)
+        self._file.write(struct.pack("<I", crc if attachment.has_crc else 0))
+        entry = struct.pack("<QQ", at, self._file.tell() - at)
+        entry += struct.pack("<QQQ", attachment.log_ns, attachment.create_ns, attachment.size_bytes)
+        entry += text_bytes(attachment.name) + text_bytes(attachment.media_type)
+        self._attachment_indexes.append(record_bytes(Op.ATTACHMENT_INDEX, entry))
+
+    def set_custom_data(self, custom_data: Mapping[str, str]) -> None:
+        """Set the `custom_data` of rosbag2, which the copy of `metadata.yaml` in the file contains."""
+        self._custom_data = dict(custom_data)
 
     def write(self, channel: int, log_ns: int, payload: bytes) -> None:
         """Append a message; its publish time is unknown, so the log time is used."""
@@ -94,6 +140,8 @@ class McapWriter:
         """Write the last chunk and the summary."""
         self._write_pending()
         self._flush()
+        if self._custom_data:
+            self.add_metadata("rosbag2", [("serialized_metadata", self._rosbag2_metadata())])
         self._put(Op.DATA_END, struct.pack("<I", 0))
         start = self._file.tell()
         groups = [
@@ -101,6 +149,8 @@ class McapWriter:
             (Op.CHANNEL, [record for record in self._records if record[0] == Op.CHANNEL]),
             (Op.STATISTICS, [record_bytes(Op.STATISTICS, self._statistics())]),
             (Op.CHUNK_INDEX, self._chunk_indexes),
+            (Op.ATTACHMENT_INDEX, self._attachment_indexes),
+            (Op.METADATA_INDEX, self._metadata_indexes),
         ]
         summary, offsets = b"", b""
         for op, records in groups:
@@ -177,11 +227,42 @@ class McapWriter:
         content += struct.pack("<QQ", len(packed), len(data))
         self._chunk_indexes.append(record_bytes(Op.CHUNK_INDEX, content))
 
+    def _rosbag2_metadata(self) -> str:
+        """Return a `metadata.yaml` in JSON, which is YAML."""
+        start_ns = self._start_ns or 0
+        information = {
+            "version": 9,
+            "storage_identifier": "mcap",
+            "relative_file_paths": [],
+            "duration": {"nanoseconds": self._end_ns - start_ns},
+            "starting_time": {"nanoseconds_since_epoch": start_ns},
+            "message_count": sum(self._counts.values()),
+            "topics_with_message_count": [
+                {
+                    "topic_metadata": {
+                        "name": topic,
+                        "type": msgtype,
+                        "serialization_format": encoding,
+                        "offered_qos_profiles": [],
+                        "type_description_hash": "",
+                    },
+                    "message_count": self._counts[number],
+                }
+                for number, (topic, msgtype, encoding) in enumerate(self._topics, 1)
+            ],
+            "compression_format": "",
+            "compression_mode": "",
+            "files": [],
+            "custom_data": self._custom_data,
+            "ros_distro": "",
+        }
+        return json.dumps({"rosbag2_bagfile_information": information})
+
     def _statistics(self) -> bytes:
         counts = b"".join(struct.pack("<HQ", channel, count) for channel, count in self._counts.items())
         return (
             struct.pack("<QHI", sum(self._counts.values()), len(self._schemas), len(self._versions))
-            + struct.pack("<II", 0, 0)
+            + struct.pack("<II", len(self._attachment_indexes), len(self._metadata_indexes))
             + struct.pack("<I", len(self._chunk_indexes))
             + struct.pack("<QQ", self._start_ns or 0, self._end_ns)
             + struct.pack("<I", len(counts))
