@@ -110,7 +110,7 @@ def compile_job(manifest: Path, *, locked: bool = True) -> tuple[Job, ...]:
     return jobs
 
 
-def compile_recording(manifest: Path, recording: Path) -> tuple[Job, ...]:
+def compile_recording(manifest: Path, recording: AnyPath) -> tuple[Job, ...]:
     """Return the jobs of a manifest for one recording instead of those of `bag.path`.
 
     `if_exists: fail`, the default, becomes `skip`, so that a recording may be submitted again.

@@ -111,7 +111,9 @@ _CREDENTIALS = re.compile(
     re.IGNORECASE,
 )
 """User names and passwords in URLs, API keys, and the options of URLs."""
-_SECRET_OPTION = re.compile("key|password|token|secret|signature", re.IGNORECASE)
+_SECRET_OPTION = re.compile(
+    r"key|password|token|secret|signature|credential|policy|\bsig=|accessid", re.IGNORECASE
+)
 _MASK = "***"
 
 

@@ -78,29 +78,44 @@ def is_transient(err: OSError) -> bool:
     return isinstance(err, ConnectionError | TimeoutError) or _TRANSIENT.search(str(err)) is not None
 
 
-_ATTEMPTS = 5
-"""Maximum number of attempts per S3 request, with a delay that doubles."""
-_CONNECT_S, _REQUEST_S = 5.0, 30.0
-"""Timeouts of a connection and of a request to S3, in seconds."""
-_RETRY_S = 30.0
-"""Time limit for all attempts of a GCS request, in seconds."""
+class Network(Struct, frozen=True):
+    """How long to wait for a server, and how often to repeat a failed request."""
+
+    attempts: int = 5
+    """Maximum number of attempts per request, with a delay that doubles; GCS repeats for `request_s` seconds instead."""
+    connect_s: float = 5.0
+    """Timeout of a connection, in seconds."""
+    request_s: float = 30.0
+    """Timeout of a request, in seconds."""
+    max_download_bytes: int | None = None
+    """Maximum size of a recording that must be downloaded completely; None for no limit."""
 
 
-def filesystem(root: str, options: str) -> FileSystem:
+def filesystem(root: str, options: str, network: Network = Network()) -> FileSystem:  # noqa: B008 - immutable
     """Return the file system of a root such as `s3://bucket`, cached per process and options.
 
     Raises:
         IngestError: The scheme or an option is unknown.
         Unreachable: The region of the bucket cannot be determined.
     """
-    return _cached_filesystem(root, options, os.getpid())  # a connection must not cross a fork
+    return _cached_filesystem(root, options, network, os.getpid())  # a connection must not cross a fork
 
 
 @lru_cache(maxsize=64)
-def _cached_filesystem(root: str, options: str, _process: int) -> FileSystem:
+def _cached_filesystem(root: str, options: str, network: Network, _process: int) -> FileSystem:
     scheme, _, bucket = root.partition("://")
+    if scheme in WEB_SCHEMES:
+        return _web(root, options, network)
     create, option_names = SCHEMES[scheme]
-    return create(bucket, _options(root, options, option_names))
+    return create(bucket, _options(root, options, option_names), network)
+
+
+def _web(root: str, query: str, network: Network) -> FileSystem:
+    from pyarrow import fs  # noqa: PLC0415 - slow to import, and only jobs with URLs need it
+
+    from mosaico_ingest.web_files import WebFiles  # noqa: PLC0415 - as the previous line
+
+    return fs.PyFileSystem(WebFiles(root, query, network))
 
 
 def _options(root: str, options: str, names: tuple[str, ...]) -> dict[str, str]:
@@ -114,7 +129,7 @@ def _options(root: str, options: str, names: tuple[str, ...]) -> dict[str, str]:
     return values
 
 
-def _s3(bucket: str, options: dict[str, str]) -> FileSystem:
+def _s3(bucket: str, options: dict[str, str], network: Network) -> FileSystem:
     from pyarrow import fs  # noqa: PLC0415 - slow to import, and only jobs with URLs need it
 
     region = options.get("region")
@@ -126,30 +141,71 @@ def _s3(bucket: str, options: dict[str, str]) -> FileSystem:
         scheme=options.get("scheme", "https"),
         endpoint_override=options.get("endpoint_override"),
         anonymous=options.get("anonymous") == "true",
-        connect_timeout=_CONNECT_S,
-        request_timeout=_REQUEST_S,
-        retry_strategy=fs.AwsStandardS3RetryStrategy(max_attempts=_ATTEMPTS),
+        connect_timeout=network.connect_s,
+        request_timeout=network.request_s,
+        retry_strategy=fs.AwsStandardS3RetryStrategy(max_attempts=network.attempts),
         allow_delayed_open=True,  # pyright: ignore[reportCallIssue] - the stubs are older; the option sends small objects in one request
     )
 
 
-def _gs(_bucket: str, options: dict[str, str]) -> FileSystem:
+def _gs(_bucket: str, options: dict[str, str], network: Network) -> FileSystem:
     from pyarrow import fs  # noqa: PLC0415 - slow to import, and only jobs with URLs need it
 
     return fs.GcsFileSystem(
         anonymous=options.get("anonymous") == "true",
         scheme=options.get("scheme", "https"),
         endpoint_override=options.get("endpoint_override"),
-        retry_time_limit=timedelta(seconds=_RETRY_S),
+        retry_time_limit=timedelta(seconds=network.request_s),
     )
 
 
-_Factory = Callable[[str, dict[str, str]], "FileSystem"]
+def _az(_container: str, options: dict[str, str], _network: Network) -> FileSystem:
+    """Return the file system of Azure; its client has timeouts and retries of its own."""
+    try:
+        from pyarrow.fs import AzureFileSystem  # noqa: PLC0415 - slow to import, and only jobs with URLs need it
+    except ImportError as error:
+        raise IngestError(
+            "this build of pyarrow has no client for az://",
+            hint="install the wheel of pyarrow from PyPI (pip install --only-binary :all: pyarrow)",
+        ) from error
+    account = options.get("account_name") or _environment(
+        "AZURE_STORAGE_ACCOUNT_NAME", "AZURE_STORAGE_ACCOUNT"
+    )
+    if account is None:
+        raise IngestError(
+            "the URL names no storage account",
+            where=f"az://{_container}",
+            hint="append ?account_name=NAME, or set AZURE_STORAGE_ACCOUNT_NAME",
+        )
+    authority: dict[str, Any] = {}
+    endpoint = options.get("endpoint_override")
+    if endpoint is not None:
+        scheme = options.get("scheme", "https")
+        authority = {
+            "blob_storage_authority": endpoint,
+            "dfs_storage_authority": endpoint,
+            "blob_storage_scheme": scheme,
+            "dfs_storage_scheme": scheme,
+        }
+    key = _environment("AZURE_STORAGE_KEY", "AZURE_STORAGE_ACCOUNT_KEY")
+    token = None if key else _environment("AZURE_STORAGE_SAS_TOKEN")
+    return AzureFileSystem(account_name=account, account_key=key, sas_token=token, **authority)
+
+
+def _environment(*names: str) -> str | None:
+    """Return the value of the first environment variable that is set."""
+    return next((value for name in names if (value := os.environ.get(name))), None)
+
+
+_Factory = Callable[[str, "dict[str, str]", Network], "FileSystem"]
 SCHEMES: dict[str, tuple[_Factory, tuple[str, ...]]] = {
     "s3": (_s3, ("endpoint_override", "scheme", "region", "anonymous")),
     "gs": (_gs, ("endpoint_override", "scheme", "anonymous")),
+    "az": (_az, ("account_name", "endpoint_override", "scheme")),
 }
-"""The supported schemes, with the options that are allowed after `?`."""
+"""The supported schemes of object stores, with the options that are allowed after `?`."""
+WEB_SCHEMES = ("https", "http")
+"""The schemes of web servers, which cannot be listed or written; the text after `?` is part of the URL."""
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/(?=[^/])|([A-Za-z][A-Za-z0-9+.-]+)://")
 """A URL; one slash is accepted too, because `Path` merges the two slashes of a URL."""
@@ -176,6 +232,7 @@ class RemotePath:
     key: str
     options: str = field(default="", repr=False)
     listed: RemoteStat | None = field(default=None, compare=False, repr=False)
+    network: Network = field(default=Network(), compare=False, repr=False)
 
     def __str__(self) -> str:
         """Return the URL without its options."""
@@ -206,9 +263,14 @@ class RemotePath:
         return replace(self, key=self.key.rpartition("/")[0], listed=None)
 
     @property
+    def is_web(self) -> bool:
+        """Whether the path is a file of a web server, which has no folders."""
+        return self.root.partition("://")[0] in WEB_SCHEMES
+
+    @property
     def filesystem(self) -> FileSystem:
         """The file system of the path."""
-        return filesystem(self.root, self.options)
+        return filesystem(self.root, self.options, self.network)
 
     @property
     def filesystem_path(self) -> str:
@@ -315,9 +377,18 @@ class RemotePath:
         """
         with translate_errors(str(self)):
             opened = file or self.open_input()
+            if self.is_web:
+                return self._web_version()
             metadata = {str(name).lower(): bytes(value).decode() for name, value in opened.metadata().items()}
             tag = next((metadata[name] for name in ("etag", "generation") if metadata.get(name)), None)
             return f"{opened.size()} {tag or self.now().stat().st_mtime_ns}"
+
+    def _web_version(self) -> str:
+        handler: Any = self.filesystem.handler  # pyright: ignore[reportAttributeAccessIssue] - that of a `PyFileSystem`
+        found = handler.properties(self.filesystem_path, cached=False)
+        if found is None:
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self))
+        return f"{found.size} {found.version}"
 
     def read_bytes(self) -> bytes:
         """Return the content of the object."""
@@ -353,6 +424,11 @@ def is_url(text: str) -> bool:
     return _URL.match(text) is not None
 
 
+def with_network(path: AnyPath, network: Network) -> AnyPath:
+    """Return a path with the timeouts and retries of its requests; local paths are returned unchanged."""
+    return replace(path, network=network) if isinstance(path, RemotePath) else path
+
+
 def without_options(text: str) -> str:
     """Return a URL without its options; other text is returned unchanged."""
     return text.partition("?")[0] if is_url(text) else text
@@ -372,16 +448,15 @@ def as_path(given: str | Path | RemotePath) -> AnyPath:
     try:
         url = urlsplit(text, allow_fragments=False)  # names of objects may contain #
     except ValueError as error:
-        raise IngestError(f"the URL is invalid: {error}", where=str(given)) from error
+        raise IngestError(f"the URL is invalid: {error}", where=without_options(text)) from error
     if url.scheme == "file":
         return Path(unquote(url.path))
-    if url.scheme not in SCHEMES:
-        schemes = ", ".join(f"{scheme}://" for scheme in (*SCHEMES, "file"))
-        raise IngestError(
-            f"unknown URL scheme {url.scheme}://", where=str(given), hint=f"use one of {schemes}"
-        )
+    where = without_options(text)
+    if url.scheme not in SCHEMES and url.scheme not in WEB_SCHEMES:
+        schemes = ", ".join(f"{scheme}://" for scheme in (*SCHEMES, *WEB_SCHEMES, "file"))
+        raise IngestError(f"unknown URL scheme {url.scheme}://", where=where, hint=f"use one of {schemes}")
     if not url.netloc:
-        raise IngestError("the URL has no bucket", where=str(given), hint=f"write {url.scheme}://BUCKET/PATH")
+        raise IngestError("the URL has no bucket", where=where, hint=f"write {url.scheme}://BUCKET/PATH")
     if "@" in url.netloc:
         raise IngestError(
             "the URL contains credentials",
@@ -405,7 +480,7 @@ def parse_url(text: str) -> AnyPath:
             "the URL has one slash after its scheme", where=text, hint=f"write {text.replace(':/', '://', 1)}"
         )
     path = as_path(text)
-    if isinstance(path, RemotePath):
+    if isinstance(path, RemotePath) and not path.is_web:
         _options(path.root, path.options, SCHEMES[path.root.partition("://")[0]][1])
     return path
 

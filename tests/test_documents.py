@@ -27,7 +27,7 @@ DOCS = sorted((ROOT / "docs").glob("*.md"))
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 TEXT = {page: page.read_text(encoding="utf-8") for page in PAGES}
 INGEST: Any = get_command(command_line())
-NOT_RUN = ("--executor", "--from", "--otel", "--metrics", "serve", "browse", "replay", "lint .")
+NOT_RUN = ("--executor", "--from", "--otel", "--metrics", "serve", "browse", "replay", "lint .", "s3://")
 """Parts of commands that need a cluster, a server, a collector, a system folder, a client or rejected messages, or that read all files."""
 EXIT_CODES = {
     "ingest diff job.yaml other.yaml": 1,

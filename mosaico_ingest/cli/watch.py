@@ -14,6 +14,7 @@ from mosaico_ingest.cli.options import JsonOption, VerifyOption, log_level
 
 if TYPE_CHECKING:
     from mosaico_ingest.job.model import Job
+    from mosaico_ingest.remote import AnyPath
     from mosaico_ingest.report.model import Report
     from mosaico_ingest.services.status import RecordingStatus
     from mosaico_ingest.services.watch import Arrivals
@@ -71,10 +72,8 @@ def _print_status(recordings: list[RecordingStatus]) -> None:
 
 def watch(
     folder: Annotated[
-        Path,
-        typer.Argument(
-            metavar="DIR", help="Folder in which recordings arrive.", exists=True, file_okay=False
-        ),
+        str,
+        typer.Argument(metavar="DIR", help="Folder or URL (s3://, gs://, az://) in which recordings arrive."),
     ],
     manifest: Annotated[
         Path,
@@ -115,27 +114,31 @@ def watch(
     ] = False,
     log: Annotated[str, log_level()] = "WARNING",
 ) -> None:
-    """Ingest recordings that arrive in a folder, until interrupted.
+    """Ingest recordings that arrive in a folder or behind a URL, until interrupted.
 
     Sequences that are already stored with the same content are skipped.
     """
     from mosaico_ingest.cli.logs import set_up_logging
     from mosaico_ingest.cli.process import collect_garbage_as_usual, interrupt_on_sigterm
     from mosaico_ingest.job.manifest import load_manifests
+    from mosaico_ingest.remote import as_path, with_network
     from mosaico_ingest.report.model import gravest
     from mosaico_ingest.services.watch import Arrivals
 
     set_up_logging(log)
     interrupt_on_sigterm()
     collect_garbage_as_usual()
-    arrivals = Arrivals(folder, rest, max(rest, unfinished_rest))
-    load_manifests(manifest)  # report mistakes now, not with the first recording
-    _print(f"watching {folder}")
+    jobs_of_manifest = load_manifests(manifest)  # report mistakes now, not with the first recording
+    watched = with_network(as_path(folder), jobs_of_manifest[0].manifest.network.limits)
+    if isinstance(watched, Path) and not watched.is_dir():
+        raise typer.BadParameter(f"{folder} is not a folder", param_hint="DIR")
+    arrivals = Arrivals(watched, rest, max(rest, unfinished_rest))
+    _print(f"watching {watched}")
     codes: list[int] = []
     deadline = time.monotonic() + rest + every if once else float("inf")
     try:
         while True:
-            complete = arrivals.settled(time.monotonic())
+            complete = _settled(arrivals)
             if complete and not _ingest(manifest, complete, jobs, arrivals, codes, once=once):
                 break
             if not complete and time.monotonic() > deadline:
@@ -152,8 +155,19 @@ def watch(
         raise typer.Exit(code)
 
 
+def _settled(arrivals: Arrivals) -> tuple[AnyPath, ...]:
+    """Return the recordings that became complete; print the reason if the folder cannot be listed at the moment."""
+    from mosaico_ingest.errors import Unreachable
+
+    try:
+        return arrivals.settled(time.monotonic())
+    except Unreachable as error:
+        _print(f"{error}; trying again")
+        return ()
+
+
 def _ingest(
-    manifest: Path, paths: tuple[Path, ...], jobs: int, arrivals: Arrivals, codes: list[int], *, once: bool
+    manifest: Path, paths: tuple[AnyPath, ...], jobs: int, arrivals: Arrivals, codes: list[int], *, once: bool
 ) -> bool:
     """Ingest recordings, print a line about each, and add its exit code to `codes`.
 
@@ -184,7 +198,7 @@ def _ingest(
     return not interrupted
 
 
-def _jobs(manifest: Path, path: Path, arrivals: Arrivals | None, codes: list[int]) -> tuple[Job, ...]:
+def _jobs(manifest: Path, path: AnyPath, arrivals: Arrivals | None, codes: list[int]) -> tuple[Job, ...]:
     from mosaico_ingest import api
     from mosaico_ingest.errors import IngestError
 
@@ -207,7 +221,7 @@ def _outcome_text(report: Report) -> str:
     return f"{outcome}, {counted(totals.written, 'message')}{rejected}, {seconds_text(report.duration_s)}"
 
 
-def _retry_text(arrivals: Arrivals | None, path: Path) -> str:
+def _retry_text(arrivals: Arrivals | None, path: AnyPath) -> str:
     """Schedule another attempt, unless the watch runs once, and return when it is due."""
     return "" if arrivals is None else f"; next attempt in {arrivals.again(path, time.monotonic()):.0f} s"
 

@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 from msgspec import Struct
 
-from mosaico_ingest.findings import Finding
+from mosaico_ingest.findings import Finding, mask_credentials
 from mosaico_ingest.job.compose import EXTENDS_KEY, combinations
 from mosaico_ingest.job.fields import Secret, marked_fields
 from mosaico_ingest.job.manifest import check_manifest, read_manifest, refusal, stand_alone
@@ -183,4 +183,6 @@ def _masked(value: Value, hidden: frozenset[str], *, secret: bool = False) -> Va
     if secret and value is not None:
         names = _VARIABLE.findall(value) if isinstance(value, str) else []
         return "".join(f"${{{name}}}" for name in names) or MASK
-    return _IN_TEXT.sub(lambda match: (match[1] or "") + MASK, value) if isinstance(value, str) else value
+    if not isinstance(value, str):
+        return value
+    return mask_credentials(_IN_TEXT.sub(lambda match: (match[1] or "") + MASK, value))

@@ -22,7 +22,7 @@ from mosaico_ingest.job.reference import job_schema
 from mosaico_ingest.job.section import Section
 from mosaico_ingest.job.validation import explain
 from mosaico_ingest.job.yaml_source import KeyPath, Source, Value, load_source, member, resolve_plain
-from mosaico_ingest.remote import AnyPath, is_url, parse_url
+from mosaico_ingest.remote import AnyPath, RemotePath, is_url, parse_url
 from mosaico_ingest.textfile import read_limited
 
 
@@ -44,9 +44,10 @@ class LoadedManifest(Struct, frozen=True):
         """Return `file:line:column` of the value at a key path."""
         return str(self.source.span(path))
 
-    def for_recording(self, recording: Path) -> LoadedManifest:
+    def for_recording(self, recording: AnyPath) -> LoadedManifest:
         """Return the manifest with another recording."""
-        bag = self.manifest.bag.replace(path=str(recording))
+        path = recording.url if isinstance(recording, RemotePath) else str(recording)
+        bag = self.manifest.bag.replace(path=path)
         return replace(self, manifest=self.manifest.replace(bag=bag))
 
     def resolve(self, path: str, *key_path: str | int) -> Path:

@@ -29,7 +29,7 @@ from typing_extensions import Self
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.findings import Span
 from mosaico_ingest.job.adapter_reference import AdapterReference, LoadedAdapter
-from mosaico_ingest.job.expect import Expectations, Frequency, SignedDuration
+from mosaico_ingest.job.expect import Duration, Expectations, Frequency, SignedDuration
 from mosaico_ingest.job.fields import FilePath, Literally, Parsed, PathRole, Secret, TopicGlob
 from mosaico_ingest.job.file_names import FileNamePattern
 from mosaico_ingest.job.image import ImageFormat, ImageSettings
@@ -59,7 +59,7 @@ from mosaico_ingest.job.values import (
     Unmodeled,
 )
 from mosaico_ingest.protocol import check_metadata, check_sequence_name, check_topic_name
-from mosaico_ingest.remote import RemotePath, as_path
+from mosaico_ingest.remote import Network, RemotePath, as_path, with_network
 
 VERSION = 1
 """The newest manifest version that this tool reads."""
@@ -418,6 +418,26 @@ def _conflict(message: str, key: str) -> PydanticCustomError:
     return PydanticCustomError("conflicting-keys", "{message}", {"key": key, "message": message})
 
 
+class NetworkSettings(Section):
+    """Timeouts and retries of the requests for recordings and stores behind URLs."""
+
+    attempts: Annotated[int, Field(ge=1, le=100)] = 5
+    """Maximum number of attempts per request, with a delay that doubles. Google Cloud Storage repeats for the time of `timeout`
+    instead; Azure uses the defaults of its client."""
+    connect_timeout: Duration = Field(default=5 * 10**9, examples=["10 s"])
+    """Maximum time to establish a connection."""
+    timeout: Duration = Field(default=30 * 10**9, examples=["2 min"])
+    """Maximum time between two parts of a response."""
+    max_download: Bytes | None = Field(default=None, examples=["20GiB"])
+    """Maximum size of a recording that cannot be read by range and is therefore downloaded; larger ones are refused. Defaults
+    to the free space of the temporary folder."""
+
+    @property
+    def limits(self) -> Network:
+        """The settings in the form that paths use."""
+        return Network(self.attempts, self.connect_timeout / 1e9, self.timeout / 1e9, self.max_download)
+
+
 class RunOptions(Section):
     """Options of a run; none of them changes the stored content."""
 
@@ -489,6 +509,8 @@ class JobSettings(Section):
     """Where rejected messages are kept; without this section, they are only counted."""
     target: DestinationSettings = DestinationSettings()
     """Where sequences are written."""
+    network: NetworkSettings = NetworkSettings()
+    """Timeouts and retries of the requests for recordings and stores behind URLs."""
     run: RunOptions = RunOptions()
     """Options of a run."""
 
@@ -538,7 +560,10 @@ class Job(JobSettings):
     @property
     def destination(self) -> Target:
         """The store, server or installed destination that the sequence is written to."""
-        return self.target.target(self.folder)
+        target = self.target.target(self.folder)
+        if isinstance(target, StoreTarget):
+            return StoreTarget(with_network(target.path, self.network.limits))
+        return target
 
     def span(self, *path: str | int) -> Span | None:
         """Return the span of a key or list item in the manifest, None if the manifest does not have it."""

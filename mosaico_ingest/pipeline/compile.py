@@ -33,7 +33,7 @@ from mosaico_ingest.job.values import LOCK_SUFFIX, LockFile
 from mosaico_ingest.job.yaml_source import Source
 from mosaico_ingest.metadata.schema import read_json
 from mosaico_ingest.metadata.sources import source_spans, with_spans
-from mosaico_ingest.remote import AnyPath, RemotePath, without_options
+from mosaico_ingest.remote import AnyPath, RemotePath, with_network, without_options
 from mosaico_ingest.rosbag.discovery import recording_files
 from mosaico_ingest.rosbag.grouping import SplitGroup, group_splits
 from mosaico_ingest.textfile import read_limited
@@ -123,7 +123,7 @@ def _fill(placeholder: Placeholder, recording: Recording) -> str:
 
 def _matches(loaded: LoadedManifest, pattern: str, key_path: tuple[str | int, ...]) -> list[AnyPath]:
     """Return the file or directory `pattern` names, or the recordings it matches, sorted."""
-    path = loaded.resolve_or_url(pattern, *key_path)
+    path = with_network(loaded.resolve_or_url(pattern, *key_path), loaded.manifest.network.limits)
     if path.exists():
         return [path]
     where = loaded.where(*key_path)
@@ -184,6 +184,8 @@ def _any_recording(paths: Iterable[AnyPath]) -> bool:
 
 def _nearby(path: AnyPath) -> str:
     """Return a hint with the existing part of a path and the nearest name in it."""
+    if isinstance(path, RemotePath) and path.is_web:
+        return "check the URL"
     folder = path.parent
     while not folder.is_dir() and folder != folder.parent:
         path, folder = folder, folder.parent

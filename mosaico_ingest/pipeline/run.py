@@ -23,6 +23,7 @@ from mosaico_ingest.pipeline.provenance import check_provenance
 from mosaico_ingest.pipeline.pump import verify, write_sequence
 from mosaico_ingest.pipeline.rejection_log import RejectionLog
 from mosaico_ingest.pipeline.task import Task
+from mosaico_ingest.remote import with_network
 from mosaico_ingest.report.collect import Collector
 from mosaico_ingest.report.contract import ContractResult
 from mosaico_ingest.report.events import (
@@ -123,7 +124,8 @@ def open_job(job: Job) -> Generator[tuple[Recording, TypeResolver]]:
     custom = [(messages.package, Path(messages.path), messages.store) for messages in job.bag.custom_msgs]
     resolver = TypeResolver(job.bag.ros_distro, custom, registry=job.registry or ROSTypeRegistry)
     max_chunk_bytes = job.bag.max_chunk_size or MAX_CHUNK_BYTES
-    with open_recording(job.paths, resolve=resolver, max_chunk_bytes=max_chunk_bytes) as recording:
+    paths = [with_network(path, job.network.limits) for path in job.paths]
+    with open_recording(paths, resolve=resolver, max_chunk_bytes=max_chunk_bytes) as recording:
         yield recording, resolver
 
 

@@ -12,7 +12,7 @@ from msgspec import Struct
 from mosaico_ingest.containers import SUFFIX_LIST, SUFFIXES, ZSTD_SUFFIX
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.findings import Finding, Severity
-from mosaico_ingest.remote import AnyPath
+from mosaico_ingest.remote import AnyPath, RemotePath
 from mosaico_ingest.rosbag.opening import is_recording
 from mosaico_ingest.textfile import read_limited
 
@@ -157,6 +157,8 @@ def _discover_path(path: AnyPath) -> RecordingFiles:
 
 def _discover_file(path: AnyPath) -> RecordingFiles:
     """Return a single file, with the metadata next to it if it describes only this file."""
+    if isinstance(path, RemotePath) and path.is_web:
+        return RecordingFiles((path,), None, ())  # a presigned URL allows only its own file
     metadata_path = path.parent / FILE_NAME
     if not metadata_path.is_file():
         return RecordingFiles((path,), None, ())

@@ -58,7 +58,9 @@ def _open_remote(path: RemotePath, stack: ExitStack, max_chunk_bytes: int) -> Sp
         split = _open_compressed(copy, path, stack, max_chunk_bytes)
         copy.unlink()
     else:
-        for log in (path.parent / f"{path.name}{suffix}" for suffix in ("-wal", "-journal")):
+        for log in (
+            () if path.is_web else (path.parent / f"{path.name}{suffix}" for suffix in ("-wal", "-journal"))
+        ):
             if log.is_file():
                 download(log, folder)
         split = _open_local(copy, path, head, stack, max_chunk_bytes)

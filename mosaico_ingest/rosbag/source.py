@@ -481,6 +481,13 @@ def download(path: RemotePath, folder: Path) -> Path:
 
 
 def _save(source: RemoteSource, folder: Path) -> Path:
+    limit = source.path.network.max_download_bytes
+    if limit is not None and source.size > limit:
+        raise BagError(
+            f"{source.size} bytes must be downloaded, and network.max_download is {limit}",
+            where=str(source.path),
+            hint="raise the limit, or convert the recording to MCAP, which is read by range",
+        )
     free = shutil.disk_usage(folder).free
     hint = "point TMPDIR at a larger disk"
     if source.size > free:

@@ -1,4 +1,4 @@
-"""Recordings that arrive in a folder, and whether they are complete."""
+"""Recordings that arrive in a folder or behind a URL, and whether they are complete."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
 
 from mosaico_ingest.containers import ACTIVE_SUFFIX, MCAP, RECORDING_NAME
+from mosaico_ingest.remote import AnyPath, RemotePath
 
 _METADATA = "metadata.yaml"
 _FIRST_RETRY_S, _LAST_RETRY_S = 60.0, 3600.0
@@ -39,14 +39,14 @@ class _Arrival:
 class Arrivals:
     """The recordings in a folder and its subfolders; hidden files, which copying programs use, are ignored."""
 
-    folder: Path
+    folder: AnyPath
     rest_s: float
     """Seconds without a change after which a recording is complete."""
     unfinished_rest_s: float = 600.0
     """The same for a recording whose end is missing: its upload may have stalled, or its recorder crashed."""
-    _arrivals: dict[Path, _Arrival] = field(default_factory=dict[Path, _Arrival])
+    _arrivals: dict[AnyPath, _Arrival] = field(default_factory=dict)
 
-    def settled(self, now: float) -> tuple[Path, ...]:
+    def settled(self, now: float) -> tuple[AnyPath, ...]:
         """Return the recordings that became complete since the last call; each once until it changes.
 
         `now` is a monotonic time in seconds.
@@ -55,11 +55,11 @@ class Arrivals:
         self._arrivals = {path: arrival for path, arrival in self._arrivals.items() if path in states}
         return tuple(path for path, files in sorted(states.items()) if self._has_settled(path, files, now))
 
-    def complete(self) -> tuple[Path, ...]:
+    def complete(self) -> tuple[AnyPath, ...]:
         """Return all recordings that are complete, including those of earlier calls of `settled`."""
         return tuple(path for path, arrival in sorted(self._arrivals.items()) if arrival.settled)
 
-    def unfinished(self) -> tuple[Path, ...]:
+    def unfinished(self) -> tuple[AnyPath, ...]:
         """Return the recordings that are not settled because their end is missing."""
         return tuple(
             path
@@ -67,14 +67,14 @@ class Arrivals:
             if not arrival.settled and _is_growing(path)
         )
 
-    def again(self, path: Path, now: float) -> float:
+    def again(self, path: AnyPath, now: float) -> float:
         """Schedule a recording that failed to settle again, and return the delay in seconds; it doubles every time."""
         arrival = self._arrivals[path]
         delay_s, arrival.delay_s = arrival.delay_s, min(2 * arrival.delay_s, _LAST_RETRY_S)
         arrival.retry_at = now + delay_s
         return delay_s
 
-    def _has_settled(self, path: Path, files: _FileStates, now: float) -> bool:
+    def _has_settled(self, path: AnyPath, files: _FileStates, now: float) -> bool:
         arrival = self._arrivals.get(path)
         if arrival is None or arrival.files != files:
             arrival = self._arrivals[path] = _Arrival(files, now)
@@ -89,12 +89,15 @@ class Arrivals:
         return True
 
 
-def is_unfinished(path: Path) -> bool:
+def is_unfinished(path: AnyPath) -> bool:
     """Return whether the end of a recording's file is missing: still being written, stalled, or truncated.
 
     MCAP files end with their magic bytes, ROS 1 bags have the offset of their index in their header, and SQLite databases
-    have their number of pages. Other files, compressed ones too, do not tell.
+    have their number of pages. Other files, compressed ones too, do not tell. Objects behind URLs appear when they are
+    complete.
     """
+    if isinstance(path, RemotePath):
+        return False
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES)
@@ -136,11 +139,11 @@ def _ends_with_index(file: BinaryIO, head: bytes, size: int) -> bool:
     return end == len(index)
 
 
-def _is_growing(path: Path) -> bool:
+def _is_growing(path: AnyPath) -> bool:
     return any(is_unfinished(file) for file in _files(path))
 
 
-def _recordings(folder: Path, parents: frozenset[Path] = frozenset()) -> Iterator[Path]:
+def _recordings(folder: AnyPath, parents: frozenset[AnyPath] = frozenset()) -> Iterator[AnyPath]:
     """Yield recordings: files, and rosbag2 directories that have their metadata.yaml, which is written last.
 
     Links that lead back to one of the parents are ignored.
@@ -164,18 +167,18 @@ def _recordings(folder: Path, parents: frozenset[Path] = frozenset()) -> Iterato
             yield entry
 
 
-def _is_split(file: Path) -> bool:
+def _is_split(file: AnyPath) -> bool:
     """Return whether a file is named like a split of a rosbag2 directory, with which it is ingested."""
     return re.match(rf"{re.escape(file.parent.name)}_\d+\.(db3|mcap)", file.name) is not None
 
 
-def _files(path: Path) -> list[Path]:
+def _files(path: AnyPath) -> list[AnyPath]:
     with suppress(OSError):
         return [path] if path.is_file() else [file for file in path.iterdir() if file.is_file()]
     return []
 
 
-def _file_states(path: Path) -> _FileStates:
+def _file_states(path: AnyPath) -> _FileStates:
     try:
         states = [(file.name, file.stat()) for file in sorted(_files(path))]
     except OSError:
@@ -187,9 +190,9 @@ _fcntl: Any = import_module("fcntl") if find_spec("fcntl") else None
 """File leases; None on Windows."""
 
 
-def _is_open(file: Path) -> bool:
+def _is_open(file: AnyPath) -> bool:
     """Return whether a process has the file open for writing; Linux grants no read lease in this case."""
-    if _fcntl is None or not hasattr(_fcntl, "F_SETLEASE"):
+    if isinstance(file, RemotePath) or _fcntl is None or not hasattr(_fcntl, "F_SETLEASE"):
         return False
     try:
         with file.open("rb") as opened:

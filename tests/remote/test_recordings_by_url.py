@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import random
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -294,3 +296,24 @@ def test_the_ledger_knows_a_recording_by_what_its_store_says(
         assert sum(line.startswith("GET /bucket/ledger") for line in objects.counts().requests) <= 4
     path.write_bytes(small.read_bytes() + b"\n")
     assert standing() in {"changed", "unreadable"}
+
+
+def test_watch_of_url_ingests_new_objects_and_skips_them_again(objects: ObjectStore, tmp_path: Path) -> None:
+    put(objects, record(tmp_path / "a.mcap", [("/a", FLOAT, START_NS, {"data": 1.0})]), "watched/day/a.mcap")
+    job = tmp_path / "job.yaml"
+    job.write_text("bag: {path: unused.mcap}\nsequence: {name: '{stem}'}\ntarget: {store: store}\n")
+    arguments = ["watch", objects.url("watched"), str(job), "--once", "--rest", "0.1", "--every", "0.1"]
+    outputs = [
+        subprocess.run(  # noqa: S603 - our own command
+            [sys.executable, "-m", "mosaico_ingest", *arguments],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=60,
+        ).stdout
+        for _ in range(2)
+    ]
+    assert "watched/day/a.mcap: completed as a, 1 message" in outputs[0]
+    assert "watched/day/a.mcap: skipped as a" in outputs[1]
+    assert "endpoint_override" not in "".join(outputs)
+    assert Store.open(tmp_path / "store").names() == ("a",)

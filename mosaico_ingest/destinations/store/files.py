@@ -219,8 +219,12 @@ class LocalFiles(Struct, frozen=True):
             folder = folder.parent
 
     def staged_files(self, session: str) -> list[AnyPath]:
-        """Return the segments that a session started and did not publish."""
-        return [path for path in self.session(session).rglob(f"{session}-*") if path.is_file()]
+        """Return the files that a session started and did not publish."""
+        return [
+            path
+            for path in self.session(session).rglob("*")
+            if path.is_file() and not path.name.startswith(self.lock(session).name)
+        ]
 
     def discard(self, session: str) -> None:
         """Remove the staged files of a session."""

@@ -1,0 +1,245 @@
+"""Files behind `http://` and `https://` as a read-only file system of pyarrow, read by range.
+
+Requests are GET requests with a range, also those for sizes, because a presigned URL allows one method only. urllib3
+repeats failed requests. Errors never contain the query of a URL, because it may be secret.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import time
+from email.utils import parsedate_to_datetime
+from io import RawIOBase
+from typing import TYPE_CHECKING, Any
+
+import pyarrow as pa
+import urllib3
+from msgspec import Struct
+from pyarrow.fs import FileInfo, FileSystemHandler, FileType
+
+from mosaico_ingest.errors import IngestError, Unreachable
+from mosaico_ingest.version import __version__
+
+if TYPE_CHECKING:
+    from mosaico_ingest.remote import Network
+
+_RETRIED = (408, 429, 500, 502, 503, 504)
+_PARTIAL, _OK, _UNSATISFIABLE = 206, 200, 416
+_MISSING = {404, 410}
+_REFUSED = {401, 403}
+_FRESH_S = 2.0
+"""Time for which the properties of a file are cached, since opening a recording asks for them several times."""
+_BACKOFF_S, _MAX_BACKOFF_S = 0.2, 10.0
+
+
+class _Properties(Struct, frozen=True):
+    """The properties of a file according to a response."""
+
+    size: int
+    modified_ns: int | None
+    version: str
+    """The ETag, or else the time of the last change; empty if the server sends neither."""
+
+
+class WebFiles(FileSystemHandler):
+    """The files of one web server, for a query that is part of every URL."""
+
+    def __init__(self, root: str, query: str, network: Network) -> None:
+        self._root = root
+        self._query = query
+        self._properties: dict[str, tuple[float, _Properties | None]] = {}
+        retries = urllib3.Retry(
+            total=network.attempts - 1,
+            status_forcelist=_RETRIED,
+            backoff_factor=_BACKOFF_S,
+            backoff_max=_MAX_BACKOFF_S,
+            allowed_methods=["GET"],
+            raise_on_status=False,
+            respect_retry_after_header=True,
+        )
+        self._pool = urllib3.PoolManager(
+            maxsize=8,
+            retries=retries,
+            timeout=urllib3.Timeout(connect=network.connect_s, read=network.request_s),
+            headers={"User-Agent": f"mosaico-ingest/{__version__}", "Accept-Encoding": "identity"},
+        )
+
+    def request(self, path: str, start: int, stop: int) -> tuple[Any, str]:
+        """Return the response to a request for a range of a file, and the URL without its query.
+
+        Raises:
+            FileNotFoundError: The file does not exist.
+            Unreachable: The server does not respond, or still fails after several attempts.
+            IngestError: Access is refused, or the server answers in another unexpected way.
+        """
+        where = f"{self._root.partition('://')[0]}://{path}"
+        url = f"{where}?{self._query}" if self._query else where
+        try:
+            response = self._pool.request(
+                "GET", url, headers={"Range": f"bytes={start}-{stop - 1}"}, preload_content=False
+            )
+        except urllib3.exceptions.HTTPError as error:
+            raise self._unreachable(where, type(_cause(error)).__name__) from None
+        status = response.status
+        if status in {_OK, _PARTIAL, _UNSATISFIABLE}:
+            return response, where
+        response.close()
+        if status in _MISSING:
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), where)
+        if status in _REFUSED:
+            hint = "check the URL and its permissions; a presigned URL may have expired, so request a new one"
+            raise IngestError(f"access is refused: HTTP status {status}", where=where, hint=hint)
+        if status in _RETRIED:
+            raise self._unreachable(where, f"HTTP status {status}")
+        raise IngestError(f"the server responds with HTTP status {status}", where=where, hint="check the URL")
+
+    def properties(self, path: str, *, cached: bool = True) -> _Properties | None:
+        """Return the properties of a file, None if it does not exist."""
+        at_s, known = self._properties.get(path, (-_FRESH_S, None))
+        if cached and time.monotonic() - at_s < _FRESH_S:
+            return known
+        try:
+            response, where = self.request(path, 0, 1)
+        except FileNotFoundError:
+            found = None
+        else:
+            try:
+                found = _properties(response, where)
+            finally:
+                _discard(response)
+        self._properties[path] = time.monotonic(), found
+        return found
+
+    def read(self, path: str, start: int, stop: int) -> bytes:
+        """Return a range of a file; if the server ignores ranges, skip the bytes before it."""
+        response, where = self.request(path, start, stop)
+        try:
+            if response.status == _UNSATISFIABLE:
+                return b""
+            if response.status == _OK:
+                _skip(response, start)
+            return response.read(stop - start)
+        except urllib3.exceptions.HTTPError as error:
+            raise self._unreachable(where, type(_cause(error)).__name__) from None
+        finally:
+            _discard(response)
+
+    def _unreachable(self, where: str, reason: str) -> Unreachable:
+        return Unreachable(
+            f"does not respond: {reason}", where=where, hint="check the address and the network"
+        )
+
+    def get_type_name(self) -> str:
+        """Return the name of the type of file system."""
+        return "http"
+
+    def normalize_path(self, path: str) -> str:
+        """Return the path as it is."""
+        return path
+
+    def get_file_info(self, paths: str | list[str]) -> list[FileInfo]:
+        """Return the properties of files."""
+        infos: list[FileInfo] = []
+        for path in [paths] if isinstance(paths, str) else paths:
+            found = self.properties(path)
+            if found is None:
+                infos.append(FileInfo(path, FileType.NotFound))
+            else:
+                infos.append(FileInfo(path, FileType.File, size=found.size, mtime_ns=found.modified_ns))
+        return infos
+
+    def get_file_info_selector(self, selector: Any) -> list[FileInfo]:  # noqa: ANN401, ARG002 - the signature of the base class
+        """Raise IngestError: a web server does not list files."""
+        raise IngestError(
+            "a web server does not list files", where=self._root, hint="write the URL of each recording"
+        )
+
+    def open_input_file(self, path: str) -> pa.PythonFile:
+        """Open a file for random access."""
+        found = self.properties(path, cached=False)
+        if found is None:
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), path)
+        return pa.PythonFile(_RangedFile(self, path, found), mode="r")
+
+    def open_input_stream(self, path: str) -> pa.PythonFile:
+        """Open a file for sequential reading."""
+        return self.open_input_file(path)
+
+    def _refuse(self, *_: object) -> Any:  # noqa: ANN401 - it never returns
+        raise IngestError(
+            "a web server cannot be written", where=self._root, hint="use a folder, s3://, gs:// or az://"
+        )
+
+    _refused: Any = _refuse
+    create_dir = delete_dir = delete_dir_contents = delete_root_dir_contents = _refused
+    delete_file = move = copy_file = open_output_stream = open_append_stream = _refused
+
+
+class _RangedFile(RawIOBase):
+    """A file that reads each range with one request."""
+
+    def __init__(self, files: WebFiles, path: str, properties: _Properties) -> None:
+        super().__init__()
+        self._files = files
+        self._path = path
+        self._size = properties.size
+        self._position = 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._position
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._size}[whence]
+        self._position = base + offset
+        return self._position
+
+    def read(self, size: int | None = -1) -> bytes:
+        end = self._size if size is None or size < 0 else min(self._position + size, self._size)
+        if end <= self._position:
+            return b""
+        data = self._files.read(self._path, self._position, end)
+        self._position += len(data)
+        return data
+
+
+def _properties(response: Any, where: str) -> _Properties:  # noqa: ANN401 - a response of urllib3
+    headers = response.headers
+    if response.status == _OK:
+        total = headers.get("Content-Length", "")
+    else:
+        total = headers.get("Content-Range", "").rpartition("/")[2]
+    if not total.isdecimal():
+        raise IngestError("the server does not tell the size of the file", where=where, hint="download it")
+    changed = headers.get("Last-Modified")
+    try:
+        modified_ns = None if changed is None else int(parsedate_to_datetime(changed).timestamp()) * 10**9
+    except ValueError:
+        modified_ns = None
+    return _Properties(int(total), modified_ns, headers.get("ETag") or changed or "")
+
+
+def _skip(response: Any, count: int) -> None:  # noqa: ANN401 - a response of urllib3
+    while count and (chunk := response.read(min(count, 1 << 20))):
+        count -= len(chunk)
+
+
+def _discard(response: Any) -> None:  # noqa: ANN401 - a response of urllib3
+    """End a response; close its connection if the server is still sending the complete file."""
+    if response.status == _OK:
+        response.close()
+    else:
+        response.drain_conn()
+    response.release_conn()
+
+
+def _cause(error: BaseException) -> BaseException:
+    """Return the reason of an error after several attempts, whose own text contains the URL."""
+    reason = getattr(error, "reason", None)
+    return reason if isinstance(reason, BaseException) else error
