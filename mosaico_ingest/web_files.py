@@ -19,7 +19,6 @@ from msgspec import Struct
 from pyarrow.fs import FileInfo, FileSystemHandler, FileType
 
 from mosaico_ingest.errors import IngestError, Unreachable
-from mosaico_ingest.version import __version__
 
 if TYPE_CHECKING:
     from mosaico_ingest.remote import Network
@@ -62,7 +61,7 @@ class WebFiles(FileSystemHandler):
             maxsize=8,
             retries=retries,
             timeout=urllib3.Timeout(connect=network.connect_s, read=network.request_s),
-            headers={"User-Agent": f"mosaico-ingest/{__version__}", "Accept-Encoding": "identity"},
+            headers={"User-Agent": "mosaico-ingest", "Accept-Encoding": "identity"},
         )
 
     def request(self, path: str, start: int, stop: int) -> tuple[Any, str]:

@@ -78,6 +78,7 @@ quarantine: {path: q, max: 0.1%, max_run: 100, systematic: 7}
 target: {host: h, port: 1, api_key: "${KEY}", tls_cert: ca.pem, tls: true, message_size: 4MB}
 run: {log_level: DEBUG, report: r.json, memory: 1MiB, jobs: 2}
 split: {by: 10 min}
+network: {attempts: 7, timeout: 1 min, max_download: 1GiB}
 """,
     )
     expected = ROSInjectionConfig(
@@ -104,6 +105,7 @@ split: {by: 10 min}
             },
             "sequence": {"family": "f", "if_exists": IfExists.APPEND},
             "split": {"by": 600 * 10**9},
+            "network": {"attempts": 7, "timeout": 60 * 10**9, "max_download": 2**30},
             "topic_settings": {
                 "/imu": {"rename": "/sensors/imu"},
                 "/camera/*": {"every": 3, "image": "png"},
