@@ -19,13 +19,12 @@ from mosaico_ingest.adapters.explain import unread_fields
 from mosaico_ingest.adapters.mapping.columns import DataType, pt
 from mosaico_ingest.adapters.mapping.conversion import check_fits
 from mosaico_ingest.adapters.mapping.loader import MappingAdapter, MappingSpec, load_adapter
-from mosaico_ingest.adapters.mapping.types import TypeMismatch, expr_type_of, format_type, is_number
+from mosaico_ingest.adapters.mapping.types import TypeMismatch, expr_type_of, format_type, is_list, is_number
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.job.yaml_source import resolve_plain
 from mosaico_ingest.ontology.registry import ontology_type, tags
-from mosaico_ingest.rosbag.definitions.linking import TEXTS, ros_shape
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Container, Definition, Field, Language
-from mosaico_ingest.rosbag.definitions.parser import BYTES
 
 
 def quote_key(name: str) -> str:
@@ -264,28 +263,19 @@ def _mirrored_field(
             else _by_adapter(nested[0], text, listed=listed)
         )
         return [f"{margin}{quote_key(name)}: {f'list[{tag}]' if listed else tag}"], [ColumnDraft(name, own)]
-    if listed:
-        return _list_columns(definition, field, margin)
-    inner = _mirrored_fields(definition, field.type, type_, margin + "    ")
+    inner = _mirrored_fields(definition, field.type, _element(type_), margin + "    ")
     lines = [line for part, _ in inner for line in part]
     drafts = tuple(column_draft for _, part in inner for column_draft in part)
     if not lines:
         return [], []
-    return [f"{margin}{quote_key(name)}:", f"{margin}  fields:", *lines], [
-        ColumnDraft(name, quote_expression(text), fields=drafts)
-    ]
+    head = [f"{margin}{quote_key(name)}:", *([f"{margin}  type: list"] if listed else [])]
+    of = quote_expression(f"{text}[]" if listed else text)
+    return [*head, f"{margin}  fields:", *lines], [ColumnDraft(name, of, fields=drafts)]
 
 
-def _list_columns(definition: Definition, field: Field, margin: str) -> _Columns:
-    """Return one list per plain field of a list of messages; deeper nesting is left to the author."""
-    columns: _Columns = ([], [])
-    for child in definition.types[field.type].fields:
-        if not child.is_message and child.container is Container.SCALAR:
-            name = f"{field.name}_{child.name}"
-            kind = "uint8" if child.type in BYTES else "string" if child.type in TEXTS else child.type
-            columns[0].append(f"{margin}{quote_key(name)}: list[{kind}]")
-            columns[1].append(ColumnDraft(name, f"{_expression(field.name)}[]{_expression('', child.name)}"))
-    return columns
+def _element(type_: DataType) -> DataType:
+    """Return the type of the elements of a list, any other type unchanged."""
+    return type_.value_type if is_list(type_) else type_
 
 
 _LONG = 1500
@@ -346,6 +336,8 @@ def _tag(definition: Definition) -> str:
 
 
 def _head(definition: Definition) -> Iterator[str]:
+    yield "# yaml-language-server: $schema=adapter.schema.json"
+    yield "# `ingest schema adapter --write .` writes that schema, for completion and hover in an editor."
     yield f"# A draft for {definition.root}: fields with matching names are mapped; complete the rest."
     constants = ", ".join(f"{one.name} = {one.value}" for one in definition.message.constants)
     if constants:

@@ -1,4 +1,4 @@
-"""`ingest adapters`: list, show, explain, test and draft adapters."""
+"""`ingest adapters`: list, show, explain, try, test and draft adapters."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from mosaico_ingest.adapters.standalone import DefinitionFinder
     from mosaico_ingest.services.adapters import Explained, Known, TestResult, TopicChoice
 
-adapters_app = typer.Typer(no_args_is_help=True, help="List, show, explain, test and draft adapters.")
+adapters_app = typer.Typer(no_args_is_help=True, help="List, show, explain, try, test and draft adapters.")
 
 TypeDistroOption = Annotated[
     str | None,
@@ -167,6 +167,54 @@ def print_topics(topics: Sequence[TopicChoice]) -> None:
         Terminal().print(table)
 
 
+@adapters_app.command("try")
+def try_messages(
+    adapter: Annotated[str, typer.Argument(metavar="NAME|FILE", help="An adapter's name or file.")],
+    *,
+    bag: Annotated[Path, typer.Option("--bag", metavar="BAG", help="Recording with the messages.")],
+    topic: Annotated[str, typer.Option("--topic", metavar="TOPIC", help="Topic of the messages.")],
+    count: Annotated[int, typer.Option("--count", "-n", min=1, metavar="N", help="Number of messages.")] = 5,
+    values: Annotated[
+        list[str] | None,
+        typer.Option("--with", metavar="NAME=VALUE", help="Value of a parameter. Repeatable."),
+    ] = None,
+    distro: TypeDistroOption = None,
+    msg_dirs: MsgDirOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show the first messages of a topic and the rows that an adapter makes of them, side by side.
+
+    Exit codes: 0 no message is rejected, 4 a message is rejected.
+    """
+    from msgspec import to_builtins
+
+    from mosaico_ingest.cli.adapter_trial import print_trial
+    from mosaico_ingest.services.adapter_trial import try_adapter
+
+    spec = _find(adapter)
+    types = _definition_finder(distro, msg_dirs)
+    tried = try_adapter(spec, bag, topic, count, resolve=types, parameters=_parameters(values or ()))
+    if as_json:
+        print_json([to_builtins(one) for one in tried], default=list)
+    else:
+        print_trial(tried)
+    if any(one.rejected for one in tried):
+        raise typer.Exit(4)
+
+
+def _parameters(options: Sequence[str]) -> dict[str, bool | int | float | str | None]:
+    """Return the values of `--with NAME=VALUE`, read as YAML reads them."""
+    from mosaico_ingest.job.yaml_source import resolve_plain
+
+    parameters: dict[str, bool | int | float | str | None] = {}
+    for option in options:
+        name, equals, text = option.partition("=")
+        if not equals:
+            raise typer.BadParameter(f"{option!r} has no value; write NAME=VALUE", param_hint="--with")
+        parameters[name] = resolve_plain(text)[0]
+    return parameters
+
+
 @adapters_app.command("test")
 def run_tests(
     adapters: Annotated[
@@ -235,6 +283,10 @@ def init(
     bag: Annotated[
         Path | None, typer.Option("--bag", metavar="BAG", help="Recording that contains the type.")
     ] = None,
+    job: Annotated[
+        Path | None,
+        typer.Option("--job", metavar="JOB.yaml", help="Manifest whose first recording contains the type."),
+    ] = None,
     record: Annotated[
         str | None,
         typer.Option("--record", metavar="TOPIC", help="Add a test with this topic's first message."),
@@ -255,14 +307,17 @@ def init(
     """Draft an adapter with every field of the type; columns with the same name are filled in."""
     from mosaico_ingest.services.adapters import draft_adapter
 
-    if record is not None and bag is None:
-        raise typer.BadParameter("needs a recording: give --bag", param_hint="--record")
+    if bag is not None and job is not None:
+        raise typer.BadParameter("give one of --bag and --job", param_hint="--job")
+    if record is not None and bag is None and job is None:
+        raise typer.BadParameter("needs a recording: give --bag or --job", param_hint="--record")
     if out is not None and out != STANDARD_OUTPUT and out.exists():
         raise typer.BadParameter(f"{out} exists", param_hint="--out")
     text = draft_adapter(
         msgtype,
         _definition_finder(distro, msg_dirs),
         bag=bag,
+        job=job,
         record=record,
         ontology=ontology,
         folder=out.parent if out else Path(),

@@ -27,10 +27,17 @@ COMMANDS = {
     "status": "watch", "report": "report", "quickstart": "quickstart",
 }  # fmt: skip
 """The module in `cli` that defines each command, in the order of `--help`."""
-GROUPS = {"adapters": "adapters", "store": "store", "keys": "serve", "schema": "schema"}
+GROUPS = {
+    "adapters": "adapters",
+    "ontology": "ontology",
+    "store": "store",
+    "keys": "serve",
+    "schema": "schema",
+}
 """The module in `cli` that defines each command group, as the Typer application `<name>_app`."""
 GROUP_HELP = {
-    "adapters": "List, show, explain, test and draft adapters.",
+    "adapters": "List, show, explain, try, test and draft adapters.",
+    "ontology": "List ontology types and show their fields.",
     "store": "List, show, query and remove the sequences of a store.",
     "keys": "Create and list the API keys of `ingest serve`.",
 }

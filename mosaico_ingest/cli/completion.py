@@ -1,4 +1,4 @@
-"""Shell completion of distros, sequences, topics, adapters and rules; Typer completes commands, options and formats."""
+"""Shell completion of distros, sequences, topics, adapters, tags and rules; Typer completes commands, options and formats."""
 
 from __future__ import annotations
 
@@ -56,6 +56,12 @@ def _adapters(_store: str, _incomplete: str) -> Iterable[str]:
     return BY_NAME
 
 
+def _tags(_store: str, _incomplete: str) -> Iterable[str]:
+    from mosaico_ingest.ontology.registry import tags
+
+    return tags()
+
+
 def _rules(_store: str, _incomplete: str) -> Iterable[str]:
     from mosaico_ingest.rules import RULES
 
@@ -70,6 +76,7 @@ _SOURCES: dict[str, Callable[[str, str], Iterable[str]]] = {
     "SEQUENCE[/TOPIC]": _topics,
     "NAME|FILE": _adapters,
     "NAME|TYPE|FILE": _adapters,
+    "TAG": _tags,
     "RULE": _rules,
 }
 """The proposals by metavar; the arguments are the store and the incomplete word."""

@@ -162,15 +162,14 @@ def write_schemas(documents: Sequence[Document], write: Path | None, check: Path
 
 
 def _schema_text(document: Document) -> str:
-    from mosaico_ingest.adapters.mapping.model import adapter_schema
-    from mosaico_ingest.job.reference import job_schema
     from mosaico_ingest.pipeline.definition_lock import lock_schema
     from mosaico_ingest.pipeline.plan_document import plan_schema
     from mosaico_ingest.report.model import report_schema
+    from mosaico_ingest.services.editor_schema import adapter_editor_schema, job_editor_schema
 
     schemas: dict[Document, Callable[[], dict[str, Any]]] = {
-        Document.JOB: job_schema,
-        Document.ADAPTER: adapter_schema,
+        Document.JOB: job_editor_schema,
+        Document.ADAPTER: adapter_editor_schema,
         Document.PLAN: plan_schema,
         Document.REPORT: report_schema,
         Document.LOCK: lock_schema,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from os.path import relpath
@@ -28,8 +29,9 @@ from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.manifest import load_manifest
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.pipeline.compile import compile_manifest
-from mosaico_ingest.pipeline.run import make_plan
+from mosaico_ingest.pipeline.run import make_plan, open_job
 from mosaico_ingest.pipeline.task import Task
+from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.rosbag.blocks import Connection, MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import (
@@ -45,17 +47,6 @@ from mosaico_ingest.rosbag.recording import Recording, open_recording
 _ROWS = 64
 
 
-def definition_in(path: Path, msgtype: str, *, resolve: Resolver) -> Definition:
-    """Return the definition of a type from a recording.
-
-    Raises:
-        BagError: The recording cannot be opened, or its definition of the type is not known.
-        NothingMatched: No topic has that type.
-    """
-    with open_recording(path, resolve=resolve) as recording:
-        return _definition(_connections(recording, msgtype=msgtype)[0])
-
-
 def message_in(
     path: Path, topic: str, index: int = 0, *, resolve: Resolver
 ) -> tuple[Definition, pa.StructArray, Envelope]:
@@ -66,28 +57,36 @@ def message_in(
         NothingMatched: There is no such topic.
     """
     with open_recording(path, resolve=resolve) as recording:
-        connections = _connections(recording, topic=topic)
-        before = 0
-        ids = [connection.id for connection in connections]
-        for batch in recording.message_blocks(ids, max_rows=_ROWS):
-            if index < before + len(batch):
-                connection = recording.connections[batch.connection]
-                one = batch.rows(np.array([index - before]))
-                envelope = Envelope(
-                    topic, connection.msgtype, one.log_times, one.publish_times, one.sequences
-                )
-                return _definition(connection), _row(connection, one), envelope
-            before += len(batch)
+        return _message_in(recording, topic, index)
+
+
+def _message_in(
+    recording: Recording, topic: str, index: int = 0
+) -> tuple[Definition, pa.StructArray, Envelope]:
+    before = 0
+    ids = [connection.id for connection in topic_connections(recording, topic)]
+    for batch in recording.message_blocks(ids, max_rows=_ROWS):
+        if index < before + len(batch):
+            connection = recording.connections[batch.connection]
+            one = batch.rows(np.array([index - before]))
+            envelope = Envelope(topic, connection.msgtype, one.log_times, one.publish_times, one.sequences)
+            return _definition(connection), _row(connection, one), envelope
+        before += len(batch)
     raise BagError(
         f"{topic} has {before} messages, there is none at index {index}",
-        where=str(path),
+        where=str(recording.files[0]),
         hint="the first is at index 0",
     )
 
 
-def _connections(
-    recording: Recording, *, topic: str | None = None, msgtype: str | None = None
+def topic_connections(
+    recording: Recording, topic: str | None = None, *, msgtype: str | None = None
 ) -> list[Connection]:
+    """Return the connections of a topic, or those with a message type.
+
+    Raises:
+        NothingMatched: There is none; the hint names the nearest.
+    """
     connections = [
         one for one in recording.connections if topic in {None, one.topic} and msgtype in {None, one.msgtype}
     ]
@@ -320,13 +319,15 @@ def draft_adapter(
     types: DefinitionFinder,
     *,
     bag: Path | None = None,
+    job: Path | None = None,
     record: str | None = None,
     ontology: str | None = None,
     folder: Path = Path(),
 ) -> str:
     """Return a draft of an adapter file for `folder`.
 
-    The type's definition is the recording's if `bag` is given; `record` names a topic whose first message is tested.
+    The type's definition is that of the recording `bag`, or of the first recording of the manifest `job`; `record` names a
+    topic whose first message is tested.
 
     Raises:
         BagError: The definition is not known, or the recording cannot be read.
@@ -334,20 +335,35 @@ def draft_adapter(
         AdapterError: The type has no fields, the topic has another type, or there is no such ontology.
     """
     name = normalize_msgtype(msgtype)
-    if bag is None:
+    if bag is None and job is None:
         definition = types.find(name)
         return draft(definition, ontology=ontology, embed=definition.source is not Source.DISTRO)
-    if record is None:
-        definition, example = definition_in(bag, name, resolve=types), None
-    else:
-        definition, row, _ = message_in(bag, record, resolve=types)
-        reference = {"bag": relpath(bag, folder), "topic": record, "index": 0}
-        example = RecordedExample(row, reference)
-        if definition.root != name:
-            raise AdapterError(
-                f"it carries {definition.root}, not {name}", where=record, hint="name another topic"
-            )
+    example = None
+    with _recording(bag, job, types) as (path, recording):
+        if record is None:
+            definition = _definition(topic_connections(recording, msgtype=name)[0])
+        else:
+            definition, row, _ = _message_in(recording, record)
+            example = RecordedExample(row, {"bag": relpath(path, folder), "topic": record, "index": 0})
+            if definition.root != name:
+                raise AdapterError(
+                    f"it carries {definition.root}, not {name}", where=record, hint="name another topic"
+                )
     return draft(definition, ontology=ontology, embed=not _in_distros(definition), example=example)
+
+
+@contextmanager
+def _recording(
+    bag: Path | None, job: Path | None, types: DefinitionFinder
+) -> Generator[tuple[AnyPath, Recording]]:
+    """Open a recording, or the first recording of a manifest with the definitions that the manifest adds."""
+    if job is None:
+        with open_recording(bag or Path(), resolve=types) as recording:
+            yield bag or Path(), recording
+        return
+    first = compile_manifest(load_manifest(job))[0]
+    with open_job(first) as (recording, _):
+        yield first.paths[0], recording
 
 
 def _in_distros(definition: Definition) -> bool:

@@ -273,3 +273,59 @@ def test_init_unknown_type_lists_searched_sources(ingest: Ingest) -> None:
 )
 def test_adapters_ambiguous_arguments_exit_2(ingest: Ingest, arguments: tuple[str, ...]) -> None:
     assert ingest(*arguments)[0] == 2
+
+
+def test_try_shows_message_and_rows_side_by_side(ingest: Ingest) -> None:
+    code, out, _ = ingest("try", "IMUAdapter", "--bag", BAG, "--topic", "/imu", "-n", 2)
+    assert code == 0
+    assert out.count("message ") >= 2
+    assert "linear_acceleration.x" in out
+    assert "acceleration.x" in out.replace("linear_acceleration.x", "")
+    assert "2 messages: 2 written, 0 dropped, 0 rejected" in out
+
+
+def test_try_json_has_rows_rejections_and_dropped_messages(ingest: Ingest, tmp_path: Path) -> None:
+    (tmp_path / "cells.yaml").write_text(
+        """version: 1
+adapter: CellsAdapter
+ros_type: acme_msgs/msg/BatteryPack
+parameters: {least: 0}
+drop_when: message.log_time % 2 == 1
+rows: filter(cells, voltage_mv >= least)[]
+ontology: {tag: Cell, fields: {millivolts: uint16}}
+fields: {millivolts: voltage_mv}
+"""
+    )
+    arguments = ("try", "cells.yaml", "--bag", BAG, "--topic", "/battery", "-n", 3, "--json")
+    code, out, _ = ingest(*arguments)
+    tried = json.loads(out)
+    assert code == 0
+    assert [one["index"] for one in tried] == [0, 1, 2]
+    for one in tried:
+        voltages = [cell["voltage_mv"] for cell in one["message"]["cells"]]
+        expected = [] if one["dropped"] else voltages
+        assert [row["millivolts"] for row in one["rows"][""]] == expected
+    code, out, _ = ingest(*arguments, "--with", "least=65535")
+    assert {one["dropped"] for one in json.loads(out)} <= {"rows", "drop_when"}
+    assert ingest(*arguments, "--with", "lest=1")[0] == 1
+
+
+def test_try_rejected_message_exits_with_4(ingest: Ingest, tmp_path: Path) -> None:
+    (tmp_path / "bad.yaml").write_text(
+        "version: 1\nadapter: BadAdapter\nros_type: acme_msgs/msg/BatteryPack\n"
+        "ontology: {tag: Bad, fields: {n: int8}}\nfields: {n: cast(voltage_mv)}\n"
+    )
+    code, out, _ = ingest("try", "bad.yaml", "--bag", BAG, "--topic", "/battery", "-n", 1)
+    assert code == 4
+    assert "[out-of-range]" in out
+
+
+def test_init_with_job_keeps_lists_of_structs_and_names_the_schema(ingest: Ingest, tmp_path: Path) -> None:
+    out = tmp_path / "pack.yaml"
+    code, _, _ = ingest("init", "acme_msgs/BatteryPack", "--job", JOB, "--record", "/battery", "-o", out)
+    text = out.read_text()
+    assert code == 0
+    assert text.startswith("# yaml-language-server: $schema=adapter.schema.json\n")
+    assert "      type: list\n      fields:\n        voltage_mv: uint16\n" in text
+    assert ingest("test", out)[0] == 0
+    assert ingest("init", "acme_msgs/BatteryPack", "--job", JOB, "--bag", BAG)[0] == 2

@@ -39,8 +39,8 @@ def test_short_options_have_one_meaning() -> None:
         for parameter in command.params:
             for short in (o for o in parameter.opts if o[0] == "-" and o[1] != "-"):
                 long = next(o for o in parameter.opts if o.startswith("--"))
-                if short in {"-n", "-m"} and name.startswith("ingest store "):
-                    continue  # -n is a number of rows, as in head and tail; `ingest bag -n` is the official --name
+                if short in {"-n", "-m"} and name.startswith(("ingest store ", "ingest adapters try")):
+                    continue  # -n is a number of rows or messages, as in head and tail; `ingest bag -n` is the official --name
                 assert meaning.setdefault(short, long) == long, name
 
 

@@ -19,7 +19,7 @@ from mosaico_ingest.ontology.types import OntologyType
 if TYPE_CHECKING:
     from mosaico_ingest.job.yaml_source import KeyPath
 
-_PLAIN_TYPES: dict[str, DataType] = {**CAST_TYPES, "string": arrays.string(), "binary": arrays.binary()}
+PLAIN_TYPES: dict[str, DataType] = {**CAST_TYPES, "string": arrays.string(), "binary": arrays.binary()}
 _LIST = re.compile(r"list\[\s*(?P<element>.+?)\s*(,\s*(?P<size>\d+)\s*)?\]")
 _ENVELOPE_COLUMN = "timestamp_ns"
 _LIST_OF_STRUCTS = "list"
@@ -64,8 +64,8 @@ def _field(name: str, field: FieldType, path: KeyPath, analyzer: Analyzer) -> Da
 
 def _type(text: str, path: KeyPath, analyzer: Analyzer) -> DataType | None:
     text = text.strip()
-    if text in _PLAIN_TYPES:
-        return _PLAIN_TYPES[text]
+    if text in PLAIN_TYPES:
+        return PLAIN_TYPES[text]
     match = _LIST.fullmatch(text)
     if match is not None:
         element = _type(match["element"], path, analyzer)
@@ -75,8 +75,8 @@ def _type(text: str, path: KeyPath, analyzer: Analyzer) -> DataType | None:
     try:
         return ontology_type(text).struct
     except UnknownTag as error:
-        nearest = suggest(text, _PLAIN_TYPES) or error.hint
-        types = f"use {', '.join(_PLAIN_TYPES)}, list[T], list[T, N] or an ontology tag"
+        nearest = suggest(text, PLAIN_TYPES) or error.hint
+        types = f"use {', '.join(PLAIN_TYPES)}, list[T], list[T, N] or an ontology tag"
         hint = f"{nearest} {types}" if nearest and nearest.startswith("did you mean") else types
         analyzer.report_value(path, f"{text!r} is neither a type nor an ontology tag", hint)
         return None
