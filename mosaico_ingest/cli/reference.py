@@ -77,7 +77,9 @@ def _usage(argument: Any) -> str:  # noqa: ANN401 - as above
 
 
 def _metavar(parameter: Any) -> str:  # noqa: ANN401 - as above
-    return str(parameter.metavar or parameter.name.upper())
+    """Return the name of a value, without the brackets that mark optional arguments."""
+    name = str(parameter.metavar or parameter.name.upper())
+    return name[1:-1] if name.startswith("[") and name.endswith("]") else name
 
 
 def _names(option: Any) -> str:  # noqa: ANN401 - as above
