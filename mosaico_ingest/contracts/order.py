@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import defaultdict
 from collections.abc import Iterator
 from itertools import pairwise
@@ -68,12 +69,13 @@ class _Records(Struct, frozen=True):
 class FileOrder:
     """Observes the messages of some connections before they are sorted by time.
 
-    The chunks of a file may be read in any order. Each chunk is reduced to its own result, and the results are joined in
+    Several threads may add messages, and the chunks of a file may be read in any order. Each chunk is reduced to its own result, and the results are joined in
     the order of the file. Messages outside chunks are kept until the end, with 24 bytes for each.
     """
 
     def __init__(self, *, has_numbers: bool) -> None:
         self._has_numbers = has_numbers
+        self._lock = threading.Lock()
         self._pieces: dict[int, list[_Piece]] = defaultdict(list)
         self._records: dict[int, list[_Records]] = defaultdict(list)
 
@@ -87,11 +89,15 @@ class FileOrder:
             numbers = words.view("<u4").reshape(-1).astype(np.int64)
         edges = (np.flatnonzero(np.diff(offsets)) + 1).tolist()
         if len(edges) == len(times) - 1:  # the offsets are those of messages, not of chunks
-            self._records[connection].append(_Records(split, offsets, times, numbers))
+            with self._lock:
+                self._records[connection].append(_Records(split, offsets, times, numbers))
             return
-        for start, end in pairwise((0, *edges, len(times))):
-            piece = _piece(split, int(offsets[start]), times[start:end], numbers[start:end])
-            self._pieces[connection].append(piece)
+        pieces = [
+            _piece(split, int(offsets[start]), times[start:end], numbers[start:end])
+            for start, end in pairwise((0, *edges, len(times)))
+        ]
+        with self._lock:
+            self._pieces[connection] += pieces
 
     def steps_back(self, connection: int) -> FileSteps:
         """Return the messages of a connection with an earlier log time than the message before them in the file."""

@@ -282,7 +282,7 @@ class Recording:
 
         The blocks of a connection are in log-time order, unless sorting its messages would take more than about
         `memory_bytes`. A block has at most `max_rows` messages. Unreadable ranges are skipped and added to
-        `unreadable`. `observe` receives the messages before they are sorted, possibly in another thread.
+        `unreadable`. `observe` receives the messages before they are sorted, in several threads.
         """
         ids = frozenset(range(len(self.connections))) if connection_ids is None else frozenset(connection_ids)
         first = EARLIEST_NS if start_ns is None else start_ns
