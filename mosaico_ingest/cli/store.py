@@ -11,6 +11,7 @@ import typer
 from mosaico_ingest.cli.console import PlainTable, Terminal, print_json, print_line
 from mosaico_ingest.cli.options import DEFAULT_STORE, JsonOption, StoreOption
 from mosaico_ingest.cli.pages import page
+from mosaico_ingest.cli.store_compact import compact
 from mosaico_ingest.cli.store_pictures import image, plot
 from mosaico_ingest.cli.store_rows import describe, head, sample, tail
 from mosaico_ingest.cli.store_sql import sql
@@ -181,7 +182,7 @@ def show(
         print_topic(topic_info, first_rows)
 
 
-for command in (head, tail, sample, describe, plot, image, sql, page):
+for command in (head, tail, sample, describe, plot, image, sql, page, compact):
     store_app.command()(command)
 
 

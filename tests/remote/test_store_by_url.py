@@ -16,6 +16,7 @@ from object_store import ObjectStore, object_store
 
 from mosaico_ingest.destinations.base import topic_schema
 from mosaico_ingest.destinations.store import Store, StoreSink
+from mosaico_ingest.destinations.store.compaction import compact
 from mosaico_ingest.destinations.store.session import StoreTopic
 from mosaico_ingest.destinations.store.store import verify
 from mosaico_ingest.errors import (
@@ -302,3 +303,19 @@ def test_damaged_catalog_document_is_named(url: str) -> None:
 def test_serve_refuses_a_store_by_url(url: str) -> None:
     with pytest.raises(SinkError, match="only a store in a local folder can be served"):
         serve(url)
+
+
+def test_compaction_keeps_rows_and_checksum_and_gc_removes_replaced_objects(url: str) -> None:
+    store = Store.open(url)
+    for _ in range(3):
+        with StoreSink(store).open("s", {}, if_exists=IfExists.APPEND) as session:
+            session.topic("/t", POINT, {}).write(POINTS)
+    rows, checksum = store.scan("s", "/t").read_all(), store.topic("s", "/t").checksum
+    assert [result.problem for result in compact(store, store.sequence("s"))] == [None]
+    assert store.scan("s", "/t").read_all().equals(rows)
+    assert store.topic("s", "/t").checksum == checksum
+    with pytest.raises(SinkError, match="compaction merged"):
+        store.delete_session("s", store.sequence("s").sessions[0].id)
+    store.collect_garbage()
+    assert len([key for key in keys(url) if key.startswith("segments/")]) == 1
+    assert store.scan("s", "/t").read_all().equals(rows)

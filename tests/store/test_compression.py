@@ -98,7 +98,7 @@ TYPES = st.sampled_from([
 ])  # fmt: skip
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     kinds=st.lists(TYPES, min_size=1, max_size=4), count=st.sampled_from([1, 40, 700]), seed=st.integers(0, 9)
 )

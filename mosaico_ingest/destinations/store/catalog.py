@@ -34,15 +34,18 @@ from mosaico_ingest.destinations.store.errors import NotInStore, sequence_change
 from mosaico_ingest.destinations.store.listing import Listing, SequenceFilter, family_topics, listing
 from mosaico_ingest.destinations.store.model import (
     Claim,
+    MergedSegment,
     NewNote,
     NewSession,
     NewTopic,
     Note,
+    Replacement,
     SegmentInfo,
     SequenceInfo,
     SessionInfo,
     TopicInfo,
     attachments_of,
+    check_not_merged,
 )
 from mosaico_ingest.destinations.store.segment import Segment
 from mosaico_ingest.errors import SequenceExists, SinkError
@@ -54,6 +57,9 @@ FORMAT = 2
 """The version of the tables; it increases if earlier releases cannot read them."""
 
 _APPLICATION = 0x6D6F7361  # "mosa", which `file catalog.sqlite` shows
+
+_LATER_COLUMNS = ("checksum", "merged")
+"""Columns of segments that the first catalogs do not have."""
 
 _STAMPS = ("user_version", "application_id")
 
@@ -94,7 +100,8 @@ CREATE TABLE segments (
     bytes INTEGER NOT NULL,
     start_ns INTEGER NOT NULL,
     end_ns INTEGER NOT NULL,
-    checksum TEXT
+    checksum TEXT,
+    merged TEXT
 );
 CREATE INDEX segments_of_topic ON segments (topic_id, start_ns);
 CREATE INDEX segments_of_session ON segments (session_id);
@@ -161,6 +168,11 @@ class Catalog:
         """See `StoreCatalog.commit`."""
         with self.write() as db:
             return _commit(db, claimed, new)
+
+    def replace_segments(self, change: Replacement) -> bool:
+        """See `StoreCatalog.replace_segments`."""
+        with self.write() as db:
+            return _replace_segments(db, change)
 
     def release(self, session: str, sequence: str) -> None:  # noqa: ARG002 - the session identifies the reservation
         """See `StoreCatalog.release`."""
@@ -351,8 +363,8 @@ def _convert(db: sqlite3.Connection) -> int:
         return FORMAT
     db.execute("BEGIN IMMEDIATE")
     if _version(db) == 1:  # another process may have been faster
-        if not _has_checksums(db):
-            db.execute("ALTER TABLE segments ADD COLUMN checksum TEXT")
+        for column in _missing_columns(db):
+            db.execute(f"ALTER TABLE segments ADD COLUMN {column} TEXT")
         schemas.convert(db)
         db.execute(f"PRAGMA user_version = {FORMAT}")
     db.execute("COMMIT")
@@ -363,9 +375,10 @@ def _version(db: sqlite3.Connection) -> int:
     return int(db.execute("PRAGMA user_version").fetchone()[0])
 
 
-def _has_checksums(db: sqlite3.Connection) -> bool:
-    columns = db.execute("SELECT name FROM pragma_table_info('segments')").fetchall()
-    return not columns or ("checksum",) in map(tuple, columns)
+def _missing_columns(db: sqlite3.Connection) -> list[str]:
+    rows = db.execute("SELECT name FROM pragma_table_info('segments')").fetchall()
+    columns = {row["name"] for row in rows}
+    return [name for name in _LATER_COLUMNS if columns and name not in columns]
 
 
 def _names(db: sqlite3.Connection) -> list[str]:
@@ -475,10 +488,21 @@ def _segments(db: sqlite3.Connection, sequence_id: int, root: Path) -> dict[int,
                 stored_bytes=row["bytes"],
                 start_ns=row["start_ns"],
                 end_ns=row["end_ns"],
-                checksum=row["checksum"] if "checksum" in row.keys() else None,  # noqa: SIM118 - `in` searches the values of a row
+                checksum=_later(row, "checksum"),
+                merged=_merged(row),
             )
         )
     return segments
+
+
+def _later(row: sqlite3.Row, column: str) -> str | None:
+    """Return the value of a column that early catalogs do not have."""
+    return row[column] if column in row.keys() else None  # noqa: SIM118 - `in` searches the values of a row
+
+
+def _merged(row: sqlite3.Row) -> tuple[MergedSegment, ...]:
+    text = _later(row, "merged")
+    return tuple(MergedSegment(session, checksum) for session, checksum in json.loads(text)) if text else ()
 
 
 def _notes(db: sqlite3.Connection, sequence_id: int) -> tuple[Note, ...]:
@@ -639,6 +663,26 @@ def _enter_segments(
         )
 
 
+def _replace_segments(db: sqlite3.Connection, change: Replacement) -> bool:
+    """Enter a merged segment in place of others, if the catalog still contains all of them."""
+    row = db.execute(
+        "SELECT topics.id FROM topics JOIN sequences ON sequences.id = sequence_id"
+        " WHERE sequences.name = ? AND topics.name = ?",
+        (change.sequence, change.topic),
+    ).fetchone()
+    topic = None if row is None else int(row["id"])
+    known = set(_paths(db, "topic_id = ?", topic)) if topic is not None else set[str]()
+    if topic is None or not known.issuperset(change.replaced):
+        return False
+    for column in _missing_columns(db):
+        db.execute(f"ALTER TABLE segments ADD COLUMN {column} TEXT")
+    db.executemany("DELETE FROM segments WHERE path = ?", [(path,) for path in change.replaced])
+    _enter_segments(db, topic, change.session, {change.path: change.segment})
+    merged = json.dumps([(part.session, part.checksum) for part in change.merged])
+    db.execute("UPDATE segments SET merged = ? WHERE path = ?", (merged, change.path))
+    return True
+
+
 def _session_ids(db: sqlite3.Connection, sequence_id: int) -> tuple[str, ...]:
     rows = db.execute("SELECT id FROM sessions WHERE sequence_id = ? ORDER BY id", (sequence_id,))
     return tuple(row["id"] for row in rows)
@@ -680,6 +724,10 @@ def _delete_topic(db: sqlite3.Connection, sequence_name: str, name: str) -> list
 def _delete_session(db: sqlite3.Connection, sequence_name: str, session_id: str) -> list[str]:
     """Remove a session, with the topics only it wrote to, and return the paths of its segments."""
     owner = _sequence_id(db, sequence_name)
+    rows = db.execute(
+        "SELECT segments.* FROM segments JOIN topics ON topics.id = topic_id WHERE sequence_id = ?", (owner,)
+    )
+    check_not_merged(session_id, sequence_name, map(_merged, rows))
     paths = _paths(db, "session_id = ?", session_id)
     if not db.execute("DELETE FROM sessions WHERE id = ? AND sequence_id = ?", (session_id, owner)).rowcount:
         raise NotInStore(f"there is no session {session_id!r}", where=sequence_name)

@@ -12,7 +12,7 @@ from msgspec import Struct
 from mosaico_ingest.destinations.store.checksum import combined
 from mosaico_ingest.destinations.store.errors import NotInStore
 from mosaico_ingest.destinations.store.segment import Segment
-from mosaico_ingest.errors import missing_library
+from mosaico_ingest.errors import SinkError, missing_library
 from mosaico_ingest.findings import suggest_names
 from mosaico_ingest.job.values import ATTACHMENTS_KEY, IfExists
 from mosaico_ingest.notebook import html_table
@@ -28,6 +28,13 @@ if TYPE_CHECKING:
     from mosaico_ingest.destinations.store.tables import Moment
 
 
+class MergedSegment(Struct, frozen=True):
+    """A segment whose rows are now part of a merged one."""
+
+    session: str
+    checksum: str | None
+
+
 class SegmentInfo(Struct, frozen=True):
     """One Parquet file: rows of one topic and session, sorted by `timestamp_ns`."""
 
@@ -40,6 +47,13 @@ class SegmentInfo(Struct, frozen=True):
     """The largest time stamp, inclusive."""
     checksum: str | None
     """Checksum of the row values, see `ContentHash`; None for segments of early versions."""
+    merged: tuple[MergedSegment, ...] = ()
+    """The segments that compaction merged into this one, in the order of their time stamps."""
+
+    @property
+    def parts(self) -> tuple[MergedSegment, ...]:
+        """The segments that sessions wrote: those merged, or this one."""
+        return self.merged or (MergedSegment(self.session, self.checksum),)
 
 
 class TopicInfo(Struct, frozen=True):
@@ -79,8 +93,8 @@ class TopicInfo(Struct, frozen=True):
 
     @property
     def checksum(self) -> str | None:
-        """Checksum of the row values, or None if a segment has none."""
-        return combined(segment.checksum for segment in self.segments)
+        """Checksum of the row values, or None if a segment has none; compaction does not change it."""
+        return combined(part.checksum for segment in self.segments for part in segment.parts)
 
     def __repr__(self) -> str:
         """Return name, ontology, rows and size, such as `<Topic yard/imu: IMU, 1,000 rows, 43.6 kB>`."""
@@ -350,6 +364,36 @@ class NewNote(Struct, frozen=True):
     topic: str | None
     message: str
     created_ns: int
+
+
+def check_not_merged(session: str, sequence: str, segments: Iterable[tuple[MergedSegment, ...]]) -> None:
+    """Check that no merged segment contains rows of a session and of others.
+
+    Raises:
+        SinkError: One does, so the session cannot be removed.
+    """
+    for merged in segments:
+        sessions = {part.session for part in merged}
+        if session in sessions and len(sessions) > 1:
+            raise SinkError(
+                f"compaction merged the rows of session {session} with those of others",
+                where=sequence,
+                hint="replace or remove the sequence",
+            )
+
+
+class Replacement(Struct, frozen=True):
+    """A merged segment and the segments of its topic that it replaces."""
+
+    sequence: str
+    topic: str
+    replaced: tuple[str, ...]
+    """Their paths, relative to the store."""
+    path: str
+    session: str
+    """The session of the first of them."""
+    segment: Segment
+    merged: tuple[MergedSegment, ...]
 
 
 class NewSession(Struct, frozen=True):

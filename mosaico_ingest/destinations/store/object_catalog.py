@@ -30,15 +30,18 @@ from mosaico_ingest.destinations.store.files import MARKER, ObjectFiles, encoded
 from mosaico_ingest.destinations.store.listing import Listing, SequenceFilter, SequenceSummary
 from mosaico_ingest.destinations.store.model import (
     Claim,
+    MergedSegment,
     NewNote,
     NewSession,
     NewTopic,
     Note,
+    Replacement,
     SegmentInfo,
     SequenceInfo,
     SessionInfo,
     TopicInfo,
     attachments_of,
+    check_not_merged,
 )
 from mosaico_ingest.destinations.store.segment import Segment
 from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
@@ -66,6 +69,13 @@ class SegmentEntry(_Part):
     checksum: str | None = None
     bounds: tuple[tuple[str, Any, Any], ...] = ()
     """Path, smallest and largest value of each column with an order."""
+    merged: tuple[tuple[str, str | None], ...] = ()
+    """Session and checksum of each segment that compaction merged into this one."""
+
+    @property
+    def merged_segments(self) -> tuple[MergedSegment, ...]:
+        """The segments that compaction merged into this one."""
+        return tuple(MergedSegment(session, checksum) for session, checksum in self.merged)
 
 
 class TopicEntry(_Part):
@@ -169,6 +179,19 @@ class SequenceDocument(_Part):
             }
         )
 
+    def with_replacement(self, change: Replacement) -> SequenceDocument | None:
+        """Return the sequence with a merged segment, or None if one of the segments it replaces is gone."""
+        held = next((topic for topic in self.topics if topic.name == change.topic), None)
+        if held is None or not {one.path for one in held.segments}.issuperset(change.replaced):
+            return None
+        merged = _entry(change.session, change.path, change.segment).model_copy(
+            update={"merged": tuple((part.session, part.checksum) for part in change.merged)}
+        )
+        kept = tuple(one for one in held.segments if one.path not in change.replaced)
+        changed = held.model_copy(update={"segments": (*kept, merged)})
+        topics = tuple(changed if topic is held else topic for topic in self.topics)
+        return self.model_copy(update={"topics": topics})
+
     def with_note(self, new: NewNote) -> SequenceDocument:
         """Return the sequence with a new note."""
         return self.model_copy(update={"notes": (*self.notes, _note(new))})
@@ -189,6 +212,9 @@ class SequenceDocument(_Part):
         rest = tuple(one for one in self.sessions if one.id != session)
         if len(rest) == len(self.sessions):
             raise NotInStore(f"there is no session {session!r}", where=self.name)
+        check_not_merged(
+            session, self.name, (one.merged_segments for each in self.topics for one in each.segments)
+        )
         topics = (
             topic.model_copy(
                 update={"segments": tuple(one for one in topic.segments if one.session != session)}
@@ -271,6 +297,7 @@ def _segment(entry: SegmentEntry, root: RemotePath) -> SegmentInfo:
         start_ns=entry.start_ns,
         end_ns=entry.end_ns,
         checksum=entry.checksum,
+        merged=entry.merged_segments,
     )
 
 
@@ -339,6 +366,15 @@ class ObjectCatalog:
         with suppress(SinkError):  # the document is committed; a claim without a live session is ignored
             self.release(new.id, claimed.sequence)
         return replaced
+
+    def replace_segments(self, change: Replacement) -> bool:
+        """See `StoreCatalog.replace_segments`."""
+        with self._holding(change.sequence):
+            document = self._load(change.sequence)
+            changed = None if document is None else document.with_replacement(change)
+            if changed is not None:
+                self._put(changed)
+        return changed is not None
 
     def release(self, session: str, sequence: str) -> None:
         """See `StoreCatalog.release`."""

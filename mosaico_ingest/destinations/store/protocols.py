@@ -7,7 +7,14 @@ from typing import Any, Protocol
 
 from mosaico_ingest.destinations.base import FamilyTopic
 from mosaico_ingest.destinations.store.listing import Listing, SequenceFilter
-from mosaico_ingest.destinations.store.model import Claim, NewNote, NewSession, SequenceInfo, TopicInfo
+from mosaico_ingest.destinations.store.model import (
+    Claim,
+    NewNote,
+    NewSession,
+    Replacement,
+    SequenceInfo,
+    TopicInfo,
+)
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.remote import AnyPath
 
@@ -115,6 +122,10 @@ class StoreCatalog(Protocol):
 
     def commit(self, claimed: Claim, new: NewSession) -> list[str]:
         """Add a session and return the paths of the segments it replaces."""
+        ...
+
+    def replace_segments(self, change: Replacement) -> bool:
+        """Enter a merged segment in place of others; False if one of them is not in the catalog any more."""
         ...
 
     def release(self, session: str, sequence: str) -> None:

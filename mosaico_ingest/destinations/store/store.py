@@ -57,7 +57,7 @@ def verify(info: SequenceInfo) -> Iterator[Checked]:
     """Read every segment of a sequence and compare pages, rows and checksums with the catalog."""
     for topic in info.topics:
         for segment in topic.segments:
-            yield Checked(topic.name, segment, _problem(topic, segment))
+            yield Checked(topic.name, segment, segment_problem(topic, segment))
 
 
 def verify_attachments(info: SequenceInfo) -> Iterator[CheckedAttachment]:
@@ -84,7 +84,8 @@ def _attachment_problem(attachment: AttachmentInfo) -> str | None:
     return f"the catalog has {expected}, the file has {form.format(size, digest.hexdigest())}"
 
 
-def _problem(topic: TopicInfo, segment: SegmentInfo) -> str | None:
+def segment_problem(topic: TopicInfo, segment: SegmentInfo) -> str | None:
+    """Read a segment completely and return how it differs from the catalog, or None."""
     try:
         with opened(segment.path, page_checksum_verification=True) as file:
             if not file.schema_arrow.equals(topic.schema):
