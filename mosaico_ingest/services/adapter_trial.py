@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import pyarrow as pa
 from msgspec import Struct
 
 from mosaico_ingest.adapters.adapter import Adapted, Adapter, AdapterSpec, Envelope
@@ -121,7 +120,7 @@ def _tried(
 def _rows_of(adapted: Adapted, index: np.ndarray[tuple[int], np.dtype[np.int64]]) -> dict[int, list[Any]]:
     """Return the rows of each message that has any, by the position of the message in the block."""
     rows: dict[int, list[Any]] = {}
-    values = cast("pa.StructArray", adapted.rows)
-    for message, row in zip(index[adapted.index].tolist(), cast("Any", values).to_pylist(), strict=True):
+    values: Any = adapted.rows  # the stubs lack to_pylist of struct arrays
+    for message, row in zip(index[adapted.index].tolist(), values.to_pylist(), strict=True):
         rows.setdefault(message, []).append(row)
     return rows

@@ -31,7 +31,6 @@ from mosaico_ingest.job.model import Job
 from mosaico_ingest.pipeline.compile import compile_manifest
 from mosaico_ingest.pipeline.run import make_plan, open_job
 from mosaico_ingest.pipeline.task import Task
-from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.rosbag.blocks import Connection, MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import (
@@ -344,7 +343,9 @@ def draft_adapter(
             definition = _definition(topic_connections(recording, msgtype=name)[0])
         else:
             definition, row, _ = _message_in(recording, record)
-            example = RecordedExample(row, {"bag": relpath(path, folder), "topic": record, "index": 0})
+            example = RecordedExample(
+                row, {"bag": path if "://" in path else relpath(path, folder), "topic": record, "index": 0}
+            )
             if definition.root != name:
                 raise AdapterError(
                     f"it carries {definition.root}, not {name}", where=record, hint="name another topic"
@@ -355,15 +356,15 @@ def draft_adapter(
 @contextmanager
 def _recording(
     bag: Path | None, job: Path | None, types: DefinitionFinder
-) -> Generator[tuple[AnyPath, Recording]]:
+) -> Generator[tuple[str, Recording]]:
     """Open a recording, or the first recording of a manifest with the definitions that the manifest adds."""
     if job is None:
         with open_recording(bag or Path(), resolve=types) as recording:
-            yield bag or Path(), recording
+            yield str(bag), recording
         return
     first = compile_manifest(load_manifest(job))[0]
     with open_job(first) as (recording, _):
-        yield first.paths[0], recording
+        yield str(first.paths[0]), recording
 
 
 def _in_distros(definition: Definition) -> bool:

@@ -65,7 +65,6 @@ def test_parse_if_else_as_ternary() -> None:
         "1j",
         "a @ b",
         "a is b",
-        "a & b",
         "a[1:2:3]",
         "a.b()",
         "f(x=1)",

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+import operator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.mapping.checker import Checker, Scope
@@ -129,6 +133,16 @@ CASES = [
     ("zip(x, y)[].x", pa.list_(I4), [[1, 2], [], None], [[1, 2], [], None]),
     ("argmin(x)", pa.list_(I4), [[2, 1, 1], [], [None, 1], None], [1, None, None, None]),
     ("argmax(x)", pa.list_(F8), [[1.0, 3.0, 3.0], [1.0, NAN]], [1, 1]),
+    ("x & 6", I4, [5, -1, None], [4, 6, None]),
+    ("x | 1", I4, [4, -2, None], [5, -1, None]),
+    ("x ^ 3", U1, [5], [6]),
+    ("~x", I4, [0, 5], [-1, -6]),
+    ("(x << 4) >> 2", I4, [1, -3, None], [4, -12, None]),
+    ("bit(x, 1)", U1, [2, 5, None], [True, False, None]),
+    (r"regex_replace(x, '(a)(b)', '\\2\\1')", TEXT, ["abab", "c", None], ["baba", "c", None]),
+    ("format('{}={:.2f}', x, 1.5)", TEXT, ["a", None], ["a=1.50", None]),
+    ("format('{:04d}/{:x}', x, x)", I4, [255, None], ["0255/ff", None]),
+    ("format('{:.1f}', x)", F8, [1.25, NAN, None], ["1.2", "nan", None]),
     ("lower(x)", TEXT, ["ŻÓ"], ["żó"]),
     ("upper(x)", TEXT, ["a"], ["A"]),
     ("strip(x)", TEXT, [" a\t"], ["a"]),
@@ -254,3 +268,58 @@ def test_sum_of_null_and_large_unsigned_number_is_null() -> None:
     rows = [{"w": 2**64 - 1, "x": []}, {"w": 3, "x": [4]}]
     kind = pa.struct({"w": pa.uint64(), "x": pa.list_(pa.int64())})
     assert column("x.w + x.x[0]", rows, kind) == [None, 7]
+
+
+INTEGERS = st.none() | st.integers(-(2**63), 2**63 - 1) | st.integers(-8, 8)
+BIT_OPERATORS: dict[str, Callable[[int, int], int | bool]] = {
+    "x & y": operator.and_,
+    "x | y": operator.or_,
+    "x ^ y": operator.xor,
+    "~x": lambda x, _: ~x,
+    "x >> (y & 31)": lambda x, y: x >> (y & 31),
+    "bit(x, y & 63)": lambda x, y: bool(x >> (y & 63) & 1),
+    "(x & 255) << (y & 31)": lambda x, y: (x & 255) << (y & 31),
+}
+
+
+@pytest.mark.parametrize("text", BIT_OPERATORS)
+@given(pairs=st.lists(st.tuples(INTEGERS, INTEGERS), max_size=5))
+@settings(max_examples=25, deadline=None)
+def test_bit_operator_equals_python(text: str, pairs: list[tuple[int | None, int | None]]) -> None:
+    left, right = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+    expected = [
+        None if x is None or (y is None and "y" in text) else BIT_OPERATORS[text](x, y or 0) for x, y in pairs
+    ]
+    assert column(text, left, pa.int64(), right) == expected
+
+
+@pytest.mark.parametrize("text", ["x << 1", "x << 64", "x >> -1", "bit(x, 64)"])
+def test_shift_out_of_range_rejects_row(text: str) -> None:
+    with pytest.raises(RowsRejected) as caught:
+        column(text, [2**62], pa.int64())
+    assert caught.value.rejections[0][0] == "overflow"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "format('{}')",
+        "format('{:.2f}', x)",
+        "format('{name}', x)",
+        "format('{', x)",
+        r"regex_replace(x, '(a)', '\\2')",
+    ],
+)
+def test_wrong_format_or_replacement_is_reported(text: str) -> None:
+    shape = pa.struct([("x", TEXT)])
+    rules: list[str] = []
+    checker = Checker(Scope(ExprType(shape), {}), lambda rule, *_: rules.append(rule), text)
+    assert checker.infer(parse(text)) is None
+    assert rules == ["operand-type"]
+
+
+@given(values=st.lists(st.none() | st.floats(-1e6, 1e6), max_size=4), digits=st.integers(0, 5))
+@settings(max_examples=25, deadline=None)
+def test_format_of_floats_equals_python(values: list[float | None], digits: int) -> None:
+    expected = [None if value is None else f"{value:.{digits}f} V" for value in values]
+    assert column(f"format('{{:.{digits}f}} V', x)", values, F8) == expected

@@ -351,8 +351,7 @@ class Checker:
                 self._fail(f"{node.name} {problem}", node.arguments[position].span)
                 return True
         if function.check_literals is not None:
-            literals = [argument.value if isinstance(argument, Constant) else None for argument in arguments]
-            problem = function.check_literals(*literals)
+            problem = function.check_literals(*arguments)
             if problem is not None:
                 self._fail(f"{node.name}: {problem}", node.span)
                 return True

@@ -135,14 +135,16 @@ _OPERATORS: dict[type[ast.AST], str] = {
     ast.Not: "not",
     ast.USub: "negative",
     ast.UAdd: "positive",
+    ast.BitAnd: "&",
+    ast.BitOr: "|",
+    ast.BitXor: "^",
+    ast.Invert: "~",
+    ast.LShift: "<<",
+    ast.RShift: ">>",
 }
 
 
 _PYTHON_ONLY: dict[type[ast.AST], str] = {
-    ast.BitAnd: "`and`",
-    ast.BitOr: "`or`",
-    ast.Invert: "`not`",
-    ast.BitXor: "`**` for a power, `!=` for an exclusive or",
     ast.Is: "is_null(x) for null, `==` for other values",
     ast.IsNot: "not is_null(x) for null, `!=` for other values",
 }

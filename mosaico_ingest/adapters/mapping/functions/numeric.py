@@ -22,8 +22,16 @@ from mosaico_ingest.adapters.mapping.functions.operators import (
     float_result,
     integer_result,
     numbers,
+    shifted,
 )
-from mosaico_ingest.adapters.mapping.functions.registry import ANY, FLOAT, NUMBER, RejectRows, function
+from mosaico_ingest.adapters.mapping.functions.registry import (
+    ANY,
+    FLOAT,
+    INTEGER,
+    NUMBER,
+    RejectRows,
+    function,
+)
 from mosaico_ingest.adapters.mapping.types import ExprType, TypeMismatch, common_type
 
 __all__: list[str] = []
@@ -201,3 +209,9 @@ def clip(refuse: RejectRows, x: Array, low: Array, high: Array) -> Array:
     x, low, high = numbers(refuse, x, low, high)
     clipped = pc.min_element_wise(pc.max_element_wise(x, low, skip_nulls=False), high, skip_nulls=False)
     return pc.if_else(pc.is_nan(x), x, clipped) if pt.is_floating(x.type) else clipped
+
+
+@function(INTEGER, INTEGER, returns=arrays.bool_())
+def bit(refuse: RejectRows, x: Array, n: Array) -> Array:
+    """Whether bit n of an integer is set; the lowest is bit 0; rejects rows with n outside of 0 … 63."""
+    return pc.equal(pc.bit_wise_and(shifted(refuse, ">>", x, n), 1), 1)

@@ -7,13 +7,16 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from mosaico_ingest.adapters.mapping.columns import Array, Mask, arrays, null_mask, pc, pt, true_mask
 from mosaico_ingest.adapters.mapping.functions.registry import (
     ANY,
     BOOLEAN,
     FLOAT,
+    INTEGER,
     NUMBER,
+    Parameter,
     RejectRows,
     function,
     set_null,
@@ -309,3 +312,88 @@ def or_(left: Array, right: Array) -> Array:
 def not_(x: Array) -> Array:
     """Logical negation."""
     return pc.invert(x)
+
+
+def _bits(expr_type: ExprType) -> tuple[int, int]:
+    return expr_type.bounds or (0, 0)
+
+
+def _and_type(left: ExprType, right: ExprType) -> ExprType:
+    natural = [high for low, high in (_bits(left), _bits(right)) if low >= 0]
+    return integer_result(0, min(natural)) if natural else integer_result()
+
+
+def _or_type(left: ExprType, right: ExprType) -> ExprType:
+    bounds = (_bits(left), _bits(right))
+    if min(low for low, _ in bounds) < 0:
+        return integer_result()
+    return integer_result(0, 2 ** max(high for _, high in bounds).bit_length() - 1)
+
+
+def _inverted_type(x: ExprType) -> ExprType:
+    low, high = _bits(x)
+    return integer_result(-high - 1, -low - 1)
+
+
+def _left_shift_type(_: ExprType, _n: ExprType) -> ExprType:
+    return integer_result()
+
+
+def _right_shift_type(x: ExprType, _: ExprType) -> ExprType:
+    low, high = _bits(x)
+    return integer_result(min(low, 0), max(high, 0))
+
+
+def _bits_of(word: str) -> Parameter:
+    return replace(INTEGER, hint=f"write `{word}` for conditions, cast(x, 'int64') for a number")
+
+
+def _add_bit_operator(sign: str, word: str, run: Callable[[Array, Array], Array], returns: Any) -> None:  # noqa: ANN401 - a result type
+    def apply(refuse: RejectRows, left: Array, right: Array) -> Array:
+        """Bitwise operation on integers of up to 63 bits and a sign."""
+        return run(*numbers(refuse, left, right))
+
+    operand = _bits_of(word)
+    function(operand, operand, returns=returns, name=sign, scalars=True)(apply)
+
+
+for _sign, _word, _run, _returns in (
+    ("&", "and", pc.bit_wise_and, _and_type),
+    ("|", "or", pc.bit_wise_or, _or_type),
+    ("^", "!=", pc.bit_wise_xor, _or_type),
+):
+    _add_bit_operator(_sign, _word, _run, _returns)
+
+
+@function(_bits_of("not"), returns=_inverted_type, name="~")
+def invert(refuse: RejectRows, x: Array) -> Array:
+    """Bitwise negation."""
+    return pc.bit_wise_not(*numbers(refuse, x))
+
+
+def shifted(refuse: RejectRows, sign: str, x: Array, n: Array) -> Array:
+    """Shift integers by a number of bits from 0 to 63; reject rows with another number, or with an overflow."""
+    x, n = numbers(refuse, x, n)
+    wrong = true_mask(pc.and_(pc.is_valid(x), pc.or_(pc.less(n, 0), pc.greater(n, _MOST_BITS - 1))))
+    if wrong.any():
+        refuse(wrong, "overflow", lambda i: f"{n[i]} is not a number of bits from 0 to {_MOST_BITS - 1}")
+        n = set_null(n, wrong)
+    if sign == ">>":
+        return pc.shift_right(x, n)
+    result = pc.shift_left(x, n)
+    lost = true_mask(pc.not_equal(pc.shift_right(result, n), x))
+    if lost.any():
+        refuse(lost, "overflow", lambda i: f"{x[i]} << {n[i]} has more than 64 bits")
+    return result
+
+
+@function(INTEGER, INTEGER, returns=_left_shift_type, name="<<")
+def left_shift(refuse: RejectRows, x: Array, n: Array) -> Array:
+    """Integer shifted to higher bits."""
+    return shifted(refuse, "<<", x, n)
+
+
+@function(INTEGER, INTEGER, returns=_right_shift_type, name=">>")
+def right_shift(refuse: RejectRows, x: Array, n: Array) -> Array:
+    """Integer shifted to lower bits; the sign is kept."""
+    return shifted(refuse, ">>", x, n)

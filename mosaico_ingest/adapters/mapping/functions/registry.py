@@ -43,6 +43,8 @@ class Parameter(Struct, frozen=True):
     """The argument must be a literal in the expression; the function receives it as a Python value."""
     check_literal: Callable[[str], str | None] | None = None
     """Returns the problem of a literal text, None if it is valid."""
+    hint: str | None = None
+    """The remedy for an argument of another type."""
     of_elements: bool = False
     """The argument is evaluated for each element of the first argument, and names refer to that element."""
 
@@ -75,7 +77,7 @@ class Function(Struct, frozen=True):
     named: bool = False
     """Whether `result_type` and `apply` take the names of the arguments as the keyword `names`."""
     check_literals: Callable[..., str | None] | None = None
-    """Returns the problem of the literals of a call together, None if they are valid."""
+    """Returns the problem of the typed arguments of a call together, None if they are valid."""
     parameters: tuple[str, ...] = ()
     summary: str = ""
 
@@ -190,7 +192,7 @@ def check_call(called: Function, arguments: list[ExprType]) -> ExprType:
         parameter = called.parameter(position)
         if not parameter.takes(argument):
             message = f"{called.name} takes {parameter.description} here, not {format_type(argument)}"
-            raise TypeMismatch(message, argument=position)
+            raise TypeMismatch(message, argument=position, hint=parameter.hint)
     if not called.sees_null and any(pt.is_null(argument.arrow) for argument in arguments):
         return ExprType(arrays.null())
     return called.result_type(*arguments)

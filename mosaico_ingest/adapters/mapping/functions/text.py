@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from string import Formatter
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
@@ -18,7 +20,7 @@ from mosaico_ingest.adapters.mapping.functions.registry import (
     list_of,
     set_null,
 )
-from mosaico_ingest.adapters.mapping.types import ExprType, is_number
+from mosaico_ingest.adapters.mapping.types import ExprType, format_type, is_number
 
 __all__: list[str] = []
 
@@ -111,6 +113,85 @@ _PATTERN = replace(TEXT_LITERAL, description="a pattern in quotes", check_litera
 def extract(s: Array, pattern: str) -> Array:
     """The match of the pattern's first group, or of the pattern if it has no group; null without a match."""
     return pc.struct_field(pc.extract_regex(s, pattern=_grouped(pattern)), [0])
+
+
+def _regex_problem(pattern: str) -> str | None:
+    try:
+        pc.match_substring_regex(arrays.array([], arrays.string()), pattern=pattern)
+    except arrays.ArrowInvalid:
+        return f"{pattern!r} is not a regular expression of RE2"
+    return None
+
+
+_REGEX = replace(TEXT_LITERAL, description="a pattern in quotes", check_literal=_regex_problem)
+
+
+def _replacement_problem(_: Any, pattern: Any, new: Any) -> str | None:  # noqa: ANN401 - typed expressions
+    try:
+        pc.replace_substring_regex(arrays.array([""]), pattern=pattern.value, replacement=new.value)
+    except arrays.ArrowInvalid as error:
+        return str(error).partition(": ")[2]
+    return None
+
+
+@function(TEXT, _REGEX, TEXT_LITERAL, returns=arrays.string(), check_literals=_replacement_problem)
+def regex_replace(s: Array, pattern: str, new: str) -> Array:
+    r"""S with every match of a pattern replaced by new, in which `\\1` is the first group."""
+    return pc.replace_substring_regex(s, pattern=pattern, replacement=new)
+
+
+_SPECIFICATION = re.compile(r"(0?\d*)(\.\d+)?([defgxX]?)")
+
+
+def _format_problem(template: Any, *values: Any) -> str | None:  # noqa: ANN401 - typed expressions
+    try:
+        parts = [part for part in Formatter().parse(template.value) if part[1] is not None]
+    except ValueError as error:
+        return str(error)
+    if len(parts) != len(values):
+        return f"the text has {len(parts)} fields, and there are {len(values)} values"
+    for (_, name, specification, conversion), value in zip(parts, values, strict=True):
+        match = _SPECIFICATION.fullmatch(specification or "")
+        if name or conversion or match is None:
+            return "a field is {}, or has a format such as {:.2f}, {:04d} or {:x}"
+        if specification and not is_number(value.type.arrow):
+            return f"{{:{specification}}} formats numbers, not {format_type(value.type.element)}"
+        whole = match[3] in {"d", "x", "X"} or (not match[2] and not match[3])
+        if specification and whole and not pt.is_integer(value.type.arrow):
+            return f"{{:{specification}}} formats integers, not {format_type(value.type.element)}"
+    return None
+
+
+@function(
+    TEXT_LITERAL,
+    _TEXT_OR_NUMBER,
+    returns=arrays.string(),
+    variadic=True,
+    check_literals=_format_problem,
+    name="format",
+)
+def format_(template: str, x: Array, *others: Array) -> Array:
+    """Text with `{}` replaced by the values, as in `format('{}: {:.2f} V', name, volts)`; formats as in Python."""
+    values = iter((x, *others))
+    pieces: list[Any] = []
+    for literal, name, specification, _ in Formatter().parse(template):
+        pieces.append(literal)
+        if name is not None:
+            pieces.append(_formatted(next(values), specification or ""))
+    return pc.binary_join_element_wise(*pieces, "")
+
+
+def _formatted(values: Array, specification: str) -> Array:
+    if not specification:
+        return pc.cast(values, arrays.string())
+    code = (
+        specification
+        if specification[-1].isalpha()
+        else f"{specification}{'d' if pt.is_integer(values.type) else 'f'}"
+    )
+    filled = np.asarray(pc.fill_null(values, 0))
+    texts = np.char.mod(f"%{code}", filled) if len(filled) else np.zeros(0, str)
+    return arrays.array(texts, arrays.string(), mask=null_mask(values))
 
 
 @function(_TEXT_OR_NUMBER, returns=arrays.string())
