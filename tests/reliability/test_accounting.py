@@ -49,7 +49,7 @@ def missing(
     promised: int | None, seen: int, unreadable: list[UnreadableRange], **plan: Any
 ) -> tuple[list[str], list[Event]]:
     events: list[Event] = []
-    topic = SimpleNamespace(target="/t", count=promised, connections=(7,))
+    topic = SimpleNamespace(target="/t", count=promised, connections=(7,), shares_messages=False)
     recording: Any = SimpleNamespace(unreadable=unreadable)
     wanted: Any = SimpleNamespace(**{"read_from_ns": None, "read_until_ns": None, **plan})
     streams: Any = (SimpleNamespace(plan=topic, read=seen),)
