@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 Int64s = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-_NO_ROWS = pa.StructArray.from_arrays([], names=[])
 _SECOND_NS = 1_000_000_000
 
 
@@ -65,7 +64,8 @@ def block_times(block: MessageBlock, decoder: Decoder, stamp: StampSource, offse
     if stamp is StampSource.LOG:
         return block.log_times + offset_ns
     if stamp is StampSource.PUBLISH:
-        return row_times(stamp, offset_ns, _NO_ROWS, block.log_times, block.publish_times).values
+        no_rows = pa.StructArray.from_arrays([], names=[])
+        return row_times(stamp, offset_ns, no_rows, block.log_times, block.publish_times).values
     decoded = decoder.decode(block)
     times = block.log_times + offset_ns
     index = decoded.index

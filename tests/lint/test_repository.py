@@ -39,8 +39,12 @@ def test_problem_matcher_parses_printed_finding() -> None:
     ]  # fmt: skip
 
 
-def test_pre_commit_hook_runs_lint_for_its_files() -> None:
-    (hook,) = yaml.safe_load((ROOT / ".pre-commit-hooks.yaml").read_text())
-    assert hook["entry"].split()[:2] == ["ingest", "lint"]
-    for name in ("configs/quickstart.yaml", "job.yml", "job.json", "msgs/Pack.msg", "docs/ci.md"):
-        assert re.search(hook["files"], name)
+def test_pre_commit_hooks_run_lint_for_their_files() -> None:
+    lint, fix = yaml.safe_load((ROOT / ".pre-commit-hooks.yaml").read_text())
+    assert lint["entry"].split()[:2] == ["ingest", "lint"]
+    assert fix["entry"].split()[:3] == ["ingest", "lint", "--fix"]
+    for name in ("configs/quickstart.yaml", "job.yml", "job.json"):
+        assert re.search(lint["files"], name)
+        assert re.search(fix["files"], name)
+    for name in ("msgs/Pack.msg", "docs/ci.md"):
+        assert re.search(lint["files"], name)

@@ -17,6 +17,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from made_recordings import define, record
+from store_formats import make_format_1
 
 from mosaico_ingest import api
 from mosaico_ingest.cli.app import main
@@ -266,8 +267,7 @@ def test_run_into_catalog_without_checksums_adds_the_column(
 ) -> None:
     write_bag({"/speed": [number(1)]})
     run_job(write_job())
-    with closing(sqlite3.connect(tmp_path / "store" / "catalog.sqlite")) as db:
-        db.execute("ALTER TABLE segments DROP COLUMN checksum")
+    make_format_1(tmp_path / "store")
     with pytest.raises(SystemExit) as ended:
         main(["verify", "--store", str(tmp_path / "store")])
     assert ended.value.code == 0

@@ -214,14 +214,17 @@ def test_splits_directories_and_globs_are_found(objects: ObjectStore, tmp_path: 
             "s3://bucket/drives/night/part_2.mcap",
         ]
         assert len(messages(two)) == 8
-    for pattern, names in {
-        "drives/night/part_*.mcap": ["part_0", "part_1", "part_2"],
-        "drives/*/part_[12].mcap": ["part_1", "part_2"],
-        "drives/**/part_1.mcap": ["part_1"],
-        "drives/*": ["night"],
-    }.items():
+    for pattern, group, names in [
+        ("drives/night/part_*.mcap", "none", ["part_0", "part_1", "part_2"]),
+        ("drives/night/part_*.mcap", "auto", ["part"]),
+        ("drives/*/part_[12].mcap", "auto", ["part_1", "part_2"]),
+        ("drives/**/part_1.mcap", "auto", ["part_1"]),
+        ("drives/*", "auto", ["night"]),
+    ]:
         job = tmp_path / "job.yaml"
-        job.write_text(f'bag: {{path: "{objects.url(pattern)}"}}\nsequence: {{name: "{{stem}}"}}\n')
+        job.write_text(
+            f'bag: {{path: "{objects.url(pattern)}", group: {group}}}\nsequence: {{name: "{{stem}}"}}\n'
+        )
         assert [one.sequence.name for one in compile_manifest(load_manifest(job))] == names
     job.write_text(f'bag: {{path: "{objects.url("drives/none*.mcap")}"}}\nsequence: {{name: a}}\n')
     with pytest.raises(NothingMatched, match=r"no recording matches s3://bucket/drives/none\*.mcap"):

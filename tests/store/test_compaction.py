@@ -16,6 +16,7 @@ import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from store_formats import make_format_1
 from typer.testing import CliRunner
 
 from mosaico_ingest.cli.app import command_line, main
@@ -153,16 +154,16 @@ def test_writer_during_compaction_wins(
     assert set(store.layout.segment_files()) == known
 
 
-def test_catalog_of_earlier_version_gets_column_with_first_compaction(
+def test_catalog_of_format_1_is_converted_by_first_compaction(
     store: Store, rows: Rows, sample: OntologyType
 ) -> None:
     append_all(store, sample, [rows([at], at) for at in range(3)])
-    assert isinstance(store.catalog, Catalog)
-    with store.catalog.write() as db:
-        db.execute("ALTER TABLE segments DROP COLUMN merged")
     expected = content(store)
-    assert [result.segments for result in run(store)] == [3]
-    assert content(store) == expected
+    make_format_1(store.layout.root)
+    old = Store.open(store.layout.root, create=False)
+    assert content(old) == expected
+    assert [result.segments for result in run(old)] == [3]
+    assert content(old) == expected
 
 
 COMPACT = """

@@ -9,6 +9,7 @@ from contextlib import closing
 
 import pyarrow as pa
 import pytest
+from store_formats import make_format_1
 
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.destinations.store.catalog import FORMAT
@@ -31,42 +32,11 @@ def fill(sink: StoreSink, rows: Rows, sample: OntologyType, names: str) -> None:
             session.topic("/imu", ontology_type("IMU"), {})
 
 
-def make_format_1(store: Store) -> None:
-    """Give each topic its own schema, as in format 1."""
-    with closing(sqlite3.connect(store.layout.root / "catalog.sqlite")) as db:
-        db.executescript(
-            """
-            PRAGMA foreign_keys = OFF;
-            PRAGMA legacy_alter_table = ON; -- keeps the references of other tables
-            DROP INDEX topics_of_schema;
-            ALTER TABLE topics RENAME TO current;
-            CREATE TABLE topics (
-                id INTEGER PRIMARY KEY,
-                sequence_id INTEGER NOT NULL REFERENCES sequences ON DELETE CASCADE,
-                session_id TEXT NOT NULL,
-                name TEXT NOT NULL,
-                ontology_tag TEXT NOT NULL,
-                serialization_format TEXT NOT NULL,
-                fingerprint TEXT NOT NULL,
-                arrow_schema BLOB NOT NULL,
-                metadata TEXT NOT NULL,
-                created_ns INTEGER NOT NULL,
-                UNIQUE (sequence_id, name)
-            );
-            INSERT INTO topics SELECT id, sequence_id, session_id, name, ontology_tag, serialization_format, fingerprint,
-                arrow_schema, metadata, created_ns FROM current JOIN schemas ON digest = schema_digest;
-            DROP TABLE current;
-            DROP TABLE schemas;
-            PRAGMA user_version = 1;
-            """
-        )
-
-
 @pytest.fixture
 def old(store: Store, sink: StoreSink, rows: Rows, sample: OntologyType) -> Store:
     """A store of format 1 with two sequences."""
     fill(sink, rows, sample, "ab")
-    make_format_1(store)
+    make_format_1(store.layout.root)
     references = query(store, "SELECT sql FROM sqlite_master WHERE name = 'segments'")
     assert "current" not in str(references)
     return store

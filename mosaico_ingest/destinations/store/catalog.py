@@ -170,7 +170,9 @@ class Catalog:
             return _commit(db, claimed, new)
 
     def replace_segments(self, change: Replacement) -> bool:
-        """See `StoreCatalog.replace_segments`."""
+        """See `StoreCatalog.replace_segments`; a catalog of an earlier format is converted."""
+        with translate_errors(self.path):
+            self._prepare(create=True)
         with self.write() as db:
             return _replace_segments(db, change)
 
@@ -674,8 +676,6 @@ def _replace_segments(db: sqlite3.Connection, change: Replacement) -> bool:
     known = set(_paths(db, "topic_id = ?", topic)) if topic is not None else set[str]()
     if topic is None or not known.issuperset(change.replaced):
         return False
-    for column in _missing_columns(db):
-        db.execute(f"ALTER TABLE segments ADD COLUMN {column} TEXT")
     db.executemany("DELETE FROM segments WHERE path = ?", [(path,) for path in change.replaced])
     _enter_segments(db, topic, change.session, {change.path: change.segment})
     merged = json.dumps([(part.session, part.checksum) for part in change.merged])
